@@ -1,0 +1,16 @@
+"""jbrep: reduced-order representations of an underactuated robot, and what they do to learning.
+
+Importing it registers the Jitterbug's environments with Gymnasium; nothing heavy is loaded until
+it is used.
+"""
+
+from types import ModuleType
+
+import wrapt
+
+
+@wrapt.when_imported("gymnasium")
+def _register(_gymnasium: ModuleType) -> None:
+    from jbrep.envs import register
+
+    register()

@@ -1,0 +1,143 @@
+"""The stable-baselines3 environment: many Jitterbugs, seen whole or through an encoder."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+from jbrep.envs.episodes import Episodes
+from jbrep.errors import InputError
+from jbrep.jitterbug.simulation import check_actions
+from jbrep.jitterbug.tasks import Array
+
+Float32 = NDArray[np.float32]
+
+
+class LatentEncoder(Protocol):
+    """What the environment needs of an encoder."""
+
+    @property
+    def latent_size(self) -> int:
+        """l, the length of a latent."""
+
+    def __call__(self, observation: Float32, /) -> Float32:
+        """Scaled observations (n, d) to latents (n, l)."""
+
+
+class JitterbugVecEnv(VecEnv):
+    """Many Jitterbugs for stable-baselines3, stepped together on MuJoCo's batch.
+
+    Observations are float32 and scaled by the nominal ranges; with an encoder, the agent sees
+    latents in their place, terminal ones too. Lane i takes seed `seed + i`.
+
+    Args:
+        task: a key of `jbrep.jitterbug.tasks.TASKS`.
+        num_envs: how many robots.
+        seed: of the first lane.
+        encoder: scaled observations to latents; None leaves the full observation.
+        num_threads: threads to step them on; None takes one for each core.
+
+    When an episode ends, `infos[i]` holds `terminal_observation`, `TimeLimit.truncated` (always
+    true: no state ends a task) and `non_finite` (whether the physics diverged).
+
+    Raises:
+        InputError: unknown task, a number below 1, an encoder whose output has another size than
+            it says; actions of another shape than (num_envs, 1), or not finite.
+    """
+
+    render_mode = None
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int,
+        seed: int = 0,
+        encoder: LatentEncoder | None = None,
+        num_threads: int | None = None,
+    ):
+        self._episodes = Episodes(task, num_envs, num_threads)
+        self.task = self._episodes.task
+        self._encoder = encoder
+        self._size = encoder.latent_size if encoder else self.task.size
+        self._actions = np.zeros((num_envs, 1))
+        self._represent(np.zeros((num_envs, self.task.size)))  # an encoder may refuse this task
+        super().__init__(
+            num_envs,
+            spaces.Box(-np.inf, np.inf, (self._size,), np.float32),
+            spaces.Box(-1, 1, (1,), np.float32),
+        )
+        self.seed(seed)
+
+    def reset(self) -> Float32:
+        """Start an episode in every lane: from the seeds if they are new, else the next."""
+        observation = self._episodes.reset(self._seeds)
+        self._reset_seeds()
+        self._reset_options()
+        return self._represent(observation)
+
+    def step_async(self, actions: NDArray[np.floating]) -> None:
+        """Take the actions, (num_envs, 1)."""
+        self._actions = check_actions(actions, self.num_envs)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """One control step in every lane."""
+        outcome = self._episodes.step(self._actions)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if outcome.done.any():
+            lanes = np.flatnonzero(outcome.done)
+            for lane, final in zip(
+                lanes, self._represent(outcome.final_observation[lanes]), strict=True
+            ):
+                infos[lane] = {
+                    "terminal_observation": final,
+                    "TimeLimit.truncated": True,
+                    "non_finite": bool(outcome.diverged[lane]),
+                }
+        reward = outcome.reward.astype(np.float32)
+        return self._represent(outcome.observation), reward, outcome.done, infos
+
+    def _represent(self, observation: Array) -> Float32:
+        scaled = self.task.scale(observation).astype(np.float32)
+        if self._encoder is None:
+            return scaled
+        latent = np.asarray(self._encoder(scaled), dtype=np.float32)
+        if latent.shape != (len(scaled), self._size):
+            raise InputError(
+                f"the encoder gave {latent.shape} for {len(scaled)} observations of "
+                f"{self.task.name}: its latent_size says ({len(scaled)}, {self._size})"
+            )
+        return latent
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """An attribute of this environment, which the lanes share."""
+        return self._for_lanes(indices, lambda: getattr(self, attr_name))
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of this environment, for all lanes."""
+        setattr(self, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
+    ) -> list[Any]:
+        """Call a method of this environment once; every lane gets the result."""
+        result = getattr(self, method_name)(*args, **kwargs)
+        return self._for_lanes(indices, lambda: result)
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
+        """False: no lane is an environment of its own."""
+        return self._for_lanes(indices, lambda: False)
+
+    def _for_lanes(self, indices: VecEnvIndices, value: Callable[[], Any]) -> list[Any]:
+        lanes: Sequence[int] = range(self.num_envs)
+        if isinstance(indices, int):
+            lanes = [indices]
+        elif indices is not None:
+            lanes = list(indices)
+        return [value() for _ in lanes]

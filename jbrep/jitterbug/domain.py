@@ -1,0 +1,147 @@
+"""The Jitterbug as a dm_control domain."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from dm_control import mujoco, suite
+from dm_control.rl import control
+from dm_control.suite import base
+from dm_control.utils import containers
+
+from jbrep.jitterbug import model, tasks
+from jbrep.jitterbug.tasks import Array, Readings
+
+DOMAIN = "jitterbug"
+SUITE = containers.TaggedTasks()
+_TIME_LIMIT = tasks.EPISODE_STEPS * tasks.CONTROL_TIMESTEP  # [s]
+
+
+class Physics(mujoco.Physics):
+    """The robot, its target, and what the tasks read of them."""
+
+    def readings(self) -> Readings:
+        """What the tasks read, as a batch of one; the arrays are views."""
+        data, named = self.data, self.named.data
+        return Readings(
+            data.qpos[None],
+            data.qvel[None],
+            named.xmat["jitterbug"][None],
+            data.sensordata[None],
+            data.mocap_pos,
+            data.mocap_quat,
+        )
+
+    def uprightness(self) -> float:
+        """Cosine between the bug's z axis and the world's."""
+        return float(tasks.uprightness(self.readings())[0])
+
+    def angle_to_target(self) -> float:
+        """Angle from the bug's heading to the target's yaw [rad]."""
+        return float(tasks.angle_to_target(self.readings())[0])
+
+    def distance_to_target(self) -> float:
+        """Distance from the bug's origin to the target [m]."""
+        return float(tasks.distance_to_target(self.readings())[0])
+
+
+class Jitterbug(base.Task):
+    """One of the five tasks.
+
+    Args:
+        task: its name, a key of `tasks.TASKS`.
+        random: a `RandomState`, a seed, or None. A seed gives the same episodes as it does in
+            the Gymnasium environment.
+
+    Raises:
+        InputError: unknown task.
+    """
+
+    def __init__(self, task: str, random: np.random.RandomState | int | None = None):
+        self._task = tasks.get_task(task)
+        if not isinstance(random, np.random.RandomState):
+            random = np.random.RandomState(np.random.PCG64(random))
+        super().__init__(random=random)
+
+    def initialize_episode(self, physics: Physics) -> None:
+        """Turn the robot and place the target, both drawn from the task's generator."""
+        start = self._task.start(self.random)
+        physics.data.qpos[3:7] = start.quaternion
+        physics.data.mocap_pos[0] = start.target_position
+        physics.data.mocap_quat[0] = start.target_quaternion
+        physics.forward()
+        super().initialize_episode(physics)
+
+    def get_observation(self, physics: Physics) -> OrderedDict[str, Array]:
+        """The observables by name, in the order of the flat observation."""
+        observation = self._task.observe(physics.readings())[0]
+        parts = self._task.split(observation)
+        return OrderedDict((name, part.copy()) for name, part in parts.items())
+
+    def get_reward(self, physics: Physics) -> float:
+        """The reward, in [0, 1]."""
+        return float(self._task.reward(physics.readings())[0])
+
+
+def _factory(name: str) -> Callable[..., control.Environment]:
+    def make(
+        time_limit: float = _TIME_LIMIT,
+        random: np.random.RandomState | int | None = None,
+        environment_kwargs: dict[str, Any] | None = None,
+    ) -> control.Environment:
+        return control.Environment(
+            Physics.from_xml_string(model.read_xml()),
+            Jitterbug(name, random=random),
+            time_limit=time_limit,
+            control_timestep=tasks.CONTROL_TIMESTEP,
+            **(environment_kwargs or {}),
+        )
+
+    make.__name__ = name
+    make.__doc__ = f"Returns the {name} task."
+    return make
+
+
+for _task in tasks.TASKS.values():
+    SUITE.add("benchmarking", _task.level)(_factory(_task.name))
+
+
+def load(
+    task: str,
+    seed: int | None = None,
+    time_limit: float = _TIME_LIMIT,
+    environment_kwargs: dict[str, Any] | None = None,
+    visualize_reward: bool = False,
+) -> control.Environment:
+    """A dm_control environment of the task.
+
+    Args:
+        task: a key of `tasks.TASKS`.
+        seed: of all draws; None draws one.
+        time_limit: of an episode [s].
+        environment_kwargs: for `dm_control.rl.control.Environment`.
+        visualize_reward: colour the robot by its reward.
+
+    Raises:
+        InputError: unknown task.
+    """
+    name = tasks.get_task(task).name
+    environment = SUITE[name](time_limit, seed, environment_kwargs)
+    environment.task.visualize_reward = visualize_reward
+    return environment
+
+
+def register_with_suite() -> None:
+    """Make `suite.load("jitterbug", task)` and all of the suite's task lists know the tasks."""
+    import jbrep.jitterbug.domain as this
+
+    suite._DOMAINS[DOMAIN] = this
+    suite.ALL_TASKS = suite._get_tasks(tag=None)
+    suite.BENCHMARKING = suite._get_tasks("benchmarking")
+    suite.EASY = suite._get_tasks("easy")
+    suite.HARD = suite._get_tasks("hard")
+    suite.EXTRA = tuple(sorted(set(suite.ALL_TASKS) - set(suite.BENCHMARKING)))
+    suite.NO_REWARD_VIZ = suite._get_tasks("no_reward_visualization")
+    suite.REWARD_VIZ = tuple(sorted(set(suite.ALL_TASKS) - set(suite.NO_REWARD_VIZ)))
+    suite.TASKS_BY_DOMAIN = suite._get_tasks_by_domain(suite.ALL_TASKS)

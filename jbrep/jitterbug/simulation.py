@@ -1,0 +1,110 @@
+"""Many Jitterbugs, stepped together on a pool of threads."""
+
+from collections.abc import Iterable, Sequence
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import ArrayLike, NDArray
+
+from jbrep.errors import InputError
+from jbrep.jitterbug import model
+from jbrep.jitterbug.tasks import Array, Readings, Task
+
+_UP_TO_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
+_DIVERGED = [  # on each of these MuJoCo puts the lane back to its default state
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQVEL),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+]
+
+
+class Simulation:
+    """n Jitterbugs in n lanes; what a lane does depends on its own start and actions alone.
+
+    Neither the number of lanes nor that of threads changes a bit of any trajectory.
+
+    Args:
+        task: what is observed and rewarded.
+        num_lanes: n, how many robots.
+        num_threads: threads to step them on; None takes one for each core.
+
+    Attributes:
+        readings: live views of the lanes, which change with every step.
+        model: the compiled MuJoCo model.
+
+    Raises:
+        InputError: a number below 1.
+    """
+
+    def __init__(self, task: Task, num_lanes: int, num_threads: int | None = None):
+        for count, what in ((num_lanes, "robots"), (num_threads, "threads")):
+            if count is not None and count < 1:
+                raise InputError(f"the number of {what} is {count}: it must be at least 1")
+        model.stop_profiling()
+        self.task = task
+        self.num_lanes = num_lanes
+        self.model = model.fast_model()
+        self._batch = Batch(self.model, num_lanes, num_threads or 0)
+        self._control = self._batch.bind("ctrl")
+        body = self.model.body("jitterbug").id
+        self.readings = Readings(
+            self._batch.bind("qpos"),
+            self._batch.bind("qvel"),
+            self._batch.bind("xmat")[:, body],
+            self._batch.bind("sensordata"),
+            self._batch.bind("mocap_pos")[:, 0],
+            self._batch.bind("mocap_quat")[:, 0],
+        )
+
+    def reset(self, lanes: Sequence[int], randoms: Iterable[np.random.Generator]) -> None:
+        """Start an episode in each of the lanes, drawn from the generator that goes with it."""
+        self._batch.reset(lanes, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        for lane, random in zip(lanes, randoms, strict=True):
+            start = self.task.start(random)
+            self.readings.qpos[lane, 3:7] = start.quaternion
+            self.readings.target_position[lane] = start.target_position
+            self.readings.target_quaternion[lane] = start.target_quaternion
+        self._batch.forward(lanes, stage=_UP_TO_VELOCITIES)
+
+    def step(self, action: Array) -> NDArray[np.bool_]:
+        """Hold the actions (n, 1) for one control step.
+
+        Returns:
+            (n,) whether the lane's physics diverged: it stands in its default state then, and
+            its episode is over.
+        """
+        self._control[:] = action
+        self._batch.step(nstep=model.PHYSICS_STEPS, stage=_UP_TO_VELOCITIES)
+        return self._batch.warning[:, _DIVERGED, 1].any(axis=1)
+
+    def observe(self) -> Array:
+        """The observations in physical units, (n, d)."""
+        return self.task.observe(self.readings)
+
+    def reward(self) -> Array:
+        """The rewards of the states that the lanes are in, (n,)."""
+        return self.task.reward(self.readings)
+
+    def copy_data(self, lane: int, data: mujoco.MjData | None = None) -> mujoco.MjData:
+        """A lane as a MuJoCo data object with its positions current, to render or inspect."""
+        data = self._batch.get_data(lane, data)
+        mujoco.mj_fwdPosition(self.model, data)
+        return data
+
+
+def check_actions(actions: ArrayLike, num_lanes: int) -> Array:
+    """The actions as (num_lanes, 1) float64.
+
+    Raises:
+        InputError: another shape, or a value that is not finite.
+    """
+    checked: Array = np.asarray(actions, dtype=np.float64)
+    if checked.shape != (num_lanes, 1):
+        raise InputError(
+            f"actions have shape {checked.shape}: ({num_lanes}, 1) is needed, one motor drive "
+            "in [-1, 1] for each robot"
+        )
+    if not np.isfinite(checked).all():
+        raise InputError(f"actions are not finite: {checked.ravel()}; they must be in [-1, 1]")
+    return checked

@@ -1,0 +1,195 @@
+"""The contract that dm_control holds its own domains to, and equality with the batched lanes."""
+
+from unittest import mock
+
+import numpy as np
+import pytest
+from conftest import needs_egl
+from dm_control import suite
+from dm_control.rl import control
+from dm_env import specs
+
+from jbrep import jitterbug
+from jbrep.errors import InputError
+from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.tasks import TASKS, get_task
+
+jitterbug.register_with_suite()
+pytestmark = pytest.mark.parametrize("task", TASKS)
+
+
+def load(task, **kwargs):
+    return suite.load("jitterbug", task, **kwargs)
+
+
+def episodes(environment, seed=0, count=2, steps=1000):
+    """Every time step of some episodes of random actions."""
+    random = np.random.default_rng(seed)
+    for _ in range(count):
+        step = environment.reset()
+        yield step
+        for _ in range(steps):
+            step = environment.step(random.uniform(-1, 1, 1))
+            yield step
+            if step.last():
+                break
+
+
+def test_the_suite_knows_the_task_in_all_its_lists(task):
+    jitterbug.register_with_suite()  # a second time changes nothing
+    pair = ("jitterbug", task)
+    level, other = (suite.EASY, suite.HARD)
+    if TASKS[task].level == "hard":
+        level, other = other, level
+    for tasks in (suite.ALL_TASKS, suite.BENCHMARKING, suite.REWARD_VIZ, level):
+        assert tasks.count(pair) == 1
+    for tasks in (suite.EXTRA, suite.NO_REWARD_VIZ, other):
+        assert pair not in tasks
+    assert suite.TASKS_BY_DOMAIN["jitterbug"] == tuple(TASKS)
+    assert len(suite.ALL_TASKS) == sum(map(len, suite.TASKS_BY_DOMAIN.values()))
+    assert ("walker", "run") in suite.ALL_TASKS
+
+
+def test_every_part_of_the_model_has_a_name(task):
+    model = load(task).physics.model
+    kinds = {
+        "body": "nbody", "joint": "njnt", "geom": "ngeom", "site": "nsite", "camera": "ncam",
+        "light": "nlight", "mesh": "nmesh", "hfield": "nhfield", "texture": "ntex",
+        "material": "nmat", "equality": "neq", "tendon": "ntendon", "actuator": "nu",
+        "sensor": "nsensor", "numeric": "nnumeric", "text": "ntext", "tuple": "ntuple",
+    }  # fmt: skip
+    for kind, size in kinds.items():
+        assert all(model.id2name(i, kind) for i in range(getattr(model, size))), kind
+    assert model.ncam >= 2
+
+
+def test_time_steps_keep_to_the_specs(task):
+    environment = load(task)
+    action = environment.action_spec()
+    assert (action.minimum, action.maximum) == (-1, 1)
+    for step in episodes(environment, steps=50):
+        spec = environment.observation_spec()
+        assert set(step.observation) == set(spec)
+        for name, value in step.observation.items():
+            spec[name].validate(value)
+            assert np.isfinite(value).all()
+        if step.first():
+            assert step.reward is None
+            assert step.discount is None
+        else:
+            assert isinstance(step.reward, float)
+            assert 0 <= step.reward <= 1
+            assert step.discount == 1.0
+
+
+def test_an_episode_ends_by_time_alone_after_1000_steps(task):
+    steps = list(episodes(load(task), count=1, steps=2000))
+    assert len(steps) == 1001
+    assert steps[-1].last()
+    assert steps[-1].discount == 1.0
+
+
+def test_equal_seeds_give_equal_episodes_and_others_differ(task):
+    def tape(seed):
+        environment = load(task, task_kwargs={"random": seed})
+        return [
+            np.concatenate([*step.observation.values(), [step.reward or 0]])
+            for step in episodes(environment, steps=30)
+        ]
+
+    np.testing.assert_array_equal(tape(3), tape(3))
+    assert not np.array_equal(tape(3)[0], tape(4)[0])
+
+
+def test_starts_are_random(task):
+    environment = load(task, task_kwargs={"random": 42})
+    one, other = environment.reset().observation, environment.reset().observation
+    assert any(not np.array_equal(one[name], other[name]) for name in one)
+
+
+def test_no_feature_is_constant(task):
+    steps = [np.concatenate(list(s.observation.values())) for s in episodes(load(task), count=2)]
+    assert (np.ptp(steps, axis=0) > 0).all()
+
+
+def test_observations_share_no_memory(task):
+    environment = load(task)
+    one = environment.reset().observation
+    other = environment.step(np.zeros(1)).observation
+    arrays = [*one.values(), *other.values()]
+    for i, array in enumerate(arrays):
+        assert not any(np.may_share_memory(array, b) for b in arrays[i + 1 :])
+
+
+def test_environment_kwargs_reach_the_environment(task):
+    environment = load(task, environment_kwargs={"flat_observation": True})
+    assert set(environment.observation_spec()) == {control.FLAT_OBSERVATION_KEY}
+    flat = environment.reset().observation[control.FLAT_OBSERVATION_KEY]
+    np.testing.assert_array_equal(flat, TASKS[task].observe(environment.physics.readings())[0])
+
+
+def test_reward_is_shown_by_colour(task):
+    environment = jitterbug.load(task, visualize_reward=True)
+    colours = environment.physics.named.model.mat_rgba
+    for reward, shown in ((-3, 0), (0.5, 0.5), (2, 1), (0.25, 0.25)):
+        with mock.patch.object(environment.task, "get_reward", return_value=reward) as get_reward:
+            environment.reset()
+            get_reward.assert_called_with(environment.physics)
+        for name in ("self", "effector", "target"):
+            blend = shown**4
+            default, highlight = colours[f"{name}_default"], colours[f"{name}_highlight"]
+            expected = blend * highlight + (1 - blend) * default
+            np.testing.assert_allclose(colours[name], expected, atol=1e-6)
+            assert not np.allclose(default, highlight)
+
+
+def test_a_generator_may_be_passed(task):
+    random = np.random.RandomState(7)
+    environment = load(task, task_kwargs={"random": random})
+    assert environment.task.random is random
+
+
+def test_physics_says_what_the_tasks_read(task):
+    environment = jitterbug.load(task, seed=1)
+    environment.reset()
+    physics = environment.physics
+    assert 0.999 < physics.uprightness() <= 1
+    assert -np.pi <= physics.angle_to_target() < np.pi
+    assert physics.distance_to_target() == pytest.approx(
+        np.linalg.norm(physics.named.data.geom_xpos["target"] - physics.data.qpos[:3])
+    )
+    assert isinstance(environment.action_spec(), specs.BoundedArray)
+
+
+def test_every_lane_has_the_same_episode_bit_for_bit(task):
+    """A plain dm_control environment and a lane among others, over two whole episodes."""
+    environment = jitterbug.load(task, seed=5)
+    lanes = Simulation(get_task(task), 3, 2)
+    randoms = [np.random.default_rng(seed) for seed in (4, 5, 6)]
+    actions = np.random.default_rng(0)
+    for _ in range(2):
+        step = environment.reset()
+        lanes.reset(range(3), randoms)
+        while True:
+            flat = np.concatenate(list(step.observation.values()))
+            np.testing.assert_array_equal(flat, lanes.observe()[1])
+            if step.last():
+                break
+            action = actions.uniform(-1, 1, (3, 1))
+            step = environment.step(action[1])
+            lanes.step(action)
+            assert step.reward == lanes.reward()[1]
+
+
+def test_an_unknown_task_is_refused(task):
+    with pytest.raises(InputError, match=f"unknown task .*{task}"):
+        jitterbug.load(task + "s")
+
+
+@needs_egl
+@pytest.mark.parametrize("camera", ["overhead", "tracking", "egocentric"])
+def test_cameras_show_something(task, camera):
+    environment = jitterbug.load(task, seed=0)
+    environment.reset()
+    frame = environment.physics.render(120, 160, camera_id=camera)
+    assert frame.std() > 10

@@ -1,0 +1,172 @@
+"""Gymnasium: ids, checkers, forms, time limit, seeds and divergence."""
+
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from conftest import needs_egl
+from gymnasium.envs.mujoco.utils import check_mujoco_reset_state
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+from jbrep.envs import JitterbugVectorEnv, environment_id
+from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import TASKS
+
+IDS = [environment_id(task) for task in TASKS]
+FACE = environment_id("face_direction")
+
+
+def test_the_ids():
+    assert IDS == [
+        "Jitterbug/MoveFromOrigin-v0",
+        "Jitterbug/FaceDirection-v0",
+        "Jitterbug/MoveInDirection-v0",
+        "Jitterbug/MoveToPosition-v0",
+        "Jitterbug/MoveToPose-v0",
+    ]
+
+
+@pytest.mark.parametrize("order", ["jbrep, gymnasium", "gymnasium, jbrep"])
+def test_importing_jbrep_registers_them_in_any_order(order):
+    code = f"import {order}; print(gymnasium.spec('{FACE}').max_episode_steps)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "1000\n"
+
+
+def test_rl_zoo3_s_way_of_importing_registers_them():
+    """Its --gym-packages option imports the package by name, then makes the id."""
+    code = (
+        "import importlib, gymnasium; importlib.import_module('jbrep');"
+        f"assert '{FACE}' in gymnasium.envs.registry; gymnasium.make('{FACE}')"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*-?infinity. This is probably too")  # no state is bounded
+@pytest.mark.parametrize("form", ["flat", "dict"])
+@pytest.mark.parametrize("env_id", IDS)
+def test_checkers(env_id, form):
+    environment = gymnasium.make(env_id, form=form)
+    check_env(environment.unwrapped, skip_render_check=True)
+    check_mujoco_reset_state(environment)
+    sb3_check_env(environment)
+
+
+def test_forms_and_scaling_agree():
+    task = TASKS["move_to_pose"]
+    found = {}
+    for form in ("flat", "dict"):
+        for scaled in (False, True):
+            environment = gymnasium.make(environment_id(task.name), form=form, scaled=scaled)
+            environment.reset(seed=2)
+            found[form, scaled] = environment.step(np.array([0.7], np.float32))[0]
+    raw = found["flat", False]
+    assert raw.dtype == np.float32
+    np.testing.assert_allclose(found["flat", True], task.scale(raw), rtol=1e-5, atol=1e-6)
+    for scaled in (False, True):
+        parts = found["dict", scaled]
+        assert list(parts) == [o.name for o in task.observables]
+        np.testing.assert_array_equal(np.concatenate(list(parts.values())), found["flat", scaled])
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_the_time_limit_truncates_and_never_terminates(env_id):
+    environment = gymnasium.make(env_id)
+    environment.reset(seed=0)
+    ends = [environment.step(environment.action_space.sample())[2:4] for _ in range(1000)]
+    assert not any(terminated for terminated, _ in ends)
+    assert [truncated for _, truncated in ends] == [False] * 999 + [True]
+
+
+def test_many_robots_are_one_repeated_with_its_own_seed():
+    many = gymnasium.make_vec(FACE, num_envs=3, max_episode_steps=40)
+    assert isinstance(many, JitterbugVectorEnv)
+    singles = [gymnasium.make(FACE, max_episode_steps=40) for _ in range(3)]
+    observation, _ = many.reset(seed=7)
+    for lane, single in enumerate(singles):
+        np.testing.assert_array_equal(observation[lane], single.reset(seed=7 + lane)[0])
+    random = np.random.default_rng(0)
+    for step in range(1, 101):
+        actions = random.uniform(-1, 1, (3, 1)).astype(np.float32)
+        observation, reward, terminated, truncated, info = many.step(actions)
+        assert not terminated.any()
+        assert truncated.all() == truncated.any() == (step % 40 == 0)
+        for lane, single in enumerate(singles):
+            one = single.step(actions[lane])
+            assert reward[lane] == one[1]
+            assert truncated[lane] == one[3]
+            if truncated[lane]:
+                np.testing.assert_array_equal(info["final_obs"][lane], one[0])
+                one = single.reset()
+            np.testing.assert_array_equal(observation[lane], one[0])
+
+
+def test_many_robots_conform_to_their_spaces_and_work_under_wrappers():
+    many = gymnasium.make_vec(FACE, num_envs=2, form="dict", max_episode_steps=5)
+    many = gymnasium.wrappers.vector.RecordEpisodeStatistics(many)
+    observation, _ = many.reset(seed=[3, 9])
+    total = np.zeros(2)
+    for _ in range(5):
+        assert observation in many.observation_space
+        observation, reward, _, _, info = many.step(many.action_space.sample())
+        total += reward
+    np.testing.assert_allclose(info["episode"]["r"], total, rtol=1e-5)
+
+
+def test_a_robot_that_diverges_is_truncated_and_flagged():
+    environment = gymnasium.make(FACE)
+    environment.reset(seed=0)
+    before = environment.step(np.zeros(1, np.float32))
+    assert before[4] == {"non_finite": False}
+    environment.unwrapped._simulation.readings.qvel[0, 0] = np.nan
+    observation, reward, terminated, truncated, info = environment.step(np.zeros(1, np.float32))
+    np.testing.assert_array_equal(observation, before[0])
+    assert (reward, terminated, truncated) == (0, False, True)
+    assert info["non_finite"]
+
+
+def test_a_lane_that_diverges_starts_anew_alone():
+    many = gymnasium.make_vec(FACE, num_envs=3)
+    many.reset(seed=0)
+    many.step(np.zeros((3, 1)))
+    many.unwrapped._episodes.simulation.readings.qvel[1, 0] = np.inf
+    observation, reward, terminated, truncated, info = many.step(np.zeros((3, 1)))
+    np.testing.assert_array_equal(truncated, [False, True, False])
+    assert reward[1] == 0
+    assert not terminated.any()
+    np.testing.assert_array_equal(info["final_info"]["non_finite"], truncated)
+    assert np.isfinite(observation).all()
+    assert np.isfinite(info["final_obs"][1]).all()
+
+
+@needs_egl
+def test_frames():
+    environment = gymnasium.make(FACE, render_mode="rgb_array", width=160, height=120)
+    environment.reset(seed=0)
+    frame = environment.render()
+    assert frame.shape == (120, 160, 3)
+    assert frame.std() > 10
+    for _ in range(50):
+        environment.step(np.ones(1, np.float32))
+    assert np.abs(environment.render().astype(int) - frame).max() > 50
+    environment.close()
+
+
+def test_mistakes_are_named():
+    with pytest.raises(InputError, match="unknown form 'image': choose one of flat, dict"):
+        gymnasium.make(FACE, form="image")
+    with pytest.raises(InputError, match="the number of robots is 0"):
+        gymnasium.make_vec(FACE, num_envs=0)
+    many = gymnasium.make_vec(FACE, num_envs=2)
+    with pytest.raises(InputError, match="3 seeds for 2 lanes"):
+        many.reset(seed=[1, 2, 3])
+    many.reset()
+    with pytest.raises(InputError, match=r"shape \(2,\): \(2, 1\) is needed"):
+        many.step(np.zeros(2))
+    single = gymnasium.make(FACE).unwrapped
+    single.reset()
+    with pytest.raises(InputError, match="not finite"):
+        single.step(np.array([np.nan]))
