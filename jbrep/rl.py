@@ -1,0 +1,90 @@
+"""One reinforcement-learning run: task, representation, algorithm, seed."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+
+from jbrep.encoders import Encoder
+from jbrep.envs.sb3 import JitterbugVecEnv
+from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import get_task
+
+ALGORITHMS: dict[str, Callable[..., BaseAlgorithm]] = {
+    "ddpg": DDPG,
+    "td3": TD3,
+    "sac": SAC,
+    "ppo": PPO,
+    "a2c": A2C,
+}
+EVALUATION_EPISODES = 10
+_EVALUATION_SEED = 1_000_000  # past the seeds of training
+
+
+@dataclass(frozen=True)
+class Run:
+    """What to train; stable-baselines3's own settings but for the paper's network."""
+
+    task: str
+    algorithm: str = "sac"
+    encoder: str | None = None  # a file, or None for the full observation
+    steps: int = 10_000
+    seed: int = 0
+
+
+def train(run: Run, folder: Path) -> dict[str, Any]:
+    """Train, evaluate the deterministic policy, and write policy.zip and run.json.
+
+    Returns:
+        What run.json holds: the settings, and the evaluation's returns.
+
+    Raises:
+        InputError: unknown task or algorithm, an encoder of another task, or a finished run in
+            the folder.
+    """
+    task = get_task(run.task)
+    if run.algorithm not in ALGORITHMS:
+        choices = ", ".join(ALGORITHMS)
+        raise InputError(f"unknown algorithm {run.algorithm!r}: choose one of {choices}")
+    if (folder / "run.json").exists():
+        raise InputError(f"{folder} holds a finished run already: choose another folder")
+    encoder = None
+    if run.encoder:
+        encoder = Encoder.load(Path(run.encoder))
+        encoder.check_task(task.name, task.feature_names)
+
+    def make_env(num_envs: int, seed: int) -> VecEnv:
+        return VecMonitor(JitterbugVecEnv(run.task, num_envs, seed, encoder))
+
+    folder.mkdir(parents=True, exist_ok=True)
+    agent = ALGORITHMS[run.algorithm](
+        "MlpPolicy",
+        make_env(1, run.seed),
+        seed=run.seed,
+        device="cpu",
+        policy_kwargs={"net_arch": [350, 250]},
+    )
+    agent.learn(run.steps, progress_bar=True)
+    returns, _ = evaluate_policy(
+        agent,
+        make_env(EVALUATION_EPISODES, _EVALUATION_SEED + run.seed),
+        n_eval_episodes=EVALUATION_EPISODES,
+        return_episode_rewards=True,
+    )
+    agent.save(folder / "policy.zip")
+    result = {
+        "run": asdict(run),
+        "representation": f"{encoder.header['kind']}-{encoder.latent_size}" if encoder else "full",
+        "returns": np.asarray(returns).round(3).tolist(),
+        "versions": {name: version(name) for name in ("jbrep", "mujoco", "stable-baselines3")},
+    }
+    (folder / "run.json").write_text(json.dumps(result, indent=2) + "\n")
+    return result
