@@ -11,6 +11,6 @@ import wrapt
 
 @wrapt.when_imported("gymnasium")
 def _register(_gymnasium: ModuleType) -> None:
-    from jbrep.envs import register
+    from jbrep.envs.registration import register
 
     register()

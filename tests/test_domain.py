@@ -154,7 +154,7 @@ def test_physics_says_what_the_tasks_read(task):
     environment.reset()
     physics = environment.physics
     assert 0.999 < physics.uprightness() <= 1
-    assert -np.pi <= physics.angle_to_target() < np.pi
+    assert -np.pi <= physics.angle_to_target() <= np.pi
     assert physics.distance_to_target() == pytest.approx(
         np.linalg.norm(physics.named.data.geom_xpos["target"] - physics.data.qpos[:3])
     )

@@ -11,6 +11,7 @@ from gymnasium.envs.mujoco.utils import check_mujoco_reset_state
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
+import jbrep.envs
 from jbrep.envs import JitterbugVectorEnv, environment_id
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
@@ -34,6 +35,19 @@ def test_importing_jbrep_registers_them_in_any_order(order):
     code = f"import {order}; print(gymnasium.spec('{FACE}').max_episode_steps)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "1000\n"
+
+
+@pytest.mark.parametrize("name", jbrep.envs.__all__)
+def test_whatever_is_imported_first(name):
+    code = f"from jbrep.envs import {name}; import gymnasium; gymnasium.spec('{FACE}')"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_gymnasium_s_environments_need_no_torch():
+    code = (
+        f"import sys, jbrep, gymnasium; gymnasium.make('{FACE}'); assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_rl_zoo3_s_way_of_importing_registers_them():

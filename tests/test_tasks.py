@@ -1,7 +1,10 @@
 """Features, starts and rewards, against values worked out by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from dm_control.utils.rewards import tolerance
 
 from jbrep.errors import InputError
 from jbrep.jitterbug import tasks
@@ -32,7 +35,7 @@ def readings(position=(0, 0, 0.035), yaw=0.0, tilt=0.0, velocity=(0, 0, 0), targ
         (turn @ lean).reshape(1, 9),
         np.array([velocity], dtype=float),
         np.array([[*target, 0.035]]),
-        about_z(aim)[None],
+        tasks.turned_x(about_z(aim)[None]),
     )
 
 
@@ -66,7 +69,7 @@ def test_shared_features_are_states():
 def test_the_motor_angle_is_wrapped_and_zero_forward(turns):
     state = readings()
     state.qpos[0, 15] = 2 * np.pi * turns - np.pi / 2  # the weight in front, on -Y
-    assert tasks.motor_angle(state)[0] == pytest.approx(0, abs=1e-12)
+    assert state.motor_angle[0] == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -76,29 +79,29 @@ def test_the_motor_angle_is_wrapped_and_zero_forward(turns):
         (np.pi / 2, 0, 0),
         (np.pi / 2, 1, 1),
         (0, 0, np.pi / 2),
-        (0, np.pi / 2, -np.pi),
+        (0, np.pi / 2 - 0.01, np.pi - 0.01),
         (-3, 3, 6 + np.pi / 2 - 2 * np.pi),
     ],
 )
 def test_angle_to_target(yaw, aim, angle):
-    assert tasks.angle_to_target(readings(yaw=yaw, aim=aim))[0] == pytest.approx(angle)
+    assert readings(yaw=yaw, aim=aim).angle_to_target[0] == pytest.approx(angle)
 
 
 def test_angle_to_target_is_blind_to_pitch():
-    tilted = tasks.angle_to_target(readings(yaw=0.3, tilt=0.5, aim=1))
-    assert tilted[0] == pytest.approx(tasks.angle_to_target(readings(yaw=0.3, aim=1))[0])
+    tilted = readings(yaw=0.3, tilt=0.5, aim=1).angle_to_target
+    assert tilted[0] == pytest.approx(readings(yaw=0.3, aim=1).angle_to_target[0])
 
 
 def test_the_target_seen_from_the_bug():
     # turned by 90 degrees the bug faces +X: a target ahead is on its -Y, one at +Y on its left, +X
     for target, seen in (((0.2, 0), (0, -0.2, 0)), ((0, 0.2), (0.2, 0, 0))):
-        found = tasks.target_in_bug_frame(readings(yaw=np.pi / 2, target=target))[0]
+        found = readings(yaw=np.pi / 2, target=target).target_in_bug_frame[0]
         np.testing.assert_allclose(found, seen, atol=1e-12)
 
 
 def test_velocity_in_target_frame():
     state = readings(velocity=(0, 0.3, 0.1), aim=np.pi / 2)
-    np.testing.assert_allclose(tasks.velocity_in_target_frame(state)[0], [0.3, 0, 0.1], atol=1e-12)
+    np.testing.assert_allclose(state.velocity_in_target_frame[0], [0.3, 0, 0.1], atol=1e-12)
 
 
 def test_rewards_where_they_are_known():
@@ -116,6 +119,33 @@ def test_rewards_where_they_are_known():
     assert reward("move_to_pose", yaw=facing, aim=np.pi / 4, target=(0.05, 0)) == pytest.approx(
         0.05
     )
+
+
+def test_terms_are_dm_control_s_tolerance():
+    """Over all values that occur; `tolerance` is the definition."""
+    random = np.random.default_rng(0)
+    turn = random.uniform(-4, 4, 1000)
+    state = replace(
+        readings(),
+        rotation=random.uniform(-1, 1, (1000, 9)),
+        velocity=random.normal(0, 0.2, (1000, 3)),
+        target_position=random.normal(0, 0.1, (1000, 3)),
+        target_axis=np.stack([np.cos(turn), np.sin(turn)], axis=1),
+    )
+    position = tolerance(state.distance_to_target, (0, 0), 0.05)
+    heading = tolerance(state.angle_to_target, (0, 0), np.pi / 2, "cosine", 0)
+    velocity = tolerance(
+        state.velocity_in_target_frame[:, 0], (0.1, np.inf), 0.1, "linear", value_at_margin=0
+    )
+    for term, expected in (
+        (tasks.upright_term, tolerance(state.uprightness, (1, 1), 0.5)),
+        (tasks.position_term, position),
+        (tasks.away_term, 1 - position),
+        (tasks.heading_term, heading),
+        (tasks.velocity_term, velocity),
+    ):
+        np.testing.assert_allclose(term(state), expected, rtol=0, atol=1e-14)
+        assert np.ptp(expected) > 0.5
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -11,11 +11,12 @@ from jbrep.jitterbug.tasks import EPISODE_STEPS, Array, get_task
 
 
 class Outcome(NamedTuple):
-    """What a step gave in each of n lanes; every array is new."""
+    """What a step gave in each of n lanes; the arrays are to be read, not written."""
 
     observation: Array  # (n, d) the next episode's first where one ended
     reward: Array  # (n,) 0 where the physics diverged
     done: NDArray[np.bool_]  # (n,)
+    ended: list[int]  # the lanes where done
     diverged: NDArray[np.bool_]  # (n,)
     final_observation: Array  # (n, d) before any reset; the last finite one where it diverged
 
@@ -47,7 +48,7 @@ class Episodes:
             if seed is not None:
                 self._randoms[lane] = np.random.default_rng(seed)
         self._restart(range(self.simulation.num_lanes))
-        return self._observation.copy()
+        return self._observation
 
     def step(self, actions: ArrayLike) -> Outcome:
         """One control step in every lane.
@@ -57,18 +58,19 @@ class Episodes:
         """
         diverged = self.simulation.step(check_actions(actions, self.simulation.num_lanes))
         reward, observation = self.simulation.reward(), self.simulation.observe()
-        if diverged.any():
+        self._steps += 1
+        done = diverged | (self._steps >= self._max_steps)
+        ended: list[int] = done.nonzero()[0].tolist()
+        if ended:
             reward[diverged] = 0
             observation[diverged] = self._observation[diverged]
         self._observation = observation
-        self._steps += 1
-        done = diverged | (self._steps >= self._max_steps)
-        final = observation.copy()
-        if done.any():
-            self._restart(np.flatnonzero(done).tolist())
-        return Outcome(self._observation.copy(), reward, done, diverged, final)
+        if ended:
+            self._restart(ended)
+        return Outcome(self._observation, reward, done, ended, diverged, observation)
 
     def _restart(self, lanes: Sequence[int]) -> None:
         self.simulation.reset(lanes, [self._randoms[lane] for lane in lanes])
         self._steps[lanes] = 0
+        self._observation = self._observation.copy()
         self._observation[lanes] = self.simulation.observe()[lanes]

@@ -196,7 +196,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         """One control step in every lane."""
         outcome = self._episodes.step(actions)
         info: dict[str, Any] = {}
-        for lane in np.flatnonzero(outcome.done).tolist():
+        for lane in outcome.ended:
             final = {
                 "final_obs": self._view(outcome.final_observation[lane]),
                 "final_info": {"non_finite": bool(outcome.diverged[lane])},

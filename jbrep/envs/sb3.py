@@ -11,7 +11,6 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from jbrep.envs.episodes import Episodes
 from jbrep.errors import InputError
-from jbrep.jitterbug.simulation import check_actions
 from jbrep.jitterbug.tasks import Array
 
 Float32 = NDArray[np.float32]
@@ -63,7 +62,7 @@ class JitterbugVecEnv(VecEnv):
         self.task = self._episodes.task
         self._encoder = encoder
         self._size = encoder.latent_size if encoder else self.task.size
-        self._actions = np.zeros((num_envs, 1))
+        self._actions: NDArray[np.floating[Any]] = np.zeros((num_envs, 1))
         self._represent(np.zeros((num_envs, self.task.size)))  # an encoder may refuse this task
         super().__init__(
             num_envs,
@@ -81,17 +80,15 @@ class JitterbugVecEnv(VecEnv):
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
         """Take the actions, (num_envs, 1)."""
-        self._actions = check_actions(actions, self.num_envs)
+        self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
         """One control step in every lane."""
         outcome = self._episodes.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        if outcome.done.any():
-            lanes = np.flatnonzero(outcome.done)
-            for lane, final in zip(
-                lanes, self._represent(outcome.final_observation[lanes]), strict=True
-            ):
+        if lanes := outcome.ended:
+            finals = self._represent(outcome.final_observation[lanes])
+            for lane, final in zip(lanes, finals, strict=True):
                 infos[lane] = {
                     "terminal_observation": final,
                     "TimeLimit.truncated": True,

@@ -30,20 +30,20 @@ class Physics(mujoco.Physics):
             named.xmat["jitterbug"][None],
             data.sensordata[None],
             data.mocap_pos,
-            data.mocap_quat,
+            tasks.turned_x(data.mocap_quat),
         )
 
     def uprightness(self) -> float:
         """Cosine between the bug's z axis and the world's."""
-        return float(tasks.uprightness(self.readings())[0])
+        return float(self.readings().uprightness[0])
 
     def angle_to_target(self) -> float:
         """Angle from the bug's heading to the target's yaw [rad]."""
-        return float(tasks.angle_to_target(self.readings())[0])
+        return float(self.readings().angle_to_target[0])
 
     def distance_to_target(self) -> float:
         """Distance from the bug's origin to the target [m]."""
-        return float(tasks.distance_to_target(self.readings())[0])
+        return float(self.readings().distance_to_target[0])
 
 
 class Jitterbug(base.Task):

@@ -9,14 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from jbrep.errors import InputError
 from jbrep.jitterbug import model
-from jbrep.jitterbug.tasks import Array, Readings, Task
+from jbrep.jitterbug.tasks import Array, Readings, Task, turned_x
 
 _UP_TO_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
-_DIVERGED = [  # on each of these MuJoCo puts the lane back to its default state
-    int(mujoco.mjtWarning.mjWARN_BADQPOS),
-    int(mujoco.mjtWarning.mjWARN_BADQVEL),
-    int(mujoco.mjtWarning.mjWARN_BADQACC),
-]
+# on a position, velocity or acceleration that is not finite, MuJoCo warns and resets the lane
+_NOT_FINITE = slice(
+    int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1
+)
 
 
 class Simulation:
@@ -30,7 +29,7 @@ class Simulation:
         num_threads: threads to step them on; None takes one for each core.
 
     Attributes:
-        readings: live views of the lanes, which change with every step.
+        readings: what the tasks read of the lanes now; new after each step.
         model: the compiled MuJoCo model.
 
     Raises:
@@ -48,14 +47,17 @@ class Simulation:
         self._batch = Batch(self.model, num_lanes, num_threads or 0)
         self._control = self._batch.bind("ctrl")
         body = self.model.body("jitterbug").id
-        self.readings = Readings(
+        self._warnings = self._batch.warning[:, _NOT_FINITE, 1]
+        self._views = (
             self._batch.bind("qpos"),
             self._batch.bind("qvel"),
             self._batch.bind("xmat")[:, body],
             self._batch.bind("sensordata"),
             self._batch.bind("mocap_pos")[:, 0],
-            self._batch.bind("mocap_quat")[:, 0],
+            np.zeros((num_lanes, 2)),
         )
+        self._target_quaternion = self._batch.bind("mocap_quat")[:, 0]
+        self.readings = Readings(*self._views)
 
     def reset(self, lanes: Sequence[int], randoms: Iterable[np.random.Generator]) -> None:
         """Start an episode in each of the lanes, drawn from the generator that goes with it."""
@@ -64,8 +66,10 @@ class Simulation:
             start = self.task.start(random)
             self.readings.qpos[lane, 3:7] = start.quaternion
             self.readings.target_position[lane] = start.target_position
-            self.readings.target_quaternion[lane] = start.target_quaternion
+            self._target_quaternion[lane] = start.target_quaternion
+        self.readings.target_axis[:] = turned_x(self._target_quaternion)
         self._batch.forward(lanes, stage=_UP_TO_VELOCITIES)
+        self.readings = Readings(*self._views)
 
     def step(self, action: Array) -> NDArray[np.bool_]:
         """Hold the actions (n, 1) for one control step.
@@ -76,7 +80,8 @@ class Simulation:
         """
         self._control[:] = action
         self._batch.step(nstep=model.PHYSICS_STEPS, stage=_UP_TO_VELOCITIES)
-        return self._batch.warning[:, _DIVERGED, 1].any(axis=1)
+        self.readings = Readings(*self._views)
+        return self._warnings.any(axis=1)
 
     def observe(self) -> Array:
         """The observations in physical units, (n, d)."""

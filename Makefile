@@ -1,0 +1,44 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+DEMO := demo
+
+.PHONY: help setup demo test check bench pictures clean
+help: ## what there is to make
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
+
+setup: $(READY) ## a virtual environment with everything in it
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "jbrep needs Python 3.11 or newer: make PYTHON=python3.11 ..."; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[learn,render,dev]'
+	@touch $@
+
+demo: $(READY) ## the whole job in minutes: collect, encode, learn on the latent and on the full state
+	rm -rf $(DEMO)
+	$(BIN)/jbrep collect --task face_direction --steps 20k --out $(DEMO)/data
+	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 8 --epochs 60 --batch-size 128 --out $(DEMO)/dae-8.safetensors
+	$(BIN)/jbrep rl --task face_direction --steps 4k --encoder $(DEMO)/dae-8.safetensors --out $(DEMO)/runs/dae-8
+	$(BIN)/jbrep rl --task face_direction --steps 4k --out $(DEMO)/runs/full
+	$(BIN)/jbrep report $(DEMO)/runs
+
+test: $(READY) ## the test suite
+	$(BIN)/python -m pytest
+
+check: $(READY) ## lint, types, import direction
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(READY) ## speed as ratios in one run, and what the hand-written policies return
+	$(BIN)/python benchmarks/throughput.py
+	$(BIN)/python benchmarks/heuristics.py
+
+pictures: $(READY) ## the pictures in docs/, drawn anew
+	MUJOCO_GL=egl $(BIN)/python tools/pictures.py docs
+
+clean: ## remove the environment and the demo's files
+	rm -rf $(VENV) $(DEMO) *.egg-info

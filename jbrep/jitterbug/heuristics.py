@@ -1,0 +1,160 @@
+"""Hand-written policies, one for each task: observations (n, d) to actions (n, 1).
+
+The bug goes where its weight swings. Swing the weight to and fro about a bearing and the bug hops
+that way, whichever way it faces. Spin the weight in bursts and the bug turns after it. A policy
+only says where to go or how far to turn. Bearings are in the bug's frame, 0 forward and counter-
+clockwise; the constants were found by tools/tune_heuristics.py.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.tasks import EPISODE_STEPS, Array, get_task, wrap
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Constants of the gait that hops toward a bearing; drives are at most 1."""
+
+    pull: float = 0.88  # drive back to the bearing, at a right angle to it
+    push: float = 0.47  # drive along the swing, at the bearing
+    keep: float = 0.41  # drive along the swing, everywhere
+    limit: float = 0.81  # more tips the bug over
+    late: float = 0.006  # turn back that much later [s]
+    ahead: float = 0.004  # foresee the bug's own turning [s]
+    rise: float = 2.6  # more drive while the body rises, for each m/s
+    nod: float = 0.026  # and while it nods toward the bearing, for each rad/s
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Constants of the gait that turns on the spot."""
+
+    burst: float = 0.73  # drive
+    coast: float = 0.04  # drive of a weight that is fast enough
+    fast: float = 65.0  # [rad/s]
+    near: float = 0.11  # rest when that close [rad]
+    ahead: float = 0.055  # foresee the turn under way [s]
+
+
+@dataclass(frozen=True)
+class Approach:
+    """Constants of slowing down toward a point."""
+
+    gentle: float = 0.65  # share of the drive on arrival
+    hurry: float = 3.8  # more of it for each metre to go
+    there: float = 0.0035  # rest, or turn, when that close [m]
+
+
+WALK = Walk()
+TURN = Turn()
+APPROACH = Approach()
+POSE_APPROACH = Approach(gentle=0.77, hurry=2.4, there=0.0185)
+POSE_TURN = Turn(burst=0.60, coast=0.12, fast=38.0, near=0.21, ahead=0.068)
+
+
+def walk_toward(state: dict[str, Array], bearing: Array, walk: Walk) -> Array:
+    """The drive that hops toward the bearing; (n, 1) as all arrays here."""
+    speed = state["motor_velocity"]
+    spin_x, spin_y, spin_z = np.split(state["angular_velocity"], 3, axis=1)
+    bearing = bearing - walk.ahead * spin_z
+    error = wrap(state["motor_angle"] - walk.late * speed - bearing)
+    rise = walk.rise * state["velocity"][:, 2:]
+    nod = walk.nod * (np.cos(bearing) * spin_x + np.sin(bearing) * spin_y)
+    along = walk.keep + walk.push * np.cos(error) + rise + nod
+    drive = np.tanh(speed / 15) * along - walk.pull * np.sin(error)
+    return np.clip(drive, -walk.limit, walk.limit)
+
+
+def turn_by(state: dict[str, Array], angle: Array, turn: Turn) -> Array:
+    """The drive that turns the bug by the angle, in bursts of a spinning weight."""
+    angle = angle - turn.ahead * state["angular_velocity"][:, 2:]
+    side = np.sign(angle)
+    drive = np.where(side * state["motor_velocity"] < turn.fast, turn.burst, turn.coast)
+    return np.where(np.abs(angle) < turn.near, 0, side * drive)
+
+
+def approach_target(state: dict[str, Array], walk: Walk, approach: Approach) -> Array:
+    """The drive that hops to the target, more gently the nearer it is."""
+    x, y, _ = np.split(state["target"], 3, axis=1)
+    share = np.minimum(approach.gentle + approach.hurry * np.hypot(x, y), 1)
+    return share * walk_toward(state, np.arctan2(x, -y), walk)
+
+
+def move_from_origin(observation: Array, walk: Walk = WALK) -> Array:
+    """Hop straight out."""
+    state = get_task("move_from_origin").split(observation)
+    w, x, y, z = np.split(state["orientation"], 4, axis=1)
+    heading = np.arctan2(2 * (x**2 + z**2) - 1, 2 * (w * z - x * y))
+    outward = np.arctan2(state["position"][:, 1:2], state["position"][:, :1])
+    return walk_toward(state, outward - heading, walk)
+
+
+def face_direction(observation: Array, turn: Turn = TURN) -> Array:
+    """Turn by the angle to the target."""
+    state = get_task("face_direction").split(observation)
+    return turn_by(state, state["angle_to_target"], turn)
+
+
+def move_in_direction(observation: Array, walk: Walk = WALK) -> Array:
+    """Hop toward where the target's yaw points."""
+    state = get_task("move_in_direction").split(observation)
+    return walk_toward(state, state["angle_to_target"], walk)
+
+
+def move_to_position(observation: Array, walk: Walk = WALK, approach: Approach = APPROACH) -> Array:
+    """Hop to the target and rest there."""
+    state = get_task("move_to_position").split(observation)
+    away = np.hypot(state["target"][:, :1], state["target"][:, 1:2]) > approach.there
+    return np.where(away, approach_target(state, walk, approach), 0)
+
+
+def move_to_pose(
+    observation: Array,
+    walk: Walk = WALK,
+    approach: Approach = POSE_APPROACH,
+    turn: Turn = POSE_TURN,
+) -> Array:
+    """Hop to the target; there, turn."""
+    state = get_task("move_to_pose").split(observation)
+    away = np.hypot(state["target"][:, :1], state["target"][:, 1:2]) > approach.there
+    go, face = (
+        approach_target(state, walk, approach),
+        turn_by(state, state["angle_to_target"], turn),
+    )
+    return np.where(away, go, face)
+
+
+HEURISTICS: dict[str, Callable[..., Array]] = {
+    policy.__name__: policy
+    for policy in (
+        move_from_origin,
+        face_direction,
+        move_in_direction,
+        move_to_position,
+        move_to_pose,
+    )
+}
+
+
+def episode_returns(
+    task: str, policy: Callable[[Array], Array], episodes: int = 50, seed: int = 0
+) -> Array:
+    """Returns of whole episodes under a policy of the observation, (episodes,).
+
+    Args:
+        task: a key of `tasks.TASKS`.
+        policy: observations in physical units, (n, d), to actions, (n, 1).
+        episodes: how many.
+        seed: episode i starts as a Gymnasium environment reset with seed + i.
+    """
+    simulation = Simulation(get_task(task), episodes)
+    simulation.reset(range(episodes), [np.random.default_rng(seed + i) for i in range(episodes)])
+    total = np.zeros(episodes)
+    for _ in range(EPISODE_STEPS):
+        simulation.step(policy(simulation.observe()))
+        total += simulation.reward()
+    return total

@@ -1,0 +1,74 @@
+"""Search over the constants of a hand-written policy with CMA-ES.
+
+python tools/tune_heuristics.py move_to_position --minutes 30
+
+Every few generations it prints the constants at the centre of the search, and the return that they
+get on episodes that the search does not see.
+"""
+
+import argparse
+import inspect
+import time
+from dataclasses import asdict, replace
+from functools import partial
+from typing import Any
+
+import cma
+import numpy as np
+
+from jbrep.jitterbug.heuristics import HEURISTICS, episode_returns
+
+SEARCH_EPISODES, TEST_EPISODES = 24, 50
+TEST_SEED = 1_000_000
+SPREAD = 0.2  # of a constant, relative to its size
+REPORT_EVERY = 3  # generations
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("task", choices=HEURISTICS)
+    parser.add_argument("--minutes", type=float, default=30)
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+
+    policy = HEURISTICS[arguments.task]
+    gaits = {
+        name: parameter.default
+        for name, parameter in inspect.signature(policy).parameters.items()
+        if parameter.default is not parameter.empty
+    }
+
+    def with_factors(factors: np.ndarray) -> dict[str, Any]:
+        factor = iter(factors)
+        return {
+            name: replace(gait, **{key: float(x * next(factor)) for key, x in asdict(gait).items()})
+            for name, gait in gaits.items()
+        }
+
+    def score(factors: np.ndarray, seed: int) -> float:
+        candidate = partial(policy, **with_factors(factors))
+        returns = episode_returns(arguments.task, candidate, SEARCH_EPISODES, seed)
+        return float(np.median(returns) + np.mean(returns)) / 2
+
+    size = sum(len(asdict(gait)) for gait in gaits.values())
+    search = cma.CMAEvolutionStrategy(
+        np.ones(size), SPREAD, {"seed": arguments.seed, "verbose": -9}
+    )
+    end = time.monotonic() + 60 * arguments.minutes
+    while time.monotonic() < end:
+        candidates = search.ask()
+        seed = search.countiter * SEARCH_EPISODES  # all candidates of a generation start alike
+        search.tell(candidates, [-score(candidate, seed) for candidate in candidates])
+        if search.countiter % REPORT_EVERY == 0:
+            constants = with_factors(search.mean)
+            test = episode_returns(
+                arguments.task, partial(policy, **constants), TEST_EPISODES, TEST_SEED
+            )
+            low, median, high = np.percentile(test, (10, 50, 90))
+            print(
+                f"generation {search.countiter}: {median:.0f} [{low:.0f}, {high:.0f}] {constants}"
+            )
+
+
+if __name__ == "__main__":
+    main()
