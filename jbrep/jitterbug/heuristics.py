@@ -33,10 +33,12 @@ class Walk:
 class Turn:
     """Constants of the gait that turns on the spot."""
 
-    burst: float = 0.73  # drive
-    coast: float = 0.04  # drive of a weight that is fast enough
+    burst: float = 0.73  # drive, at most
+    gentle: float = 0.42  # drive of the last touch
+    hurry: float = 0.8  # more drive for each radian to go
+    coast: float = 0.0  # drive of a weight that is fast enough
     fast: float = 65.0  # [rad/s]
-    near: float = 0.11  # rest when that close [rad]
+    near: float = 0.06  # rest when that close [rad]
     ahead: float = 0.055  # foresee the turn under way [s]
 
 
@@ -53,7 +55,7 @@ WALK = Walk()
 TURN = Turn()
 APPROACH = Approach()
 POSE_APPROACH = Approach(gentle=0.77, hurry=2.4, there=0.0185)
-POSE_TURN = Turn(burst=0.60, coast=0.12, fast=38.0, near=0.21, ahead=0.068)
+POSE_TURN = Turn(burst=0.60, gentle=0.60, hurry=0.0, coast=0.12, fast=38.0, near=0.21, ahead=0.068)
 
 
 def walk_toward(state: dict[str, Array], bearing: Array, walk: Walk) -> Array:
@@ -73,7 +75,8 @@ def turn_by(state: dict[str, Array], angle: Array, turn: Turn) -> Array:
     """The drive that turns the bug by the angle, in bursts of a spinning weight."""
     angle = angle - turn.ahead * state["angular_velocity"][:, 2:]
     side = np.sign(angle)
-    drive = np.where(side * state["motor_velocity"] < turn.fast, turn.burst, turn.coast)
+    burst = np.minimum(turn.gentle + turn.hurry * np.abs(angle), turn.burst)
+    drive = np.where(side * state["motor_velocity"] < turn.fast, burst, turn.coast)
     return np.where(np.abs(angle) < turn.near, 0, side * drive)
 
 
