@@ -1,7 +1,5 @@
 """The Jitterbug's ids in Gymnasium's registry."""
 
-import gymnasium
-
 from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS
 
 SOLVED = 900  # the return at which the paper calls a task solved
@@ -13,7 +11,9 @@ def environment_id(task: str) -> str:
 
 
 def register() -> None:
-    """Register the five tasks; importing jbrep sees to it."""
+    """Register the five tasks; importing jbrep sees to it as soon as there is a Gymnasium."""
+    import gymnasium
+
     for task in TASKS:
         gymnasium.register(
             environment_id(task),

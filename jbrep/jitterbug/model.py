@@ -10,6 +10,7 @@ from jbrep.jitterbug.tasks import CONTROL_TIMESTEP
 
 PHYSICS_TIMESTEP = 0.0002  # [s]
 PHYSICS_STEPS = round(CONTROL_TIMESTEP / PHYSICS_TIMESTEP)  # in a control step
+_ARENA = 1 << 20  # [bytes] for each robot; MuJoCo's own choice is 14 times as much
 
 
 def read_xml() -> str:
@@ -32,6 +33,7 @@ def fast_model() -> mujoco.MjModel:
     touching = [geom for geom in spec.geoms if geom.contype and geom.name != "floor"]
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
+    spec.memory = _ARENA
     for geom in touching:
         spec.add_pair(name=geom.name, geomname1="floor", geomname2=geom.name)
     return spec.compile()

@@ -44,7 +44,8 @@ class Simulation:
         self.task = task
         self.num_lanes = num_lanes
         self.model = model.fast_model()
-        self._batch = Batch(self.model, num_lanes, num_threads or 0)
+        # persistent: a lane's next step goes on from what reading it has computed already
+        self._batch = Batch(self.model, num_lanes, num_threads or 0, persistent=True)
         self._control = self._batch.bind("ctrl")
         body = self.model.body("jitterbug").id
         self._warnings = self._batch.warning[:, _NOT_FINITE, 1]
