@@ -1,5 +1,7 @@
 """The denoising autoencoder: network, corruption, training."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -50,7 +52,8 @@ def train(dataset: Dataset, training: Training) -> Encoder:
     with torch.random.fork_rng():
         torch.manual_seed(training.seed)
         network = make_network(task.size, training.latent)
-    _fit(network, unit[train_rows], training, generator)
+    with _one_thread():
+        _fit(network, unit[train_rows], training, generator)
     with torch.no_grad():
         error = nn.functional.mse_loss(network(unit[test_rows]), unit[test_rows]).item()
     header = {
@@ -62,6 +65,17 @@ def train(dataset: Dataset, training: Training) -> Encoder:
     }
     weights = [parameter.detach().numpy() for parameter in network.parameters()]
     return Encoder(header, low.astype(np.float32), high.astype(np.float32), *weights)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """So small a network gains nothing from more threads, and waits long where cores are busy."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _fit(

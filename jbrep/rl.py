@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from jbrep.jitterbug.tasks import get_task
 ALGORITHMS: dict[str, Callable[..., BaseAlgorithm]] = {
     "ddpg": DDPG,
     "td3": TD3,
-    "sac": SAC,
+    "sac": partial(SAC, train_freq=2),  # one gradient step in two steps
     "ppo": PPO,
     "a2c": A2C,
 }
@@ -31,7 +32,7 @@ _EVALUATION_SEED = 1_000_000  # past the seeds of training
 
 @dataclass(frozen=True)
 class Run:
-    """What to train; stable-baselines3's own settings but for the paper's network."""
+    """What to train, with the paper's network and stable-baselines3's own settings."""
 
     task: str
     algorithm: str = "sac"

@@ -9,11 +9,11 @@ from jbrep import jitterbug
 
 CAMERAS = ("overhead", "tracking", "egocentric")
 SIZE = (480, 640)  # height, width [pixels]
-SETTLE_STEPS = 30
+SETTLE_STEPS = 40
 
 
 def main(folder: Path) -> None:
-    environment = jitterbug.load("move_to_pose", seed=8)
+    environment = jitterbug.load("move_to_pose", seed=141)
     environment.reset()
     for _ in range(SETTLE_STEPS):
         environment.step([0.0])

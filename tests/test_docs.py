@@ -1,0 +1,32 @@
+"""The Python in README and docs runs as it stands; the commands there exist."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from jbrep.cli import main
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCKS = [
+    pytest.param(block, id=f"{page.name}-{i}")
+    for page in PAGES
+    for i, block in enumerate(re.findall(r"^```python\n(.*?)^```", page.read_text(), re.M | re.S))
+]
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_the_python_runs(block):
+    exec(compile(block, "block", "exec"), {})
+
+
+def test_every_command_is_shown_and_every_command_shown_exists():
+    shown = set(re.findall(r"^ {4}jbrep ([a-z-]+)", (ROOT / "README.md").read_text(), re.M))
+    assert shown == set(main.commands)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_pictures_lead_somewhere(page):
+    targets = re.findall(r"\]\(([^)#]+)\)", page.read_text())
+    assert not [t for t in targets if "://" not in t and not (page.parent / t).exists()]
