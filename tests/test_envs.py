@@ -169,6 +169,16 @@ def test_frames():
     environment.close()
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Gymnasium's viewer
+def test_missing_opengl_is_said_in_one_line_and_all_else_works(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    environment = gymnasium.make(FACE, render_mode="rgb_array").unwrapped
+    environment.reset(seed=0)
+    with pytest.raises(InputError, match=r"no OpenGL to render with .* set MUJOCO_GL=egl"):
+        environment.render()
+    assert environment.step(np.zeros(1))[0].shape == (16,)
+
+
 def test_mistakes_are_named():
     with pytest.raises(InputError, match="unknown form 'image': choose one of flat, dict"):
         gymnasium.make(FACE, form="image")

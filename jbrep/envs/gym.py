@@ -20,6 +20,10 @@ Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
 _FORMS = ("flat", "dict")
 _ACTIONS = spaces.Box(-1, 1, (1,), np.float32)
+_NO_OPENGL = (
+    "no OpenGL to render with ({}): without a display, install libegl1 and libgl1 and set "
+    "MUJOCO_GL=egl; also pip install 'jbrep[render]'"
+)
 
 
 @dataclass(frozen=True)
@@ -124,15 +128,22 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._view(self._observation), reward, False, diverged, {"non_finite": diverged}
 
     def render(self) -> Any:
-        """A frame, as Gymnasium's own MuJoCo environments give it."""
+        """A frame, as Gymnasium's own MuJoCo environments give it.
+
+        Raises:
+            InputError: no OpenGL to render with.
+        """
         if self.render_mode is None:
             return None
         data = self.data
-        if self._renderer is None:
-            from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
+        try:
+            if self._renderer is None:
+                from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
-            self._renderer = MujocoRenderer(self.model, data, **self._frame)
-        return self._renderer.render(self.render_mode)
+                self._renderer = MujocoRenderer(self.model, data, **self._frame)
+            return self._renderer.render(self.render_mode)
+        except (ImportError, AttributeError, RuntimeError) as error:
+            raise InputError(_NO_OPENGL.format(error)) from error
 
     def close(self) -> None:
         """Free the renderer."""
