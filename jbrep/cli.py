@@ -44,6 +44,9 @@ class _Cli(click.Group):
             super().invoke(ctx)
         except InputError as error:
             raise _Mistake(str(error)) from None
+        except click.UsageError as error:
+            command = error.ctx.command_path if error.ctx else "jbrep"
+            raise _Mistake(f"{error.format_message()} See {command} --help.") from None
         except ModuleNotFoundError as error:
             if error.name not in _LEARN:
                 raise
@@ -84,7 +87,10 @@ def collect(task: str, steps: int, seed: int, threads: int | None, out: Path) ->
 @click.option("--seed", default=0, show_default=True, help="Of weights, order and noise.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="The encoder file.")
 def train_dae(data: Path, latent: int, epochs: int, batch_size: int, seed: int, out: Path) -> None:
-    """Train a denoising autoencoder on 80 % of the episodes; print its error on the rest."""
+    """Train a denoising autoencoder.
+
+    It sees 80 % of the episodes; its error on the rest is printed.
+    """
     from jbrep.dae import Training, train
     from jbrep.dataset import Dataset
 
@@ -106,7 +112,10 @@ def train_dae(data: Path, latent: int, epochs: int, batch_size: int, seed: int, 
 @click.option("--seed", default=0, show_default=True, help="Of agent and environment.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A new folder.")
 def rl(task: str, algorithm: str, encoder: str | None, steps: int, seed: int, out: Path) -> None:
-    """Train an agent on the full observation or on an encoder's latent, and evaluate it."""
+    """Train and evaluate one agent.
+
+    It sees the full observation, scaled, or an encoder's latent.
+    """
     from jbrep.rl import Run, train
 
     result = train(Run(task, algorithm, encoder, steps, seed), out)

@@ -63,6 +63,8 @@ def test_every_command_has_help_with_an_example(command):
         (("rl", "--task", "face_direction", "--algorithm", "dqn", "--out", "x"), "ddpg, td3"),
         (("rl", "--task", "face_direction", "--encoder", "x", "--out", "y"), "no encoder at x"),
         (("report", "none"), "no finished run below none"),
+        (("report",), "Missing argument 'FOLDER'. See jbrep report --help."),
+        (("fly",), "No such command 'fly'. See jbrep --help."),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, tmp_path, monkeypatch):
