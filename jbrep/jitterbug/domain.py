@@ -1,5 +1,6 @@
 """The Jitterbug as a dm_control domain."""
 
+import sys
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
@@ -134,9 +135,7 @@ def load(
 
 def register_with_suite() -> None:
     """Make `suite.load("jitterbug", task)` and all of the suite's task lists know the tasks."""
-    import jbrep.jitterbug.domain as this
-
-    suite._DOMAINS[DOMAIN] = this
+    suite._DOMAINS[DOMAIN] = sys.modules[__name__]
     suite.ALL_TASKS = suite._get_tasks(tag=None)
     suite.BENCHMARKING = suite._get_tasks("benchmarking")
     suite.EASY = suite._get_tasks("easy")

@@ -19,7 +19,6 @@ _Float = TypeVar("_Float", bound=np.floating[Any])
 
 CONTROL_TIMESTEP = 0.01  # [s]
 EPISODE_STEPS = 1000  # control steps
-DISCOUNT = 0.99
 
 _MAX_TILT = 0.025  # of the start's turning axis, in x and y
 _TARGET_HEIGHT = 0.035  # [m]
