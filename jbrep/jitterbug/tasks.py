@@ -76,8 +76,7 @@ class Readings:
     @property
     def target_in_bug_frame(self) -> Array:
         """Target position seen from the bug: +X its left, -Y its front, (n, 3)."""
-        offset = self.target_position - self.qpos[:, :3]
-        return (self.rotation.reshape(-1, 3, 3) * offset[:, :, None]).sum(axis=1)
+        return (self.rotation.reshape(-1, 3, 3) * self._offset[:, :, None]).sum(axis=1)
 
     @cached_property
     def velocity_in_target_frame(self) -> Array:
@@ -92,8 +91,12 @@ class Readings:
     @property
     def distance_to_target(self) -> Array:
         """Distance from the bug's origin to the target, (n,)."""
-        offset = self.target_position - self.qpos[:, :3]
-        return np.sqrt((offset * offset).sum(axis=1))
+        x, y, z = self._offset.T
+        return np.sqrt(x * x + y * y + z * z)
+
+    @cached_property
+    def _offset(self) -> Array:
+        return self.target_position - self.qpos[:, :3]
 
 
 class Start(NamedTuple):
