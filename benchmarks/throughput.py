@@ -35,6 +35,7 @@ SECONDS = 0.1
 Stepper = Callable[[], int]  # steps some robots once and returns how many
 
 
+@cache  # its process makes it once
 def dm_control_loop() -> Stepper:
     environment = jitterbug.load(TASK, seed=0)
     environment.reset()
@@ -97,14 +98,9 @@ def rate(step: Stepper) -> float:
     return steps / elapsed
 
 
-@cache
-def _dm_control() -> Stepper:
-    return dm_control_loop()
-
-
 def rate_of_dm_control() -> float:
     """In a process of its own: jbrep takes MuJoCo's clock away, a user of dm_control has it."""
-    return rate(_dm_control())
+    return rate(dm_control_loop())
 
 
 def main() -> None:

@@ -3,7 +3,7 @@
 The bug goes where its weight swings. Swing the weight to and fro about a bearing and the bug hops
 that way, whichever way it faces. Spin the weight in bursts and the bug turns after it. A policy
 only says where to go or how far to turn. Bearings are in the bug's frame, 0 forward and counter-
-clockwise; the constants were found by tools/tune_heuristics.py.
+clockwise; tools/tune_heuristics.py searches over the constants.
 """
 
 from collections.abc import Callable
@@ -80,10 +80,14 @@ def turn_by(state: dict[str, Array], angle: Array, turn: Turn) -> Array:
     return np.where(np.abs(angle) < turn.near, 0, side * drive)
 
 
+def _distance(state: dict[str, Array]) -> Array:
+    return np.hypot(state["target"][:, :1], state["target"][:, 1:2])
+
+
 def approach_target(state: dict[str, Array], walk: Walk, approach: Approach) -> Array:
     """The drive that hops to the target, more gently the nearer it is."""
     x, y, _ = np.split(state["target"], 3, axis=1)
-    share = np.minimum(approach.gentle + approach.hurry * np.hypot(x, y), 1)
+    share = np.minimum(approach.gentle + approach.hurry * _distance(state), 1)
     return share * walk_toward(state, np.arctan2(x, -y), walk)
 
 
@@ -111,8 +115,8 @@ def move_in_direction(observation: Array, walk: Walk = WALK) -> Array:
 def move_to_position(observation: Array, walk: Walk = WALK, approach: Approach = APPROACH) -> Array:
     """Hop to the target and rest there."""
     state = get_task("move_to_position").split(observation)
-    away = np.hypot(state["target"][:, :1], state["target"][:, 1:2]) > approach.there
-    return np.where(away, approach_target(state, walk, approach), 0)
+    go = approach_target(state, walk, approach)
+    return np.where(_distance(state) > approach.there, go, 0)
 
 
 def move_to_pose(
@@ -123,12 +127,9 @@ def move_to_pose(
 ) -> Array:
     """Hop to the target; there, turn."""
     state = get_task("move_to_pose").split(observation)
-    away = np.hypot(state["target"][:, :1], state["target"][:, 1:2]) > approach.there
-    go, face = (
-        approach_target(state, walk, approach),
-        turn_by(state, state["angle_to_target"], turn),
-    )
-    return np.where(away, go, face)
+    go = approach_target(state, walk, approach)
+    face = turn_by(state, state["angle_to_target"], turn)
+    return np.where(_distance(state) > approach.there, go, face)
 
 
 HEURISTICS: dict[str, Callable[..., Array]] = {

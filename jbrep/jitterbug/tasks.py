@@ -161,7 +161,7 @@ _TARGET_POSITION = _observable("target", "x y z", "m", (3, 3, 0.1), lambda r: r.
 
 
 # Each term equals `dm_control.utils.rewards.tolerance` with the bounds, margin and sigmoid that its
-# docstring names, in a quarter of the time; called once a step, that shows.
+# docstring names, with fewer array operations; called once a step, that shows.
 
 
 def upright_term(r: Readings) -> Array:
