@@ -31,6 +31,7 @@ class Simulation:
     Attributes:
         readings: what the tasks read of the lanes now; new after each step.
         model: the compiled MuJoCo model.
+        target_quaternion: of the lanes' targets, (n, 4).
 
     Raises:
         InputError: a number below 1.
@@ -57,7 +58,7 @@ class Simulation:
             self._batch.bind("mocap_pos")[:, 0],
             np.zeros((num_lanes, 2)),
         )
-        self._target_quaternion = self._batch.bind("mocap_quat")[:, 0]
+        self.target_quaternion = self._batch.bind("mocap_quat")[:, 0]
         self.readings = Readings(*self._views)
 
     def reset(self, lanes: Sequence[int], randoms: Iterable[np.random.Generator]) -> None:
@@ -67,8 +68,26 @@ class Simulation:
             start = self.task.start(random)
             self.readings.qpos[lane, 3:7] = start.quaternion
             self.readings.target_position[lane] = start.target_position
-            self._target_quaternion[lane] = start.target_quaternion
-        self.readings.target_axis[:] = turned_x(self._target_quaternion)
+            self.target_quaternion[lane] = start.target_quaternion
+        self._forward(lanes)
+
+    def restore(
+        self, qpos: Array, qvel: Array, target_position: Array, target_quaternion: Array
+    ) -> None:
+        """Put the lanes in stored states: (n, 16), (n, 15), (n, 3) and (n, 4).
+
+        From an episode's first state, the same actions lead through the same states, bit for bit.
+        """
+        lanes = range(self.num_lanes)
+        self._batch.reset(lanes, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.readings.qpos[:] = qpos
+        self.readings.qvel[:] = qvel
+        self.readings.target_position[:] = target_position
+        self.target_quaternion[:] = target_quaternion
+        self._forward(lanes)
+
+    def _forward(self, lanes: Sequence[int]) -> None:
+        self.readings.target_axis[:] = turned_x(self.target_quaternion)
         self._batch.forward(lanes, stage=_UP_TO_VELOCITIES)
         self.readings = Readings(*self._views)
 
