@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DEMO := demo
 
-.PHONY: help setup demo test check bench pictures clean
+.PHONY: help setup demo test check bench pictures samples clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -19,6 +19,7 @@ $(READY): pyproject.toml constraints.txt
 demo: $(READY) ## the whole job in minutes: collect, encode, learn on the latent and on the full state
 	rm -rf $(DEMO)
 	$(BIN)/jbrep collect --task face_direction --steps 20k --out $(DEMO)/data
+	$(BIN)/jbrep data info $(DEMO)/data
 	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 8 --epochs 60 --batch-size 128 --out $(DEMO)/dae-8.safetensors
 	$(BIN)/jbrep rl --task face_direction --steps 4k --encoder $(DEMO)/dae-8.safetensors --out $(DEMO)/runs/dae-8
 	$(BIN)/jbrep rl --task face_direction --steps 4k --out $(DEMO)/runs/full
@@ -35,10 +36,15 @@ check: $(READY) ## lint, types, import direction
 
 bench: $(READY) ## speed as ratios in one run, and what the hand-written policies return
 	$(BIN)/python benchmarks/throughput.py
+	$(BIN)/python benchmarks/dataset.py
 	$(BIN)/python benchmarks/heuristics.py
 
 pictures: $(READY) ## the pictures in docs/, drawn anew
 	MUJOCO_GL=egl $(BIN)/python tools/pictures.py docs
+
+samples: $(READY) ## the sample data sets in data/, made anew
+	for task in move_from_origin face_direction move_in_direction move_to_position move_to_pose; do \
+	  rm -rf data/sample/$$task; $(BIN)/jbrep collect --task $$task --steps 4k --out data/sample/$$task; done
 
 clean: ## remove the environment and the demo's files
 	rm -rf $(VENV) $(DEMO) *.egg-info

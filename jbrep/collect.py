@@ -1,93 +1,247 @@
-"""The collector: a random policy on many Jitterbugs, written to shards."""
+"""The collector: a policy on many Jitterbugs, streamed to the shards of a data set."""
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
-from jbrep.dataset import shard_path, write_shard
+from jbrep.dataset.manifest import (
+    MANIFEST,
+    Manifest,
+    Settings,
+    check_listing,
+    commit,
+    new_manifest,
+    read_manifest,
+    write_manifest,
+)
+from jbrep.dataset.schema import EPISODES, Columns, episode_returns, episode_seed
+from jbrep.dataset.storage import exclusive
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
+from jbrep.policies import Policy, make_policy
 
-SHARD_EPISODES = 100
+LANES = 100
 
-
-@dataclass(frozen=True)
-class Collection:
-    """What to collect; the data are a function of this alone."""
-
-    task: str
-    steps: int  # rounded up to whole episodes
-    seed: int = 0
-
-    @property
-    def episodes(self) -> int:
-        """How many episodes."""
-        return -(-self.steps // EPISODE_STEPS)
+Array = NDArray[Any]
+Tick = Callable[[int], object]  # told how many control steps were made
 
 
-def collect(collection: Collection, folder: Path, num_threads: int | None = None) -> None:
-    """Collect into a new folder, a shard after the other.
+class Written(NamedTuple):
+    """What a call did."""
+
+    manifest: Manifest
+    rows: int  # written by it
+    seconds: float
+
+
+def collect(
+    settings: Settings, folder: Path, lanes: int = LANES, num_threads: int | None = None
+) -> Written:
+    """Collect what is missing of a data set; neither lanes nor threads change a byte of it.
+
+    Args:
+        settings: what to collect.
+        folder: new, or one where the same was begun.
+        lanes: how many robots to step at once.
+        num_threads: threads to step them on; None takes one for each core.
 
     Raises:
-        InputError: unknown task, no steps, or data in the folder already.
+        InputError: settings that can't be, other settings in the folder, a shard that is gone or
+            cut short, or no space.
     """
-    task = get_task(collection.task)
-    if collection.steps < 1:
-        raise InputError(f"the number of steps is {collection.steps}: it must be at least 1")
-    if shard_path(folder, 0).exists():
-        raise InputError(f"{folder} holds a data set already: choose another folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    attributes = {
-        **asdict(collection),
-        "policy": "uniform",
-        "feature_names": list(task.feature_names),
-        "feature_units": [feature.unit for feature in task.features],
+    policy = make_policy(dict(settings.policy))
+    for count, what in ((lanes, "lanes"), (num_threads, "threads")):
+        if count is not None and count < 1:
+            raise InputError(f"the number of {what} is {count}: it must be at least 1")
+
+    def make(shard: int, tick: Tick) -> Columns:
+        return simulate_shard(settings, policy, shard, tick, lanes, num_threads)
+
+    return write_shards(settings, folder, make)
+
+
+def write_shards(settings: Settings, folder: Path, make: Callable[[int, Tick], Columns]) -> Written:
+    """Commit the shards that are missing, each as `make` gives it.
+
+    Raises:
+        InputError: as `collect` does.
+    """
+    settings.check()
+    began = time.monotonic()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"can't make the folder {folder}: {error.strerror}") from None
+    with exclusive(folder):
+        manifest = _begin(settings, folder)
+        rows = sum(entry.rows for entry in manifest.shards)
+        with tqdm(
+            total=settings.episodes * EPISODE_STEPS,
+            initial=rows,
+            unit="step",
+            unit_scale=True,
+            desc=folder.name,
+        ) as progress:
+            for shard in range(len(manifest.shards), settings.num_shards):
+                manifest = commit(folder, manifest, make(shard, progress.update))
+                size = sum(entry.bytes for entry in manifest.shards)
+                progress.set_postfix_str(f"{size / 1e6:,.0f} MB on disk")
+    made = sum(entry.rows for entry in manifest.shards) - rows
+    return Written(manifest, made, time.monotonic() - began)
+
+
+def _begin(settings: Settings, folder: Path) -> Manifest:
+    """The manifest to go on from."""
+    if (folder / MANIFEST).exists() or any(folder.glob("shard-*.h5")):
+        manifest = read_manifest(folder)
+        _check_same(manifest, new_manifest(settings), folder)
+        check_listing(folder, manifest)
+    else:
+        manifest = new_manifest(settings)
+        _check_space(settings, folder)
+        write_manifest(folder, manifest)
+    return manifest
+
+
+def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
+    """Going on must give what an uninterrupted run gives."""
+    differing = _differences(asdict(there.settings), asdict(wanted.settings))
+    if differing:
+        raise InputError(
+            f"{folder} holds a data set of other settings: {differing}; "
+            "choose another folder, or the same settings to go on"
+        )
+    differing = _differences(there.versions, wanted.versions)
+    if differing and not there.complete:
+        raise InputError(
+            f"{folder} was begun with other versions: {differing}; "
+            "install those to go on, or choose another folder"
+        )
+
+
+def _differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{name} {there.get(name)} (now: {wanted[name]})"
+        for name in wanted
+        if there.get(name) != wanted[name]
+    )
+
+
+def _check_space(settings: Settings, folder: Path) -> None:
+    needed = settings.episodes * EPISODE_STEPS * settings.row_bytes()
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise InputError(
+            f"no space for the data set in {folder}: about {needed:,} bytes are needed, "
+            f"{free:,} are free"
+        )
+
+
+def simulate_shard(
+    settings: Settings,
+    policy: Policy,
+    shard: int,
+    tick: Tick,
+    lanes: int = LANES,
+    num_threads: int | None = None,
+) -> Columns:
+    """The columns of a shard, which are a function of its number and the settings alone."""
+    episodes = np.array(settings.shard_range(shard))
+    blocks = [
+        _simulate(settings, policy, episodes[start : start + lanes], tick, num_threads)
+        for start in range(0, len(episodes), lanes)
+    ]
+    return {name: np.concatenate([block[name] for block in blocks]) for name in settings.specs()}
+
+
+def _simulate(
+    settings: Settings, policy: Policy, episodes: Array, tick: Tick, num_threads: int | None
+) -> dict[str, Array]:
+    """Columns of n whole episodes, one in each lane."""
+    task, n = get_task(settings.task), len(episodes)
+    seeds = [episode_seed(settings.seed, int(episode)) for episode in episodes]
+    randoms = [np.random.default_rng(seed) for seed in seeds]
+    simulation = Simulation(task, n, num_threads)
+    simulation.reset(range(n), randoms)
+    start = {
+        "initial_qpos": simulation.readings.qpos.copy(),
+        "initial_qvel": simulation.readings.qvel.copy(),
+        "target_position": simulation.readings.target_position.copy(),
+        "target_quaternion": simulation.target_quaternion.copy(),
     }
-    episodes = np.arange(collection.episodes)
-    with tqdm(total=len(episodes) * EPISODE_STEPS, unit="step", unit_scale=True) as progress:
-        for shard, start in enumerate(range(0, len(episodes), SHARD_EPISODES)):
-            columns = _collect_episodes(
-                collection, episodes[start : start + SHARD_EPISODES], num_threads, progress
-            )
-            write_shard(shard_path(folder, shard), columns, attributes)
-
-
-def _collect_episodes(
-    collection: Collection, episodes: Any, num_threads: int | None, progress: "tqdm[None]"
-) -> dict[str, Any]:
-    simulation = Simulation(get_task(collection.task), len(episodes), num_threads)
-    randoms = [_episode_random(collection.seed, episode) for episode in episodes]
-    lanes = range(len(episodes))
-    simulation.reset(lanes, randoms)
-    actions = np.stack([r.uniform(-1, 1, (EPISODE_STEPS, 1)) for r in randoms], axis=1)
-    rows = []
-    for row in _rollout(simulation, actions.astype(np.float32)):
-        rows.append(row)
-        progress.update(len(episodes))
-    observation, action, reward, alive = (np.stack(c, axis=1) for c in zip(*rows, strict=True))
-    shape = alive.shape
-    return {
-        "observation": observation[alive],
-        "action": action[alive],
-        "reward": reward[alive],
-        "episode": np.broadcast_to(np.asarray(episodes)[:, None], shape)[alive],
-        "step": np.broadcast_to(np.arange(EPISODE_STEPS), shape)[alive],
+    act = policy.begin(task, randoms)
+    tape = _Tape(simulation, settings.store_state)
+    for step in range(EPISODE_STEPS):
+        tape.action[step] = act(tape.record_state(step))
+        diverged = simulation.step(tape.action[step])
+        tape.record_outcome(step, diverged)
+        tick(n)
+    tape.record_state(EPISODE_STEPS)
+    return tape.rows(episodes) | {
+        EPISODES + name: column
+        for name, column in (start | {"seed": np.array(seeds)} | tape.ends(episodes)).items()
     }
 
 
-def _episode_random(seed: int, episode: int) -> np.random.Generator:
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(episode),)))
+class _Tape:
+    """What n lanes go through in T steps, time first: states (T + 1, n, ...), steps (T, n, ...)."""
 
+    def __init__(self, simulation: Simulation, store_state: bool):
+        task, n = simulation.task, simulation.num_lanes
+        self._simulation = simulation
+        sources: dict[str, Array] = {
+            "qpos": simulation.readings.qpos,
+            "qvel": simulation.readings.qvel,
+        }
+        self._sources = sources if store_state else {}
+        self._states: dict[str, Array] = {
+            name: np.empty((EPISODE_STEPS + 1, *source.shape))
+            for name, source in self._sources.items()
+        }
+        self._states["observation"] = np.empty((EPISODE_STEPS + 1, n, task.size), np.float32)
+        self.action = np.empty((EPISODE_STEPS, n, 1), np.float32)
+        self._reward = np.empty((EPISODE_STEPS, n), np.float32)
+        self._length = np.full(n, EPISODE_STEPS, np.int32)
 
-def _rollout(simulation: Simulation, actions: Any) -> Iterator[tuple[Any, Any, Any, Any]]:
-    """Observation, action, reward and whether the physics held, for each step of (T, n, 1)."""
-    alive = np.ones(simulation.num_lanes, dtype=bool)
-    for action in actions:
-        observation = simulation.observe().astype(np.float32)
-        alive = alive & ~simulation.step(action)
-        yield observation, action, simulation.reward(), alive
+    def record_state(self, step: int) -> Array:
+        """Write down the state that the lanes are in, and give what is observed."""
+        for name, source in self._sources.items():
+            self._states[name][step] = source
+        observation = self._simulation.observe()
+        self._states["observation"][step] = observation
+        return observation
+
+    def record_outcome(self, step: int, diverged: NDArray[np.bool_]) -> None:
+        """Write down what the action led to; an episode ends before the step that diverged."""
+        self._reward[step] = self._simulation.reward()
+        self._length[diverged] = np.minimum(self._length[diverged], step)
+
+    def rows(self, episodes: Array) -> dict[str, Array]:
+        """Columns by step, an episode after the other."""
+        step = np.arange(EPISODE_STEPS, dtype=np.int32)
+        kept = step < self._length[:, None]
+        steps = self._states | {"action": self.action, "reward": self._reward}
+        rows: dict[str, Array] = {
+            "episode": np.repeat(episodes.astype(np.int32), self._length),
+            "step": np.broadcast_to(step, kept.shape)[kept],
+        }
+        return rows | {name: a[:EPISODE_STEPS].swapaxes(0, 1)[kept] for name, a in steps.items()}
+
+    def ends(self, episodes: Array) -> dict[str, Array]:
+        """Columns by episode."""
+        lanes = np.arange(len(episodes))
+        ends: dict[str, Array] = {
+            "episode": episodes.astype(np.int32),
+            "length": self._length,
+            "return": episode_returns(self.rows(episodes)["reward"], self._length),
+            "diverged": (self._length < EPISODE_STEPS).astype(np.uint8),
+        }
+        return ends | {f"final_{name}": a[self._length, lanes] for name, a in self._states.items()}

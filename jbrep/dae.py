@@ -43,10 +43,10 @@ def train(dataset: Dataset, training: Training) -> Encoder:
             f"the latent size is {training.latent}: {task.name} has {task.size} features, so it "
             f"must be from 1 to {task.size}"
         )
-    scaled = task.scale(dataset.columns["observation"].astype(np.float64))
     train_rows, test_rows = dataset.split()
-    low, high = scaled[train_rows].min(axis=0), scaled[train_rows].max(axis=0)
-    unit = torch.from_numpy((2 * (scaled - low) / (high - low) - 1).astype(np.float32))
+    scaler = dataset.fit_scaler(train_rows)
+    low, high = task.scale(np.stack((scaler.low, scaler.high)).astype(np.float64))
+    unit = torch.from_numpy(scaler.scale(dataset["observation"][:]))
 
     generator = torch.Generator().manual_seed(training.seed)
     with torch.random.fork_rng():

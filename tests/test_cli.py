@@ -11,7 +11,8 @@ from stable_baselines3 import SAC
 
 from jbrep.cli import main
 
-COMMANDS = sorted(main.commands)
+DATA = main.commands["data"]
+COMMANDS = sorted({*main.commands} - {"data"}) + [f"data {name}" for name in sorted(DATA.commands)]
 
 
 def jbrep(*arguments):
@@ -47,7 +48,7 @@ def test_the_whole_pipeline(tmp_path):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_an_example(command):
-    text = jbrep(command, "--help").output
+    text = jbrep(*command.split(), "--help").output
     assert f"Example: jbrep {command}" in text
     for line in re.findall(r"^  -.*", text, re.MULTILINE):
         assert len(line.split(maxsplit=2)) > 2, line
@@ -57,8 +58,21 @@ def test_every_command_has_help_with_an_example(command):
     ("arguments", "message"),
     [
         (("collect", "--task", "fly", "--steps", "1k", "--out", "x"), "unknown task 'fly'"),
-        (("collect", "--task", "face_direction", "--steps", "-1", "--out", "x"), "at least 1"),
+        (
+            ("collect", "--task", "face_direction", "--steps", "-1", "--out", "x"),
+            "must be from 1 to",
+        ),
         (("train-dae", "--data", "none", "--latent", "8", "--out", "x"), "no data set in none"),
+        (("data", "info", "none"), "no data set in none"),
+        (("data", "verify", "none"), "no data set in none"),
+        (("data", "repair", "none"), "no data set in none"),
+        (("data", "derive", "none", "--task", "fly", "--out", "x"), "no data set in none"),
+        (("data", "export", "none", "--to", "npz", "--out", "x"), "no data set in none"),
+        (("data", "fly"), "No such command 'fly'. See jbrep data --help."),
+        (
+            ("collect", "--task", "fly", "--steps", "1", "--policy", "sprint", "--out", "x"),
+            "unknown policy 'sprint'",
+        ),
         (("rl", "--task", "fly", "--out", "x"), "choose one of move_from_origin"),
         (("rl", "--task", "face_direction", "--algorithm", "dqn", "--out", "x"), "ddpg, td3"),
         (("rl", "--task", "face_direction", "--encoder", "x", "--out", "y"), "no encoder at x"),
@@ -74,6 +88,31 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, tmp_path, mon
     assert result.output.count("\n") == 1
     assert message in result.output
     assert not list(tmp_path.iterdir())
+
+
+def test_a_data_set_from_collecting_to_exporting(tmp_path):
+    data, derived = tmp_path / "data", tmp_path / "derived"
+    arguments = ("collect", "--task", "face_direction", "--steps", "2k", "--store-state")
+    told = jbrep(*arguments, "--shard-episodes", 1, "--out", data).output
+    assert "2 episodes of face_direction, 2,000 rows, 0.7 MB in" in told
+    assert re.search(r"2,000 rows in \d+ s, [\d,]+ a second", told)
+    told = jbrep(*arguments, "--shard-episodes", 1, "--out", data)
+    assert (told.exit_code, "complete already: nothing was done" in told.output) == (0, True)
+    assert "2,000 in 2 episodes" in jbrep("data", "info", data).output
+    told = jbrep("data", "verify", data, "--replay", 2)
+    assert "2,000 rows in 2 of 2 shards, every hash, shape, number and range as it" in told.output
+    assert "2 episodes simulated again: equal in every bit" in told.output
+    told = jbrep("data", "derive", data, "--task", "move_in_direction", "--out", derived)
+    assert "2 episodes of move_in_direction, 2,000 rows" in told.output
+    told = jbrep("data", "export", derived, "--to", "npz", "--out", tmp_path / "data.npz")
+    assert f"open it with numpy.load('{tmp_path / 'data.npz'}')\n" in told.output
+    assert "is whole: nothing to repair" in jbrep("data", "repair", data).output
+    (data / "shard-00001.h5").unlink()
+    told = jbrep("data", "verify", data)
+    assert (told.exit_code, told.output.count("\n")) == (1, 1)
+    assert "shard-00001.h5 is missing: jbrep data repair makes it again" in told.output
+    assert "shard-00001.h5 made again" in jbrep("data", "repair", data).output
+    assert jbrep("data", "verify", data).exit_code == 0
 
 
 @pytest.mark.parametrize(
@@ -102,11 +141,21 @@ def test_a_missing_extra_is_named(monkeypatch, tmp_path):
     )
 
 
+def test_a_missing_package_for_an_export_is_named(monkeypatch, tmp_path, collected):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    result = jbrep("data", "export", collected, "--to", "parquet", "--out", tmp_path / "x")
+    assert (result.exit_code, result.output) == (
+        2,
+        "Error: this needs pyarrow: pip install 'jbrep[export]'\n",
+    )
+
+
 def test_help_loads_nothing_heavy():
     code = (
         "import sys; from jbrep.cli import main;"
         "main(['--help'], standalone_mode=False);"
-        "print(sorted({'numpy', 'torch', 'gymnasium', 'mujoco', 'h5py'} & set(sys.modules)))"
+        "heavy = {'numpy', 'torch', 'gymnasium', 'mujoco', 'h5py', 'filelock'};"
+        "print(sorted(heavy & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.endswith("[]\n")

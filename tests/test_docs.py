@@ -8,7 +8,7 @@ import pytest
 from jbrep.cli import main
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "data" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCKS = [
     pytest.param(block, id=f"{page.name}-{i}")
     for page in PAGES
@@ -17,13 +17,20 @@ BLOCKS = [
 
 
 @pytest.mark.parametrize("block", BLOCKS)
-def test_the_python_runs(block):
+def test_the_python_runs(block, monkeypatch):
+    monkeypatch.chdir(ROOT)
     exec(compile(block, "block", "exec"), {})
 
 
 def test_every_command_is_shown_and_every_command_shown_exists():
     shown = set(re.findall(r"^ {4}jbrep ([a-z-]+)", (ROOT / "README.md").read_text(), re.M))
     assert shown == set(main.commands)
+
+
+def test_every_data_command_is_shown_and_every_one_shown_exists():
+    text = "".join(page.read_text() for page in PAGES)
+    shown = set(re.findall(r"^ {4}jbrep data ([a-z-]+)", text, re.M))
+    assert shown == set(main.commands["data"].commands)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

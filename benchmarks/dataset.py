@@ -1,0 +1,234 @@
+"""Collecting and reading, side by side with what a user would do instead.
+
+python benchmarks/dataset.py; ratios are medians over rounds taken in turn, so that a machine that
+slows down slows both sides.
+"""
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from torch.utils.data import DataLoader, TensorDataset
+
+from jbrep import jitterbug
+from jbrep.collect import simulate_shard, write_shards
+from jbrep.dataset import Dataset
+from jbrep.dataset.manifest import Settings, commit, new_manifest
+from jbrep.dataset.schema import EPISODES
+from jbrep.jitterbug.model import PHYSICS_STEPS, fast_model, stop_profiling
+from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS
+from jbrep.policies import Uniform
+
+TASK = "face_direction"
+LANES = 50
+ROWS = 5_000_000
+BATCH = 8192
+ROUNDS = 6
+
+COLD = f"""
+import numpy as np
+rows = np.random.default_rng(0).integers({ROWS}, size={BATCH})
+"""
+COLD_JBREP = """
+from jbrep.dataset import Dataset
+Dataset({folder!r})["observation"][rows]
+"""
+COLD_MEMMAP = """
+np.memmap({flat!r}, np.float32, mode="r").reshape(-1, 16)[rows]
+"""
+
+
+def timed(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def show(what: str, ratios: list[float], aim: str) -> None:
+    low, median, high = np.percentile(ratios, (10, 50, 90))
+    print(f"{what:66} {median:6.2f}  [{low:.2f}, {high:.2f}]   {aim}", flush=True)
+
+
+@cache  # its process makes it once
+def dm_control_file() -> tuple[Any, h5py.File]:
+    environment = jitterbug.load(TASK, seed=0)
+    file = h5py.File(Path(tempfile.mkdtemp()) / "loop.h5", "w")
+    for name, width in (("observation", TASKS[TASK].size), ("action", 1), ("reward", 1)):
+        file.create_dataset(name, (0, width), "f4", maxshape=(None, width), chunks=(1000, width))
+    return environment, file
+
+
+def dm_control_loop() -> float:
+    """Control steps per second of one episode in a loop that appends it to an HDF5 file."""
+    environment, file = dm_control_file()
+    random = np.random.default_rng(0)
+
+    def episode() -> None:
+        rows: dict[str, list[Any]] = {"observation": [], "action": [], "reward": []}
+        now = environment.reset()
+        while not now.last():
+            action = random.uniform(-1, 1, 1)
+            rows["observation"].append(np.concatenate(list(now.observation.values())))
+            now = environment.step(action)
+            rows["action"].append(action)
+            rows["reward"].append([now.reward])
+        for name, values in rows.items():
+            file[name].resize(len(file[name]) + len(values), axis=0)
+            file[name][-len(values) :] = values
+        file.flush()
+
+    return EPISODE_STEPS / timed(episode)
+
+
+def collected_rate(folder: Path) -> float:
+    """Control steps per second of collecting a shard to the disk."""
+    settings = Settings(task=TASK, steps=LANES * EPISODE_STEPS, shard_episodes=LANES)
+
+    def make(shard: int, tick: Callable[[int], object]) -> Any:
+        return simulate_shard(settings, Uniform(), shard, tick, LANES)
+
+    return settings.steps / timed(lambda: write_shards(settings, folder, make))
+
+
+def bare_rate() -> float:
+    """Control steps per second of the same physics and nothing else."""
+    batch = Batch(fast_model(), LANES, 0)
+    control = batch.bind("ctrl")
+    random = np.random.default_rng(0)
+
+    def episodes() -> None:
+        batch.reset()
+        for _ in range(EPISODE_STEPS):
+            control[:] = random.uniform(-1, 1, (LANES, 1))
+            batch.step(nstep=PHYSICS_STEPS)
+
+    return LANES * EPISODE_STEPS / timed(episodes)
+
+
+def compare_collectors(folder: Path) -> None:
+    stop_profiling()
+    rates: dict[str, list[float]] = {"jbrep": [], "bare": [], "loop": []}
+    with ProcessPoolExecutor(1, get_context("spawn")) as elsewhere:  # it keeps MuJoCo's clock
+        for k in range(ROUNDS):
+            rates["loop"].append(elsewhere.submit(dm_control_loop).result())
+            rates["jbrep"].append(collected_rate(folder / f"collected-{k}"))
+            rates["bare"].append(bare_rate())
+    for name, values in rates.items():
+        print(f"{name:8} {np.median(values):10,.0f} control steps/s")
+    ours = np.array(rates["jbrep"])
+    show("collector to disk / bare batched physics", list(ours / rates["bare"]), ">= 0.95")
+    loop = "collector to disk / dm_control loop that appends to HDF5"
+    show(loop, list(ours / rates["loop"]), ">= 2.8")
+
+
+def memory_of(steps: int, folder: Path) -> float:
+    """The collector's peak of resident memory [MB]."""
+    code = (
+        "import resource, sys; from jbrep.cli import main\n"
+        "main(sys.argv[1:], standalone_mode=False)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+    )
+    arguments = ["collect", "--task", TASK, "--steps", str(steps), "--out", str(folder)]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
+    )
+    return float(done.stdout.split()[-1])
+
+
+def make_rows(folder: Path) -> Dataset:
+    """Five million rows of noise, in the shards that a collector writes."""
+    settings = Settings(task=TASK, steps=ROWS)
+    manifest = new_manifest(settings)
+    folder.mkdir()
+    random = np.random.default_rng(0)
+    for shard in range(settings.num_shards):
+        counts = manifest.row_counts(shard, 100 * EPISODE_STEPS)
+        columns = {
+            name: random.integers(0, 100, spec.shape(counts[name])).astype(spec.dtype)
+            for name, spec in settings.specs().items()
+        }
+        columns[EPISODES + "length"][:] = EPISODE_STEPS
+        manifest = commit(folder, manifest, columns)
+    return Dataset(folder)
+
+
+def copy_through(blocks: Iterator[Any], size: int) -> None:
+    buffer = np.empty((BATCH, size), np.float32)
+    for block in blocks:
+        buffer[: len(block)] = block
+
+
+def compare_readers(folder: Path) -> None:
+    data = make_rows(folder / "rows")
+    flat, size = folder / "flat", data.task.size
+    np.asarray(data["observation"]).tofile(flat)
+    codes = {
+        "python and numpy alone": COLD,
+        "jbrep": COLD + COLD_JBREP.format(folder=str(data.folder)),
+        "np.memmap of one flat file, unchecked": COLD + COLD_MEMMAP.format(flat=str(flat)),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in codes}
+    for _ in range(2 * ROUNDS):
+        for name, code in codes.items():
+            run = [sys.executable, "-c", code]
+            seconds[name].append(timed(lambda run=run: subprocess.run(run, check=True)))
+    for name, values in seconds.items():
+        print(f"cold process to a first random batch: {name:40} {np.median(values):.3f} s")
+    print("  aim: < 0.5 s; jbrep checks the hash of every shard in that time", flush=True)
+
+    def flat_rows() -> Any:
+        return np.memmap(flat, np.float32, mode="r").reshape(-1, size)
+
+    def sequential(rows: Any) -> float:
+        starts = range(0, ROWS, BATCH)
+        return timed(lambda: copy_through((rows[s : s + BATCH] for s in starts), size))
+
+    first, later = [], []
+    for _ in range(ROUNDS):
+        opened = Dataset(data.folder)
+        plain = flat_rows()
+        first.append(sequential(plain) / sequential(opened["observation"]))
+        later.append(sequential(plain) / sequential(opened["observation"]))
+    show("first sequential pass, which checks / np.memmap", first, "")
+    show("sequential pass / np.memmap", later, ">= 0.9")
+
+    tensors = TensorDataset(torch.from_numpy(np.asarray(data["observation"])))
+    loader = DataLoader(tensors, batch_size=BATCH, shuffle=True)
+    memory, disk = data.batches(size=BATCH), data.batches(size=BATCH, memory=64 << 20)
+    assert memory.in_memory
+    assert not disk.in_memory
+    ratios: dict[str, list[float]] = {"first": [], "later": [], "disk": []}
+    for k in range(ROUNDS // 2):
+        whole = timed(lambda: [None for _ in loader])
+        if k == 0:
+            ratios["first"].append(whole / timed(lambda: [None for _ in memory]))
+        ratios["later"].append(whole / timed(lambda: [None for _ in memory]))
+        ratios["disk"].append(whole / timed(lambda: [None for _ in disk]))
+    show("first shuffled pass, which loads / torch DataLoader", ratios["first"], "")
+    show("shuffled pass from memory / torch DataLoader", ratios["later"], ">= 20")
+    show("shuffled pass by runs from the disk, 64 MiB / torch DataLoader", ratios["disk"], "")
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        compare_readers(folder)
+        compare_collectors(folder)
+        for steps in (100_000, 400_000):
+            peak = memory_of(steps, folder / f"memory-{steps}")
+            print(f"collector's peak memory, {steps:,} steps: {peak:.0f} MB   aim: < 500 MB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,8 @@
+"""Data sets: folders of HDF5 shards of flat columns, named by a manifest."""
+
+from jbrep.dataset.columns import Batches, Column, Scaler
+from jbrep.dataset.manifest import Settings
+from jbrep.dataset.reader import Dataset, Split
+from jbrep.dataset.shard import DamageError
+
+__all__ = ["Batches", "Column", "DamageError", "Dataset", "Scaler", "Settings", "Split"]

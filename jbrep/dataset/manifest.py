@@ -1,0 +1,321 @@
+"""What has been committed to a data set's folder; a shard counts once the manifest names it."""
+
+import hashlib
+import json
+import operator
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from jbrep.dataset.schema import (
+    EPISODES,
+    FORMAT,
+    FORMAT_VERSION,
+    Columns,
+    Spec,
+    all_specs,
+    check_root_seed,
+    step_specs,
+)
+from jbrep.dataset.shard import (
+    MEND,
+    DamageError,
+    column_hashes,
+    file_hash,
+    map_columns,
+    map_file,
+    shard_image,
+)
+from jbrep.dataset.storage import write_whole
+from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import EPISODE_STEPS, Task, get_task
+
+MANIFEST = "manifest.json"
+_PACKAGES = ("jbrep", "mujoco", "numpy", "h5py")
+_HASH = "sha256"  # of all else in the manifest
+_MAX_STEPS = 10**12  # episodes have 32-bit numbers
+_MAX_BYTES = 1 << 28  # of a manifest: 200,000 shards
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What decides the data, and how it is cut into shards."""
+
+    task: str
+    policy: Mapping[str, Any] = field(default_factory=lambda: {"kind": "uniform"})  # and constants
+    steps: int  # asked for; rounded up to whole episodes
+    seed: int = 0  # the root of all episodes' seeds
+    shard_episodes: int = 100
+    store_state: bool = False
+
+    def check(self) -> None:
+        """Make sure that it can be collected.
+
+        Raises:
+            InputError: unknown task, a seed out of range, or a number below 1.
+            TypeError: a value of another type.
+        """
+        get_task(self.task)
+        for count, what in ((self.steps, "steps"), (self.shard_episodes, "episodes in a shard")):
+            if not 1 <= operator.index(count) <= _MAX_STEPS:
+                raise InputError(
+                    f"the number of {what} is {count}: it must be from 1 to {_MAX_STEPS:,}"
+                )
+        check_root_seed(operator.index(self.seed))
+        if not isinstance(self.policy["kind"], str):
+            raise TypeError
+
+    @property
+    def episodes(self) -> int:
+        """How many episodes."""
+        return -(-self.steps // EPISODE_STEPS)
+
+    @property
+    def num_shards(self) -> int:
+        """How many shards hold them."""
+        return -(-self.episodes // self.shard_episodes)
+
+    def shard_range(self, shard: int) -> range:
+        """The episodes in a shard."""
+        start = shard * self.shard_episodes
+        return range(start, min(start + self.shard_episodes, self.episodes))
+
+    def specs(self) -> dict[str, Spec]:
+        """The columns of each shard."""
+        return all_specs(get_task(self.task), self.store_state)
+
+    def row_bytes(self) -> int:
+        """Bytes that a control step takes."""
+        specs = step_specs(get_task(self.task), self.store_state).values()
+        return sum(spec.dtype.itemsize * max(1, sum(spec.row)) for spec in specs)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A committed shard."""
+
+    bytes: int
+    rows: int
+    xxh3: str  # of the file
+    sha256: Mapping[str, str]  # of each column
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a data set's folder holds."""
+
+    settings: Settings
+    versions: Mapping[str, str]  # of the packages that made it
+    shards: tuple[Entry, ...] = ()
+
+    @property
+    def task(self) -> Task:
+        """The task whose features the observations hold."""
+        return get_task(self.settings.task)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every shard has been committed."""
+        return len(self.shards) == self.settings.num_shards
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over the hashes of all columns: it names the data."""
+        parts = (f"{name} {digest}\n" for e in self.shards for name, digest in e.sha256.items())
+        return hashlib.sha256("".join(parts).encode()).hexdigest()
+
+    def row_counts(self, shard: int, rows: int) -> dict[str, int]:
+        """How many rows each column of a shard has."""
+        episodes = len(self.settings.shard_range(shard))
+        return {n: episodes if n.startswith(EPISODES) else rows for n in self.settings.specs()}
+
+    def attributes(self, shard: int, rows: int) -> dict[str, Any]:
+        """What a shard's file says of itself, enough to make the manifest again."""
+        return {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "shard": shard,
+            "rows": rows,
+            "feature_names": list(self.task.feature_names),
+            "feature_units": [feature.unit for feature in self.task.features],
+            **asdict(self.settings),
+            "policy": json.dumps(self.settings.policy),
+            "store_state": int(self.settings.store_state),  # booleans are rare in HDF5
+            "versions": json.dumps(self.versions),
+        }
+
+    @classmethod
+    def from_attributes(cls, attributes: Mapping[str, Any]) -> "Manifest":
+        """The manifest, still without shards, that the attributes of a shard were made from.
+
+        Raises:
+            KeyError, TypeError, ValueError: they weren't made from one.
+        """
+        own = {known.name: attributes[known.name] for known in fields(Settings)}
+        own["policy"] = json.loads(own["policy"])
+        own["store_state"] = bool(own["store_state"])
+        manifest = cls(Settings(**own), json.loads(attributes["versions"]))
+        manifest.settings.check()
+        return manifest
+
+
+def shard_name(shard: int) -> str:
+    """File name of the shard of that number."""
+    return f"shard-{shard:05d}.h5"
+
+
+def new_manifest(settings: Settings) -> Manifest:
+    """A manifest without shards, of the versions that are installed."""
+    return Manifest(settings, {name: version(name) for name in _PACKAGES})
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of a data set, checked to the last bit.
+
+    Raises:
+        InputError: no data set there, or one that a newer jbrep wrote.
+        DamageError: not what jbrep wrote.
+    """
+    path = folder / MANIFEST
+    try:
+        status = path.stat()
+        raw = path.read_bytes() if status.st_size <= _MAX_BYTES else b""
+    except (FileNotFoundError, NotADirectoryError):
+        if any(folder.glob("shard-*.h5")):
+            raise DamageError(f"{path} is missing: {MEND}") from None
+        raise InputError(
+            f"no data set in {folder}: a folder that jbrep collect wrote is expected"
+        ) from None
+    try:
+        record = json.loads(raw)
+        if raw != _text(record) or record["format"] != FORMAT:
+            raise ValueError
+        newer = record["format_version"] > FORMAT_VERSION
+        manifest = None if newer else _parse(record)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise DamageError(f"{path} is damaged: it isn't what jbrep wrote; {MEND}") from None
+    if manifest is None:
+        raise InputError(
+            f"{path} has format version {record['format_version']}: this jbrep reads up to "
+            f"{FORMAT_VERSION}, so a newer one is needed"
+        )
+    return manifest
+
+
+def _text(record: dict[str, Any]) -> bytes:
+    """The one way to write a record: any other byte is damage."""
+    body = {key: value for key, value in record.items() if key != _HASH}
+    digest = hashlib.sha256(json.dumps(body).encode()).hexdigest()
+    return (json.dumps({**body, _HASH: digest}, indent=1) + "\n").encode()
+
+
+def _record(manifest: Manifest) -> dict[str, Any]:
+    fields = asdict(manifest)
+    return {"format": FORMAT, "format_version": FORMAT_VERSION, **fields}
+
+
+def _parse(record: dict[str, Any]) -> Manifest:
+    settings = Settings(**record["settings"])
+    settings.check()
+    shards = tuple(Entry(**entry) for entry in record["shards"])
+    columns = set(settings.specs())
+    if len(shards) > settings.num_shards or any(e.sha256.keys() != columns for e in shards):
+        raise ValueError
+    for shard, entry in enumerate(shards):
+        most = EPISODE_STEPS * len(settings.shard_range(shard))
+        if operator.index(entry.bytes) < 0 or not 0 <= operator.index(entry.rows) <= most:
+            raise ValueError
+    versions = {str(package): str(number) for package, number in record["versions"].items()}
+    return Manifest(settings, versions, shards)
+
+
+def open_shard(folder: Path, manifest: Manifest, shard: int) -> dict[str, Any]:
+    """A shard's columns as read-only views, once its bytes are found to be those committed.
+
+    Raises:
+        DamageError: they aren't, or it is missing.
+    """
+    path, entry = folder / shard_name(shard), manifest.shards[shard]
+    content = map_file(path)
+    if len(content) != entry.bytes or file_hash(content) != entry.xxh3:
+        raise DamageError(
+            f"{path} is damaged: {len(content):,} bytes that aren't the {entry.bytes:,} that were "
+            f"committed; {MEND}"
+        )
+    return map_columns(
+        path, content, manifest.settings.specs(), manifest.row_counts(shard, entry.rows)
+    )
+
+
+def check_listing(folder: Path, manifest: Manifest) -> None:
+    """Make sure that the shards in the folder are those of the manifest, by name and size.
+
+    One more shard than the manifest names is a commit under way; a reader passes it by.
+
+    Raises:
+        DamageError: one is missing, cut short, or not one of them.
+    """
+    for problem in listing_problems(folder, manifest):
+        raise DamageError(problem)
+
+
+def listing_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
+    """What `check_listing` finds wrong, a line for each shard."""
+    for shard, entry in enumerate(manifest.shards):
+        path = folder / shard_name(shard)
+        try:
+            size = path.lstat().st_size
+        except FileNotFoundError:
+            yield f"{path} is missing: {MEND}"
+            continue
+        if size != entry.bytes:
+            yield (
+                f"{path} is damaged: it has {size:,} bytes, {entry.bytes:,} were committed; {MEND}"
+            )
+    for path in stray_shards(folder, manifest):
+        yield f"{path} is not one of the {len(manifest.shards)} shards of the data set"
+
+
+def stray_shards(folder: Path, manifest: Manifest) -> list[Path]:
+    """HDF5 files in the folder that the manifest doesn't name, but for a commit under way."""
+    known = {shard_name(shard) for shard in range(len(manifest.shards))}
+    if not manifest.complete:
+        known.add(shard_name(len(manifest.shards)))
+    return sorted(path for path in folder.glob("*.h5") if path.name not in known)
+
+
+def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
+    """Write the next shard, then the manifest that names it.
+
+    Raises:
+        InputError: it can't be written; the message says where and how much.
+    """
+    shard = len(manifest.shards)
+    entry = write_shard(folder, manifest, shard, columns)
+    manifest = replace(manifest, shards=(*manifest.shards, entry))
+    write_manifest(folder, manifest)
+    return manifest
+
+
+def write_shard(folder: Path, manifest: Manifest, shard: int, columns: Columns) -> Entry:
+    """Write a shard's file; it doesn't count before a manifest names it.
+
+    Raises:
+        InputError: it can't be written.
+    """
+    rows = len(columns["step"])
+    hashes = column_hashes(columns)
+    image = shard_image(columns, hashes, manifest.attributes(shard, rows))
+    write_whole(folder / shard_name(shard), image)
+    return Entry(len(image), rows, file_hash(image), hashes)
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Put the manifest in place of the one before.
+
+    Raises:
+        InputError: it can't be written.
+    """
+    write_whole(folder / MANIFEST, _text(_record(manifest)))

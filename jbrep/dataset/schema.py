@@ -1,0 +1,100 @@
+"""What a data set holds: the columns, and how an episode's seed follows from the root seed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import Task
+
+Columns = Mapping[str, NDArray[Any]]
+
+FORMAT = "jbrep data set"
+FORMAT_VERSION = 1
+EPISODES = "episodes/"  # the HDF5 group of the columns with one row for each episode
+
+_QPOS, _QVEL = 16, 15  # sizes of MuJoCo's position and velocity
+_MAX_ROOT = 2**31 - 2
+
+
+@dataclass(frozen=True)
+class Spec:
+    """Type of a column and shape of one of its rows."""
+
+    dtype: np.dtype[Any]
+    row: tuple[int, ...] = ()
+
+    def shape(self, rows: int) -> tuple[int, ...]:
+        """Shape of the whole column."""
+        return (rows, *self.row)
+
+
+def _spec(dtype: str, *row: int) -> Spec:
+    return Spec(np.dtype(dtype), row)
+
+
+def step_specs(task: Task, store_state: bool) -> dict[str, Spec]:
+    """Columns with a row for each control step, in the order of episode, then step."""
+    specs = {
+        "observation": _spec("<f4", task.size),  # before the action, in physical units
+        "action": _spec("<f4", 1),  # the drive that was held, in [-1, 1]
+        "reward": _spec("<f4"),  # of the state that the action led to
+        "episode": _spec("<i4"),  # from 0 in the data set
+        "step": _spec("<i4"),  # from 0 in the episode
+    }
+    if store_state:  # with the observation
+        specs |= {"qpos": _spec("<f8", _QPOS), "qvel": _spec("<f8", _QVEL)}
+    return specs
+
+
+def episode_specs(task: Task, store_state: bool) -> dict[str, Spec]:
+    """Columns with a row for each episode."""
+    specs = {
+        "episode": _spec("<i4"),
+        "seed": _spec("<i8"),
+        "length": _spec("<i4"),  # rows stored
+        "return": _spec("<f8"),  # sum of the rewards stored
+        "diverged": _spec("|u1"),  # 1 where the physics went non-finite after the last row
+        "initial_qpos": _spec("<f8", _QPOS),
+        "initial_qvel": _spec("<f8", _QVEL),
+        "target_position": _spec("<f8", 3),
+        "target_quaternion": _spec("<f8", 4),
+        "final_observation": _spec("<f4", task.size),  # after the last action
+    }
+    if store_state:
+        specs |= {"final_qpos": _spec("<f8", _QPOS), "final_qvel": _spec("<f8", _QVEL)}
+    return {EPISODES + name: spec for name, spec in specs.items()}
+
+
+def all_specs(task: Task, store_state: bool) -> dict[str, Spec]:
+    """All columns of a shard, by their paths in the file."""
+    return step_specs(task, store_state) | episode_specs(task, store_state)
+
+
+def check_root_seed(seed: int) -> None:
+    """Make sure that `episode_seed` can take it.
+
+    Raises:
+        InputError: it is out of range.
+    """
+    if not 0 <= seed <= _MAX_ROOT:
+        raise InputError(f"the seed is {seed}: it must be from 0 to {_MAX_ROOT:,}")
+
+
+def episode_seed(root: int, episode: int) -> int:
+    """The seed of an episode: (root + 1) * 2**32 + episode.
+
+    No two episodes share one, within a data set or between data sets of different root seeds,
+    and none is small enough to be one that people give an environment. `env.reset(seed=...)`
+    with it starts the same episode.
+    """
+    return ((root + 1) << 32) + episode
+
+
+def episode_returns(reward: NDArray[np.float32], lengths: NDArray[Any]) -> NDArray[np.float64]:
+    """Sums over the episodes of the rewards stored, in double precision, in the order of rows."""
+    owner = np.repeat(np.arange(len(lengths)), lengths)
+    return np.bincount(owner, reward, len(lengths)).astype(np.float64)

@@ -1,0 +1,183 @@
+"""Is a data set what it says it is? Hashes, shapes, numbers, ranges, and the physics itself."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from tqdm import tqdm
+
+from jbrep.dataset.manifest import (
+    Manifest,
+    listing_problems,
+    open_shard,
+    read_manifest,
+    shard_name,
+)
+from jbrep.dataset.reader import Dataset
+from jbrep.dataset.schema import EPISODES, episode_returns, episode_seed
+from jbrep.dataset.shard import DamageError, column_hash
+from jbrep.errors import InputError
+from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.tasks import EPISODE_STEPS, Task
+
+_LANES = 100
+_BOUNDED = ("rad", "1")  # angles are wrapped, quaternions are of length 1: their ranges are bounds
+
+Columns = dict[str, NDArray[Any]]
+
+
+def find_problems(folder: Path) -> Iterator[str]:
+    """Everything about the files of a data set that isn't as it should be, a line for each.
+
+    Raises:
+        InputError: there is no data set.
+    """
+    try:
+        manifest = read_manifest(folder)
+    except DamageError as damage:
+        yield str(damage)
+        return
+    yield from listing_problems(folder, manifest)
+    for shard in tqdm(range(len(manifest.shards)), unit="shard", desc="verify", leave=False):
+        path = folder / shard_name(shard)
+        try:
+            columns = open_shard(folder, manifest, shard)
+        except DamageError as damage:
+            if path.exists() and path.lstat().st_size == manifest.shards[shard].bytes:
+                yield str(damage)  # else its size or absence has been told
+            continue
+        for problem in _hash_problems(manifest, shard, columns):
+            yield f"{path}: {problem}"
+        for problem in _content_problems(manifest, shard, columns):
+            yield f"{path}: {problem}"
+
+
+def _hash_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
+    for name, expected in manifest.shards[shard].sha256.items():
+        if column_hash(columns[name]) != expected:
+            yield f"the SHA-256 of {name} is another than the manifest's"
+
+
+def _content_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
+    """What the numbers themselves must fulfil."""
+    for name, values in columns.items():
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            yield f"{name} has values that are not finite"
+    yield from _range_problems(manifest.task, columns)
+    yield from _episode_problems(manifest, shard, columns)
+
+
+def _range_problems(task: Task, columns: Columns) -> Iterator[str]:
+    ranges = [("action", columns["action"], -1.0, 1.0), ("reward", columns["reward"], 0.0, 1.0)]
+    for values in (columns["observation"], columns[EPISODES + "final_observation"]):
+        ranges += [
+            (feature.name, values[:, i], feature.low, feature.high)
+            for i, feature in enumerate(task.features)
+            if feature.unit in _BOUNDED
+        ]
+    for name, values, low, high in ranges:
+        if len(values) and not np.float32(low) <= values.min() <= values.max() <= np.float32(high):
+            reach = f"goes from {values.min():g} to {values.max():g}"
+            yield f"{name} {reach}, beyond [{low:g}, {high:g}]"
+
+
+def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
+    """Numbers, seeds, starts, lengths and returns fit the settings and each other."""
+    settings, rows = manifest.settings, manifest.shards[shard].rows
+    own = {n.removeprefix(EPISODES): v for n, v in columns.items() if n.startswith(EPISODES)}
+    numbers = np.array(settings.shard_range(shard))
+    seeds = [episode_seed(settings.seed, int(number)) for number in numbers]
+    lengths = own["length"]
+    checks: dict[str, tuple[ArrayLike, ArrayLike]] = {
+        "episode numbers": (own["episode"], numbers),
+        "seeds": (own["seed"], np.array(seeds)),
+        "diverged": (own["diverged"], lengths < EPISODE_STEPS),
+    }
+    if lengths.min() < 0 or lengths.max() > EPISODE_STEPS or lengths.sum() != rows:
+        yield f"the lengths of the episodes don't add up to {rows:,} rows"
+    else:
+        first = np.cumsum(lengths) - lengths
+        checks |= {
+            "the rows' episode": (columns["episode"], np.repeat(numbers, lengths)),
+            "the rows' step": (columns["step"], np.arange(rows) - np.repeat(first, lengths)),
+            "returns": (own["return"], episode_returns(columns["reward"], lengths)),
+        }
+    starts = [manifest.task.start(np.random.default_rng(seed)) for seed in seeds]
+    checks |= {
+        "initial orientations": (own["initial_qpos"][:, 3:7], [s.quaternion for s in starts]),
+        "target positions": (own["target_position"], [s.target_position for s in starts]),
+        "target orientations": (own["target_quaternion"], [s.target_quaternion for s in starts]),
+    }
+    for what, (found, expected) in checks.items():
+        if not np.array_equal(found, expected):
+            yield f"{what} are not what seeds, lengths and rewards make of them"
+
+
+def replay(dataset: Dataset, episodes: int, num_threads: int | None = None) -> Iterator[str]:
+    """Simulate some episodes again from their stored start and actions, and compare every bit.
+
+    Args:
+        dataset: where they are.
+        episodes: how many; they are drawn evenly at random, the same ones each time.
+        num_threads: threads to simulate on; None takes one for each core.
+
+    Yields:
+        A line for each episode that comes out otherwise.
+
+    Raises:
+        InputError: fewer episodes are there.
+    """
+    total = len(dataset.episodes["episode"])
+    if not 0 <= episodes <= total:
+        raise InputError(f"{episodes} episodes can't be replayed: the data set has {total:,}")
+    chosen = np.sort(np.random.default_rng(0).permutation(total)[:episodes])
+    with tqdm(total=episodes * EPISODE_STEPS, unit="step", unit_scale=True, leave=False) as bar:
+        for start in range(0, episodes, _LANES):
+            for episode in _replay_some(dataset, chosen[start : start + _LANES], num_threads, bar):
+                yield (
+                    f"{dataset.folder}: episode {episode} simulated again differs: another "
+                    f"machine, or other versions than {dict(dataset.manifest.versions)}?"
+                )
+
+
+def _replay_some(
+    dataset: Dataset, chosen: NDArray[Any], num_threads: int | None, bar: "tqdm[None]"
+) -> list[int]:
+    own = {name: column[chosen] for name, column in dataset.episodes.items()}
+    simulation = Simulation(dataset.task, len(chosen), num_threads)
+    simulation.restore(
+        *(own[n] for n in ("initial_qpos", "initial_qvel", "target_position", "target_quaternion"))
+    )
+    first = (np.cumsum(dataset.episodes["length"]) - dataset.episodes["length"])[chosen]
+    names = [name for name in dataset.columns if name not in ("episode", "step")]
+    columns = {name: dataset[name] for name in names}
+    equal = np.ones(len(chosen), dtype=bool)
+    for step in range(EPISODE_STEPS + 1):
+        running = own["length"] > step
+        rows = np.where(running, first + step, 0)
+        stored = {name: column[rows] for name, column in columns.items()}
+        ending = own["length"] == step
+        seen: Columns = {
+            "observation": simulation.observe().astype(np.float32),
+            "qpos": simulation.readings.qpos,
+            "qvel": simulation.readings.qvel,
+        }
+        for name, values in seen.items():
+            if name in stored:
+                equal &= _same(values, stored[name]) | ~running
+                equal &= _same(values, own[f"final_{name}"]) | ~ending
+        if step < EPISODE_STEPS:
+            simulation.step(np.where(running[:, None], stored["action"], 0))
+            reward = simulation.reward().astype(np.float32)
+            equal &= _same(reward, stored["reward"]) | ~running
+            bar.update(len(chosen))
+    return chosen[~equal].tolist()
+
+
+def _same(values: NDArray[Any], stored: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which lanes are equal in every bit."""
+    one, other = (np.ascontiguousarray(a).reshape(len(a), -1) for a in (values, stored))
+    same: NDArray[np.bool_] = (one.view(np.uint8) == other.view(np.uint8)).all(axis=1)
+    return same

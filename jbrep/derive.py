@@ -1,0 +1,117 @@
+"""Another task's data set from a collected one: the same motion, observed and rewarded anew."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.collect import Tick, Written, write_shards
+from jbrep.dataset import Dataset
+from jbrep.dataset.manifest import open_shard
+from jbrep.dataset.schema import EPISODES, Columns, episode_returns
+from jbrep.errors import InputError
+from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.tasks import Task, get_task
+from jbrep.policies import make_policy
+
+_LANES = 500
+
+Array = NDArray[Any]
+
+
+class Stored(NamedTuple):
+    """States of n robots, as `Simulation.restore` takes them."""
+
+    qpos: Array  # (n, 16)
+    qvel: Array  # (n, 15)
+    target_position: Array  # (n, 3)
+    target_quaternion: Array  # (n, 4)
+
+
+def derive(
+    source: Path,
+    task_name: str,
+    folder: Path,
+    store_state: bool = False,
+    num_threads: int | None = None,
+) -> Written:
+    """Make the data set that collecting the task with the same settings would, bit for bit.
+
+    Actions that don't depend on what is observed lead to the same states whatever the task.
+
+    Args:
+        source: a complete data set with its states stored.
+        task_name: the task to observe and reward.
+        folder: where to write; a derivation that was stopped goes on.
+        store_state: keep the states.
+        num_threads: threads to work on; None takes one for each core.
+
+    Raises:
+        InputError: the source has no states, is unfinished or damaged, or was made by a policy
+            that looks at observations; or as `collect` does.
+    """
+    dataset = Dataset(source)
+    settings = dataset.manifest.settings
+    if not settings.store_state:
+        raise InputError(f"{source} has no states: collect it with --store-state")
+    if not dataset.manifest.complete:
+        raise InputError(f"{source} is not finished: the same jbrep collect goes on with it")
+    if not make_policy(dict(settings.policy)).open_loop:
+        raise InputError(
+            f"{source} was made by a {settings.policy['kind']} policy, which acts on what it "
+            f"observes: collect {task_name} itself"
+        )
+    task = get_task(task_name)
+    settings = replace(settings, task=task_name, store_state=store_state)
+
+    def make(shard: int, tick: Tick) -> Columns:
+        columns = open_shard(source, dataset.manifest, shard)
+        return _observe_anew(columns, task, settings.specs(), tick, num_threads)
+
+    return write_shards(settings, folder, make)
+
+
+def _observe_anew(
+    columns: Columns, task: Task, names: Iterable[str], tick: Tick, num_threads: int | None
+) -> Columns:
+    """The columns of a shard as another task has them."""
+    own = {n.removeprefix(EPISODES): c for n, c in columns.items() if n.startswith(EPISODES)}
+    length = own["length"]
+    starts = [task.start(np.random.default_rng(int(seed))) for seed in own["seed"]]
+    target = {
+        "target_position": np.stack([start.target_position for start in starts]),
+        "target_quaternion": np.stack([start.target_quaternion for start in starts]),
+    }
+    owner = np.repeat(np.arange(len(length)), length)
+    row = np.arange(len(owner)) + owner  # where it stands once final states are put in
+    ends = np.cumsum(length)
+    final = ends + np.arange(len(length))
+    states = Stored(
+        *(np.insert(columns[n], ends, own[f"final_{n}"], axis=0) for n in ("qpos", "qvel")),
+        *(np.repeat(values, length + 1, axis=0) for values in target.values()),
+    )
+    observation, reward = _read(states, task, num_threads)
+    tick(len(row))
+    anew = {
+        "observation": observation[row],
+        "reward": reward[row + 1],
+        EPISODES + "final_observation": observation[final],
+        EPISODES + "return": episode_returns(reward[row + 1], length),
+    } | {EPISODES + name: values for name, values in target.items()}
+    return {name: anew.get(name, columns[name]) for name in names}
+
+
+def _read(states: Stored, task: Task, num_threads: int | None) -> tuple[Array, Array]:
+    """Observations (n, d) and rewards (n,) of the states."""
+    n = len(states.qpos)
+    lanes = min(_LANES, n)
+    simulation = Simulation(task, lanes, num_threads)
+    observation, reward = np.empty((n, task.size), np.float32), np.empty(n, np.float32)
+    for start in range(0, n, lanes):
+        rows = slice(min(start, n - lanes), start + lanes)  # the last ones overlap
+        simulation.restore(*(values[rows] for values in states))
+        observation[rows], reward[rows] = simulation.observe(), simulation.reward()
+    return observation, reward

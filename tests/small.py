@@ -1,0 +1,31 @@
+"""Small data sets, and shards without the wait for physics."""
+
+from jbrep.collect import write_shards
+from jbrep.dataset.manifest import Settings, open_shard, read_manifest
+
+
+def settings(**changes):
+    small = {
+        "task": "face_direction",
+        "policy": {"kind": "uniform"},
+        "steps": 5000,
+        "seed": 3,
+        "shard_episodes": 1,
+        "store_state": True,
+    }
+    return Settings(**{**small, **changes})
+
+
+def write_again(source, folder):
+    """Commit the shards of a data set to another folder, as a collector would."""
+    manifest = read_manifest(source)
+
+    def make(shard, tick):
+        return open_shard(source, manifest, shard)
+
+    return write_shards(manifest.settings, folder, make).manifest
+
+
+def contents(folder):
+    """The bytes of all files that belong to a data set."""
+    return {p.name: p.read_bytes() for p in sorted(folder.iterdir()) if p.name != ".lock"}

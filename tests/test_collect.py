@@ -1,0 +1,393 @@
+"""The collector: what it writes, and that nothing but the settings decides it."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from kills import COMMAND, kill_and_resume
+from small import contents, settings, write_again
+
+from jbrep import collect as collecting
+from jbrep import jitterbug
+from jbrep.collect import collect, write_shards
+from jbrep.dataset import DamageError, Dataset
+from jbrep.dataset.manifest import open_shard, read_manifest, write_manifest
+from jbrep.dataset.schema import episode_seed
+from jbrep.dataset.storage import exclusive
+from jbrep.dataset.verify import find_problems, replay
+from jbrep.derive import derive
+from jbrep.envs import environment_id
+from jbrep.errors import InputError
+from jbrep.jitterbug.simulation import Simulation
+
+
+def test_rows_are_the_episodes_of_a_random_policy(collected):
+    dataset = Dataset(collected)
+    assert len(dataset) == 5000
+    np.testing.assert_array_equal(dataset["episode"], np.repeat(np.arange(5), 1000))
+    np.testing.assert_array_equal(dataset["step"], np.tile(np.arange(1000), 5))
+    assert abs(dataset["action"][:].mean()) < 0.05
+    assert dataset["action"][:].std() == pytest.approx(1 / np.sqrt(3), rel=0.02)
+
+
+def test_an_episode_s_seed_starts_it_in_the_environments_too(collected):
+    dataset = Dataset(collected)
+    environment = gymnasium.make(environment_id("face_direction"))
+    for episode in (0, 3):
+        seed = int(dataset.episodes["seed"][episode])
+        observation, _ = environment.reset(seed=seed)
+        first = episode * 1000
+        np.testing.assert_array_equal(observation, dataset["observation"][first])
+        for step in range(20):
+            np.testing.assert_array_equal(observation, dataset["observation"][first + step])
+            observation, reward, *_ = environment.step(dataset["action"][first + step])
+            assert np.float32(reward) == dataset["reward"][first + step]
+        physics = jitterbug.load("face_direction", seed=seed)
+        physics.reset()
+        qpos = dataset.episodes["initial_qpos"][episode]
+        np.testing.assert_array_equal(physics.physics.data.qpos, qpos)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{"lanes": 1, "num_threads": 1}, {"lanes": 3, "num_threads": 2}, {"lanes": 64}],
+    ids=str,
+)
+def test_neither_lanes_nor_threads_change_a_byte(how, tmp_path):
+    some = settings(steps=3000, shard_episodes=2)
+    collect(some, tmp_path / "plain")
+    collect(some, tmp_path / "other", **how)
+    assert contents(tmp_path / "plain") == contents(tmp_path / "other")
+
+
+def test_shards_cut_the_same_rows(collected, tmp_path):
+    collect(settings(shard_episodes=3, store_state=False), tmp_path / "wide")
+    wide, narrow = Dataset(tmp_path / "wide"), Dataset(collected)
+    for name in wide.columns:
+        np.testing.assert_array_equal(wide[name], narrow[name])
+    for name in wide.episodes:
+        np.testing.assert_array_equal(wide.episodes[name], narrow.episodes[name])
+
+
+@pytest.mark.parametrize("kind", ["heuristic", "constant", "ornstein-uhlenbeck"])
+def test_other_policies_are_collected_and_replayed(kind, tmp_path):
+    collect(settings(steps=2000, policy={"kind": kind}, shard_episodes=2), tmp_path / "data")
+    dataset = Dataset(tmp_path / "data")
+    assert not list(find_problems(dataset.folder))
+    assert not list(replay(dataset, 2))
+    if kind == "heuristic":
+        assert dataset.episodes["return"].min() > 700
+
+
+def test_what_is_there_already_is_left_alone(copied):
+    before = contents(copied)
+    times = [path.stat().st_mtime_ns for path in sorted(copied.iterdir()) if path.suffix == ".h5"]
+    written = collect(settings(), copied)
+    assert (written.rows, written.manifest.complete) == (0, True)
+    assert contents(copied) == before
+    assert times == [p.stat().st_mtime_ns for p in sorted(copied.iterdir()) if p.suffix == ".h5"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("task", "move_to_pose"),
+        ("policy", {"kind": "heuristic"}),
+        ("steps", 6000),
+        ("seed", 4),
+        ("shard_episodes", 2),
+        ("store_state", False),
+    ],
+)
+def test_other_settings_on_the_same_folder_are_refused_by_name(name, value, copied):
+    before = contents(copied)
+    with pytest.raises(InputError, match=f"other settings: {name} .* \\(now: ") as refusal:
+        collect(settings(**{name: value}), copied)
+    assert str(value) in str(refusal.value)
+    assert contents(copied) == before
+
+
+def test_versions_are_not_mixed_in_a_data_set(copied):
+    whole = contents(copied)
+    manifest = read_manifest(copied)
+    older = replace(manifest, versions={**manifest.versions, "mujoco": "3.16.9"})
+    write_manifest(copied, replace(older, shards=older.shards[:4]))
+    (copied / "shard-00004.h5").unlink()
+    with pytest.raises(InputError, match=r"begun with other versions: mujoco 3.16.9 \(now: "):
+        collect(settings(), copied)
+    write_manifest(copied, replace(manifest, shards=manifest.shards[:4]))
+    assert collect(settings(), copied).rows == 1000
+    assert contents(copied) == whole
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"task": "fly"}, "unknown task 'fly'"),
+        ({"steps": 0}, "number of steps is 0: it must be from 1 to"),
+        ({"shard_episodes": 0}, "number of episodes in a shard is 0"),
+        ({"seed": -1}, "the seed is -1: it must be from 0"),
+        ({"seed": 2**31}, "the seed is 2147483648"),
+        ({"policy": {"kind": "sprint"}}, "unknown policy 'sprint'"),
+    ],
+)
+def test_mistakes_leave_nothing_behind(change, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        collect(settings(**change), tmp_path / "data")
+    for how in ({"lanes": 0}, {"num_threads": 0}):
+        with pytest.raises(InputError, match="must be at least 1"):
+            collect(settings(), tmp_path / "data", **how)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_can_t_be_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"can't make the folder .*file"):
+        collect(settings(), tmp_path / "file")
+
+
+def test_no_two_episodes_share_a_seed():
+    """Between all episodes of neighbouring and of far roots, and no seed that people give."""
+    roots = (0, 1, 2, 7, 2**20, 2**31 - 3, 2**31 - 2)
+    numbers = (0, 1, 2, 99, 100, 4_999, 10**6, 2**31 - 1)
+    seeds = {episode_seed(root, number) for root in roots for number in numbers}
+    assert len(seeds) == len(roots) * len(numbers)
+    assert min(seeds) >= 2**32
+    assert max(seeds) < 2**63
+
+
+def test_seeds_are_distinct_across_shards_and_data_sets(collected, tmp_path):
+    collect(settings(seed=4, steps=3000), tmp_path / "other")
+    seeds = np.concatenate([Dataset(f).episodes["seed"] for f in (collected, tmp_path / "other")])
+    assert len(np.unique(seeds)) == 8
+    starts = np.concatenate(
+        [Dataset(f).episodes["initial_qpos"] for f in (collected, tmp_path / "other")]
+    )
+    assert len(np.unique(starts, axis=0)) == 8
+
+
+@pytest.fixture
+def diverging(monkeypatch, tmp_path):
+    """Lane 1 goes non-finite in its 301st step, lane 2 in its first."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs there
+    step, made = Simulation.step, {}
+
+    def spoil(simulation, action):
+        count = made[simulation] = made.get(simulation, -1) + 1
+        for lane, when in ((1, 300), (2, 0)):
+            if count == when and simulation.num_lanes == 4:
+                simulation.readings.qvel[lane, 0] = np.nan
+        return step(simulation, action)
+
+    monkeypatch.setattr(Simulation, "step", spoil)
+
+
+@pytest.mark.usefixtures("diverging")
+def test_an_episode_ends_before_its_physics_goes_non_finite(tmp_path, collected):
+    some = settings(steps=4000, shard_episodes=4)
+    collect(some, tmp_path / "data")
+    dataset = Dataset(tmp_path / "data")
+    np.testing.assert_array_equal(dataset.episodes["length"], [1000, 300, 0, 1000])
+    np.testing.assert_array_equal(dataset.episodes["diverged"], [0, 1, 1, 0])
+    whole = Dataset(collected)
+    kept = np.isin(whole["episode"][:], (0, 3)) | (
+        (whole["episode"][:] == 1) & (whole["step"][:] < 300)
+    )
+    for name in whole.columns:
+        np.testing.assert_array_equal(dataset[name], whole[name][kept])
+    final = dataset.episodes["final_observation"]
+    np.testing.assert_array_equal(final[1], whole["observation"][1300])
+    np.testing.assert_array_equal(final[2], whole["observation"][2000])
+    assert not list(find_problems(dataset.folder))
+    assert not list(replay(dataset, 4))
+    derive(dataset.folder, "move_to_pose", tmp_path / "derived")
+    derived = Dataset(tmp_path / "derived")
+    np.testing.assert_array_equal(derived.episodes["length"], [1000, 300, 0, 1000])
+    assert not list(find_problems(derived.folder))
+
+
+def test_kills_lose_at_most_the_open_shard(tmp_path):
+    """`python tests/kills.py 200` does ten times as many."""
+    assert kill_and_resume(20, tmp_path, seed=0).kills == 20
+
+
+STAGES = ["write", "sync", "rename", "sync folder"] * 2  # of the shard, then of the manifest
+
+
+@pytest.mark.parametrize("stage", range(len(STAGES)), ids=lambda k: f"{k}-{STAGES[k]}")
+def test_a_kill_at_any_stage_of_a_commit(stage, collected, tmp_path):
+    folder = tmp_path / "data"
+    script = f"""
+import os, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+from small import write_again
+left = {stage + 1 + 4 + 8}  # four calls make the first manifest, eight each shard
+def deadly(call):
+    def wrapped(*arguments, **keywords):
+        global left
+        left -= call is not opening or arguments[1:] == ("wb",)
+        if not left:
+            os.kill(os.getpid(), 9)
+        return call(*arguments, **keywords)
+    return wrapped
+opening = Path.open
+os.fsync, Path.replace, Path.open = map(deadly, (os.fsync, Path.replace, Path.open))
+write_again(Path({str(collected)!r}), Path({str(folder)!r}))
+"""
+    killed = subprocess.run([sys.executable, "-c", script], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    committed = len(read_manifest(folder).shards)
+    assert committed == (2 if stage == 7 else 1)
+    before = contents(folder)
+    dataset = Dataset(folder)
+    np.testing.assert_array_equal(
+        dataset["observation"], Dataset(collected)["observation"][: committed * 1000]
+    )
+    write_again(collected, folder)
+    after = contents(folder)
+    assert after == contents(collected)
+    for shard in range(committed):
+        name = f"shard-{shard:05d}.h5"
+        assert after[name] == before[name]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6])
+@pytest.mark.parametrize("stage", ["open", "fsync", "replace"])
+def test_no_space_at_any_stage_of_a_commit(stage, count, collected, tmp_path, monkeypatch):
+    folder = tmp_path / "data"
+    owner = os if stage == "fsync" else Path
+    call, calls = getattr(owner, stage), []
+
+    def full(*arguments, **keywords):
+        calls.append(stage != "open" or arguments[1:] == ("wb",))
+        if calls[-1] and sum(calls) == count:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return call(*arguments, **keywords)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, stage, full)
+        with pytest.raises(InputError, match=r"can't write .*: No space left") as refusal:
+            write_again(collected, folder)
+    assert str(folder) in str(refusal.value)
+    assert "bytes are needed" in str(refusal.value)
+    assert not list(folder.glob("*.partial"))
+    if (folder / "manifest.json").exists():
+        dataset = Dataset(folder)
+        np.testing.assert_array_equal(
+            dataset["reward"], Dataset(collected)["reward"][: len(dataset)]
+        )
+    write_again(collected, folder)
+    assert contents(folder) == contents(collected)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can mount a small file system")
+def test_a_disk_that_is_really_full(collected, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1500k", "tmpfs", str(disk)]
+    if subprocess.run(mount, check=False, capture_output=True).returncode:
+        pytest.skip("no small file system can be mounted here")
+    manifest = read_manifest(collected)
+
+    def make(shard, tick):
+        if shard == 2:
+            (disk / "ballast").write_bytes(bytes(2_200_000))
+        return open_shard(collected, manifest, shard)
+
+    try:
+        with pytest.raises(InputError, match=r"about 1,640,000 bytes are needed, 1,5[0-9,]+ are"):
+            write_shards(manifest.settings, disk / "data", make)
+        subprocess.run(["mount", "-o", "remount,size=3m", str(disk)], check=True)
+        with pytest.raises(InputError, match=r"can't write .*shard-00002\.h5: No space left"):
+            write_shards(manifest.settings, disk / "data", make)
+        assert not list((disk / "data").glob("*.partial"))
+        assert len(Dataset(disk / "data")) == 2000
+        (disk / "ballast").unlink()
+        write_again(collected, disk / "data")
+        assert contents(disk / "data") == contents(collected)
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_write_that_reads_back_otherwise_is_refused(collected, tmp_path, monkeypatch):
+    read = Path.read_bytes
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            Path, "read_bytes", lambda path: b"" if "partial" in path.name else read(path)
+        )
+        with pytest.raises(InputError, match=r"can't write .*it reads back otherwise"):
+            write_again(collected, tmp_path / "data")
+    assert [path.name for path in (tmp_path / "data").iterdir()] == [".lock"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_within_seconds_and_it_says_how_to_go_on(number, tmp_path):
+    process = subprocess.Popen(
+        [*COMMAND, "--steps", "5M", "--out", tmp_path / "data"],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not (tmp_path / "data" / "shard-00000.h5").exists():
+        time.sleep(0.1)
+        assert process.poll() is None
+    process.send_signal(number)
+    _, told = process.communicate(timeout=5)
+    assert process.returncode == 128 + number
+    assert told.endswith("stopped; the same command goes on where it stopped\n")
+    assert not list((tmp_path / "data").glob("*.partial"))
+    assert len(Dataset(tmp_path / "data")) > 0
+
+
+def test_a_second_collector_is_refused_until_the_first_is_dead(collected, tmp_path):
+    folder = tmp_path / "data"
+    folder.mkdir()
+    script = (
+        "import sys, time; from pathlib import Path; from jbrep.dataset.storage import exclusive\n"
+        "with exclusive(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
+    )
+    holder = subprocess.Popen([sys.executable, "-c", script, folder], stdout=subprocess.PIPE)
+    try:
+        assert holder.stdout.readline() == b"held\n"
+        for _ in range(2):  # the first refusal must not spoil the second
+            began = time.monotonic()
+            with pytest.raises(InputError, match=f"written by process {holder.pid} on .* since"):
+                write_again(collected, folder)
+            assert time.monotonic() - began < 1
+        assert [path.name for path in folder.iterdir()] == [".lock"]
+    finally:
+        holder.kill()
+        holder.communicate()
+    write_again(collected, folder)
+    assert contents(folder) == contents(collected)
+    with exclusive(folder):
+        pass
+
+
+def test_a_collector_goes_on_only_where_its_shards_are_whole(collected, tmp_path, monkeypatch):
+    folder = tmp_path / "data"
+
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(collecting, "commit", stop)
+        with pytest.raises(KeyboardInterrupt):
+            collect(settings(), folder)
+    assert len(read_manifest(folder).shards) == 0
+    write_again(collected, folder)
+    (folder / "shard-00003.h5").write_bytes(b"cut")
+    with pytest.raises(DamageError, match=r"shard-00003\.h5 is damaged"):
+        collect(settings(), folder)
+    (folder / "manifest.json").unlink()
+    with pytest.raises(DamageError, match=r"manifest\.json is missing"):
+        collect(settings(), folder)
+    assert open_shard(collected, read_manifest(collected), 0)

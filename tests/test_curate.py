@@ -1,0 +1,187 @@
+"""Replaying, repairing and deriving data sets."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small import contents, settings
+
+from jbrep.collect import collect
+from jbrep.dataset import DamageError, Dataset
+from jbrep.dataset.manifest import (
+    MANIFEST,
+    Entry,
+    commit,
+    open_shard,
+    read_manifest,
+    write_manifest,
+)
+from jbrep.dataset.verify import find_problems, replay
+from jbrep.derive import derive
+from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import TASKS
+from jbrep.repair import repair
+
+
+def test_replayed_episodes_are_equal_bit_for_bit(collected):
+    dataset = Dataset(collected)
+    assert not list(replay(dataset, 5, num_threads=1))
+    assert not list(replay(dataset, 0))
+    with pytest.raises(InputError, match="6 episodes can't be replayed: the data set has 5"):
+        list(replay(dataset, 6))
+
+
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [
+        ("observation", 400),
+        ("action", 10),
+        ("reward", 999),
+        ("qvel", 500),
+        ("episodes/initial_qvel", 0),
+        ("episodes/final_observation", 0),
+        ("episodes/final_qpos", 0),
+    ],
+)
+def test_replay_finds_one_bit_of_difference(name, row, collected, tmp_path):
+    """As another machine's rounding would make it: all hashes hold."""
+    manifest = read_manifest(collected)
+    spoiled = replace(manifest, shards=())
+    write_manifest(tmp_path, spoiled)
+    for shard in range(5):
+        columns = dict(open_shard(collected, manifest, shard))
+        if shard == 3:
+            values = columns[name].copy()
+            values.reshape(len(values), -1)[row].view(np.uint8)[0] ^= 1
+            columns[name] = values
+        spoiled = commit(tmp_path, spoiled, columns)
+    (problem,) = replay(Dataset(tmp_path), 5)
+    assert "episode 3 simulated again differs" in problem
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "policy", [{"kind": "uniform"}, {"kind": "ornstein-uhlenbeck", "mu": 0.0, "theta": 1.0}]
+)
+def test_a_derived_data_set_is_the_collected_one(task, policy, tmp_path):
+    """All files, to the last bit, as if it had been collected."""
+    some = settings(steps=3000, shard_episodes=2, policy=policy, task="face_direction")
+    collect(some, tmp_path / "source")
+    wanted = replace(some, task=task, store_state=task == "move_to_pose")
+    collect(wanted, tmp_path / "collected")
+    written = derive(tmp_path / "source", task, tmp_path / "derived", wanted.store_state)
+    assert written.rows == 3000
+    assert contents(tmp_path / "derived") == contents(tmp_path / "collected")
+
+
+def test_a_derivation_goes_on_and_leaves_a_finished_one_alone(collected, tmp_path):
+    derive(collected, "move_to_pose", tmp_path / "whole")
+    manifest = read_manifest(tmp_path / "whole")
+    folder = tmp_path / "begun"
+    begun = replace(manifest, shards=())
+    folder.mkdir()
+    for shard in range(2):
+        begun = commit(folder, begun, open_shard(tmp_path / "whole", manifest, shard))
+    assert derive(collected, "move_to_pose", folder).rows == 3000
+    assert contents(folder) == contents(tmp_path / "whole")
+    assert derive(collected, "move_to_pose", folder).rows == 0
+
+
+def test_what_can_t_be_derived(collected, copied, tmp_path):
+    with pytest.raises(InputError, match="unknown task 'fly'"):
+        derive(collected, "fly", tmp_path / "x")
+    with pytest.raises(InputError, match="other settings: task face_direction"):
+        derive(collected, "move_to_pose", copied)
+    derive(collected, "face_direction", tmp_path / "stateless")
+    with pytest.raises(InputError, match="has no states: collect it with --store-state"):
+        derive(tmp_path / "stateless", "move_to_pose", tmp_path / "x")
+    collect(settings(steps=1000, policy={"kind": "heuristic"}), tmp_path / "heuristic")
+    with pytest.raises(InputError, match="made by a heuristic policy, which acts on what it"):
+        derive(tmp_path / "heuristic", "move_to_pose", tmp_path / "x")
+    manifest = read_manifest(copied)
+    (copied / "shard-00004.h5").unlink()
+    write_manifest(copied, replace(manifest, shards=manifest.shards[:4]))
+    with pytest.raises(InputError, match="is not finished"):
+        derive(copied, "move_to_pose", tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_damaged_source_ends_a_derivation_before_its_rows_are_used(copied, tmp_path):
+    path = copied / "shard-00002.h5"
+    content = bytearray(path.read_bytes())
+    content[5000] ^= 4
+    path.write_bytes(content)
+    with pytest.raises(DamageError, match=r"shard-00002\.h5 is damaged"):
+        derive(copied, "move_to_pose", tmp_path / "derived")
+    assert len(Dataset(tmp_path / "derived")) == 2000
+
+
+def test_repair_leaves_a_whole_data_set_alone(copied):
+    before = contents(copied)
+    assert not list(repair(copied))
+    assert contents(copied) == before
+
+
+def test_repair_makes_everything_again_as_it_was(copied, collected):
+    (copied / "shard-00001.h5").unlink()
+    content = bytearray((copied / "shard-00003.h5").read_bytes())
+    content[7000] ^= 1
+    (copied / "shard-00003.h5").write_bytes(content)
+    (copied / "shard-00004.h5").rename(copied / "shard-00009.h5")
+    told = list(repair(copied, lanes=3, num_threads=1))
+    assert [line.split("/")[-1] for line in told] == [
+        "shard-00009.h5 set aside as shard-00009.h5.unlisted: it is not one of the data set's "
+        "shards",
+        "shard-00001.h5 made again",
+        "shard-00003.h5 made again",
+        "shard-00004.h5 made again",
+    ]
+    aside = copied / "shard-00009.h5.unlisted"
+    assert aside.read_bytes() == (collected / "shard-00004.h5").read_bytes()
+    aside.unlink()
+    assert contents(copied) == contents(collected)
+
+
+@pytest.mark.parametrize("loss", ["missing", "flipped"])
+def test_repair_reads_the_manifest_from_the_shards(loss, copied, collected):
+    path = copied / MANIFEST
+    if loss == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes().replace(b"uniform", b"uniforn"))
+    content = bytearray((copied / "shard-00000.h5").read_bytes())
+    content[9000] ^= 1  # and a shard is damaged, too: nothing tells its hashes now
+    (copied / "shard-00000.h5").write_bytes(content)
+    told = [line.split("/")[-1] for line in repair(copied)]
+    assert told == ["manifest.json read from the shards again", "shard-00000.h5 made again"]
+    assert contents(copied) == contents(collected)
+
+
+def test_what_can_t_be_repaired(copied, tmp_path):
+    with pytest.raises(InputError, match="no data set in"):
+        list(repair(tmp_path))
+    manifest = read_manifest(copied)
+    hashes = {**manifest.shards[2].sha256, "reward": 64 * "0"}  # of another machine, say
+    entry = Entry(**{**vars(manifest.shards[2]), "sha256": hashes})
+    shards = (*manifest.shards[:2], entry, *manifest.shards[3:])
+    write_manifest(copied, replace(manifest, shards=shards))
+    (copied / "shard-00002.h5").unlink()
+    with pytest.raises(InputError, match=r"00002\.h5 can't be made again here.*'mujoco'"):
+        list(repair(copied))
+    assert not (copied / "shard-00002.h5").exists()
+    for path in copied.glob("shard-*.h5"):
+        path.write_bytes(b"nothing")
+    (copied / MANIFEST).unlink()
+    with pytest.raises(DamageError, match="no shard tells how it was collected"):
+        list(repair(copied))
+
+
+def test_a_shard_written_by_another_hdf5_is_adopted_if_its_columns_are_the_same(copied):
+    manifest = read_manifest(copied)
+    entry = Entry(**{**vars(manifest.shards[2]), "xxh3": 32 * "0"})
+    shards = (*manifest.shards[:2], entry, *manifest.shards[3:])
+    write_manifest(copied, replace(manifest, shards=shards))
+    assert list(find_problems(copied))
+    assert len(list(repair(copied))) == 1
+    assert read_manifest(copied) == manifest
+    assert not list(find_problems(copied))

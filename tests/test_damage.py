@@ -1,0 +1,447 @@
+"""Damage, and files that mean harm: found before a row is returned, and named."""
+
+import json
+import os
+import re
+import shutil
+import threading
+
+import h5py
+import numpy as np
+import pytest
+from small import write_again
+
+from jbrep.dataset import DamageError, Dataset
+from jbrep.dataset.manifest import (
+    MANIFEST,
+    Entry,
+    Manifest,
+    read_manifest,
+    shard_name,
+    write_manifest,
+)
+from jbrep.dataset.shard import column_hashes, file_hash, shard_image
+from jbrep.dataset.verify import find_problems
+from jbrep.errors import InputError
+
+
+def read_all(folder):
+    """Every number of a data set."""
+    dataset = Dataset(folder)
+    return [dataset[name][:] for name in dataset.columns], dataset.episodes
+
+
+def flip(random, files):
+    path = random.choice(files)
+    content = bytearray(path.read_bytes())
+    place = random.integers(8 * len(content))
+    content[place // 8] ^= 1 << (place % 8)
+    path.write_bytes(content)
+    return [path]
+
+
+def truncate(random, files):
+    path = random.choice(files)
+    os.truncate(path, random.integers(path.stat().st_size))
+    return [path]
+
+
+def append(random, files):
+    path = random.choice(files)
+    path.write_bytes(path.read_bytes() + random.bytes(random.integers(1, 100)))
+    return [path]
+
+
+def remove(random, files):
+    path = random.choice(files)
+    path.unlink()
+    return [path]
+
+
+def swap(random, files):
+    one, other = random.choice(files[:-1], 2, replace=False)  # the last is the manifest
+    aside = one.with_suffix(".aside")
+    one.rename(aside)
+    other.rename(one)
+    aside.rename(other)
+    return [one, other]
+
+
+def duplicate(random, files):
+    one, other = random.choice(files[:-1], 2, replace=False)
+    target = random.choice([other, one.with_name("shard-00005.h5"), one.with_name("copy.h5")])
+    shutil.copy(one, target)
+    return [target]
+
+
+def rename(random, files):
+    path = random.choice(files)
+    target = path.with_name(str(random.choice(["shard-00005.h5", "shard-00012.h5", "old.h5"])))
+    path.rename(target)
+    return [path, target]
+
+
+def scramble(random, files):
+    """A stretch of random bytes, or of zeros as a disk that lost a page leaves it."""
+    path = random.choice(files)
+    content = bytearray(path.read_bytes())
+    start = random.integers(len(content))
+    length = len(content[start : start + 512])
+    noise = random.bytes(length) if random.random() < 0.5 else bytes(length)
+    content[start : start + length] = noise
+    changed = bytes(content) != path.read_bytes()
+    path.write_bytes(content)
+    return [path] if changed else flip(random, files)
+
+
+DAMAGES = (flip, flip, flip, truncate, append, remove, swap, duplicate, rename, scramble)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_none_of_500_random_damages_is_missed(seed, copied):
+    random = np.random.default_rng(seed)
+    files = [*sorted(copied.glob("*.h5")), copied / MANIFEST]
+    whole = {path: path.read_bytes() for path in files}
+    for trial in range(50):
+        damage = DAMAGES[trial % len(DAMAGES)]
+        touched = damage(random, np.array(files))
+        with pytest.raises(DamageError) as found:
+            read_all(copied)
+        assert any(path.name in str(found.value) for path in touched), (damage, touched)
+        assert "\n" not in str(found.value)
+        problems = list(find_problems(copied))
+        assert any(path.name in problem for path in touched for problem in problems)
+        for path in {*copied.glob("*.h5"), copied / MANIFEST} - set(files):
+            path.unlink()
+        for path, content in whole.items():
+            path.write_bytes(content)
+    read_all(copied)
+
+
+def test_every_bit_of_the_small_parts_counts(copied):
+    """All bits of the manifest and of a shard's first 2 KiB, where HDF5's own structure is."""
+    for path, end in ((copied / MANIFEST, 500), (copied / "shard-00000.h5", 256)):
+        whole = path.read_bytes()
+        for place in range(8 * end):
+            content = bytearray(whole)
+            content[place // 8] ^= 1 << (place % 8)
+            path.write_bytes(content)
+            with pytest.raises(DamageError, match=path.name):
+                Dataset(copied)["reward"][0]
+        path.write_bytes(whole)
+
+
+def test_rows_of_a_damaged_shard_are_not_returned_but_others_are(copied):
+    path = copied / "shard-00003.h5"
+    content = bytearray(path.read_bytes())
+    content[-5] ^= 1
+    path.write_bytes(content)
+    dataset = Dataset(copied)
+    assert dataset["reward"][2999].shape == ()
+    for rows in (3000, slice(2999, 3001), [0, 3999]):
+        with pytest.raises(DamageError, match=r"shard-00003\.h5 is damaged"):
+            dataset["observation"][rows]
+
+
+def test_a_file_that_is_left_over_or_not_a_shard_is_named(copied, collected):
+    (copied / "notes.txt").write_text("collected on a Tuesday")
+    (copied / "manifest.json.partial").write_text("{")
+    read_all(copied)
+    write_manifest(copied, Manifest(**{**vars(read_manifest(copied)), "shards": ()}))
+    with pytest.raises(DamageError, match=r"shard-00001\.h5 is not one of the 0 shards"):
+        Dataset(copied)
+
+
+def manifest_of(**changes):
+    def change(record):
+        record.update(changes)
+
+    return change
+
+
+def settings_of(**changes):
+    return lambda record: record["settings"].update(changes)
+
+
+def entry_of(**changes):
+    return lambda record: record["shards"][0].update(changes)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (manifest_of(format_version=2), "has format version 2: this jbrep reads up to 1"),
+        (manifest_of(format="other"), "is damaged"),
+        (manifest_of(shards={}), "is not one of the 0 shards"),
+        (manifest_of(shards=[[]]), "is damaged"),
+        (manifest_of(versions=[]), "is damaged"),
+        (settings_of(task="fly"), "is damaged"),
+        (settings_of(task=["fly"]), "is damaged"),
+        (settings_of(steps=-1), "is damaged"),
+        (settings_of(steps="many"), "is damaged"),
+        (settings_of(shard_episodes=1.5), "is damaged"),
+        (settings_of(policy="uniform"), "is damaged"),
+        (settings_of(more=1), "is damaged"),
+        (settings_of(steps=10**30), "is damaged"),
+        (settings_of(steps=10**12, shard_episodes=10**8), "has shape"),
+        (entry_of(rows=-1), "is damaged"),
+        (entry_of(rows=2.5), "is damaged"),
+        (entry_of(rows=999), "has shape"),
+        (entry_of(rows=10**30), "is damaged"),
+        (entry_of(bytes=10**15), "has"),
+        (entry_of(sha256=[]), "is damaged"),
+        (entry_of(sha256={}), "is damaged"),
+        (entry_of(path="/etc/passwd"), "is damaged"),
+    ],
+)
+def test_a_manifest_that_means_harm(change, message, copied):
+    """Its own hash is right: a stranger can work it out."""
+    from jbrep.dataset import manifest
+
+    record = json.loads((copied / MANIFEST).read_bytes())
+    change(record)
+    (copied / MANIFEST).write_bytes(manifest._text(record))
+    with pytest.raises(InputError, match=message):
+        read_all(copied)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{}", b"[" * 100_000, b"null", b"\xff\xfe", b'{"format": "jbrep data set"}', b"\0" * 99],
+    ids=range(7),
+)
+def test_a_manifest_of_anything_else(content, copied):
+    (copied / MANIFEST).write_bytes(content)
+    with pytest.raises(DamageError, match=r"manifest\.json is damaged"):
+        Dataset(copied)
+
+
+def test_a_huge_manifest_is_not_read(copied):
+    os.truncate(copied / MANIFEST, 1 << 40)  # sparse
+    with pytest.raises(DamageError, match=r"manifest\.json is damaged"):
+        Dataset(copied)
+
+
+def external_storage(file, fifo):
+    del file["reward"]
+    file.create_dataset("reward", (1000,), "<f4", external=[(str(fifo), 0, 4000)])
+
+
+def external_link(file, fifo):
+    del file["reward"]
+    file["reward"] = h5py.ExternalLink(str(fifo), "reward")
+
+
+def soft_link(file, fifo):
+    file.move("reward", "elsewhere")
+    file["reward"] = h5py.SoftLink("/elsewhere")
+
+
+def soft_link_of_the_same_count(file, fifo):
+    del file["reward"]
+    file["reward"] = h5py.SoftLink("/step")
+
+
+def virtual(file, fifo):
+    del file["reward"]
+    layout = h5py.VirtualLayout((1000,), "<f4")
+    layout[:] = h5py.VirtualSource(str(fifo), "reward", (1000,))
+    file.create_virtual_dataset("reward", layout)
+
+
+def virtual_without_end(file, fifo):
+    del file["reward"]
+    layout = h5py.VirtualLayout((1000,), "<f4", maxshape=(None,))
+    source = h5py.VirtualSource(str(fifo), "reward", (1000,), maxshape=(None,))
+    layout[0 : h5py.h5s.UNLIMITED] = source[0 : h5py.h5s.UNLIMITED]
+    file.create_virtual_dataset("reward", layout)
+
+
+def linked_group(file, fifo):
+    del file["episodes"]
+    file["episodes"] = h5py.ExternalLink(str(fifo), "/")
+
+
+def huge(file, fifo):
+    del file["reward"]
+    file.create_dataset("reward", (1 << 50,), "<f4", chunks=(1 << 20,))
+
+
+def never_written(file, fifo):
+    del file["reward"]
+    space = h5py.h5s.create_simple((1000,))
+    h5py.h5d.create(file.id, b"reward", h5py.h5t.IEEE_F32LE, space)
+
+
+def compressed(file, fifo):
+    del file["reward"]
+    file.create_dataset("reward", data=np.zeros(1000, "<f4"), compression="gzip")
+
+
+def unknown_filter(file, fifo):
+    del file["reward"]
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_chunk((100,))
+    properties.set_filter(h5py.h5z.FILTER_SZIP + 60_000, h5py.h5z.FLAG_OPTIONAL, (1, 2))
+    space = h5py.h5s.create_simple((1000,))
+    h5py.h5d.create(file.id, b"reward", h5py.h5t.IEEE_F32LE, space, properties)
+
+
+def another_type(file, fifo):
+    del file["reward"]
+    file["reward"] = np.zeros(1000)
+
+
+def text(file, fifo):
+    del file["reward"]
+    file["reward"] = ["pickle"] * 1000
+
+
+def group(file, fifo):
+    del file["reward"]
+    file.create_group("reward")
+
+
+def column_for_group(file, fifo):
+    del file["episodes"]
+    file["episodes"] = np.zeros(11)
+
+
+def more(file, fifo):
+    file["more"] = np.zeros(3)
+
+
+HARMS = (
+    external_storage,
+    external_link,
+    soft_link,
+    soft_link_of_the_same_count,
+    virtual,
+    virtual_without_end,
+    linked_group,
+    huge,
+    never_written,
+    compressed,
+    unknown_filter,
+    another_type,
+    text,
+    group,
+    column_for_group,
+    more,
+)
+
+
+@pytest.mark.parametrize("harm", HARMS, ids=lambda harm: harm.__name__)
+def test_a_shard_that_means_harm(harm, copied, tmp_path):
+    """Its hashes are right. Whoever opened the other file, a pipe that nobody fills, would hang."""
+    fifo = tmp_path / "pipe"
+    os.mkfifo(fifo)
+    path = copied / "shard-00000.h5"
+    with h5py.File(path, "r+") as file:
+        harm(file, fifo)
+    adopt(copied, path)
+    errors = []
+
+    def read():
+        try:
+            Dataset(copied)["observation"][0]
+        except DamageError as error:
+            errors.append(str(error))
+
+    thread = threading.Thread(target=read, daemon=True)
+    thread.start()
+    thread.join(timeout=30)
+    assert not thread.is_alive()
+    assert len(errors) == 1
+    assert path.name in errors[0]
+    assert errors[0] in list(find_problems(copied))
+
+
+def adopt(folder, path):
+    """Make the manifest name a changed first shard."""
+    content, manifest = path.read_bytes(), read_manifest(folder)
+    first = manifest.shards[0]
+    entry = Entry(len(content), first.rows, file_hash(content), first.sha256)
+    shards = (entry, *manifest.shards[1:])
+    write_manifest(folder, Manifest(manifest.settings, manifest.versions, shards))
+
+
+def test_a_shard_that_is_a_link_or_a_folder_is_refused(copied, collected):
+    path = copied / "shard-00001.h5"
+    path.unlink()
+    path.symlink_to(collected / "shard-00001.h5")
+    with pytest.raises(DamageError, match=r"shard-00001\.h5 is damaged"):
+        read_all(copied)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(DamageError, match=r"shard-00001\.h5 is damaged"):
+        read_all(copied)
+
+
+def spoil(name, place, value):
+    def change(columns):
+        columns[name] = columns[name].copy()
+        columns[name][place] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (spoil("observation", (3, 2), np.nan), "observation has values that are not finite"),
+        (spoil("qvel", (3, 2), np.inf), "qvel has values that are not finite"),
+        (spoil("action", 5, 1.5), r"action goes from .* to 1.5, beyond \[-1, 1\]"),
+        (spoil("reward", 5, -0.5), r"reward goes from -0.5"),
+        (spoil("observation", (5, 13), 4), "motor_angle goes from"),
+        (spoil("observation", (5, 3), 2), "orientation_w goes from"),
+        (spoil("episodes/final_observation", (0, 15), 9), "angle_to_target goes from"),
+        (spoil("episode", 5, 1), "the rows' episode"),
+        (spoil("step", 5, 6), "the rows' step"),
+        (spoil("reward", 5, 0.123), "returns are not"),
+        (spoil("episodes/seed", 0, 5), "seeds are not"),
+        (spoil("episodes/length", 0, 999), "lengths of the episodes don't add up to 1,000 rows"),
+        (spoil("episodes/length", 0, -1), "lengths of the episodes don't add up to 1,000 rows"),
+        (spoil("episodes/episode", 0, 7), "episode numbers"),
+        (spoil("episodes/diverged", 0, 1), "diverged"),
+        (spoil("episodes/return", 0, 1), "returns"),
+        (spoil("episodes/initial_qpos", (0, 4), 0.5), "initial orientations"),
+        (spoil("episodes/target_quaternion", (0, 0), 0.5), "target orientations"),
+        (spoil("episodes/target_position", (0, 0), 0.5), "target positions"),
+    ],
+)
+def test_verify_finds_numbers_that_can_t_be(change, message, copied, collected):
+    """Written as a collector with a fault would write them, hashes and all."""
+    manifest = read_manifest(copied)
+    with h5py.File(collected / shard_name(0)) as file:
+        columns = {name: file[name][:] for name in manifest.settings.specs()}
+    change(columns)
+    hashes = column_hashes(columns)
+    image = shard_image(columns, hashes, manifest.attributes(0, 1000))
+    (copied / shard_name(0)).write_bytes(image)
+    entry = Entry(len(image), 1000, file_hash(image), hashes)
+    shards = (entry, *manifest.shards[1:])
+    write_manifest(copied, Manifest(manifest.settings, manifest.versions, shards))
+    problems = list(find_problems(copied))
+    assert problems
+    assert all("shard-00000.h5: " in problem for problem in problems)
+    assert any(re.search(message, problem) for problem in problems), problems
+
+
+def test_verify_tells_all_that_is_wrong(copied):
+    (copied / "shard-00001.h5").unlink()
+    (copied / "shard-00002.h5").write_bytes(b"short")
+    flip(np.random.default_rng(0), [copied / "shard-00004.h5"])
+    shutil.copy(copied / "shard-00000.h5", copied / "copy.h5")
+    problems = list(find_problems(copied))
+    assert len(problems) == 4
+    for name in ("00001.h5 is missing", "00002.h5 is damaged", "00004.h5 is damaged", "copy.h5"):
+        assert sum(name in problem for problem in problems) == 1
+
+
+def test_a_whole_data_set_has_no_problems(collected, tmp_path):
+    assert not list(find_problems(collected))
+    write_again(collected, tmp_path / "again")
+    assert not list(find_problems(tmp_path / "again"))
+    with pytest.raises(InputError, match="no data set in"):
+        list(find_problems(tmp_path))

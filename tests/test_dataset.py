@@ -1,0 +1,265 @@
+"""Reading: columns over shards, splits, scaling, batches, and tools that know nothing of jbrep."""
+
+import pickle
+
+import h5py
+import numpy as np
+import pytest
+from small import settings, write_again
+
+from jbrep.dataset import Dataset, Scaler
+from jbrep.dataset.card import card
+from jbrep.dataset.columns import Column
+from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import TASKS
+
+
+@pytest.fixture(scope="module")
+def dataset(collected):
+    return Dataset(collected)
+
+
+@pytest.fixture(scope="module")
+def parts():
+    random = np.random.default_rng(0)
+    return [random.normal(size=(rows, 3)) for rows in (4, 0, 7, 1)]
+
+
+@pytest.fixture(scope="module")
+def column(parts):
+    ends = np.cumsum([len(part) for part in parts])
+    return Column(lambda shard: parts[shard], ends, np.dtype(float), (3,))
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        0,
+        -1,
+        slice(None),
+        slice(1, 3),
+        slice(2, 9),
+        slice(4, 4),
+        slice(-3, None),
+        slice(11, 2, -2),
+        np.array([0, 11, 4, 4, -2]),
+        np.array([], dtype=int),
+        np.array([[1, 5], [11, 0]]),
+        np.arange(12) % 3 == 0,
+        np.zeros(12, dtype=bool),
+        (5, 1),
+        (slice(3, 8), 2),
+        (slice(None), slice(1, None)),
+        (np.array([7, 0]), 0),
+    ],
+    ids=str,
+)
+def test_a_column_is_indexed_like_the_array_it_stands_for(column, parts, key):
+    expected = np.concatenate(parts)[key]
+    np.testing.assert_array_equal(column[key], expected)
+    assert column[key].shape == expected.shape
+    assert column[key].dtype == expected.dtype
+
+
+def test_a_column_as_an_array(column, parts):
+    whole = np.concatenate(parts)
+    assert column.shape == whole.shape
+    assert len(column) == 12
+    np.testing.assert_array_equal(np.asarray(column), whole)
+    np.testing.assert_array_equal(np.stack(list(column)), whole)
+    np.testing.assert_array_equal(np.concatenate(list(column.chunks(3))), whole)
+    assert np.asarray(column, dtype=np.float32).dtype == np.float32
+    np.testing.assert_array_equal(column[[2, 1]], whole[[2, 1]])
+    for key in (12, -13, [3, 12]):
+        with pytest.raises(IndexError, match="there are 12"):
+            column[key]
+    with pytest.raises(IndexError, match="a mask of shape"):
+        column[np.ones(5, dtype=bool)]
+
+
+def test_a_slice_within_a_shard_is_a_view_of_the_file(dataset):
+    rows = dataset["observation"][1100:1200]
+    assert not rows.flags.owndata
+    assert not rows.flags.writeable
+    assert dataset["observation"][900:1100].flags.owndata
+
+
+def test_features_and_observables_by_name(dataset):
+    observation = dataset["observation"][:]
+    names = TASKS["face_direction"].feature_names
+    for i, name in enumerate(names):
+        np.testing.assert_array_equal(dataset[name][:], observation[:, i])
+    np.testing.assert_array_equal(dataset["velocity"][10:20], observation[10:20, 7:10])
+    assert dataset["velocity"].shape == (5000, 3)
+    assert dataset["motor_velocity"][[3, 4999]].shape == (2,)
+    with pytest.raises(InputError, match="no column, observable or feature 'speed': choose one of"):
+        dataset["speed"]
+
+
+def test_another_process_opens_it_anew(dataset):
+    again = pickle.loads(pickle.dumps(dataset))
+    np.testing.assert_array_equal(again["reward"], dataset["reward"])
+
+
+def test_episodes_have_columns_of_their_own(dataset):
+    episodes = dataset.episodes
+    np.testing.assert_array_equal(episodes["episode"], np.arange(5))
+    np.testing.assert_array_equal(episodes["length"], 1000)
+    reward = dataset["reward"][:].reshape(5, 1000).astype(float)
+    np.testing.assert_allclose(episodes["return"], reward.sum(axis=1), rtol=1e-12)
+    np.testing.assert_array_equal(episodes["initial_qpos"], dataset["qpos"][::1000])
+    assert not np.array_equal(episodes["final_qpos"], dataset["qpos"][999::1000])
+
+
+def test_the_split_is_by_episode_and_seeded(dataset):
+    train, test = dataset.split()
+    episode = dataset["episode"][:]
+    assert len(np.unique(episode[test])) == 1
+    assert not set(episode[train]) & set(episode[test])
+    np.testing.assert_array_equal(np.union1d(train, test), np.arange(5000))
+    np.testing.assert_array_equal(test, dataset.split().test)
+    assert len({tuple(np.unique(episode[dataset.split(seed=s).test])) for s in range(20)}) > 1
+    assert len(np.unique(episode[dataset.split(test=0.99).test])) == 4
+    for share in (0, 1, -0.2):
+        with pytest.raises(InputError, match="must be between 0 and 1"):
+            dataset.split(test=share)
+
+
+def test_scaling_is_fitted_on_the_rows_that_are_given(dataset):
+    train, test = dataset.split()
+    scaler = dataset.fit_scaler(train)
+    observation = dataset["observation"][:]
+    scaled = scaler.scale(observation[train])
+    np.testing.assert_allclose(scaled.min(axis=0), -1, atol=1e-5)
+    np.testing.assert_allclose(scaled.max(axis=0), 1, atol=1e-5)
+    assert np.abs(scaler.scale(observation[test])).max() > 1
+    back = scaler.unscale(scaler.scale(observation))
+    np.testing.assert_allclose(back, observation, atol=2e-5)
+    assert scaled.dtype == np.float32
+
+
+def test_a_feature_that_never_changes_is_scaled_to_0():
+    low = np.array([2, -1], np.float32)
+    scaler = Scaler(low, np.array([2, 1], np.float32))
+    np.testing.assert_array_equal(scaler.scale(low[None]), [[0, -1]])
+    np.testing.assert_array_equal(scaler.unscale(np.array([[0, 1]], np.float32)), [[2, 1]])
+
+
+@pytest.mark.parametrize("memory", [1 << 30, 100_000], ids=["memory", "runs"])
+def test_every_row_comes_once_in_a_pass_in_another_order_each_time(dataset, memory):
+    rows = dataset.split().train
+    names = ("observation", "episode", "step")
+    batches = dataset.batches(rows, names, size=300, seed=5, memory=memory)
+    assert batches.in_memory == (memory > 1_000_000)
+    passes = []
+    for _ in range(2):
+        drawn = list(batches)
+        assert [len(batch["step"]) for batch in drawn] == [300] * 13 + [100]
+        assert len(drawn) == len(batches)
+        number = np.concatenate([batch["episode"] * 1000 + batch["step"] for batch in drawn])
+        observation = np.concatenate([batch["observation"] for batch in drawn])
+        np.testing.assert_array_equal(observation, dataset["observation"][number])
+        np.testing.assert_array_equal(np.sort(number), rows)
+        passes.append(number)
+    assert (passes[0] != passes[1]).mean() > 0.9
+    again = next(iter(dataset.batches(rows, names, size=300, seed=5, memory=memory)))
+    np.testing.assert_array_equal(again["episode"] * 1000 + again["step"], passes[0][:300])
+    other = next(iter(dataset.batches(rows, names, size=300, seed=6, memory=memory)))
+    assert not np.array_equal(other["step"], again["step"])
+
+
+def test_a_batch_from_the_disk_mixes_runs(dataset):
+    batches = dataset.batches(columns=["step", "episode"], size=512, memory=8 * 2048)
+    assert not batches.in_memory
+    assert np.mean([len(np.unique(batch["episode"])) for batch in batches]) > 1.5
+
+
+def test_a_reader_sees_the_committed_part_while_a_collector_writes(
+    collected, tmp_path, monkeypatch
+):
+    from jbrep.dataset import manifest
+
+    seen = []
+
+    def look(folder, content):
+        shards = sorted(path.name for path in folder.glob("shard-*.h5"))
+        if shards:
+            dataset = Dataset(folder)
+            np.testing.assert_array_equal(
+                dataset["observation"][:], Dataset(collected)["observation"][: len(dataset)]
+            )
+            seen.append((len(shards), len(dataset), dataset.manifest.complete))
+        return write_manifest(folder, content)
+
+    write_manifest = manifest.write_manifest
+    monkeypatch.setattr(manifest, "write_manifest", look)
+    write_again(collected, tmp_path / "growing")
+    assert seen == [(k + 1, 1000 * k, False) for k in range(5)]
+
+
+def test_the_card_tells_what_is_there(dataset, collected):
+    text = card(dataset)
+    for part in ("face_direction, 16 features", "uniform", "5,000 in 5 episodes", "5 of 5 shards"):
+        assert part in text
+    low, median, high = np.percentile(dataset.episodes["return"], (10, 50, 90))
+    assert f"median {median:.1f} [10 % {low:.1f}, 90 % {high:.1f}]" in text
+    speed = dataset["motor_velocity"][:].astype(float)
+    line = next(line for line in text.splitlines() if "motor_velocity" in line).split()
+    assert [float(word) for word in line[2:6]] == pytest.approx(
+        [speed.min(), speed.mean(), speed.max(), speed.std()], rel=1e-3
+    )
+    assert dataset.manifest.fingerprint in text
+
+
+def test_an_unfinished_data_set_is_called_so(collected, tmp_path):
+    from dataclasses import replace
+
+    from jbrep.dataset.manifest import read_manifest, write_manifest
+
+    manifest = read_manifest(collected)
+    write_manifest(tmp_path, replace(manifest, shards=()))
+    empty = Dataset(tmp_path)
+    assert len(empty) == len(empty["observation"][:]) == 0
+    assert "0 of 5 shards, 0.0 MB; unfinished" in card(empty)
+    with pytest.raises(InputError, match="0 episode can't be split"):
+        empty.split()
+
+
+def test_a_shard_is_flat_columns_that_any_hdf5_tool_opens(collected):
+    with h5py.File(collected / "shard-00002.h5") as file:
+        assert file["observation"].shape == (1000, 16)
+        assert all(file[name].chunks is None for name in file if name != "episodes")
+        assert list(file.attrs["feature_names"]) == list(TASKS["face_direction"].feature_names)
+        assert list(file.attrs["feature_units"][-3:]) == ["rad", "rad/s", "rad"]
+        assert (file.attrs["task"], file.attrs["seed"], file.attrs["shard"]) == (
+            "face_direction",
+            3,
+            2,
+        )
+        assert file["episodes/seed"][:].tolist() == [4 * 2**32 + 2]
+
+
+def test_rerun_s_own_reader_opens_a_shard(collected, dataset):
+    from rerun.experimental import Hdf5Reader
+
+    reader = Hdf5Reader(collected / "shard-00001.h5")
+    assert ("/observation", (1000, 16)) in [(d.path, d.shape) for d in reader.datasets()]
+    assert reader.attributes()["task"] == "face_direction"
+    stream = reader.stream(ignore_datasets=["/episodes"], use_structs=False)
+    rewards = [
+        chunk.to_record_batch().column(i)
+        for chunk in stream
+        for i, name in enumerate(chunk.to_record_batch().schema.names)
+        if "reward" in name
+    ]
+    (reward,) = rewards
+    np.testing.assert_array_equal(np.concatenate(reward.to_pylist()), dataset["reward"][1000:2000])
+
+
+def test_mistakes_are_named(tmp_path):
+    with pytest.raises(InputError, match="no data set in"):
+        Dataset(tmp_path)
+    with pytest.raises(InputError, match="no data set in"):
+        Dataset(tmp_path / "none")
+    with pytest.raises(InputError, match="must be from 0 to"):
+        settings(seed=-1).check()
