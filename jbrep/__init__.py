@@ -9,8 +9,10 @@ from types import ModuleType
 import wrapt
 
 
-@wrapt.when_imported("gymnasium")
 def _register(_gymnasium: ModuleType) -> None:
     from jbrep.envs.registration import register
 
     register()
+
+
+wrapt.register_post_import_hook(_register, "gymnasium")

@@ -3,7 +3,7 @@
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from jbrep.dataset.lock import exclusive
 from jbrep.dataset.manifest import (
     MANIFEST,
     Manifest,
@@ -22,11 +23,10 @@ from jbrep.dataset.manifest import (
     write_manifest,
 )
 from jbrep.dataset.schema import EPISODES, Columns, episode_returns, episode_seed
-from jbrep.dataset.storage import exclusive
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
-from jbrep.policies import Policy, make_policy
+from jbrep.policies import Policy, make_policy, policy_settings
 
 LANES = 100
 
@@ -57,15 +57,25 @@ def collect(
         InputError: settings that can't be, other settings in the folder, a shard that is gone or
             cut short, or no space.
     """
-    policy = make_policy(dict(settings.policy))
-    for count, what in ((lanes, "lanes"), (num_threads, "threads")):
-        if count is not None and count < 1:
-            raise InputError(f"the number of {what} is {count}: it must be at least 1")
+    policy = make_policy(settings.policy)
+    settings = replace(settings, policy=policy_settings(policy))
+    check_counts(lanes, num_threads)
 
     def make(shard: int, tick: Tick) -> Columns:
         return simulate_shard(settings, policy, shard, tick, lanes, num_threads)
 
     return write_shards(settings, folder, make)
+
+
+def check_counts(lanes: int, num_threads: int | None) -> None:
+    """Make sure that there is something to simulate on.
+
+    Raises:
+        InputError: a number below 1.
+    """
+    for count, what in ((lanes, "lanes"), (num_threads, "threads")):
+        if count is not None and count < 1:
+            raise InputError(f"the number of {what} is {count}: it must be at least 1")
 
 
 def write_shards(settings: Settings, folder: Path, make: Callable[[int, Tick], Columns]) -> Written:

@@ -59,7 +59,7 @@ def derive(
         raise InputError(f"{source} has no states: collect it with --store-state")
     if not dataset.manifest.complete:
         raise InputError(f"{source} is not finished: the same jbrep collect goes on with it")
-    if not make_policy(dict(settings.policy)).open_loop:
+    if not make_policy(settings.policy).open_loop:
         raise InputError(
             f"{source} was made by a {settings.policy['kind']} policy, which acts on what it "
             f"observes: collect {task_name} itself"

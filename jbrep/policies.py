@@ -1,6 +1,6 @@
 """Policies to collect with, each a few constants that name it in a command and in a manifest."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Protocol
 
@@ -112,25 +112,18 @@ def parse_policy(text: str) -> Policy:
     """A policy as people write it: `uniform`, `constant:drive=0.5`.
 
     Raises:
-        InputError: an unknown policy, or a constant that it doesn't have.
+        InputError: as `make_policy` does.
     """
     kind, _, constants = text.partition(":")
-    try:
-        pairs = [pair.split("=") for pair in constants.split(",") if pair]
-        return make_policy({"kind": kind, **{name.strip(): float(v) for name, v in pairs}})
-    except (TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{text!r} is no policy: write it as uniform, or as constant:drive=0.5"
-        ) from None
+    pairs = (pair.partition("=") for pair in constants.split(",") if pair)
+    return make_policy({"kind": kind, **{name.strip(): value for name, _, value in pairs}})
 
 
-def make_policy(settings: dict[str, Any]) -> Policy:
+def make_policy(settings: Mapping[str, Any]) -> Policy:
     """The policy of those settings, as a manifest has them.
 
     Raises:
-        InputError: an unknown policy, or a constant that it doesn't have.
+        InputError: an unknown policy, a constant that it doesn't have, or one out of range.
     """
     constants = {name: value for name, value in settings.items() if name != "kind"}
     if settings["kind"] not in POLICIES:
@@ -139,12 +132,19 @@ def make_policy(settings: dict[str, Any]) -> Policy:
         )
     policy = POLICIES[settings["kind"]]
     known = [field.name for field in fields(policy)]
-    for name in constants:
+    for name, value in constants.items():
         if name not in known:
             raise InputError(
                 f"policy {policy.kind} has no constant {name!r}: "
                 f"{'it has ' + ', '.join(known) if known else 'it has none'}"
             )
+        try:
+            constants[name] = float(value)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"policy {policy.kind}: {name} is {value!r}, a number is expected, as in "
+                "constant:drive=0.5"
+            ) from None
     return policy(**constants)
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from jbrep.collect import LANES, simulate_shard
+from jbrep.collect import LANES, check_counts, simulate_shard
+from jbrep.dataset.lock import exclusive
 from jbrep.dataset.manifest import (
     MANIFEST,
     Entry,
@@ -25,14 +26,13 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.shard import (
     DamageError,
+    Shard,
     column_hashes,
     file_hash,
-    map_columns,
     map_file,
     stored_attributes,
     stored_hashes,
 )
-from jbrep.dataset.storage import exclusive
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import EPISODE_STEPS
 from jbrep.policies import make_policy
@@ -52,11 +52,13 @@ def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> 
         InputError: no data set there, or a shard that comes out otherwise than it was: another
             machine or other versions made it.
     """
+    check_counts(lanes, num_threads)
     with contextlib.suppress(DamageError):
         read_manifest(folder)
     with exclusive(folder):
+        before = None
         try:
-            manifest = read_manifest(folder)
+            manifest = before = read_manifest(folder)
         except DamageError:
             manifest = _recover(folder)
             yield f"{folder / MANIFEST} read from the shards again"
@@ -70,7 +72,8 @@ def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> 
             shards = (*manifest.shards[:shard], entry, *manifest.shards[shard + 1 :])
             manifest = replace(manifest, shards=shards)
             yield f"{folder / shard_name(shard)} made again"
-        write_manifest(folder, manifest)
+        if manifest != before:
+            write_manifest(folder, manifest)
 
 
 def _set_aside(path: Path) -> Path:
@@ -82,7 +85,7 @@ def _set_aside(path: Path) -> Path:
 
 def _is_whole(folder: Path, manifest: Manifest, shard: int) -> bool:
     try:
-        open_shard(folder, manifest, shard)
+        dict(open_shard(folder, manifest, shard))
     except DamageError:
         return False
     return True
@@ -96,7 +99,7 @@ def _make_again(
     with tqdm(total=total, unit="step", unit_scale=True, desc=shard_name(shard)) as progress:
         columns = simulate_shard(
             settings,
-            make_policy(dict(settings.policy)),
+            make_policy(settings.policy),
             shard,
             progress.update,
             lanes,
@@ -144,7 +147,7 @@ def _entry(folder: Path, manifest: Manifest, shard: int) -> Entry:
         content = map_file(path)
         rows = stored_attributes(path)["rows"]
         counts = manifest.row_counts(shard, rows)
-        hashes = column_hashes(map_columns(path, content, specs, counts))
+        hashes = column_hashes(Shard(path, content, specs, counts))
         whole = stored_hashes(path, specs) == hashes
         told = stored_attributes(path) == manifest.attributes(shard, rows)
     except (DamageError, KeyError, TypeError, ValueError):

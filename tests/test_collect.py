@@ -19,9 +19,9 @@ from jbrep import collect as collecting
 from jbrep import jitterbug
 from jbrep.collect import collect, write_shards
 from jbrep.dataset import DamageError, Dataset
+from jbrep.dataset.lock import exclusive
 from jbrep.dataset.manifest import open_shard, read_manifest, write_manifest
 from jbrep.dataset.schema import episode_seed
-from jbrep.dataset.storage import exclusive
 from jbrep.dataset.verify import find_problems, replay
 from jbrep.derive import derive
 from jbrep.envs import environment_id
@@ -81,6 +81,8 @@ def test_shards_cut_the_same_rows(collected, tmp_path):
 def test_other_policies_are_collected_and_replayed(kind, tmp_path):
     collect(settings(steps=2000, policy={"kind": kind}, shard_episodes=2), tmp_path / "data")
     dataset = Dataset(tmp_path / "data")
+    constants = {"heuristic": 0, "constant": 1, "ornstein-uhlenbeck": 3}[kind]
+    assert len(dataset.manifest.settings.policy) == 1 + constants  # defaults written down, too
     assert not list(find_problems(dataset.folder))
     assert not list(replay(dataset, 2))
     if kind == "heuristic":
@@ -351,7 +353,7 @@ def test_a_second_collector_is_refused_until_the_first_is_dead(collected, tmp_pa
     folder = tmp_path / "data"
     folder.mkdir()
     script = (
-        "import sys, time; from pathlib import Path; from jbrep.dataset.storage import exclusive\n"
+        "import sys, time; from pathlib import Path; from jbrep.dataset.lock import exclusive\n"
         "with exclusive(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
     holder = subprocess.Popen([sys.executable, "-c", script, folder], stdout=subprocess.PIPE)

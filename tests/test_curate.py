@@ -120,6 +120,8 @@ def test_repair_leaves_a_whole_data_set_alone(copied):
     before = contents(copied)
     assert not list(repair(copied))
     assert contents(copied) == before
+    with pytest.raises(InputError, match="number of lanes is 0"):
+        list(repair(copied, lanes=0))
 
 
 def test_repair_makes_everything_again_as_it_was(copied, collected):

@@ -1,6 +1,7 @@
 """Reading: columns over shards, splits, scaling, batches, and tools that know nothing of jbrep."""
 
 import pickle
+from itertools import accumulate
 
 import h5py
 import numpy as np
@@ -27,7 +28,7 @@ def parts():
 
 @pytest.fixture(scope="module")
 def column(parts):
-    ends = np.cumsum([len(part) for part in parts])
+    ends = list(accumulate(len(part) for part in parts))
     return Column(lambda shard: parts[shard], ends, np.dtype(float), (3,))
 
 

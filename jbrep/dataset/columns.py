@@ -1,6 +1,7 @@
 """Views over all shards of a data set, and the scaling that is fitted to them."""
 
-from collections.abc import Callable, Iterator
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +21,7 @@ class Column:
 
     Args:
         part: gives the column's part in a shard of that number, (rows, ...).
-        ends: row number after each shard's last, (shards,).
+        ends: row number after each shard's last.
         dtype: of the values.
         row: shape of one row.
     """
@@ -28,14 +29,14 @@ class Column:
     def __init__(
         self,
         part: Callable[[int], Array],
-        ends: NDArray[np.int64],
+        ends: Sequence[int],
         dtype: np.dtype[Any],
         row: tuple[int, ...],
     ):
         self._part = part
         self._ends = ends
         self.dtype = dtype
-        self.shape = (int(ends[-1]) if len(ends) else 0, *row)
+        self.shape = (ends[-1] if ends else 0, *row)
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -80,15 +81,16 @@ class Column:
     def _slice(self, start: int, stop: int, step: int) -> Array:
         if step != 1:
             return self._take(np.arange(start, stop, step))
-        parts = [self._part(0)[:0]] if len(self._ends) else [np.empty(self.shape, self.dtype)]
-        shard = int(np.searchsorted(self._ends, start, side="right"))
+        parts = []
+        shard = bisect_right(self._ends, start)
         while start < stop:
-            end = int(self._ends[shard])
-            part = self._part(shard)
+            end, part = self._ends[shard], self._part(shard)
             first = end - len(part)
             parts.append(part[start - first : stop - first])
             start, shard = min(stop, end), shard + 1
-        return parts[1] if len(parts) == 2 else np.concatenate(parts)
+        if len(parts) == 1:
+            return parts[0]
+        return np.concatenate(parts) if parts else np.empty((0, *self.shape[1:]), self.dtype)
 
     def _take(self, rows: Array) -> Array:
         flat = rows.ravel()

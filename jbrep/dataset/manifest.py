@@ -5,7 +5,6 @@ import json
 import operator
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,9 @@ from jbrep.dataset.schema import (
 from jbrep.dataset.shard import (
     MEND,
     DamageError,
+    Shard,
     column_hashes,
     file_hash,
-    map_columns,
     map_file,
     shard_image,
 )
@@ -168,6 +167,8 @@ def shard_name(shard: int) -> str:
 
 def new_manifest(settings: Settings) -> Manifest:
     """A manifest without shards, of the versions that are installed."""
+    from importlib.metadata import version  # not at the top: readers needn't wait for it
+
     return Manifest(settings, {name: version(name) for name in _PACKAGES})
 
 
@@ -231,8 +232,8 @@ def _parse(record: dict[str, Any]) -> Manifest:
     return Manifest(settings, versions, shards)
 
 
-def open_shard(folder: Path, manifest: Manifest, shard: int) -> dict[str, Any]:
-    """A shard's columns as read-only views, once its bytes are found to be those committed.
+def open_shard(folder: Path, manifest: Manifest, shard: int) -> Shard:
+    """A shard's columns, once its bytes are found to be those committed.
 
     Raises:
         DamageError: they aren't, or it is missing.
@@ -244,9 +245,7 @@ def open_shard(folder: Path, manifest: Manifest, shard: int) -> dict[str, Any]:
             f"{path} is damaged: {len(content):,} bytes that aren't the {entry.bytes:,} that were "
             f"committed; {MEND}"
         )
-    return map_columns(
-        path, content, manifest.settings.specs(), manifest.row_counts(shard, entry.rows)
-    )
+    return Shard(path, content, manifest.settings.specs(), manifest.row_counts(shard, entry.rows))
 
 
 def check_listing(folder: Path, manifest: Manifest) -> None:

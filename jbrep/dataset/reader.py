@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from jbrep.dataset.columns import Batches, Column, Scaler
 from jbrep.dataset.manifest import check_listing, open_shard, read_manifest
 from jbrep.dataset.schema import EPISODES, step_specs
+from jbrep.dataset.shard import Shard
 from jbrep.errors import InputError
 
 _OPEN_SHARDS = 256  # memory-mapped at a time: each takes a file descriptor
@@ -51,14 +53,14 @@ class Dataset:
         check_listing(self.folder, self.manifest)
         self.task = self.manifest.task
         self._shard = lru_cache(_OPEN_SHARDS)(self._open)
-        self._ends = np.cumsum([entry.rows for entry in self.manifest.shards], dtype=np.int64)
+        self._ends = list(accumulate(entry.rows for entry in self.manifest.shards))
         self._specs = step_specs(self.task, self.manifest.settings.store_state)
 
-    def _open(self, shard: int) -> dict[str, NDArray[Any]]:
+    def _open(self, shard: int) -> Shard:
         return open_shard(self.folder, self.manifest, shard)
 
     def __len__(self) -> int:
-        return int(self._ends[-1]) if len(self._ends) else 0
+        return self._ends[-1] if self._ends else 0
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Dataset, (self.folder,)  # another process opens it anew

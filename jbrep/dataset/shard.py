@@ -4,7 +4,8 @@ import hashlib
 import math
 import mmap
 import stat
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -97,10 +98,8 @@ def stored_hashes(path: Path, names: Iterable[str]) -> dict[str, str]:
         raise DamageError(f"{path} is damaged: its hashes can't be read") from error
 
 
-def map_columns(
-    path: Path, content: mmap.mmap, specs: Mapping[str, Spec], rows: Mapping[str, int]
-) -> dict[str, NDArray[Any]]:
-    """The columns of a shard as read-only views of its bytes.
+class Shard(Mapping[str, NDArray[Any]]):
+    """The columns of a shard as read-only views of its bytes, each checked when first asked for.
 
     Nothing but contiguous data inside this very file is accepted, so HDF5 is never asked to read
     any: no link, external file, virtual data set or filter is followed.
@@ -112,59 +111,84 @@ def map_columns(
         rows: how many rows each has.
 
     Raises:
-        DamageError: the file's structure is another.
+        DamageError: when a column is asked for, if the file's structure is another.
     """
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            _check_names(path, file, specs)
-            offsets = {
-                name: _offset(path, file[name], name, spec, rows[name])
-                for name, spec in specs.items()
-            }
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
-        if isinstance(error, DamageError):
-            raise
-        raise DamageError(f"{path} is damaged: not an HDF5 file of flat columns") from error
-    views = {}
-    for name, spec in specs.items():
-        shape = spec.shape(rows[name])
-        count = math.prod(shape)
-        if offsets[name] + count * spec.dtype.itemsize > len(content):
-            raise DamageError(f"{path} is damaged: {name} goes beyond its end")
-        views[name] = np.frombuffer(content, spec.dtype, count, offsets[name]).reshape(shape)
-    return views
 
+    def __init__(
+        self, path: Path, content: mmap.mmap, specs: Mapping[str, Spec], rows: Mapping[str, int]
+    ):
+        self._path = path
+        self._content = content
+        self._specs = specs
+        self._rows = rows
+        self._views: dict[str, NDArray[Any]] = {}
 
-def _check_names(path: Path, file: h5py.File, specs: Mapping[str, Spec]) -> None:
-    """Every link on the way to a column is a hard one, and there is nothing else."""
-    groups = {name.rpartition("/")[0] for name in specs} - {""}
-    expected = {name.partition("/")[0] for name in specs}
-    for group in ("", *sorted(groups)):
-        here = file[group or "/"]
-        names = expected if not group else {n.split("/")[1] for n in specs if n.startswith(group)}
-        if len(here) != len(names):
-            raise DamageError(
-                f"{path} holds {len(here)} entries in {group or 'its root'}: "
-                f"{', '.join(sorted(names))} are expected"
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._specs)
+
+    def __len__(self) -> int:
+        return len(self._specs)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self._views:
+            spec = self._specs[name]
+            shape = spec.shape(self._rows[name])
+            with self._structure() as file:
+                if not self._views:
+                    self._check_names(file)
+                offset = self._offset(h5py.h5d.open(file, name.encode()), name, spec.dtype, shape)
+            count = math.prod(shape)
+            if offset + count * spec.dtype.itemsize > len(self._content):
+                raise self._damage(f"{name} goes beyond its end")
+            view = np.frombuffer(self._content, spec.dtype, count, offset)
+            self._views[name] = view.reshape(shape)
+        return self._views[name]
+
+    def _damage(self, what: str) -> DamageError:
+        return DamageError(f"{self._path} is damaged: {what}")
+
+    @contextmanager
+    def _structure(self) -> Iterator[h5py.h5f.FileID]:
+        """The file as HDF5 sees it; what HDF5 can't make sense of is damage."""
+        try:
+            with h5py.File(self._path, "r", locking=False) as file:
+                yield file.id
+        except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+            if isinstance(error, DamageError):
+                raise
+            raise self._damage("it isn't an HDF5 file of flat columns") from error
+
+    def _check_names(self, file: h5py.h5f.FileID) -> None:
+        """The file holds the columns that are expected, by hard links, and nothing else."""
+        names = {name.encode() for name in self._specs}
+        self._check_links(h5py.h5g.open(file, b"/"), {n.partition(b"/")[0] for n in names})
+        for group in {name.rpartition(b"/")[0] for name in names} - {b""}:
+            inside = {n.rpartition(b"/")[2] for n in names if n.startswith(group + b"/")}
+            self._check_links(h5py.h5g.open(file, group), inside)
+
+    def _check_links(self, group: h5py.h5g.GroupID, names: set[bytes]) -> None:
+        if group.get_num_objs() != len(names):
+            raise self._damage(
+                f"{group.get_num_objs()} entries beside {b', '.join(sorted(names)).decode()}, "
+                f"which are {len(names)}"
             )
         for name in names:
-            if not isinstance(here.get(name, getlink=True), h5py.HardLink):
-                raise DamageError(f"{path}: {name} is a link out of its place, which is refused")
+            if group.links.get_info(name).type != h5py.h5l.TYPE_HARD:
+                raise self._damage(f"{name.decode()} is a link to elsewhere, which is refused")
 
-
-def _offset(path: Path, dataset: Any, name: str, spec: Spec, rows: int) -> int:
-    """Where the column begins in the file, once its layout is found to be plain."""
-    if not isinstance(dataset, h5py.Dataset):
-        raise DamageError(f"{path}: {name} is not a data set")
-    layout = dataset.id.get_create_plist()
-    if layout.get_layout() != h5py.h5d.CONTIGUOUS or layout.get_external_count():
-        raise DamageError(f"{path}: {name} is not stored contiguously in this file")
-    if dataset.shape != spec.shape(rows) or dataset.dtype != spec.dtype:
-        raise DamageError(
-            f"{path}: {name} has shape {dataset.shape} and type {dataset.dtype}: "
-            f"{spec.shape(rows)} and {spec.dtype} are expected"
-        )
-    offset: int | None = dataset.id.get_offset()
-    if offset is None and rows:
-        raise DamageError(f"{path}: {name} was never written")
-    return offset or 0
+    def _offset(
+        self, column: h5py.h5d.DatasetID, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]
+    ) -> int:
+        """Where the column begins in the file, once its layout is found to be plain."""
+        layout = column.get_create_plist()
+        if layout.get_layout() != h5py.h5d.CONTIGUOUS or layout.get_external_count():
+            raise self._damage(f"{name} is not stored contiguously in this file")
+        if column.shape != shape or column.dtype != dtype:
+            raise self._damage(
+                f"{name} has shape {column.shape} and type {column.dtype}: {shape} and {dtype} "
+                "are expected"
+            )
+        offset: int | None = column.get_offset()
+        if offset is None and 0 not in shape:
+            raise self._damage(f"{name} was never written")
+        return offset or 0

@@ -43,7 +43,7 @@ def find_problems(folder: Path) -> Iterator[str]:
     for shard in tqdm(range(len(manifest.shards)), unit="shard", desc="verify", leave=False):
         path = folder / shard_name(shard)
         try:
-            columns = open_shard(folder, manifest, shard)
+            columns = dict(open_shard(folder, manifest, shard))
         except DamageError as damage:
             if path.exists() and path.lstat().st_size == manifest.shards[shard].bytes:
                 yield str(damage)  # else its size or absence has been told
