@@ -135,15 +135,15 @@ def compare_collectors(folder: Path) -> None:
 def memory_of(steps: int, folder: Path) -> float:
     """The collector's peak of resident memory [MB]."""
     code = (
-        "import resource, sys; from jbrep.cli import main\n"
+        "import re, sys; from jbrep.cli import main\n"
         "main(sys.argv[1:], standalone_mode=False)\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+        "print(re.search(r'VmHWM:\\s+(\\d+)', open('/proc/self/status').read())[1])"
     )
     arguments = ["collect", "--task", TASK, "--steps", str(steps), "--out", str(folder)]
     done = subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
     )
-    return float(done.stdout.split()[-1])
+    return int(done.stdout.split()[-1]) / 1000
 
 
 def make_rows(folder: Path) -> Dataset:

@@ -16,8 +16,9 @@ from jbrep.dataset.manifest import (
     MANIFEST,
     Manifest,
     Settings,
-    check_listing,
+    check_files,
     commit,
+    hdf5_files,
     new_manifest,
     read_manifest,
     write_manifest,
@@ -113,7 +114,7 @@ def _begin(settings: Settings, folder: Path) -> Manifest:
     if (folder / MANIFEST).exists() or any(folder.glob("shard-*.h5")):
         manifest = read_manifest(folder)
         _check_same(manifest, new_manifest(settings), folder)
-        check_listing(folder, manifest)
+        check_files(folder, manifest, hdf5_files(folder))
     else:
         manifest = new_manifest(settings)
         _check_space(settings, folder)

@@ -17,10 +17,11 @@ from jbrep.dataset.manifest import (
     MANIFEST,
     Entry,
     Manifest,
+    hdf5_files,
     open_shard,
     read_manifest,
     shard_name,
-    stray_shards,
+    strangers,
     write_manifest,
     write_shard,
 )
@@ -62,7 +63,7 @@ def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> 
         except DamageError:
             manifest = _recover(folder)
             yield f"{folder / MANIFEST} read from the shards again"
-        for path in stray_shards(folder, manifest):
+        for path in strangers(manifest, hdf5_files(folder)):
             aside = _set_aside(path)
             yield f"{path} set aside as {aside.name}: it is not one of the data set's shards"
         for shard in range(len(manifest.shards)):

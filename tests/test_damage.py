@@ -222,6 +222,20 @@ def test_a_huge_manifest_is_not_read(copied):
         Dataset(copied)
 
 
+def test_files_that_can_t_be_read_are_named(copied, monkeypatch):
+    dataset = Dataset(copied)
+
+    def refuse(path, *arguments, **keywords):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(type(copied), "open", refuse)
+    with pytest.raises(InputError, match=r"can't read .*shard-00000\.h5: Permission denied"):
+        dataset["reward"][0]
+    monkeypatch.setattr(type(copied), "read_bytes", refuse)
+    with pytest.raises(InputError, match=r"can't read .*manifest\.json: Permission denied"):
+        Dataset(copied)
+
+
 def external_storage(file, fifo):
     del file["reward"]
     file.create_dataset("reward", (1000,), "<f4", external=[(str(fifo), 0, 4000)])

@@ -1,6 +1,7 @@
 """Reading: columns over shards, splits, scaling, batches, and tools that know nothing of jbrep."""
 
 import pickle
+from dataclasses import replace
 from itertools import accumulate
 
 import h5py
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 from small import settings, write_again
 
-from jbrep.dataset import Dataset, Scaler
+from jbrep.collect import write_shards
+from jbrep.dataset import Dataset, Scaler, manifest, reader
 from jbrep.dataset.card import card
 from jbrep.dataset.columns import Column
 from jbrep.errors import InputError
@@ -178,8 +180,6 @@ def test_a_batch_from_the_disk_mixes_runs(dataset):
 def test_a_reader_sees_the_committed_part_while_a_collector_writes(
     collected, tmp_path, monkeypatch
 ):
-    from jbrep.dataset import manifest
-
     seen = []
 
     def look(folder, content):
@@ -198,6 +198,27 @@ def test_a_reader_sees_the_committed_part_while_a_collector_writes(
     assert seen == [(k + 1, 1000 * k, False) for k in range(5)]
 
 
+def test_shards_committed_while_it_opens_are_no_strangers(collected, tmp_path, monkeypatch):
+    folder = tmp_path / "growing"
+
+    def stop(shard, tick):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_shards(settings(), folder, stop)
+
+    def read_late(folder):
+        found = read_manifest(folder)
+        write_again(collected, folder)
+        return found
+
+    read_manifest = manifest.read_manifest
+    monkeypatch.setattr(reader, "read_manifest", read_late)
+    assert len(Dataset(folder)) == 0
+    monkeypatch.undo()
+    assert len(Dataset(folder)) == 5000
+
+
 def test_the_card_tells_what_is_there(dataset, collected):
     text = card(dataset)
     for part in ("face_direction, 16 features", "uniform", "5,000 in 5 episodes", "5 of 5 shards"):
@@ -213,12 +234,8 @@ def test_the_card_tells_what_is_there(dataset, collected):
 
 
 def test_an_unfinished_data_set_is_called_so(collected, tmp_path):
-    from dataclasses import replace
-
-    from jbrep.dataset.manifest import read_manifest, write_manifest
-
-    manifest = read_manifest(collected)
-    write_manifest(tmp_path, replace(manifest, shards=()))
+    whole = manifest.read_manifest(collected)
+    manifest.write_manifest(tmp_path, replace(whole, shards=()))
     empty = Dataset(tmp_path)
     assert len(empty) == len(empty["observation"][:]) == 0
     assert "0 of 5 shards, 0.0 MB; unfinished" in card(empty)

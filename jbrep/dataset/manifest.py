@@ -189,6 +189,8 @@ def read_manifest(folder: Path) -> Manifest:
         raise InputError(
             f"no data set in {folder}: a folder that jbrep collect wrote is expected"
         ) from None
+    except OSError as error:
+        raise InputError(f"can't read {path}: {error.strerror}") from error
     try:
         record = json.loads(raw)
         if raw != _text(record) or record["format"] != FORMAT:
@@ -210,11 +212,6 @@ def _text(record: dict[str, Any]) -> bytes:
     body = {key: value for key, value in record.items() if key != _HASH}
     digest = hashlib.sha256(json.dumps(body).encode()).hexdigest()
     return (json.dumps({**body, _HASH: digest}, indent=1) + "\n").encode()
-
-
-def _record(manifest: Manifest) -> dict[str, Any]:
-    fields = asdict(manifest)
-    return {"format": FORMAT, "format_version": FORMAT_VERSION, **fields}
 
 
 def _parse(record: dict[str, Any]) -> Manifest:
@@ -248,20 +245,26 @@ def open_shard(folder: Path, manifest: Manifest, shard: int) -> Shard:
     return Shard(path, content, manifest.settings.specs(), manifest.row_counts(shard, entry.rows))
 
 
-def check_listing(folder: Path, manifest: Manifest) -> None:
-    """Make sure that the shards in the folder are those of the manifest, by name and size.
+def hdf5_files(folder: Path) -> list[Path]:
+    """The files that should be shards; list them before the manifest is read.
 
-    One more shard than the manifest names is a commit under way; a reader passes it by.
+    Then whatever a collector commits in between is in the manifest at least.
+    """
+    return sorted(folder.glob("*.h5"))
+
+
+def check_files(folder: Path, manifest: Manifest, files: list[Path]) -> None:
+    """Make sure that the files are the shards of the manifest, by name and size.
 
     Raises:
         DamageError: one is missing, cut short, or not one of them.
     """
-    for problem in listing_problems(folder, manifest):
+    for problem in file_problems(folder, manifest, files):
         raise DamageError(problem)
 
 
-def listing_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
-    """What `check_listing` finds wrong, a line for each shard."""
+def file_problems(folder: Path, manifest: Manifest, files: list[Path]) -> Iterator[str]:
+    """What `check_files` finds wrong, a line for each file."""
     for shard, entry in enumerate(manifest.shards):
         path = folder / shard_name(shard)
         try:
@@ -273,16 +276,16 @@ def listing_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
             yield (
                 f"{path} is damaged: it has {size:,} bytes, {entry.bytes:,} were committed; {MEND}"
             )
-    for path in stray_shards(folder, manifest):
+    for path in strangers(manifest, files):
         yield f"{path} is not one of the {len(manifest.shards)} shards of the data set"
 
 
-def stray_shards(folder: Path, manifest: Manifest) -> list[Path]:
-    """HDF5 files in the folder that the manifest doesn't name, but for a commit under way."""
+def strangers(manifest: Manifest, files: list[Path]) -> list[Path]:
+    """Files that the manifest doesn't name, nor are they the shard whose commit is under way."""
     known = {shard_name(shard) for shard in range(len(manifest.shards))}
     if not manifest.complete:
         known.add(shard_name(len(manifest.shards)))
-    return sorted(path for path in folder.glob("*.h5") if path.name not in known)
+    return [path for path in files if path.name not in known]
 
 
 def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
@@ -317,4 +320,5 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     Raises:
         InputError: it can't be written.
     """
-    write_whole(folder / MANIFEST, _text(_record(manifest)))
+    record = {"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(manifest)}
+    write_whole(folder / MANIFEST, _text(record))

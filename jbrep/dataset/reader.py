@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.columns import Batches, Column, Scaler
-from jbrep.dataset.manifest import check_listing, open_shard, read_manifest
+from jbrep.dataset.manifest import check_files, hdf5_files, open_shard, read_manifest
 from jbrep.dataset.schema import EPISODES, step_specs
 from jbrep.dataset.shard import Shard
 from jbrep.errors import InputError
@@ -49,8 +49,9 @@ class Dataset:
 
     def __init__(self, folder: str | Path):
         self.folder = Path(folder)
+        files = hdf5_files(self.folder)
         self.manifest = read_manifest(self.folder)
-        check_listing(self.folder, self.manifest)
+        check_files(self.folder, self.manifest, files)
         self.task = self.manifest.task
         self._shard = lru_cache(_OPEN_SHARDS)(self._open)
         self._ends = list(accumulate(entry.rows for entry in self.manifest.shards))

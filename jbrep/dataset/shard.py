@@ -57,6 +57,7 @@ def map_file(path: Path) -> mmap.mmap:
 
     Raises:
         DamageError: no such file, not a regular one, or an empty one.
+        InputError: it can't be read.
     """
     try:
         status = path.lstat()
@@ -66,6 +67,8 @@ def map_file(path: Path) -> mmap.mmap:
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except FileNotFoundError:
         raise DamageError(f"{path} is missing: {MEND}") from None
+    except OSError as error:
+        raise InputError(f"can't read {path}: {error.strerror}") from error
 
 
 def stored_attributes(path: Path) -> dict[str, Any]:

@@ -10,7 +10,8 @@ from tqdm import tqdm
 
 from jbrep.dataset.manifest import (
     Manifest,
-    listing_problems,
+    file_problems,
+    hdf5_files,
     open_shard,
     read_manifest,
     shard_name,
@@ -34,12 +35,13 @@ def find_problems(folder: Path) -> Iterator[str]:
     Raises:
         InputError: there is no data set.
     """
+    files = hdf5_files(folder)
     try:
         manifest = read_manifest(folder)
     except DamageError as damage:
         yield str(damage)
         return
-    yield from listing_problems(folder, manifest)
+    yield from file_problems(folder, manifest, files)
     for shard in tqdm(range(len(manifest.shards)), unit="shard", desc="verify", leave=False):
         path = folder / shard_name(shard)
         try:
