@@ -50,18 +50,18 @@ def _run(data: Path, seconds: float | None) -> bool:
     steps = ("--steps", str(SETTINGS.steps), "--out", str(data))
     lock = data / ".lock"
     before = lock.stat().st_mtime_ns if lock.exists() else 0
-    process = subprocess.Popen(
-        [*COMMAND, *steps], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-    )
-    while process.poll() is None and not (lock.exists() and lock.stat().st_mtime_ns > before):
-        time.sleep(0.02)
-    try:
-        assert process.wait(seconds) == 0
-        return True
-    except subprocess.TimeoutExpired:
-        process.kill()
-        assert process.wait() == -signal.SIGKILL
-        return False
+    told = data.with_suffix(".told")
+    with told.open("w") as stderr:
+        process = subprocess.Popen([*COMMAND, *steps], stdout=subprocess.DEVNULL, stderr=stderr)
+        while process.poll() is None and not (lock.exists() and lock.stat().st_mtime_ns > before):
+            time.sleep(0.02)
+        try:
+            assert process.wait(seconds) == 0, told.read_text()[-1000:]
+            return True
+        except subprocess.TimeoutExpired:
+            process.kill()
+            assert process.wait() == -signal.SIGKILL
+            return False
 
 
 def _check_prefix(data: Path, peace: dict[str, bytes]) -> int:
