@@ -234,10 +234,11 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
 @_threads
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A folder.")
 def derive(data: Path, task: str, store_state: bool, threads: int | None, out: Path) -> None:
-    """Make another task's data set of the same motion, without simulating again.
+    """Make another task's data set of the same motion.
 
-    It equals collecting that task with the same settings, bit for bit. The data set needs its
-    states (collect --store-state) and a policy that doesn't act on observations.
+    Nothing is simulated again, and it equals collecting that task with the same settings, bit for
+    bit. The data set needs its states (collect --store-state) and a policy that doesn't act on
+    observations.
     """
     from jbrep.derive import derive as run
 

@@ -37,7 +37,7 @@ def kill_and_resume(kills: int, folder: Path, seed: int) -> Tally:
     tally = Tally()
     while tally.kills < kills or not tally.ends:
         data = folder / f"data-{tally.ends}"
-        while not _run(data, random.uniform(0.2, 2.5) if tally.kills < kills else None):
+        while not _run(data, random.uniform(0.1, 2) if tally.kills < kills else None):
             tally.kills += 1
             tally.committed += _check_prefix(data, peace)
         assert contents(data) == peace
