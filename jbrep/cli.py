@@ -43,9 +43,17 @@ _COUNT = _Count()
 class _Mistake(click.ClickException):
     exit_code = 2
 
+    def __init__(self, message: str):
+        super().__init__(_printable(message))
+
+
+def _printable(line: str) -> str:
+    """One line that can't steer a terminal, whatever a file's name holds."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+
 
 @contextmanager
-def _stoppable() -> Iterator[None]:
+def _stoppable(how_to_go_on: str) -> Iterator[None]:
     """Ctrl-C and SIGTERM end the command between two steps, with a line on how to go on."""
     numbers = (signal.SIGINT, signal.SIGTERM)
 
@@ -56,7 +64,7 @@ def _stoppable() -> Iterator[None]:
     try:
         yield
     except SystemExit:
-        click.echo("stopped; the same command goes on where it stopped", err=True)
+        click.echo(f"stopped; {how_to_go_on}", err=True)
         raise
     finally:
         for number, handler in zip(numbers, before, strict=True):
@@ -91,8 +99,18 @@ def main() -> None:
     """Reduced-order representations of the Jitterbug, and what they do to learning."""
 
 
-_threads = click.option("--threads", type=int, help="To work on; all cores if not given.")
-_lanes = click.option("--lanes", default=100, show_default=True, help="Robots stepped at once.")
+_GOES_ON = "the same command goes on where it stopped"
+
+_threads = click.option(
+    "--threads", type=click.IntRange(1, 4096), help="To work on; all cores if not given."
+)
+_lanes = click.option(
+    "--lanes",
+    type=click.IntRange(1, 100_000),
+    default=100,
+    show_default=True,
+    help="Robots stepped at once.",
+)
 _data = click.argument("data", type=click.Path(path_type=Path))
 
 
@@ -140,7 +158,7 @@ def collect(
         shard_episodes=shard_episodes,
         store_state=store_state,
     )
-    with _stoppable():
+    with _stoppable(_GOES_ON):
         _tell(out, run(settings, out, lanes, threads))
 
 
@@ -189,12 +207,12 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
 
     problems = 0
     for problem in find_problems(data):
-        click.echo(problem)
+        click.echo(_printable(problem))
         problems += 1
     if not problems:
         dataset = Dataset(data)
         for problem in replay_episodes(dataset, replay, threads):
-            click.echo(problem)
+            click.echo(_printable(problem))
             problems += 1
     if problems:
         ctx.exit(1)
@@ -216,10 +234,10 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
     """Make damaged and missing files again, as they were."""
     from jbrep.repair import repair as run
 
-    with _stoppable():
+    with _stoppable(_GOES_ON):
         done = 0
         for line in run(data, lanes, threads):
-            click.echo(line)
+            click.echo(_printable(line))
             done += 1
     if not done:
         click.echo(f"{data} is whole: nothing to repair")
@@ -242,7 +260,7 @@ def derive(data: Path, task: str, store_state: bool, threads: int | None, out: P
     """
     from jbrep.derive import derive as run
 
-    with _stoppable():
+    with _stoppable(_GOES_ON):
         _tell(out, run(data, task, out, store_state, threads))
 
 
@@ -258,7 +276,8 @@ def export(data: Path, to: str, out: Path) -> None:
     from jbrep.dataset import Dataset
     from jbrep.export import export as run
 
-    click.echo(f"open it with {run(Dataset(data), to, out)}")
+    with _stoppable("nothing is left of it"):
+        click.echo(f"open it with {run(Dataset(data), to, out)}")
 
 
 @main.command(epilog=_example("jbrep train-dae --data data/face --latent 8 --out encoder-8"))

@@ -1,6 +1,5 @@
 """The collector: a policy on many Jitterbugs, streamed to the shards of a data set."""
 
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
@@ -24,6 +23,7 @@ from jbrep.dataset.manifest import (
     write_manifest,
 )
 from jbrep.dataset.schema import EPISODES, Columns, episode_returns, episode_seed
+from jbrep.dataset.storage import check_space
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
@@ -111,13 +111,14 @@ def write_shards(settings: Settings, folder: Path, make: Callable[[int, Tick], C
 
 def _begin(settings: Settings, folder: Path) -> Manifest:
     """The manifest to go on from."""
-    if (folder / MANIFEST).exists() or any(folder.glob("shard-*.h5")):
+    files = hdf5_files(folder)
+    if (folder / MANIFEST).exists() or files:
         manifest = read_manifest(folder)
         _check_same(manifest, new_manifest(settings), folder)
-        check_files(folder, manifest, hdf5_files(folder))
+        check_files(folder, manifest, files)
     else:
         manifest = new_manifest(settings)
-        _check_space(settings, folder)
+        check_space(folder, settings.episodes * EPISODE_STEPS * settings.row_bytes())
         write_manifest(folder, manifest)
     return manifest
 
@@ -144,16 +145,6 @@ def _differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
         for name in wanted
         if there.get(name) != wanted[name]
     )
-
-
-def _check_space(settings: Settings, folder: Path) -> None:
-    needed = settings.episodes * EPISODE_STEPS * settings.row_bytes()
-    free = shutil.disk_usage(folder).free
-    if needed > free:
-        raise InputError(
-            f"no space for the data set in {folder}: about {needed:,} bytes are needed, "
-            f"{free:,} are free"
-        )
 
 
 def simulate_shard(

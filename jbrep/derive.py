@@ -1,6 +1,6 @@
 """Another task's data set from a collected one: the same motion, observed and rewarded anew."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collect import Tick, Written, write_shards
+from jbrep.collect import Tick, Written, check_counts, write_shards
 from jbrep.dataset import Dataset
-from jbrep.dataset.manifest import open_shard
-from jbrep.dataset.schema import EPISODES, Columns, episode_returns
+from jbrep.dataset.manifest import new_manifest, open_shard
+from jbrep.dataset.schema import EPISODES, Columns, episode_returns, episode_seed
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import Task, get_task
@@ -64,23 +64,37 @@ def derive(
             f"{source} was made by a {settings.policy['kind']} policy, which acts on what it "
             f"observes: collect {task_name} itself"
         )
+    check_counts(1, num_threads)
     task = get_task(task_name)
     settings = replace(settings, task=task_name, store_state=store_state)
 
+    if dataset.manifest.versions != (ours := new_manifest(settings).versions):
+        raise InputError(
+            f"{source} was made with {dict(dataset.manifest.versions)}, here are {dict(ours)}: "
+            "a derived data set needs the same"
+        )
+
     def make(shard: int, tick: Tick) -> Columns:
         columns = open_shard(source, dataset.manifest, shard)
-        return _observe_anew(columns, task, settings.specs(), tick, num_threads)
+        numbers = settings.shard_range(shard)
+        seeds = [episode_seed(settings.seed, number) for number in numbers]
+        return _observe_anew(columns, task, seeds, settings.specs(), tick, num_threads)
 
     return write_shards(settings, folder, make)
 
 
 def _observe_anew(
-    columns: Columns, task: Task, names: Iterable[str], tick: Tick, num_threads: int | None
+    columns: Columns,
+    task: Task,
+    seeds: Sequence[int],
+    names: Iterable[str],
+    tick: Tick,
+    num_threads: int | None,
 ) -> Columns:
     """The columns of a shard as another task has them."""
     own = {n.removeprefix(EPISODES): c for n, c in columns.items() if n.startswith(EPISODES)}
     length = own["length"]
-    starts = [task.start(np.random.default_rng(int(seed))) for seed in own["seed"]]
+    starts = [task.start(np.random.default_rng(seed)) for seed in seeds]
     target = {
         "target_position": np.stack([start.target_position for start in starts]),
         "target_quaternion": np.stack([start.target_quaternion for start in starts]),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from jbrep.dataset import Dataset
+from jbrep.dataset.storage import check_space
 from jbrep.errors import InputError
 
 _MINARI_FOLDER = "MINARI_DATASETS_PATH"
@@ -40,9 +41,11 @@ def export(dataset: Dataset, to: str, out: Path) -> str:
     if not len(dataset):
         raise InputError(f"{dataset.folder} has no rows yet")
     try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        check_space(out.parent, len(dataset) * dataset.manifest.settings.row_bytes())
         return FORMATS[to](dataset, out)
-    except OSError as error:
-        raise InputError(f"can't write {error.filename or out}: {error.strerror}") from error
+    except (OSError, RuntimeError) as error:  # HDF5 ends in the latter where space runs out
+        raise InputError(f"can't write {out}: {getattr(error, 'strerror', error)}") from error
 
 
 def _to_npz(dataset: Dataset, out: Path) -> str:
@@ -69,6 +72,8 @@ def _to_parquet(dataset: Dataset, out: Path) -> str:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    episodes = out.with_stem(f"{out.stem}-episodes")
+    _check_new(episodes)
     schema = pa.schema(
         [
             pa.field(name, pa.from_numpy_dtype(dtype), nullable=False, metadata={"unit": unit})
@@ -82,7 +87,6 @@ def _to_parquet(dataset: Dataset, out: Path) -> str:
         for chunk in tqdm(chunks, unit="chunk", desc=out.name, leave=False):
             arrays = [column for values in chunk for column in _flat(values)]
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
-    episodes = out.with_stem(f"{out.stem}-episodes")
     with _new_file(episodes) as partial:
         columns = {name: list(values) for name, values in dataset.episodes.items()}
         pq.write_table(pa.table(columns), partial)
@@ -177,13 +181,17 @@ def _minari_episodes(dataset: Dataset) -> Iterator[Any]:
         )
 
 
+def _check_new(path: Path) -> None:
+    if path.exists():
+        raise InputError(f"{path} exists already: choose another name")
+
+
 @contextmanager
 def _new_file(path: Path) -> Iterator[Path]:
     """A temporary name for a file that gets its own name when it is whole."""
-    if path.exists():
-        raise InputError(f"{path} exists already: choose another name")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    _check_new(path)
     partial = path.with_name(path.name + ".partial")
+    partial.unlink(missing_ok=True)  # it may be a link
     try:
         yield partial
         partial.rename(path)

@@ -116,7 +116,7 @@ def parse_policy(text: str) -> Policy:
     """
     kind, _, constants = text.partition(":")
     pairs = (pair.partition("=") for pair in constants.split(",") if pair)
-    return make_policy({"kind": kind, **{name.strip(): value for name, _, value in pairs}})
+    return _make(kind, {name.strip(): value for name, _, value in pairs})
 
 
 def make_policy(settings: Mapping[str, Any]) -> Policy:
@@ -126,23 +126,25 @@ def make_policy(settings: Mapping[str, Any]) -> Policy:
         InputError: an unknown policy, a constant that it doesn't have, or one out of range.
     """
     constants = {name: value for name, value in settings.items() if name != "kind"}
-    if settings["kind"] not in POLICIES:
-        raise InputError(
-            f"unknown policy {settings['kind']!r}: choose one of {', '.join(POLICIES)}"
-        )
-    policy = POLICIES[settings["kind"]]
+    return _make(settings["kind"], constants)
+
+
+def _make(kind: str, constants: dict[str, Any]) -> Policy:
+    if kind not in POLICIES:
+        raise InputError(f"unknown policy {kind!r}: choose one of {', '.join(POLICIES)}")
+    policy = POLICIES[kind]
     known = [field.name for field in fields(policy)]
     for name, value in constants.items():
         if name not in known:
             raise InputError(
-                f"policy {policy.kind} has no constant {name!r}: "
+                f"policy {kind} has no constant {name!r}: "
                 f"{'it has ' + ', '.join(known) if known else 'it has none'}"
             )
         try:
-            constants[name] = float(value)
-        except (TypeError, ValueError):
+            constants[name] = float(value) + 0.0  # -0 is 0
+        except (TypeError, ValueError, OverflowError):
             raise InputError(
-                f"policy {policy.kind}: {name} is {value!r}, a number is expected, as in "
+                f"policy {kind}: {name} is {value!r}, a number is expected, as in "
                 "constant:drive=0.5"
             ) from None
     return policy(**constants)

@@ -1,10 +1,7 @@
-"""Mending a data set: damaged or missing shards, and the manifest, are made again as they were."""
+"""Mending a data set: damaged or missing files are made again as they were."""
 
-import contextlib
-import json
-import re
-from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -14,6 +11,7 @@ from tqdm import tqdm
 from jbrep.collect import LANES, check_counts, simulate_shard
 from jbrep.dataset.lock import exclusive
 from jbrep.dataset.manifest import (
+    BACKUP,
     MANIFEST,
     Entry,
     Manifest,
@@ -25,24 +23,14 @@ from jbrep.dataset.manifest import (
     write_manifest,
     write_shard,
 )
-from jbrep.dataset.shard import (
-    DamageError,
-    Shard,
-    column_hashes,
-    file_hash,
-    map_file,
-    stored_attributes,
-    stored_hashes,
-)
+from jbrep.dataset.shard import DamageError, column_hashes
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import EPISODE_STEPS
 from jbrep.policies import make_policy
 
-_LOST = Entry(0, 0, "", {})  # of a shard that neither manifest nor file tells of
-
 
 def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> Iterator[str]:
-    """Make damaged and missing shards again, and the manifest from the shards if that is gone.
+    """Make damaged and missing shards again, and the manifest from its backup or the other way.
 
     What isn't part of the data set is set aside under another name, never deleted.
 
@@ -54,15 +42,9 @@ def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> 
             machine or other versions made it.
     """
     check_counts(lanes, num_threads)
-    with contextlib.suppress(DamageError):
-        read_manifest(folder)
+    good = _good_manifest(folder)
     with exclusive(folder):
-        before = None
-        try:
-            manifest = before = read_manifest(folder)
-        except DamageError:
-            manifest = _recover(folder)
-            yield f"{folder / MANIFEST} read from the shards again"
+        manifest = before = read_manifest(folder, good)
         for path in strangers(manifest, hdf5_files(folder)):
             aside = _set_aside(path)
             yield f"{path} set aside as {aside.name}: it is not one of the data set's shards"
@@ -73,8 +55,32 @@ def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> 
             shards = (*manifest.shards[:shard], entry, *manifest.shards[shard + 1 :])
             manifest = replace(manifest, shards=shards)
             yield f"{folder / shard_name(shard)} made again"
-        if manifest != before:
+        if manifest != before or not _is_double(folder, manifest):
             write_manifest(folder, manifest)
+            yield f"{folder / MANIFEST} and its backup written again"
+
+
+def _good_manifest(folder: Path) -> str:
+    """The name of the manifest, or of its backup where that is damaged.
+
+    Raises:
+        DamageError: both are.
+    """
+    for name in (MANIFEST, BACKUP):
+        with suppress(DamageError):
+            read_manifest(folder, name)
+            return name
+    raise DamageError(
+        f"{folder} can't be repaired: {MANIFEST} and {BACKUP} are both damaged or missing; collect "
+        "it again in another folder"
+    )
+
+
+def _is_double(folder: Path, manifest: Manifest) -> bool:
+    try:
+        return read_manifest(folder) == read_manifest(folder, BACKUP) == manifest
+    except InputError:
+        return False
 
 
 def _set_aside(path: Path) -> Path:
@@ -106,51 +112,10 @@ def _make_again(
             lanes,
             num_threads,
         )
-    if known and column_hashes(columns) != known:
+    if column_hashes(columns) != known:
         raise InputError(
             f"{folder / shard_name(shard)} can't be made again here: it comes out otherwise than "
             f"it was with {dict(manifest.versions)}; use these versions and the machine it was "
             "made on"
         )
     return write_shard(folder, manifest, shard, columns)
-
-
-def _recover(folder: Path) -> Manifest:
-    """The manifest that most shards agree on, with an entry for each of them."""
-    shards = {
-        int(match[1]): path
-        for path in folder.glob("shard-*.h5")
-        if (match := re.fullmatch(r"shard-(\d{5,})\.h5", path.name))
-    }
-    stories = Counter(story for path in shards.values() if (story := _story(path)))
-    if not stories:
-        raise DamageError(f"{folder} can't be repaired: no shard tells how it was collected")
-    manifest = Manifest.from_attributes(json.loads(stories.most_common(1)[0][0]))
-    known = min(max(shards) + 1, manifest.settings.num_shards)
-    entries = (_entry(folder, manifest, shard) for shard in range(known))
-    return replace(manifest, shards=tuple(entries))
-
-
-def _story(path: Path) -> str | None:
-    """How a shard says it was collected, as all shards of its data set should say it."""
-    try:
-        attributes = stored_attributes(path)
-        manifest = Manifest.from_attributes(attributes)
-        return json.dumps(manifest.attributes(shard=0, rows=0))
-    except (DamageError, KeyError, TypeError, ValueError):
-        return None
-
-
-def _entry(folder: Path, manifest: Manifest, shard: int) -> Entry:
-    """What a shard's file tells of itself, if it holds."""
-    path, specs = folder / shard_name(shard), manifest.settings.specs()
-    try:
-        content = map_file(path)
-        rows = stored_attributes(path)["rows"]
-        counts = manifest.row_counts(shard, rows)
-        hashes = column_hashes(Shard(path, content, specs, counts))
-        whole = stored_hashes(path, specs) == hashes
-        told = stored_attributes(path) == manifest.attributes(shard, rows)
-    except (DamageError, KeyError, TypeError, ValueError):
-        return _LOST
-    return Entry(len(content), rows, file_hash(content), hashes) if whole and told else _LOST

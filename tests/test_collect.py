@@ -221,7 +221,7 @@ def test_kills_lose_at_most_the_open_shard(tmp_path):
     assert kill_and_resume(20, tmp_path, seed=0).kills == 20
 
 
-STAGES = ["write", "sync", "rename", "sync folder"] * 2  # of the shard, then of the manifest
+STAGES = ["write", "sync", "rename", "sync folder"] * 3  # of shard, backup and manifest
 
 
 @pytest.mark.parametrize("stage", range(len(STAGES)), ids=lambda k: f"{k}-{STAGES[k]}")
@@ -232,11 +232,11 @@ import os, sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 from small import write_again
-left = {stage + 1 + 4 + 8}  # four calls make the first manifest, eight each shard
+left = {stage + 1 + 8 + 12}  # eight calls make the first manifest, twelve each shard
 def deadly(call):
     def wrapped(*arguments, **keywords):
         global left
-        left -= call is not opening or arguments[1:] == ("wb",)
+        left -= call is not opening or arguments[1:] == ("xb",)
         if not left:
             os.kill(os.getpid(), 9)
         return call(*arguments, **keywords)
@@ -248,7 +248,7 @@ write_again(Path({str(collected)!r}), Path({str(folder)!r}))
     killed = subprocess.run([sys.executable, "-c", script], check=False)
     assert killed.returncode == -signal.SIGKILL
     committed = len(read_manifest(folder).shards)
-    assert committed == (2 if stage == 7 else 1)
+    assert committed == (2 if stage == 11 else 1)
     before = contents(folder)
     dataset = Dataset(folder)
     np.testing.assert_array_equal(
@@ -270,7 +270,7 @@ def test_no_space_at_any_stage_of_a_commit(stage, count, collected, tmp_path, mo
     call, calls = getattr(owner, stage), []
 
     def full(*arguments, **keywords):
-        calls.append(stage != "open" or arguments[1:] == ("wb",))
+        calls.append(stage != "open" or arguments[1:] == ("xb",))
         if calls[-1] and sum(calls) == count:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return call(*arguments, **keywords)

@@ -149,17 +149,15 @@ def test_repair_makes_everything_again_as_it_was(copied, collected):
 
 
 @pytest.mark.parametrize("loss", ["missing", "flipped"])
-def test_repair_reads_the_manifest_from_the_shards(loss, copied, collected):
+def test_repair_reads_the_manifest_from_its_backup(loss, copied, collected):
     path = copied / MANIFEST
     if loss == "missing":
         path.unlink()
     else:
         path.write_bytes(path.read_bytes().replace(b"uniform", b"uniforn"))
-    content = bytearray((copied / "shard-00000.h5").read_bytes())
-    content[9000] ^= 1  # and a shard is damaged, too: nothing tells its hashes now
-    (copied / "shard-00000.h5").write_bytes(content)
+    (copied / "shard-00000.h5").write_bytes(b"and a shard is damaged, too")
     told = [line.split("/")[-1] for line in repair(copied)]
-    assert told == ["manifest.json read from the shards again", "shard-00000.h5 made again"]
+    assert told == ["shard-00000.h5 made again", "manifest.json and its backup written again"]
     assert contents(copied) == contents(collected)
 
 
@@ -175,11 +173,21 @@ def test_what_can_t_be_repaired(copied, tmp_path):
     with pytest.raises(InputError, match=r"00002\.h5 can't be made again here.*'mujoco'"):
         list(repair(copied))
     assert not (copied / "shard-00002.h5").exists()
-    for path in copied.glob("shard-*.h5"):
-        path.write_bytes(b"nothing")
     (copied / MANIFEST).unlink()
-    with pytest.raises(DamageError, match="no shard tells how it was collected"):
+    (copied / "manifest.backup.json").write_bytes(b"{}")
+    with pytest.raises(
+        DamageError, match=r"can't be repaired: manifest\.json and manifest\.backup"
+    ):
         list(repair(copied))
+
+
+def test_other_versions_are_not_passed_off_as_these(copied, tmp_path):
+    manifest = read_manifest(copied)
+    older = {**manifest.versions, "mujoco": "3.16.9"}
+    write_manifest(copied, replace(manifest, versions=older))
+    with pytest.raises(InputError, match="a derived data set needs the same"):
+        derive(copied, "move_to_pose", tmp_path / "derived")
+    assert not (tmp_path / "derived").exists()
 
 
 def test_a_shard_written_by_another_hdf5_is_adopted_if_its_columns_are_the_same(copied):
@@ -188,6 +196,6 @@ def test_a_shard_written_by_another_hdf5_is_adopted_if_its_columns_are_the_same(
     shards = (*manifest.shards[:2], entry, *manifest.shards[3:])
     write_manifest(copied, replace(manifest, shards=shards))
     assert list(find_problems(copied))
-    assert len(list(repair(copied))) == 1
+    assert len(list(repair(copied))) == 2
     assert read_manifest(copied) == manifest
     assert not list(find_problems(copied))

@@ -22,7 +22,10 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.shard import column_hashes, file_hash, shard_image
 from jbrep.dataset.verify import find_problems
+from jbrep.derive import derive
 from jbrep.errors import InputError
+from jbrep.export import export
+from jbrep.repair import repair
 
 
 def read_all(folder):
@@ -163,6 +166,10 @@ def settings_of(**changes):
     return lambda record: record["settings"].update(changes)
 
 
+def versions_of(jbrep):
+    return lambda record: record["versions"].update(jbrep=jbrep)
+
+
 def entry_of(**changes):
     return lambda record: record["shards"][0].update(changes)
 
@@ -183,7 +190,15 @@ def entry_of(**changes):
         (settings_of(policy="uniform"), "is damaged"),
         (settings_of(more=1), "is damaged"),
         (settings_of(steps=10**30), "is damaged"),
-        (settings_of(steps=10**12, shard_episodes=10**8), "has shape"),
+        (settings_of(steps=10**12, shard_episodes=10**12), "is damaged"),
+        (settings_of(steps=10**12), "is damaged"),
+        (settings_of(store_state="yes"), "is damaged"),
+        (settings_of(policy={"kind": "../../up"}), "is damaged"),
+        (settings_of(policy={"kind": "constant", "drive": 10**400}), "is damaged"),
+        (settings_of(policy={"kind": "constant", "drive": "fast"}), "is damaged"),
+        (manifest_of(versions={"jbrep": "1"}), "is damaged"),
+        (versions_of("\x1b[2J"), "is damaged"),
+        (versions_of("\ud800"), "is damaged"),
         (entry_of(rows=-1), "is damaged"),
         (entry_of(rows=2.5), "is damaged"),
         (entry_of(rows=999), "has shape"),
@@ -380,6 +395,55 @@ def adopt(folder, path):
     write_manifest(folder, Manifest(manifest.settings, manifest.versions, shards))
 
 
+def test_a_manifest_that_is_no_file_is_not_opened(copied):
+    manifest = copied / MANIFEST
+    manifest.unlink()
+    os.mkfifo(manifest)  # opened, it would hang
+    with pytest.raises(DamageError, match=r"manifest\.json is damaged"):
+        Dataset(copied)
+    manifest.unlink()
+    manifest.symlink_to("/dev/zero")
+    with pytest.raises(DamageError, match=r"manifest\.json is damaged"):
+        Dataset(copied)
+
+
+@pytest.mark.parametrize("length", [2**31 - 1, -5, 10, 1500])
+def test_lengths_that_rows_can_t_be_found_by_are_refused(length, copied, tmp_path):
+    forge(copied, spoil("episodes/length", 0, length))
+    for use in (
+        lambda: Dataset(copied).split(),
+        lambda: export(Dataset(copied), "minari", tmp_path / "minari"),
+        lambda: derive(copied, "move_to_pose", tmp_path / "derived"),
+    ):
+        with pytest.raises(DamageError, match=r"00000\.h5 is damaged: the lengths of its episodes"):
+            use()
+
+
+def test_the_backup_of_the_manifest_is_looked_after(copied, collected):
+    backup = copied / "manifest.backup.json"
+    for spoiling in (backup.unlink, lambda: backup.write_bytes(b"{}")):
+        spoiling()
+        (problem,) = find_problems(copied)
+        assert "manifest.backup.json" in problem
+        read_all(copied)
+        assert len(list(repair(copied))) == 1
+        assert backup.read_bytes() == (copied / MANIFEST).read_bytes()
+    write_manifest(copied, Manifest(**{**vars(read_manifest(collected)), "shards": ()}))
+    shutil.copy(collected / MANIFEST, copied)
+    (problem,) = find_problems(copied)
+    assert "manifest.backup.json is of another data set" in problem
+
+
+def test_nothing_is_written_through_a_link(copied, collected, tmp_path):
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    (copied / "shard-00000.h5").unlink()
+    (copied / "shard-00000.h5.partial").symlink_to(victim)
+    list(repair(copied))
+    assert victim.read_text() == "precious"
+    assert not list(find_problems(copied))
+
+
 def test_a_shard_that_is_a_link_or_a_folder_is_refused(copied, collected):
     path = copied / "shard-00001.h5"
     path.unlink()
@@ -390,6 +454,20 @@ def test_a_shard_that_is_a_link_or_a_folder_is_refused(copied, collected):
     path.mkdir()
     with pytest.raises(DamageError, match=r"shard-00001\.h5 is damaged"):
         read_all(copied)
+
+
+def forge(folder, change):
+    """Write the first shard as a collector with a fault would, hashes and all."""
+    manifest = read_manifest(folder)
+    with h5py.File(folder / shard_name(0)) as file:
+        columns = {name: file[name][:] for name in manifest.settings.specs()}
+    change(columns)
+    hashes = column_hashes(columns)
+    image = shard_image(columns, hashes, manifest.attributes(0, 1000))
+    (folder / shard_name(0)).write_bytes(image)
+    entry = Entry(len(image), 1000, file_hash(image), hashes)
+    shards = (entry, *manifest.shards[1:])
+    write_manifest(folder, Manifest(manifest.settings, manifest.versions, shards))
 
 
 def spoil(name, place, value):
@@ -414,8 +492,8 @@ def spoil(name, place, value):
         (spoil("step", 5, 6), "the rows' step"),
         (spoil("reward", 5, 0.123), "returns are not"),
         (spoil("episodes/seed", 0, 5), "seeds are not"),
-        (spoil("episodes/length", 0, 999), "lengths of the episodes don't add up to 1,000 rows"),
-        (spoil("episodes/length", 0, -1), "lengths of the episodes don't add up to 1,000 rows"),
+        (spoil("episodes/length", 0, 999), "lengths of its episodes don't add up to 1,000 rows"),
+        (spoil("episodes/length", 0, -1), "lengths of its episodes don't add up to 1,000 rows"),
         (spoil("episodes/episode", 0, 7), "episode numbers"),
         (spoil("episodes/diverged", 0, 1), "diverged"),
         (spoil("episodes/return", 0, 1), "returns"),
@@ -424,21 +502,11 @@ def spoil(name, place, value):
         (spoil("episodes/target_position", (0, 0), 0.5), "target positions"),
     ],
 )
-def test_verify_finds_numbers_that_can_t_be(change, message, copied, collected):
-    """Written as a collector with a fault would write them, hashes and all."""
-    manifest = read_manifest(copied)
-    with h5py.File(collected / shard_name(0)) as file:
-        columns = {name: file[name][:] for name in manifest.settings.specs()}
-    change(columns)
-    hashes = column_hashes(columns)
-    image = shard_image(columns, hashes, manifest.attributes(0, 1000))
-    (copied / shard_name(0)).write_bytes(image)
-    entry = Entry(len(image), 1000, file_hash(image), hashes)
-    shards = (entry, *manifest.shards[1:])
-    write_manifest(copied, Manifest(manifest.settings, manifest.versions, shards))
+def test_verify_finds_numbers_that_can_t_be(change, message, copied):
+    forge(copied, change)
     problems = list(find_problems(copied))
     assert problems
-    assert all("shard-00000.h5: " in problem for problem in problems)
+    assert all("shard-00000.h5" in problem for problem in problems)
     assert any(re.search(message, problem) for problem in problems), problems
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small import settings, write_again
 
-from jbrep.collect import write_shards
+from jbrep.collect import collect, write_shards
 from jbrep.dataset import Dataset, Scaler, manifest, reader
 from jbrep.dataset.card import card
 from jbrep.dataset.columns import Column
@@ -73,6 +73,13 @@ def test_a_column_as_an_array(column, parts):
     np.testing.assert_array_equal(np.concatenate(list(column.chunks(3))), whole)
     assert np.asarray(column, dtype=np.float32).dtype == np.float32
     np.testing.assert_array_equal(column[[2, 1]], whole[[2, 1]])
+    for dtype in (np.uint8, np.int8, np.int64):
+        np.testing.assert_array_equal(column[np.array([2, 1], dtype)], whole[[2, 1]])
+    assert column[()].shape == whole[()].shape == (12, 3)
+    with pytest.raises(IndexError, match="only the first axis takes an array"):
+        column[[0, 1], [0, 1]]
+    with pytest.raises(IndexError, match="a slice or a mask are needed"):
+        column["motor"]
     for key in (12, -13, [3, 12]):
         with pytest.raises(IndexError, match="there are 12"):
             column[key]
@@ -97,6 +104,36 @@ def test_features_and_observables_by_name(dataset):
     assert dataset["motor_velocity"][[3, 4999]].shape == (2,)
     with pytest.raises(InputError, match="no column, observable or feature 'speed': choose one of"):
         dataset["speed"]
+
+
+def test_an_array_of_a_column_is_the_reader_s_own(dataset, collected, tmp_path):
+    collect(settings(steps=1000), tmp_path / "one")
+    for data in (dataset, Dataset(tmp_path / "one")):
+        values = np.array(data["reward"])
+        assert values.flags.writeable
+        assert isinstance(data["reward"][5], np.float32)
+
+
+def test_a_shard_is_read_through_once_however_often_it_is_opened(collected, monkeypatch):
+    hashed = []
+
+    def count(content):
+        hashed.append(len(content))
+        return file_hash(content)
+
+    file_hash = manifest.file_hash
+    monkeypatch.setattr(manifest, "file_hash", count)
+    monkeypatch.setattr(reader, "_OPEN_SHARDS", 2)
+    data = Dataset(collected)
+    for _ in range(3):
+        data["reward"][::500]
+    assert len(hashed) == 5
+
+
+def test_batches_that_can_t_be_are_refused(dataset):
+    for wrong in ({"size": 0}, {"seed": -1}):
+        with pytest.raises(InputError, match="at least 1 and 0 are needed"):
+            dataset.batches(**wrong)
 
 
 def test_another_process_opens_it_anew(dataset):

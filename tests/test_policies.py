@@ -83,6 +83,7 @@ def test_policies_as_people_write_them(text, policy):
         ("sprint", "unknown policy 'sprint': choose one of uniform, heuristic"),
         ("constant:speed=1", "no constant 'speed': it has drive"),
         ("uniform:low=0", "no constant 'low': it has none"),
+        ("constant:kind=heuristic", "no constant 'kind'"),
         ("constant:drive", "drive is '', a number is expected"),
         ("constant:drive=fast", "drive is 'fast', a number is expected"),
         ("constant:drive=2", r"must be in \[-1, 1\]"),

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jbrep.errors import InputError
+
 Array = NDArray[Any]
 
 _CHUNK = 1 << 16  # rows at a time where all are looked at
@@ -43,8 +45,10 @@ class Column:
 
     def __getitem__(self, rows: int | slice | ArrayLike | tuple[Any, ...]) -> Array:
         if isinstance(rows, tuple):
-            first, *others = rows
-            before = () if isinstance(first, int | np.integer) else (slice(None),)
+            first, *others = rows or (slice(None),)
+            if any(np.ndim(other) for other in others if not isinstance(other, slice)):
+                raise IndexError("only the first axis takes an array: index its result again")
+            before = () if np.ndim(first) == 0 and not isinstance(first, slice) else (slice(None),)
             return self[first][(*before, *others)]
         if isinstance(rows, slice):
             return self._slice(*rows.indices(len(self)))
@@ -53,16 +57,18 @@ class Column:
             if numbers.shape != (len(self),):
                 raise IndexError(f"a mask of shape {numbers.shape}: {(len(self),)} is needed")
             numbers = numbers.nonzero()[0]
-        if numbers.size == 0:
-            numbers = numbers.astype(np.int64)
-        elif numbers.min() < -len(self) or numbers.max() >= len(self):
+        if numbers.size and numbers.dtype.kind not in "iu":
+            raise IndexError(f"rows of type {numbers.dtype}: numbers, a slice or a mask are needed")
+        numbers = numbers.astype(np.int64)
+        if numbers.size and (numbers.min() < -len(self) or numbers.max() >= len(self)):
             raise IndexError(f"rows from {numbers.min()} to {numbers.max()}: there are {len(self)}")
         return self._take(np.where(numbers < 0, numbers + len(self), numbers))
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         if copy is False:
             raise ValueError("a column over shards is copied when made an array")
-        return self[:].astype(dtype or self.dtype, copy=False)
+        values = self[:]
+        return values.astype(dtype or self.dtype, copy=not values.flags.owndata)
 
     def __iter__(self) -> Iterator[Array]:
         for chunk in self.chunks():
@@ -102,7 +108,7 @@ class Column:
             where = order[bounds[shard] : bounds[shard + 1]]
             part = self._part(int(shard))
             taken[where] = part[flat[where] - (self._ends[shard] - len(part))]
-        return taken.reshape((*rows.shape, *self.shape[1:]))
+        return taken.reshape((*rows.shape, *self.shape[1:]))[()]
 
 
 @dataclass(frozen=True)
@@ -160,6 +166,8 @@ class Batches:
     def __init__(
         self, columns: dict[str, Column], rows: NDArray[np.int64], size: int, seed: int, memory: int
     ):
+        if size < 1 or seed < 0:
+            raise InputError(f"batches of {size} with seed {seed}: at least 1 and 0 are needed")
         self._columns = columns
         self._rows = rows
         self._size = size
@@ -194,7 +202,7 @@ class Batches:
 
     def _from_runs(self, random: np.random.Generator) -> Iterator[dict[str, Array]]:
         starts = random.permutation(np.arange(0, len(self._rows), self._RUN))
-        together = max(1, self._fitting // self._RUN)
+        together = max(1, self._fitting // (3 * self._RUN))  # old, new, and new while it is made
         left = self._rows[:0]
         for group in range(0, len(starts), together):
             runs = [self._rows[s : s + self._RUN] for s in starts[group : group + together]]

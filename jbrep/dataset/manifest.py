@@ -3,8 +3,9 @@
 import hashlib
 import json
 import operator
+import re
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from jbrep.dataset.shard import (
     column_hashes,
     file_hash,
     map_file,
+    read_regular,
     shard_image,
 )
 from jbrep.dataset.storage import write_whole
@@ -32,10 +34,13 @@ from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import EPISODE_STEPS, Task, get_task
 
 MANIFEST = "manifest.json"
+BACKUP = "manifest.backup.json"
 _PACKAGES = ("jbrep", "mujoco", "numpy", "h5py")
 _HASH = "sha256"  # of all else in the manifest
 _MAX_STEPS = 10**12  # episodes have 32-bit numbers
-_MAX_BYTES = 1 << 28  # of a manifest: 200,000 shards
+_MAX_BYTES = 1 << 25  # of a manifest; a shard takes 1.5 kB of it
+_MAX_SHARDS = 10_000
+_MAX_SHARD_EPISODES = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,13 +62,19 @@ class Settings:
             TypeError: a value of another type.
         """
         get_task(self.task)
-        for count, what in ((self.steps, "steps"), (self.shard_episodes, "episodes in a shard")):
-            if not 1 <= operator.index(count) <= _MAX_STEPS:
-                raise InputError(
-                    f"the number of {what} is {count}: it must be from 1 to {_MAX_STEPS:,}"
-                )
         check_root_seed(operator.index(self.seed))
-        if not isinstance(self.policy["kind"], str):
+        for count, most, what in (
+            (self.steps, _MAX_STEPS, "steps"),
+            (self.shard_episodes, _MAX_SHARD_EPISODES, "episodes in a shard"),
+        ):
+            if not 1 <= operator.index(count) <= most:
+                raise InputError(f"the number of {what} is {count}: it must be from 1 to {most:,}")
+        if self.num_shards > _MAX_SHARDS:
+            raise InputError(
+                f"{self.num_shards:,} shards are more than {_MAX_SHARDS:,}: put more than "
+                f"{self.shard_episodes} episodes in a shard"
+            )
+        if type(self.store_state) is not bool or not _is_policy(self.policy):
             raise TypeError
 
     @property
@@ -131,7 +142,7 @@ class Manifest:
         return {n: episodes if n.startswith(EPISODES) else rows for n in self.settings.specs()}
 
     def attributes(self, shard: int, rows: int) -> dict[str, Any]:
-        """What a shard's file says of itself, enough to make the manifest again."""
+        """What a shard's file says of itself."""
         return {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
@@ -145,19 +156,13 @@ class Manifest:
             "versions": json.dumps(self.versions),
         }
 
-    @classmethod
-    def from_attributes(cls, attributes: Mapping[str, Any]) -> "Manifest":
-        """The manifest, still without shards, that the attributes of a shard were made from.
 
-        Raises:
-            KeyError, TypeError, ValueError: they weren't made from one.
-        """
-        own = {known.name: attributes[known.name] for known in fields(Settings)}
-        own["policy"] = json.loads(own["policy"])
-        own["store_state"] = bool(own["store_state"])
-        manifest = cls(Settings(**own), json.loads(attributes["versions"]))
-        manifest.settings.check()
-        return manifest
+def _is_policy(settings: Mapping[str, Any]) -> bool:
+    """A kind, which is a word, and numbers."""
+    constants = {name: value for name, value in settings.items() if name != "kind"}
+    return re.fullmatch("[a-z-]+", settings["kind"]) is not None and all(
+        type(value) in (int, float) and abs(value) < _MAX_STEPS for value in constants.values()
+    )
 
 
 def shard_name(shard: int) -> str:
@@ -172,20 +177,23 @@ def new_manifest(settings: Settings) -> Manifest:
     return Manifest(settings, {name: version(name) for name in _PACKAGES})
 
 
-def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a data set, checked to the last bit.
+def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
+    """The manifest of a data set, or its backup, checked to the last bit.
 
     Raises:
         InputError: no data set there, or one that a newer jbrep wrote.
         DamageError: not what jbrep wrote.
     """
-    path = folder / MANIFEST
+    path = folder / name
     try:
-        status = path.stat()
-        raw = path.read_bytes() if status.st_size <= _MAX_BYTES else b""
-    except (FileNotFoundError, NotADirectoryError):
-        if any(folder.glob("shard-*.h5")):
+        raw = read_regular(path, _MAX_BYTES)
+    except FileNotFoundError:
+        if (folder / BACKUP).exists() or any(hdf5_files(folder)):
             raise DamageError(f"{path} is missing: {MEND}") from None
+        raise InputError(
+            f"no data set in {folder}: a folder that jbrep collect wrote is expected"
+        ) from None
+    except NotADirectoryError:
         raise InputError(
             f"no data set in {folder}: a folder that jbrep collect wrote is expected"
         ) from None
@@ -225,23 +233,41 @@ def _parse(record: dict[str, Any]) -> Manifest:
         most = EPISODE_STEPS * len(settings.shard_range(shard))
         if operator.index(entry.bytes) < 0 or not 0 <= operator.index(entry.rows) <= most:
             raise ValueError
-    versions = {str(package): str(number) for package, number in record["versions"].items()}
+    versions = record["versions"]
+    if set(versions) != set(_PACKAGES):
+        raise ValueError
+    if not all(re.fullmatch(r"[\w.+!-]+", number, re.ASCII) for number in versions.values()):
+        raise ValueError
     return Manifest(settings, versions, shards)
 
 
-def open_shard(folder: Path, manifest: Manifest, shard: int) -> Shard:
+def open_shard(
+    folder: Path, manifest: Manifest, shard: int, known: set[tuple[int, ...]] | None = None
+) -> Shard:
     """A shard's columns, once its bytes are found to be those committed.
+
+    Args:
+        folder: of the data set.
+        manifest: which bytes they are.
+        shard: its number.
+        known: marks of files that were found so before, to be added to: while a file stays the
+            same one, it isn't read through again.
 
     Raises:
         DamageError: they aren't, or it is missing.
     """
     path, entry = folder / shard_name(shard), manifest.shards[shard]
     content = map_file(path)
-    if len(content) != entry.bytes or file_hash(content) != entry.xxh3:
-        raise DamageError(
-            f"{path} is damaged: {len(content):,} bytes that aren't the {entry.bytes:,} that were "
-            f"committed; {MEND}"
-        )
+    status = path.stat()
+    mark = (shard, status.st_ino, status.st_size, status.st_mtime_ns)
+    if known is None or mark not in known:
+        if len(content) != entry.bytes or file_hash(content) != entry.xxh3:
+            raise DamageError(
+                f"{path} is damaged: {len(content):,} bytes that aren't the {entry.bytes:,} that "
+                f"were committed; {MEND}"
+            )
+        if known is not None:
+            known.add(mark)
     return Shard(path, content, manifest.settings.specs(), manifest.row_counts(shard, entry.rows))
 
 
@@ -250,7 +276,10 @@ def hdf5_files(folder: Path) -> list[Path]:
 
     Then whatever a collector commits in between is in the manifest at least.
     """
-    return sorted(folder.glob("*.h5"))
+    try:
+        return sorted(folder.glob("*.h5"))
+    except OSError:
+        return []  # the manifest can't be read either
 
 
 def check_files(folder: Path, manifest: Manifest, files: list[Path]) -> None:
@@ -315,10 +344,11 @@ def write_shard(folder: Path, manifest: Manifest, shard: int, columns: Columns) 
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Put the manifest in place of the one before.
+    """Put the manifest in place of the one before, and its backup, which is written first.
 
     Raises:
         InputError: it can't be written.
     """
     record = {"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(manifest)}
-    write_whole(folder / MANIFEST, _text(record))
+    for name in (BACKUP, MANIFEST):
+        write_whole(folder / name, _text(record))

@@ -53,12 +53,13 @@ class Dataset:
         self.manifest = read_manifest(self.folder)
         check_files(self.folder, self.manifest, files)
         self.task = self.manifest.task
+        self._known: set[tuple[int, ...]] = set()
         self._shard = lru_cache(_OPEN_SHARDS)(self._open)
         self._ends = list(accumulate(entry.rows for entry in self.manifest.shards))
         self._specs = step_specs(self.task, self.manifest.settings.store_state)
 
     def _open(self, shard: int) -> Shard:
-        return open_shard(self.folder, self.manifest, shard)
+        return open_shard(self.folder, self.manifest, shard, self._known)
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0

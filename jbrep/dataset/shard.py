@@ -4,7 +4,7 @@ import hashlib
 import math
 import mmap
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,9 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from jbrep.dataset.schema import Columns, Spec
+from jbrep.dataset.schema import EPISODES, Columns, Spec
 from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import EPISODE_STEPS
 
 MEND = "jbrep data repair makes it again"
 _HASH = "sha256"  # attribute of every column
@@ -52,6 +53,18 @@ def shard_image(
         return file.id.get_file_image()
 
 
+def read_regular(path: Path, most: int) -> bytes:
+    """A file's bytes; none of something else than a file, or of one that is larger.
+
+    Raises:
+        OSError: it can't be read.
+    """
+    status = path.lstat()
+    if not stat.S_ISREG(status.st_mode) or status.st_size > most:
+        return b""
+    return path.read_bytes()
+
+
 def map_file(path: Path) -> mmap.mmap:
     """A file's bytes as they are on disk.
 
@@ -69,36 +82,6 @@ def map_file(path: Path) -> mmap.mmap:
         raise DamageError(f"{path} is missing: {MEND}") from None
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror}") from error
-
-
-def stored_attributes(path: Path) -> dict[str, Any]:
-    """What a shard says of itself: whole numbers, texts and lists of texts.
-
-    Raises:
-        DamageError: it can't be read.
-    """
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            return {name: _plain(value) for name, value in file.attrs.items()}
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
-        raise DamageError(f"{path} is damaged: its attributes can't be read") from error
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
-
-
-def stored_hashes(path: Path, names: Iterable[str]) -> dict[str, str]:
-    """The hashes that the columns of a shard carry.
-
-    Raises:
-        DamageError: they can't be read.
-    """
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            return {name: str(file[name].attrs[_HASH]) for name in names}
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
-        raise DamageError(f"{path} is damaged: its hashes can't be read") from error
 
 
 class Shard(Mapping[str, NDArray[Any]]):
@@ -143,9 +126,17 @@ class Shard(Mapping[str, NDArray[Any]]):
             count = math.prod(shape)
             if offset + count * spec.dtype.itemsize > len(self._content):
                 raise self._damage(f"{name} goes beyond its end")
-            view = np.frombuffer(self._content, spec.dtype, count, offset)
-            self._views[name] = view.reshape(shape)
+            view = np.frombuffer(self._content, spec.dtype, count, offset).reshape(shape)
+            if name == EPISODES + "length":
+                self._check_lengths(view)
+            self._views[name] = view
         return self._views[name]
+
+    def _check_lengths(self, lengths: NDArray[Any]) -> None:
+        """Rows are found by them."""
+        rows = self._rows["step"]
+        if lengths.min() < 0 or lengths.max() > EPISODE_STEPS or lengths.sum() != rows:
+            raise self._damage(f"the lengths of its episodes don't add up to {rows:,} rows")
 
     def _damage(self, what: str) -> DamageError:
         return DamageError(f"{self._path} is damaged: {what}")

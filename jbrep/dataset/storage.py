@@ -1,6 +1,7 @@
 """Files that are there whole or not at all."""
 
 import os
+import shutil
 from contextlib import suppress
 from pathlib import Path
 
@@ -17,7 +18,8 @@ def write_whole(path: Path, content: bytes) -> None:
     """
     partial = path.with_name(path.name + _PARTIAL)
     try:
-        with partial.open("wb") as file:
+        partial.unlink(missing_ok=True)
+        with partial.open("xb") as file:  # never through a link that stands there
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -41,3 +43,16 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def check_space(folder: Path, needed: int) -> None:
+    """Make sure that so many bytes are free.
+
+    Raises:
+        InputError: they aren't.
+    """
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise InputError(
+            f"no space in {folder}: about {needed:,} bytes are needed, {free:,} are free"
+        )

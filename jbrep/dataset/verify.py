@@ -1,6 +1,7 @@
 """Is a data set what it says it is? Hashes, shapes, numbers, ranges, and the physics itself."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from jbrep.dataset.manifest import (
+    BACKUP,
     Manifest,
     file_problems,
     hdf5_files,
@@ -18,7 +20,7 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.schema import EPISODES, episode_returns, episode_seed
-from jbrep.dataset.shard import DamageError, column_hash
+from jbrep.dataset.shard import MEND, DamageError, column_hash
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import EPISODE_STEPS, Task
@@ -42,6 +44,7 @@ def find_problems(folder: Path) -> Iterator[str]:
         yield str(damage)
         return
     yield from file_problems(folder, manifest, files)
+    yield from _backup_problems(folder, manifest)
     for shard in tqdm(range(len(manifest.shards)), unit="shard", desc="verify", leave=False):
         path = folder / shard_name(shard)
         try:
@@ -54,6 +57,19 @@ def find_problems(folder: Path) -> Iterator[str]:
             yield f"{path}: {problem}"
         for problem in _content_problems(manifest, shard, columns):
             yield f"{path}: {problem}"
+
+
+def _backup_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
+    """The backup may be a shard ahead of the manifest of an unfinished data set, no more."""
+    try:
+        backup = read_manifest(folder, BACKUP)
+    except InputError as error:
+        yield str(error)
+        return
+    ahead = len(backup.shards) - len(manifest.shards)
+    known = replace(backup, shards=backup.shards[: len(manifest.shards)])
+    if known != manifest or ahead not in (0, 1):
+        yield f"{folder / BACKUP} is of another data set: {MEND}"
 
 
 def _hash_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
@@ -97,15 +113,12 @@ def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Itera
         "seeds": (own["seed"], np.array(seeds)),
         "diverged": (own["diverged"], lengths < EPISODE_STEPS),
     }
-    if lengths.min() < 0 or lengths.max() > EPISODE_STEPS or lengths.sum() != rows:
-        yield f"the lengths of the episodes don't add up to {rows:,} rows"
-    else:
-        first = np.cumsum(lengths) - lengths
-        checks |= {
-            "the rows' episode": (columns["episode"], np.repeat(numbers, lengths)),
-            "the rows' step": (columns["step"], np.arange(rows) - np.repeat(first, lengths)),
-            "returns": (own["return"], episode_returns(columns["reward"], lengths)),
-        }
+    first = np.cumsum(lengths) - lengths
+    checks |= {
+        "the rows' episode": (columns["episode"], np.repeat(numbers, lengths)),
+        "the rows' step": (columns["step"], np.arange(rows) - np.repeat(first, lengths)),
+        "returns": (own["return"], episode_returns(columns["reward"], lengths)),
+    }
     starts = [manifest.task.start(np.random.default_rng(seed)) for seed in seeds]
     checks |= {
         "initial orientations": (own["initial_qpos"][:, 3:7], [s.quaternion for s in starts]),
@@ -134,6 +147,8 @@ def replay(dataset: Dataset, episodes: int, num_threads: int | None = None) -> I
     total = len(dataset.episodes["episode"])
     if not 0 <= episodes <= total:
         raise InputError(f"{episodes} episodes can't be replayed: the data set has {total:,}")
+    if not len(dataset):
+        return
     chosen = np.sort(np.random.default_rng(0).permutation(total)[:episodes])
     with tqdm(total=episodes * EPISODE_STEPS, unit="step", unit_scale=True, leave=False) as bar:
         for start in range(0, episodes, _LANES):
