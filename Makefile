@@ -13,7 +13,7 @@ $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "jbrep needs Python 3.11 or newer: make PYTHON=python3.11 ..."; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[learn,render,dev]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[export,learn,render,dev]'
 	@touch $@
 
 demo: $(READY) ## the whole job in minutes: collect, encode, learn on the latent and on the full state
