@@ -61,17 +61,17 @@ def show(what: str, ratios: list[float], aim: str) -> None:
 
 
 @cache  # its process makes it once
-def dm_control_file() -> tuple[Any, h5py.File]:
+def dm_control_file(folder: Path) -> tuple[Any, h5py.File]:
     environment = jitterbug.load(TASK, seed=0)
-    file = h5py.File(Path(tempfile.mkdtemp()) / "loop.h5", "w")
+    file = h5py.File(folder / "loop.h5", "w")
     for name, width in (("observation", TASKS[TASK].size), ("action", 1), ("reward", 1)):
         file.create_dataset(name, (0, width), "f4", maxshape=(None, width), chunks=(1000, width))
     return environment, file
 
 
-def dm_control_loop() -> float:
+def dm_control_loop(folder: Path) -> float:
     """Control steps per second of one episode in a loop that appends it to an HDF5 file."""
-    environment, file = dm_control_file()
+    environment, file = dm_control_file(folder)
     random = np.random.default_rng(0)
 
     def episode() -> None:
@@ -121,7 +121,7 @@ def compare_collectors(folder: Path) -> None:
     rates: dict[str, list[float]] = {"jbrep": [], "bare": [], "loop": []}
     with ProcessPoolExecutor(1, get_context("spawn")) as elsewhere:  # it keeps MuJoCo's clock
         for k in range(ROUNDS):
-            rates["loop"].append(elsewhere.submit(dm_control_loop).result())
+            rates["loop"].append(elsewhere.submit(dm_control_loop, folder).result())
             rates["jbrep"].append(collected_rate(folder / f"collected-{k}"))
             rates["bare"].append(bare_rate())
     for name, values in rates.items():

@@ -187,10 +187,9 @@ def _simulate(
         tape.record_outcome(step, diverged)
         tick(n)
     tape.record_state(EPISODE_STEPS)
-    return tape.rows(episodes) | {
-        EPISODES + name: column
-        for name, column in (start | {"seed": np.array(seeds)} | tape.ends(episodes)).items()
-    }
+    rows = tape.rows(episodes)
+    ends = start | {"seed": np.array(seeds)} | tape.ends(episodes, rows["reward"])
+    return rows | {EPISODES + name: column for name, column in ends.items()}
 
 
 class _Tape:
@@ -237,13 +236,13 @@ class _Tape:
         }
         return rows | {name: a[:EPISODE_STEPS].swapaxes(0, 1)[kept] for name, a in steps.items()}
 
-    def ends(self, episodes: Array) -> dict[str, Array]:
-        """Columns by episode."""
+    def ends(self, episodes: Array, reward: Array) -> dict[str, Array]:
+        """Columns by episode; the reward is that of the rows."""
         lanes = np.arange(len(episodes))
         ends: dict[str, Array] = {
             "episode": episodes.astype(np.int32),
             "length": self._length,
-            "return": episode_returns(self.rows(episodes)["reward"], self._length),
+            "return": episode_returns(reward, self._length),
             "diverged": (self._length < EPISODE_STEPS).astype(np.uint8),
         }
         return ends | {f"final_{name}": a[self._length, lanes] for name, a in self._states.items()}

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from jbrep.collect import Tick, Written, check_counts, write_shards
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import new_manifest, open_shard
-from jbrep.dataset.schema import EPISODES, Columns, episode_returns, episode_seed
+from jbrep.dataset.schema import (
+    EPISODES,
+    Columns,
+    episode_columns,
+    episode_returns,
+    episode_seed,
+)
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import Task, get_task
@@ -92,7 +98,7 @@ def _observe_anew(
     num_threads: int | None,
 ) -> Columns:
     """The columns of a shard as another task has them."""
-    own = {n.removeprefix(EPISODES): c for n, c in columns.items() if n.startswith(EPISODES)}
+    own = episode_columns(columns)
     length = own["length"]
     starts = [task.start(np.random.default_rng(seed)) for seed in seeds]
     target = {

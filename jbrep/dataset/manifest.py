@@ -187,13 +187,9 @@ def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
     path = folder / name
     try:
         raw = read_regular(path, _MAX_BYTES)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         if (folder / BACKUP).exists() or any(hdf5_files(folder)):
             raise DamageError(f"{path} is missing: {MEND}") from None
-        raise InputError(
-            f"no data set in {folder}: a folder that jbrep collect wrote is expected"
-        ) from None
-    except NotADirectoryError:
         raise InputError(
             f"no data set in {folder}: a folder that jbrep collect wrote is expected"
         ) from None

@@ -74,6 +74,15 @@ def all_specs(task: Task, store_state: bool) -> dict[str, Spec]:
     return step_specs(task, store_state) | episode_specs(task, store_state)
 
 
+def episode_columns(columns: Columns) -> dict[str, NDArray[Any]]:
+    """Those of a shard's columns that have a row for each episode, by their names in the group."""
+    return {
+        name.removeprefix(EPISODES): column
+        for name, column in columns.items()
+        if name.startswith(EPISODES)
+    }
+
+
 def check_root_seed(seed: int) -> None:
     """Make sure that `episode_seed` can take it.
 

@@ -53,16 +53,19 @@ def shard_image(
         return file.id.get_file_image()
 
 
+def _regular_size(path: Path) -> int:
+    """Bytes of a file; 0 of a link, a pipe or anything else that isn't one."""
+    status = path.lstat()
+    return status.st_size if stat.S_ISREG(status.st_mode) else 0
+
+
 def read_regular(path: Path, most: int) -> bytes:
-    """A file's bytes; none of something else than a file, or of one that is larger.
+    """A file's bytes; none of something else than a file, or of one that is larger than `most`.
 
     Raises:
         OSError: it can't be read.
     """
-    status = path.lstat()
-    if not stat.S_ISREG(status.st_mode) or status.st_size > most:
-        return b""
-    return path.read_bytes()
+    return path.read_bytes() if 0 < _regular_size(path) <= most else b""
 
 
 def map_file(path: Path) -> mmap.mmap:
@@ -73,8 +76,7 @@ def map_file(path: Path) -> mmap.mmap:
         InputError: it can't be read.
     """
     try:
-        status = path.lstat()
-        if not stat.S_ISREG(status.st_mode) or not status.st_size:
+        if not _regular_size(path):
             raise DamageError(f"{path} is damaged: a regular file that isn't empty is expected")
         with path.open("rb") as file:
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

@@ -19,7 +19,7 @@ from jbrep.dataset.manifest import (
     shard_name,
 )
 from jbrep.dataset.reader import Dataset
-from jbrep.dataset.schema import EPISODES, episode_returns, episode_seed
+from jbrep.dataset.schema import EPISODES, episode_columns, episode_returns, episode_seed
 from jbrep.dataset.shard import MEND, DamageError, column_hash
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
@@ -104,23 +104,19 @@ def _range_problems(task: Task, columns: Columns) -> Iterator[str]:
 def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
     """Numbers, seeds, starts, lengths and returns fit the settings and each other."""
     settings, rows = manifest.settings, manifest.shards[shard].rows
-    own = {n.removeprefix(EPISODES): v for n, v in columns.items() if n.startswith(EPISODES)}
+    own = episode_columns(columns)
     numbers = np.array(settings.shard_range(shard))
     seeds = [episode_seed(settings.seed, int(number)) for number in numbers]
     lengths = own["length"]
+    first = np.cumsum(lengths) - lengths
+    starts = [manifest.task.start(np.random.default_rng(seed)) for seed in seeds]
     checks: dict[str, tuple[ArrayLike, ArrayLike]] = {
         "episode numbers": (own["episode"], numbers),
         "seeds": (own["seed"], np.array(seeds)),
         "diverged": (own["diverged"], lengths < EPISODE_STEPS),
-    }
-    first = np.cumsum(lengths) - lengths
-    checks |= {
         "the rows' episode": (columns["episode"], np.repeat(numbers, lengths)),
         "the rows' step": (columns["step"], np.arange(rows) - np.repeat(first, lengths)),
         "returns": (own["return"], episode_returns(columns["reward"], lengths)),
-    }
-    starts = [manifest.task.start(np.random.default_rng(seed)) for seed in seeds]
-    checks |= {
         "initial orientations": (own["initial_qpos"][:, 3:7], [s.quaternion for s in starts]),
         "target positions": (own["target_position"], [s.target_position for s in starts]),
         "target orientations": (own["target_quaternion"], [s.target_quaternion for s in starts]),
