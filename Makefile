@@ -20,8 +20,11 @@ demo: $(READY) ## the whole job in minutes: collect, encode, learn on the latent
 	rm -rf $(DEMO)
 	$(BIN)/jbrep collect --task face_direction --steps 20k --out $(DEMO)/data
 	$(BIN)/jbrep data info $(DEMO)/data
-	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 8 --epochs 60 --batch-size 128 --out $(DEMO)/dae-8.safetensors
-	$(BIN)/jbrep rl --task face_direction --steps 4k --encoder $(DEMO)/dae-8.safetensors --out $(DEMO)/runs/dae-8
+	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 12 8 4 --epochs 200 --batch-size 128 --out $(DEMO)/encoders
+	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 8 --architecture deep --epochs 40 --batch-size 128 --out $(DEMO)/encoders
+	$(BIN)/jbrep train-encoder --kind random --data $(DEMO)/data --latent 8 --out $(DEMO)/encoders
+	$(BIN)/jbrep evaluate --encoder $(addprefix $(DEMO)/encoders/,$(addsuffix .safetensors,dae-12 dae-8 dae-4 dae-deep-8 random-8)) --data $(DEMO)/data --out $(DEMO)/evaluation
+	$(BIN)/jbrep rl --task face_direction --steps 4k --encoder dae-8 --out $(DEMO)/runs/dae-8
 	$(BIN)/jbrep rl --task face_direction --steps 4k --out $(DEMO)/runs/full
 	$(BIN)/jbrep report $(DEMO)/runs
 
@@ -37,6 +40,7 @@ check: $(READY) ## lint, types, import direction
 bench: $(READY) ## speed as ratios in one run, and what the hand-written policies return
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/dataset.py
+	$(BIN)/python benchmarks/encoders.py
 	$(BIN)/python benchmarks/heuristics.py
 
 pictures: $(READY) ## the pictures in docs/, drawn anew

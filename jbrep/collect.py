@@ -23,7 +23,7 @@ from jbrep.dataset.manifest import (
     write_manifest,
 )
 from jbrep.dataset.schema import EPISODES, Columns, episode_returns, episode_seed
-from jbrep.dataset.storage import check_space
+from jbrep.dataset.storage import check_space, make_folder
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
@@ -87,10 +87,7 @@ def write_shards(settings: Settings, folder: Path, make: Callable[[int, Tick], C
     """
     settings.check()
     began = time.monotonic()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"can't make the folder {folder}: {error.strerror}") from None
+    make_folder(folder)
     with exclusive(folder):
         manifest = _begin(settings, folder)
         rows = sum(entry.rows for entry in manifest.shards)

@@ -14,7 +14,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from jbrep.encoders import Encoder
+from jbrep.dataset.storage import make_folder
+from jbrep.encoders import find
 from jbrep.envs.sb3 import JitterbugVecEnv
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import get_task
@@ -36,7 +37,7 @@ class Run:
 
     task: str
     algorithm: str = "sac"
-    encoder: str | None = None  # a file, or None for the full observation
+    encoder: str | None = None  # a file, a name that ships, or None for the full observation
     steps: int = 10_000
     seed: int = 0
 
@@ -57,15 +58,12 @@ def train(run: Run, folder: Path) -> dict[str, Any]:
         raise InputError(f"unknown algorithm {run.algorithm!r}: choose one of {choices}")
     if (folder / "run.json").exists():
         raise InputError(f"{folder} holds a finished run already: choose another folder")
-    encoder = None
-    if run.encoder:
-        encoder = Encoder.load(Path(run.encoder))
-        encoder.check_task(task.name, task.feature_names)
+    encoder = find(run.encoder, task.name) if run.encoder else None
 
     def make_env(num_envs: int, seed: int) -> VecEnv:
         return VecMonitor(JitterbugVecEnv(run.task, num_envs, seed, encoder))
 
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     agent = ALGORITHMS[run.algorithm](
         "MlpPolicy",
         make_env(1, run.seed),
@@ -83,7 +81,7 @@ def train(run: Run, folder: Path) -> dict[str, Any]:
     agent.save(folder / "policy.zip")
     result = {
         "run": asdict(run),
-        "representation": f"{encoder.header['kind']}-{encoder.latent_size}" if encoder else "full",
+        "representation": encoder.name if encoder else "full",
         "returns": np.asarray(returns).round(3).tolist(),
         "versions": {name: version(name) for name in ("jbrep", "mujoco", "stable-baselines3")},
     }

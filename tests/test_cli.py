@@ -11,8 +11,10 @@ from stable_baselines3 import SAC
 
 from jbrep.cli import main
 
-DATA = main.commands["data"]
-COMMANDS = sorted({*main.commands} - {"data"}) + [f"data {name}" for name in sorted(DATA.commands)]
+GROUPS = ("data", "encoder")
+COMMANDS = sorted({*main.commands} - {*GROUPS}) + [
+    f"{group} {name}" for group in GROUPS for name in sorted(main.commands[group].commands)
+]
 
 
 def jbrep(*arguments):
@@ -22,13 +24,28 @@ def jbrep(*arguments):
 
 
 def test_the_whole_pipeline(tmp_path):
-    data, encoder, runs = tmp_path / "data", tmp_path / "dae-8", tmp_path / "runs"
+    data, encoders, runs = tmp_path / "data", tmp_path / "encoders", tmp_path / "runs"
     assert (
         "2 episodes of face_direction"
         in jbrep("collect", "--task", "face_direction", "--steps", "2k", "--out", data).output
     )
-    trained = jbrep("train-dae", "--data", data, "--latent", 8, "--epochs", 2, "--out", encoder)
-    assert re.search(r"held-out mean squared error [\d.]+ over 1,000 rows", trained.output)
+    made = ("--data", data, "--latent", 8, 4, "--out", encoders)
+    told = jbrep("train-dae", *made, "--epochs", 2).stdout
+    assert re.search(
+        r"^dae-8: held-out mean squared error [\d.]+, .*dae-8.safetensors$", told, re.M
+    )
+    assert re.search(r"^dae-4: .*dae-4.safetensors$", told, re.M)
+    assert "dae-4.safetensors, complete already" in jbrep("train-dae", *made, "--epochs", 2).output
+    assert "pca-4: held-out mean" in jbrep("train-encoder", "--kind", "pca", *made).output
+    encoder = encoders / "dae-8.safetensors"
+    files = (encoder, encoders / "pca-4.safetensors")
+    told = jbrep("evaluate", "--encoder", *files, "--data", data, "--out", tmp_path / "judged")
+    for label in ("full", "dae-8", "pca-4", "judged/evaluation.json", "error_by_feature.png"):
+        assert label in told.output
+    assert (tmp_path / "judged" / "error_by_latent.png").exists()
+    assert "16 -> 8 tanh" in jbrep("encoder", "info", encoder).output
+    told = jbrep("encoder", "export", encoder, "--out", tmp_path / "it.onnx").output
+    assert f"onnxruntime.InferenceSession('{tmp_path / 'it.onnx'}')" in told
     for state, arguments in {"dae-8": ("--encoder", encoder), "full": ()}.items():
         settings = ("--task", "face_direction", "--steps", 200, "--seed", 1, *arguments)
         assert f"returns on {state}: " in jbrep("rl", *settings, "--out", runs / state).output
@@ -75,7 +92,35 @@ def test_every_command_has_help_with_an_example(command):
         ),
         (("rl", "--task", "fly", "--out", "x"), "choose one of move_from_origin"),
         (("rl", "--task", "face_direction", "--algorithm", "dqn", "--out", "x"), "ddpg, td3"),
-        (("rl", "--task", "face_direction", "--encoder", "x", "--out", "y"), "no encoder at x"),
+        (("train-dae", "--data", "none", "--out", "x"), "needs latent sizes: --latent 12 8 4, say"),
+        (
+            (
+                "train-encoder",
+                "--kind",
+                "pca",
+                "--data",
+                "x",
+                "--latent",
+                "8",
+                "--seed",
+                "1",
+                "--out",
+                "x",
+            ),
+            "pca takes no --seed: leave it out",
+        ),
+        (
+            ("train-encoder", "--kind", "vae", "--data", "x", "--out", "x"),
+            "unknown kind 'vae': choose one of identity",
+        ),
+        (
+            ("train-dae", "--data", "x", "--latent", "8", "--architecture", "wide", "--out", "x"),
+            "unknown architecture 'wide'",
+        ),
+        (("evaluate", "--encoder", "dae-8", "--data", "none"), "no data set in none"),
+        (("encoder", "info", "none"), "no encoder at none"),
+        (("encoder", "info", "dae-9", "--task", "face_direction"), "no encoder 'dae-9'"),
+        (("rl", "--task", "face_direction", "--encoder", "x", "--out", "y"), "no encoder 'x'"),
         (("report", "none"), "no finished run below none"),
         (("report",), "Missing argument 'FOLDER'. See jbrep report --help."),
         (("fly",), "No such command 'fly'. See jbrep --help."),
@@ -133,7 +178,8 @@ def test_steps_that_are_no_number_are_refused(text, tmp_path):
 
 def test_a_missing_extra_is_named(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "jbrep.dae", raising=False)
+    for name in [n for n in sys.modules if n.startswith(("jbrep.dae", "jbrep.fit"))]:
+        monkeypatch.delitem(sys.modules, name)
     result = jbrep("train-dae", "--data", tmp_path, "--latent", 8, "--out", tmp_path / "x")
     assert (result.exit_code, result.output) == (
         2,

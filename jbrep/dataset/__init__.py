@@ -3,6 +3,16 @@
 from jbrep.dataset.columns import Batches, Column, Scaler
 from jbrep.dataset.manifest import Settings
 from jbrep.dataset.reader import Dataset, Split
+from jbrep.dataset.scaled import ScaledDataset
 from jbrep.dataset.shard import DamageError
 
-__all__ = ["Batches", "Column", "DamageError", "Dataset", "Scaler", "Settings", "Split"]
+__all__ = [
+    "Batches",
+    "Column",
+    "DamageError",
+    "Dataset",
+    "ScaledDataset",
+    "Scaler",
+    "Settings",
+    "Split",
+]

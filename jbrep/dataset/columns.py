@@ -3,6 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -129,21 +130,25 @@ class Scaler:
             high = np.maximum(high, values.max(axis=0))
         return cls(low, high)
 
-    @property
-    def _half_width(self) -> Array:
-        return np.where(self.high > self.low, (self.high - self.low) / 2, 1)
+    @cached_property
+    def half_width(self) -> Array:
+        """What a feature is divided by, (d,); 1 for a constant one."""
+        half_width = (self.high - self.low) / 2
+        half_width[half_width == 0] = 1
+        return half_width
 
-    @property
-    def _centre(self) -> Array:
+    @cached_property
+    def centre(self) -> Array:
+        """What becomes 0, (d,)."""
         return (self.high + self.low) / 2
 
     def scale(self, values: Array) -> Array:
         """Physical units (n, d) to [-1, 1]; beyond it where the fitted rows didn't reach."""
-        return (values - self._centre) / self._half_width
+        return (values - self.centre) / self.half_width
 
     def unscale(self, scaled: Array) -> Array:
         """The inverse of `scale`."""
-        return scaled * self._half_width + self._centre
+        return scaled * self.half_width + self.centre
 
 
 class Batches:

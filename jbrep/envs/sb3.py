@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from jbrep.encoders import Encoder
 from jbrep.envs.episodes import Episodes
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import Array
@@ -24,28 +25,31 @@ class LatentEncoder(Protocol):
         """l, the length of a latent."""
 
     def __call__(self, observation: Float32, /) -> Float32:
-        """Scaled observations (n, d) to latents (n, l)."""
+        """Observations (n, d) in physical units to latents (n, l)."""
 
 
 class JitterbugVecEnv(VecEnv):
     """Many Jitterbugs for stable-baselines3, stepped together on MuJoCo's batch.
 
-    Observations are float32 and scaled by the nominal ranges; with an encoder, the agent sees
-    latents in their place, terminal ones too. Lane i takes seed `seed + i`.
+    Observations are float32 and scaled by the nominal ranges; with an encoder, which is given them
+    in physical units, the agent sees latents in their place, terminal ones too. Lane i takes seed
+    `seed + i`.
 
     Args:
         task: a key of `jbrep.jitterbug.tasks.TASKS`.
         num_envs: how many robots.
         seed: of the first lane.
-        encoder: scaled observations to latents; None leaves the full observation.
+        encoder: a `jbrep.encoders.Encoder`, or any function of float32 observations in physical
+            units with a `latent_size`; None leaves the full observation.
         num_threads: threads to step them on; None takes one for each core.
 
     When an episode ends, `infos[i]` holds `terminal_observation`, `TimeLimit.truncated` (always
     true: no state ends a task) and `non_finite` (whether the physics diverged).
 
     Raises:
-        InputError: unknown task, a number below 1, an encoder whose output has another size than
-            it says; actions of another shape than (num_envs, 1), or not finite.
+        InputError: unknown task, a number below 1, an encoder made for other features or whose
+            output has another size than it says; actions of another shape than (num_envs, 1), or
+            not finite.
     """
 
     render_mode = None
@@ -63,7 +67,9 @@ class JitterbugVecEnv(VecEnv):
         self._encoder = encoder
         self._size = encoder.latent_size if encoder else self.task.size
         self._actions: NDArray[np.floating[Any]] = np.zeros((num_envs, 1))
-        self._represent(np.zeros((num_envs, self.task.size)))  # an encoder may refuse this task
+        if isinstance(encoder, Encoder):
+            encoder.check_task(self.task)
+        self._represent(np.zeros((num_envs, self.task.size)))  # an encoder may refuse this shape
         super().__init__(
             num_envs,
             spaces.Box(-np.inf, np.inf, (self._size,), np.float32),
@@ -98,14 +104,13 @@ class JitterbugVecEnv(VecEnv):
         return self._represent(outcome.observation), reward, outcome.done, infos
 
     def _represent(self, observation: Array) -> Float32:
-        scaled = self.task.scale(observation).astype(np.float32)
         if self._encoder is None:
-            return scaled
-        latent = np.asarray(self._encoder(scaled), dtype=np.float32)
-        if latent.shape != (len(scaled), self._size):
+            return self.task.scale(observation).astype(np.float32)
+        latent = np.asarray(self._encoder(observation.astype(np.float32)), dtype=np.float32)
+        if latent.shape != (len(observation), self._size):
             raise InputError(
-                f"the encoder gave {latent.shape} for {len(scaled)} observations of "
-                f"{self.task.name}: its latent_size says ({len(scaled)}, {self._size})"
+                f"the encoder gave {latent.shape} for {len(observation)} observations of "
+                f"{self.task.name}: its latent_size says ({len(observation)}, {self._size})"
             )
         return latent
 

@@ -1,0 +1,112 @@
+"""Training and using encoders, side by side with what a user would do instead.
+
+python benchmarks/encoders.py; ratios are medians over rounds taken in turn, so that a machine that
+slows down slows both sides.
+"""
+
+import time
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn.functional import mse_loss
+from torch.utils.data import DataLoader, TensorDataset
+
+from jbrep.dae.gradient import Gradient
+from jbrep.dae.network import ARCHITECTURES, Autoencoder
+from jbrep.dae.training import NOISE, Trainer, Training
+from jbrep.encoders import find
+from jbrep.encoders.encoder import run
+
+ROWS = 4_000_000
+SIZE = 16
+LATENT = 8
+BATCH = 8192
+ROUNDS = 3
+STEPS = 200
+CALLS = 5_000
+
+
+def timed(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def show(what: str, values: list[float], aim: str = "") -> None:
+    low, median, high = np.percentile(values, (10, 50, 90))
+    print(f"{what:72} {median:8.4g}  [{low:.4g}, {high:.4g}]   {aim}", flush=True)
+
+
+def usual_epoch(rows: torch.Tensor) -> None:
+    """The loop of every tutorial."""
+    network = Autoencoder(ARCHITECTURES["paper"], SIZE, LATENT, seed=0)
+    optimiser = torch.optim.Adam(network.parameters(), 5e-4)
+    for (clean,) in DataLoader(TensorDataset(rows), BATCH, shuffle=True):
+        optimiser.zero_grad()
+        mse_loss(network(clean + NOISE * torch.randn_like(clean)), clean).backward()
+        optimiser.step()
+
+
+def our_epoch(rows: torch.Tensor) -> None:
+    next(Trainer(Training.of(LATENT), rows, rows[:1]).epochs())
+
+
+def compare_epochs() -> None:
+    devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    for device in devices:
+        rows = torch.empty(ROWS, SIZE, device=device).uniform_(-1, 1)
+        ours, usual = [], []
+        for _ in range(ROUNDS):
+            ours.append(timed(partial(our_epoch, rows)))
+            usual.append(timed(partial(usual_epoch, rows)))
+        ratios = [theirs / mine for theirs, mine in zip(usual, ours, strict=True)]
+        show(f"epoch of {ROWS:,} rows, {device}: DataLoader's time / ours", ratios, "aim 15")
+        show(f"rows per second, {device}, ours", [ROWS / seconds for seconds in ours])
+
+
+def compare_gradients() -> None:
+    for name, architecture in ARCHITECTURES.items():
+        network = Autoencoder(architecture, SIZE, LATENT, seed=0)
+        gradient = Gradient((*network.encoder, *network.decoder), BATCH)
+        rows = torch.empty(BATCH, SIZE).uniform_(-1, 1)
+        columns = rows.T.contiguous()
+
+        def autograd(network: nn.Module = network, rows: torch.Tensor = rows) -> None:
+            network.zero_grad()
+            mse_loss(network(rows), rows).backward()
+
+        written_out = partial(gradient, columns, columns)
+        ratios = []
+        for _ in range(2 * ROUNDS):
+            theirs = timed(lambda work=autograd: [work() for _ in range(STEPS // 4)])
+            mine = timed(lambda work=written_out: [work() for _ in range(STEPS // 4)])
+            ratios.append(theirs / mine)
+        show(f"gradient of {name}, a batch of {BATCH}, one thread: autograd's time / ours", ratios)
+
+
+def compare_one_row() -> None:
+    """What encode costs on one row beyond its own arithmetic."""
+    encoder = find("dae-8", "face_direction")
+    row = np.zeros((1, SIZE), np.float32)
+    parts = {"NumPy": row, "torch": torch.from_numpy(row)}
+    for library, values in parts.items():
+        _, there = encoder._prepare(values, SIZE, "observations")
+
+        def bare(values: object = values, there: object = there) -> object:
+            return run(there.encoder, (values - there.centre) / there.half_width)
+
+        over = []
+        for _ in range(2 * ROUNDS):
+            whole = timed(lambda v=values: [encoder.encode(v) for _ in range(CALLS)])
+            over.append((whole - timed(lambda work=bare: [work() for _ in range(CALLS)])) / CALLS)
+        show(f"encode, one row, {library}: overhead [us]", [1e6 * s for s in over], "aim below 50")
+
+
+if __name__ == "__main__":
+    compare_epochs()  # on as many threads as each takes
+    torch.set_num_threads(1)
+    compare_gradients()
+    compare_one_row()

@@ -1,0 +1,18 @@
+"""The command line: parse, call one function, print."""
+
+import click
+
+from jbrep.cli.base import Cli
+from jbrep.cli.data import collect, data
+from jbrep.cli.encoders import encoder, evaluate, train_dae, train_encoder
+from jbrep.cli.runs import report, rl
+
+
+@click.group(cls=Cli, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="jbrep")
+def main() -> None:
+    """Reduced-order representations of the Jitterbug, and what they do to learning."""
+
+
+for _command in (collect, data, train_dae, train_encoder, evaluate, encoder, rl, report):
+    main.add_command(_command)

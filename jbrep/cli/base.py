@@ -1,0 +1,96 @@
+"""What the commands share: mistakes, Ctrl-C, numbers as people write them."""
+
+import math
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+import click
+
+from jbrep.errors import InputError
+
+_EXTRAS = {  # what a missing package is installed with
+    **dict.fromkeys(("torch", "stable_baselines3", "safetensors", "rich"), "learn"),
+    **dict.fromkeys(("matplotlib", "skdim", "sklearn", "tensorboard"), "learn"),
+    **dict.fromkeys(("minari", "onnx", "pyarrow"), "export"),
+}
+
+
+class _Count(click.ParamType[int]):
+    """A whole number as people write it: 5000000, 5_000_000, 5e6, 5M, 5k."""
+
+    name = "number"
+
+    def convert(
+        self, value: str | int, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int:
+        text = str(value).replace("_", "").lower()
+        factor = {"k": 1_000, "m": 1_000_000}.get(text[-1:], 1)
+        try:
+            number = float(text[:-1] if factor > 1 else text) * factor
+        except ValueError:
+            number = math.nan
+        if not number.is_integer():
+            self.fail(f"{value!r} is no whole number: write it as 5000000, 5_000_000, 5e6 or 5M")
+        return int(number)
+
+
+COUNT = _Count()
+GOES_ON = "the same command goes on where it stopped"
+
+
+class _Mistake(click.ClickException):
+    exit_code = 2
+
+    def __init__(self, message: str):
+        super().__init__(printable(message))
+
+
+def printable(line: str) -> str:
+    """One line that can't steer a terminal, whatever a file's name holds."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+
+
+@contextmanager
+def stoppable(how_to_go_on: str) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the command between two steps, with a line on how to go on."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+
+    def stop(number: int, frame: FrameType | None) -> NoReturn:
+        raise SystemExit(128 + number)
+
+    before = [signal.signal(number, stop) for number in numbers]
+    try:
+        yield
+    except SystemExit:
+        click.echo(f"stopped; {how_to_go_on}", err=True)
+        raise
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+class Cli(click.Group):
+    """A user's mistake is one line and exit code 2; anything else shows its traceback."""
+
+    def invoke(self, ctx: click.Context) -> None:
+        """Run a command."""
+        try:
+            super().invoke(ctx)
+        except InputError as error:
+            raise _Mistake(str(error)) from None
+        except click.UsageError as error:
+            command = error.ctx.command_path if error.ctx else "jbrep"
+            raise _Mistake(f"{error.format_message()} See {command} --help.") from None
+        except ModuleNotFoundError as error:
+            if error.name not in _EXTRAS:
+                raise
+            extra = _EXTRAS[error.name]
+            raise _Mistake(f"this needs {error.name}: pip install 'jbrep[{extra}]'") from None
+
+
+def example(text: str) -> str:
+    """The end of a command's help."""
+    return f"Example: {text}"

@@ -1,0 +1,1 @@
+"""The denoising autoencoder: network, training, checkpoints."""

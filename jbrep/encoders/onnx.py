@@ -1,0 +1,87 @@
+"""Encoders as ONNX, for whatever runs that."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from jbrep.dataset.storage import write_whole
+from jbrep.encoders.encoder import Encoder, Layer
+from jbrep.errors import InputError
+
+_OPSET = 17
+_OPERATORS = {"relu": "Relu", "tanh": "Tanh", "linear": "Identity"}
+
+
+def export(encoder: Encoder, path: Path) -> None:
+    """Write encoder and decoder, with the scaling, as one model.
+
+    Its input is `observation`, (n, d) float32 in physical units; its outputs are `latent`, (n, l),
+    and `reconstruction`, (n, d) in physical units. The header stands in its metadata.
+
+    Raises:
+        InputError: the file is there already, or can't be written.
+    """
+    if path.exists():
+        raise InputError(f"{path} is there already: choose another file")
+    write_whole(path, model(encoder).SerializeToString(deterministic=True))
+
+
+def model(encoder: Encoder) -> onnx.ModelProto:
+    """The model, checked."""
+    graph = _Graph()
+    graph.constant("centre", encoder.scaler.centre)
+    graph.constant("half_width", encoder.scaler.half_width)
+    graph.node("Sub", ("observation", "centre"), "centred")
+    graph.node("Div", ("centred", "half_width"), "scaled")
+    graph.layers("encoder", encoder.encoder, "scaled", "latent")
+    graph.layers("decoder", encoder.decoder, "latent", "decoded")
+    graph.node("Mul", ("decoded", "half_width"), "widened")
+    graph.node("Add", ("widened", "centre"), "reconstruction")
+    sizes = {"latent": encoder.latent_size, "reconstruction": encoder.size}
+    made = helper.make_model(
+        helper.make_graph(
+            graph.nodes,
+            encoder.name,
+            [_rows("observation", encoder.size)],
+            [_rows(name, size) for name, size in sizes.items()],
+            graph.constants,
+        ),
+        opset_imports=[helper.make_opsetid("", _OPSET)],
+        ir_version=8,
+        producer_name="jbrep",
+    )
+    helper.set_model_props(made, {"jbrep": json.dumps(dict(encoder.header))})
+    onnx.checker.check_model(made, full_check=True)
+    return made
+
+
+def _rows(name: str, size: int) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, TensorProto.FLOAT, ("rows", size))
+
+
+class _Graph:
+    """Nodes and constants, as they come."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+
+    def constant(self, name: str, value: np.ndarray) -> str:
+        self.constants.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
+        return name
+
+    def node(self, operator: str, inputs: tuple[str, ...], output: str) -> str:
+        self.nodes.append(helper.make_node(operator, inputs, [output], output))
+        return output
+
+    def layers(self, part: str, layers: tuple[Layer, ...], value: str, output: str) -> None:
+        """Through all layers; the last gives the output."""
+        for i, layer in enumerate(layers):
+            names = f"{part}.{i}.weight", f"{part}.{i}.bias"
+            weight, bias = map(self.constant, names, (layer.weight.T, layer.bias))
+            dense = self.node("Gemm", (value, weight, bias), f"{part}.{i}.dense")
+            value = self.node(_OPERATORS[layer.activation], (dense,), f"{part}.{i}")
+        self.node("Identity", (value,), output)

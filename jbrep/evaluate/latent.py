@@ -1,0 +1,72 @@
+"""What a latent looks like: its units, and how many dimensions it fills."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.encoders import Encoder
+from jbrep.evaluate.bootstrap import without_nan
+from jbrep.evaluate.held_out import HeldOut, some
+
+_ROWS = 200_000
+_POINTS = 5_000  # for intrinsic dimensions
+_SATURATED = 0.95  # of a tanh unit's magnitude
+_DEAD = 0.01  # standard deviation, of the liveliest unit's
+_NEIGHBOURS = 20  # of the maximum-likelihood estimator
+
+
+def latent(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
+    """Units, correlations and dimensions of the latent over held-out rows.
+
+    The participation ratio is (sum of the covariance's eigenvalues)^2 / sum of their squares.
+    """
+    values = encode(encoder, held_out, some(held_out.data.test, _ROWS)).astype(np.float64)
+    deviation = values.std(axis=0)
+    live = deviation > _DEAD * deviation.max()
+    spectrum = np.linalg.eigvalsh(np.atleast_2d(np.cov(values.T)))
+    return {
+        "mean": values.mean(axis=0).tolist(),
+        "variance": (deviation**2).tolist(),
+        "dead": np.flatnonzero(~live).tolist(),
+        "saturation": _saturation(encoder, values),
+        "correlation": _correlation(values, live),
+        "participation_ratio": float(spectrum.sum() ** 2 / np.square(spectrum).sum()),
+        "intrinsic_dimension": intrinsic_dimension(some(values, _POINTS)),
+    }
+
+
+def encode(encoder: Encoder, held_out: HeldOut, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Latents of those rows, (n, l)."""
+    return np.concatenate([encoder.encode(chunk) for chunk in held_out.data.observations(rows)])
+
+
+def _saturation(encoder: Encoder, values: NDArray[np.float64]) -> list[float] | None:
+    """The share of rows in which each tanh unit is near its end; None of a linear latent."""
+    if not encoder.encoder or encoder.encoder[-1].activation != "tanh":
+        return None
+    return (np.abs(values) > _SATURATED).mean(axis=0).tolist()
+
+
+def _correlation(values: NDArray[np.float64], live: NDArray[np.bool_]) -> list[list[float | None]]:
+    """Pearson's, (l, l); None with a dead unit."""
+    found = np.full((len(live), len(live)), np.nan)
+    found[np.ix_(live, live)] = np.corrcoef(values[:, live].T)
+    return without_nan(found.tolist())
+
+
+def intrinsic_dimension(values: NDArray[Any]) -> dict[str, float | None]:
+    """Estimates of how many dimensions points (n, k) fill locally, by scikit-dimension.
+
+    TwoNN (Facco et al. 2017) and the maximum likelihood of Levina and Bickel (2005). None where
+    there are too few different points.
+    """
+    from skdim.id import MLE, TwoNN  # not at the top: it takes seconds
+
+    points = np.unique(values, axis=0)
+    if len(points) <= 2 * _NEIGHBOURS:
+        return {"two_nn": None, "mle": None}
+    return {
+        "two_nn": float(TwoNN().fit(points).dimension_),
+        "mle": float(MLE(K=_NEIGHBOURS).fit(points).dimension_),
+    }

@@ -1,0 +1,133 @@
+"""What can be read from a latent: the robot's state, and what comes next."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.linear_model import Ridge
+from sklearn.neighbors import NearestNeighbors
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from jbrep.encoders import Encoder
+from jbrep.evaluate.bootstrap import Array, Interval, bootstrap, r_squared, variation
+from jbrep.evaluate.held_out import HeldOut, Rows, some
+from jbrep.evaluate.truth import quantities, state
+
+_ROWS = 100_000  # to fit on, and to judge on
+_CORRELATED = 50_000
+_QUERIES = 5_000
+_REFERENCES = 20_000
+_NEIGHBOURS = 5
+_PENALTY = 1.0  # of the ridge, on standardised latents
+
+
+def probes(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
+    """R^2 of a ridge regression of each quantity on the latent, fitted on training rows.
+
+    The cosine and sine of an angle count together.
+    """
+    data = held_out.data
+    train, test = some(data.train, _ROWS), some(data.test, _ROWS)
+    before, after = data.dataset["observation"][train], data.dataset["observation"][test]
+    wanted, true = (quantities(data.task, rows) for rows in (before, after))
+    latents, unseen = encoder.encode(before), encoder.encode(after)
+    found = {}
+    for name, values in wanted.items():
+        predicted = _ridge().fit(latents, values).predict(unseen)
+        found[name] = _explained(predicted, true[name], test, held_out).tolist()
+    return found
+
+
+def dynamics(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
+    """R^2 of the next latent: linear in latent and action, and taken to stay as it is.
+
+    Units count by their variance.
+    """
+    data = held_out.data
+    steps = []
+    for rows in (data.train, data.test):
+        chosen = held_out.followed(some(rows, _ROWS))
+        now, then = (encoder.encode(data.dataset["observation"][r]) for r in (chosen, chosen + 1))
+        steps.append((chosen, now, data.dataset["action"][chosen], then))
+    (_, *known), (test, now, action, then) = steps
+    predicted = _ridge().fit(np.hstack(known[:2]), known[2]).predict(np.hstack((now, action)))
+    return {
+        "linear": _explained(predicted, then, test, held_out).tolist(),
+        "persistence": _explained(now, then, test, held_out).tolist(),
+    }
+
+
+def _ridge() -> Any:
+    return make_pipeline(StandardScaler(), Ridge(_PENALTY))
+
+
+def neighbours(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
+    """How alike the states of nearest neighbours in the latent are (KNN-MSE).
+
+    The mean squared difference between a held-out row's state and those of its 5 nearest
+    neighbours, as in the S-RL Toolbox (Raffin et al. 2018), but of thousands of rows rather than
+    five, over the whole state with every dimension standardised, and with neighbours from training
+    episodes alone, never from the moments before and after. Unrelated rows have 2.
+    """
+    data = held_out.data
+    test, train = some(data.test, _QUERIES), some(data.train, _REFERENCES)
+    asked, known = (data.dataset["observation"][rows] for rows in (test, train))
+    wanted, true = (np.stack(list(state(data.task, o).values()), 1) for o in (asked, known))
+    scale = true.std(axis=0)
+    varying = scale > 0
+    index = NearestNeighbors(n_neighbors=min(_NEIGHBOURS, len(train))).fit(encoder.encode(known))
+    nearest = index.kneighbors(encoder.encode(asked), return_distance=False)
+    apart = (true[nearest] - wanted[:, None])[..., varying] / scale[varying]
+    sums, counts = held_out.sums(test, np.square(apart).mean(axis=1), np.ones((len(test), 1)))
+    by_name = bootstrap(lambda s, n: s / n, sums, counts).tolist()
+    names = [n for n, varies in zip(state(data.task, known[:1]), varying, strict=True) if varies]
+    return {
+        "mse": bootstrap(lambda s, n: s.mean(axis=-1) / n[..., 0], sums, counts).tolist(),
+        "dimensions": dict(zip(names, by_name, strict=True)),
+    }
+
+
+def correlation(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
+    """How directly units show the state: the ground-truth correlation (GTC).
+
+    For each dimension of the state, the largest absolute correlation with a unit of the latent; as
+    in the S-RL Toolbox, but the other dimensions of the state are no candidates.
+    """
+    data = held_out.data
+    test = some(data.test, _CORRELATED)
+    observation = data.dataset["observation"][test]
+    truth = state(data.task, observation)
+    left, right = encoder.encode(observation), np.stack(list(truth.values()), 1)
+    z, s = (np.asarray(v - v.mean(axis=0), np.float64) for v in (left, right))
+    products = (z[:, :, None] * s[:, None, :]).reshape(len(test), -1)
+    sums = held_out.sums(test, z, s, z**2, s**2, products, np.ones((len(test), 1)))
+
+    def largest(z: Array, s: Array, zz: Array, ss: Array, zs: Array, n: Array) -> Array:
+        spread_z, spread_s = variation(z, zz, n), variation(s, ss, n)
+        shared = zs.reshape(*z.shape, -1) - z[..., :, None] * s[..., None, :] / n[..., None]
+        rho = np.abs(shared) / np.sqrt(spread_z[..., :, None] * spread_s[..., None, :])
+        return np.nan_to_num(rho).max(axis=-2)
+
+    by_name = bootstrap(largest, *sums).tolist()
+    return {
+        "mean": bootstrap(lambda *sums: largest(*sums).mean(axis=-1), *sums).tolist(),
+        "dimensions": dict(zip(truth, by_name, strict=True)),
+    }
+
+
+def _explained(
+    predicted: NDArray[Any], true: NDArray[Any], rows: Rows, held_out: HeldOut
+) -> Interval:
+    """R^2 of all columns (n, k) together."""
+    true = np.asarray(true, np.float64)
+    predicted = predicted.reshape(true.shape)  # scikit-learn gives one column as (n,)
+    shifted = true - true.mean(axis=0)  # keeps the digits of a small variation
+    sums = held_out.sums(
+        rows, (predicted - true) ** 2, shifted, shifted**2, np.ones((len(rows), 1))
+    )
+
+    def statistic(residual: Array, total: Array, squares: Array, n: Array) -> Array:
+        return r_squared(residual.sum(axis=-1), variation(total, squares, n).sum(axis=-1))
+
+    return bootstrap(statistic, *sums)

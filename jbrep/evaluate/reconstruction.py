@@ -1,0 +1,130 @@
+"""What an encoder and its decoder lose, clean and corrupted."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.dataset import ScaledDataset
+from jbrep.encoders import Encoder
+from jbrep.encoders.controls import Layers, linear_denoiser, pca
+from jbrep.evaluate.bootstrap import Array, bootstrap, r_squared, variation
+from jbrep.evaluate.held_out import HeldOut, Rows, some
+
+NOISES = (0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # of features scaled to [-1, 1]
+_QUANTILES = (0.5, 0.9, 0.99, 0.999, 1)
+_CORRUPTED_ROWS = 100_000
+_WORST = 5
+
+
+def reconstruction(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
+    """Errors over all held-out rows, of features scaled to [-1, 1] and in physical units.
+
+    Beside them stands the error of PCA with as many components, fitted on the training part.
+    """
+    data = held_out.data
+    errors = _errors(encoder, data, data.test)
+    (sums,) = held_out.sums(data.test, errors)
+    return {
+        "mse": bootstrap(_mean, sums, held_out.row_counts).tolist(),
+        **_beside_pca(encoder.latent_size, sums, held_out),
+        "features": _by_feature(sums, held_out),
+        "quantiles": dict(
+            zip(
+                map(str, _QUANTILES),
+                np.quantile(errors.mean(axis=1), _QUANTILES).tolist(),
+                strict=True,
+            )
+        ),
+        "worst_episodes": _worst(sums, held_out),
+    }
+
+
+def corruption(encoder: Encoder, held_out: HeldOut) -> list[dict[str, Any]]:
+    """Errors of reconstructions of corrupted rows from clean ones, at each strength.
+
+    Beside them stand the corrupted rows' own error, and that of the linear denoiser of the same
+    latent size that is best at that strength.
+    """
+    data = held_out.data
+    rows = some(data.test, _CORRUPTED_ROWS)
+    (counts,) = held_out.sums(rows, np.ones((len(rows), 1)))
+    found = []
+    for noise in NOISES:
+        linear = _linear(data, linear_denoiser(encoder.latent_size, noise, data.moments))
+        ours, best = held_out.sums(
+            rows, *(_errors(each, data, rows, noise) for each in (encoder, linear))
+        )
+        found.append(
+            {
+                "noise": noise,
+                "mse": bootstrap(_mean, ours, counts).tolist(),
+                "input_mse": noise**2,
+                "linear_mse": bootstrap(_mean, best, counts).tolist(),
+            }
+        )
+    return found
+
+
+def _mean(squares: Array, rows: Array) -> Array:
+    """Over rows and features, of sums of squares (..., d)."""
+    return squares.mean(axis=-1) / rows[..., 0]
+
+
+def _errors(
+    encoder: Encoder, data: ScaledDataset, rows: Rows, noise: float = 0
+) -> NDArray[np.float32]:
+    """Squared errors of each feature, scaled, (n, d); the noise is the same for every encoder."""
+    width = data.scaler.half_width
+    random = np.random.default_rng(0)
+    found = []
+    for observation in data.observations(rows):
+        drawn = random.standard_normal(observation.shape, np.float32) if noise else 0
+        back = encoder.decode(encoder.encode(observation + noise * drawn * width))
+        found.append(np.square((back - observation) / width))
+    return np.concatenate(found)
+
+
+def _linear(data: ScaledDataset, layers: tuple[Layers, Layers]) -> Encoder:
+    return Encoder({"name": "linear"}, data.scaler, *layers)
+
+
+def _beside_pca(latent: int, sums: Array, held_out: HeldOut) -> dict[str, Any]:
+    data = held_out.data
+    reference = _linear(data, pca(data, latent))
+    (linear,) = held_out.sums(data.test, _errors(reference, data, data.test))
+    ratio = bootstrap(lambda ours, pca: ours.sum(axis=-1) / pca.sum(axis=-1), sums, linear)
+    return {
+        "pca_mse": bootstrap(_mean, linear, held_out.row_counts).tolist(),
+        "ratio_to_pca": ratio.tolist() if latent < data.task.size else None,
+    }
+
+
+def _by_feature(sums: Array, held_out: HeldOut) -> list[dict[str, Any]]:
+    data, rows = held_out.data, held_out.row_counts
+    total, squares = held_out.variation
+    width = data.scaler.half_width.astype(float)
+    mse = bootstrap(lambda e, n: e / n, sums, rows).tolist()
+    rmse = bootstrap(lambda e, n: np.sqrt(e / n) * width, sums, rows).tolist()
+    r2 = bootstrap(
+        lambda e, t, s, n: r_squared(e, variation(t, s, n)), sums, total, squares, rows
+    ).tolist()
+    return [
+        {"name": f.name, "unit": f.unit, "mse": mse[i], "rmse_physical": rmse[i], "r2": r2[i]}
+        for i, f in enumerate(data.task.features)
+    ]
+
+
+def _worst(sums: Array, held_out: HeldOut) -> list[dict[str, Any]]:
+    """The episodes with the largest mean error."""
+    errors = _mean(sums, np.maximum(held_out.row_counts, 1))
+    order = np.argsort(-errors, kind="stable")[:_WORST]
+    seeds = held_out.data.dataset.episodes["seed"]
+    return [
+        {
+            "episode": int(held_out.numbers[i]),
+            "seed": int(seeds[held_out.numbers[i]]),
+            "mse": float(errors[i]),
+        }
+        for i in order
+    ]

@@ -1,0 +1,87 @@
+"""An evaluation as tables to read on a screen."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from jbrep.evaluate.evaluation import FULL
+from jbrep.tables import table
+
+_NOISE = 0.1  # the corruption to show
+
+
+def summary(evaluation: dict[str, Any]) -> str:
+    """What is lost, and what the latent keeps, an encoder to a line."""
+    data = evaluation["data"]
+    return "\n".join(
+        (
+            f"Error on {data['test_episodes']:,} held-out episodes of {data['task']}, "
+            f"{data['test_rows']:,} rows; features scaled to [-1, 1], 95 % intervals over episodes",
+            "",
+            _losses(evaluation["encoders"]),
+            "",
+            "What the latent keeps: R^2 of linear probes; KNN-MSE (2: nothing); GTC (1: every "
+            "state dimension is a unit); R^2 of the next latent",
+            "",
+            _kept(evaluation["encoders"]),
+        )
+    )
+
+
+def _losses(encoders: dict[str, Any]) -> str:
+    header = ("encoder", "l", "error", "times PCA's", f"from noise {_NOISE}", "best linear")
+    rows = []
+    for label, found in encoders.items():
+        if label == FULL:
+            continue
+        lost = found["reconstruction"]
+        ratio = lost["ratio_to_pca"]
+        noisy = next(c for c in found["corruption"] if c["noise"] == _NOISE)
+        worst = min(lost["features"], key=lambda f: (f["r2"][0] is None, f["r2"][0]))
+        rows.append(
+            (
+                label,
+                str(found["latent"]),
+                interval(lost["mse"], ".5f"),
+                interval(ratio, ".3f") if ratio else "-",
+                number(noisy["mse"][0], ".5f"),
+                number(noisy["linear_mse"][0], ".5f"),
+                f"{worst['name']} {number(worst['r2'][0], '.2f')}",
+            )
+        )
+    return table((*header, "worst feature, R^2"), rows)
+
+
+def _kept(encoders: dict[str, Any]) -> str:
+    read = list(encoders[FULL]["probes"])
+    header = ("encoder", *(name.replace("_", " ") for name in read), "KNN", "GTC", "next")
+    rows = [
+        (
+            label,
+            *(number(found["probes"][name][0], ".2f") for name in read),
+            number(found["neighbours"]["mse"][0], ".2f"),
+            number(found["correlation"]["mean"][0], ".2f"),
+            number(found["dynamics"]["linear"][0], ".2f"),
+            *_shape(found["latent_units"]),
+        )
+        for label, found in encoders.items()
+    ]
+    return table((*header, "dead", "saturated", "participation", "dimension"), rows)
+
+
+def _shape(units: dict[str, Any]) -> Iterable[str]:
+    saturation = units["saturation"]
+    yield str(len(units["dead"]))
+    yield number(max(saturation), ".0%") if saturation else "-"
+    yield number(units["participation_ratio"], ".1f")
+    yield number(units["intrinsic_dimension"]["two_nn"], ".1f")
+
+
+def interval(values: list[float | None], form: str) -> str:
+    """A value with its interval, if it has one: 1.08 [1.07, 1.09]."""
+    value, low, high = (number(v, form) for v in values)
+    return value if values[1] is None else f"{value} [{low}, {high}]"
+
+
+def number(value: float | None, form: str) -> str:
+    """A number in that format, or a dash where there is none."""
+    return "-" if value is None else format(value, f"z{form}")  # no negative zero

@@ -1,0 +1,133 @@
+"""Linear codes against their closed forms."""
+
+import numpy as np
+import pytest
+import torch
+from sklearn.decomposition import PCA
+from torch import nn
+
+from jbrep.dae.gradient import Gradient
+from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.dataset.scaled import Moments
+from jbrep.encoders.controls import linear_code, linear_denoiser, pca, random_projection
+from jbrep.encoders.encoder import run
+
+
+@pytest.fixture(scope="module")
+def data(collected):
+    return ScaledDataset(Dataset(collected))
+
+
+@pytest.fixture(scope="module")
+def rows(data):
+    return data.load(data.train)
+
+
+def error(parts, rows, noise=0.0, seed=0):
+    """Mean squared error of reconstructions of corrupted rows from clean ones."""
+    drawn = noise * np.random.default_rng(seed).normal(size=rows.shape)
+    encoder, decoder = parts
+    return np.mean((run(decoder, run(encoder, (rows + drawn).astype(np.float32))) - rows) ** 2)
+
+
+def expected_error(parts, moments, noise):
+    """The same in expectation over rows and noise, for a linear code."""
+    (encoder,), (decoder,) = parts
+    both = decoder.weight.astype(float) @ encoder.weight.astype(float)
+    lost = both - np.eye(len(both))
+    shift = lost @ moments.mean + decoder.weight @ encoder.bias + decoder.bias
+    spread = np.trace(lost @ moments.covariance @ lost.T) + noise**2 * np.square(both).sum()
+    return (spread + shift @ shift) / len(both)
+
+
+def test_moments_are_those_of_the_training_rows(data, rows):
+    np.testing.assert_allclose(data.moments.mean, rows.mean(axis=0, dtype=float), atol=1e-9)
+    expected = np.cov(rows.T.astype(float), bias=True)
+    np.testing.assert_allclose(data.moments.covariance, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("latent", [1, 4, 8, 12])
+def test_pca_is_scikit_learns_and_loses_the_smallest_variances(data, rows, latent):
+    theirs = PCA(latent).fit(rows.astype(float))
+    reference = theirs.inverse_transform(theirs.transform(rows.astype(float)))
+    ours = error(pca(data, latent), rows)
+    assert ours == pytest.approx(np.mean((reference - rows) ** 2), rel=1e-4)
+    dropped = np.linalg.eigvalsh(data.moments.covariance)[: 16 - latent]
+    assert ours == pytest.approx(dropped.sum() / 16, rel=1e-4)
+
+
+def test_no_linear_code_beats_pca(data, rows):
+    best = error(pca(data, 6), rows)
+    for seed in range(20):
+        assert error(random_projection(data, 6, seed), rows) > best
+        weight = np.random.default_rng(seed).normal(size=(6, 16))
+        assert error(linear_code(weight, data.moments), rows) > best
+
+
+def test_a_random_projection_is_orthonormal_and_its_decoder_the_best(data, rows):
+    (encoder,), (decoder,) = random_projection(data, 5, seed=1)
+    np.testing.assert_allclose(encoder.weight @ encoder.weight.T, np.eye(5), atol=1e-6)
+    latent = np.column_stack((run((encoder,), rows), np.ones(len(rows)))).astype(float)
+    least = np.linalg.lstsq(latent, rows.astype(float), rcond=None)[1].sum() / rows.size
+    assert error(((encoder,), (decoder,)), rows) == pytest.approx(least, rel=1e-4)
+    same, other = (random_projection(data, 5, seed)[0][0].weight for seed in (1, 2))
+    np.testing.assert_array_equal(encoder.weight, same)
+    assert not np.array_equal(encoder.weight, other)
+
+
+def test_without_noise_the_denoiser_is_pca(data, rows):
+    ours, theirs = error(linear_denoiser(7, 0, data.moments), rows), error(pca(data, 7), rows)
+    assert ours == pytest.approx(theirs, rel=1e-4)
+
+
+def test_at_full_rank_the_denoiser_is_ridge_regression(data):
+    (encoder,), (decoder,) = linear_denoiser(16, 0.3, data.moments)
+    covariance = data.moments.covariance
+    ridge = covariance @ np.linalg.inv(covariance + 0.09 * np.eye(16))
+    np.testing.assert_allclose(decoder.weight @ encoder.weight, ridge, atol=1e-5)
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.5])
+def test_no_linear_code_denoises_better(data, noise):
+    bound = expected_error(linear_denoiser(6, noise, data.moments), data.moments, noise)
+    assert bound < expected_error(pca(data, 6), data.moments, noise)
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        (encoder,), (decoder,) = linear_denoiser(6, noise, data.moments)
+        moved = encoder.weight + 0.01 * generator.normal(size=encoder.weight.shape)
+        parts = ((encoder._replace(weight=moved),), (decoder,))
+        assert expected_error(parts, data.moments, noise) > bound
+
+
+def train_linear(rows, latent, noise, steps):
+    """A linear autoencoder, trained on the whole at each step."""
+    torch.manual_seed(0)
+    stack = nn.Sequential(nn.Linear(rows.shape[1], latent), nn.Linear(latent, rows.shape[1]))
+    optimiser = torch.optim.Adam(stack.parameters(), 3e-3)
+    gradient = Gradient(stack, len(rows))
+    clean = torch.from_numpy(rows.T.copy())
+    for _ in range(steps):
+        gradient(clean + noise * torch.randn(clean.shape), clean)
+        optimiser.step()
+    return stack
+
+
+def test_the_denoiser_bounds_a_linear_dae_that_comes_near_it():
+    generator = np.random.default_rng(0)
+    rows = (generator.normal(size=(4000, 3)) @ generator.normal(size=(3, 6)) / 3).astype(np.float32)
+    moments = Moments(rows.mean(axis=0, dtype=float), np.cov(rows.T.astype(float), bias=True))
+    bound = expected_error(linear_denoiser(2, 0.3, moments), moments, 0.3)
+    parts = [
+        (type("L", (), {"weight": m.weight.detach().numpy(), "bias": m.bias.detach().numpy()}),)
+        for m in train_linear(rows, 2, 0.3, 1500)
+    ]
+    trained = expected_error(parts, moments, 0.3)
+    assert bound < trained < 1.02 * bound
+
+
+def test_a_wide_linear_autoencoder_reconstructs():
+    rows = np.random.default_rng(0).normal(size=(500, 5)).astype(np.float32)
+    stack = train_linear(rows, 8, 0, 2500)
+    with torch.no_grad():
+        lost = (stack(torch.from_numpy(rows)) - torch.from_numpy(rows)).square().mean().item()
+    assert lost < 1e-4

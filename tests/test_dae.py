@@ -1,0 +1,209 @@
+"""The denoising autoencoder: gradient, corruption, training, checkpoints."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import mse_loss
+
+from jbrep.dae import checkpoint
+from jbrep.dae.gradient import Gradient
+from jbrep.dae.network import ARCHITECTURES, Autoencoder, layers
+from jbrep.dae.training import Trainer, Training, ahead, get_device
+from jbrep.encoders.encoder import run
+from jbrep.errors import InputError
+
+
+def rows(count=600, size=16, seed=0):
+    """Rows near a plane of 4 dimensions."""
+    random = np.random.default_rng(seed)
+    plane = random.normal(size=(4, size)) / 4
+    return torch.from_numpy((random.normal(size=(count, 4)) @ plane).astype(np.float32))
+
+
+def trainer(train=None, **changes):
+    how = {"latent": 4, "epochs": 3, "batch_size": 100, "learning_rate": 3e-3, **changes}
+    train = rows() if train is None else train
+    return Trainer(Training.of(**how), train, train[:50])
+
+
+def trained(**changes):
+    it = trainer(**changes)
+    list(it.epochs())
+    return it
+
+
+def weights(it):
+    return torch.cat([p.detach().flatten() for p in it.network.parameters()])
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+@pytest.mark.parametrize("count", [64, 37])
+def test_the_gradient_is_autograds(architecture, count):
+    network = Autoencoder(ARCHITECTURES[architecture], 16, 5, seed=1)
+    values, target = rows(count, seed=1), rows(count, seed=2)
+    loss = mse_loss(network(values), target)
+    expected = torch.autograd.grad(loss, list(network.parameters()))
+    gradient = Gradient((*network.encoder, *network.decoder), 64)
+    for _ in range(2):  # nothing is left over from the first
+        assert gradient(values.T, target.T).item() == pytest.approx(loss.item(), rel=1e-5)
+        for parameter, wanted in zip(network.parameters(), expected, strict=True):
+            torch.testing.assert_close(parameter.grad, wanted, rtol=1e-4, atol=1e-6)
+
+
+def test_the_papers_architecture_has_two_layers_with_tanh():
+    network = Autoencoder(ARCHITECTURES["paper"], 16, 12, seed=0)
+    shapes = [(layer.weight.shape, layer.activation) for layer in layers(network.encoder)]
+    shapes += [(layer.weight.shape, layer.activation) for layer in layers(network.decoder)]
+    assert shapes == [((12, 16), "tanh"), ((16, 12), "tanh")]
+    usual = Training.of(12)
+    assert (usual.epochs, usual.batch_size, usual.learning_rate) == (200, 8192, 5e-4)
+    assert (usual.noise, usual.seed) == (0.1, 0)
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_layers_give_what_the_network_gives(architecture):
+    network, values = Autoencoder(ARCHITECTURES[architecture], 16, 5, seed=0), rows(9)
+    parts = (*layers(network.encoder), *layers(network.decoder))
+    expected = network(values).detach()
+    np.testing.assert_allclose(run(parts, values.numpy()), expected, rtol=1e-4, atol=1e-6)
+
+
+def drawn(it, epoch):
+    """All clean and corrupted rows of an epoch, in its order."""
+    batches = list(it._batches(epoch))
+    assert [clean.shape[1] for clean, _ in batches] == [100] * 20
+    return (torch.cat(part, 1).T for part in zip(*batches, strict=True))
+
+
+def test_every_row_comes_once_with_noise_of_its_own():
+    data = rows(2000)
+    it = trainer(data, noise=0.3)
+    clean, corrupted = drawn(it, 1)
+    again, _ = drawn(it, 2)
+    assert not torch.equal(clean, again)
+    order = [c.sum(1).sort().values for c in (clean, again, data)]
+    torch.testing.assert_close(order[0], order[2])
+    torch.testing.assert_close(order[1], order[2])
+    noise = (corrupted - clean).numpy()
+    assert noise.std() == pytest.approx(0.3, rel=0.02)
+    assert abs(noise.mean()) < 0.01
+    across = np.corrcoef(noise.T) - np.eye(16)
+    assert np.abs(across).max() < 0.1  # features
+    assert abs(np.corrcoef(noise[:-1].ravel(), noise[1:].ravel())[0, 1]) < 0.02  # samples
+    assert len(np.unique(noise.round(6))) > 25_000
+    assert abs(np.corrcoef(noise[:, 0], clean[:, 0])[0, 1]) < 0.1
+
+
+def test_latent_sizes_see_the_same_order_and_noise():
+    data = rows(2000)
+    for ours, theirs in zip(
+        trainer(data, latent=2)._batches(1), trainer(data, latent=9)._batches(1), strict=True
+    ):
+        assert torch.equal(ours[1], theirs[1])
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_training_comes_near_the_bound_of_linear_codes(architecture):
+    data = rows(3000)
+    it = trained(train=data, architecture=architecture, epochs=40, noise=0.01)
+    assert it.history[-1].train_loss < it.history[0].train_loss / 5
+    assert it.history[-1].test_loss < 0.1 * data.square().mean().item()
+
+
+def test_the_same_seed_gives_the_same_weights_whatever_the_threads():
+    before = torch.get_num_threads()
+    one = weights(trained(seed=1))
+    torch.manual_seed(99)  # what the caller drew must not matter
+    torch.set_num_threads(2)
+    try:
+        assert torch.equal(one, weights(trained(seed=1)))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert not torch.equal(one, weights(trained(seed=2)))
+
+
+def test_the_best_epoch_is_that_of_the_lowest_training_loss():
+    it = trainer(learning_rate=0.5, epochs=6)
+    states = []
+    for _ in it.epochs():
+        states.append({n: p.clone() for n, p in it.network.state_dict().items()})
+    losses = [epoch.train_loss for epoch in it.history]
+    assert it.best_epoch == losses.index(min(losses)) + 1
+    for name, value in states[it.best_epoch - 1].items():
+        assert torch.equal(it.best[name], value)
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_a_checkpoint_goes_on_to_the_same_weights(architecture, tmp_path):
+    whole = trained(architecture=architecture, epochs=5)
+    first = trainer(architecture=architecture, epochs=5)
+    steps = first.epochs()
+    next(steps), next(steps)
+    steps.close()
+    checkpoint.save(first, {"seed": 0}, tmp_path / "at")
+    second = trainer(architecture=architecture, epochs=5)
+    checkpoint.restore(second, {"seed": 0}, tmp_path / "at")
+    assert len(second.history) == 2
+    list(second.epochs())
+    assert torch.equal(weights(whole), weights(second))
+    assert second.history == whole.history
+    assert all(torch.equal(whole.best[name], second.best[name]) for name in whole.best)
+
+
+def test_a_checkpoint_of_something_else_is_refused(tmp_path):
+    it = trained()
+    checkpoint.save(it, {"seed": 0, "noise": 0.1}, tmp_path / "at")
+    with pytest.raises(InputError, match=r"begun otherwise: noise 0\.1 there, 0\.2 here"):
+        checkpoint.restore(trainer(), {"seed": 0, "noise": 0.2}, tmp_path / "at")
+    whole = (tmp_path / "at").read_bytes()
+    for content in (b"", whole[:50], whole[:-1], b"\x80" + whole[1:]):
+        (tmp_path / "at").write_bytes(content)
+        with pytest.raises(InputError, match="is damaged: delete it to begin anew"):
+            checkpoint.restore(trainer(), {"seed": 0, "noise": 0.1}, tmp_path / "at")
+    checkpoint.save(it, {"seed": 0}, tmp_path / "at")
+    with pytest.raises(InputError, match="is damaged: delete it to begin anew"):
+        checkpoint.restore(trainer(latent=5), {"seed": 0}, tmp_path / "at")
+
+
+def test_the_learning_rate_of_deep_falls_to_zero_and_that_of_paper_stays():
+    deep, paper = trainer(architecture="deep"), trainer()
+    rates = [deep._learning_rate(epoch, batch) for epoch in (1, 2, 3) for batch in range(6)]
+    assert rates[0] == 3e-3
+    assert rates == sorted(rates, reverse=True)
+    assert rates[-1] < 0.01 * rates[0]
+    assert {paper._learning_rate(epoch, 3) for epoch in (1, 2, 3)} == {3e-3}
+
+
+def test_ahead_keeps_order_and_errors():
+    assert list(ahead(iter(range(5)))) == [0, 1, 2, 3, 4]
+    assert list(ahead(())) == []
+
+    def fails():
+        yield 1
+        raise ValueError("no more")
+
+    items = ahead(fails())
+    assert next(items) == 1
+    with pytest.raises(ValueError, match="no more"):
+        next(items)
+
+
+def test_mistakes_are_named():
+    with pytest.raises(InputError, match="unknown architecture 'wide': choose one of paper, deep"):
+        Training.of(4, "wide")
+    with pytest.raises(InputError, match="batch size is 0: at least 1 is needed"):
+        Training.of(4, batch_size=0)
+    with pytest.raises(InputError, match="epochs is -1: at least 1 is needed"):
+        Training.of(4, epochs=-1)
+    for bad in ({"learning_rate": 0}, {"learning_rate": np.nan}, {"noise": -1}, {"noise": np.inf}):
+        with pytest.raises(InputError, match="a positive number and one from 0 are needed"):
+            Training.of(4, **bad)
+    with pytest.raises(InputError, match="no device 'quantum' here: take auto, cpu or cuda"):
+        get_device("quantum")
+    with pytest.raises(InputError, match=r"the loss is nan in epoch 1: a learning rate below"):
+        trained(train=rows() * torch.nan)
+
+
+def test_auto_is_the_gpu_where_there_is_one():
+    assert get_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")

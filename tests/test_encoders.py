@@ -1,0 +1,290 @@
+"""Encoders: their arithmetic, their file, what they refuse, and the ones that ship."""
+
+import io
+import json
+import os
+import pickle
+import struct
+import time
+from dataclasses import replace
+
+import numpy as np
+import onnxruntime
+import pytest
+import safetensors.numpy
+import torch
+
+from jbrep.dataset import DamageError, Scaler
+from jbrep.encoders import Encoder, Layer, load, save
+from jbrep.encoders import file as encoder_file
+from jbrep.encoders.card import card
+from jbrep.encoders.file import fingerprint
+from jbrep.encoders.onnx import export
+from jbrep.envs import JitterbugVecEnv
+from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import TASKS
+
+TASK = TASKS["face_direction"]
+RANDOM = np.random.default_rng(0)
+
+
+def layer(inputs, outputs, activation):
+    weight, bias = RANDOM.normal(size=(outputs, inputs)), RANDOM.normal(size=outputs)
+    return Layer(weight.astype(np.float32), bias.astype(np.float32), activation)
+
+
+def header(**changes):
+    facts = {"kind": "dae", "name": "dae-3", "task": TASK.name}
+    records = {"training": {"latent": 3}, "data": {"seed": 0}, "metrics": {}, "versions": {}}
+    return {**facts, "features": list(TASK.feature_names), **records, **changes}
+
+
+def make(encoder=None, decoder=None, **changes):
+    low = -np.arange(1, 17, dtype=np.float32)
+    return Encoder(
+        header(**changes),
+        Scaler(low, 2 - low),
+        encoder or (layer(16, 5, "relu"), layer(5, 3, "tanh")),
+        decoder or (layer(3, 16, "linear"),),
+    )
+
+
+@pytest.fixture
+def encoder():
+    return make()
+
+
+def observations(*shape):
+    return RANDOM.normal(size=(*shape, 16)).astype(np.float32)
+
+
+def test_encode_scales_and_runs_the_layers(encoder):
+    rows = observations(7)
+    (first, second), (last,) = encoder.encoder, encoder.decoder
+    scaled = (rows - 1) / (np.arange(1, 17) + 1)
+    hidden = np.maximum(scaled @ first.weight.T + first.bias, 0)
+    latent = np.tanh(hidden @ second.weight.T + second.bias)
+    np.testing.assert_allclose(encoder.encode(rows), latent, rtol=1e-4, atol=1e-6)
+    back = (latent @ last.weight.T + last.bias) * (np.arange(1, 17) + 1) + 1
+    np.testing.assert_allclose(encoder.decode(encoder(rows)), back, rtol=1e-4, atol=1e-4)
+    assert (encoder.size, encoder.latent_size, encoder.name) == (16, 3, "dae-3")
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (4,), (2, 3), (0,)])
+def test_numpy_and_torch_agree_in_float32_at_any_shape(encoder, shape):
+    rows = observations(*shape)
+    latent = encoder.encode(rows)
+    assert (latent.shape, latent.dtype) == ((*shape, 3), np.float32)
+    assert encoder.encode(rows.astype(np.float64)).dtype == np.float32
+    tensor = encoder.encode(torch.from_numpy(rows))
+    assert tensor.dtype == torch.float32
+    np.testing.assert_allclose(tensor.numpy(), latent, rtol=1e-4, atol=1e-6)
+    back = encoder.decode(tensor)
+    assert back.shape == (*shape, 16)
+    np.testing.assert_allclose(back.numpy(), encoder.decode(latent), rtol=1e-4, atol=1e-4)
+
+
+def test_gradients_flow_through_torch(encoder):
+    rows = torch.from_numpy(observations(2)).requires_grad_()
+    encoder.encode(rows).sum().backward()
+    step = 1e-2
+    moved = rows.detach().clone()
+    moved[:, 3] += step
+    change = (encoder.encode(moved) - encoder.encode(rows.detach())).sum(1) / step
+    np.testing.assert_allclose(rows.grad[:, 3], change, rtol=0.05, atol=1e-3)
+
+
+def test_another_length_is_refused(encoder):
+    with pytest.raises(InputError, match=r"takes observations of 16 numbers: shape \(2, 15\)"):
+        encoder.encode(np.zeros((2, 15)))
+    with pytest.raises(InputError, match=r"takes latents of 3 numbers: shape \(4,\)"):
+        encoder.decode(torch.zeros(4))
+
+
+def test_the_file_gives_the_same_encoder_back(encoder, tmp_path):
+    save(encoder, tmp_path / "one")
+    again = load(tmp_path / "one")
+    save(again, tmp_path / "two")
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+    assert again.header == encoder.header
+    assert fingerprint(again) == fingerprint(encoder)
+    rows = observations(5)
+    np.testing.assert_array_equal(encoder(rows), again(rows))
+    np.testing.assert_array_equal(encoder.decode(again(rows)), again.decode(encoder(rows)))
+
+
+def test_an_identity_has_no_layers(tmp_path):
+    scaler = Scaler(-np.ones(16, np.float32), np.full(16, 3, np.float32))
+    save(Encoder(header(), scaler, (), ()), tmp_path / "it")
+    it, rows = load(tmp_path / "it"), observations(3)
+    np.testing.assert_allclose(it(rows), (rows - 1) / 2, rtol=1e-6)
+    assert it.latent_size == 16
+
+
+def test_any_changed_bit_is_refused(encoder, tmp_path):
+    path = tmp_path / "encoder"
+    save(encoder, path)
+    whole = path.read_bytes()
+    for bit in RANDOM.choice(8 * len(whole), 400, replace=False):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match="encoder"):
+            load(path)
+
+
+def test_truncated_appended_and_foreign_files_are_refused(encoder, tmp_path):
+    path = tmp_path / "encoder"
+    with pytest.raises(InputError, match="no encoder at"):
+        load(path)
+    save(encoder, path)
+    whole = path.read_bytes()
+    stream = io.BytesIO()
+    torch.save({"low": torch.zeros(16)}, stream)
+    other = safetensors.numpy.save({"low": np.zeros(16, np.float32)})
+    for content in (
+        b"",
+        whole[:7],
+        whole[:100],
+        whole[:-4],
+        whole + b"x",
+        stream.getvalue(),
+        other,
+    ):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match="is not a jbrep encoder"):
+            load(path)
+
+
+class Bomb:
+    def __reduce__(self):
+        return os.mkdir, ("exploded",)
+
+
+def test_nothing_in_a_file_is_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, content in {
+        "pickle": pickle.dumps(Bomb()),
+        "in a header": struct.pack("<Q", 100) + pickle.dumps(Bomb()).ljust(100),
+    }.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match="is not a jbrep encoder"):
+            load(tmp_path / name)
+    assert not (tmp_path / "exploded").exists()
+
+
+def test_hostile_sizes_end_at_once(tmp_path):
+    start = time.process_time()
+    huge, pipe = tmp_path / "huge", tmp_path / "pipe"
+    with huge.open("wb") as file:
+        file.truncate(1 << 40)
+    os.mkfifo(pipe)
+    for path in (huge, pipe, tmp_path):
+        with pytest.raises(InputError, match="1 to 16,777,216 bytes"):
+            load(path)
+    deep = b"[" * 100_000
+    for length in (2**63, len(deep), 0):
+        huge.unlink()
+        huge.write_bytes(struct.pack("<Q", length) + deep)
+        with pytest.raises(InputError, match="is not a jbrep encoder"):
+            load(huge)
+    assert time.process_time() - start < 5
+
+
+def forged(encoder, path, **changes):
+    """A file with right hashes and what a forger chose."""
+    head = {"format": "jbrep encoder", "format_version": 1, **encoder.header}
+    head |= {"encoder": ["relu", "tanh"], "decoder": ["linear"], **changes.pop("header", {})}
+    tensors = {n: t for n, t in {**encoder.tensors(), **changes}.items() if t is not None}
+    head["sha256"] = encoder_file._digest(head, tensors)
+    path.write_bytes(safetensors.numpy.save(tensors, {"jbrep": json.dumps(head)}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"decoder.0.bias": np.zeros(3, np.float32)}, r"tensor decoder.0.bias has shape \(3,\)"),
+        (
+            {"encoder.1.weight": np.zeros((3, 4), np.float32)},
+            r"encoder.1.weight has shape \(3, 4\)",
+        ),
+        ({"encoder.0.weight": np.zeros(16, np.float32)}, r"encoder.0.weight has shape \(16,\)"),
+        ({"encoder.0.bias": np.zeros(5)}, "tensor encoder.0.bias holds float64"),
+        (
+            {"high": np.full(16, np.nan, np.float32)},
+            "tensor high holds a number that is not finite",
+        ),
+        ({"low": np.zeros(15, np.float32)}, r"tensor low has shape \(15,\): \(16,\)"),
+        ({"high": np.zeros(15, np.float32)}, r"tensor high has shape \(15,\): \(16,\)"),
+        ({"encoder.1.bias": None}, "tensor encoder.1.bias is missing"),
+        ({"spy": np.zeros(1, np.float32)}, "tensor spy is none of an encoder's"),
+        ({"header": {"encoder": ["relu", "sine"]}}, "unknown activation 'sine'"),
+        ({"header": {"decoder": []}}, "is none of an encoder's"),
+        ({"header": {"features": ["a", 1]}}, "its header's features are no words"),
+        ({"header": {"name": "\x1b[2J"}}, "its name .* is none"),
+        ({"header": {"metrics": 3}}, "its header has no metrics"),
+        ({"header": {"format_version": 2}}, "has format version 2: this jbrep reads up to 1"),
+        ({"header": {"format": "other"}}, "is not a jbrep encoder"),
+    ],
+)
+def test_a_forgery_is_refused_and_the_tensor_named(encoder, changes, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        load(forged(encoder, tmp_path / "forged", **changes))
+
+
+def test_tampering_with_a_weight_is_found(encoder, tmp_path):
+    save(encoder, tmp_path / "encoder")
+    whole = (tmp_path / "encoder").read_bytes()
+    number = encoder.encoder[0].weight[0, 0].tobytes()
+    (tmp_path / "encoder").write_bytes(whole.replace(number, np.float32(1).tobytes()))
+    with pytest.raises(DamageError, match="is damaged: its numbers or header aren't those written"):
+        load(tmp_path / "encoder")
+
+
+def test_features_that_differ_are_named(encoder):
+    encoder.check_task(TASK)
+    with pytest.raises(
+        InputError, match="made for face_direction, whose features differ from thos"
+    ):
+        encoder.check_task(TASKS["move_to_pose"])
+    permuted = list(TASK.feature_names)
+    permuted[4], permuted[7] = permuted[7], permuted[4]
+    with pytest.raises(
+        InputError, match="velocity_x as feature 4, where face_direction has orientation_x"
+    ):
+        replace(encoder, header=header(features=permuted)).check_task(TASK)
+    fewer = replace(encoder, header=header(features=list(TASK.feature_names[:15])))
+    with pytest.raises(InputError, match=r"has nothing as feature 15, where .* angle_to_target"):
+        fewer.check_task(TASK)
+
+
+def test_the_environment_shows_latents_and_refuses_another_task(encoder):
+    environment = JitterbugVecEnv("face_direction", 2, seed=5, encoder=encoder)
+    plain = JitterbugVecEnv("face_direction", 2, seed=5)
+    physical = TASK.unscale(plain.reset().astype(float))
+    np.testing.assert_allclose(environment.reset(), encoder(physical), atol=1e-5)
+    with pytest.raises(InputError, match="made for face_direction"):
+        JitterbugVecEnv("move_to_pose", 1, encoder=encoder)
+
+
+@pytest.mark.parametrize("rows", [1, 6])
+def test_onnx_gives_what_torch_gives(encoder, rows, tmp_path):
+    export(encoder, tmp_path / "it.onnx")
+    session = onnxruntime.InferenceSession(tmp_path / "it.onnx")
+    values = observations(rows)
+    latent, back = session.run(["latent", "reconstruction"], {"observation": values})
+    tensor = encoder.encode(torch.from_numpy(values))
+    np.testing.assert_allclose(latent, tensor.numpy(), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(back, encoder.decode(tensor).numpy(), rtol=1e-4, atol=1e-4)
+    stored = session.get_modelmeta().custom_metadata_map["jbrep"]
+    assert json.loads(stored)["features"] == list(TASK.feature_names)
+    with pytest.raises(InputError, match=r"it.onnx is there already"):
+        export(encoder, tmp_path / "it.onnx")
+
+
+def test_the_card_tells_layers_and_ranges(encoder):
+    text = card(encoder)
+    assert "16 -> 5 relu -> 3 tanh" in text
+    assert "sha256     " + fingerprint(encoder) in text
+    assert text.count("\n") > 16

@@ -1,0 +1,341 @@
+"""Diagnostics: against closed forms, other libraries, and sums by hand."""
+
+import json
+
+import mujoco
+import numpy as np
+import pytest
+from sklearn.linear_model import Ridge
+from sklearn.metrics import r2_score
+from sklearn.preprocessing import StandardScaler
+
+from jbrep.dataset import Dataset, ScaledDataset, Scaler
+from jbrep.encoders import Encoder, Layer
+from jbrep.encoders.controls import pca, random_projection
+from jbrep.errors import InputError
+from jbrep.evaluate import evaluate
+from jbrep.evaluate.bootstrap import bootstrap, by_episode
+from jbrep.evaluate.files import EVALUATION, write
+from jbrep.evaluate.held_out import HeldOut, some
+from jbrep.evaluate.latent import intrinsic_dimension, latent
+from jbrep.evaluate.readout import correlation, dynamics, neighbours, probes
+from jbrep.evaluate.reconstruction import NOISES, corruption, reconstruction
+from jbrep.evaluate.summary import summary
+from jbrep.evaluate.truth import quantities, state
+from jbrep.figures import encoder_figures
+from jbrep.jitterbug.tasks import TASKS
+
+
+@pytest.fixture(scope="module")
+def data(collected):
+    return ScaledDataset(Dataset(collected))
+
+
+@pytest.fixture(scope="module")
+def held_out(data):
+    """Three of the five episodes, so that there is something to resample."""
+    wide = ScaledDataset(data.dataset)
+    wide.train, wide.test = data.dataset.split(test=0.6)
+    wide.scaler = data.dataset.fit_scaler(wide.train)
+    return HeldOut(wide)
+
+
+def make(scaled, parts, name="it-4", **changes):
+    facts = {"kind": "test", "name": name, "task": scaled.task.name, "data": {}}
+    features = list(scaled.task.feature_names)
+    return Encoder({**facts, "features": features, **changes}, scaled.scaler, *parts)
+
+
+@pytest.fixture(scope="module")
+def coder(held_out):
+    """A random projection to 4 numbers."""
+    return make(held_out.data, random_projection(held_out.data, 4, seed=0))
+
+
+@pytest.fixture(scope="module")
+def everything(held_out):
+    """The scaled observation itself."""
+    return make(held_out.data, ((), ()))
+
+
+def observed(held_out, part):
+    return held_out.data.dataset["observation"][getattr(held_out.data, part)]
+
+
+def test_intervals_cover_the_truth_as_often_as_they_say():
+    random = np.random.default_rng(0)
+    covered = 0
+    for _ in range(300):
+        episodes = random.normal(3, 2, size=(60, 1))
+        found = bootstrap(lambda s, n: (s / n)[..., 0], episodes, np.ones((60, 1)))
+        assert found.value == pytest.approx(episodes.mean())
+        covered += found.low <= 3 <= found.high
+    assert 0.9 <= covered / 300 <= 0.98
+
+
+def test_resamples_are_the_same_for_all_that_is_compared():
+    random = np.random.default_rng(0)
+    one = random.normal(size=(40, 1))
+    ratio = bootstrap(lambda a, b: (a / b)[..., 0], 2 * one**2, one**2)
+    np.testing.assert_allclose(ratio, 2)
+    assert bootstrap(lambda a: a[..., 0], one) == bootstrap(lambda a: a[..., 0], one)
+
+
+def test_one_episode_has_no_interval():
+    found = bootstrap(lambda s: s[..., 0], np.ones((1, 1)))
+    assert found.value == 1
+    assert np.isnan([found.low, found.high]).all()
+    assert found.tolist() == [1.0, None, None]
+
+
+def test_sums_by_episode():
+    values = np.arange(10.0).reshape(5, 2)
+    expected = [[2, 4], [0, 0], [18, 21]]
+    np.testing.assert_array_equal(by_episode(values, np.array([0, 0, 2, 2, 2]), 3), expected)
+
+
+def test_held_out_rows_know_their_episodes(held_out):
+    assert len(held_out) == 3
+    episode = held_out.data.dataset["episode"][held_out.data.test]
+    np.testing.assert_array_equal(held_out.numbers[held_out.place(held_out.data.test)], episode)
+    followed = held_out.followed(held_out.data.test)
+    steps = held_out.data.dataset["step"]
+    np.testing.assert_array_equal(steps[followed + 1], steps[followed] + 1)
+    assert len(followed) == 3 * 999
+    assert len(some(held_out.data.test, 100)) == 100
+
+
+def test_errors_are_those_of_encode_and_decode(held_out, coder):
+    found = reconstruction(coder, held_out)
+    rows = observed(held_out, "test")
+    lost = coder.decode(coder.encode(rows)).astype(float) - rows
+    scaled = lost / held_out.data.scaler.half_width
+    assert found["mse"][0] == pytest.approx(np.mean(scaled**2), rel=1e-5)
+    assert found["mse"][1] < found["mse"][0] < found["mse"][2]
+    for i, feature in enumerate(found["features"]):
+        assert feature["name"] == held_out.data.task.feature_names[i]
+        assert feature["mse"][0] == pytest.approx(np.mean(scaled[:, i] ** 2), rel=1e-4)
+        rmse = np.sqrt(np.mean(lost[:, i] ** 2))
+        assert feature["rmse_physical"][0] == pytest.approx(rmse, rel=1e-4)
+        r2 = r2_score(rows[:, i].astype(float), rows[:, i] + lost[:, i])
+        assert feature["r2"][0] == pytest.approx(r2, rel=1e-3, abs=1e-4)
+    by_row = (scaled**2).mean(axis=1)
+    assert found["quantiles"]["0.9"] == pytest.approx(np.quantile(by_row, 0.9), rel=1e-3)
+    assert found["quantiles"]["1"] == pytest.approx(by_row.max(), rel=1e-3)
+    worst = found["worst_episodes"][0]
+    errors = by_row.reshape(3, 1000).mean(axis=1)
+    assert worst["episode"] == held_out.numbers[errors.argmax()]
+    assert worst["mse"] == pytest.approx(errors.max(), rel=1e-4)
+    assert worst["seed"] == held_out.data.dataset.episodes["seed"][worst["episode"]]
+
+
+def test_pca_is_its_own_reference_and_the_identity_loses_nothing(held_out, coder, everything):
+    same = reconstruction(make(held_out.data, pca(held_out.data, 4)), held_out)
+    np.testing.assert_allclose(same["ratio_to_pca"], 1, rtol=1e-4)
+    assert same["mse"] == pytest.approx(same["pca_mse"], rel=1e-4)
+    assert reconstruction(coder, held_out)["ratio_to_pca"][0] > 1
+    nothing = reconstruction(everything, held_out)
+    assert nothing["mse"][0] < 1e-10
+    assert nothing["ratio_to_pca"] is None
+
+
+def test_errors_are_scaled_by_the_data_not_by_the_encoder(held_out, coder):
+    wider = Scaler(coder.scaler.low * 2 - 1, coder.scaler.high * 2 + 1)
+    stretched = Encoder(coder.header, wider, (), ())
+    moved = Layer(np.eye(16, dtype=np.float32), np.full(16, 0.01, np.float32), "linear")
+    shifted = Encoder(coder.header, wider, (), (moved,))
+    assert reconstruction(stretched, held_out)["mse"][0] < 1e-10
+    expected = np.mean((0.01 * wider.half_width / held_out.data.scaler.half_width) ** 2)
+    assert reconstruction(shifted, held_out)["mse"][0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_corruption_of_the_identity_stays_and_the_linear_denoiser_is_better(data, everything):
+    levels = corruption(everything, HeldOut(train_as_test(data)))
+    assert [level["noise"] for level in levels] == list(NOISES)
+    for level in levels[1:]:
+        assert level["mse"][0] == pytest.approx(level["noise"] ** 2, rel=0.03)
+        assert level["input_mse"] == level["noise"] ** 2
+        assert level["linear_mse"][0] < level["mse"][0]
+
+
+def test_dead_and_saturated_units_are_found(held_out):
+    weight = np.zeros((4, 16), np.float32)
+    weight[0, 14], weight[1, 13], weight[3, 13] = 1, 50, 0.001
+    parts = (
+        (Layer(weight, np.zeros(4, np.float32), "tanh"),),
+        (Layer(weight.T, np.zeros(16, np.float32), "linear"),),
+    )
+    found = latent(make(held_out.data, parts), held_out)
+    assert found["dead"] == [2, 3]
+    assert found["saturation"][1] > 0.9
+    assert found["saturation"][0] == 0
+    assert found["correlation"][2] == [None] * 4
+    assert found["correlation"][0][0] == pytest.approx(1)
+    assert 1 < found["participation_ratio"] < 2
+
+
+def test_the_participation_ratio_counts_equal_variances(held_out):
+    data = held_out.data
+    values, vectors = np.linalg.eigh(data.moments.covariance)
+    weight = (vectors[:, -5:] / np.sqrt(values[-5:])).T.astype(np.float32)
+    whitened = (Layer(weight, np.zeros(5, np.float32), "linear"),)
+    back = (Layer(weight.T.copy(), np.zeros(16, np.float32), "linear"),)
+    found = latent(make(data, (whitened, back)), HeldOut(train_as_test(data)))
+    assert found["participation_ratio"] == pytest.approx(5, rel=1e-3)
+    np.testing.assert_allclose(found["variance"], 1, rtol=1e-3)
+    assert found["saturation"] is None
+
+
+def train_as_test(data):
+    """The same with its training rows held out, too."""
+    other = ScaledDataset(data.dataset)
+    other.train = other.test = data.train
+    other.scaler = data.scaler
+    return other
+
+
+def test_intrinsic_dimensions_of_what_is_known():
+    random = np.random.default_rng(0)
+    plane = random.normal(size=(3000, 3)) @ random.normal(size=(3, 10))
+    for estimate in intrinsic_dimension(plane).values():
+        assert estimate == pytest.approx(3, abs=0.3)
+    angle = random.uniform(0, 2 * np.pi, 3000)
+    circle = np.stack((np.cos(angle), np.sin(angle)), axis=1)
+    for estimate in intrinsic_dimension(circle).values():
+        assert estimate == pytest.approx(1, abs=0.1)
+    assert intrinsic_dimension(np.zeros((3000, 4))) == {"two_nn": None, "mle": None}
+
+
+def test_quantities_are_those_of_the_simulated_body():
+    task = TASKS["move_to_pose"]
+    random = np.random.default_rng(0)
+    rows = random.normal(size=(50, task.size))
+    rows[:, 3:7] /= np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
+    found = quantities(task, rows)
+    for i, row in enumerate(rows):
+        rotation = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, row[3:7])
+        face = -rotation.reshape(3, 3)[:2, 1]
+        face /= np.linalg.norm(face)
+        np.testing.assert_allclose(found["heading"][i], face, atol=1e-9)
+        assert found["uprightness"][i, 0] == pytest.approx(rotation[8])
+        assert found["forward_speed"][i, 0] == pytest.approx(face @ row[7:9])
+        np.testing.assert_allclose(found["motor_phase"][i], (np.cos(row[13]), np.sin(row[13])))
+        ahead, left = -row[16], row[15]
+        bearing = np.arctan2(*found["bearing_of_target"][i][::-1])
+        assert bearing == pytest.approx(np.arctan2(left, ahead))
+        np.testing.assert_allclose(found["angle_to_target"][i], (np.cos(row[18]), np.sin(row[18])))
+    names = list(state(task, rows))
+    assert names[:3] == ["heading_cos", "heading_sin", "uprightness"]
+    assert "orientation_w" not in names
+    assert "motor_angle" not in names
+    assert {"position_x", "motor_velocity", "target_z"} <= set(names)
+
+
+def test_every_task_has_its_quantities():
+    with_target = {
+        name
+        for name, task in TASKS.items()
+        if "bearing_of_target" in quantities(task, np.ones((1, task.size)))
+    }
+    assert with_target == {"move_to_position", "move_to_pose"}
+
+
+def test_probes_are_ridge_regressions(held_out, coder):
+    train, test = observed(held_out, "train"), observed(held_out, "test")
+    found = probes(coder, held_out)
+    scaler = StandardScaler().fit(coder.encode(train))
+    wanted, true = (quantities(held_out.data.task, rows) for rows in (train, test))
+    for name, values in found.items():
+        fitted = Ridge(1.0).fit(scaler.transform(coder.encode(train)), wanted[name])
+        predicted = fitted.predict(scaler.transform(coder.encode(test))).reshape(len(test), -1)
+        expected = r2_score(true[name], predicted, multioutput="variance_weighted")
+        assert values[0] == pytest.approx(expected, rel=1e-3, abs=1e-3)
+
+
+def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
+    dataset = held_out.data.dataset
+    parts = []
+    for rows in (held_out.data.train, held_out.data.test):
+        kept = rows[dataset["step"][rows] < 999]
+        z = [coder.encode(dataset["observation"][r]) for r in (kept, kept + 1)]
+        parts.append((np.column_stack((z[0], dataset["action"][kept])), z[1]))
+    (known, after), (unseen, true) = parts
+    scaler = StandardScaler().fit(known)
+    predicted = Ridge(1.0).fit(scaler.transform(known), after).predict(scaler.transform(unseen))
+    found = dynamics(coder, held_out)
+    expected = r2_score(true, predicted, multioutput="variance_weighted")
+    assert found["linear"][0] == pytest.approx(expected, abs=1e-3)
+    still = r2_score(true, unseen[:, :4], multioutput="variance_weighted")
+    assert found["persistence"][0] == pytest.approx(still, abs=1e-3)
+    assert found["linear"][0] > found["persistence"][0]
+
+
+def test_neighbours_come_from_training_episodes(held_out, coder, everything):
+    data = held_out.data
+    test, train = observed(held_out, "test"), observed(held_out, "train")
+    wanted, true = (np.stack(list(state(data.task, o).values()), 1) for o in (test, train))
+    apart = coder.encode(test)[:, None] - coder.encode(train)[None]
+    nearest = np.argsort((apart**2).sum(axis=-1), axis=1)[:, :5]
+    expected = (((true[nearest] - wanted[:, None]) / true.std(axis=0)) ** 2).mean()
+    found = neighbours(coder, held_out)
+    assert found["mse"][0] == pytest.approx(expected, rel=1e-2)
+    assert np.mean([v[0] for v in found["dimensions"].values()]) == pytest.approx(found["mse"][0])
+    assert neighbours(everything, held_out)["mse"][0] < found["mse"][0]
+
+
+def test_correlation_takes_units_alone_as_candidates(held_out, coder, everything):
+    rows = observed(held_out, "test")
+    truth = state(held_out.data.task, rows)
+    latents = coder.encode(rows)
+    found = correlation(coder, held_out)
+    for name, values in truth.items():
+        expected = max(abs(np.corrcoef(unit, values)[0, 1]) for unit in latents.T)
+        assert found["dimensions"][name][0] == pytest.approx(expected, abs=1e-4)
+    shown = correlation(everything, held_out)["dimensions"]
+    assert shown["motor_velocity"][0] == pytest.approx(1)
+    assert shown["uprightness"][0] < 0.99  # though other dimensions of the state are related
+
+
+def test_an_evaluation_is_plain_json_and_repeats(data, tmp_path):
+    encoders = {"pca-4": make(data, pca(data, 4)), "r-4": make(data, random_projection(data, 4, 0))}
+    one = write(encoders, data, tmp_path / "it")
+    text = (tmp_path / "it" / EVALUATION).read_text()
+    assert list(json.loads(text)["encoders"]) == ["full", "pca-4", "r-4"]
+    assert write(encoders, data, tmp_path / "it") == one
+    assert (tmp_path / "it" / EVALUATION).read_text() == text
+    with pytest.raises(InputError, match="holds something else than the evaluation of these"):
+        write({"r-4": encoders["r-4"]}, data, tmp_path / "it")
+    assert (tmp_path / "it" / EVALUATION).read_text() == text
+    shown = summary(json.loads(text))
+    assert "pca-4" in shown
+    assert "nan" not in shown
+    pictures = encoder_figures(json.loads(text), tmp_path)
+    assert [p.name for p in pictures] == [
+        "error_by_feature.png",
+        "error_by_latent.png",
+        "error_by_corruption.png",
+    ]
+    assert all(p.read_bytes().startswith(b"\x89PNG") for p in pictures)
+    before = pictures[0].read_bytes()
+    assert encoder_figures(json.loads(text), tmp_path)[0].read_bytes() == before
+
+
+def test_whether_an_encoder_may_have_seen_the_episodes(data):
+    fingerprint = data.dataset.manifest.fingerprint
+    sources = {
+        "same": {"fingerprint": fingerprint, "seed": 3},
+        "overlaps": {"fingerprint": "other", "seed": 3},
+        "apart": {"fingerprint": "other", "seed": 4},
+    }
+    encoders = {n: make(data, pca(data, 2), data=source) for n, source in sources.items()}
+    found = evaluate(encoders, data)["seen"]
+    assert found == {"same": "no test row", "overlaps": "maybe", "apart": "none"}
+
+
+def test_other_features_are_refused(data):
+    with pytest.raises(InputError, match="made for move_to_pose, whose features differ"):
+        evaluate({"it": make(data, ((), ()), task="move_to_pose", features=["a"] * 16)}, data)
+    permuted = list(reversed(data.task.feature_names))
+    with pytest.raises(InputError, match="has angle_to_target as feature 0"):
+        evaluate({"it": make(data, ((), ()), features=permuted)}, data)

@@ -1,0 +1,198 @@
+"""Encoders of every kind from a data set: scaling, files, kills, mistakes."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from small import settings
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from jbrep.collect import write_shards
+from jbrep.dae.training import Training
+from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.dataset.lock import exclusive
+from jbrep.dataset.manifest import open_shard, read_manifest
+from jbrep.encoders import load
+from jbrep.errors import InputError
+from jbrep.fit import KINDS, Fitter
+
+
+@pytest.fixture(scope="module")
+def data(collected):
+    return ScaledDataset(Dataset(collected))
+
+
+def how(latent=4, **changes):
+    return Training.of(latent, **{"epochs": 3, "batch_size": 500, **changes})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_has_the_error_that_its_file_says(data, kind, tmp_path):
+    fitted = Fitter(data, tmp_path).fit(kind, how())
+    encoder = load(fitted.path)
+    assert fitted.anew
+    assert fitted.path.name == ("identity" if kind == "identity" else f"{kind}-4") + ".safetensors"
+    rows = data.dataset["observation"][data.test]
+    lost = (encoder.decode(encoder.encode(rows)) - rows) / data.scaler.half_width
+    expected = np.mean(lost.astype(float) ** 2)
+    assert encoder.header["metrics"]["held_out_mse"] == pytest.approx(expected, rel=1e-6)
+    assert encoder.header["data"]["fingerprint"] == data.dataset.manifest.fingerprint
+    assert encoder.header["data"]["train_rows"] == 4000
+    assert set(encoder.header["training"]) == set(KINDS[kind].settings)
+    bytes_before = fitted.path.read_bytes()
+    again = Fitter(data, tmp_path).fit(kind, how())
+    assert not again.anew
+    assert fitted.path.read_bytes() == bytes_before
+
+
+def test_scaling_is_fitted_on_the_training_part_only(data, tmp_path):
+    encoder = Fitter(data, tmp_path).fit("pca", how()).encoder
+    rows = data.dataset["observation"][data.train]
+    np.testing.assert_array_equal(encoder.scaler.low, rows.min(axis=0))
+    np.testing.assert_array_equal(encoder.scaler.high, rows.max(axis=0))
+    everything = data.dataset["observation"][:]
+    assert (everything.max(axis=0) > encoder.scaler.high).any()
+
+
+def test_a_denoiser_beats_a_plain_autoencoder_from_noise_only(data, tmp_path):
+    fitter = Fitter(data, tmp_path)
+    training = {"epochs": 60, "batch_size": 100, "learning_rate": 3e-3}
+    plain = fitter.fit("ae", how(8, **training)).encoder
+    denoising = fitter.fit("dae", how(8, noise=0.5, **training)).encoder
+    rows = data.dataset["observation"][data.test]
+    noise = np.random.default_rng(0).normal(size=rows.shape).astype(np.float32)
+    width = data.scaler.half_width
+
+    def error(encoder, strength):
+        back = encoder.decode(encoder.encode(rows + strength * noise * width))
+        return np.mean(((back - rows) / width) ** 2)
+
+    assert error(denoising, 0.5) < error(plain, 0.5)
+    assert error(plain, 0) < error(denoising, 0)
+
+
+def test_tensorboard_has_the_losses(data, tmp_path):
+    Fitter(data, tmp_path).fit("dae", how())
+    events = EventAccumulator(str(tmp_path / "dae-4.training")).Reload()
+    for name in ("train_loss", "test_loss"):
+        assert [e.step for e in events.Scalars(name)] == [1, 2, 3]
+    assert not (tmp_path / "dae-4.training" / "checkpoint.safetensors").exists()
+
+
+TRAIN = "from jbrep.cli import main; main()", "train-dae", "--latent", "4", "--batch-size", "50"
+
+
+@pytest.fixture(scope="module")
+def whole(data, tmp_path_factory):
+    """The file of a training that nothing stopped."""
+    folder = tmp_path_factory.mktemp("whole")
+    return Fitter(data, folder).fit("dae", how(epochs=30, batch_size=50)).path
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_training_goes_on_to_the_same_file(whole, collected, number, tmp_path):
+    out, work = tmp_path / "stopped", tmp_path / "stopped" / "dae-4.training"
+    command = [sys.executable, "-c", *TRAIN, "--epochs", "30", "--data", collected, "--out", out]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    while not (work / "checkpoint.safetensors").exists():
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.01)
+    process.send_signal(number)
+    told = process.communicate()[1]
+    path = out / "dae-4.safetensors"
+    if number == signal.SIGKILL:
+        assert not path.exists()
+    else:
+        assert process.returncode == 128 + number
+        assert f"the same command goes on where it stopped; the best so far is in {out}" in told
+        kept = load(path).header["metrics"]
+        assert 1 <= kept["best_epoch"] <= kept["epochs"] < 30
+    subprocess.run(command, check=True, capture_output=True)
+    assert path.read_bytes() == whole.read_bytes()
+
+
+def test_only_one_may_train_it(data, tmp_path):
+    fitter = Fitter(data, tmp_path)
+    work = tmp_path / "dae-4.training"
+    work.mkdir()
+    with exclusive(work), pytest.raises(InputError, match="is being written by process"):
+        fitter.fit("dae", how())
+    assert fitter.fit("dae", how()).anew
+
+
+def test_other_settings_or_data_are_refused_and_nothing_is_lost(data, collected, tmp_path):
+    fitter = Fitter(data, tmp_path)
+    path = fitter.fit("dae", how()).path
+    before = path.read_bytes()
+    with pytest.raises(
+        InputError, match=r"made otherwise: noise 0\.1 there, 0\.2 here; take anoth"
+    ):
+        fitter.fit("dae", how(noise=0.2))
+    other = changed(collected, tmp_path / "other", lambda rows: rows + 1)
+    with pytest.raises(InputError, match="made otherwise: other data"):
+        Fitter(ScaledDataset(other), tmp_path).fit("dae", how())
+    assert path.read_bytes() == before
+
+
+def test_mistakes_are_named(data, tmp_path):
+    fitter = Fitter(data, tmp_path)
+    for latent in (0, -1, 16, 17):
+        for kind in ("pca", "dae", "untrained"):
+            with pytest.raises(InputError, match=f"latent size is {latent}: .* from 1 to 15"):
+                fitter.fit(kind, how(latent))
+    with pytest.raises(InputError, match="unknown kind 'vae': choose one of identity, pca, random"):
+        fitter.fit("vae", how())
+    with pytest.raises(InputError, match="without noise is a plain autoencoder: take the kind ae"):
+        fitter.fit("dae", how(noise=0))
+    (tmp_path / "file").write_text("")
+    for kind in ("pca", "dae"):
+        with pytest.raises(InputError, match="can't make the folder"):
+            Fitter(data, tmp_path / "file").fit(kind, how())
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def changed(source, folder, change, episodes=5):
+    """A copy of a data set with other observations."""
+    manifest = read_manifest(source)
+
+    def make(shard, tick):
+        columns = dict(open_shard(source, manifest, shard))
+        return {**columns, "observation": change(columns["observation"].copy())}
+
+    write_shards(settings(steps=1000 * episodes), folder, make)
+    return Dataset(folder)
+
+
+def test_a_constant_feature_is_scaled_to_zero(collected, tmp_path):
+    def still(rows):
+        rows[:, 2] = 0.03
+        return rows
+
+    data = ScaledDataset(changed(collected, tmp_path / "data", still))
+    assert data.constant_features == ("position_z",)
+    fitter = Fitter(data, tmp_path)
+    for kind in ("dae", "pca", "identity"):
+        encoder = fitter.fit(kind, how()).encoder
+        rows = data.dataset["observation"][:9]
+        assert np.isfinite(encoder(rows)).all()
+    np.testing.assert_array_equal(encoder(rows)[:, 2], 0)
+    np.testing.assert_array_equal(encoder.decode(encoder(rows))[:, 2], np.float32(0.03))
+
+
+def test_a_number_that_is_not_finite_is_named(collected, tmp_path):
+    def broken(rows):
+        rows[500, 3] = np.nan
+        return rows
+
+    dataset = changed(collected, tmp_path / "data", broken)
+    with pytest.raises(InputError, match="numbers that aren't finite in orientation_w: look with"):
+        ScaledDataset(dataset)
+
+
+def test_one_episode_is_too_few(collected, tmp_path):
+    dataset = changed(collected, tmp_path / "data", lambda rows: rows, episodes=1)
+    with pytest.raises(InputError, match="1 episode can't be split: collect at least 2"):
+        ScaledDataset(dataset)
