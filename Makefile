@@ -3,8 +3,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DEMO := demo
+TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
-.PHONY: help setup demo test check bench pictures samples clean
+.PHONY: help setup demo test check bench pictures samples data encoders clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -24,7 +25,7 @@ demo: $(READY) ## the whole job in minutes: collect, encode, learn on the latent
 	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 8 --architecture deep --epochs 40 --batch-size 128 --out $(DEMO)/encoders
 	$(BIN)/jbrep train-encoder --kind random --data $(DEMO)/data --latent 8 --out $(DEMO)/encoders
 	$(BIN)/jbrep evaluate --encoder $(addprefix $(DEMO)/encoders/,$(addsuffix .safetensors,dae-12 dae-8 dae-4 dae-deep-8 random-8)) --data $(DEMO)/data --out $(DEMO)/evaluation
-	$(BIN)/jbrep rl --task face_direction --steps 4k --encoder dae-8 --out $(DEMO)/runs/dae-8
+	$(BIN)/jbrep rl --task face_direction --steps 4k --encoder $(DEMO)/encoders/dae-8.safetensors --out $(DEMO)/runs/dae-8
 	$(BIN)/jbrep rl --task face_direction --steps 4k --out $(DEMO)/runs/full
 	$(BIN)/jbrep report $(DEMO)/runs
 
@@ -47,8 +48,16 @@ pictures: $(READY) ## the pictures in docs/, drawn anew
 	MUJOCO_GL=egl $(BIN)/python tools/pictures.py docs
 
 samples: $(READY) ## the sample data sets in data/, made anew
-	for task in move_from_origin face_direction move_in_direction move_to_position move_to_pose; do \
+	for task in $(TASKS); do \
 	  rm -rf data/sample/$$task; $(BIN)/jbrep collect --task $$task --steps 4k --out data/sample/$$task; done
+
+data: $(READY) ## data sets of five million states in data/: half an hour, 4 GB
+	$(BIN)/jbrep collect --task face_direction --steps 5M --store-state --out data/face_direction
+	for task in $(filter-out face_direction,$(TASKS)); do \
+	  $(BIN)/jbrep data derive data/face_direction --task $$task --out data/$$task || exit; done
+
+encoders: data ## results/encoders/ from these: hours; goes on where it was stopped
+	$(BIN)/python tools/encoders.py data encoders results/encoders $(TASKS)
 
 clean: ## remove the environment and the demo's files
 	rm -rf $(VENV) $(DEMO) *.egg-info

@@ -1,7 +1,7 @@
 """The collector: a policy on many Jitterbugs, streamed to the shards of a data set."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.schema import EPISODES, Columns, episode_returns, episode_seed
 from jbrep.dataset.storage import check_space, make_folder
-from jbrep.errors import InputError
+from jbrep.errors import InputError, differences
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
 from jbrep.policies import Policy, make_policy, policy_settings
@@ -122,26 +122,18 @@ def _begin(settings: Settings, folder: Path) -> Manifest:
 
 def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
     """Going on must give what an uninterrupted run gives."""
-    differing = _differences(asdict(there.settings), asdict(wanted.settings))
+    differing = differences(asdict(there.settings), asdict(wanted.settings))
     if differing:
         raise InputError(
             f"{folder} holds a data set of other settings: {differing}; "
             "choose another folder, or the same settings to go on"
         )
-    differing = _differences(there.versions, wanted.versions)
+    differing = differences(there.versions, wanted.versions)
     if differing and not there.complete:
         raise InputError(
             f"{folder} was begun with other versions: {differing}; "
             "install those to go on, or choose another folder"
         )
-
-
-def _differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    return ", ".join(
-        f"{name} {there.get(name)} (now: {wanted[name]})"
-        for name in wanted
-        if there.get(name) != wanted[name]
-    )
 
 
 def simulate_shard(

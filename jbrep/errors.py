@@ -1,5 +1,17 @@
 """The one exception that means "the user can mend this"."""
 
+from collections.abc import Mapping
+from typing import Any
+
 
 class InputError(ValueError):
     """A user's mistake: one line with what was wrong, what was expected, and the choices."""
+
+
+def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """What is wanted and isn't there, for a message; nothing if all is."""
+    return ", ".join(
+        f"{name} {there.get(name)} (now: {value})"
+        for name, value in wanted.items()
+        if there.get(name) != value
+    )

@@ -1,5 +1,6 @@
 """Figures, drawn from the tables that the other stages write."""
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jbrep.dataset.storage import write_whole
 from jbrep.evaluate.evaluation import FULL
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -31,28 +33,38 @@ _REFERENCE: Any = {"color": "0.4", "linestyle": "--", "linewidth": 1.2}
 def encoder_figures(evaluation: dict[str, Any], folder: Path) -> list[Path]:
     """Draw an evaluation: error by feature, error against latent size, error against corruption.
 
+    The last two need an encoder whose latent is smaller than the observation.
+
     Args:
         evaluation: what jbrep.evaluate.evaluate returned, or its JSON.
         folder: where to write the pictures.
 
     Returns:
         The files.
+
+    Raises:
+        InputError: they can't be written.
     """
-    drawings = {
-        "error_by_feature": _error_by_feature,
-        "error_by_latent": _error_by_latent,
-        "error_by_corruption": _error_by_corruption,
-    }
+    drawings = {"error_by_feature": _error_by_feature}
+    if _sizes(_encoders(evaluation)):
+        drawings |= {
+            "error_by_latent": _error_by_latent,
+            "error_by_corruption": _error_by_corruption,
+        }
     files = []
     with mpl.rc_context(_STYLE):
         for name, draw in drawings.items():
+            picture = io.BytesIO()
+            draw(evaluation).savefig(picture)
             files.append(folder / f"{name}.png")
-            draw(evaluation).savefig(files[-1])
+            write_whole(files[-1], picture.getvalue())
     return files
 
 
 def _encoders(evaluation: dict[str, Any]) -> dict[str, Any]:
-    return {label: e for label, e in evaluation["encoders"].items() if label != FULL}
+    """By label, in which a dollar sign doesn't begin a formula."""
+    found = evaluation["encoders"].items()
+    return {label.replace("$", r"\$"): e for label, e in found if label != FULL}
 
 
 def _sizes(encoders: dict[str, Any]) -> list[int]:

@@ -1,6 +1,7 @@
 """Encoders of every kind from a data set, each in its file."""
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from importlib.metadata import version
@@ -18,11 +19,12 @@ from jbrep.dae.network import Autoencoder, get_architecture, layers
 from jbrep.dae.training import Epoch, Trainer, Training, get_device
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.lock import exclusive
+from jbrep.dataset.scaled import sample
 from jbrep.dataset.storage import make_folder
 from jbrep.encoders import Encoder, load, save
 from jbrep.encoders.controls import Layers, pca, random_projection
-from jbrep.encoders.file import SUFFIX
-from jbrep.errors import InputError
+from jbrep.encoders.file import ERROR, SUFFIX
+from jbrep.errors import InputError, differences
 
 _WATCHED = 100_000  # held-out rows whose error is shown after each epoch
 _EVERY = ("latent", "architecture", "epochs", "batch_size", "learning_rate", "seed")
@@ -95,28 +97,40 @@ class Fitter:
         checkpoint, from which the same call goes on.
 
         Raises:
-            InputError: an unknown kind, a latent size out of range, or a file of other settings or
-                data.
+            InputError: as `check` does, or the files can't be written.
         """
-        kept = get_kind(kind)
-        settings = {name: getattr(training, name) for name in kept.settings}
-        _check(kind, settings, self._data.task.size)
-        header = self._header(kind, settings)
+        done = self.check(kind, training)
+        header = self._header(kind, training)
         path = self._folder / f"{header['name']}{SUFFIX}"
-        if path.exists() and _is_done(path, header):
+        if done:
             return Fitted(load(path), path, False)
-        if kept.make:
-            make_folder(self._folder)
-            self._save(header, kept.make(self._data, training), path, {})
+        make_folder(self._folder)
+        if make := KINDS[kind].make:
+            self._save(header, make(self._data, training), path, {})
         else:
             work = path.with_suffix(".training")
             make_folder(work)
             with exclusive(work):
-                self._train(header, replace(training, noise=settings.get("noise", 0)), path, work)
+                noise = header["training"].get("noise", 0)
+                self._train(header, replace(training, noise=noise), path, work)
         return Fitted(load(path), path, True)
 
-    def _header(self, kind: str, settings: dict[str, Any]) -> dict[str, Any]:
+    def check(self, kind: str, training: Training) -> bool:
+        """Make sure that it can be made; whether it is there already.
+
+        Raises:
+            InputError: an unknown kind, a latent size out of range, or a file of other settings or
+                data.
+        """
+        get_kind(kind)
+        header = self._header(kind, training)
+        _check(kind, header["training"], self._data.task.size)
+        path = self._folder / f"{header['name']}{SUFFIX}"
+        return os.path.exists(path) and _is_done(path, header)  # noqa: PTH110, it never raises
+
+    def _header(self, kind: str, training: Training) -> dict[str, Any]:
         """What an encoder is and where it comes from."""
+        settings = {name: getattr(training, name) for name in KINDS[kind].settings}
         manifest = self._data.dataset.manifest
         architecture = settings.get("architecture", "paper")
         words = [kind, *([architecture] if architecture != "paper" else [])]
@@ -140,14 +154,11 @@ class Fitter:
     def _train(self, header: dict[str, Any], training: Training, path: Path, work: Path) -> None:
         """Train from the checkpoint there is, or from the start."""
         trainer = Trainer(training, *self._rows)
-        identity = {
-            **header["training"],
-            "data": header["data"]["fingerprint"],
-            "device": self._device.type,
-            "torch": header["versions"]["torch"],
-        }
+        versions = {"device": self._device.type, "torch": header["versions"]["torch"]}
+        identity = {**_identity(header), **versions}
         at = work / "checkpoint.safetensors"
-        checkpoint.restore(trainer, identity, at)
+        if at.exists():
+            checkpoint.restore(trainer, identity, at)
         try:
             with SummaryWriter(str(work), purge_step=len(trainer.history) + 1) as scalars:
                 for _ in _shown(trainer, header["name"]):
@@ -176,14 +187,12 @@ class Fitter:
         """Write the file, with the error on all held-out rows."""
         encoder = Encoder(header, self._data.scaler, *parts)
         error = held_out_error(encoder, self._data)
-        save(
-            replace(encoder, header={**header, "metrics": {**metrics, "held_out_mse": error}}), path
-        )
+        save(replace(encoder, header={**header, "metrics": {**metrics, ERROR: error}}), path)
 
     @cached_property
     def _rows(self) -> tuple[Tensor, Tensor]:
         """Training rows, and some held-out ones from all over, on the device."""
-        test = self._data.test[:: -(-len(self._data.test) // _WATCHED)]
+        test = sample(self._data.test, _WATCHED)
         train, watched = (
             torch.from_numpy(self._data.load(rows)).to(self._device)
             for rows in (self._data.train, test)
@@ -192,12 +201,15 @@ class Fitter:
 
 
 def held_out_error(encoder: Encoder, data: ScaledDataset) -> float:
-    """Mean squared error of the reconstruction over all held-out rows, scaled to [-1, 1]."""
+    """Mean squared error of the reconstruction over all held-out rows, scaled to [-1, 1].
+
+    In six digits: those after them differ with the number of threads.
+    """
     total = 0.0
     for rows in data.observations(data.test):
         error = (encoder.decode(encoder.encode(rows)) - rows) / data.scaler.half_width
         total += float(np.square(error, dtype=np.float64).sum())
-    return total / (len(data.test) * data.task.size)
+    return float(f"{total / (len(data.test) * data.task.size):.6g}")
 
 
 def _check(kind: str, settings: dict[str, Any], size: int) -> None:
@@ -217,18 +229,18 @@ def _is_done(path: Path, header: dict[str, Any]) -> bool:
         InputError: the file is of other settings or other data.
     """
     there = load(path).header
-    differing = [
-        f"{name} {there['training'].get(name)!r} there, {value!r} here"
-        for name, value in header["training"].items()
-        if there["training"].get(name) != value
-    ]
-    if there["data"]["fingerprint"] != header["data"]["fingerprint"]:
-        differing.append("other data")
-    if differing:
+    asked = _identity(header)
+    if differing := differences(_identity(there), asked):
         raise InputError(
-            f"{path} is made otherwise: {', '.join(differing)}; take another folder, or delete it"
+            f"{path} is made otherwise: {differing}; take another folder, or delete it"
         )
-    return there["metrics"].get("epochs") == there["training"].get("epochs")
+    return there["metrics"].get("epochs") == asked.get("epochs")
+
+
+def _identity(header: Mapping[str, Any]) -> dict[str, Any]:
+    """What makes two encoders of one name the same."""
+    data = header["data"].get("fingerprint")
+    return {**header["training"], "kind": header["kind"], "task": header["task"], "data": data}
 
 
 def _shown(trainer: Trainer, name: str) -> Iterator[Epoch]:

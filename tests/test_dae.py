@@ -9,6 +9,7 @@ from jbrep.dae import checkpoint
 from jbrep.dae.gradient import Gradient
 from jbrep.dae.network import ARCHITECTURES, Autoencoder, layers
 from jbrep.dae.training import Trainer, Training, ahead, get_device
+from jbrep.encoders import container
 from jbrep.encoders.encoder import run
 from jbrep.errors import InputError
 
@@ -154,16 +155,45 @@ def test_a_checkpoint_goes_on_to_the_same_weights(architecture, tmp_path):
 def test_a_checkpoint_of_something_else_is_refused(tmp_path):
     it = trained()
     checkpoint.save(it, {"seed": 0, "noise": 0.1}, tmp_path / "at")
-    with pytest.raises(InputError, match=r"begun otherwise: noise 0\.1 there, 0\.2 here"):
+    with pytest.raises(InputError, match=r"begun otherwise: noise 0\.1 \(now: 0\.2\); take"):
         checkpoint.restore(trainer(), {"seed": 0, "noise": 0.2}, tmp_path / "at")
     whole = (tmp_path / "at").read_bytes()
     for content in (b"", whole[:50], whole[:-1], b"\x80" + whole[1:]):
         (tmp_path / "at").write_bytes(content)
-        with pytest.raises(InputError, match="is damaged: delete it to begin anew"):
+        with pytest.raises(InputError, match="is not a jbrep checkpoint"):
             checkpoint.restore(trainer(), {"seed": 0, "noise": 0.1}, tmp_path / "at")
     checkpoint.save(it, {"seed": 0}, tmp_path / "at")
     with pytest.raises(InputError, match="is damaged: delete it to begin anew"):
         checkpoint.restore(trainer(latent=5), {"seed": 0}, tmp_path / "at")
+
+
+@pytest.mark.parametrize(
+    ("name", "tensor"),
+    [
+        ("adam.encoder.0.weight.exp_avg", np.zeros(3, np.float32)),
+        ("adam.encoder.0.weight.step", np.zeros(7, np.float32)),
+        ("adam.encoder.0.weight.step", np.zeros((), np.float64)),
+        ("adam.encoder.0.weight.exp_avg_sq", None),
+        ("best.decoder.0.bias", np.zeros(17, np.float32)),
+        ("spy", np.zeros(1, np.float32)),
+    ],
+)
+def test_a_forged_checkpoint_is_refused(name, tensor, tmp_path):
+    checkpoint.save(trained(), {}, tmp_path / "at")
+    tensors, header = container.read(tmp_path / "at", "checkpoint")
+    forged = {n: t for n, t in {**tensors, name: tensor}.items() if t is not None}
+    container.write(tmp_path / "at", forged, header)
+    with pytest.raises(InputError, match="is damaged"):
+        checkpoint.restore(trainer(), {}, tmp_path / "at")
+
+
+@pytest.mark.parametrize("history", [[], [[10**400, 1]], [[float("nan"), 1]], [1], [[1]], None])
+def test_a_checkpoint_with_a_forged_history_is_refused(history, tmp_path):
+    checkpoint.save(trained(), {}, tmp_path / "at")
+    tensors, header = container.read(tmp_path / "at", "checkpoint")
+    container.write(tmp_path / "at", tensors, {**header, "history": history})
+    with pytest.raises(InputError, match="is damaged"):
+        checkpoint.restore(trainer(), {}, tmp_path / "at")
 
 
 def test_the_learning_rate_of_deep_falls_to_zero_and_that_of_paper_stays():
@@ -192,17 +222,30 @@ def test_ahead_keeps_order_and_errors():
 def test_mistakes_are_named():
     with pytest.raises(InputError, match="unknown architecture 'wide': choose one of paper, deep"):
         Training.of(4, "wide")
-    with pytest.raises(InputError, match="batch size is 0: at least 1 is needed"):
+    with pytest.raises(InputError, match="batch size is 0: from 1 to"):
         Training.of(4, batch_size=0)
-    with pytest.raises(InputError, match="epochs is -1: at least 1 is needed"):
+    with pytest.raises(InputError, match="epochs is -1: from 1 to"):
         Training.of(4, epochs=-1)
+    with pytest.raises(InputError, match=r"seed is 1000+: from 0 to 9223372036854775807"):
+        Training.of(4, seed=10**20)
     for bad in ({"learning_rate": 0}, {"learning_rate": np.nan}, {"noise": -1}, {"noise": np.inf}):
         with pytest.raises(InputError, match="a positive number and one from 0 are needed"):
             Training.of(4, **bad)
-    with pytest.raises(InputError, match="no device 'quantum' here: take auto, cpu or cuda"):
-        get_device("quantum")
-    with pytest.raises(InputError, match=r"the loss is nan in epoch 1: a learning rate below"):
-        trained(train=rows() * torch.nan)
+    for name in ("quantum", "meta"):
+        with pytest.raises(InputError, match=f"no device '{name}' here: take auto"):
+            get_device(name)
+
+
+@pytest.mark.parametrize("how", [{"learning_rate": 1e38}, {"noise": 1e38}])
+def test_losses_that_overflow_end_the_training_and_leave_the_best(how):
+    it = trainer(**how, architecture="deep", batch_size=600)
+    with pytest.raises(InputError, match=r"the losses are .* or a learning rate below .*, is need"):
+        list(it.epochs())
+    assert all(p.isfinite().all() for p in it.best.values())
+
+
+def test_a_batch_larger_than_the_data_takes_it_whole():
+    assert torch.equal(weights(trained(batch_size=600)), weights(trained(batch_size=10**15)))
 
 
 def test_auto_is_the_gpu_where_there_is_one():

@@ -35,7 +35,8 @@ def layer(inputs, outputs, activation):
 
 def header(**changes):
     facts = {"kind": "dae", "name": "dae-3", "task": TASK.name}
-    records = {"training": {"latent": 3}, "data": {"seed": 0}, "metrics": {}, "versions": {}}
+    records = {"training": {"latent": 3}, "data": {"seed": 0}, "versions": {}}
+    records["metrics"] = {"held_out_mse": 0.1}
     return {**facts, "features": list(TASK.feature_names), **records, **changes}
 
 
@@ -213,10 +214,26 @@ def forged(encoder, path, **changes):
         ({"encoder.0.bias": np.zeros(5)}, "tensor encoder.0.bias holds float64"),
         (
             {"high": np.full(16, np.nan, np.float32)},
-            "tensor high holds a number that is not finite",
+            "tensor high holds a number that is not finite, or beyond",
         ),
         ({"low": np.zeros(15, np.float32)}, r"tensor low has shape \(15,\): \(16,\)"),
         ({"high": np.zeros(15, np.float32)}, r"tensor high has shape \(15,\): \(16,\)"),
+        (
+            {"decoder.0.weight": np.full((16, 3), 3e38, np.float32)},
+            "not finite, or beyond 1000000000000",
+        ),
+        (
+            {
+                "encoder.1.weight": np.zeros((0, 5), np.float32),
+                "encoder.1.bias": np.zeros(0, np.float32),
+            },
+            r"encoder.1.weight has shape \(0, 5\): \(1, 5\)",
+        ),
+        ({"header": {"metrics": {}}}, "its header has no held_out_mse among its metrics"),
+        (
+            {"header": {"encoder": ["relu", "tanh"], "decoder": ["linear"], "data": []}},
+            "has no data",
+        ),
         ({"encoder.1.bias": None}, "tensor encoder.1.bias is missing"),
         ({"spy": np.zeros(1, np.float32)}, "tensor spy is none of an encoder's"),
         ({"header": {"encoder": ["relu", "sine"]}}, "unknown activation 'sine'"),
@@ -231,6 +248,13 @@ def forged(encoder, path, **changes):
 def test_a_forgery_is_refused_and_the_tensor_named(encoder, changes, message, tmp_path):
     with pytest.raises(InputError, match=message):
         load(forged(encoder, tmp_path / "forged", **changes))
+
+
+def test_wide_layers_and_latents_larger_than_observations_are_refused():
+    with pytest.raises(InputError, match="at most 4096, and no more in the latent than"):
+        make((layer(16, 5000, "relu"), layer(5000, 3, "tanh")))
+    with pytest.raises(InputError, match="no more in the latent than there are features, 16"):
+        make((layer(16, 17, "tanh"),), (layer(17, 16, "linear"),))
 
 
 def test_tampering_with_a_weight_is_found(encoder, tmp_path):

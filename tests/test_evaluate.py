@@ -10,13 +10,14 @@ from sklearn.metrics import r2_score
 from sklearn.preprocessing import StandardScaler
 
 from jbrep.dataset import Dataset, ScaledDataset, Scaler
+from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder, Layer
 from jbrep.encoders.controls import pca, random_projection
 from jbrep.errors import InputError
 from jbrep.evaluate import evaluate
 from jbrep.evaluate.bootstrap import bootstrap, by_episode
 from jbrep.evaluate.files import EVALUATION, write
-from jbrep.evaluate.held_out import HeldOut, some
+from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import intrinsic_dimension, latent
 from jbrep.evaluate.readout import correlation, dynamics, neighbours, probes
 from jbrep.evaluate.reconstruction import NOISES, corruption, reconstruction
@@ -102,7 +103,16 @@ def test_held_out_rows_know_their_episodes(held_out):
     steps = held_out.data.dataset["step"]
     np.testing.assert_array_equal(steps[followed + 1], steps[followed] + 1)
     assert len(followed) == 3 * 999
-    assert len(some(held_out.data.test, 100)) == 100
+
+
+def test_a_sample_is_in_order_and_of_any_step(held_out):
+    rows = sample(held_out.data.test, 500)
+    assert len(np.unique(rows)) == 500
+    assert (np.diff(rows) > 0).all()
+    np.testing.assert_array_equal(rows, sample(held_out.data.test, 500))
+    steps = held_out.data.dataset["step"][rows]
+    assert len(np.unique(steps % 10)) == 10
+    np.testing.assert_array_equal(sample(rows, 500), rows)
 
 
 def test_errors_are_those_of_encode_and_decode(held_out, coder):
@@ -295,6 +305,58 @@ def test_correlation_takes_units_alone_as_candidates(held_out, coder, everything
     shown = correlation(everything, held_out)["dimensions"]
     assert shown["motor_velocity"][0] == pytest.approx(1)
     assert shown["uprightness"][0] < 0.99  # though other dimensions of the state are related
+
+
+def still(units, weight=0.0):
+    """Layers whose latent hardly depends on what is observed."""
+    bias = np.linspace(-0.3, 0.3, units, dtype=np.float32)
+    matrix = np.zeros((units, 16), np.float32)
+    matrix[0, 13] = weight
+    return (Layer(matrix, bias, "tanh"),), (
+        Layer(matrix.T.copy(), np.zeros(16, np.float32), "linear"),
+    )
+
+
+@pytest.mark.parametrize("parts", [still(3), still(3, 1.0), still(1), still(1, 1.0)])
+def test_dead_and_single_units_can_be_judged(held_out, parts, tmp_path):
+    found = write({"it": make(held_out.data, parts)}, held_out.data, tmp_path)["encoders"]["it"]
+    gtc = found["correlation"]
+    assert all(0 <= value[0] <= 1 + 1e-9 for value in gtc["dimensions"].values())
+    units = len(found["latent_units"]["variance"])
+    assert len(found["latent_units"]["dead"]) in (units, units - 1)
+
+
+def test_the_observation_alone_can_be_judged(held_out, everything, tmp_path):
+    evaluation = write({"identity": everything}, held_out.data, tmp_path)
+    assert [p.name for p in encoder_figures(evaluation, tmp_path)] == ["error_by_feature.png"]
+
+
+def test_a_constant_feature_can_be_judged(data):
+    flat = ScaledDataset(data.dataset)
+    flat.observations = lambda rows: iter([still_height(data, rows)])
+    flat.scaler = Scaler(
+        np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.low),
+        np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.high),
+    )
+    found = evaluate({"pca-4": make(flat, pca(flat, 4))}, flat)["encoders"]["pca-4"]
+    assert found["reconstruction"]["features"][2]["r2"] == [None, None, None]
+    assert found["corruption"][0]["linear_mse"][0] == pytest.approx(
+        found["reconstruction"]["mse"][0], rel=1e-3
+    )
+
+
+def still_height(data, rows):
+    observation = data.dataset["observation"][rows].copy()
+    observation[:, 2] = 0.03
+    return observation
+
+
+def test_labels_and_numbers_that_cannot_be_judged(data):
+    with pytest.raises(InputError, match="the label full is that of the observation itself"):
+        evaluate({"full": make(data, ((), ()))}, data)
+    huge = Layer(np.full((16, 16), 1e11, np.float32), np.zeros(16, np.float32), "linear")
+    with pytest.raises(InputError, match="it gives numbers that aren't finite"):
+        evaluate({"it": make(data, ((), (huge,) * 4))}, data)
 
 
 def test_an_evaluation_is_plain_json_and_repeats(data, tmp_path):

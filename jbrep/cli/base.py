@@ -28,8 +28,11 @@ class _Count(click.ParamType[int]):
     ) -> int:
         text = str(value).replace("_", "").lower()
         factor = {"k": 1_000, "m": 1_000_000}.get(text[-1:], 1)
+        digits = text[:-1] if factor > 1 else text
+        if digits.isdecimal():
+            return int(digits) * factor
         try:
-            number = float(text[:-1] if factor > 1 else text) * factor
+            number = float(digits) * factor
         except ValueError:
             number = math.nan
         if not number.is_integer():

@@ -103,6 +103,7 @@ def _fit(
 ) -> None:
     from jbrep.dae.training import Training
     from jbrep.dataset import Dataset, ScaledDataset
+    from jbrep.encoders.file import ERROR
     from jbrep.fit import Fitter, get_kind
 
     given = {name: value for name, value in how.items() if value is not None}
@@ -117,10 +118,12 @@ def _fit(
     for name in scaled.constant_features:
         click.echo(f"{name} never varies in the training part: it is scaled to 0", err=True)
     fitter = Fitter(scaled, out, device)
-    with stoppable(f"{GOES_ON}; the best so far is in {out}"):
+    for training in trainings:  # all that is wrong before the first hour
+        fitter.check(kind, training)
+    with stoppable(f"{GOES_ON}; what is best so far is in {out}"):
         for training in trainings:
             found = fitter.fit(kind, training)
-            error = found.encoder.header["metrics"]["held_out_mse"]
+            error = found.encoder.header["metrics"][ERROR]
             there = "" if found.anew else ", complete already"
             click.echo(
                 f"{found.encoder.name}: held-out mean squared error {error:.5f}, features scaled "
@@ -153,6 +156,7 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path) -> None:
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders import find
+    from jbrep.encoders.file import SUFFIX
     from jbrep.evaluate.files import EVALUATION, write
     from jbrep.evaluate.summary import summary
     from jbrep.figures import encoder_figures
@@ -160,10 +164,13 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path) -> None:
     scaled = ScaledDataset(Dataset(data))
     found = [find(name, scaled.task.name) for name in encoder]
     names = [each.name for each in found]
-    labels = [n if names.count(n) == 1 else given for n, given in zip(names, encoder, strict=True)]
-    with stoppable("nothing was written"):
+    labels = [  # by the path, if more than one has the name
+        name if names.count(name) == 1 else given.removesuffix(SUFFIX)
+        for name, given in zip(names, encoder, strict=True)
+    ]
+    with stoppable("the same command starts anew"):
         evaluation = write(dict(zip(labels, found, strict=True)), scaled, out)
-    figures = encoder_figures(evaluation, out)
+        figures = encoder_figures(evaluation, out)
     for label, seen in evaluation["seen"].items():
         if seen == "maybe":
             click.echo(
@@ -215,4 +222,8 @@ def _open(encoder: str, task: str | None) -> Any:
     """An encoder by name and task, or by file alone."""
     from jbrep.encoders import find, load
 
-    return find(encoder, task) if task else load(Path(encoder))
+    if task:
+        return find(encoder, task)
+    if not Path(encoder).exists():
+        raise InputError(f"no encoder at {encoder}: of one that ships, the --task is needed, too")
+    return load(Path(encoder))

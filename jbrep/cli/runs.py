@@ -7,12 +7,18 @@ import click
 from jbrep.cli.base import COUNT, example
 
 
-@click.command(epilog=example("jbrep rl --task face_direction --encoder encoder-8 --out runs/a"))
+@click.command(epilog=example("jbrep rl --task face_direction --encoder dae-8 --out runs/a"))
 @click.option("--task", required=True, help="A Jitterbug task, such as face_direction.")
 @click.option("--algorithm", default="sac", show_default=True, help="ddpg, td3, sac, ppo or a2c.")
-@click.option("--encoder", help="An encoder file; the full observation if not given.")
+@click.option("--encoder", help="A file, or a name that ships; the full observation if not given.")
 @click.option("--steps", default=10_000, show_default=True, type=COUNT, help="Control steps.")
-@click.option("--seed", default=0, show_default=True, help="Of agent and environment.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**31),
+    default=0,
+    show_default=True,
+    help="Of agent and environment.",
+)
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A new folder.")
 def rl(task: str, algorithm: str, encoder: str | None, steps: int, seed: int, out: Path) -> None:
     """Train and evaluate one agent.

@@ -1,92 +1,72 @@
 """Where training has got to, in a file that runs nothing when it is read."""
 
-import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import safetensors.torch
-from safetensors import SafetensorError, safe_open
+import torch
 from torch import Tensor
 
 from jbrep.dae.training import Epoch, Trainer
-from jbrep.dataset.storage import write_whole
-from jbrep.errors import InputError
-
-_KEY = "jbrep"
+from jbrep.encoders import container
+from jbrep.errors import InputError, differences
 
 
 def save(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
     """Write the trainer's state, whole or not at all.
 
     Args:
-        trainer: between two epochs.
+        trainer: after at least one epoch.
         identity: what must be equal for training to go on: plain JSON.
         path: the file.
     """
-    header = {"identity": identity, "history": trainer.history}
-    content = safetensors.torch.save(_tensors(trainer), {_KEY: json.dumps(header)})
-    write_whole(path, content)
+    tensors = {name: tensor.cpu().numpy() for name, tensor in _state(trainer).items()}
+    container.write(path, tensors, {"identity": identity, "history": trainer.history})
 
 
 def restore(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
-    """Bring a new trainer to where the file's was; without a file it stays new.
+    """Bring a trainer to where the file's was; nothing of the trainer's own progress stays.
 
     Raises:
         InputError: the file is damaged, or of other settings, data or versions.
     """
-    if not path.exists():
-        return
+    tensors, header = container.read(path, "checkpoint")
     try:
-        with safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {})[_KEY])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        differing = differences(dict(header["identity"]), identity)
         history = [Epoch(*map(float, epoch)) for epoch in header["history"]]
-        there = header["identity"]
-        if not isinstance(there, dict):
-            raise TypeError("no settings in it")
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{path} is damaged: delete it to begin anew ({error})") from None
-    differing = [
-        f"{name} {there.get(name)!r} there, {value!r} here"
-        for name, value in identity.items()
-        if there.get(name) != value
-    ]
+    except (KeyError, TypeError, ValueError, ArithmeticError):
+        raise _damaged(path) from None
     if differing:
         raise InputError(
-            f"{path} was begun otherwise: {', '.join(differing)}; take another --out, or delete it "
-            "to begin anew"
+            f"{path} was begun otherwise: {differing}; take another folder, or delete it to begin "
+            "anew"
         )
-    _fill(trainer, tensors, path)
+    if not history or not all(math.isfinite(loss) for epoch in history for loss in epoch):
+        raise _damaged(path)
+    state = _state(trainer)
+    given = {name: torch.from_numpy(tensor) for name, tensor in tensors.items()}
+    if _shapes(given) != _shapes(state):
+        raise _damaged(path)
+    for name, tensor in given.items():
+        state[name].copy_(tensor)
     trainer.history = history
 
 
-def _tensors(trainer: Trainer) -> dict[str, Tensor]:
-    """All that an epoch changes."""
-    network = {f"network.{name}": p for name, p in trainer.network.state_dict().items()}
-    best = {f"best.{name}": p for name, p in trainer.best.items()}
-    moments = {
-        f"adam.{i}.{name}": value
-        for i, state in trainer.optimiser.state_dict()["state"].items()
-        for name, value in state.items()
-    }
-    return {**network, **best, **moments}
+def _state(trainer: Trainer) -> dict[str, Tensor]:
+    """All that an epoch changes, by name; the tensors are the trainer's own."""
+    named = {f"network.{name}": p for name, p in trainer.network.state_dict().items()}
+    named |= {f"best.{name}": p for name, p in trainer.best.items()}
+    for name, parameter in trainer.network.named_parameters():
+        named |= {
+            f"adam.{name}.{key}": value for key, value in trainer.optimiser.state[parameter].items()
+        }
+    return named
 
 
-def _fill(trainer: Trainer, tensors: dict[str, Tensor], path: Path) -> None:
-    """Put a checkpoint's tensors in their places."""
+def _shapes(tensors: dict[str, Tensor]) -> dict[str, Any]:
+    return {name: (tensor.shape, tensor.dtype) for name, tensor in tensors.items()}
 
-    def under(prefix: str) -> dict[str, Tensor]:
-        return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
 
-    optimiser = trainer.optimiser.state_dict()
-    numbers = optimiser["param_groups"][0]["params"]
-    optimiser["state"] = {i: under(f"adam.{i}.") for i in numbers}
-    try:
-        trainer.network.load_state_dict(under("best."))
-        trainer.best = {name: p.clone() for name, p in trainer.network.state_dict().items()}
-        trainer.network.load_state_dict(under("network."))
-        trainer.optimiser.load_state_dict(optimiser)
-    except (RuntimeError, KeyError, ValueError) as error:
-        why = " ".join(str(error).split())
-        raise InputError(f"{path} is damaged: delete it to begin anew ({why})") from None
+def _damaged(path: Path) -> InputError:
+    return InputError(f"{path} is damaged: delete it to begin anew")

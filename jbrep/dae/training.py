@@ -17,6 +17,7 @@ from jbrep.dae.gradient import Gradient
 from jbrep.dae.network import Autoencoder, get_architecture
 from jbrep.errors import InputError
 
+_MOST = 1 << 63  # numbers that torch takes are smaller
 NOISE = 0.1  # standard deviation, of features scaled to [-1, 1]
 _TOGETHER = 4  # batches drawn at once
 _Item = TypeVar("_Item")
@@ -71,9 +72,11 @@ class Training:
             InputError: it can't.
         """
         for name, least in (("epochs", 1), ("batch_size", 1), ("seed", 0)):
-            if getattr(self, name) < least:
+            if not least <= getattr(self, name) < _MOST:
                 said = name.replace("_", " ")
-                raise InputError(f"{said} is {getattr(self, name)}: at least {least} is needed")
+                raise InputError(
+                    f"{said} is {getattr(self, name)}: from {least} to {_MOST - 1} is needed"
+                )
         if not 0 < self.learning_rate < np.inf or not 0 <= self.noise < np.inf:
             raise InputError(
                 f"learning rate {self.learning_rate} and noise {self.noise}: a positive number and "
@@ -89,20 +92,18 @@ class Epoch(NamedTuple):
 
 
 def get_device(name: str) -> torch.device:
-    """A device by torch's name; auto takes a GPU where there is one.
+    """The device cpu or cuda; auto takes a GPU where there is one.
 
     Raises:
-        InputError: torch knows none of that name here.
+        InputError: another name, or no GPU here.
     """
-    try:
-        device = torch.device(
-            ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
-        )
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        why = str(error).splitlines()[0]
-        raise InputError(f"no device {name!r} here: take auto, cpu or cuda ({why})") from None
-    return device
+    gpu = torch.cuda.is_available()
+    if name == "auto":
+        return torch.device("cuda" if gpu else "cpu")
+    if name not in ("cpu", "cuda") or (name == "cuda" and not gpu):
+        here = "auto, cpu or cuda" if gpu else "auto or cpu"
+        raise InputError(f"no device {name!r} here: take {here}")
+    return torch.device(name)
 
 
 class Trainer:
@@ -131,11 +132,13 @@ class Trainer:
         size = train.shape[1]
         network = Autoencoder(architecture, size, training.latent, training.seed)
         self.network = network.to(train.device)
+        self.best = _copy(self.network)
         modules = (*self.network.encoder, *self.network.decoder)
-        self._gradient = Gradient(modules, training.batch_size)
+        self._batch_size = min(training.batch_size, len(train))
+        self._gradient = Gradient(modules, self._batch_size)
         self.optimiser = Adam(self.network.parameters(), training.learning_rate, fused=True)
         self._decay = architecture.decay
-        self.best: dict[str, Tensor] = {}
+        self._begin_optimiser()
         self.history: list[Epoch] = []
 
     @property
@@ -159,27 +162,37 @@ class Trainer:
             total += self._gradient(corrupted, clean) * clean.shape[1]
             self.optimiser.step()
         train_loss = float(total) / len(self._train)
-        if not math.isfinite(train_loss):
-            raise InputError(
-                f"the loss is {train_loss} in epoch {number}: a learning rate below "
-                f"{self.training.learning_rate} is needed"
-            )
         with torch.no_grad():
             test_loss = float(mse_loss(self.network(self._test), self._test))
+        if not math.isfinite(train_loss) or not math.isfinite(test_loss):
+            raise InputError(
+                f"the losses are {train_loss} and {test_loss} in epoch {number}: less noise than "
+                f"{self.training.noise}, or a learning rate below {self.training.learning_rate}, "
+                "is needed"
+            )
+        if all(train_loss < epoch.train_loss for epoch in self.history):
+            self.best = _copy(self.network)
         self.history.append(Epoch(train_loss, test_loss))
-        if self.best_epoch == number:
-            self.best = {name: p.clone() for name, p in self.network.state_dict().items()}
+
+    def _begin_optimiser(self) -> None:
+        """Make the state that Adam would make at its first step, for a checkpoint to fill."""
+        for p in self.network.parameters():
+            self.optimiser.state[p] = {
+                "step": torch.zeros((), device=p.device),
+                "exp_avg": torch.zeros_like(p),
+                "exp_avg_sq": torch.zeros_like(p),
+            }
 
     def _learning_rate(self, number: int, batch: int) -> float:
         if not self._decay:
             return self.training.learning_rate
-        batches = -(-len(self._train) // self.training.batch_size)
+        batches = -(-len(self._train) // self._batch_size)
         done = (number - 1 + batch / batches) / self.training.epochs
         return self.training.learning_rate * (1 + math.cos(math.pi * done)) / 2
 
     def _batches(self, number: int) -> Iterator[tuple[Tensor, Tensor]]:
         """Every row once, (d, rows): clean, and with noise of its own on each feature."""
-        size = self.training.batch_size
+        size = self._batch_size
         for clean, corrupted in ahead(self._draws(number)):
             yield from zip(clean.split(size, 1), corrupted.split(size, 1), strict=True)
 
@@ -189,13 +202,17 @@ class Trainer:
         words = np.random.SeedSequence((self.training.seed, number)).generate_state(1, np.uint64)
         generator = torch.Generator(rows.device).manual_seed(int(words[0]))
         order = torch.randperm(len(rows), generator=generator, device=rows.device)
-        for batches in order.split(_TOGETHER * self.training.batch_size):
+        for batches in order.split(_TOGETHER * self._batch_size):
             clean = rows.index_select(0, batches).T.contiguous()
             if noise:
                 drawn = torch.empty_like(clean).normal_(0, noise, generator=generator)
                 yield clean, drawn.add_(clean)
             else:
                 yield clean, clean
+
+
+def _copy(network: Autoencoder) -> dict[str, Tensor]:
+    return {name: p.clone() for name, p in network.state_dict().items()}
 
 
 def ahead(items: Iterable[_Item]) -> Iterator[_Item]:

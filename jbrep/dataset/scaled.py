@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,13 @@ from jbrep.dataset.reader import Dataset
 from jbrep.errors import InputError
 
 _CHUNK = 1 << 16  # rows at a time
+
+
+def sample(rows: NDArray[Any], most: int) -> NDArray[Any]:
+    """At most so many of them, in order; always the same draw, and of any step of an episode."""
+    if len(rows) <= most:
+        return rows
+    return rows[np.sort(np.random.default_rng(0).choice(len(rows), most, replace=False))]
 
 
 class Moments(NamedTuple):
@@ -38,9 +45,11 @@ class ScaledDataset:
         self.task = dataset.task
         self.train, self.test = dataset.split()
         self.scaler = dataset.fit_scaler(self.train)
-        finite = np.isfinite(self.scaler.low) & np.isfinite(self.scaler.high)
-        if not finite.all():
-            bad = ", ".join(self._names(~finite))
+        unseen = dataset.fit_scaler(self.test)
+        extrema = (self.scaler.low, self.scaler.high, unseen.low, unseen.high)
+        broken = np.asarray(~np.isfinite(extrema).all(axis=0))
+        if broken.any():
+            bad = ", ".join(self._names(broken))
             raise InputError(
                 f"{dataset.folder} holds numbers that aren't finite in {bad}: look with jbrep data "
                 "verify"

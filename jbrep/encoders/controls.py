@@ -48,7 +48,7 @@ def linear_denoiser(latent: int, noise: float, moments: Moments) -> tuple[Layers
     """
     mean, covariance = moments
     corrupted = covariance + noise**2 * np.eye(len(mean))
-    ridge = np.linalg.solve(corrupted, covariance).T
+    ridge = covariance @ np.linalg.pinv(corrupted, hermitian=True)
     _, vectors = np.linalg.eigh(ridge @ covariance)
     directions = vectors[:, ::-1][:, :latent]
     weight = directions.T @ ridge

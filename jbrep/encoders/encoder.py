@@ -14,6 +14,9 @@ from jbrep.jitterbug.tasks import Task
 Float32 = NDArray[np.float32]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 
+_WIDEST = 4096
+_MOST = 1e12  # what float32 arithmetic stays clear of
+
 
 class Layer(NamedTuple):
     """A dense layer: activation(values @ weight.T + bias)."""
@@ -46,7 +49,7 @@ class _Parts(NamedTuple):
     decoder: tuple[Layer, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Encoder:
     """An encoder with its decoder, and the scaling that they were made for.
 
@@ -76,6 +79,11 @@ class Encoder:
             self._check(name, tensor, sizes)
         if sizes[-1] != self.size:
             raise InputError(f"the last layer gives {sizes[-1]} features: {self.size} are needed")
+        if max(sizes) > _WIDEST or self.latent_size > self.size:
+            raise InputError(
+                f"layers of {sizes[1:]} units: at most {_WIDEST}, and no more in the latent than "
+                f"there are features, {self.size}"
+            )
         for layer in (*self.encoder, *self.decoder):
             if layer.activation not in ACTIVATIONS:
                 choices = ", ".join(ACTIVATIONS)
@@ -86,7 +94,7 @@ class Encoder:
     def _check(self, name: str, tensor: Any, sizes: list[int]) -> None:
         """One tensor; `sizes` has those of the layers up to it."""
         if name.endswith("weight"):
-            rows = tensor.shape[0] if np.ndim(tensor) == 2 else 1
+            rows = max(1, tensor.shape[0]) if np.ndim(tensor) == 2 else 1
             expected: tuple[int, ...] = (rows, sizes[-1])
             sizes.append(rows)
         else:
@@ -95,8 +103,8 @@ class Encoder:
             raise InputError(f"tensor {name} has shape {tensor.shape}: {expected} is needed")
         if tensor.dtype != np.float32:
             raise InputError(f"tensor {name} holds {tensor.dtype}: float32 is needed")
-        if not np.isfinite(tensor).all():
-            raise InputError(f"tensor {name} holds a number that is not finite")
+        if not (np.abs(tensor) < _MOST).all():
+            raise InputError(f"tensor {name} holds a number that is not finite, or beyond {_MOST}")
 
     def tensors(self) -> dict[str, Float32]:
         """All its numbers by name, as they stand in its file."""
@@ -151,7 +159,7 @@ class Encoder:
 
     def _prepare(self, values: Any, size: int, what: str) -> tuple[Any, _Parts]:
         """Values as float32, and this encoder's numbers where the values are."""
-        if hasattr(values, "device") and not isinstance(values, np.ndarray):
+        if type(values).__module__ == "torch":
             values, parts = values.float(), self._on_device(values.device)
         else:
             values, parts = np.asarray(values, np.float32), self._on[None]

@@ -8,21 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors.numpy
-from safetensors import SafetensorError
 
 from jbrep.dataset import DamageError, Scaler
-from jbrep.dataset.shard import read_regular
-from jbrep.dataset.storage import write_whole
+from jbrep.encoders import container
+from jbrep.encoders.container import Tensors
 from jbrep.encoders.encoder import Encoder, Layer
 from jbrep.errors import InputError
 
 FORMAT = "jbrep encoder"
 FORMAT_VERSION = 1
 SUFFIX = ".safetensors"
-_KEY = "jbrep"  # of the header among the file's metadata
+ERROR = "held_out_mse"  # the metric that every encoder has
 _HASH = "sha256"  # of the rest of the header and all tensors
-_MAX_BYTES = 1 << 24
 _TEXTS = ("kind", "name", "task")
 _RECORDS = ("training", "data", "metrics", "versions")
 
@@ -34,7 +31,7 @@ def save(encoder: Encoder, path: Path) -> None:
         InputError: it can't be written.
     """
     header = {**_whole_header(encoder), _HASH: fingerprint(encoder)}
-    write_whole(path, safetensors.numpy.save(encoder.tensors(), {_KEY: json.dumps(header)}))
+    container.write(path, encoder.tensors(), header)
 
 
 def fingerprint(encoder: Encoder) -> str:
@@ -59,21 +56,7 @@ def load(path: Path) -> Encoder:
             and tensors don't fit together; the message names the tensor.
         DamageError: it isn't what was written.
     """
-    try:
-        raw = read_regular(path, _MAX_BYTES)
-    except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"no encoder at {path}") from None
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror}") from error
-    if not raw:
-        raise InputError(
-            f"{path} is not a jbrep encoder: a regular file of 1 to {_MAX_BYTES:,} bytes is needed"
-        )
-    try:
-        tensors = safetensors.numpy.load(raw)
-        header = _header(raw)
-    except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{path} is not a jbrep encoder, or cut short: {error}") from None
+    tensors, header = container.read(path, "encoder")
     if header.get("format") != FORMAT or not isinstance(header.get("format_version"), int):
         raise InputError(f"{path} is not a jbrep encoder")
     if header["format_version"] > FORMAT_VERSION:
@@ -89,16 +72,7 @@ def load(path: Path) -> Encoder:
         raise InputError(f"{path}: {error}") from None
 
 
-def _header(raw: bytes) -> dict[str, Any]:
-    """The header, of bytes that safetensors found well-formed."""
-    length = int.from_bytes(raw[:8], "little")
-    header = json.loads(json.loads(raw[8 : 8 + length])["__metadata__"][_KEY])
-    if not isinstance(header, dict):
-        raise TypeError("its header is no JSON object")
-    return header
-
-
-def _digest(header: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> str:
+def _digest(header: Mapping[str, Any], tensors: Tensors) -> str:
     """SHA-256 of a header in its one spelling, and of all tensors."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name, tensor in sorted(tensors.items()):
@@ -107,7 +81,7 @@ def _digest(header: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> str
     return digest.hexdigest()
 
 
-def _encoder(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Encoder:
+def _encoder(header: dict[str, Any], tensors: Tensors) -> Encoder:
     """Both put together; what is left to go wrong is what a forger wrote."""
     _check(header)
     parts = {}
@@ -136,12 +110,14 @@ def _check(header: dict[str, Any]) -> None:
             raise InputError(f"its header has no {name}")
     if not re.fullmatch("[a-z0-9-]+", header["name"]):
         raise InputError(f"its name {header['name']!r} is none")
+    if not isinstance(header["metrics"].get(ERROR), float):
+        raise InputError(f"its header has no {ERROR} among its metrics")
     for name in ("features", "encoder", "decoder"):
         if not all(isinstance(word, str) for word in header[name]):
             raise InputError(f"its header's {name} are no words")
 
 
-def _take(tensors: dict[str, np.ndarray], name: str) -> np.ndarray:
+def _take(tensors: Tensors, name: str) -> np.ndarray:
     if name not in tensors:
         raise InputError(f"tensor {name} is missing")
     return tensors.pop(name)

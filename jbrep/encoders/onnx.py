@@ -1,6 +1,7 @@
 """Encoders as ONNX, for whatever runs that."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ def export(encoder: Encoder, path: Path) -> None:
     Raises:
         InputError: the file is there already, or can't be written.
     """
-    if path.exists():
+    if os.path.exists(path):  # noqa: PTH110, unlike Path's it never raises
         raise InputError(f"{path} is there already: choose another file")
     write_whole(path, model(encoder).SerializeToString(deterministic=True))
 

@@ -1,5 +1,6 @@
 """Encoders that come with the package, by name."""
 
+import os
 from pathlib import Path
 
 from jbrep.encoders.encoder import Encoder
@@ -27,7 +28,7 @@ def find(name: str | Path, task: str) -> Encoder:
     shipped = names(get_task(task).name)
     if str(name) in shipped:
         return load(_FOLDER / task / f"{name}{SUFFIX}")
-    if not Path(name).exists():
+    if not os.path.exists(name):  # noqa: PTH110, unlike Path's it never raises
         raise InputError(
             f"no encoder {str(name)!r}: a file is needed, or one that ships for {task}: "
             f"{', '.join(shipped)}"

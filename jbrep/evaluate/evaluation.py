@@ -3,10 +3,13 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from jbrep.dataset import ScaledDataset
+from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
+from jbrep.errors import InputError
 from jbrep.evaluate.bootstrap import RESAMPLES
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import latent
@@ -39,11 +42,11 @@ def evaluate(encoders: Mapping[str, Encoder], data: ScaledDataset) -> dict[str, 
             this data set.
 
     Raises:
-        InputError: an encoder made for other features.
+        InputError: an encoder made for other features, or whose numbers overflow.
     """
-    for encoder in encoders.values():
-        encoder.check_task(data.task)
     held_out = HeldOut(data)
+    for label, encoder in encoders.items():
+        _check(label, encoder, data)
     full = Encoder({"kind": "identity", "name": FULL}, data.scaler, (), ())
     found = {}
     everything = {FULL: full, **encoders}
@@ -64,12 +67,24 @@ def evaluate(encoders: Mapping[str, Encoder], data: ScaledDataset) -> dict[str, 
     }
 
 
+def _check(label: str, encoder: Encoder, data: ScaledDataset) -> None:
+    if label == FULL:
+        raise InputError(f"the label {FULL} is that of the observation itself: take another")
+    encoder.check_task(data.task)
+    for rows in data.observations(sample(data.test, 1000)):
+        with np.errstate(over="ignore", invalid="ignore"):
+            back = encoder.decode(encoder.encode(rows))
+        if not np.isfinite(back).all():
+            raise InputError(f"{label} gives numbers that aren't finite: train it anew")
+
+
 def seen(encoder: Encoder, data: ScaledDataset) -> str:
     """Whether the encoder was trained on this data set: "no test row", "none" or "maybe"."""
     source, manifest = encoder.header["data"], data.dataset.manifest
     if source.get("fingerprint") == manifest.fingerprint:
         return "no test row"
-    return "maybe" if source.get("seed") == manifest.settings.seed else "none"
+    apart = "seed" in source and source["seed"] != manifest.settings.seed
+    return "none" if apart else "maybe"
 
 
 def _describe(held_out: HeldOut) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The file that an evaluation is kept in."""
 
 import json
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -34,12 +35,12 @@ def write(encoders: Mapping[str, Encoder], data: ScaledDataset, folder: Path) ->
     """
     path = folder / EVALUATION
     marks = {label: fingerprint(encoder) for label, encoder in encoders.items()}
-    if path.exists():
+    if os.path.exists(path):  # noqa: PTH110, unlike Path's it never raises
         _check_same(path, {"data": data.dataset.manifest.fingerprint, "encoders": marks})
+    make_folder(folder)
     evaluation = evaluate(encoders, data)
     for label, mark in marks.items():
         evaluation["encoders"][label]["sha256"] = mark
-    make_folder(folder)
     write_whole(path, _text(evaluation).encode())
     return evaluation
 
@@ -60,9 +61,9 @@ def _check_same(path: Path, wanted: dict[str, Any]) -> None:
 
 
 def _text(value: Any) -> str:
-    """JSON with each innermost list on one line."""
+    """JSON with each list of numbers on one line."""
     text = json.dumps(_rounded(value), indent=1, allow_nan=False)
-    return re.sub(r"\[[^\[\]{}]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
+    return re.sub(r"\[[-+.,\deEnul\s]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
 
 
 def _rounded(value: Any) -> Any:

@@ -12,11 +12,6 @@ from jbrep.evaluate.bootstrap import Array, by_episode
 Rows = NDArray[np.int64]
 
 
-def some(rows: NDArray[Any], most: int) -> NDArray[Any]:
-    """At most so many of them, evenly spread."""
-    return rows[:: max(1, -(-len(rows) // most))]
-
-
 class HeldOut:
     """Held-out rows of a data set, by episode.
 

@@ -5,14 +5,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
 from jbrep.evaluate.bootstrap import without_nan
-from jbrep.evaluate.held_out import HeldOut, some
+from jbrep.evaluate.held_out import HeldOut
 
 _ROWS = 200_000
 _POINTS = 5_000  # for intrinsic dimensions
 _SATURATED = 0.95  # of a tanh unit's magnitude
 _DEAD = 0.01  # standard deviation, of the liveliest unit's
+_STILL = 1e-6  # standard deviation that is rounding
 _NEIGHBOURS = 20  # of the maximum-likelihood estimator
 
 
@@ -21,9 +23,9 @@ def latent(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
 
     The participation ratio is (sum of the covariance's eigenvalues)^2 / sum of their squares.
     """
-    values = encode(encoder, held_out, some(held_out.data.test, _ROWS)).astype(np.float64)
+    values = encode(encoder, held_out, sample(held_out.data.test, _ROWS)).astype(np.float64)
     deviation = values.std(axis=0)
-    live = deviation > _DEAD * deviation.max()
+    live = deviation > max(_DEAD * deviation.max(), _STILL)
     spectrum = np.linalg.eigvalsh(np.atleast_2d(np.cov(values.T)))
     return {
         "mean": values.mean(axis=0).tolist(),
@@ -31,8 +33,10 @@ def latent(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
         "dead": np.flatnonzero(~live).tolist(),
         "saturation": _saturation(encoder, values),
         "correlation": _correlation(values, live),
-        "participation_ratio": float(spectrum.sum() ** 2 / np.square(spectrum).sum()),
-        "intrinsic_dimension": intrinsic_dimension(some(values, _POINTS)),
+        "participation_ratio": (
+            float(spectrum.sum() ** 2 / np.square(spectrum).sum()) if live.any() else None
+        ),
+        "intrinsic_dimension": intrinsic_dimension(sample(values, _POINTS)),
     }
 
 
@@ -66,7 +70,7 @@ def intrinsic_dimension(values: NDArray[Any]) -> dict[str, float | None]:
     points = np.unique(values, axis=0)
     if len(points) <= 2 * _NEIGHBOURS:
         return {"two_nn": None, "mle": None}
-    return {
-        "two_nn": float(TwoNN().fit(points).dimension_),
-        "mle": float(MLE(K=_NEIGHBOURS).fit(points).dimension_),
-    }
+    points = np.pad(points, ((0, 0), (0, 1)))  # the library refuses a single column
+    estimates = TwoNN().fit(points).dimension_, MLE(K=_NEIGHBOURS).fit(points).dimension_
+    two_nn, mle = without_nan([float(estimate) for estimate in estimates])
+    return {"two_nn": two_nn, "mle": mle}

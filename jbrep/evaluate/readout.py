@@ -9,9 +9,10 @@ from sklearn.neighbors import NearestNeighbors
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
+from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
 from jbrep.evaluate.bootstrap import Array, Interval, bootstrap, r_squared, variation
-from jbrep.evaluate.held_out import HeldOut, Rows, some
+from jbrep.evaluate.held_out import HeldOut, Rows
 from jbrep.evaluate.truth import quantities, state
 
 _ROWS = 100_000  # to fit on, and to judge on
@@ -28,7 +29,7 @@ def probes(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
     The cosine and sine of an angle count together.
     """
     data = held_out.data
-    train, test = some(data.train, _ROWS), some(data.test, _ROWS)
+    train, test = sample(data.train, _ROWS), sample(data.test, _ROWS)
     before, after = data.dataset["observation"][train], data.dataset["observation"][test]
     wanted, true = (quantities(data.task, rows) for rows in (before, after))
     latents, unseen = encoder.encode(before), encoder.encode(after)
@@ -47,7 +48,7 @@ def dynamics(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
     data = held_out.data
     steps = []
     for rows in (data.train, data.test):
-        chosen = held_out.followed(some(rows, _ROWS))
+        chosen = held_out.followed(sample(rows, _ROWS))
         now, then = (encoder.encode(data.dataset["observation"][r]) for r in (chosen, chosen + 1))
         steps.append((chosen, now, data.dataset["action"][chosen], then))
     (_, *known), (test, now, action, then) = steps
@@ -71,11 +72,11 @@ def neighbours(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
     episodes alone, never from the moments before and after. Unrelated rows have 2.
     """
     data = held_out.data
-    test, train = some(data.test, _QUERIES), some(data.train, _REFERENCES)
+    test, train = sample(data.test, _QUERIES), sample(data.train, _REFERENCES)
     asked, known = (data.dataset["observation"][rows] for rows in (test, train))
     wanted, true = (np.stack(list(state(data.task, o).values()), 1) for o in (asked, known))
     scale = true.std(axis=0)
-    varying = scale > 0
+    varying = np.ptp(true, axis=0) > 0
     index = NearestNeighbors(n_neighbors=min(_NEIGHBOURS, len(train))).fit(encoder.encode(known))
     nearest = index.kneighbors(encoder.encode(asked), return_distance=False)
     apart = (true[nearest] - wanted[:, None])[..., varying] / scale[varying]
@@ -95,7 +96,7 @@ def correlation(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
     in the S-RL Toolbox, but the other dimensions of the state are no candidates.
     """
     data = held_out.data
-    test = some(data.test, _CORRELATED)
+    test = sample(data.test, _CORRELATED)
     observation = data.dataset["observation"][test]
     truth = state(data.task, observation)
     left, right = encoder.encode(observation), np.stack(list(truth.values()), 1)
@@ -106,8 +107,8 @@ def correlation(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
     def largest(z: Array, s: Array, zz: Array, ss: Array, zs: Array, n: Array) -> Array:
         spread_z, spread_s = variation(z, zz, n), variation(s, ss, n)
         shared = zs.reshape(*z.shape, -1) - z[..., :, None] * s[..., None, :] / n[..., None]
-        rho = np.abs(shared) / np.sqrt(spread_z[..., :, None] * spread_s[..., None, :])
-        return np.nan_to_num(rho).max(axis=-2)
+        spread = np.sqrt(spread_z[..., :, None] * spread_s[..., None, :])
+        return np.where(spread > 0, np.abs(shared) / spread, 0).max(axis=-2)
 
     by_name = bootstrap(largest, *sums).tolist()
     return {

@@ -1,15 +1,17 @@
 """What an encoder and its decoder lose, clean and corrupted."""
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
+from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
 from jbrep.encoders.controls import Layers, linear_denoiser, pca
 from jbrep.evaluate.bootstrap import Array, bootstrap, r_squared, variation
-from jbrep.evaluate.held_out import HeldOut, Rows, some
+from jbrep.evaluate.held_out import HeldOut, Rows
 
 NOISES = (0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # of features scaled to [-1, 1]
 _QUANTILES = (0.5, 0.9, 0.99, 0.999, 1)
@@ -47,14 +49,12 @@ def corruption(encoder: Encoder, held_out: HeldOut) -> list[dict[str, Any]]:
     latent size that is best at that strength.
     """
     data = held_out.data
-    rows = some(data.test, _CORRUPTED_ROWS)
+    rows = sample(data.test, _CORRUPTED_ROWS)
     (counts,) = held_out.sums(rows, np.ones((len(rows), 1)))
     found = []
     for noise in NOISES:
-        linear = _linear(data, linear_denoiser(encoder.latent_size, noise, data.moments))
-        ours, best = held_out.sums(
-            rows, *(_errors(each, data, rows, noise) for each in (encoder, linear))
-        )
+        (ours,) = held_out.sums(rows, _errors(encoder, data, rows, noise))
+        best = _best_linear(held_out, encoder.latent_size, noise)
         found.append(
             {
                 "noise": noise,
@@ -85,18 +85,33 @@ def _errors(
     return np.concatenate(found)
 
 
+@lru_cache(1024)  # as many encoders of one size share it
+def _best_linear(held_out: HeldOut, latent: int, noise: float) -> Array:
+    """Sums of squared errors of the best linear denoiser, by episode."""
+    data = held_out.data
+    rows = sample(data.test, _CORRUPTED_ROWS)
+    linear = _linear(data, linear_denoiser(latent, noise, data.moments))
+    return held_out.sums(rows, _errors(linear, data, rows, noise))[0]
+
+
+@lru_cache(1024)
+def _pca(held_out: HeldOut, latent: int) -> Array:
+    """Sums of squared errors of PCA, by episode."""
+    data = held_out.data
+    linear = _linear(data, pca(data, latent))
+    return held_out.sums(data.test, _errors(linear, data, data.test))[0]
+
+
 def _linear(data: ScaledDataset, layers: tuple[Layers, Layers]) -> Encoder:
     return Encoder({"name": "linear"}, data.scaler, *layers)
 
 
 def _beside_pca(latent: int, sums: Array, held_out: HeldOut) -> dict[str, Any]:
-    data = held_out.data
-    reference = _linear(data, pca(data, latent))
-    (linear,) = held_out.sums(data.test, _errors(reference, data, data.test))
+    linear = _pca(held_out, latent)
     ratio = bootstrap(lambda ours, pca: ours.sum(axis=-1) / pca.sum(axis=-1), sums, linear)
     return {
         "pca_mse": bootstrap(_mean, linear, held_out.row_counts).tolist(),
-        "ratio_to_pca": ratio.tolist() if latent < data.task.size else None,
+        "ratio_to_pca": ratio.tolist() if latent < held_out.data.task.size else None,
     }
 
 
