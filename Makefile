@@ -17,7 +17,7 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[export,learn,render,dev]'
 	@touch $@
 
-demo: $(READY) ## the whole job in minutes: collect, encode, learn on the latent and on the full state
+demo: $(READY) ## the whole job in minutes: collect, train and judge encoders, learn on latent and full state
 	rm -rf $(DEMO)
 	$(BIN)/jbrep collect --task face_direction --steps 20k --out $(DEMO)/data
 	$(BIN)/jbrep data info $(DEMO)/data

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from jbrep.errors import InputError
+from jbrep.tables import table
 
-_ROW = "{:<20} {:<10} {:<8} {:>4} {:>9} {:>15} {:>20}"
+_HEADER = ("task", "algorithm", "state", "seed", "steps", "median return", "10-90 %")
 
 
 def summarise(folder: Path) -> str:
@@ -19,13 +20,11 @@ def summarise(folder: Path) -> str:
     files = sorted(folder.rglob("run.json"))
     if not files:
         raise InputError(f"no finished run below {folder}: a run.json is expected")
-    lines = [_ROW.format("task", "algorithm", "state", "seed", "steps", "median return", "10-90 %")]
+    rows = []
     for file in files:
         result = json.loads(file.read_text())
         run = result["run"]
         low, median, high = np.percentile(result["returns"], (10, 50, 90))
-        state = result["representation"]
-        spread = f"[{low:.0f}, {high:.0f}]"
-        settings = (run["task"], run["algorithm"], state, run["seed"], f"{run['steps']:,}")
-        lines.append(_ROW.format(*settings, f"{median:.0f}", spread))
-    return "\n".join(lines)
+        settings = run["task"], run["algorithm"], result["representation"], str(run["seed"])
+        rows.append((*settings, f"{run['steps']:,}", f"{median:.0f}", f"[{low:.0f}, {high:.0f}]"))
+    return table(_HEADER, rows)

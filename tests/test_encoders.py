@@ -15,11 +15,12 @@ import safetensors.numpy
 import torch
 
 from jbrep.dataset import DamageError, Scaler
-from jbrep.encoders import Encoder, Layer, load, save
+from jbrep.encoders import Encoder, Layer, find, load, save
 from jbrep.encoders import file as encoder_file
 from jbrep.encoders.card import card
 from jbrep.encoders.file import fingerprint
 from jbrep.encoders.onnx import export
+from jbrep.encoders.shipped import names
 from jbrep.envs import JitterbugVecEnv
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
@@ -312,3 +313,30 @@ def test_the_card_tells_layers_and_ranges(encoder):
     assert "16 -> 5 relu -> 3 tanh" in text
     assert "sha256     " + fingerprint(encoder) in text
     assert text.count("\n") > 16
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_encoders_ship_for_every_task(task):
+    assert names(task) == ("dae-12", "dae-8", "dae-4")
+    errors = []
+    for name in names(task):
+        shipped = find(name, task)
+        shipped.check_task(TASKS[task])
+        source = shipped.header["data"]
+        assert source["train_rows"] + source["test_rows"] == 5_000_000
+        assert shipped.header["training"]["epochs"] == shipped.header["metrics"]["epochs"] == 200
+        errors.append(shipped.header["metrics"]["held_out_mse"])
+    assert errors == sorted(errors)
+
+
+def test_a_name_that_ships_comes_before_a_file(encoder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save(encoder, tmp_path / "dae-8")
+    assert find("dae-8", TASK.name).latent_size == 8
+    assert find("./dae-8", TASK.name).latent_size == 3
+    with pytest.raises(
+        InputError, match=r"no encoder 'dae-9': .* ships for face_direction: dae-12"
+    ):
+        find("dae-9", TASK.name)
+    with pytest.raises(InputError, match="made for face_direction"):
+        find("./dae-8", "move_to_pose")
