@@ -1,10 +1,12 @@
 """Diagnostics: against closed forms, other libraries, and sums by hand."""
 
 import json
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
+from sklearn.decomposition import PCA
 from sklearn.linear_model import Ridge
 from sklearn.metrics import r2_score
 from sklearn.preprocessing import StandardScaler
@@ -271,6 +273,9 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
         z = [coder.encode(dataset["observation"][r]) for r in (kept, kept + 1)]
         parts.append((np.column_stack((z[0], dataset["action"][kept])), z[1]))
     (known, after), (unseen, true) = parts
+    whiten = PCA(whiten=True).fit(known[:, :4]).transform
+    after, true = whiten(after), whiten(true)
+    known, unseen = (np.column_stack((whiten(v[:, :4]), v[:, 4])) for v in (known, unseen))
     scaler = StandardScaler().fit(known)
     predicted = Ridge(1.0).fit(scaler.transform(known), after).predict(scaler.transform(unseen))
     found = dynamics(coder, held_out)
@@ -279,6 +284,18 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     still = r2_score(true, unseen[:, :4], multioutput="variance_weighted")
     assert found["persistence"][0] == pytest.approx(still, abs=1e-3)
     assert found["linear"][0] > found["persistence"][0]
+
+
+def test_mixing_the_units_does_not_change_how_well_the_next_is_read(held_out, coder):
+    mixed = np.random.default_rng(0).normal(size=(4, 4)).astype(np.float32) * [[9], [1], [1], [0.1]]
+    (layer,) = coder.encoder
+    stirred = layer._replace(
+        weight=(mixed @ layer.weight).astype(np.float32),
+        bias=(mixed @ layer.bias).astype(np.float32),
+    )
+    other = replace(coder, encoder=(stirred,))
+    for name, values in dynamics(coder, held_out).items():
+        assert values == pytest.approx(dynamics(other, held_out)[name], abs=1e-3)
 
 
 def test_neighbours_come_from_training_episodes(held_out, coder, everything):

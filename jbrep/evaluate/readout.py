@@ -1,5 +1,6 @@
 """What can be read from a latent: the robot's state, and what comes next."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,8 @@ _CORRELATED = 50_000
 _QUERIES = 5_000
 _REFERENCES = 20_000
 _NEIGHBOURS = 5
+_ROUNDING = 1e-6  # of the largest variance
+_STILL = 1e-12  # variance that is rounding
 _PENALTY = 1.0  # of the ridge, on standardised latents
 
 
@@ -43,7 +46,8 @@ def probes(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
 def dynamics(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
     """R^2 of the next latent: linear in latent and action, and taken to stay as it is.
 
-    Units count by their variance.
+    The latent is whitened first, so that how units are scaled and mixed doesn't matter: every
+    direction in which it varies counts alike.
     """
     data = held_out.data
     steps = []
@@ -51,12 +55,24 @@ def dynamics(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
         chosen = held_out.followed(sample(rows, _ROWS))
         now, then = (encoder.encode(data.dataset["observation"][r]) for r in (chosen, chosen + 1))
         steps.append((chosen, now, data.dataset["action"][chosen], then))
+    whitened = _whitening(steps[0][1])
+    steps = [(rows, whitened(now), act, whitened(then)) for rows, now, act, then in steps]
     (_, *known), (test, now, action, then) = steps
     predicted = _ridge().fit(np.hstack(known[:2]), known[2]).predict(np.hstack((now, action)))
     return {
         "linear": _explained(predicted, then, test, held_out).tolist(),
         "persistence": _explained(now, then, test, held_out).tolist(),
     }
+
+
+def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
+    """To uncorrelated directions of unit variance, without those of none; if all are, to one 0."""
+    mean = latents.mean(axis=0, dtype=np.float64)
+    variances, directions = np.linalg.eigh(np.cov(latents.T).reshape(len(mean), -1))
+    kept = variances > max(_ROUNDING * variances[-1], _STILL)
+    scales = np.where(kept, 1 / np.sqrt(np.where(kept, variances, 1)), 0)
+    matrix = (directions * scales)[:, kept | (np.arange(len(kept)) == len(kept) - 1)]
+    return lambda values: (values - mean) @ matrix
 
 
 def _ridge() -> Any:

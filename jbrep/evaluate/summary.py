@@ -1,6 +1,5 @@
 """An evaluation as tables to read on a screen."""
 
-from collections.abc import Iterable
 from typing import Any
 
 from jbrep.evaluate.evaluation import FULL
@@ -19,10 +18,14 @@ def summary(evaluation: dict[str, Any]) -> str:
             "",
             _losses(evaluation["encoders"]),
             "",
-            "What the latent keeps: R^2 of linear probes; KNN-MSE (2: nothing); GTC (1: every "
-            "state dimension is a unit); R^2 of the next latent",
+            "What can be read: R^2 of linear probes; KNN-MSE (2: nothing); GTC (1: units show the "
+            "state itself); R^2 of the next latent, whitened",
             "",
-            _kept(evaluation["encoders"]),
+            _readings(evaluation["encoders"]),
+            "",
+            "Units: dead, the most saturated one, participation ratio, intrinsic dimension",
+            "",
+            _units(evaluation["encoders"]),
         )
     )
 
@@ -51,29 +54,40 @@ def _losses(encoders: dict[str, Any]) -> str:
     return table((*header, "worst feature, R^2"), rows)
 
 
-def _kept(encoders: dict[str, Any]) -> str:
-    read = list(encoders[FULL]["probes"])
-    header = ("encoder", *(name.replace("_", " ") for name in read), "KNN", "GTC", "next")
+def _readings(encoders: dict[str, Any]) -> str:
+    probes = list(encoders[FULL]["probes"])
+    header = ("encoder", *(name.replace("_", " ") for name in probes), "KNN", "GTC", "next")
     rows = [
         (
             label,
-            *(number(found["probes"][name][0], ".2f") for name in read),
+            *(number(found["probes"][name][0], ".2f") for name in probes),
             number(found["neighbours"]["mse"][0], ".2f"),
             number(found["correlation"]["mean"][0], ".2f"),
             number(found["dynamics"]["linear"][0], ".2f"),
-            *_shape(found["latent_units"]),
         )
         for label, found in encoders.items()
     ]
-    return table((*header, "dead", "saturated", "participation", "dimension"), rows)
+    return table(header, rows)
 
 
-def _shape(units: dict[str, Any]) -> Iterable[str]:
-    saturation = units["saturation"]
-    yield str(len(units["dead"]))
-    yield number(max(saturation), ".0%") if saturation else "-"
-    yield number(units["participation_ratio"], ".1f")
-    yield number(units["intrinsic_dimension"]["two_nn"], ".1f")
+def _units(encoders: dict[str, Any]) -> str:
+    rows = []
+    for label, found in encoders.items():
+        units = found["latent_units"]
+        saturated = max(units["saturation"]) if units["saturation"] else None
+        estimates = units["intrinsic_dimension"]
+        rows.append(
+            (
+                label,
+                str(len(units["dead"])),
+                number(saturated, ".0%"),
+                number(units["participation_ratio"], ".1f"),
+                number(estimates["two_nn"], ".1f"),
+                number(estimates["mle"], ".1f"),
+            )
+        )
+    header = ("encoder", "dead", "saturated", "participation", "TwoNN", "max. likelihood")
+    return table(header, rows)
 
 
 def interval(values: list[float | None], form: str) -> str:
