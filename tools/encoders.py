@@ -1,13 +1,17 @@
 """Train encoders of every kind for some tasks, and put them side by side.
 
-python tools/encoders.py DATA ENCODERS RESULTS TASK...; what is there already is kept.
+python tools/encoders.py DATA ENCODERS RESULTS TASK...; what is there already is kept. Without a
+task it prints the overview of RESULTS alone.
 """
 
+import json
 import sys
 from pathlib import Path
+from typing import Any
 
-from jbrep.dae.training import Training
+from jbrep.dae.training import NOISE, Training
 from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.evaluate.evaluation import FULL
 from jbrep.evaluate.files import write
 from jbrep.evaluate.summary import summary
 from jbrep.figures import encoder_figures
@@ -39,8 +43,27 @@ def compare(data: ScaledDataset, encoders: Path, results: Path) -> None:
     print(summary(evaluation))
 
 
+def overview(results: Path) -> str:
+    """All tasks side by side: times PCA's error, and at noise 0.1 times the best linear's."""
+    files = sorted(results.glob("*/evaluation.json"))
+    found = {file.parent.name: json.loads(file.read_text())["encoders"] for file in files}
+    names = [n for n in dict.fromkeys(n for e in found.values() for n in e) if n != FULL]
+    lines = [f"| | {' | '.join(found)} |", "|---" * (len(found) + 1) + "|"]
+    for name in names:
+        cells = [_cell(encoders[name]) if name in encoders else "-" for encoders in found.values()]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _cell(encoder: dict[str, Any]) -> str:
+    noisy = next(level for level in encoder["corruption"] if level["noise"] == NOISE)
+    clean = encoder["reconstruction"]["ratio_to_pca"][0]
+    return f"{clean:.2f}, {noisy['mse'][0] / noisy['linear_mse'][0]:.2f}"
+
+
 if __name__ == "__main__":
     data, encoders, results, *tasks = sys.argv[1:]
     for task in tasks:
         scaled = ScaledDataset(Dataset(Path(data, task)))
         compare(scaled, Path(encoders, task), Path(results, task))
+    print(overview(Path(results)))
