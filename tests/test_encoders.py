@@ -218,6 +218,8 @@ def forged(encoder, path, **changes):
             "tensor high holds a number that is not finite, or beyond",
         ),
         ({"low": np.zeros(15, np.float32)}, r"tensor low has shape \(15,\): \(16,\)"),
+        ({"low": np.zeros((), np.float32)}, r"tensor low has shape \(\): \(16,\)"),
+        ({"low": np.zeros((16, 1), np.float32)}, r"tensor low has shape \(16, 1\): \(16,\)"),
         ({"high": np.zeros(15, np.float32)}, r"tensor high has shape \(15,\): \(16,\)"),
         (
             {"decoder.0.weight": np.full((16, 3), 3e38, np.float32)},

@@ -94,10 +94,9 @@ def _encoder(header: dict[str, Any], tensors: Tensors) -> Encoder:
     scaler = Scaler(_take(tensors, "low"), _take(tensors, "high"))
     if tensors:
         raise InputError(f"tensor {min(tensors)} is none of an encoder's")
-    if len(header["features"]) != len(scaler.low):
-        raise InputError(
-            f"tensor low has shape {scaler.low.shape}: {(len(header['features']),)} is needed"
-        )
+    expected = (len(header["features"]),)
+    if scaler.low.shape != expected:
+        raise InputError(f"tensor low has shape {scaler.low.shape}: {expected} is needed")
     del header["format"], header["format_version"]
     return Encoder(header, scaler, tuple(parts["encoder"]), tuple(parts["decoder"]))
 
