@@ -1,6 +1,5 @@
 """Encoders of every kind from a data set, each in its file."""
 
-import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -20,7 +19,7 @@ from jbrep.dae.training import Epoch, Trainer, Training, get_device
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.lock import exclusive
 from jbrep.dataset.scaled import sample
-from jbrep.dataset.storage import make_folder
+from jbrep.dataset.storage import exists, make_folder
 from jbrep.encoders import Encoder, load, save
 from jbrep.encoders.controls import Layers, pca, random_projection
 from jbrep.encoders.file import ERROR, SUFFIX
@@ -99,10 +98,8 @@ class Fitter:
         Raises:
             InputError: as `check` does, or the files can't be written.
         """
-        done = self.check(kind, training)
-        header = self._header(kind, training)
-        path = self._folder / f"{header['name']}{SUFFIX}"
-        if done:
+        header, path = self._plan(kind, training)
+        if exists(path) and _is_done(path, header):
             return Fitted(load(path), path, False)
         make_folder(self._folder)
         if make := KINDS[kind].make:
@@ -122,11 +119,15 @@ class Fitter:
             InputError: an unknown kind, a latent size out of range, or a file of other settings or
                 data.
         """
+        header, path = self._plan(kind, training)
+        return exists(path) and _is_done(path, header)
+
+    def _plan(self, kind: str, training: Training) -> tuple[dict[str, Any], Path]:
+        """The header of what is asked for, and its file, once it is found to be possible."""
         get_kind(kind)
         header = self._header(kind, training)
         _check(kind, header["training"], self._data.task.size)
-        path = self._folder / f"{header['name']}{SUFFIX}"
-        return os.path.exists(path) and _is_done(path, header)  # noqa: PTH110, it never raises
+        return header, self._folder / f"{header['name']}{SUFFIX}"
 
     def _header(self, kind: str, training: Training) -> dict[str, Any]:
         """What an encoder is and where it comes from."""

@@ -220,10 +220,11 @@ def export(encoder: str, task: str | None, out: Path) -> None:
 
 def _open(encoder: str, task: str | None) -> Any:
     """An encoder by name and task, or by file alone."""
+    from jbrep.dataset.storage import exists
     from jbrep.encoders import find, load
 
     if task:
         return find(encoder, task)
-    if not Path(encoder).exists():
+    if not exists(encoder):
         raise InputError(f"no encoder at {encoder}: of one that ships, the --task is needed, too")
     return load(Path(encoder))

@@ -82,6 +82,11 @@ class Column:
             for start in range(0, len(part), size):
                 yield part[start : start + size]
 
+    def parts(self, rows: NDArray[np.int64], size: int = _CHUNK) -> Iterator[Array]:
+        """Those rows in their order, copies of at most so many at a time."""
+        for start in range(0, len(rows), size):
+            yield self[rows[start : start + size]]
+
     def __repr__(self) -> str:
         return f"Column(shape={self.shape}, dtype={self.dtype}, shards={len(self._ends)})"
 
@@ -124,8 +129,7 @@ class Scaler:
         """The extrema of those rows of a column (N, d)."""
         low = np.full(column.shape[1:], np.inf, column.dtype)
         high = -low
-        for start in range(0, len(rows), _CHUNK):
-            values = column[rows[start : start + _CHUNK]]
+        for values in column.parts(rows):
             low = np.minimum(low, values.min(axis=0))
             high = np.maximum(high, values.max(axis=0))
         return cls(low, high)

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from jbrep.dataset.reader import Dataset
 from jbrep.errors import InputError
 
-_CHUNK = 1 << 16  # rows at a time
-
 
 def sample(rows: NDArray[Any], most: int) -> NDArray[Any]:
     """At most so many of them, in order; always the same draw, and of any step of an episode."""
@@ -65,9 +63,7 @@ class ScaledDataset:
 
     def observations(self, rows: NDArray[np.int64]) -> Iterator[NDArray[np.float32]]:
         """Observations of those rows in physical units, in order, some (n, d) at a time."""
-        observation = self.dataset["observation"]
-        for start in range(0, len(rows), _CHUNK):
-            yield observation[rows[start : start + _CHUNK]]
+        return self.dataset["observation"].parts(rows)
 
     def chunks(self, rows: NDArray[np.int64]) -> Iterator[NDArray[np.float32]]:
         """The same, scaled."""

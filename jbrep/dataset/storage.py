@@ -45,6 +45,11 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+def exists(path: str | Path) -> bool:
+    """Whether something is there; False, too, where that can't be told, as of a name too long."""
+    return os.path.exists(path)  # noqa: PTH110, Path.exists raises there
+
+
 def make_folder(folder: Path) -> None:
     """Make a folder and those above it, if they aren't there.
 

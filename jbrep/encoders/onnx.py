@@ -1,14 +1,13 @@
 """Encoders as ONNX, for whatever runs that."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from jbrep.dataset.storage import write_whole
+from jbrep.dataset.storage import exists, write_whole
 from jbrep.encoders.encoder import Encoder, Layer
 from jbrep.errors import InputError
 
@@ -25,7 +24,7 @@ def export(encoder: Encoder, path: Path) -> None:
     Raises:
         InputError: the file is there already, or can't be written.
     """
-    if os.path.exists(path):  # noqa: PTH110, unlike Path's it never raises
+    if exists(path):
         raise InputError(f"{path} is there already: choose another file")
     write_whole(path, model(encoder).SerializeToString(deterministic=True))
 

@@ -1,8 +1,8 @@
 """Encoders that come with the package, by name."""
 
-import os
 from pathlib import Path
 
+from jbrep.dataset.storage import exists
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.file import SUFFIX, load
 from jbrep.errors import InputError
@@ -28,7 +28,7 @@ def find(name: str | Path, task: str) -> Encoder:
     shipped = names(get_task(task).name)
     if str(name) in shipped:
         return load(_FOLDER / task / f"{name}{SUFFIX}")
-    if not os.path.exists(name):  # noqa: PTH110, unlike Path's it never raises
+    if not exists(name):
         raise InputError(
             f"no encoder {str(name)!r}: a file is needed, or one that ships for {task}: "
             f"{', '.join(shipped)}"

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,13 +49,19 @@ def bootstrap(
         resamples: how many draws of as many episodes as there are, with replacement.
     """
     count = len(sums[0])
-    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), resamples)
-    weights = np.concatenate((np.ones((1, count)), draws))
+    weights = _weights(count, resamples)
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.asarray(statistic(*(np.tensordot(weights, s, 1) for s in sums)))
     if count < 2:
         return Interval(values[0], values[0] * np.nan, values[0] * np.nan)
     return Interval(values[0], *np.percentile(values[1:], _BOUNDS, axis=0))
+
+
+@lru_cache(4)
+def _weights(count: int, resamples: int) -> Array:
+    """How often each episode counts: once each, then as each resample drew them."""
+    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), resamples)
+    return np.concatenate((np.ones((1, count)), draws))
 
 
 def by_episode(values: NDArray[Any], episode: NDArray[np.int64], count: int) -> Array:

@@ -1,14 +1,13 @@
 """The file that an evaluation is kept in."""
 
 import json
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from jbrep.dataset import ScaledDataset
-from jbrep.dataset.storage import make_folder, write_whole
+from jbrep.dataset.storage import exists, make_folder, write_whole
 from jbrep.encoders import Encoder
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError
@@ -35,7 +34,7 @@ def write(encoders: Mapping[str, Encoder], data: ScaledDataset, folder: Path) ->
     """
     path = folder / EVALUATION
     marks = {label: fingerprint(encoder) for label, encoder in encoders.items()}
-    if os.path.exists(path):  # noqa: PTH110, unlike Path's it never raises
+    if exists(path):
         _check_same(path, {"data": data.dataset.manifest.fingerprint, "encoders": marks})
     make_folder(folder)
     evaluation = evaluate(encoders, data)
