@@ -1,13 +1,13 @@
 """Every command, as a stranger would type it."""
 
-import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
-from stable_baselines3 import SAC
+from stable_baselines3 import A2C
 
 from jbrep.cli import main
 
@@ -47,20 +47,63 @@ def test_the_whole_pipeline(tmp_path):
     told = jbrep("encoder", "export", encoder, "--out", tmp_path / "it.onnx").output
     assert f"onnxruntime.InferenceSession('{tmp_path / 'it.onnx'}')" in told
     for state, arguments in {"dae-8": ("--encoder", encoder), "full": ()}.items():
-        settings = ("--task", "face_direction", "--steps", 200, "--seed", 1, *arguments)
-        assert f"returns on {state}: " in jbrep("rl", *settings, "--out", runs / state).output
-        result = json.loads((runs / state / "run.json").read_text())
-        assert len(result["returns"]) == 10
-        agent = SAC.load(runs / state / "policy.zip")
+        settings = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 80, *arguments)
+        given = (*settings, "--evaluation-episodes", 2, "--out", runs / state)
+        assert f"returns on {state} at the end: " in jbrep("rl", *given).output
+        assert f"returns on {state} at the end: " in jbrep("rl", *given).output  # it is over
+        agent = A2C.load(runs / state / "policy.zip", device="cpu")
         assert agent.observation_space.shape == ((8,) if state == "dae-8" else (16,))
     table = jbrep("report", runs).output.splitlines()
-    assert [line.split()[:4] for line in table[1:]] == [
-        ["face_direction", "sac", "dae-8", "1"],
-        ["face_direction", "sac", "full", "1"],
+    assert [line.split()[:3] for line in table[1:3]] == [
+        ["face_direction/a2c/dae-8", "0", "80"],
+        ["face_direction/a2c/full", "0", "80"],
     ]
-    again = jbrep("rl", "--task", "face_direction", "--out", runs / "full")
+    assert "no statistics: face_direction/a2c/full has one seed" in table[4]
+    assert (runs / "returns.csv").exists()
+    again = jbrep("rl", "--task", "face_direction", "--seed", 1, "--out", runs / "full")
     assert (again.exit_code, again.output.count("\n")) == (2, 1)
-    assert "holds a finished run already" in again.output
+    assert "holds another run: algorithm a2c (now: sac)" in again.output
+
+
+def test_a_policys_returns(tmp_path):
+    run = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 40)
+    jbrep("rl", *run, "--evaluation-episodes", 1, "--out", tmp_path / "run")
+    told = jbrep("evaluate-policy", tmp_path / "run", "--episodes", 2).output
+    assert re.fullmatch(r"face_direction on identity: median return \d+ \[\d+, \d+\] .*\n", told)
+    policy = tmp_path / "run" / "policy.zip"
+    refused = jbrep("evaluate-policy", policy)
+    assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
+    assert "runs as code when it is read; --trust" in refused.output
+    zip_file = ("--trust", "--task", "face_direction", "--algorithm", "a2c")
+    assert jbrep("evaluate-policy", policy, "--episodes", 2, *zip_file).output == told
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
+def test_a_run_that_fails_says_why_and_ends_with_1(tmp_path, monkeypatch):
+    from jbrep.rl.presets import PRESETS, get_preset
+
+    preset = get_preset("paper", "a2c")
+    wild = replace(preset, settings={**preset.settings, "learning_rate": 1e30})
+    monkeypatch.setitem(PRESETS["paper"], "a2c", wild)
+    run = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 200)
+    failed = jbrep("rl", *run, "--evaluation-episodes", 1, "--out", tmp_path / "run")
+    assert failed.exit_code == 1
+    assert re.search(r"the run failed: .* after [\d,]+ steps; .*run\.json keeps it", failed.stderr)
+
+
+def test_a_studys_dry_run_and_its_mistakes(tmp_path):
+    told = jbrep("study", "studies/first.toml", "--dry-run", "--out", tmp_path / "dry").output
+    assert told.count("face_direction/sac-modern/dae-8/seed-") == 5
+    assert "20 runs to go, 0 over; " in told
+    for arguments, message in (
+        (("studies/none.toml",), "no study at studies/none.toml"),
+        (("studies/first.toml", "--backend", "slurm"), "unknown backend 'slurm'"),
+        (("README.md",), "README.md is no TOML"),
+    ):
+        refused = jbrep("study", *arguments, "--out", tmp_path / "dry")
+        assert (refused.exit_code, refused.output.count("\n")) == (2, 1), refused.output
+        assert message in refused.output
+    assert not (tmp_path / "dry").exists()
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -121,7 +164,7 @@ def test_every_command_has_help_with_an_example(command):
         (("encoder", "info", "none"), "no encoder at none"),
         (("encoder", "info", "dae-9", "--task", "face_direction"), "no encoder 'dae-9'"),
         (("rl", "--task", "face_direction", "--encoder", "x", "--out", "y"), "no encoder 'x'"),
-        (("report", "none"), "no finished run below none"),
+        (("report", "none"), "no run that is over below none"),
         (("report",), "Missing argument 'FOLDER'. See jbrep report --help."),
         (("fly",), "No such command 'fly'. See jbrep --help."),
     ],

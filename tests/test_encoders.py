@@ -319,16 +319,21 @@ def test_the_card_tells_layers_and_ranges(encoder):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_encoders_ship_for_every_task(task):
-    assert names(task) == ("dae-12", "dae-8", "dae-4")
-    errors = []
+    sizes = [f"{kind}-{latent}" for kind in ("dae", "pca", "random") for latent in (12, 8, 4)]
+    assert names(task) == (*sizes[:3], "identity", *sizes[3:])
+    errors = {}
     for name in names(task):
         shipped = find(name, task)
         shipped.check_task(TASKS[task])
         source = shipped.header["data"]
         assert source["train_rows"] + source["test_rows"] == 5_000_000
-        assert shipped.header["training"]["epochs"] == shipped.header["metrics"]["epochs"] == 200
-        errors.append(shipped.header["metrics"]["held_out_mse"])
-    assert errors == sorted(errors)
+        assert source["fingerprint"] == find("identity", task).header["data"]["fingerprint"]
+        errors[name] = shipped.header["metrics"]["held_out_mse"]
+        if shipped.header["kind"] == "dae":
+            training = shipped.header["training"]
+            assert training["epochs"] == shipped.header["metrics"]["epochs"] == 200
+    for kind in ("dae", "pca", "random"):
+        assert errors["identity"] < errors[f"{kind}-12"] < errors[f"{kind}-8"] < errors[f"{kind}-4"]
 
 
 def test_a_name_that_ships_comes_before_a_file(encoder, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import click
 from jbrep.cli.base import Cli
 from jbrep.cli.data import collect, data
 from jbrep.cli.encoders import encoder, evaluate, train_dae, train_encoder
-from jbrep.cli.runs import report, rl
+from jbrep.cli.runs import evaluate_policy, report, rl, study
 
 
 @click.group(cls=Cli, context_settings={"help_option_names": ["-h", "--help"]})
@@ -14,5 +14,9 @@ def main() -> None:
     """Reduced-order representations of the Jitterbug, and what they do to learning."""
 
 
-for _command in (collect, data, train_dae, train_encoder, evaluate, encoder, rl, report):
+_COMMANDS = (
+    *(collect, data, train_dae, train_encoder, evaluate, encoder),
+    *(rl, evaluate_policy, study, report),
+)
+for _command in _COMMANDS:
     main.add_command(_command)

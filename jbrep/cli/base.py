@@ -12,9 +12,11 @@ import click
 from jbrep.errors import InputError
 
 _EXTRAS = {  # what a missing package is installed with
-    **dict.fromkeys(("torch", "stable_baselines3", "safetensors", "rich"), "learn"),
-    **dict.fromkeys(("matplotlib", "skdim", "sklearn", "tensorboard"), "learn"),
+    **dict.fromkeys(("joblib", "matplotlib", "rich", "safetensors", "sb3_contrib"), "learn"),
+    **dict.fromkeys(("scipy", "skdim", "sklearn", "stable_baselines3"), "learn"),
+    **dict.fromkeys(("tensorboard", "torch"), "learn"),
     **dict.fromkeys(("minari", "onnx", "pyarrow"), "export"),
+    "ray": "cluster",
 }
 
 

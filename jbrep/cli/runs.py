@@ -1,41 +1,172 @@
 """Agents, and what came of them."""
 
+import os
 from pathlib import Path
+from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, example
+from jbrep.cli.base import COUNT, GOES_ON, example, printable, stoppable
 
-
-@click.command(epilog=example("jbrep rl --task face_direction --encoder dae-8 --out runs/a"))
-@click.option("--task", required=True, help="A Jitterbug task, such as face_direction.")
-@click.option("--algorithm", default="sac", show_default=True, help="ddpg, td3, sac, ppo or a2c.")
-@click.option("--encoder", help="A file, or a name that ships; the full observation if not given.")
-@click.option("--steps", default=10_000, show_default=True, type=COUNT, help="Control steps.")
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**31),
-    default=0,
-    show_default=True,
-    help="Of agent and environment.",
+_episodes = click.option(
+    "--episodes", default=20, show_default=True, type=COUNT, help="How many, the same each time."
 )
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="A new folder.")
-def rl(task: str, algorithm: str, encoder: str | None, steps: int, seed: int, out: Path) -> None:
+
+
+@click.command(
+    epilog=example("jbrep rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a")
+)
+@click.option("--task", required=True, help="A Jitterbug task, such as face_direction.")
+@click.option(
+    "--algorithm", default="sac", show_default=True, help="ddpg, td3, sac, ppo, a2c or trpo."
+)
+@click.option(
+    "--preset", default="paper", show_default=True, help="Whose settings: paper or modern."
+)
+@click.option(
+    "--encoder",
+    default="identity",
+    help="A file, or a name that ships; the full observation if not given, scaled the same way.",
+)
+@click.option("--steps", default=100_000, show_default=True, type=COUNT, help="Control steps.")
+@click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
+@click.option(
+    "--evaluate-every", default=10_000, show_default=True, type=COUNT, help="In control steps."
+)
+@click.option(
+    "--evaluation-episodes",
+    default=10,
+    show_default=True,
+    type=COUNT,
+    help="Of the deterministic policy, each time, with starts that training doesn't have.",
+)
+@click.option(
+    "--out", required=True, type=click.Path(path_type=Path), help="A folder for this run."
+)
+@click.pass_context
+def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
     """Train and evaluate one agent.
 
-    It sees the full observation, scaled, or an encoder's latent.
+    It sees the full observation, scaled, or an encoder's latent. Killed or stopped by Ctrl-C, the
+    same command goes on from the last minute's checkpoint, to the same result.
     """
+    from tqdm import tqdm
+
     from jbrep.rl import Run, train
+    from jbrep.rl.files import EVALUATIONS, read_evaluations
 
-    result = train(Run(task, algorithm, encoder, steps, seed), out)
-    returns = ", ".join(f"{r:.0f}" for r in result["returns"])
-    click.echo(f"returns on {result['representation']}: {returns}; policy and run.json in {out}")
+    run = Run(**settings)
+    run.check()
+    with (
+        stoppable(GOES_ON),
+        tqdm(total=run.steps, desc=f"{run.algorithm} on {run.encoder}", unit="step") as progress,
+    ):
+
+        def watch(step: int, mean: float | None) -> None:
+            progress.update(step - progress.n)
+            progress.set_postfix(evaluation="-" if mean is None else f"{mean:.0f}", refresh=False)
+
+        result = train(run, out, watch)
+    if "reason" in result:
+        click.echo(f"the run failed: {result['reason']}; {out / 'run.json'} keeps it", err=True)
+        context.exit(1)
+    rows = read_evaluations(out)
+    returns = ", ".join(f"{e.episode_return:.0f}" for e in rows if e.step == rows[-1].step)
+    name = result["settings"]["representation"]
+    click.echo(f"returns on {name} at the end: {returns}; {out / EVALUATIONS} has those before")
 
 
-@click.command(epilog=example("jbrep report runs"))
+@click.command(epilog=example("jbrep evaluate-policy runs/a --episodes 100"))
+@click.argument("policy", type=click.Path(path_type=Path))
+@_episodes
+@click.option("--trust", is_flag=True, help="Read a zip file from elsewhere, which can run code.")
+@click.option("--task", default="face_direction", help="Of such a file.")
+@click.option("--algorithm", default="sac", help="Of such a file.")
+@click.option("--encoder", default="identity", help="That such a file was trained on.")
+def evaluate_policy(
+    policy: Path, episodes: int, trust: bool, task: str, algorithm: str, encoder: str
+) -> None:
+    """Show the returns of a trained policy.
+
+    POLICY is a folder of jbrep rl, or a zip file that stable-baselines3 wrote. Of a folder only
+    numbers are read. Such a zip file runs as code when it is opened, so it needs --trust.
+    """
+    import numpy as np
+
+    from jbrep.rl.agent import Evaluator
+    from jbrep.rl.policy import load_run, load_zip
+
+    if policy.is_dir():
+        trained = load_run(policy)
+    else:
+        trained = load_zip(policy, task, algorithm, encoder, trust)
+    returns = Evaluator(trained.task, trained.encoder, episodes).returns(trained.policy)
+    low, median, high = np.percentile(returns, (10, 50, 90))
+    click.echo(
+        printable(
+            f"{trained.task} on {trained.encoder.name}: median return {median:.0f} "
+            f"[{low:.0f}, {high:.0f}] (10th and 90th percentile of {episodes} episodes)"
+        )
+    )
+
+
+@click.command(epilog=example("jbrep study studies/smoke.toml --out runs/smoke"))
+@click.argument("study", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="A folder; runs/NAME if not given.")
+@click.option(
+    "--workers", type=click.IntRange(1, 1024), help="Runs at once; one for each core if not given."
+)
+@click.option(
+    "--backend",
+    default="joblib",
+    show_default=True,
+    help="joblib, on this machine, or ray, on the cluster that RAY_ADDRESS names.",
+)
+@click.option("--dry-run", is_flag=True, help="List the runs and estimate the time.")
+@click.pass_context
+def study(
+    context: click.Context,
+    /,
+    study: Path,
+    out: Path | None,
+    workers: int | None,
+    backend: str,
+    dry_run: bool,
+) -> None:
+    """Run a grid of tasks, algorithms, representations and seeds, and judge it.
+
+    STUDY is a TOML file, such as those in studies/. Data sets and encoders are made first. What is
+    finished is never run again: stopped or killed, the same command goes on.
+    """
+    from jbrep.study.config import read_study
+    from jbrep.study.plan import Plan
+    from jbrep.study.runner import get_backend
+    from jbrep.study.study import conduct, outline
+
+    plan = Plan(read_study(study), out or Path("runs") / study.stem)
+    run, count = get_backend(backend), workers or os.cpu_count() or 1
+    if dry_run:
+        click.echo(outline(plan, count))
+        return
+    with stoppable(GOES_ON):
+        crashed = conduct(plan, run, count)
+    _show(plan.folder)
+    if crashed:
+        click.echo(f"{crashed} runs crashed: the same command tries them again", err=True)
+        context.exit(1)
+
+
+@click.command(epilog=example("jbrep report runs/smoke"))
 @click.argument("folder", type=click.Path(path_type=Path))
 def report(folder: Path) -> None:
-    """Show the runs below a folder side by side."""
-    from jbrep.report import summarise
+    """Show what the runs below a folder say: tables, comparisons, verdicts."""
+    _show(folder)
 
-    click.echo(summarise(folder))
+
+def _show(folder: Path) -> None:
+    from jbrep.study.results import as_text, read_results, write_results
+
+    results = read_results(folder)
+    for line in as_text(results).splitlines():
+        click.echo(printable(line))
+    click.echo("\n" + "\n".join(map(str, write_results(results, folder))))

@@ -28,25 +28,26 @@ def write(path: Path, tensors: Tensors, header: Mapping[str, Any]) -> None:
     write_whole(path, safetensors.numpy.save(tensors, {_KEY: json.dumps(header)}))
 
 
-def read(path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
+def read(path: Path, what: str, most: int = _MAX_BYTES) -> tuple[Tensors, dict[str, Any]]:
     """Tensors and header of such a file.
 
     Args:
         path: the file.
         what: it should be, for messages: an encoder.
+        most: bytes that it may have.
 
     Raises:
         InputError: no such file, or another kind of file.
     """
     try:
-        raw = read_regular(path, _MAX_BYTES)
+        raw = read_regular(path, most)
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"no {what} at {path}") from None
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror}") from error
     if not raw:
         raise InputError(
-            f"{path} is not a jbrep {what}: a regular file of 1 to {_MAX_BYTES:,} bytes is needed"
+            f"{path} is not a jbrep {what}: a regular file of 1 to {most:,} bytes is needed"
         )
     try:
         return safetensors.numpy.load(raw), _header(raw)

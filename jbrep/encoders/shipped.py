@@ -12,9 +12,14 @@ _FOLDER = Path(__file__).parent / "shipped"
 
 
 def names(task: str) -> tuple[str, ...]:
-    """Names of the encoders that ship for a task, the largest latent first."""
+    """Names of the encoders that ship for a task, by kind, the largest latent first."""
+
+    def order(name: str) -> tuple[str, int]:
+        kind, _, latent = name.partition("-")
+        return kind, -int(latent or 0)
+
     found = (path.name.removesuffix(SUFFIX) for path in (_FOLDER / task).glob(f"*{SUFFIX}"))
-    return tuple(sorted(found, key=lambda name: -int(name.rpartition("-")[2])))
+    return tuple(sorted(found, key=order))
 
 
 def find(name: str | Path, task: str) -> Encoder:

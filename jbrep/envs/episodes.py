@@ -1,7 +1,7 @@
 """Episodes on many lanes: seeds, time limit, and reset in the step that ends an episode."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -68,6 +68,23 @@ class Episodes:
         if ended:
             self._restart(ended)
         return Outcome(self._observation, reward, done, ended, diverged, observation)
+
+    @property
+    def state(self) -> tuple[dict[str, Array], list[Any]]:
+        """What `restore` takes: arrays by name, (n, ...) each, and the generators' states."""
+        arrays = {**self.simulation.state, "observation": self._observation.copy()}
+        arrays["steps"] = self._steps.astype(np.float64)
+        generators = [random.bit_generator.state for random in self._randoms]
+        return arrays, generators
+
+    def restore(self, arrays: Mapping[str, Array], generators: Sequence[Any]) -> None:
+        """Go on from where `state` was taken, bit for bit."""
+        physics = dict(arrays)
+        self._steps[:] = physics.pop("steps")
+        self._observation = physics.pop("observation").copy()
+        for random, state in zip(self._randoms, generators, strict=True):
+            random.bit_generator.state = state
+        self.simulation.restore(**physics)
 
     def _restart(self, lanes: Sequence[int]) -> None:
         self.simulation.reset(lanes, [self._randoms[lane] for lane in lanes])

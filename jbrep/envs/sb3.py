@@ -43,6 +43,10 @@ class JitterbugVecEnv(VecEnv):
             units with a `latent_size`; None leaves the full observation.
         num_threads: threads to step them on; None takes one for each core.
 
+    Attributes:
+        task: the task.
+        episodes: what goes on in the lanes; its `state` is all that `episodes.restore` needs.
+
     When an episode ends, `infos[i]` holds `terminal_observation`, `TimeLimit.truncated` (always
     true: no state ends a task) and `non_finite` (whether the physics diverged).
 
@@ -62,8 +66,8 @@ class JitterbugVecEnv(VecEnv):
         encoder: LatentEncoder | None = None,
         num_threads: int | None = None,
     ):
-        self._episodes = Episodes(task, num_envs, num_threads)
-        self.task = self._episodes.task
+        self.episodes = Episodes(task, num_envs, num_threads)
+        self.task = self.episodes.task
         self._encoder = encoder
         self._size = encoder.latent_size if encoder else self.task.size
         self._actions: NDArray[np.floating[Any]] = np.zeros((num_envs, 1))
@@ -79,7 +83,7 @@ class JitterbugVecEnv(VecEnv):
 
     def reset(self) -> Float32:
         """Start an episode in every lane: from the seeds if they are new, else the next."""
-        observation = self._episodes.reset(self._seeds)
+        observation = self.episodes.reset(self._seeds)
         self._reset_seeds()
         self._reset_options()
         return self._represent(observation)
@@ -90,7 +94,7 @@ class JitterbugVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """One control step in every lane."""
-        outcome = self._episodes.step(self._actions)
+        outcome = self.episodes.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if lanes := outcome.ended:
             finals = self._represent(outcome.final_observation[lanes])

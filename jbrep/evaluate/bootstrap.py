@@ -16,7 +16,7 @@ _BOUNDS = (2.5, 97.5)  # [%]
 
 
 class Interval(NamedTuple):
-    """A value with its 95 % percentile bootstrap interval."""
+    """A value with its interval: of 95 %, from a percentile bootstrap, unless said otherwise."""
 
     value: Any
     low: Any

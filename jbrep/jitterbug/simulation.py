@@ -59,6 +59,7 @@ class Simulation:
             np.zeros((num_lanes, 2)),
         )
         self.target_quaternion = self._batch.bind("mocap_quat")[:, 0]
+        self._warmstart = self._batch.bind("qacc_warmstart")
         self.readings = Readings(*self._views)
 
     def reset(self, lanes: Sequence[int], randoms: Iterable[np.random.Generator]) -> None:
@@ -71,12 +72,30 @@ class Simulation:
             self.target_quaternion[lane] = start.target_quaternion
         self._forward(lanes)
 
+    @property
+    def state(self) -> dict[str, Array]:
+        """A copy of what `restore` takes."""
+        now = self.readings
+        return {
+            "qpos": now.qpos.copy(),
+            "qvel": now.qvel.copy(),
+            "target_position": now.target_position.copy(),
+            "target_quaternion": self.target_quaternion.copy(),
+            "warmstart": self._warmstart.copy(),
+        }
+
     def restore(
-        self, qpos: Array, qvel: Array, target_position: Array, target_quaternion: Array
+        self,
+        qpos: Array,
+        qvel: Array,
+        target_position: Array,
+        target_quaternion: Array,
+        warmstart: ArrayLike = 0.0,
     ) -> None:
         """Put the lanes in stored states: (n, 16), (n, 15), (n, 3) and (n, 4).
 
-        From an episode's first state, the same actions lead through the same states, bit for bit.
+        The same actions lead from there through the same states, bit for bit. Past an episode's
+        first state that needs the warm start, (n, 15), where MuJoCo's solver starts its search.
         """
         lanes = range(self.num_lanes)
         self._batch.reset(lanes, stage=mujoco.mjtStage.mjSTAGE_NONE)
@@ -84,6 +103,7 @@ class Simulation:
         self.readings.qvel[:] = qvel
         self.readings.target_position[:] = target_position
         self.target_quaternion[:] = target_quaternion
+        self._warmstart[:] = warmstart
         self._forward(lanes)
 
     def _forward(self, lanes: Sequence[int]) -> None:

@@ -1,0 +1,95 @@
+"""A run's folder: what a run leaves there, written and read."""
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jbrep.dataset.shard import read_regular
+from jbrep.dataset.storage import exists, write_whole
+from jbrep.errors import InputError
+
+RUN = "run.json"  # written last: the run is over where it is
+POLICY = "policy.zip"
+ENCODER = "encoder.safetensors"
+EPISODES = "episodes.csv"
+EVALUATIONS = "evaluations.csv"
+FINISHED, FAILED = "finished", "failed"
+_MAX_BYTES = 1 << 28
+
+
+class Episode(NamedTuple):
+    """An episode of training."""
+
+    step: int  # of training, over all lanes, at its end
+    lane: int
+    episode_return: float
+    length: int  # control steps
+    diverged: bool  # its physics, which ended it
+
+
+class Evaluation(NamedTuple):
+    """An episode of the deterministic policy."""
+
+    step: int  # of training before it
+    episode: int  # the same number is the same start
+    episode_return: float
+
+
+def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -> None:
+    """Write a long table as CSV."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(name.removeprefix("episode_") for name in kind._fields)
+    writer.writerows([f"{v:.3f}" if isinstance(v, float) else int(v) for v in row] for row in rows)
+    write_whole(path, text.getvalue().encode())
+
+
+def read_evaluations(folder: Path) -> list[Evaluation]:
+    """The evaluations of a run.
+
+    Raises:
+        InputError: the file is missing or no such table.
+    """
+    path = folder / EVALUATIONS
+    try:
+        rows = list(csv.reader(_text(path).splitlines()))
+        if rows[0] != ["step", "episode", "return"]:
+            raise ValueError
+        return [Evaluation(int(step), int(e), float(r)) for step, e, r in rows[1:]]
+    except (ValueError, IndexError):
+        raise InputError(f"{path} is not a table of evaluations, or cut short") from None
+
+
+def write_run(folder: Path, run: Mapping[str, Any]) -> None:
+    """Write run.json."""
+    write_whole(folder / RUN, (json.dumps(run, indent=2, allow_nan=False) + "\n").encode())
+
+
+def read_run(folder: Path) -> dict[str, Any]:
+    """What run.json says of a run that is over.
+
+    Raises:
+        InputError: there is none, or it is something else.
+    """
+    path = folder / RUN
+    if not exists(path):
+        raise InputError(f"no run that is over in {folder}: a {RUN} is expected")
+    try:
+        run = json.loads(_text(path))
+        fields = (run["settings"], run["status"], run["seconds"])
+        kinds = (dict, str, float)
+        if not all(isinstance(f, kind) for f, kind in zip(fields, kinds, strict=True)):
+            raise TypeError
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise InputError(f"{path} is damaged, or not of a run") from None
+    return dict(run)
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_regular(path, _MAX_BYTES).decode()
+    except OSError as error:
+        raise InputError(f"can't read {path}: {error.strerror}") from error

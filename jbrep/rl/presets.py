@@ -1,0 +1,146 @@
+"""The algorithms and their settings, as data."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from sb3_contrib import TRPO
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import (
+    ActionNoise,
+    NormalActionNoise,
+    OrnsteinUhlenbeckActionNoise,
+)
+
+from jbrep.errors import InputError
+
+
+class Normal(NamedTuple):
+    """Independent noise on each action, of mean 0."""
+
+    sigma: float
+
+    def make(self) -> ActionNoise:
+        """As stable-baselines3 has it."""
+        return NormalActionNoise(np.zeros(1), np.full(1, self.sigma))
+
+
+class OrnsteinUhlenbeck(NamedTuple):
+    """Noise that drifts back to its mean, from 0 at each episode's start."""
+
+    mean: float
+    sigma: float
+    theta: float
+
+    def make(self) -> ActionNoise:
+        """As stable-baselines3 has it, a control step being its time unit's hundredth."""
+        return OrnsteinUhlenbeckActionNoise(
+            np.full(1, self.mean), np.full(1, self.sigma), self.theta
+        )
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Settings of an algorithm; stable-baselines3's own hold for what isn't named."""
+
+    hidden: tuple[int, ...]  # units of each hidden layer, of actor and of critic, with ReLU
+    settings: Mapping[str, Any]  # what the algorithm's class is given
+    num_envs: int = 1  # robots that learn together
+    noise: Normal | OrnsteinUhlenbeck | None = None  # on the actions, in [-1, 1]
+    optimizer: Mapping[str, Any] = field(default_factory=dict)  # of Adam
+
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "ddpg": DDPG,
+    "td3": TD3,
+    "sac": SAC,
+    "ppo": PPO,
+    "a2c": A2C,
+    "trpo": TRPO,
+}
+
+_SHARED = {"learning_rate": 1e-4, "gamma": 0.99}
+_HIDDEN = (350, 250)
+_ON_POLICY = {"eps": 1e-5}  # Adam's, as stable-baselines3 has it for PPO and A2C
+_PAPER = {
+    "ddpg": Preset(
+        _HIDDEN,
+        {
+            **_SHARED,
+            "batch_size": 256,
+            "gradient_steps": 50,
+            "train_freq": 100,
+            "buffer_size": 1_000_000,
+            "tau": 1e-3,
+        },
+        noise=OrnsteinUhlenbeck(mean=0.3, sigma=0.3, theta=0.15),
+    ),
+    "td3": Preset(
+        _HIDDEN,
+        {**_SHARED, "learning_starts": 10_000, "gradient_steps": 1000, "train_freq": 1000},
+        noise=Normal(0.2),
+    ),
+    "sac": Preset(_HIDDEN, {**_SHARED, "batch_size": 256, "ent_coef": "auto"}, noise=Normal(0.2)),
+    "ppo": Preset(
+        _HIDDEN,
+        {
+            **_SHARED,
+            "n_steps": 256,
+            "ent_coef": 0.01,
+            "vf_coef": 0.5,
+            "max_grad_norm": 0.5,
+            "gae_lambda": 0.95,
+            "batch_size": 512,  # 4 minibatches of the 8 x 256 steps
+            "clip_range": 0.2,
+            "clip_range_vf": None,
+            "n_epochs": 4,
+        },
+        num_envs=8,
+        optimizer=_ON_POLICY,
+    ),
+    "a2c": Preset(_HIDDEN, {**_SHARED, "use_rms_prop": False}, num_envs=8, optimizer=_ON_POLICY),
+    "trpo": Preset(_HIDDEN, {**_SHARED, "n_steps": 256}, num_envs=8, optimizer=_ON_POLICY),
+}
+
+_OFF_POLICY = {"learning_rate": 3e-4, "learning_starts": 1000, "train_freq": 4}  # 25 Hz
+_MODERN = {
+    "ddpg": Preset((256, 256), _OFF_POLICY, noise=Normal(0.2)),
+    "td3": Preset((256, 256), _OFF_POLICY, noise=Normal(0.2)),
+    "sac": Preset((256, 256), _OFF_POLICY),
+    "ppo": Preset(
+        (64, 64),
+        {"learning_rate": 3e-4, "n_steps": 256, "batch_size": 64, "n_epochs": 10},
+        num_envs=8,
+        optimizer=_ON_POLICY,
+    ),
+    "a2c": Preset(
+        (64, 64),
+        {"learning_rate": 7e-4, "use_rms_prop": False, "n_steps": 8, "gae_lambda": 0.9},
+        num_envs=8,
+        optimizer=_ON_POLICY,
+    ),
+    "trpo": Preset(
+        (64, 64),
+        {"learning_rate": 1e-3, "n_steps": 256, "n_critic_updates": 20, "cg_damping": 0.1},
+        num_envs=8,
+        optimizer=_ON_POLICY,
+    ),
+}
+PRESETS = {"paper": _PAPER, "modern": _MODERN}
+
+
+def get_preset(preset: str, algorithm: str) -> Preset:
+    """The settings of that name for an algorithm.
+
+    Raises:
+        InputError: there is no preset or algorithm of that name; the message lists them.
+    """
+    for word, what, choices in (
+        (algorithm, "algorithm", list(ALGORITHMS)),
+        (preset, "preset", list(PRESETS)),
+    ):
+        if word not in choices:
+            raise InputError(f"unknown {what} {word!r}: choose one of {', '.join(choices)}")
+    return PRESETS[preset][algorithm]

@@ -1,0 +1,173 @@
+"""A representation's runs against the baseline's: numbers, and verdicts on the claims."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import levene
+
+from jbrep.evaluate.bootstrap import Array, Interval
+from jbrep.stats.claims import CLAIMS, Claim, decide, in_words
+from jbrep.stats.intervals import FEWEST, LEVEL, constant, difference, percentile, variance_ratio
+from jbrep.stats.labels import STEPS_TO, Label, median
+from jbrep.stats.power import seeds_needed
+
+_ERROR = 0.05  # how often any of a study's verdicts may be wrong
+
+
+def simultaneous_level(family: int) -> float:
+    """Of as many intervals, so that all hold together at 95 % (Bonferroni)."""
+    return 1 - _ERROR / max(family, 1)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the runs say about a claim.
+
+    Args:
+        claim: in words.
+        verdict: supported, contradicted or undecided, by the simultaneous interval alone.
+        boundary: the value that the interval must exclude.
+        nominal: the number that the claim is about, with its 95 % interval.
+        simultaneous: the same with the interval of the level that all of a study's verdicts share.
+        p: two-sided, of lying on the boundary.
+        p_holm: adjusted for all verdicts of the study.
+        seeds_needed: a label, to decide what is undecided, or "> 320"; None for what is decided
+            or has a reason.
+        reason: why it is undecided, other than too wide an interval.
+    """
+
+    claim: str
+    verdict: str
+    boundary: float
+    nominal: Interval
+    simultaneous: Interval
+    p: float
+    p_holm: float
+    seeds_needed: int | str | None
+    reason: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A representation against the baseline.
+
+    Args:
+        representation: its label.
+        numbers: each with its 95 % interval.
+        brown_forsythe_p: of equal variances of final returns, as a check of the permutation test.
+        verdicts: one for each claim.
+    """
+
+    representation: str
+    numbers: Mapping[str, Interval]
+    brown_forsythe_p: float
+    verdicts: tuple[Verdict, ...]
+
+
+def compare(label: Label, baseline: Label, family: int, seed: int) -> Comparison:
+    """A label against the baseline; the p-values of its verdicts are yet to be adjusted.
+
+    Args:
+        label: of the representation.
+        baseline: of the same task and algorithm.
+        family: how many verdicts the study has.
+        seed: of all that is drawn.
+    """
+    final, final_of_baseline = label.by_run["final_return"], baseline.by_run["final_return"]
+    numbers = {
+        "final_return_difference": difference(final, final_of_baseline),
+        "mean_return_difference": difference(
+            label.by_run["mean_return"], baseline.by_run["mean_return"]
+        ),
+        "variance_ratio": variance_ratio(final, final_of_baseline),
+        "variance_ratio_bootstrap": percentile(
+            _ratio_of_variances, final, final_of_baseline, seed=seed
+        ),
+        "probability_of_improvement": percentile(
+            probability_of_improvement, final, final_of_baseline, seed=seed
+        ),
+    }
+    for name in STEPS_TO:
+        numbers[f"{name}_ratio"] = percentile(
+            _ratio_of_medians, label.by_run[name], baseline.by_run[name], seed=seed
+        )
+    return Comparison(
+        representation=label.representation,
+        numbers=numbers,
+        brown_forsythe_p=_brown_forsythe(final, final_of_baseline),
+        verdicts=tuple(_judge(claim, label, baseline, family, seed) for claim in CLAIMS),
+    )
+
+
+def probability_of_improvement(x: Array, y: Array) -> Array:
+    """How often a run of x (..., n) is above one of y (..., m), a tie counting half, (...).
+
+    Mann and Whitney's statistic, as in Agarwal et al. 2021, "Deep Reinforcement Learning at the
+    Edge of the Statistical Precipice".
+    """
+    return (1 + np.sign(x[..., :, None] - y[..., None, :]).mean(axis=(-2, -1))) / 2
+
+
+def _ratio_of_variances(x: Array, y: Array) -> Array:
+    return x.var(axis=-1, ddof=1) / y.var(axis=-1, ddof=1)
+
+
+def _ratio_of_medians(x: Array, y: Array) -> Array:
+    return median(x) / median(y)
+
+
+def _brown_forsythe(x: Array, y: Array) -> float:
+    if constant(x) or constant(y) or min(len(x), len(y)) < FEWEST:
+        return np.nan
+    return float(levene(x, y, center="median").pvalue)
+
+
+def _judge(claim: Claim, label: Label, baseline: Label, family: int, seed: int) -> Verdict:
+    x, y = label.by_run[claim.measure], baseline.by_run[claim.measure]
+    level = simultaneous_level(family)
+    boundary = float(claim.boundary(y))
+    simultaneous = claim.interval(x, y, level)
+    decided = int(decide(claim, simultaneous, claim.boundary(y)))
+    reason = _reason(claim, x, y)
+    if decided > 0 and label.failed and not claim.despite_failures:
+        decided, reason = 0, "failed runs"
+    needed = None if decided or reason else seeds_needed(claim, x, y, level, seed)
+    p = claim.p_value(x, y, boundary, seed)
+    return Verdict(
+        claim=claim.name,
+        verdict=in_words(decided),
+        boundary=boundary,
+        nominal=claim.interval(x, y, LEVEL),
+        simultaneous=simultaneous,
+        p=p,
+        p_holm=p,
+        seeds_needed=needed,
+        reason=reason,
+    )
+
+
+def _reason(claim: Claim, x: Array, y: Array) -> str | None:
+    if not np.isnan(claim.interval(x, y, LEVEL).low):
+        return None
+    return "no variance" if constant(x) or constant(y) else "too few runs"
+
+
+def adjusted(comparisons: Sequence[Comparison]) -> list[Comparison]:
+    """The same with the p-values of all verdicts adjusted together."""
+    p = np.array([verdict.p for c in comparisons for verdict in c.verdicts])
+    of_holm = iter(holm(p).tolist())
+    return [
+        replace(c, verdicts=tuple(replace(v, p_holm=next(of_holm)) for v in c.verdicts))
+        for c in comparisons
+    ]
+
+
+def holm(p: Array) -> Array:
+    """P-values (k,) adjusted for their number (Holm 1979); NaN counts as 1 and stays NaN."""
+    counted = np.where(np.isnan(p), 1, p)
+    order = np.argsort(counted, kind="stable")
+    factors = np.arange(len(p), 0, -1)
+    found = np.empty(len(p))
+    found[order] = np.minimum(np.maximum.accumulate(factors * counted[order]), 1)
+    return np.where(np.isnan(p), np.nan, found)

@@ -1,0 +1,124 @@
+"""Learning curves on a grid of steps that all runs compared share."""
+
+from itertools import chain
+
+import numpy as np
+from scipy.stats import trim_mean
+
+from jbrep.errors import InputError
+from jbrep.evaluate.bootstrap import Array, Interval
+from jbrep.stats.intervals import percentile
+from jbrep.stats.runs import Group, RunCurve
+
+PERCENTILES = (10, 25, 50, 75, 90)
+_LAST = 0.1  # of the grid's range, for the final return
+_POINTS = 64  # at a time, to keep the resamples in memory
+
+
+def iqm(values: Array) -> Array:
+    """The interquartile mean of (..., n): that of the middle half (Agarwal et al. 2021)."""
+    return trim_mean(values, 0.25, axis=-1)
+
+
+def common_grid(group: Group) -> tuple[Array, str | None]:
+    """The steps at which all runs of a group are compared, (g,), and what was cut off.
+
+    The grid ends where the first run that didn't fail ends, and begins where the last one begins:
+    nothing is extrapolated. Between, it has the evaluations of the run that has fewest, as more
+    would only be interpolated.
+
+    Raises:
+        InputError: runs without steps in common.
+    """
+    runs = list(chain.from_iterable(group.values()))
+    whole = [run for run in runs if run.failed_at is None]
+    start = max(_curve(run)[0][0] for run in runs)
+    end = min(_last(run) for run in whole or runs)
+    if start >= end:
+        raise InputError(
+            f"{runs[0].task}/{runs[0].algorithm}: the evaluations of one run end at step {end}, "
+            f"those of another begin at {start:g}; train runs that overlap"
+        )
+    inside = [run.steps[(start < run.steps) & (run.steps < end)] for run in whole or runs]
+    fewest = min(inside, key=lambda steps: (len(steps), *steps))
+    return np.array([start, *fewest, end], float), _cut(whole, end)
+
+
+def _last(run: RunCurve) -> int:
+    return run.total_steps if run.failed_at is not None else int(run.steps[-1])
+
+
+def _cut(runs: list[RunCurve], end: int) -> str | None:
+    longest = max((run.steps[-1] for run in runs), default=end)
+    if longest == end:
+        return None
+    run = min((r for r in runs if r.steps[-1] == end), key=lambda r: (r.representation, r.seed))
+    return (
+        f"ends at step {end:,} with {run.representation}, seed {run.seed}; "
+        f"the longest run has {longest:,}"
+    )
+
+
+def on_grid(run: RunCurve, grid: Array) -> Array:
+    """The mean return of a run's evaluations at each step of the grid, (g,)."""
+    return np.interp(grid, *_curve(run))
+
+
+def _curve(run: RunCurve) -> tuple[Array, Array]:
+    """Steps and mean returns, with a failed run's zeros; it ends at one that interp carries on."""
+    steps, returns = run.steps.astype(float), run.returns.mean(axis=1)
+    if run.failed_at is None:
+        return steps, returns
+    before = steps < run.failed_at
+    if not before.any():
+        return np.zeros(1), np.zeros(1)
+    return np.append(steps[before], run.failed_at), np.append(returns[before], 0)
+
+
+def bands(curves: Array, seed: int) -> dict[str, Array | Interval]:
+    """Of the runs of a label at each step, (g,) each.
+
+    Percentiles over runs, the mean, and the interquartile mean with its interval, from resampling
+    whole curves.
+
+    Args:
+        curves: on the grid, (runs, g).
+        seed: of the resamples.
+    """
+    parts = [
+        percentile(iqm, curves.T[first : first + _POINTS], seed=seed)
+        for first in range(0, curves.shape[1], _POINTS)
+    ]
+    return {
+        **{f"p{q}": np.percentile(curves, q, axis=0) for q in PERCENTILES},
+        "mean": curves.mean(axis=0),
+        "iqm": Interval(*(np.concatenate(part) for part in zip(*parts, strict=True))),
+    }
+
+
+def final_return(curves: Array, grid: Array) -> Array:
+    """The mean of curves (runs, g) over the evaluations in the last tenth of the grid's range."""
+    start, end = grid[0], grid[-1]
+    return curves[:, grid >= end - _LAST * (end - start)].mean(axis=1)
+
+
+def mean_return(curves: Array, grid: Array) -> Array:
+    """The area under curves (runs, g), divided by the grid's length: the mean over training."""
+    return np.trapezoid(curves, grid, axis=1) / (grid[-1] - grid[0])
+
+
+def steps_to(curves: Array, grid: Array, threshold: float) -> Array:
+    """The first step at which each curve, (runs, g), reaches a return; inf where it never does.
+
+    NaN for a threshold that isn't above 0: there is nothing to reach.
+    """
+    if not threshold > 0:
+        return np.full(len(curves), np.nan)
+    above = curves >= threshold
+    after = above.argmax(axis=1)  # 0, too, where it's never reached
+    before = np.maximum(after - 1, 0)
+    rows = np.arange(len(curves))
+    low, high = curves[rows, before], curves[rows, after]
+    share = np.divide(threshold - low, high - low, out=np.zeros(len(curves)), where=high > low)
+    crossing = grid[before] + np.clip(share, 0, 1) * (grid[after] - grid[before])
+    return np.where(above.any(axis=1), crossing, np.inf)

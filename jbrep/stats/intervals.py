@@ -1,0 +1,163 @@
+"""Intervals over runs, each by the method that covered best in simulations.
+
+Coverage [%] of 95 % intervals for 5, 10 and 20 runs a group, drawn from a normal distribution, from
+a skewed one (1000 minus a gamma variable of shape 2), and from Student's with 5 degrees of freedom
+(600 to 40,000 samples each):
+
+                                         normal              skewed              heavy tails
+    mean: Student's t                    94.9  93.8  95.1    91.3  93.4  93.1    96.4  95.3  95.7
+      bootstrap-t                        94.7  93.3  95.0    92.9  95.4  93.9    94.5  93.0  93.8
+      percentile bootstrap               83.5  88.9  92.3    80.1  89.5  90.9    84.3  89.5  92.0
+    difference of means: Welch's t       95.3  94.0  94.9    95.6  95.7  94.1    96.1  94.7  95.2
+      bootstrap-t                        95.9  94.0  95.4    94.6  94.0  93.0    95.3  92.6  93.2
+      percentile bootstrap               88.7  90.6  93.7    86.6  90.7  92.6    87.3  90.2  92.8
+    ratio of variances: Bonett's         97.9  96.1  95.5    97.2  95.5  95.2    97.0  95.7  95.2
+      with variances of 4 to 1           97.1  95.4  96.2    96.3  94.0  93.9    96.0  93.8  94.1
+      bootstrap-t of jackknife errors    98.0  93.9  94.0    96.5  91.0  93.0    97.2  94.4  92.1
+      percentile bootstrap               96.9  93.4  92.0    95.6  88.5  90.4    95.5  92.1  90.0
+    SD: Bonett's                         99.5  95.7  94.9    98.7  93.1  90.3    98.9  95.2  91.9
+      percentile bootstrap               63.6  76.7  85.9    52.3  65.1  75.1    54.5  68.3  76.5
+    median: percentile bootstrap         93.7  92.3  94.8    93.4  94.1  92.9    93.6  93.1  93.9
+    IQM: percentile bootstrap            89.5  92.2  94.5    89.7  94.9  93.6    89.7  93.3  94.7
+    P(improvement): the same             90.2  92.8  94.8    89.8  94.0  94.2    91.3  93.8  94.3
+      with means an SD apart             84.8  91.5  94.3    86.0  91.2  94.5    84.2  91.5  92.0
+    IQR: percentile bootstrap            86.8  94.6  97.3    82.5  93.4  94.5    87.1  97.3  97.0
+    MAD: percentile bootstrap            66.9  94.1  97.3    67.1  92.5  94.8    72.1  95.9  96.9
+
+With five runs, then, a percentile interval is too short. It stays where the literature uses it, so
+that numbers compare (Agarwal et al. 2021); a verdict never depends on one. With five runs an
+interval of the ratio of variances is wide, times and divided by ten, and nothing covers returns of
+which a fifth are near 0 (seven in ten for the mean, nine in ten for the ratio, with five runs).
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+from scipy.stats import norm, trim_mean, ttest_1samp
+
+from jbrep.evaluate.bootstrap import Array, Interval
+
+LEVEL = 0.95
+RESAMPLES = 2000
+UNDEFINED = Interval(np.nan, np.nan, np.nan)
+_TINY = np.finfo(float).tiny  # against 0 / 0
+FEWEST = 3  # runs that a variance's interval takes: with two, Bonett's covers 86 %
+
+
+def percentile(statistic: Callable[..., Array], *samples: Array, seed: int = 0) -> Interval:
+    """A statistic with its 95 % percentile interval, from a stratified bootstrap over whole runs.
+
+    Resamples where it is undefined widen the interval at both ends.
+
+    Args:
+        statistic: of samples with runs on the last axis, (..., n) each, (...).
+        samples: one for each group, which is resampled on its own, (..., n) each.
+        seed: of the resamples.
+    """
+    random = np.random.default_rng(seed)
+    drawn = []
+    for sample in samples:
+        runs = sample.shape[-1]
+        drawn.append(sample[..., random.integers(0, runs, (RESAMPLES, runs))])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value, values = statistic(*samples), statistic(*drawn)
+    unknown = np.isnan(values)
+    low, high = (
+        np.quantile(np.where(unknown, worst, values), q, axis=-1, method="inverted_cdf")
+        for q, worst in (((1 - LEVEL) / 2, -np.inf), ((1 + LEVEL) / 2, np.inf))
+    )
+    return Interval(value, low, high)
+
+
+def constant(values: Array) -> NDArray[np.bool_]:
+    """Whether values (..., n) differ by rounding at most, (...)."""
+    return np.ptp(values, axis=-1) <= 1e-9 * np.abs(values).max(axis=-1)
+
+
+def mean(values: Array) -> Interval:
+    """The mean of (n,) with Student's 95 % interval; NaN for its ends where nothing varies."""
+    if constant(values):
+        return Interval(values.mean(), np.nan, np.nan)
+    found = ttest_1samp(values, 0).confidence_interval(LEVEL)
+    return Interval(values.mean(), found.low, found.high)
+
+
+def difference(x: Array, y: Array, level: float = LEVEL) -> Interval:
+    """The mean of x (..., n) minus that of y (..., m), with Welch's interval, (...).
+
+    NaN for its ends where neither varies.
+    """
+    value, error, freedom = welch(x, y)
+    half = stdtrit(freedom, (1 + level) / 2) * error
+    return Interval(value, value - half, value + half)
+
+
+def welch(x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """The difference of means, its error and its degrees of freedom, (...) each.
+
+    Welch 1947, "The generalization of 'Student's' problem when several different population
+    variances are involved". NaN for the last two where neither x (..., n) nor y (..., m) varies;
+    scipy's ttest_ind warns there.
+    """
+    n, m = x.shape[-1], y.shape[-1]
+    of_x, of_y = x.var(axis=-1, ddof=1) / n, y.var(axis=-1, ddof=1) / m
+    squared = np.where(constant(x) & constant(y), np.nan, of_x + of_y)
+    freedom = squared**2 / (of_x**2 / (n - 1) + of_y**2 / (m - 1) + _TINY)
+    return x.mean(axis=-1) - y.mean(axis=-1), np.sqrt(squared), freedom
+
+
+def deviation(values: Array) -> Interval:
+    """The standard deviation of (n,) with Bonett's 95 % interval.
+
+    Bonett 2006, "Approximate confidence interval for standard deviation of nonnormal
+    distributions", Computational Statistics & Data Analysis 50: of the log variance, with a
+    kurtosis about a trimmed mean. NaN for its ends with two runs, or where nothing varies.
+    """
+    runs, value = len(values), values.std(ddof=1)
+    if runs < FEWEST or constant(values):
+        return Interval(value, np.nan, np.nan)
+    quartic, squares = _moments(values)
+    z = norm.ppf((1 + LEVEL) / 2)
+    correction = runs / (runs - z)
+    half = z * correction * np.sqrt(_log_error(runs * quartic / squares**2, runs))
+    centre = math.log(correction * value**2)
+    return Interval(value, np.exp((centre - half) / 2), np.exp((centre + half) / 2))
+
+
+def variance_ratio(x: Array, y: Array, level: float = LEVEL) -> Interval:
+    """The variance of x (..., n) over that of y (..., m), with Bonett's interval, (...).
+
+    Bonett 2006, "Robust confidence interval for a ratio of standard deviations", Applied
+    Psychological Measurement 30: a normal interval of the log ratio, whose error has the kurtosis
+    pooled over both groups. His correction for groups of unequal size is left out, as it breaks
+    down for levels near 1. NaN for its ends where a group doesn't vary, or has two runs only.
+    """
+    n, m = x.shape[-1], y.shape[-1]
+    (quartic_x, squares_x), (quartic_y, squares_y) = _moments(x), _moments(y)
+    known = ~constant(x) & ~constant(y) & (min(n, m) >= FEWEST)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = (squares_x / (n - 1)) / (squares_y / (m - 1))
+        kurtosis = (n + m) * (quartic_x + quartic_y) / (squares_x + squares_y) ** 2
+        error = np.sqrt(_log_error(kurtosis, n) + _log_error(kurtosis, m))
+        half = np.where(known, norm.ppf((1 + level) / 2) * error, np.nan)
+        return Interval(value, value * np.exp(-half), value * np.exp(half))
+
+
+def _moments(values: Array) -> tuple[Array, Array]:
+    """Of (..., n): the sums of fourth powers about a trimmed mean, of squares about the mean."""
+    n = values.shape[-1]
+    # the part that Bonett trims off each end is half, that is, all but the median, for five runs
+    centre = np.median(values, axis=-1) if n < 6 else trim_mean(values, _trimmed(n), axis=-1)
+    return ((values - centre[..., None]) ** 4).sum(axis=-1), n * values.var(axis=-1)
+
+
+def _trimmed(n: int) -> float:
+    return 1 / (2 * math.sqrt(n - 4))
+
+
+def _log_error(kurtosis: Array, n: int) -> Array:
+    """The squared error of the log of a variance of n values."""
+    return (kurtosis - (n - 3) / n) / (n - 1)

@@ -1,0 +1,166 @@
+"""Runs of reinforcement learning: the unit of replication is one run, that is, one seed."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from numbers import Integral
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.errors import InputError
+from jbrep.evaluate.bootstrap import Array
+
+MAX_RETURN = 1000.0  # an episode's 1,000 steps, each with a reward in [0, 1]
+_ROUNDING = 1e-6 * MAX_RETURN
+
+
+@dataclass(frozen=True, eq=False)
+class RunCurve:
+    """What the policies of one run returned, at the training steps where they were evaluated.
+
+    A failed run counts as return 0 from the step at which it failed: rewards are never negative,
+    so failing can't flatter a label.
+
+    Args:
+        task: the task's name.
+        algorithm: the algorithm's name.
+        representation: what the agent observed: the label of the baseline, or of an encoder.
+        seed: the run's own.
+        settings: a hash, or any text, of what must be equal under one label.
+        steps: training steps of the evaluations, (k,), ascending.
+        returns: of each evaluation's episodes, (k, e), in [0, 1000].
+        total_steps: training steps that were asked for.
+        failed_at: training step at which the run failed; None if it didn't.
+
+    Raises:
+        InputError: a record that isn't so.
+    """
+
+    task: str
+    algorithm: str
+    representation: str
+    seed: int
+    settings: str
+    steps: NDArray[np.int64]
+    returns: Array
+    total_steps: int
+    failed_at: int | None = None
+
+    def __post_init__(self) -> None:
+        if not _is_whole(self.seed):
+            raise self._error(f"its seed is {self.seed!r}", "a run has a whole number as its seed")
+        given, returns = np.asarray(self.steps), np.asarray(self.returns, float)
+        if given.size and not np.issubdtype(given.dtype, np.integer):
+            raise self._error(f"its steps are {given.dtype}", "give whole numbers, (evaluations,)")
+        steps = given.astype(np.int64)
+        if not steps.size and not returns.size:
+            returns = returns.reshape(0, 1)  # failed before the first evaluation
+        if given.ndim != 1 or np.any(np.diff(steps) <= 0):
+            raise self._error("its steps don't ascend", "give whole numbers, (evaluations,)")
+        if returns.ndim != 2 or len(returns) != len(steps) or not returns.shape[1]:
+            raise self._error(
+                f"its returns have the shape {returns.shape}",
+                f"give (evaluations, episodes), with {len(steps)} evaluations as in its steps",
+            )
+        if not np.isfinite(returns).all():
+            raise self._error("returns aren't finite", "a run that diverged has failed: failed_at")
+        if (
+            returns.size
+            and not -_ROUNDING <= returns.min() <= returns.max() <= MAX_RETURN + _ROUNDING
+        ):
+            found = f"[{returns.min():g}, {returns.max():g}]"
+            raise self._error(f"its returns are in {found}", f"they lie in [0, {MAX_RETURN:g}]")
+        self._check_length(steps)
+        for name, value in (("steps", steps), ("returns", returns.copy())):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    def _check_length(self, steps: NDArray[np.int64]) -> None:
+        if self.failed_at is None and len(steps) < 2:
+            raise self._error(
+                f"it was evaluated {len(steps)} times",
+                "a curve takes two evaluations; episodes of one are no runs",
+            )
+        if self.failed_at is not None and not 0 <= self.failed_at <= self.total_steps:
+            raise self._error(
+                f"it failed at step {self.failed_at}", f"that is within 0 to {self.total_steps}"
+            )
+        if len(steps) and not 0 <= steps[0] <= steps[-1] <= self.total_steps:
+            raise self._error(
+                f"it was evaluated at steps {steps[0]} to {steps[-1]}",
+                f"they lie within its total_steps, {self.total_steps}",
+            )
+
+    @property
+    def label(self) -> str:
+        """Task, algorithm and representation: what runs that differ by seed alone share."""
+        return f"{self.task}/{self.algorithm}/{self.representation}"
+
+    def _error(self, found: str, expected: str) -> InputError:
+        return InputError(f"run {self.label}, seed {self.seed}: {found}; {expected}")
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+Group = dict[str, list[RunCurve]]  # runs by seed, under their representation
+
+
+def groups(runs: Sequence[RunCurve], baseline: str) -> dict[tuple[str, str], Group]:
+    """Runs to be compared: under (task, algorithm), then representation, the baseline first.
+
+    In the order of names and seeds, whatever the order given.
+
+    Raises:
+        InputError: what isn't a run, a label of one run, a seed or a curve twice under a label,
+            settings that differ under a label, a group without its baseline, or no run.
+    """
+    found: dict[tuple[str, str], Group] = defaultdict(lambda: defaultdict(list))
+    for run in runs:
+        if not isinstance(run, RunCurve):
+            raise InputError(
+                f"runs hold a {type(run).__name__}: give a RunCurve for each run; episodes are no "
+                "substitute for runs"
+            )
+        found[run.task, run.algorithm][run.representation].append(run)
+    if not found:
+        raise InputError("there are no runs: give at least two of the baseline")
+    return {key: _in_order(found[key], key, baseline) for key in sorted(found)}
+
+
+def _in_order(group: Group, key: tuple[str, str], baseline: str) -> Group:
+    if baseline not in group:
+        raise InputError(
+            f"{'/'.join(key)} has no runs of the baseline {baseline!r}: choose one of "
+            f"{', '.join(sorted(group))}, or train it"
+        )
+    ordered = {
+        name: sorted(group[name], key=lambda run: run.seed)
+        for name in sorted(group, key=lambda name: (name != baseline, *_by_latent(name)))
+    }
+    for of_label in ordered.values():
+        _check_label(of_label)
+    return ordered
+
+
+def _by_latent(name: str) -> tuple[str, int, str]:
+    """Sorts dae-12 before dae-8."""
+    kind, _, latent = name.rpartition("-")
+    return (kind, -int(latent), name) if latent.isdecimal() else (name, 0, name)
+
+
+def _check_label(runs: list[RunCurve]) -> None:
+    label, seeds = runs[0].label, [run.seed for run in runs]
+    if len(runs) < 2:
+        raise InputError(f"{label} has one seed: train at least two, better ten")
+    if len(set(seeds)) < len(seeds):
+        twice = next(seed for seed in seeds if seeds.count(seed) > 1)
+        raise InputError(f"{label} has seed {twice} twice: give each run once")
+    settings = sorted({run.settings for run in runs})
+    if len(settings) > 1:
+        raise InputError(
+            f"{label} mixes the settings {', '.join(settings)}: a label has one; name the others "
+            "differently"
+        )

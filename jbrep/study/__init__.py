@@ -1,0 +1,1 @@
+"""A grid of runs from a TOML file: prepared, run side by side, judged."""

@@ -1,0 +1,70 @@
+"""The data sets and encoders that a study's runs need."""
+
+from pathlib import Path
+
+from jbrep.collect import collect
+from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.dataset.manifest import MANIFEST, Settings
+from jbrep.dataset.storage import exists
+from jbrep.derive import derive
+from jbrep.encoders import find
+from jbrep.errors import InputError
+from jbrep.fit import Fitter
+from jbrep.jitterbug.tasks import get_task
+from jbrep.study.config import Data
+from jbrep.study.plan import Plan
+
+
+def check(plan: Plan) -> None:
+    """Make sure, before anything is made, that the runs will have their encoders.
+
+    Raises:
+        InputError: an encoder that doesn't ship, a latent size out of range, or no data set.
+    """
+    study = plan.study
+    for task in study.tasks:
+        if study.data and study.data.folder:
+            Dataset(_folder(study.data, task))
+        for representation in plan.representations:
+            if study.data is None:
+                find(representation.encoder, task)
+            elif representation.training.latent >= get_task(task).size:
+                raise InputError(
+                    f"{representation.name} is no reduction of {task}, which has "
+                    f"{get_task(task).size} features"
+                )
+
+
+def prepare(plan: Plan) -> None:
+    """Make what isn't there yet, data sets first; what is there is left as it is.
+
+    Raises:
+        InputError: as `collect`, `derive` and `Fitter.fit`, or an encoder that doesn't ship.
+    """
+    data = plan.study.data
+    if data is None:
+        return
+    for task in plan.study.tasks:
+        folder = _data(plan, data, task)
+        fitter = Fitter(ScaledDataset(Dataset(folder)), plan.encoders(task))
+        for representation in plan.representations:
+            fitter.fit(representation.kind, representation.training)
+
+
+def _data(plan: Plan, data: Data, task: str) -> Path:
+    """The folder of a task's data set; simulated for the first task, derived for the others."""
+    if data.folder:
+        return _folder(data, task)
+    first = plan.study.tasks[0]
+    source = plan.folder / "data" / first
+    if task == first:
+        collect(Settings(task=task, steps=data.steps, seed=data.seed, store_state=True), source)
+        return source
+    derive(source, task, plan.folder / "data" / task)
+    return plan.folder / "data" / task
+
+
+def _folder(data: Data, task: str) -> Path:
+    """Where a data set is that the study was given: the folder itself, or the task's in it."""
+    folder = Path(data.folder)
+    return folder if exists(folder / MANIFEST) else folder / task

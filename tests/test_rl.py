@@ -1,0 +1,372 @@
+"""One run: settings, files, evaluation, kills, failures, and files from strangers."""
+
+import dataclasses
+import io
+import json
+import pickle
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import SAC
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+
+from jbrep.encoders import find
+from jbrep.envs.episodes import Episodes
+from jbrep.errors import InputError
+from jbrep.rl import Run, train
+from jbrep.rl.agent import EVALUATION_SEED, Evaluator, make_agent, make_env, training_seed
+from jbrep.rl.files import FAILED, FINISHED, read_evaluations, read_run
+from jbrep.rl.policy import load_run, load_zip
+from jbrep.rl.presets import ALGORITHMS, PRESETS, get_preset
+
+TASK = "face_direction"
+SHORT = Run(task=TASK, algorithm="a2c", encoder="dae-8", steps=80, evaluation_episodes=1)
+
+
+def agent_of(algorithm, preset="paper", encoder="dae-8"):
+    settings = get_preset(preset, algorithm)
+    env = make_env(TASK, settings.num_envs, 0, find(encoder, TASK))
+    return make_agent(algorithm, settings, env, seed=0)
+
+
+def widths(network):
+    return [m.out_features for m in network.modules() if isinstance(m, torch.nn.Linear)]
+
+
+def weights(folder):
+    """All that torch saved in a policy's zip file."""
+    with zipfile.ZipFile(folder / "policy.zip") as file:
+        names = [name for name in file.namelist() if name.endswith(".pth")]
+        return {n: torch.load(io.BytesIO(file.read(n)), weights_only=True) for n in names}
+
+
+def assert_same_run(one, other):
+    for name in ("episodes.csv", "evaluations.csv"):
+        assert (one / name).read_bytes() == (other / name).read_bytes()
+    torch.testing.assert_close(weights(one), weights(other), rtol=0, atol=0)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("short")
+    train(SHORT, folder)
+    return folder
+
+
+def test_table_one_reaches_ddpg():
+    agent = agent_of("ddpg")
+    assert agent.lr_schedule(1) == agent.lr_schedule(0) == 1e-4
+    assert (agent.gamma, agent.batch_size, agent.gradient_steps) == (0.99, 256, 50)
+    assert (agent.train_freq.frequency, agent.train_freq.unit.value) == (100, "step")
+    assert (agent.replay_buffer.buffer_size, agent.tau) == (1_000_000, 1e-3)
+    noise = agent.action_noise
+    assert isinstance(noise, OrnsteinUhlenbeckActionNoise)
+    assert (noise._mu, noise._sigma, noise._theta) == (0.3, 0.3, 0.15)
+    for network in (agent.actor, agent.critic):
+        assert widths(network) == [350, 250, 1]
+        assert isinstance(network.optimizer, torch.optim.Adam)
+        assert network.optimizer.param_groups[0]["lr"] == 1e-4
+        assert sum(isinstance(m, torch.nn.ReLU) for m in network.modules()) == 2
+
+
+def test_table_one_reaches_ppo():
+    agent = agent_of("ppo")
+    assert agent.lr_schedule(1) == agent.lr_schedule(0) == 1e-4
+    assert (agent.gamma, agent.n_steps, agent.ent_coef, agent.vf_coef) == (0.99, 256, 0.01, 0.5)
+    assert (agent.max_grad_norm, agent.gae_lambda, agent.n_epochs) == (0.5, 0.95, 4)
+    assert (agent.clip_range(1), agent.clip_range(0), agent.clip_range_vf) == (0.2, 0.2, None)
+    assert agent.n_steps * agent.n_envs / agent.batch_size == 4
+    extractor = agent.policy.mlp_extractor
+    assert widths(extractor.policy_net) == widths(extractor.value_net) == [350, 250]
+    assert isinstance(extractor.policy_net[1], torch.nn.ReLU)
+    assert isinstance(agent.policy.optimizer, torch.optim.Adam)
+    assert agent.policy.optimizer.param_groups[0]["eps"] == 1e-5  # as without a preset
+
+
+def test_the_later_versions_settings_reach_sac_and_td3():
+    sac, td3 = agent_of("sac"), agent_of("td3")
+    for agent in (sac, td3):
+        assert agent.lr_schedule(1) == 1e-4
+        assert isinstance(agent.action_noise, NormalActionNoise)
+        assert (agent.action_noise._mu, agent.action_noise._sigma) == (0, 0.2)
+        assert widths(agent.actor)[:2] == [350, 250]
+    assert (sac.batch_size, sac.ent_coef) == (256, "auto")
+    assert (td3.learning_starts, td3.gradient_steps, td3.train_freq.frequency) == (
+        10_000,
+        1000,
+        1000,
+    )
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_preset_makes_an_agent_with_adam(algorithm, preset):
+    agent = agent_of(algorithm, preset)
+    optimizers = [
+        m.optimizer for m in (agent.policy, *agent.policy.children()) if hasattr(m, "optimizer")
+    ]
+    assert optimizers
+    assert {type(o) for o in optimizers} == {torch.optim.Adam}
+    assert agent.predict(agent.env.reset())[0].shape == (PRESETS[preset][algorithm].num_envs, 1)
+
+
+def test_a_runs_folder(short):
+    run = read_run(short)
+    assert run["status"] == FINISHED
+    assert run["steps"] == 80
+    assert run["settings"]["representation"] == "dae-8"
+    assert run["settings"]["hidden"] == [350, 250]
+    assert {"torch", "mujoco", "stable-baselines3"} <= set(run["versions"])
+    assert run["seconds"] > 0
+    assert run["cpu"]
+    assert [(e.step, e.episode) for e in read_evaluations(short)] == [(0, 0), (80, 0)]
+    assert (short / "episodes.csv").read_text() == "step,lane,return,length,diverged\n"
+    assert list((short / "tensorboard").glob("events.*"))
+    assert not (short / "checkpoint.safetensors").exists()
+
+
+def test_plain_sb3_loads_the_policy_that_was_evaluated(short):
+    plain = ALGORITHMS["a2c"].load(short / "policy.zip", device="cpu")
+    trained = load_run(short)
+    encoder = find("dae-8", TASK)
+    rows = encoder(np.random.default_rng(0).normal(size=(50, 16)).astype(np.float32))
+    expected = plain.predict(rows, deterministic=True)[0]
+    np.testing.assert_array_equal(trained.policy.predict(rows, deterministic=True)[0], expected)
+    returns = Evaluator(TASK, trained.encoder, 1).returns(trained.policy)
+    at_end = [e.episode_return for e in read_evaluations(short) if e.step == 80]
+    np.testing.assert_allclose(returns, at_end, atol=5e-4)
+
+
+def test_evaluation_is_the_deterministic_policys_return():
+    agent = agent_of("ppo")
+    encoder = find("dae-8", TASK)
+    lanes = Episodes(TASK, 2)
+    observation, total = lanes.reset([EVALUATION_SEED, EVALUATION_SEED + 1]), np.zeros(2)
+    for _ in range(1000):
+        latent = encoder(observation.astype(np.float32))
+        outcome = lanes.step(agent.predict(latent, deterministic=True)[0])
+        observation, total = outcome.observation, total + outcome.reward
+    evaluator = Evaluator(TASK, encoder, 2)
+    for _ in range(2):  # the same episodes each time
+        np.testing.assert_allclose(evaluator.returns(agent), total, rtol=1e-5)
+
+
+def test_training_episodes_are_recorded_and_evaluation_leaves_no_trace(tmp_path):
+    run = dataclasses.replace(SHORT, steps=8080)
+    for name, every in (("often", 4000), ("never", 10_000)):
+        train(dataclasses.replace(run, evaluate_every=every), tmp_path / name)
+    often, never = tmp_path / "often", tmp_path / "never"
+    assert (often / "episodes.csv").read_bytes() == (never / "episodes.csv").read_bytes()
+    torch.testing.assert_close(weights(often), weights(never), rtol=0, atol=0)
+    steps = [0, 4000, 8000, 8080]
+    assert sorted({e.step for e in read_evaluations(often)}) == steps
+    rows = [line.split(",") for line in (often / "episodes.csv").read_text().splitlines()[1:]]
+    assert [(row[0], row[1], row[3], row[4]) for row in rows] == [
+        ("8000", str(lane), "1000", "0") for lane in range(8)
+    ]
+    assert len({row[2] for row in rows}) > 4
+
+
+def test_runs_of_two_seeds_share_no_start_with_each_other_or_evaluation():
+    seeds = [training_seed(seed) for seed in range(1000)]
+    assert min(np.diff(sorted(seeds))) > 64
+    assert max(seeds) + 64 < EVALUATION_SEED
+
+
+def test_the_full_observation_is_scaled_as_encoders_scale_it():
+    full, dae = find("identity", TASK), find("dae-8", TASK)
+    env = make_env(TASK, 1, 7, full)
+    plain = Episodes(TASK, 1).reset([7]).astype(np.float32)
+    np.testing.assert_allclose(env.reset(), dae.scaler.scale(plain), rtol=1e-5, atol=1e-6)
+
+
+def test_neither_threads_nor_a_second_time_change_a_bit(short, tmp_path):
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        train(SHORT, tmp_path / "again")
+    finally:
+        torch.set_num_threads(threads)
+    assert_same_run(short, tmp_path / "again")
+
+
+def test_another_seed_is_another_run(short, tmp_path):
+    train(dataclasses.replace(SHORT, seed=1), tmp_path / "other")
+    with pytest.raises(AssertionError):
+        assert_same_run(short, tmp_path / "other")
+
+
+def test_a_run_that_is_over_is_left_alone(short):
+    before = {p: p.stat().st_mtime_ns for p in short.iterdir()}
+    assert train(SHORT, short)["status"] == FINISHED
+    with pytest.raises(InputError, match=r"holds another run: seed 0 \(now: 5\)"):
+        train(dataclasses.replace(SHORT, seed=5), short)
+    assert {p: p.stat().st_mtime_ns for p in short.iterdir()} == before
+
+
+def test_mid_episode_the_environment_goes_on_bit_for_bit():
+    drive = np.random.default_rng(0).uniform(-1, 1, (1200, 3, 1))
+    one, other = Episodes(TASK, 3), Episodes(TASK, 3)
+    one.reset([1, 2, 3])
+    other.reset([7, 8, 9])
+    for action in drive[:700]:
+        one.step(action)
+    arrays, generators = one.state
+    other.restore(arrays, json.loads(json.dumps(generators)))
+    for action in drive[700:]:  # past the episode's end
+        expected, found = one.step(action), other.step(action)
+        for name in ("observation", "reward", "done", "final_observation"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+KILLED = {
+    "ddpg": Run(task=TASK, algorithm="ddpg", encoder="dae-8", steps=500, evaluation_episodes=1),
+    "sac": Run(task=TASK, algorithm="sac", preset="modern", steps=1100, evaluation_episodes=1),
+    "ppo": Run(task=TASK, algorithm="ppo", encoder="dae-4", steps=6144, evaluation_episodes=1),
+}
+
+
+def go(run, folder, stop):
+    """Train in another process; kill it when so many checkpoints have been written."""
+    text = (
+        "import sys; from pathlib import Path; from jbrep.rl import Run, train;"
+        f"train({run!r}, Path({str(folder)!r}), save_every=0.05)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", text], stderr=subprocess.PIPE, text=True)
+    seen, checkpoint = set(), folder / "checkpoint.safetensors"
+    while process.poll() is None and len(seen) < stop:
+        if checkpoint.exists():
+            seen.add(checkpoint.stat().st_mtime_ns)
+        time.sleep(0.005)
+    process.kill()
+    error = process.communicate()[1]
+    return process.returncode, error[-2000:]
+
+
+@pytest.mark.parametrize("algorithm", KILLED)
+def test_a_killed_run_goes_on_to_the_same_bits(algorithm, tmp_path):
+    run, folder = KILLED[algorithm], tmp_path / "killed"
+    killed, error = go(run, folder, stop=2)
+    assert killed == -signal.SIGKILL, error
+    checkpoint = (folder / "checkpoint.safetensors").read_bytes()
+    again, error = go(run, folder, stop=10**9)
+    assert again == 0, error
+    train(run, tmp_path / "peace")
+    assert_same_run(tmp_path / "peace", folder)
+    (tmp_path / "spoilt").mkdir()
+    spoilt = tmp_path / "spoilt" / "checkpoint.safetensors"
+    for content in (checkpoint[:-100], b"", pickle.dumps(run), checkpoint):
+        spoilt.write_bytes(content)
+        with pytest.raises(InputError, match=r"checkpoint\.safetensors (is|was)"):
+            train(dataclasses.replace(run, seed=9), tmp_path / "spoilt")
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
+@pytest.mark.parametrize("algorithm", ["ddpg", "sac", "ppo"])
+def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
+    preset = get_preset("paper", algorithm)
+    wild = dataclasses.replace(preset, settings={**preset.settings, "learning_rate": 1e30})
+    monkeypatch.setitem(PRESETS["paper"], algorithm, wild)
+    run = Run(task=TASK, algorithm=algorithm, steps=4096, evaluation_episodes=1)
+    result = train(run, tmp_path / "wild")
+    assert result["status"] == FAILED
+    assert "loss is" in result["reason"] or "not finite" in result["reason"]
+    assert result["steps"] < 4096 + 2048
+    assert not (tmp_path / "wild" / "policy.zip").exists()
+    assert train(run, tmp_path / "wild") == result
+    with pytest.raises(InputError, match="failed: it has no policy"):
+        load_run(tmp_path / "wild")
+
+
+class Trap:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("member", ["policy.pth", "data"])
+def test_nothing_in_a_runs_folder_runs_as_code(member, short, tmp_path):
+    for name in ("run.json", "encoder.safetensors"):
+        (tmp_path / name).write_bytes((short / name).read_bytes())
+    sprung = tmp_path / "sprung"
+    with (
+        zipfile.ZipFile(short / "policy.zip") as old,
+        zipfile.ZipFile(tmp_path / "policy.zip", "w") as new,
+    ):
+        for name in old.namelist():
+            content = pickle.dumps(Trap(sprung), protocol=2) if name == member else old.read(name)
+            new.writestr(name, content)
+    if member == "policy.pth":
+        with pytest.raises(InputError, match=r"policy\.zip is damaged"):
+            load_run(tmp_path)
+    else:
+        load_run(tmp_path)
+    assert not sprung.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("policy.zip", b"PK", "damaged"),
+        ("policy.zip", None, "missing or damaged"),
+        ("encoder.safetensors", None, "no encoder"),
+        ("run.json", b"{", "damaged, or not of a run"),
+        ("run.json", None, "no run that is over"),
+        ("run.json", "hidden", "don't fit together"),
+        ("run.json", "algorithm", "'x' is unknown"),
+        ("run.json", "encoder", "not the encoder"),
+    ],
+)
+def test_a_damaged_folder_is_named(name, content, message, short, tmp_path):
+    for each in ("run.json", "encoder.safetensors", "policy.zip"):
+        (tmp_path / each).write_bytes((short / each).read_bytes())
+    if content is None:
+        (tmp_path / name).unlink()
+    elif isinstance(content, bytes):
+        (tmp_path / name).write_bytes(content)
+    else:
+        run = json.loads((short / name).read_text())
+        run["settings"][content] = [3] if content == "hidden" else "x"
+        (tmp_path / name).write_text(json.dumps(run))
+    with pytest.raises(InputError, match=message) as error:
+        load_run(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_zip_file_from_elsewhere_needs_trust(tmp_path):
+    path = tmp_path / "agent.zip"
+    SAC("MlpPolicy", make_env(TASK, 1, 0, find("dae-8", TASK)), buffer_size=10).save(path)
+    with pytest.raises(InputError, match="runs as code when it is read; --trust"):
+        load_zip(path, TASK, "sac", "dae-8", trust=False)
+    assert load_zip(path, TASK, "sac", "dae-8", trust=True).task == TASK
+    for algorithm, encoder in (("sac", "dae-4"), ("ppo", "dae-8"), ("fly", "dae-8")):
+        with pytest.raises(InputError, match=r"is no|unknown algorithm"):
+            load_zip(path, TASK, algorithm, encoder, trust=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"task": "fly"}, "unknown task"),
+        ({"algorithm": "dqn"}, "unknown algorithm 'dqn': choose one of ddpg"),
+        ({"preset": "best"}, "unknown preset 'best': choose one of paper, modern"),
+        ({"encoder": "dae-9"}, "no encoder 'dae-9'"),
+        ({"seed": 2**31}, "the seed is"),
+        ({"steps": 0}, "steps is 0"),
+        ({"evaluate_every": 0}, "evaluate every is 0"),
+        ({"evaluation_episodes": 0}, "evaluation episodes is 0"),
+    ],
+)
+def test_what_cannot_be_run_is_refused(change, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        train(dataclasses.replace(SHORT, **change), tmp_path / "new")
+    assert not (tmp_path / "new").exists()

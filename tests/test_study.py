@@ -1,0 +1,367 @@
+"""Studies: their files, their preparation, kills, workers, clusters, results."""
+
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jbrep.encoders import load
+from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import TASKS
+from jbrep.rl.files import RUN, read_run, write_run
+from jbrep.rl.presets import PRESETS, get_preset
+from jbrep.study.config import Data, Study, read_study
+from jbrep.study.plan import Plan
+from jbrep.study.prepare import prepare
+from jbrep.study.progress import in_words
+from jbrep.study.results import RETURNS, STATISTICS, read_results, read_runs, write_results
+from jbrep.study.runner import get_backend, on_this_machine
+from jbrep.study.study import conduct, outline
+from jbrep.study.work import PROGRESS
+
+TINY = Study(
+    tasks=("face_direction",),
+    algorithms=("a2c",),
+    representations=("full", "pca-8"),
+    seeds=(0, 1, 2),
+    steps=80,
+    evaluate_every=40,
+    evaluation_episodes=1,
+)
+TOML = """
+tasks = ["face_direction"]
+algorithms = ["a2c"]
+representations = ["full", "pca-8"]
+seeds = 3
+steps = 80
+evaluate_every = 40
+evaluation_episodes = 1
+"""
+
+
+def jbrep(*arguments, **options):
+    command = [sys.executable, "-c", "from jbrep.cli import main; main()", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def tables(folder):
+    """All that a study concludes, as bytes."""
+    write_results(read_results(folder), folder)
+    return [(folder / name).read_bytes() for name in (RETURNS, STATISTICS)]
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """The tiny study on one worker, at its end."""
+    plan = Plan(TINY, tmp_path_factory.mktemp("study") / "done")
+    assert conduct(plan, on_this_machine, 1) == 0
+    return plan
+
+
+def test_the_presets_are_studies():
+    found = {p.stem: read_study(p) for p in Path("studies").glob("*.toml")}
+    assert set(found) == {"smoke", "desk", "first", "paper"}
+    paper = found["paper"]
+    assert (paper.steps, len(paper.seeds), paper.data) == (5_000_000, 10, Data(steps=5_000_000))
+    assert {"dae-12", "dae-8", "dae-4", "full"} <= set(paper.representations)
+    assert len(found["first"].seeds) >= 5
+    assert found["first"].steps == 50_000
+
+
+def test_a_study_from_toml(tmp_path):
+    path = tmp_path / "tiny.toml"
+    path.write_text(TOML)
+    assert read_study(path) == TINY
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("tasks", "task", "unknown task: known are tasks, algorithms"),
+        ("face_direction", "fly", "unknown task 'fly'"),
+        ('"a2c"', '"dqn"', "unknown algorithm 'dqn'"),
+        ('"a2c"', '"a2c-best"', "unknown preset 'best'"),
+        ('"pca-8"', '"pca"', "unknown representation 'pca': full, or a kind and a latent size"),
+        ('"pca-8"', '"fit-8"', "unknown kind 'fit'"),
+        ('"pca-8"', '"dae-wide-8"', "unknown architecture 'wide'"),
+        ('"pca-8"', '"full"', "representations is .*each once"),
+        ("seeds = 3", "seeds = []", "seeds is .*one or more"),
+        ("seeds = 3", "seeds = 0", "seeds is 0: a list of int"),
+        ("seeds = 3", "seeds = [0.5]", r"seeds is \[0.5\]: a list of int"),
+        ("steps = 80", "steps = '80'", "steps is '80': int is needed"),
+        ("steps = 80", "", "steps is missing"),
+        ("steps = 80", "steps = 80\ndata = 7", "data is 7: a table is needed"),
+        ("steps = 80", "steps = 80\ndata = {rows = 7}", "unknown data.rows"),
+        ("steps = 80", "steps = 80\ndata = {}", "data needs either steps"),
+        ("steps = 80", "steps = 80\ntraining = {epochs = 3}", "so data is needed, too"),
+        (
+            "steps = 80",
+            "steps = 80\ndata = {steps = 9}\ntraining = {depth = 3}",
+            "training: .*depth",
+        ),
+        ("steps = 80", "steps 80", "is no TOML"),
+    ],
+)
+def test_a_mistaken_study_is_refused(old, new, message, tmp_path):
+    path = tmp_path / "tiny.toml"
+    path.write_text(TOML.replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as error:
+        read_study(path)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+
+
+def test_a_study_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match="no study at"):
+        read_study(tmp_path / "none.toml")
+
+
+def test_every_cell_has_its_run(done):
+    names = {cell.name for cell in done.cells}
+    assert len(names) == 6
+    for name in names:
+        run = read_run(done.folder / "runs" / name)
+        task, algorithm, representation, seed = name.split("/")
+        settings = run["settings"]
+        assert (settings["task"], settings["algorithm"]) == (task, algorithm)
+        assert settings["representation"] == representation
+        assert f"seed-{settings['seed']}" == seed
+        assert not (done.folder / "runs" / name / PROGRESS).exists()
+
+
+def test_two_workers_give_the_same_tables(done, tmp_path):
+    plan = Plan(TINY, tmp_path / "two")
+    assert conduct(plan, on_this_machine, 2) == 0
+    assert tables(plan.folder) == tables(done.folder)
+
+
+def test_what_is_finished_is_not_run_again_and_seeds_may_come(done, tmp_path, monkeypatch):
+    grown = Plan(dataclasses.replace(TINY, seeds=(0, 1, 2, 3)), done.folder)
+    assert [cell.name for cell in grown.cells if not grown.is_over(cell)] == [
+        "face_direction/a2c/full/seed-3",
+        "face_direction/a2c/pca-8/seed-3",
+    ]
+    before = {p: p.stat().st_mtime_ns for p in (done.folder / "runs").rglob("*.*")}
+    assert conduct(done, None, 1) == 0  # nothing is left to run
+    assert {p: p.stat().st_mtime_ns for p in (done.folder / "runs").rglob("*.*")} == before
+    other = Plan(dataclasses.replace(TINY, steps=90), done.folder)
+    with pytest.raises(InputError, match=r"another study: steps 80 \(now: 90\)"):
+        conduct(other, None, 1)
+
+
+def test_it_makes_data_and_encoders(tmp_path):
+    study = dataclasses.replace(
+        TINY,
+        tasks=("face_direction", "move_to_pose"),
+        representations=("full", "dae-8", "random-4"),
+        data=Data(steps=2000, seed=5),
+        training={"epochs": 2, "batch_size": 256},
+    )
+    plan = Plan(study, tmp_path / "made")
+    plan.begin()
+    prepare(plan)
+    prints = set()
+    for cell in plan.cells:
+        encoder = load(Path(plan.run(cell).encoder))
+        encoder.check_task(TASKS[cell.task])
+        assert encoder.header["data"]["seed"] == 5
+        prints.add((cell.task, encoder.header["data"]["fingerprint"]))
+        plan.run(cell).check()
+    assert len(prints) == 2
+    stamp = {p: p.stat().st_mtime_ns for p in plan.folder.rglob("*.safetensors")}
+    assert len(stamp) == 6
+    prepare(plan)
+    assert {p: p.stat().st_mtime_ns for p in stamp} == stamp
+
+
+def test_a_data_set_from_elsewhere(collected, tmp_path):
+    for folder in (collected, collected.parent):
+        study = dataclasses.replace(TINY, data=Data(folder=str(folder)))
+        plan = Plan(study, tmp_path / folder.name)
+        prepare(plan)
+        assert (plan.encoders("face_direction") / "pca-8.safetensors").exists()
+    for name, message in (("pca-16", "no reduction of face_direction"), ("pca-99", "no reduction")):
+        wrong = dataclasses.replace(study, representations=("full", name))
+        with pytest.raises(InputError, match=message):
+            conduct(Plan(wrong, tmp_path / "wrong"), None, 1)
+    with pytest.raises(InputError, match="no encoder 'pca-5'"):
+        conduct(
+            Plan(dataclasses.replace(TINY, representations=("full", "pca-5")), tmp_path / "w"),
+            *(None, 1),
+        )
+    assert not (tmp_path / "w").exists()
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
+def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
+    preset = get_preset("paper", "a2c")
+    wild = dataclasses.replace(preset, settings={**preset.settings, "learning_rate": 1e30})
+    monkeypatch.setitem(PRESETS["modern"], "a2c", wild)
+    study = dataclasses.replace(TINY, algorithms=("a2c", "a2c-modern"), seeds=(0, 1))
+    plan = Plan(study, tmp_path / "mixed")
+    blocked = plan.folder_of(plan.cells[0])
+    blocked.mkdir(parents=True)
+    (blocked / "encoder.safetensors").mkdir()  # where a file is to be
+    assert conduct(plan, on_this_machine, 1) == 1
+    assert "can't write" in (blocked / "error.txt").read_text()
+    over = {cell.name: read_run(plan.folder_of(cell))["status"] for cell in plan.cells[1:]}
+    for name, status in over.items():
+        assert status == ("failed" if "a2c-modern" in name else "finished")
+    (blocked / "encoder.safetensors").rmdir()
+    assert conduct(plan, on_this_machine, 1) == 0
+    analysis = read_results(plan.folder).analysis
+    failed = {group.algorithm: [len(x.failed) for x in group.labels] for group in analysis.groups}
+    assert failed == {"a2c": [0, 0], "a2c-modern": [2, 2]}
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_killed_study_goes_on(how, done, tmp_path):
+    path, out = tmp_path / "tiny.toml", tmp_path / "killed"
+    path.write_text(TOML)
+    process = jbrep("study", path, "--out", out, "--workers", 2)
+    deadline = time.monotonic() + 120
+    while not list(out.rglob(RUN)) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    children = workers_of(process.pid)
+    process.send_signal(how)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == (-how if how == signal.SIGKILL else 128 + how), told
+    assert children
+    while any(is_alive(child) for child in children):  # none is left behind
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    if how == signal.SIGINT:
+        assert "the same command goes on" in told
+        assert "Traceback" not in told
+    assert len(list(out.rglob(RUN))) < 6
+    process = jbrep("study", path, "--out", out, "--workers", 2)
+    said, told = process.communicate(timeout=120)
+    assert process.returncode == 0, told
+    assert "less variance" in said
+    assert tables(out) == tables(done.folder)
+
+
+def test_runs_whose_worker_is_killed_are_gone_on_with(done, tmp_path):
+    path, out = tmp_path / "tiny.toml", tmp_path / "killed"
+    path.write_text(TOML)
+    process = jbrep("study", path, "--out", out, "--workers", 2)
+    deadline = time.monotonic() + 120
+    while not list(out.rglob(PROGRESS)) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(workers_of(process.pid)[-1], signal.SIGKILL)
+    _, told = process.communicate(timeout=120)
+    assert process.returncode == 0, told
+    assert tables(out) == tables(done.folder)
+
+
+def workers_of(pid):
+    """The loky workers that a process has."""
+    found = subprocess.run(["pgrep", "-P", str(pid), "-f", "popen_loky"], capture_output=True)
+    return [int(each) for each in found.stdout.split()]
+
+
+def is_alive(pid):
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+def test_on_a_cluster_that_loses_a_node(done, tmp_path):
+    pytest.importorskip("ray")
+    script = Path(__file__).with_name("cluster.py")
+    told = subprocess.run(
+        [sys.executable, script, str(tmp_path / "ray")],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        env={**os.environ, "HOME": str(tmp_path)},
+    )
+    assert told.returncode == 0, told.stderr[-3000:]
+    assert "a node died at work" in told.stdout
+    assert tables(tmp_path / "ray") == tables(done.folder)
+
+
+def test_one_study_at_a_time(done):
+    from jbrep.dataset.lock import exclusive
+
+    with exclusive(done.folder), pytest.raises(InputError, match="is being written by process"):
+        conduct(done, on_this_machine, 1)
+
+
+def test_a_dry_run_lists_and_runs_nothing(tmp_path):
+    text = outline(Plan(TINY, tmp_path / "dry"), 2)
+    assert text.count("face_direction/a2c/") == 6
+    assert re.search(r"6 runs to go, 0 over; [\d.]+ s of one core, [\d.]+ s with 2 workers", text)
+    assert not (tmp_path / "dry").exists()
+
+
+def test_the_long_table_holds_every_evaluation(done):
+    lines = tables(done.folder)[0].decode().splitlines()
+    assert lines[0] == "task,algorithm,representation,seed,step,episode,return"
+    assert len(lines) == 1 + 6 * 3
+    assert lines[1].startswith("face_direction,a2c,full,0,0,0,")
+    statistics = json.loads((done.folder / STATISTICS).read_text())
+    final = statistics["groups"][0]["labels"][0]["by_run"]["final_return"]
+    assert final == [
+        float(line.split(",")[-1]) for line in lines[1:] if ",full," in line and ",80,0," in line
+    ]
+
+
+def test_a_single_seed_gives_its_returns_and_says_why_no_more(done, tmp_path):
+    source = done.folder_of(done.cells[0])
+    for name in (RUN, "evaluations.csv"):
+        (tmp_path / name).write_bytes((source / name).read_bytes())
+    results = read_results(tmp_path)
+    assert results.analysis is None
+    assert "has one seed" in results.refusal
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("evaluations.csv", "step,episode,return\n0,0", "not a table of evaluations"),
+        ("evaluations.csv", "step,episode,return\n0,0,nan\n80,0,1\n", "finite"),
+        (RUN, "[]", "damaged, or not of a run"),
+        (RUN, "settings", "damaged, or not of a run"),
+    ],
+)
+def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
+    source = done.folder_of(done.cells[0])
+    for each in (RUN, "evaluations.csv"):
+        (tmp_path / each).write_bytes((source / each).read_bytes())
+    if content == "settings":
+        write_run(tmp_path, {**read_run(tmp_path), "settings": {}})
+    else:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_runs(tmp_path)
+
+
+def test_no_run_and_no_backend(tmp_path):
+    with pytest.raises(InputError, match="no run that is over below"):
+        read_runs(tmp_path)
+    with pytest.raises(InputError, match="unknown backend 'slurm': choose one of joblib, ray"):
+        get_backend("slurm")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(12.4, "12 s"), (300, "5.0 min"), (90 * 60, "1.5 h"), (1e6, "277.8 h")]
+)
+def test_durations_in_words(seconds, words):
+    assert in_words(seconds) == words
+
+
+def test_interpolation_leaves_evaluations_as_they_are(done):
+    run = read_runs(done.folder)[0]
+    assert run.steps.tolist() == [0, 40, 80]
+    assert np.all((run.returns >= 0) & (run.returns <= 1000))
