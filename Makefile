@@ -5,7 +5,7 @@ READY := $(VENV)/.ready
 DEMO := demo
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
-.PHONY: help setup demo test check bench pictures samples data encoders clean
+.PHONY: help setup demo test check bench pictures samples data encoders first clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -14,7 +14,7 @@ $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "jbrep needs Python 3.11 or newer: make PYTHON=python3.11 ..."; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[export,learn,render,dev]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[cluster,export,learn,render,dev]'
 	@touch $@
 
 demo: $(READY) ## the whole job in minutes: collect, train and judge encoders, learn on latent and full state
@@ -25,9 +25,7 @@ demo: $(READY) ## the whole job in minutes: collect, train and judge encoders, l
 	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 8 --architecture deep --epochs 40 --batch-size 128 --out $(DEMO)/encoders
 	$(BIN)/jbrep train-encoder --kind random --data $(DEMO)/data --latent 8 --out $(DEMO)/encoders
 	$(BIN)/jbrep evaluate --encoder $(addprefix $(DEMO)/encoders/,$(addsuffix .safetensors,dae-12 dae-8 dae-4 dae-deep-8 random-8)) --data $(DEMO)/data --out $(DEMO)/evaluation
-	$(BIN)/jbrep rl --task face_direction --steps 4k --encoder $(DEMO)/encoders/dae-8.safetensors --out $(DEMO)/runs/dae-8
-	$(BIN)/jbrep rl --task face_direction --steps 4k --out $(DEMO)/runs/full
-	$(BIN)/jbrep report $(DEMO)/runs
+	$(BIN)/jbrep study studies/smoke.toml --out $(DEMO)/study
 
 test: $(READY) ## the test suite
 	$(BIN)/python -m pytest
@@ -42,6 +40,7 @@ bench: $(READY) ## speed as ratios in one run, and what the hand-written policie
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/dataset.py
 	$(BIN)/python benchmarks/encoders.py
+	$(BIN)/python benchmarks/learning.py
 	$(BIN)/python benchmarks/heuristics.py
 
 pictures: $(READY) ## the pictures in docs/, drawn anew
@@ -59,6 +58,10 @@ data: $(READY) ## data sets of five million states in data/: half an hour, 4 GB
 encoders: data ## results/encoders/ from these: hours; goes on where it was stopped
 	rm -rf $(addprefix results/encoders/,$(TASKS))
 	$(BIN)/python tools/encoders.py data encoders results/encoders $(TASKS)
+
+first: $(READY) ## results/first/ anew: two hours; goes on where it was stopped
+	$(BIN)/jbrep study studies/first.toml --out runs/first
+	cp runs/first/returns.csv runs/first/statistics.json results/first/
 
 clean: ## remove the environment and the demo's files
 	rm -rf $(VENV) $(DEMO) *.egg-info

@@ -149,7 +149,7 @@ class Trainer:
 
     def epochs(self) -> Iterator[Epoch]:
         """Train to the end, an epoch for each that is asked for."""
-        with _one_thread():
+        with one_thread():
             while len(self.history) < self.training.epochs:
                 self._epoch()
                 yield self.history[-1]
@@ -226,8 +226,8 @@ def ahead(items: Iterable[_Item]) -> Iterator[_Item]:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """So small a network gains nothing from more threads, and waits long where cores are busy."""
+def one_thread() -> Iterator[None]:
+    """Torch on one: networks so small gain little from more, which move the last bits and wait."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -4,16 +4,16 @@ import hashlib
 import io
 import platform
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import torch
 from stable_baselines3.common.logger import Logger
 
+from jbrep.dae.training import one_thread
 from jbrep.dataset.lock import exclusive
 from jbrep.dataset.storage import exists, make_folder, write_whole
 from jbrep.encoders import Encoder, find, save
@@ -43,6 +43,7 @@ FULL = "full"  # what the identity is called beside what is smaller
 _CHECKPOINT = "checkpoint.safetensors"
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 _MOST_SEED = 1 << 31
+_NOT_FINITE = ("found invalid values", "actions are not finite")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,8 +202,8 @@ class _Training:
             agent.learn(self._steps, callback=self._recorder)
         except NotFiniteError as error:
             problem = str(error)
-        except ValueError as error:  # torch's distributions refuse NaN, between two losses
-            if "found invalid values" not in str(error):
+        except ValueError as error:  # torch's distributions refuse NaN, as the environment does
+            if not any(words in str(error) for words in _NOT_FINITE):
                 raise
             problem = "the policy's actions are not finite"
         else:
@@ -232,14 +233,3 @@ def _cpu() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """More threads would move the last bits, and wait for each other where cores are shared."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

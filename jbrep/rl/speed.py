@@ -4,10 +4,11 @@ import time
 from dataclasses import replace
 from typing import Any
 
+from jbrep.dae.training import one_thread
 from jbrep.encoders import find
 from jbrep.rl.agent import Evaluator, make_agent, make_env
 from jbrep.rl.presets import get_preset
-from jbrep.rl.run import Run, one_thread
+from jbrep.rl.run import Run
 
 _LEAST_STEPS = 300
 

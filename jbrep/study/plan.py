@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from jbrep.dataset.shard import read_regular
 from jbrep.dataset.storage import exists, make_folder, write_whole
@@ -105,10 +106,16 @@ class Plan:
         path = self.folder / STUDY
         wanted = plain(asdict(self.study))
         if exists(path):
-            there = json.loads(read_regular(path, _MAX_BYTES))
             shared = {name: value for name, value in wanted.items() if name not in _GRID}
-            if differing := differences(there, shared):
+            if differing := differences(_read(path), shared):
                 raise InputError(
                     f"{self.folder} holds another study: {differing}; choose another --out"
                 )
         write_whole(path, (json.dumps(wanted, indent=2) + "\n").encode())
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(read_regular(path, _MAX_BYTES)))
+    except (OSError, ValueError, TypeError, RecursionError):
+        raise InputError(f"{path} is damaged, or not of a study: choose another --out") from None

@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import replace
 
 from jbrep.dataset.lock import exclusive
+from jbrep.rl import train
 from jbrep.rl.speed import estimate
 from jbrep.study.plan import Cell, Plan
 from jbrep.study.prepare import check, prepare
@@ -12,7 +13,7 @@ from jbrep.study.runner import Backend
 from jbrep.study.work import CRASHED
 
 
-def conduct(plan: Plan, run: Backend, workers: int) -> int:
+def conduct(plan: Plan, backend: Backend, workers: int) -> int:
     """Prepare a study and bring all its runs to their end; how many crashed.
 
     Raises:
@@ -22,14 +23,17 @@ def conduct(plan: Plan, run: Backend, workers: int) -> int:
     plan.begin()
     with exclusive(plan.folder):
         prepare(plan)
-        for cell in plan.cells:  # all that is wrong before the first hour
-            plan.run(cell).check()
         left = [cell for cell in plan.cells if not plan.is_over(cell)]
+        for cell in plan.cells:  # all that is wrong before the first hour
+            if cell in left:
+                plan.run(cell).check()
+            else:
+                train(plan.run(cell), plan.folder_of(cell))  # is over, and must be this very run
         if not left:
             return 0
         outcomes = Counter[str]()
         with Progress(plan, left) as progress:
-            for outcome in run(plan, left, workers):
+            for outcome in backend(plan, left, workers):
                 progress.tell(outcome)
                 outcomes[outcome.status] += 1
     return outcomes[CRASHED]

@@ -6,6 +6,7 @@ import threading
 import time
 import traceback
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,7 +38,7 @@ def work(name: str, run: Run, folder: Path, parent: int) -> Outcome:
     """
     if os.getppid() == parent:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+        _watch(parent)
     try:
         make_folder(folder)
         result = train(run, folder, _Reporter(folder))
@@ -70,6 +71,11 @@ class _Reporter:
         if now - self._told >= _EVERY:
             self._path.write_text(f"{step} {'-' if mean is None else f'{mean:.0f}'}")
             self._told = now
+
+
+@cache  # once for each process
+def _watch(parent: int) -> None:
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 
 def _end_with(parent: int) -> None:
