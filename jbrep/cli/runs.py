@@ -59,7 +59,9 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
     run.check()
     with (
         stoppable(GOES_ON),
-        tqdm(total=run.steps, desc=f"{run.algorithm} on {run.encoder}", unit="step") as progress,
+        tqdm(
+            total=run.steps, desc=f"{run.algorithm} on {run.encoder}", unit="step", delay=0.5
+        ) as progress,
     ):
 
         def watch(step: int, mean: float | None) -> None:

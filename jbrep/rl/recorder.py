@@ -63,6 +63,7 @@ class Recorder(BaseCallback):
         self._begin, self._watch = begin, watch
         self._save, self._save_every = save, save_every
         self._saved = time.monotonic()
+        self._mean: float | None = None  # return of the last evaluation
 
     @property
     def record(self) -> dict[str, Any]:
@@ -84,7 +85,7 @@ class Recorder(BaseCallback):
         if time.monotonic() - self._saved >= self._save_every:
             self._save()
             self._saved = time.monotonic()
-        self._watch(self.model.num_timesteps, self._last_mean())
+        self._watch(self.model.num_timesteps, self._mean)
 
     def _on_step(self) -> bool:
         for lane in np.flatnonzero(self.locals["dones"]).tolist():
@@ -102,20 +103,15 @@ class Recorder(BaseCallback):
     def _on_training_end(self) -> None:
         check_finite(self.model)
         self._evaluate()
-        self._watch(self.model.num_timesteps, self._last_mean())
+        self._watch(self.model.num_timesteps, self._mean)
 
     def _evaluate(self) -> None:
         step = self.model.num_timesteps
         returns = self._evaluator.returns(self.model).round(3).tolist()
         self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(returns)]
-        self.logger.record("evaluation/mean_return", float(np.mean(returns)))
+        self._mean = float(np.mean(returns))
+        self.logger.record("evaluation/mean_return", self._mean)
         self.logger.dump(step)
-
-    def _last_mean(self) -> float | None:
-        if not self.evaluations:
-            return None
-        last = self.evaluations[-1].step
-        return float(np.mean([e.episode_return for e in self.evaluations if e.step == last]))
 
 
 def check_finite(agent: BaseAlgorithm) -> None:

@@ -43,7 +43,8 @@ class Plan:
     """
 
     def __init__(self, study: Study, folder: Path):
-        self.study, self.folder = study, folder
+        self.study = study
+        self.folder = folder.absolute()  # workers may stand elsewhere
 
     @cached_property
     def representations(self) -> tuple[Representation, ...]:

@@ -25,10 +25,10 @@ def conduct(plan: Plan, backend: Backend, workers: int) -> int:
         prepare(plan)
         left = [cell for cell in plan.cells if not plan.is_over(cell)]
         for cell in plan.cells:  # all that is wrong before the first hour
-            if cell in left:
-                plan.run(cell).check()
+            if plan.is_over(cell):
+                train(plan.run(cell), plan.folder_of(cell))  # makes sure that it is this very run
             else:
-                train(plan.run(cell), plan.folder_of(cell))  # is over, and must be this very run
+                plan.run(cell).check()
         if not left:
             return 0
         outcomes = Counter[str]()
