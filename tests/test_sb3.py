@@ -121,7 +121,7 @@ def test_a_lane_that_diverges_is_flagged_and_the_others_go_on():
     for action in drive[:10]:
         before = one.step(action)[0]
         other.step(action)
-    one._episodes.simulation.readings.qvel[1] = np.nan
+    one.episodes.simulation.readings.qvel[1] = np.nan
     for step, action in enumerate(drive[10:]):
         observation, reward, done, infos = one.step(action)
         expected = other.step(action)
