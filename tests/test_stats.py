@@ -545,6 +545,30 @@ def test_failed_runs_do_not_speak_for_a_steady_representation():
     assert (found.verdict, found.reason, found.seeds_needed) == ("undecided", "failed runs", None)
 
 
+def test_nothing_follows_from_a_baseline_that_did_not_learn():
+    idle = [
+        replace(run, returns=np.full_like(run.returns, 250 + run.seed))
+        for run in study({"full": [0] * 5, "dae-8": [0] * 5})
+    ]
+    for verdict in analyse(idle).groups[0].comparisons[0].verdicts:
+        assert (verdict.verdict, verdict.reason) == ("undecided", "full didn't learn")
+        assert verdict.seeds_needed is None
+
+
+def test_a_representation_that_did_not_learn_is_not_steadier():
+    runs = study({"full": [500, 700, 900, 600, 800], "dae-8": [0] * 5})
+    runs = [
+        run
+        if run.representation == "full"
+        else replace(run, returns=np.full_like(run.returns, 250 + run.seed / 10))
+        for run in runs
+    ]
+    similar, steadier, _ = analyse(runs).groups[0].comparisons[0].verdicts
+    assert similar.verdict == "contradicted"
+    assert steadier.simultaneous.high < 1
+    assert (steadier.verdict, steadier.reason) == ("undecided", "dae-8 didn't learn")
+
+
 def test_two_runs_are_too_few_for_a_variance():
     found = analyse(study({"full": [500, 510], "dae-8": [480, 520]}))
     steadier = found.groups[0].comparisons[0].verdicts[1]

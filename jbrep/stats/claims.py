@@ -25,7 +25,8 @@ class Claim(NamedTuple):
         boundary: what the interval must exclude, from y, (...).
         side: 1 if an interval above the boundary supports it, -1 if one below.
         p_value: two-sided, of lying on the boundary, from x (n,), y (m,), the boundary and a seed.
-        despite_failures: whether it may be supported where runs of the representation failed.
+        despite_failures: whether it may be supported where runs of the representation failed, or
+            learned nothing.
     """
 
     name: str
@@ -96,7 +97,7 @@ def _one(y: Array) -> Array:
     return np.ones(y.shape[:-1])
 
 
-# equal zeros of failed runs vary little, which must not speak for a representation
+# runs that failed or learned nothing vary little, which must not speak for a representation
 CLAIMS = (
     Claim("similar reward", "final_return", difference, _margin, 1, mean_p, True),
     Claim("less variance", "final_return", variance_ratio, _one, -1, variance_p, False),

@@ -130,8 +130,11 @@ def _judge(claim: Claim, label: Label, baseline: Label, family: int, seed: int) 
     simultaneous = claim.interval(x, y, level)
     decided = int(decide(claim, simultaneous, claim.boundary(y)))
     reason = _reason(claim, x, y)
-    if decided > 0 and label.failed and not claim.despite_failures:
-        decided, reason = 0, "failed runs"
+    if not baseline.learned:  # then all do nothing alike
+        decided, reason = 0, f"{baseline.representation} didn't learn"
+    elif decided > 0 and not claim.despite_failures and (label.failed or not label.learned):
+        decided = 0
+        reason = "failed runs" if label.failed else f"{label.representation} didn't learn"
     needed = None if decided or reason else seeds_needed(claim, x, y, level, seed)
     p = claim.p_value(x, y, boundary, seed)
     return Verdict(

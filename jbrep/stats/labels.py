@@ -47,6 +47,12 @@ class Label:
     by_run: Mapping[str, Array]
     numbers: Mapping[str, Interval]
 
+    @property
+    def learned(self) -> bool:
+        """Whether the final return lies above the untrained policy's, beyond chance."""
+        gain = self.numbers["gain"]
+        return bool(gain.value > 0 and not gain.low <= 0)  # without an end where nothing varies
+
 
 def thresholds(baseline: list[RunCurve], grid: Array) -> dict[str, float]:
     """The returns to reach, by the baseline's median final return; their names are STEPS_TO."""
@@ -69,6 +75,7 @@ def describe(runs: list[RunCurve], grid: Array, reach: Mapping[str, float], seed
     by_run = {
         "final_return": final_return(curves, grid),
         "mean_return": mean_return(curves, grid),
+        "gain": final_return(curves, grid) - curves[:, 0],
         **{name: steps_to(curves, grid, threshold) for name, threshold in reach.items()},
         **within_runs(curves, failed),
         **fixed_policy(runs, grid[-1]),
@@ -95,6 +102,7 @@ def _numbers(by_run: Mapping[str, Array], seed: int) -> dict[str, Interval]:
         found[f"{name}_mean"] = mean(values)
         found[f"{name}_median"] = percentile(median, values, seed=seed)
         found[f"{name}_iqm"] = percentile(iqm, values, seed=seed)
+    found["gain"] = mean(by_run["gain"])
     final = by_run["final_return"]
     found["final_return_sd"] = deviation(final)
     found["final_return_iqr"] = percentile(lambda v: iqr(v, axis=-1), final, seed=seed)

@@ -63,12 +63,13 @@ def spread_rows(group: GroupAnalysis) -> Rows:
     """A line for each label."""
     names = ("final_return_sd", "final_return_iqr", "final_return_mad", "risk_across_runs")
     return (_KEY, "SD", "IQR", "MAD", "CVaR"), [
-        (label.representation, *(_of(label, name) for name in names)) for label in group.labels
+        (label.representation, *(_of(label, name, ",.1f") for name in names))
+        for label in group.labels
     ]
 
 
-def _of(label: Label, name: str) -> str:
-    return _shown(label.numbers[name], ",.0f")
+def _of(label: Label, name: str, form: str = ",.0f") -> str:
+    return _shown(label.numbers[name], form)
 
 
 def _steps(label: Label, name: str) -> str:
