@@ -59,8 +59,9 @@ encoders: data ## results/encoders/ from these: hours; goes on where it was stop
 	rm -rf $(addprefix results/encoders/,$(TASKS))
 	$(BIN)/python tools/encoders.py data encoders results/encoders $(TASKS)
 
-first: $(READY) ## results/first/ anew: two hours; goes on where it was stopped
+first: $(READY) ## results/first/ anew: an hour or two; goes on where it was stopped
 	$(BIN)/jbrep study studies/first.toml --out runs/first
+	$(BIN)/jbrep report runs/first > results/first/tables.txt
 	cp runs/first/returns.csv runs/first/statistics.json results/first/
 
 clean: ## remove the environment and the demo's files

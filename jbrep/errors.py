@@ -1,11 +1,24 @@
 """The one exception that means "the user can mend this"."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
+
+_Choice = TypeVar("_Choice")
 
 
 class InputError(ValueError):
     """A user's mistake: one line with what was wrong, what was expected, and the choices."""
+
+
+def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:
+    """What goes by that name.
+
+    Raises:
+        InputError: nothing does; the message lists the names.
+    """
+    if name not in choices:
+        raise InputError(f"unknown {what} {name!r}: choose one of {', '.join(choices)}")
+    return choices[name]
 
 
 def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:

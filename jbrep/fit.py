@@ -23,7 +23,7 @@ from jbrep.dataset.storage import exists, make_folder
 from jbrep.encoders import Encoder, load, save
 from jbrep.encoders.controls import Layers, pca, random_projection
 from jbrep.encoders.file import ERROR, SUFFIX
-from jbrep.errors import InputError, differences
+from jbrep.errors import InputError, choose, differences
 
 _WATCHED = 100_000  # held-out rows whose error is shown after each epoch
 _EVERY = ("latent", "architecture", "epochs", "batch_size", "learning_rate", "seed")
@@ -59,9 +59,7 @@ def get_kind(kind: str) -> _Kind:
     Raises:
         InputError: there is none of that name; the message lists them.
     """
-    if kind not in KINDS:
-        raise InputError(f"unknown kind {kind!r}: choose one of {', '.join(KINDS)}")
-    return KINDS[kind]
+    return choose(kind, KINDS, "kind")
 
 
 class Fitted(NamedTuple):

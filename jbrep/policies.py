@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from jbrep.errors import InputError
+from jbrep.errors import InputError, choose
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, Array, Task
 
@@ -130,9 +130,7 @@ def make_policy(settings: Mapping[str, Any]) -> Policy:
 
 
 def _make(kind: str, constants: dict[str, Any]) -> Policy:
-    if kind not in POLICIES:
-        raise InputError(f"unknown policy {kind!r}: choose one of {', '.join(POLICIES)}")
-    policy = POLICIES[kind]
+    policy = choose(kind, POLICIES, "policy")
     known = [field.name for field in fields(policy)]
     for name, value in constants.items():
         if name not in known:

@@ -322,7 +322,7 @@ def test_nothing_in_a_runs_folder_runs_as_code(member, short, tmp_path):
         ("run.json", b"{", "damaged, or not of a run"),
         ("run.json", None, "no run that is over"),
         ("run.json", "hidden", "don't fit together"),
-        ("run.json", "algorithm", "'x' is unknown"),
+        ("run.json", "algorithm", "unknown algorithm 'x'"),
         ("run.json", "encoder", "not the encoder"),
     ],
 )

@@ -8,10 +8,6 @@ import click
 
 from jbrep.cli.base import COUNT, GOES_ON, example, printable, stoppable
 
-_episodes = click.option(
-    "--episodes", default=20, show_default=True, type=COUNT, help="How many, the same each time."
-)
-
 
 @click.command(
     epilog=example("jbrep rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a")
@@ -80,7 +76,9 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
 
 @click.command(epilog=example("jbrep evaluate-policy runs/a --episodes 100"))
 @click.argument("policy", type=click.Path(path_type=Path))
-@_episodes
+@click.option(
+    "--episodes", default=20, show_default=True, type=COUNT, help="How many, the same each time."
+)
 @click.option("--trust", is_flag=True, help="Read a zip file from elsewhere, which can run code.")
 @click.option("--task", default="face_direction", help="Of such a file.")
 @click.option("--algorithm", default="sac", help="Of such a file.")

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from jbrep.encoders import Layer
-from jbrep.errors import InputError
+from jbrep.errors import choose
 
 _MODULES = {"relu": nn.ReLU, "tanh": nn.Tanh}
 _NAMES = {module: name for name, module in _MODULES.items()}
@@ -36,9 +36,7 @@ def get_architecture(name: str) -> Architecture:
     Raises:
         InputError: there is none; the message lists them.
     """
-    if name not in ARCHITECTURES:
-        raise InputError(f"unknown architecture {name!r}: choose one of {', '.join(ARCHITECTURES)}")
-    return ARCHITECTURES[name]
+    return choose(name, ARCHITECTURES, "architecture")
 
 
 class Autoencoder(nn.Module):

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.errors import InputError
+from jbrep.errors import choose
 
 Array = NDArray[np.float64]
 _Float = TypeVar("_Float", bound=np.floating[Any])
@@ -314,6 +314,4 @@ def get_task(name: str) -> Task:
     Raises:
         InputError: there is none; the message lists the tasks.
     """
-    if name not in TASKS:
-        raise InputError(f"unknown task {name!r}: choose one of {', '.join(TASKS)}")
-    return TASKS[name]
+    return choose(name, TASKS, "task")

@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.encoders import Encoder, find, load
 from jbrep.encoders.file import fingerprint
-from jbrep.errors import InputError
+from jbrep.errors import InputError, choose
 from jbrep.jitterbug.tasks import get_task
 from jbrep.rl.agent import make_agent, make_env
 from jbrep.rl.files import ENCODER, FINISHED, POLICY, read_run
@@ -70,11 +70,10 @@ def load_zip(path: Path, task: str, algorithm: str, encoder: str, trust: bool) -
             f"{path} is not in a folder of jbrep rl: stable-baselines3 files hold pickled Python, "
             "which runs as code when it is read; --trust, if you know who made it"
         )
-    if algorithm not in ALGORITHMS:
-        raise InputError(f"unknown algorithm {algorithm!r}: choose one of {', '.join(ALGORITHMS)}")
+    learner = choose(algorithm, ALGORITHMS, "algorithm")
     seen = find(encoder, get_task(task).name)
     try:
-        agent = ALGORITHMS[algorithm].load(path, make_env(task, 1, 0, seen), device="cpu")
+        agent = learner.load(path, make_env(task, 1, 0, seen), device="cpu")
     except Exception as error:  # whatever its pickled parts do
         raise InputError(f"{path} is no {algorithm} policy for {task}: {_line(error)}") from None
     return Trained(agent.policy, task, seen)
@@ -85,8 +84,7 @@ def _build(settings: dict[str, Any], encoder: Encoder, weights: dict[str, Any]) 
     task, algorithm = get_task(settings["task"]).name, settings["algorithm"]
     if fingerprint(encoder) != settings["encoder"]:
         raise InputError(f"{ENCODER} is not the encoder that the run was made with")
-    if algorithm not in ALGORITHMS:
-        raise InputError(f"the algorithm {algorithm!r} is unknown")
+    choose(algorithm, ALGORITHMS, "algorithm")
     encoder.check_task(get_task(task))
     hidden = tuple(min(int(units), _MAX_UNITS) for units in settings["hidden"])
     agent = make_agent(algorithm, Preset(hidden, {}), make_env(task, 1, 0, encoder), 0)

@@ -14,7 +14,7 @@ from stable_baselines3.common.noise import (
     OrnsteinUhlenbeckActionNoise,
 )
 
-from jbrep.errors import InputError
+from jbrep.errors import choose
 
 
 class Normal(NamedTuple):
@@ -137,10 +137,5 @@ def get_preset(preset: str, algorithm: str) -> Preset:
     Raises:
         InputError: there is no preset or algorithm of that name; the message lists them.
     """
-    for word, what, choices in (
-        (algorithm, "algorithm", list(ALGORITHMS)),
-        (preset, "preset", list(PRESETS)),
-    ):
-        if word not in choices:
-            raise InputError(f"unknown {what} {word!r}: choose one of {', '.join(choices)}")
-    return PRESETS[preset][algorithm]
+    choose(algorithm, ALGORITHMS, "algorithm")
+    return choose(preset, PRESETS, "preset")[algorithm]

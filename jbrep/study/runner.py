@@ -8,7 +8,7 @@ from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky import get_reusable_executor
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-from jbrep.errors import InputError
+from jbrep.errors import InputError, choose
 from jbrep.study.plan import Cell, Plan
 from jbrep.study.work import Outcome, work
 
@@ -79,9 +79,7 @@ def get_backend(name: str) -> Backend:
     Raises:
         InputError: there is none of that name; the message lists them.
     """
-    if name not in BACKENDS:
-        raise InputError(f"unknown backend {name!r}: choose one of {', '.join(BACKENDS)}")
-    return BACKENDS[name]
+    return choose(name, BACKENDS, "backend")
 
 
 def _job(plan: Plan, cell: Cell) -> tuple[Any, ...]:
