@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,10 +40,20 @@ class Evaluation(NamedTuple):
 
 def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -> None:
     """Write a long table as CSV."""
+    columns = [name.removeprefix("episode_") for name in kind._fields]
+    write_csv(path, columns, ([_shown(value) for value in row] for row in rows))
+
+
+def _shown(value: float) -> str | int:
+    return f"{value:.3f}" if isinstance(value, float) else int(value)
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a table, whole or not at all."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(name.removeprefix("episode_") for name in kind._fields)
-    writer.writerows([f"{v:.3f}" if isinstance(v, float) else int(v) for v in row] for row in rows)
+    writer.writerow(columns)
+    writer.writerows(rows)
     write_whole(path, text.getvalue().encode())
 
 

@@ -4,10 +4,12 @@ import time
 from dataclasses import replace
 from typing import Any
 
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
 from jbrep.dae.training import one_thread
 from jbrep.encoders import find
 from jbrep.rl.agent import Evaluator, make_agent, make_env
-from jbrep.rl.presets import get_preset
+from jbrep.rl.presets import ALGORITHMS, get_preset
 from jbrep.rl.run import Run
 
 _LEAST_STEPS = 300
@@ -19,7 +21,7 @@ def estimate(run: Run) -> float:
     preset = get_preset(run.preset, run.algorithm)
     settings: dict[str, Any] = {**preset.settings}
     rollout = settings.get("train_freq", settings.get("n_steps", 1) * preset.num_envs)
-    if "n_steps" not in settings and run.algorithm in ("ddpg", "td3", "sac"):
+    if issubclass(ALGORITHMS[run.algorithm], OffPolicyAlgorithm):
         settings["learning_starts"] = 0  # with gradient steps from the first rollout on
     agent = make_agent(
         run.algorithm,

@@ -1,8 +1,6 @@
 """A study's runs as one table, and what the statistics say of them."""
 
-import csv
 import hashlib
-import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +10,7 @@ import numpy as np
 
 from jbrep.dataset.storage import write_whole
 from jbrep.errors import InputError
-from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run
+from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, write_csv
 from jbrep.stats import Analysis, RunCurve, analyse, summary
 from jbrep.tables import table
 
@@ -88,7 +86,7 @@ def read_results(folder: Path) -> Results:
 def write_results(results: Results, folder: Path) -> list[Path]:
     """Write all returns as one long table, and the statistics if there are any."""
     paths = [folder / RETURNS]
-    write_whole(paths[0], _table_of(results.runs).encode())
+    write_csv(paths[0], _COLUMNS, _rows(results.runs))
     if results.analysis:
         paths.append(folder / STATISTICS)
         write_whole(paths[1], results.analysis.to_json().encode())
@@ -102,16 +100,12 @@ def as_text(results: Results) -> str:
     return summary(results.analysis)
 
 
-def _table_of(runs: list[RunCurve]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
+def _rows(runs: list[RunCurve]) -> Iterator[tuple[Any, ...]]:
     for run in sorted(runs, key=lambda run: (run.label, run.seed)):
         for step, returns in zip(run.steps.tolist(), run.returns.tolist(), strict=True):
             for episode, each in enumerate(returns):
                 key = (run.task, run.algorithm, run.representation, run.seed)
-                writer.writerow((*key, step, episode, f"{each:.3f}"))
-    return text.getvalue()
+                yield (*key, step, episode, f"{each:.3f}")
 
 
 def _ends(runs: list[RunCurve]) -> tuple[tuple[str, ...], Iterator[tuple[str, ...]]]:
