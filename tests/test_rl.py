@@ -21,8 +21,8 @@ from jbrep.encoders import find
 from jbrep.envs.episodes import Episodes
 from jbrep.errors import InputError
 from jbrep.rl import Run, train
-from jbrep.rl.agent import EVALUATION_SEED, Evaluator, make_agent, make_env, training_seed
-from jbrep.rl.files import FAILED, FINISHED, read_evaluations, read_run
+from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
+from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, read_evaluations, read_run
 from jbrep.rl.policy import load_run, load_zip
 from jbrep.rl.presets import ALGORITHMS, PRESETS, get_preset
 

@@ -12,9 +12,8 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from jbrep.encoders import Encoder
 from jbrep.envs.sb3 import JitterbugVecEnv
+from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rl.presets import ALGORITHMS, Preset
-
-EVALUATION_SEED = 1 << 31  # of the first episode; training's are smaller
 
 
 def make_env(task: str, num_envs: int, seed: int, encoder: Encoder) -> VecMonitor:

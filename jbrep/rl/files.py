@@ -16,6 +16,7 @@ POLICY = "policy.zip"
 ENCODER = "encoder.safetensors"
 EPISODES = "episodes.csv"
 EVALUATIONS = "evaluations.csv"
+EVALUATION_SEED = 1 << 31  # of the first episode of an evaluation; training's are smaller
 FINISHED, FAILED = "finished", "failed"
 _MAX_BYTES = 1 << 28
 

@@ -4,16 +4,19 @@ import io
 import pickle
 import textwrap
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.encoders import Encoder, find, load
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError, choose
-from jbrep.jitterbug.tasks import get_task
+from jbrep.jitterbug.tasks import Array, Task, get_task
+from jbrep.policies import Actor
 from jbrep.rl.agent import make_agent, make_env
 from jbrep.rl.files import ENCODER, FINISHED, POLICY, read_run
 from jbrep.rl.presets import ALGORITHMS, Preset
@@ -30,6 +33,15 @@ class Trained(NamedTuple):
     task: str
     encoder: Encoder
 
+    def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
+        """Act deterministically; nothing is drawn."""
+
+        def act(observation: Array) -> Array:
+            seen = self.encoder.encode(observation.astype(np.float32))
+            return self.policy.predict(seen, deterministic=True)[0]
+
+        return act
+
 
 def load_run(folder: Path) -> Trained:
     """The policy of a finished run; nothing that the folder holds is run as code.
@@ -43,13 +55,26 @@ def load_run(folder: Path) -> Trained:
     run = read_run(folder)
     if run["status"] != FINISHED:
         raise InputError(f"the run in {folder} {run['status']}: it has no policy")
+    return _read(folder, run, _weights(folder / POLICY))
+
+
+def _read(folder: Path, run: dict[str, Any], weights: dict[str, Any]) -> Trained:
     encoder = load(folder / ENCODER)
     try:
-        return _build(run["settings"], encoder, _weights(folder / POLICY))
+        return _build(run["settings"], encoder, weights)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"the files in {folder} don't fit together: {_line(error)}") from None
+
+
+def load_untrained(folder: Path) -> Trained:
+    """The policy that a run began with.
+
+    Raises:
+        InputError: no run that is over there, or one whose files don't fit together.
+    """
+    return _read(folder, read_run(folder), {})
 
 
 def load_zip(path: Path, task: str, algorithm: str, encoder: str, trust: bool) -> Trained:
@@ -80,15 +105,18 @@ def load_zip(path: Path, task: str, algorithm: str, encoder: str, trust: bool) -
 
 
 def _build(settings: dict[str, Any], encoder: Encoder, weights: dict[str, Any]) -> Trained:
-    """What was trained, with its weights."""
+    """What was trained, with its weights; without any, as it began."""
     task, algorithm = get_task(settings["task"]).name, settings["algorithm"]
     if fingerprint(encoder) != settings["encoder"]:
         raise InputError(f"{ENCODER} is not the encoder that the run was made with")
     choose(algorithm, ALGORITHMS, "algorithm")
     encoder.check_task(get_task(task))
     hidden = tuple(min(int(units), _MAX_UNITS) for units in settings["hidden"])
-    agent = make_agent(algorithm, Preset(hidden, {}), make_env(task, 1, 0, encoder), 0)
-    agent.policy.load_state_dict(weights)
+    agent = make_agent(
+        algorithm, Preset(hidden, {}), make_env(task, 1, 0, encoder), settings["seed"]
+    )
+    if weights:
+        agent.policy.load_state_dict(weights)
     return Trained(agent.policy, task, encoder)
 
 

@@ -1,0 +1,79 @@
+"""Where an episode to look at comes from: a data set, a trained run, or a policy by its name."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from jbrep.dataset import Dataset
+from jbrep.dataset.manifest import MANIFEST
+from jbrep.dataset.storage import exists
+from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import Task, get_task
+from jbrep.policies import POLICIES, parse_policy
+from jbrep.rl.files import EVALUATION_SEED, RUN, read_run
+from jbrep.rollout import Begin, Rollout, play, replay
+
+
+class Player(NamedTuple):
+    """A policy with its task."""
+
+    name: str
+    task: Task
+    begin: Begin
+    together: int = 1  # episodes that its evaluation played at once
+
+    def play(self, episodes: Sequence[int], target_yaw: float | None = None) -> list[Rollout]:
+        """Episodes of those that every run is evaluated on, by their numbers from 0."""
+        seeds = [EVALUATION_SEED + episode for episode in episodes]
+        return play(self.task, self.begin, self.name, seeds, target_yaw, show=True)
+
+
+def find_episode(source: str, episode: int = 0, task: str | None = None) -> Rollout:
+    """An episode of a data set by its number, or one under a policy that `find_player` knows.
+
+    Those under a policy are the episodes of evaluation. Of a run they come out as they did when it
+    was evaluated, which takes all of them at once: a network rounds otherwise for another number.
+
+    Raises:
+        InputError: as `find_player`, or there is no such episode.
+    """
+    if exists(Path(source) / MANIFEST):
+        return replay(Dataset(source), episode)
+    player = find_player(source, task)
+    if episode < 0:
+        raise InputError(f"there is no episode {episode}: they count from 0")
+    if episode < player.together:
+        return player.play(range(player.together))[episode]
+    return player.play([episode])[0]
+
+
+def find_player(source: str, task: str | None = None) -> Player:
+    """The policy of a run's folder, or one by its name, such as heuristic or constant:drive=0.5.
+
+    Args:
+        source: which.
+        task: for a policy by its name.
+
+    Raises:
+        InputError: neither, or no task to a name, or a run of another task.
+    """
+    if exists(Path(source) / RUN):
+        return _of_run(Path(source), task)
+    if source.partition(":")[0] not in POLICIES:
+        raise InputError(
+            f"{source} is no data set, no folder of a run that is over, and no policy: those are "
+            f"{', '.join(POLICIES)}"
+        )
+    if task is None:
+        raise InputError(f"policy {source} needs a --task")
+    return Player(source, get_task(task), parse_policy(source).begin)
+
+
+def _of_run(folder: Path, task: str | None) -> Player:
+    from jbrep.rl.policy import load_run  # brings torch
+
+    trained = load_run(folder)
+    if task not in (None, trained.task):
+        raise InputError(f"{folder} is a run of {trained.task}, not of {task}")
+    together = read_run(folder)["settings"]["evaluation_episodes"]
+    return Player(str(folder), get_task(trained.task), trained.begin, together)
