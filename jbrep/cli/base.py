@@ -12,11 +12,15 @@ import click
 from jbrep.errors import InputError
 
 _EXTRAS = {  # what a missing package is installed with
-    **dict.fromkeys(("joblib", "matplotlib", "rich", "safetensors", "sb3_contrib"), "learn"),
+    **dict.fromkeys(
+        ("jinja2", "joblib", "matplotlib", "rich", "safetensors", "sb3_contrib"), "learn"
+    ),
     **dict.fromkeys(("scipy", "skdim", "sklearn", "stable_baselines3"), "learn"),
     **dict.fromkeys(("tensorboard", "torch"), "learn"),
     **dict.fromkeys(("minari", "onnx", "pyarrow"), "export"),
+    **dict.fromkeys(("PIL", "av"), "render"),
     "ray": "cluster",
+    "rerun": "view",
 }
 
 

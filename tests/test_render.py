@@ -1,0 +1,259 @@
+"""Videos show the states that were simulated, at the time when they were."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from conftest import needs_egl
+from PIL import Image
+
+from jbrep.cli import main
+from jbrep.errors import InputError
+from jbrep.jitterbug.model import plain_model
+from jbrep.render.film import Film, Pace
+from jbrep.render.formats import encode_gif, encode_mp4, get_format
+from jbrep.render.pictures import Camera, add_caption, band_height
+from jbrep.sources import find_episode
+
+SIZE = (96, 64)
+SAMPLE = "data/sample/move_to_pose"
+
+
+@pytest.fixture(scope="module")
+def episode():
+    return find_episode(SAMPLE)
+
+
+@pytest.fixture(scope="module")
+def camera():
+    with Camera("tracking", *SIZE) as camera:
+        yield camera
+
+
+def render(*arguments):
+    small = ("--size", "x".join(map(str, SIZE)), "--seconds", 0.2)
+    result = CliRunner().invoke(main, ["render", *map(str, (*small, *arguments))])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result
+
+
+def read_mp4(path):
+    """Its frames, and what a browser asks of it."""
+    import av
+
+    with av.open(str(path)) as container:
+        (stream,) = container.streams.video
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+        codec = stream.codec_context
+        return frames, (codec.name, codec.pix_fmt, stream.average_rate)
+
+
+def read_gif(path):
+    with Image.open(path) as gif:
+        frames, durations = [], []
+        for number in range(gif.n_frames):
+            gif.seek(number)
+            frames.append(np.asarray(gif.convert("RGB")))
+            durations.append(gif.info["duration"])
+        return frames, durations, gif.info["loop"]
+
+
+def same(frame, other, tolerance):
+    return np.abs(frame.astype(float) - other).mean() < tolerance
+
+
+@needs_egl
+def test_an_mp4_from_the_command(tmp_path):
+    told = render(SAMPLE, "--out", tmp_path / "new" / "a.mp4").stdout
+    assert "a.mp4: 96 x 64 pixels, 0.2 s, 5 frames, 0.0 MB\n" in told
+    frames, form = read_mp4(tmp_path / "new" / "a.mp4")
+    assert form == ("h264", "yuv420p", 25)
+    assert [frame.shape for frame in frames] == [(64, 96, 3)] * 5
+    assert not same(frames[0], frames[-1], 2)
+    assert [path.name for path in tmp_path.rglob("*.*")] == ["a.mp4"]
+    content = (tmp_path / "new" / "a.mp4").read_bytes()
+    assert content.index(b"moov") < content.index(b"mdat")  # it plays while it loads
+
+
+@needs_egl
+def test_a_gif_from_the_command_loops(tmp_path):
+    render(SAMPLE, "--out", tmp_path / "a.gif", "--fps", 30)
+    frames, durations, loop = read_gif(tmp_path / "a.gif")
+    assert (len(frames), frames[0].shape, loop) == (6, (64, 96, 3), 0)
+    assert durations == [30, 40, 30, 30, 40, 30]  # as near to 1/30 s as a GIF counts
+    assert not same(frames[0], frames[-1], 2)
+
+
+@needs_egl
+def test_side_by_side(tmp_path):
+    sources = ("uniform", "constant:drive=1")
+    told = render(*sources, "--task", "face_direction", "--out", tmp_path / "two.mp4")
+    assert "two.mp4: 192 x 64 pixels" in told.stdout
+    frames, _ = read_mp4(tmp_path / "two.mp4")
+    left, right = frames[-1][:, :94], frames[-1][:, 98:]
+    assert frames[-1].shape == (64, 192, 3)
+    assert not same(left, right, 2)
+
+
+@needs_egl
+@pytest.mark.parametrize("name", ["overhead", "tracking", "egocentric"])
+def test_a_frame_shows_what_mujoco_renders(name, episode):
+    model = plain_model()
+    data = mujoco.MjData(model)
+    data.qpos[:] = episode.qpos[40]
+    data.mocap_pos[0], data.mocap_quat[0] = episode.target_position, episode.target_quaternion
+    mujoco.mj_forward(model, data)
+    with mujoco.Renderer(model, 120, 160) as renderer:
+        renderer.update_scene(data, name)
+        expected = renderer.render()
+    with Camera(name, 160, 120) as camera:
+        film = Film([episode, episode], camera, Pace(fps=5, seconds=0.6))
+        frame = np.asarray(list(film.frames())[2])
+    below = band_height(120)
+    assert film.states.tolist() == [0, 20, 40]
+    assert same(frame[below:, :158], expected[below:, :158], 3)
+    assert same(frame[below:, 162:], expected[below:, 2:], 3)
+    assert not same(frame[:below, :160], expected[:below], 20)
+
+
+@needs_egl
+@pytest.mark.parametrize(
+    ("pace", "frames", "last"),
+    [
+        (Pace(), 250, 996),
+        (Pace(speed=0.5), 500, 998),
+        (Pace(speed=2), 125, 992),
+        (Pace(50), 500, 998),
+    ],
+)
+def test_speed_and_frames(pace, frames, last, episode, camera):
+    film = Film([episode], camera, pace)
+    assert (len(film), len(film.states), film.states[-1]) == (frames, frames, last)
+    assert film.seconds == pytest.approx(10 / pace.speed)
+
+
+@needs_egl
+def test_one_that_ends_before_the_others_stands_still(episode, camera):
+    short = replace(
+        episode,
+        **{name: getattr(episode, name)[:21] for name in ("qpos", "qvel", "rotation", "velocity")},
+        action=episode.action[:20],
+    )
+    film = Film([episode, short], camera, Pace(fps=5, seconds=1))
+    frames = [np.asarray(frame) for frame in film.frames()]
+    assert len(frames) == 5
+    assert same(frames[1][:, 98:], frames[4][:, 98:], 0.01)
+    assert not same(frames[1][:, :94], frames[4][:, :94], 1)
+
+
+def test_a_caption_keeps_to_its_band_and_to_its_room():
+    for width, height in ((64, 64), (320, 240), (1280, 960)):
+        picture = Image.new("RGB", (width, height), "green")
+        add_caption(picture, "runs/a" * 50, "return 712    9.96 s")
+        pixels = np.asarray(picture)
+        assert (pixels[band_height(height) :] == (0, 128, 0)).all()
+        assert (pixels[: band_height(height)] != (0, 128, 0)).any(axis=2).all()
+    for name, shown in ((f"{'runs' * 9}/sac/seed-0", "…/sac/seed-0"), ("a", "a")):
+        one, other = (Image.new("RGB", (240, 180)) for _ in range(2))
+        add_caption(one, name, "return 712    9.96 s")
+        add_caption(other, shown, "return 712    9.96 s")
+        assert one == other
+
+
+def test_a_gif_keeps_the_colour_of_what_is_small(tmp_path):
+    floor = np.random.default_rng(0).integers(80, 200, (2, 60, 80, 3), dtype=np.uint8)
+    floor[:, 30:34, 40:44] = (220, 40, 30)
+    encode_gif(map(Image.fromarray, floor), tmp_path / "a.gif", 10)
+    frames, durations, _ = read_gif(tmp_path / "a.gif")
+    np.testing.assert_allclose(frames[0][32, 42], (220, 40, 30), atol=25)
+    assert durations == [100, 100]
+
+
+def test_an_mp4_keeps_what_it_is_given(tmp_path):
+    ramp = np.tile(np.linspace(0, 255, 96, dtype=np.uint8)[None, :, None], (64, 1, 3))
+    encode_mp4(map(Image.fromarray, [ramp, ramp, 255 - ramp]), tmp_path / "a.mp4", 12.5)
+    frames, form = read_mp4(tmp_path / "a.mp4")
+    assert form[2] == 12.5
+    assert same(frames[1], ramp, 4)
+    assert same(frames[2], 255 - ramp, 4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--out", "a.avi"), "a.avi has no suffix of a video: .mp4 or .gif is needed"),
+        (("--out", "there.mp4"), "there.mp4 is there already: choose another name"),
+        (("--camera", "side"), "unknown camera 'side': choose one of overhead, tracking, ego"),
+        (("--size", "640"), "'640' is no size: write it as 640x480"),
+        (("--size", "641x480"), "the size is 641x480: both must be even and from 64 to 3840"),
+        (("--size", "9000x9000"), "both must be even and from 64 to 3840"),
+        (("--fps", 0), "frames a second: 0, it must be from 1 to 50"),
+        (("--speed", "nan"), "speed: nan, it must be from 0.01 to 100"),
+        (("--seconds", 11), "simulated seconds: 11, it must be from 0.01 to 10"),
+        (("--episode", 1, "uniform"), "differ in their task or start: side by side go"),
+        (("--episode", 4), "has no episode 4: it has 4, from 0"),
+        (("nowhere",), "nowhere is no data set, no folder of a run that is over, and no policy"),
+        (("--size", "3840x64", *["uniform"] * 2), "are 11,520 pixels wide: at most 7,680"),
+        (
+            ("--out", "a.gif", "--size", "1920x1080", "--seconds", "10"),
+            "a.gif would have 259,200,000 pixels, at most 200,000,000 go into a .gif",
+        ),
+    ],
+)
+@needs_egl
+def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, tmp_path, monkeypatch):
+    data = Path("data").resolve()
+    monkeypatch.chdir(tmp_path)
+    Path("data").symlink_to(data)
+    Path("there.mp4").touch()
+    result = render(SAMPLE, "--task", "move_to_pose", "--out", "a.mp4", *arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr.splitlines()[-1]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "there.mp4"]
+
+
+@needs_egl
+def test_ctrl_c_leaves_no_file(tmp_path, monkeypatch):
+    import signal
+
+    from jbrep.render import film
+
+    monkeypatch.setattr(film, "add_caption", lambda *given: signal.raise_signal(signal.SIGINT))
+    stopped = render(SAMPLE, "--out", tmp_path / "a.mp4")
+    assert (stopped.exit_code, stopped.stderr) == (130, "stopped; no video was written\n")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("platform", ["disable", "nonsense"])
+def test_missing_opengl_is_one_line(platform, tmp_path):
+    """In a process of its own: MuJoCo looks for it once, when imported."""
+    command = ("render", SAMPLE, "--out", str(tmp_path / "a.mp4"))
+    result = subprocess.run(
+        [sys.executable, "-c", f"from jbrep.cli import main; main({command})"],
+        env={"MUJOCO_GL": platform},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (result.returncode, result.stderr.count("\n")) == (2, 1), result.stderr
+    assert "rendering needs EGL, and MuJoCo finds none" in result.stderr
+    assert "apt-get install libegl1 libgl1, and set MUJOCO_GL=egl" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_opengl_that_fails_late_is_one_line(monkeypatch):
+    def fail(*arguments):
+        raise mujoco.FatalError("an OpenGL platform library has not been loaded")
+
+    monkeypatch.setattr(mujoco, "Renderer", fail, raising=False)
+    with pytest.raises(InputError, match=r"MuJoCo finds none \(an OpenGL platform library"):
+        Camera()
+
+
+def test_a_suffix_in_capitals():
+    assert get_format(Path("A.GIF")) == get_format(Path("a.gif"))
