@@ -10,6 +10,19 @@ class InputError(ValueError):
     """A user's mistake: one line with what was wrong, what was expected, and the choices."""
 
 
+def check_version(path: object, found: Any, known: int) -> None:
+    """Make sure that a file's format isn't newer than the one known here.
+
+    Raises:
+        InputError: it is.
+    """
+    if not isinstance(found, int) or found > known:
+        raise InputError(
+            f"{path} has format version {found}: this jbrep reads up to {known}, so a newer one is "
+            "needed"
+        )
+
+
 def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:
     """What goes by that name.
 

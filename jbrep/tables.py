@@ -1,6 +1,18 @@
 """Tables as text."""
 
+import csv
+import io
 from collections.abc import Iterable, Sequence
+from typing import Any
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """As CSV."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -576,7 +576,7 @@ def test_two_runs_are_too_few_for_a_variance():
 
 
 def test_tables_have_a_line_for_each_label_comparison_and_verdict(analysis):
-    text = summary(analysis)
+    text = summary(analysis.tolist())
     assert text.startswith("face_direction, sac: 18 runs over 10,000 steps")
     assert "nan" not in text
     assert "inf" not in text

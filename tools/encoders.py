@@ -14,7 +14,8 @@ from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.evaluate.evaluation import FULL
 from jbrep.evaluate.files import write
 from jbrep.evaluate.summary import summary
-from jbrep.figures import encoder_figures
+from jbrep.figures import encoder_plots
+from jbrep.figures import write as write_plots
 from jbrep.fit import Fitter
 
 LATENTS = (12, 8, 4)
@@ -39,7 +40,7 @@ def compare(data: ScaledDataset, encoders: Path, results: Path) -> None:
     ]
     evaluation = write({encoder.name: encoder for encoder in fitted}, data, results)
     (results / "tables.txt").write_text(summary(evaluation) + "\n")
-    encoder_figures(evaluation, results)
+    write_plots(encoder_plots(evaluation), results)
     print(summary(evaluation))
 
 

@@ -159,7 +159,8 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path) -> None:
     from jbrep.encoders.file import SUFFIX
     from jbrep.evaluate.files import EVALUATION, write
     from jbrep.evaluate.summary import summary
-    from jbrep.figures import encoder_figures
+    from jbrep.figures import encoder_plots
+    from jbrep.figures import write as write_plots
 
     scaled = ScaledDataset(Dataset(data))
     found = [find(name, scaled.task.name) for name in encoder]
@@ -170,7 +171,7 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path) -> None:
     ]
     with stoppable("the same command starts anew"):
         evaluation = write(dict(zip(labels, found, strict=True)), scaled, out)
-        figures = encoder_figures(evaluation, out)
+        pictures = write_plots(encoder_plots(evaluation), out)
     for label, seen in evaluation["seen"].items():
         if seen == "maybe":
             click.echo(
@@ -178,7 +179,7 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path) -> None:
                 "not be new to it"
             )
     click.echo(summary(evaluation))
-    click.echo("\n" + "\n".join(map(str, (out / EVALUATION, *figures))))
+    click.echo("\n" + "\n".join(map(str, (out / EVALUATION, *pictures))))
 
 
 @click.group()

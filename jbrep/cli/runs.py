@@ -138,6 +138,7 @@ def study(
     STUDY is a TOML file, such as those in studies/. Data sets and encoders are made first. What is
     finished is never run again: stopped or killed, the same command goes on.
     """
+    from jbrep.report import write_report
     from jbrep.study.config import read_study
     from jbrep.study.plan import Plan
     from jbrep.study.runner import get_backend
@@ -150,7 +151,7 @@ def study(
         return
     with stoppable(GOES_ON):
         crashed = conduct(plan, run, count)
-    _show(plan.folder)
+    _tell([*_conclude(plan.folder), *write_report(plan.folder)])
     if crashed:
         click.echo(f"{crashed} runs crashed: the same command tries them again", err=True)
         context.exit(1)
@@ -158,15 +159,33 @@ def study(
 
 @click.command(epilog=example("jbrep report runs/smoke"))
 @click.argument("folder", type=click.Path(path_type=Path))
-def report(folder: Path) -> None:
-    """Show what the runs below a folder say: tables, comparisons, verdicts."""
-    _show(folder)
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="A folder for it; the study's own if not given."
+)
+def report(folder: Path, out: Path | None) -> None:
+    """Show what a study says: tables, a page, a summary, figures.
+
+    FOLDER is of a study, finished or not, or any with runs below it. Where there are no runs, as
+    in results/first, the report is made from the tables alone.
+    """
+    from jbrep.report import write_report
+    from jbrep.study.results import has_runs
+
+    paths = _conclude(folder) if has_runs(folder) else []
+    _tell([*paths, *write_report(folder, out)])
 
 
-def _show(folder: Path) -> None:
+def _conclude(folder: Path) -> list[Path]:
+    """Print and write the tables of the runs below a folder."""
+    from jbrep.study.heuristics import write_heuristics
     from jbrep.study.results import as_text, read_results, write_results
 
     results = read_results(folder)
     for line in as_text(results).splitlines():
         click.echo(printable(line))
-    click.echo("\n" + "\n".join(map(str, write_results(results, folder))))
+    tasks = {run.task for run in results.runs}
+    return [*write_results(results, folder), write_heuristics(tasks, folder)]
+
+
+def _tell(paths: list[Path]) -> None:
+    click.echo("\n" + "\n".join(printable(str(path)) for path in paths))

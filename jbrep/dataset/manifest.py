@@ -30,7 +30,7 @@ from jbrep.dataset.shard import (
     shard_image,
 )
 from jbrep.dataset.storage import write_whole
-from jbrep.errors import InputError
+from jbrep.errors import InputError, check_version
 from jbrep.jitterbug.tasks import EPISODE_STEPS, Task, get_task
 
 MANIFEST = "manifest.json"
@@ -195,20 +195,19 @@ def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
         ) from None
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror}") from error
+    damage = DamageError(f"{path} is damaged: it isn't what jbrep wrote; {MEND}")
     try:
         record = json.loads(raw)
         if raw != _text(record) or record["format"] != FORMAT:
-            raise ValueError
-        newer = record["format_version"] > FORMAT_VERSION
-        manifest = None if newer else _parse(record)
+            raise damage
+        version = operator.index(record["format_version"])
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise DamageError(f"{path} is damaged: it isn't what jbrep wrote; {MEND}") from None
-    if manifest is None:
-        raise InputError(
-            f"{path} has format version {record['format_version']}: this jbrep reads up to "
-            f"{FORMAT_VERSION}, so a newer one is needed"
-        )
-    return manifest
+        raise damage from None
+    check_version(path, version, FORMAT_VERSION)
+    try:
+        return _parse(record)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise damage from None
 
 
 def _text(record: dict[str, Any]) -> bytes:

@@ -13,7 +13,7 @@ from jbrep.dataset import DamageError, Scaler
 from jbrep.encoders import container
 from jbrep.encoders.container import Tensors
 from jbrep.encoders.encoder import Encoder, Layer
-from jbrep.errors import InputError
+from jbrep.errors import InputError, check_version
 
 FORMAT = "jbrep encoder"
 FORMAT_VERSION = 1
@@ -59,11 +59,7 @@ def load(path: Path) -> Encoder:
     tensors, header = container.read(path, "encoder")
     if header.get("format") != FORMAT or not isinstance(header.get("format_version"), int):
         raise InputError(f"{path} is not a jbrep encoder")
-    if header["format_version"] > FORMAT_VERSION:
-        raise InputError(
-            f"{path} has format version {header['format_version']}: this jbrep reads up to "
-            f"{FORMAT_VERSION}, so a newer one is needed"
-        )
+    check_version(path, header["format_version"], FORMAT_VERSION)
     if header.pop(_HASH, None) != _digest(header, tensors):
         raise DamageError(f"{path} is damaged: its numbers or header aren't those written")
     try:

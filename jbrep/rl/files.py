@@ -1,7 +1,6 @@
 """A run's folder: what a run leaves there, written and read."""
 
 import csv
-import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -9,8 +8,11 @@ from typing import Any, NamedTuple
 
 from jbrep.dataset.shard import read_regular
 from jbrep.dataset.storage import exists, write_whole
-from jbrep.errors import InputError
+from jbrep.errors import InputError, check_version
+from jbrep.tables import csv_text
 
+FORMAT = "jbrep run"
+FORMAT_VERSION = 1
 RUN = "run.json"  # written last: the run is over where it is
 POLICY = "policy.zip"
 ENCODER = "encoder.safetensors"
@@ -51,11 +53,7 @@ def _shown(value: float) -> str | int:
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Write a table, whole or not at all."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    write_whole(path, text.getvalue().encode())
+    write_whole(path, csv_text(columns, rows).encode())
 
 
 def read_evaluations(folder: Path) -> list[Evaluation]:
@@ -76,7 +74,8 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
 
 def write_run(folder: Path, run: Mapping[str, Any]) -> None:
     """Write run.json."""
-    write_whole(folder / RUN, (json.dumps(run, indent=2, allow_nan=False) + "\n").encode())
+    record = {"format": FORMAT, "format_version": FORMAT_VERSION, **run}
+    write_whole(folder / RUN, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_run(folder: Path) -> dict[str, Any]:
@@ -90,13 +89,15 @@ def read_run(folder: Path) -> dict[str, Any]:
         raise InputError(f"no run that is over in {folder}: a {RUN} is expected")
     try:
         run = json.loads(_text(path))
+        version = run.get("format_version", 1)  # the first ones didn't say
         fields = (run["settings"], run["status"], run["seconds"])
         kinds = (dict, str, float)
         if not all(isinstance(f, kind) for f, kind in zip(fields, kinds, strict=True)):
             raise TypeError
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(f"{path} is damaged, or not of a run") from None
-    return dict(run)
+    check_version(path, version, FORMAT_VERSION)
+    return {name: run[name] for name in run if name not in ("format", "format_version")}
 
 
 def _text(path: Path) -> str:

@@ -11,8 +11,11 @@ from jbrep.evaluate.bootstrap import Array, Interval, without_nan
 from jbrep.stats.claims import CLAIMS
 from jbrep.stats.comparison import Comparison, adjusted, compare, simultaneous_level
 from jbrep.stats.curves import common_grid
-from jbrep.stats.labels import Label, describe, thresholds
+from jbrep.stats.labels import PROFILE_RETURNS, Label, describe, thresholds
 from jbrep.stats.runs import Group, RunCurve, groups
+
+FORMAT = "jbrep statistics"
+FORMAT_VERSION = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +59,12 @@ class Analysis:
 
     def to_json(self) -> str:
         """All of it as JSON; an interval is [value, low, high], null stands for not finite."""
-        return json.dumps(self.tolist(), indent=2, allow_nan=False) + "\n"
+        record = {"format": FORMAT, "format_version": FORMAT_VERSION, **self.tolist()}
+        return json.dumps(record, indent=2, allow_nan=False) + "\n"
 
     def tolist(self) -> dict[str, Any]:
         """The same as plain dicts, lists, numbers and text."""
-        return _plain(self)
+        return {**_plain(self), "profile_returns": PROFILE_RETURNS.tolist()}
 
 
 def analyse(runs: Sequence[RunCurve], baseline: str = "full", seed: int = 0) -> Analysis:

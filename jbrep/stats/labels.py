@@ -13,6 +13,7 @@ from jbrep.stats.reliability import TAIL_OF_RUNS, expected_shortfall, fixed_poli
 from jbrep.stats.runs import RunCurve
 
 SOLVED = 900.0  # a final return that counts as a task solved
+PROFILE_RETURNS = np.linspace(0, 1000, 51)  # at which a performance profile is drawn
 SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the baseline's median final return
 STEPS_TO = tuple(f"steps_to_{name}" for name in (*SHARES, "900"))
 WITHIN = (  # of one run
@@ -37,6 +38,7 @@ class Label:
         curve: over the grid, (g,) each: percentiles over runs, mean, interquartile mean.
         by_run: numbers of each run, (runs,) each, in the order of seeds.
         numbers: numbers of the label, each with its 95 % interval.
+        profile: the share of runs whose final return is above each of PROFILE_RETURNS, (51,).
     """
 
     representation: str
@@ -46,6 +48,7 @@ class Label:
     curve: Mapping[str, Array | Interval]
     by_run: Mapping[str, Array]
     numbers: Mapping[str, Interval]
+    profile: Interval
 
     @property
     def learned(self) -> bool:
@@ -88,7 +91,14 @@ def describe(runs: list[RunCurve], grid: Array, reach: Mapping[str, float], seed
         curve=bands(curves, seed),
         by_run=by_run,
         numbers=_numbers(by_run, seed),
+        profile=profile(by_run["final_return"], seed),
     )
+
+
+def profile(final_return: Array, seed: int) -> Interval:
+    """A performance profile (Agarwal et al. 2021): shares of runs (n,) above PROFILE_RETURNS."""
+    above = (final_return > PROFILE_RETURNS[:, None]).astype(float)
+    return percentile(lambda values: values.mean(axis=-1), above, seed=seed)
 
 
 def _curves(runs: list[RunCurve], grid: Array) -> Array:

@@ -1,7 +1,7 @@
 """Runs of reinforcement learning: the unit of replication is one run, that is, one seed."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 
@@ -127,22 +127,26 @@ def groups(runs: Sequence[RunCurve], baseline: str) -> dict[tuple[str, str], Gro
         found[run.task, run.algorithm][run.representation].append(run)
     if not found:
         raise InputError("there are no runs: give at least two of the baseline")
-    return {key: _in_order(found[key], key, baseline) for key in sorted(found)}
+    return {key: _ordered(found[key], key, baseline) for key in sorted(found)}
 
 
-def _in_order(group: Group, key: tuple[str, str], baseline: str) -> Group:
+def _ordered(group: Group, key: tuple[str, str], baseline: str) -> Group:
     if baseline not in group:
         raise InputError(
             f"{'/'.join(key)} has no runs of the baseline {baseline!r}: choose one of "
             f"{', '.join(sorted(group))}, or train it"
         )
     ordered = {
-        name: sorted(group[name], key=lambda run: run.seed)
-        for name in sorted(group, key=lambda name: (name != baseline, *_by_latent(name)))
+        name: sorted(group[name], key=lambda run: run.seed) for name in in_order(group, baseline)
     }
     for of_label in ordered.values():
         _check_label(of_label)
     return ordered
+
+
+def in_order(names: Iterable[str], baseline: str) -> list[str]:
+    """Representations as tables and figures have them: the baseline, then larger latents first."""
+    return sorted(set(names), key=lambda name: (name != baseline, *_by_latent(name)))
 
 
 def _by_latent(name: str) -> tuple[str, int, str]:

@@ -128,13 +128,17 @@ def read_study(path: Path) -> Study:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is no TOML: {error}") from None
     try:
-        return _study(given)
+        return as_study(given)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def _study(given: dict[str, Any]) -> Study:
-    """A count of seeds stands for the first so many."""
+def as_study(given: dict[str, Any]) -> Study:
+    """A study from what TOML or JSON gave; a count of seeds stands for the first so many.
+
+    Raises:
+        InputError: something in it is unknown, missing or out of range.
+    """
     if "data" in given:
         given["data"] = Data(**_checked(Data, given["data"], "data."))
     if isinstance(given.get("seeds"), int) and 0 < given["seeds"] < 1 << 16:

@@ -13,7 +13,7 @@ from jbrep.errors import InputError, differences
 from jbrep.rl import Run
 from jbrep.rl.files import RUN
 from jbrep.rl.run import plain
-from jbrep.study.config import Learner, Representation, Study
+from jbrep.study.config import Learner, Representation, Study, as_study
 
 STUDY = "study.json"
 _GRID = ("tasks", "algorithms", "representations", "seeds")  # may grow
@@ -113,6 +113,22 @@ class Plan:
                     f"{self.folder} holds another study: {differing}; choose another --out"
                 )
         write_whole(path, (json.dumps(wanted, indent=2) + "\n").encode())
+
+
+def read_plan(folder: Path) -> Plan | None:
+    """The study that a folder is of; None if it holds runs alone.
+
+    Raises:
+        InputError: what says so is damaged.
+    """
+    path = folder / STUDY
+    if not exists(path):
+        return None
+    given = {name: value for name, value in _read(path).items() if value is not None}
+    try:
+        return Plan(as_study(given), folder)
+    except InputError as error:
+        raise InputError(f"{path} is damaged, or of a newer jbrep: {error}") from None
 
 
 def _read(path: Path) -> dict[str, Any]:

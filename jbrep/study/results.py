@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,12 +12,38 @@ import numpy as np
 from jbrep.dataset.storage import write_whole
 from jbrep.errors import InputError
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, write_csv
+from jbrep.rl.run import FULL
 from jbrep.stats import Analysis, RunCurve, analyse, summary
+from jbrep.study.record import RECORD, as_json, learner, record
 from jbrep.tables import table
 
 RETURNS = "returns.csv"
 STATISTICS = "statistics.json"
 _COLUMNS = ("task", "algorithm", "representation", "seed", "step", "episode", "return")
+
+
+class Results(NamedTuple):
+    """What a folder of runs says."""
+
+    folders: list[Path]  # of the runs
+    runs: list[RunCurve]
+    analysis: Analysis | None
+    left_out: list[str]  # what there are no statistics of, and why
+
+
+def read_results(folder: Path) -> Results:
+    """The runs below a folder that are over, and their statistics where they allow any.
+
+    Raises:
+        InputError: no run is over there, or a file is damaged.
+    """
+    folders = _folders(folder)
+    runs = [_curve(each) for each in folders]
+    compared, left_out = _comparable(runs)
+    try:
+        return Results(folders, runs, analyse(compared) if compared else None, left_out)
+    except InputError as error:
+        return Results(folders, runs, None, [*left_out, str(error)])
 
 
 def read_runs(folder: Path) -> list[RunCurve]:
@@ -25,10 +52,36 @@ def read_runs(folder: Path) -> list[RunCurve]:
     Raises:
         InputError: there is none, or a file of one is damaged.
     """
-    files = sorted(folder.rglob(RUN))
-    if not files:
+    return [_curve(each) for each in _folders(folder)]
+
+
+def has_runs(folder: Path) -> bool:
+    """Whether a run below a folder is over."""
+    return any(folder.rglob(RUN))
+
+
+def _folders(folder: Path) -> list[Path]:
+    found = sorted(file.parent for file in folder.rglob(RUN))
+    if not found:
         raise InputError(f"no run that is over below {folder}: jbrep study or jbrep rl makes one")
-    return [_curve(file.parent) for file in files]
+    return found
+
+
+def _comparable(runs: list[RunCurve]) -> tuple[list[RunCurve], list[str]]:
+    """The runs that statistics can be made of while others are missing, and what is left out."""
+    counts = Counter((run.task, run.algorithm, run.representation) for run in runs)
+    alone = {
+        key: f"{'/'.join(key)}: one run is over, two are needed"
+        for key, count in counts.items()
+        if count == 1
+    }
+    alone |= {
+        key: f"{'/'.join(key)}: two runs of {FULL} are needed to compare it with"
+        for key in counts
+        if counts[*key[:2], FULL] < 2 and key not in alone
+    }
+    kept = [run for run in runs if (run.task, run.algorithm, run.representation) not in alone]
+    return kept, sorted(alone.values())
 
 
 def _curve(folder: Path) -> RunCurve:
@@ -42,18 +95,15 @@ def _curve(folder: Path) -> RunCurve:
 
 
 def _as_curve(run: dict[str, Any], folder: Path) -> RunCurve:
-    settings = dict(run["settings"])
-    seed = settings.pop("seed")
-    preset = settings["preset"]
-    suffix = "" if preset == "paper" else f"-{preset}"
+    settings = {name: value for name, value in run["settings"].items() if name != "seed"}
     evaluations = read_evaluations(folder)
     steps = sorted({each.step for each in evaluations})
     returns = [[e.episode_return for e in evaluations if e.step == step] for step in steps]
     return RunCurve(
         task=settings["task"],
-        algorithm=settings["algorithm"] + suffix,
+        algorithm=learner(settings),
         representation=settings["representation"],
-        seed=seed,
+        seed=run["settings"]["seed"],
         settings=hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8],
         steps=np.array(steps, dtype=np.int64),
         returns=np.array(returns, dtype=np.float64),
@@ -62,42 +112,28 @@ def _as_curve(run: dict[str, Any], folder: Path) -> RunCurve:
     )
 
 
-class Results(NamedTuple):
-    """What a folder of runs says."""
-
-    runs: list[RunCurve]
-    analysis: Analysis | None
-    refusal: str  # why there are no statistics
-
-
-def read_results(folder: Path) -> Results:
-    """The runs below a folder, and their statistics where they allow any.
+def write_results(results: Results, folder: Path) -> list[Path]:
+    """Write all returns as one long table, what was run, and the statistics if there are any.
 
     Raises:
-        InputError: no run is over there, or a file is damaged.
+        InputError: a file of a run is damaged, or they can't be written.
     """
-    runs = read_runs(folder)
-    try:
-        return Results(runs, analyse(runs), "")
-    except InputError as error:
-        return Results(runs, None, str(error))
-
-
-def write_results(results: Results, folder: Path) -> list[Path]:
-    """Write all returns as one long table, and the statistics if there are any."""
-    paths = [folder / RETURNS]
+    found = record(folder, results.folders, results.left_out)
+    paths = [folder / RETURNS, folder / RECORD]
     write_csv(paths[0], _COLUMNS, _rows(results.runs))
+    write_whole(paths[1], as_json(found))
     if results.analysis:
         paths.append(folder / STATISTICS)
-        write_whole(paths[1], results.analysis.to_json().encode())
+        write_whole(paths[2], results.analysis.to_json().encode())
+    else:
+        (folder / STATISTICS).unlink(missing_ok=True)  # it would be of other runs
     return paths
 
 
 def as_text(results: Results) -> str:
     """Tables to read: the statistics, or each run's end where there are none."""
-    if results.analysis is None:
-        return f"{table(*_ends(results.runs))}\n\nno statistics: {results.refusal}"
-    return summary(results.analysis)
+    shown = summary(results.analysis.tolist()) if results.analysis else table(*_ends(results.runs))
+    return "\n".join((shown, *(f"\nno statistics: {line}" for line in results.left_out)))
 
 
 def _rows(runs: list[RunCurve]) -> Iterator[tuple[Any, ...]]:

@@ -1,0 +1,208 @@
+"""Learning curves: returns over training."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, MaxNLocator
+
+from jbrep.figures.plot import Plot
+from jbrep.figures.style import COLUMN, LINE, PAGE, ink, plain, reference, styles
+from jbrep.stats.runs import in_order
+
+Group = dict[str, Any]  # of statistics.json: what was found for a task and an algorithm
+Heuristics = Mapping[str, Sequence[float]]  # returns of the hand-written policy, by task
+
+_BAND = ("p10", "p50", "p90")
+_COLUMNS = ("task", "algorithm", "representation", "step", *_BAND, "iqm", "iqm_low", "iqm_high")
+
+
+class Return(NamedTuple):
+    """A row of returns.csv: an episode of an evaluation."""
+
+    task: str
+    algorithm: str
+    representation: str
+    seed: int
+    step: int
+    episode: int
+    episode_return: float
+
+
+def baseline_curves(groups: Sequence[Group], heuristics: Heuristics) -> Plot:
+    """The baseline alone, tasks by algorithms, as the paper's Fig. 7."""
+    first = [{**group, "labels": group["labels"][:1]} for group in groups]
+    name = groups[0]["labels"][0]["representation"]
+    return Plot(
+        "training_curves",
+        f"Training on the {name} observation",
+        _CAPTION,
+        _COLUMNS,
+        list(_rows(first)),
+        lambda: _grid_of_curves(first, heuristics),
+    )
+
+
+def curves(groups: Sequence[Group], heuristics: Heuristics) -> Plot:
+    """Every representation on one axis, tasks by algorithms."""
+    return Plot(
+        "representations",
+        "Training on the full and on reduced observations",
+        _CAPTION,
+        _COLUMNS,
+        list(_rows(groups)),
+        lambda: _grid_of_curves(groups, heuristics),
+    )
+
+
+_CAPTION = (
+    "Return of the deterministic policy over training: median and 10 to 90 % over runs. Dashed: "
+    "the hand-written policy's median on the same starts; dotted: "
+    f"{LINE}, where the paper calls a task solved."
+)
+
+
+def every_run(returns: Sequence[Return], baseline: str) -> Plot:
+    """Each run by itself: a row for each task and algorithm, a panel for each representation."""
+    runs: dict[tuple[str, str], dict[str, dict[int, dict[int, list[float]]]]] = {}
+    for row in returns:
+        of_label = runs.setdefault((row.task, row.algorithm), {}).setdefault(row.representation, {})
+        steps = of_label.setdefault(row.seed, {}).setdefault(row.step, [])
+        steps.append(row.episode_return)
+    means = {
+        key: {
+            label: {
+                seed: {step: float(np.mean(each)) for step, each in steps.items()}
+                for seed, steps in of_label.items()
+            }
+            for label, of_label in labels.items()
+        }
+        for key, labels in runs.items()
+    }
+    table = [
+        (*key, label, seed, step, f"{mean:.3f}")
+        for key, labels in means.items()
+        for label, of_label in labels.items()
+        for seed, steps in of_label.items()
+        for step, mean in steps.items()
+    ]
+    return Plot(
+        "every_run",
+        "Every run",
+        "Mean return of each evaluation, a line for each run; thick: their median.",
+        ("task", "algorithm", "representation", "seed", "step", "mean_return"),
+        table,
+        lambda: _draw_runs(means, baseline),
+    )
+
+
+def _rows(groups: Sequence[Group]) -> Iterator[tuple[Any, ...]]:
+    for group in groups:
+        for label in group["labels"]:
+            curve = label["curve"]
+            columns = [group["grid"], *(curve[name] for name in _BAND), *np.array(curve["iqm"]).T]
+            for step, *values in zip(*columns, strict=True):
+                key = (group["task"], group["algorithm"], label["representation"], int(step))
+                yield *key, *("" if v is None else f"{v:.3f}" for v in values)
+
+
+def _grid_of_curves(groups: Sequence[Group], heuristics: Heuristics) -> Figure:
+    names = [label["representation"] for group in groups for label in group["labels"]]
+    look = styles(names, first=groups[0]["labels"][0]["representation"])
+
+    def draw(axes: Axes, group: Group) -> None:
+        if returns := heuristics.get(group["task"]):
+            axes.axhline(float(np.median(returns)), label="hand-written", **reference())
+        axes.axhline(LINE, color=ink(), linestyle=":", linewidth=0.8, alpha=0.65)
+        for label in group["labels"]:
+            name, curve = label["representation"], label["curve"]
+            low, median, high = (np.array(curve[key], float) for key in _BAND)
+            colour, marker = look[name]["color"], look[name]["marker"]
+            axes.fill_between(group["grid"], low, high, color=colour, alpha=0.15, linewidth=0)
+            axes.plot(
+                *(group["grid"], median),
+                **{"color": colour, "marker": marker, "ms": 2.5, "label": plain(name)},
+                markevery=max(1, len(median) // 8),
+            )
+
+    return grid(groups, draw, legend=True)
+
+
+def grid(
+    groups: Sequence[Group], draw: Callable[[Axes, Group], None], legend: bool = False
+) -> Figure:
+    """A panel for each task (rows) and algorithm (columns), over steps of training."""
+    tasks = list(dict.fromkeys(group["task"] for group in groups))
+    algorithms = list(dict.fromkeys(group["algorithm"] for group in groups))
+    by_place = {(group["task"], group["algorithm"]): group for group in groups}
+    width = COLUMN if len(algorithms) == 1 else PAGE
+    figure = Figure(figsize=(width, 0.5 + (2.0 if len(algorithms) < 3 else 1.6) * len(tasks)))
+    panels = figure.subplots(len(tasks), len(algorithms), squeeze=False, sharey=True)
+    for (i, j), axes in np.ndenumerate(panels):
+        group = by_place.get((tasks[i], algorithms[j]))
+        if group is None:
+            axes.set_axis_off()
+            continue
+        draw(axes, group)
+        axes.set_title(plain(f"{tasks[i]}, {algorithms[j]}"))
+        training_axes(axes, group["grid"][-1])
+        axes.set_xlabel("training step" if i == len(tasks) - 1 else "")
+        axes.set_ylabel("" if j else "return")
+    if legend:
+        below(figure, panels.ravel())
+    return figure
+
+
+def training_axes(axes: Axes, last: float) -> None:
+    """Steps from 0 on, returns from 0 to 1,000."""
+    axes.set(xlim=(0, last), ylim=(-15, 1015), yticks=range(0, 1001, 250))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+
+
+def below(figure: Figure, panels: Iterable[Axes]) -> None:
+    """One legend under all panels, lines to compare with last."""
+    entries = {
+        name: handle
+        for axes in panels
+        for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    names = sorted(entries, key=lambda name: _is_broken(entries[name]))
+    columns = 4 if figure.get_figwidth() < PAGE else 6
+    figure.legend([entries[n] for n in names], names, loc="outside lower center", ncols=columns)
+
+
+def _is_broken(handle: Any) -> bool:
+    return isinstance(handle, Line2D) and handle.get_linestyle() not in ("-", "None")
+
+
+def _draw_runs(means: Mapping[tuple[str, str], Mapping[str, Any]], baseline: str) -> Figure:
+    names = in_order((label for labels in means.values() for label in labels), baseline)
+    look = styles(names, first=baseline)
+    figure = Figure(figsize=(PAGE, 0.35 + 1.35 * len(means)))
+    panels = figure.subplots(len(means), len(names), squeeze=False, sharey=True, sharex="row")
+    for (i, j), axes in np.ndenumerate(panels):
+        (task, algorithm), labels = list(means.items())[i]
+        runs = labels.get(names[j])
+        if runs is None:
+            axes.set_axis_off()
+            continue
+        _draw_label(axes, runs, look[names[j]]["color"])
+        title = f"{task}, {algorithm}\n{names[j]}" if j == 0 else names[j]
+        axes.set_title(plain(title))
+        training_axes(axes, max(max(steps) for of in labels.values() for steps in of.values()))
+        axes.set_xlabel("training step" if i == len(means) - 1 else "")
+        axes.set_ylabel("" if j else "return")
+    return figure
+
+
+def _draw_label(axes: Axes, runs: Mapping[int, Mapping[int, float]], colour: str) -> None:
+    for steps in runs.values():
+        axes.plot(list(steps), list(steps.values()), color=colour, linewidth=0.6, alpha=0.55)
+    shared = sorted(set.intersection(*(set(steps) for steps in runs.values())))
+    if len(runs) > 1:
+        middle = [np.median([steps[step] for steps in runs.values()]) for step in shared]
+        axes.plot(shared, middle, color=colour, linewidth=1.6)

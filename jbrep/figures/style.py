@@ -1,0 +1,82 @@
+"""One style for all figures: sized for a paper's column, safe for the colour-blind."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import matplotlib as mpl
+from cycler import cycler
+
+COLUMN, PAGE = 3.45, 7.1  # widths in a paper of two columns [inches]
+LINE = 900  # the return at which the paper calls a task solved
+MARKERS = "osD^vPX*"
+
+# Okabe and Ito's colours; on dark paper, lighter ones in the same order of hues
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
+_ON_DARK = ("#56B4E9", "#FF8A3D", "#2BC89B", "#E69FC8", "#F0C940", "#9BD3F5", "#A0A0A0")
+
+PAPER: Any = {
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.labelsize": 7,
+    "axes.linewidth": 0.6,
+    "axes.prop_cycle": cycler(color=_COLOURS),
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 7.5,
+    "figure.constrained_layout.use": True,
+    "font.size": 7,
+    "grid.alpha": 0.25,
+    "grid.linewidth": 0.5,
+    "legend.fontsize": 6.5,
+    "legend.frameon": False,
+    "lines.linewidth": 1.2,
+    "pdf.fonttype": 42,  # text stays text
+    "savefig.dpi": 250,
+    "svg.hashsalt": "jbrep",
+    "xtick.labelsize": 6.5,
+    "xtick.major.width": 0.6,
+    "ytick.labelsize": 6.5,
+    "ytick.major.width": 0.6,
+}
+LIGHT_PAGE: Any = {**PAPER, "savefig.transparent": True}
+DARK_PAGE: Any = {
+    **LIGHT_PAGE,
+    "axes.prop_cycle": cycler(color=_ON_DARK),
+    **dict.fromkeys(
+        ("axes.edgecolor", "axes.labelcolor", "grid.color", "text.color", "xtick.color"), "#DDDDDD"
+    ),
+    "grid.alpha": 0.16,
+    "ytick.color": "#DDDDDD",
+}
+
+
+def ink() -> str:
+    """The colour of text in the style that holds."""
+    return str(mpl.rcParams["text.color"])
+
+
+def reference() -> dict[str, Any]:
+    """A line to compare with."""
+    return {"color": ink(), "linestyle": "--", "linewidth": 0.9, "alpha": 0.65}
+
+
+def styles(names: Iterable[str], first: str | None = None) -> dict[str, dict[str, Any]]:
+    """Colour and marker of each name, in the style that holds.
+
+    Args:
+        names: in order.
+        first: the one in the colour of text, if it is among them.
+    """
+    colours = mpl.rcParams["axes.prop_cycle"].by_key()["color"]
+    others = [name for name in dict.fromkeys(names) if name != first]
+    found = {
+        name: {"color": colours[i % len(colours)], "marker": MARKERS[(i + 1) % len(MARKERS)]}
+        for i, name in enumerate(others)
+    }
+    return {**({first: {"color": ink(), "marker": MARKERS[0]}} if first else {}), **found}
+
+
+def plain(text: str) -> str:
+    """Text in which a dollar sign begins no formula."""
+    return text.replace("$", r"\$")

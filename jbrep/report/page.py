@@ -1,0 +1,76 @@
+"""A report as one HTML page that needs nothing besides itself."""
+
+import base64
+import hashlib
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from jbrep.figures.plot import Plot, picture
+from jbrep.figures.style import DARK_PAGE, LIGHT_PAGE, PAGE
+from jbrep.report import facts
+from jbrep.report.tables import Tables
+from jbrep.report.words import Answer
+from jbrep.stats.summary import Rows, group_tables
+from jbrep.tables import csv_text
+
+_WIDEST = 1000  # of a figure [CSS pixels]
+
+
+def page(tables: Tables, answers: Sequence[Answer], plots: Sequence[Plot]) -> str:
+    """The page; whatever the tables hold is shown as text and never runs."""
+    script = _own("page.js")
+    template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    return template.from_string(_own("page.html.j2")).render(
+        name=tables.name,
+        outline=facts.outline(tables),
+        notices=facts.notices(tables),
+        answers=answers,
+        figures=[_figure(plot) for plot in plots],
+        tables=_tables(tables.statistics) if tables.statistics else [],
+        runs=facts.run_rows(tables),
+        failed=facts.failed_rows(tables),
+        missing=facts.missing_rows(tables),
+        versions=facts.version_rows(tables),
+        processors=tables.record["processors"],
+        encoders=facts.encoder_rows(tables),
+        settings=facts.setting_rows(tables),
+        reproduce=facts.reproduce(tables),
+        style=Markup(_own("page.css")),
+        script=Markup(script),
+        script_hash=_base64(hashlib.sha256(script.encode()).digest()),
+    )
+
+
+def _tables(statistics: Mapping[str, Any]) -> list[tuple[str, Rows]]:
+    """Every table of every group, under a title that says which."""
+    return [
+        (f"{group['task']}, {group['algorithm']}. {title}" if i else title, rows)
+        for group in statistics["groups"]
+        for i, (title, rows) in enumerate(group_tables(group, statistics))
+    ]
+
+
+def _figure(plot: Plot) -> dict[str, Any]:
+    width = plot.draw().get_figwidth()
+    return {
+        "name": plot.name,
+        "title": plot.title,
+        "caption": plot.caption,
+        "width": round(min(_WIDEST, _WIDEST * max(width, 0.62 * PAGE) / PAGE)),
+        "light": _base64(picture(plot, "svg", LIGHT_PAGE)),
+        "dark": _base64(picture(plot, "svg", DARK_PAGE)),
+        "table": _base64(csv_text(plot.columns, plot.rows).encode()),
+    }
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()
+
+
+def _own(name: str) -> str:
+    """A part of the page that lies beside this module."""
+    return resources.files(__package__).joinpath(name).read_text()
