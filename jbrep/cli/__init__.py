@@ -6,7 +6,7 @@ from jbrep.cli.base import Cli
 from jbrep.cli.data import collect, data
 from jbrep.cli.encoders import encoder, evaluate, train_dae, train_encoder
 from jbrep.cli.render import render
-from jbrep.cli.runs import evaluate_policy, report, rl, study
+from jbrep.cli.runs import behaviour, evaluate_policy, report, rl, study
 
 
 @click.group(cls=Cli, context_settings={"help_option_names": ["-h", "--help"]})
@@ -17,7 +17,7 @@ def main() -> None:
 
 _COMMANDS = (
     *(collect, data, train_dae, train_encoder, evaluate, encoder),
-    *(rl, evaluate_policy, study, report),
+    *(rl, evaluate_policy, behaviour, study, report),
     render,
 )
 for _command in _COMMANDS:

@@ -110,6 +110,36 @@ def evaluate_policy(
     )
 
 
+@click.command(epilog=example("jbrep behaviour runs/full runs/dae-4 --out behaviour"))
+@click.argument("policies", nargs=-1, required=True)
+@click.option("--task", help="Of policies by name, such as move_in_direction.")
+@click.option("--episodes", default=100, show_default=True, type=COUNT, help="Of each policy.")
+@click.option(
+    "--target-yaw", default=45.0, show_default=True, help="Where every target points [degrees]."
+)
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="A folder.")
+def behaviour(
+    policies: tuple[str, ...], task: str | None, episodes: int, target_yaw: float, out: Path
+) -> None:
+    """Draw what policies do: how the motor turns, where the robot goes.
+
+    A policy is the folder of a run, shown before and after training, or goes by its name, such as
+    heuristic. All play the same episodes.
+    """
+    import numpy as np
+
+    from jbrep.behaviour import SPEEDS, observe
+    from jbrep.figures import behaviour_plots, write
+
+    yaw = np.deg2rad(target_yaw)
+    with stoppable("the same command starts anew"):
+        found, behaviours = observe(policies, task, episodes, yaw)
+    for each in behaviours:
+        low, median, high = np.percentile(each.returns, (10, 50, 90))
+        click.echo(printable(f"{each.name}: median return {median:.0f} [{low:.0f}, {high:.0f}]"))
+    _tell(write(behaviour_plots(found.name, behaviours, SPEEDS, yaw), out))
+
+
 @click.command(epilog=example("jbrep study studies/smoke.toml --out runs/smoke"))
 @click.argument("study", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="A folder; runs/NAME if not given.")

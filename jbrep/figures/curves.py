@@ -163,15 +163,15 @@ def training_axes(axes: Axes, last: float) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(5))
 
 
-def below(figure: Figure, panels: Iterable[Axes]) -> None:
-    """One legend under all panels, lines to compare with last."""
+def below(figure: Figure, panels: Iterable[Axes], columns: int | None = None) -> None:
+    """One legend under all panels, lines to compare with last; as many columns as usual fit."""
     entries = {
         name: handle
         for axes in panels
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     names = sorted(entries, key=lambda name: _is_broken(entries[name]))
-    columns = 4 if figure.get_figwidth() < PAGE else 6
+    columns = columns or (4 if figure.get_figwidth() < PAGE else 6)
     figure.legend([entries[n] for n in names], names, loc="outside lower center", ncols=columns)
 
 

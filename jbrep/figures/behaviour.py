@@ -1,0 +1,128 @@
+"""What policies do: how the motor turns, and where the robot goes (the paper's Figs. 4 and 5)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from jbrep.evaluate.bootstrap import Array
+from jbrep.figures.plot import Plot
+from jbrep.figures.style import COLUMN, PAGE, ink, plain, styles
+
+
+@dataclass(frozen=True, eq=False)
+class Behaviour:
+    """What a policy did in some episodes.
+
+    Args:
+        name: of the policy.
+        returns: of each episode, (episodes,).
+        motor: share of time in each bin of the motor's velocity, (b,).
+        edges: of the cells of the floor, the same in x and y [m], (k + 1,).
+        places: share of time in each cell, (k, k), x first.
+    """
+
+    name: str
+    returns: Array
+    motor: Array
+    edges: Array
+    places: Array
+
+
+def behaviour_plots(
+    task: str, behaviours: Sequence[Behaviour], speeds: Array, target_yaw: float
+) -> list[Plot]:
+    """A histogram of the motor's velocity, and heat maps of position.
+
+    Args:
+        task: that the policies are for.
+        behaviours: of each policy.
+        speeds: edges of the bins of the motor's velocity [rad/s], (b + 1,).
+        target_yaw: where the targets pointed [rad].
+    """
+    episodes = len(behaviours[0].returns)
+    return [
+        Plot(
+            "motor_velocity",
+            f"{task}: how the motor turns",
+            f"Share of time at each motor velocity over {episodes} episodes, and their median "
+            "return.",
+            ("policy", "low", "high", "share"),
+            [
+                (each.name, low, high, share)
+                for each in behaviours
+                for low, high, share in zip(speeds, speeds[1:], each.motor, strict=False)
+            ],
+            lambda: _draw_motor(task, behaviours, speeds),
+        ),
+        Plot(
+            "positions",
+            f"{task}: where the robot goes",
+            f"Share of time in each cell of 2 cm over {episodes} episodes from the ring; arrow: "
+            "where the target points.",
+            ("policy", "x", "y", "share"),
+            [row for each in behaviours for row in _cells(each)],
+            lambda: _draw_places(task, behaviours, target_yaw),
+        ),
+    ]
+
+
+def _cells(each: Behaviour) -> list[tuple[str, str, str, float]]:
+    """The cells that were visited, by their middles."""
+    middles = (each.edges[:-1] + each.edges[1:]) / 2
+    return [
+        (each.name, f"{middles[i]:.3f}", f"{middles[j]:.3f}", each.places[i, j])
+        for i, j in np.argwhere(each.places)
+    ]
+
+
+def _draw_motor(task: str, behaviours: Sequence[Behaviour], speeds: Array) -> Figure:
+    """A panel for each policy, each with its own scale: some stand still nearly all the time."""
+    figure = Figure(figsize=(COLUMN, 0.65 + 0.85 * len(behaviours)))
+    panels = figure.subplots(len(behaviours), sharex=True, squeeze=False)[:, 0]
+    look = styles(each.name for each in behaviours)
+    for axes, each in zip(panels, behaviours, strict=True):
+        colour = look[each.name]["color"]
+        axes.stairs(100 * each.motor, speeds, color=colour, fill=True, alpha=0.75)
+        axes.set_title(plain(f"{each.name}: return {np.median(each.returns):.0f}"))
+        axes.set(xlim=(-180, 180), ylabel="time [%]")
+        axes.set_xticks(range(-150, 151, 50))
+    panels[-1].set_xlabel("motor velocity [rad/s]")
+    figure.suptitle(f"{task}: how the motor turns", size=8)
+    return figure
+
+
+def _draw_places(task: str, behaviours: Sequence[Behaviour], target_yaw: float) -> Figure:
+    across = min(4, len(behaviours))
+    rows = -(-len(behaviours) // across)
+    width = COLUMN if across == 1 else PAGE
+    figure = Figure(figsize=(width, 0.55 + rows * (0.4 + (width - 0.8) / across)))
+    panels = figure.subplots(rows, across, squeeze=False, sharex=True, sharey=True).ravel()
+    lowest = min(each.places[each.places > 0].min() for each in behaviours)
+    norm = LogNorm(lowest, max(each.places.max() for each in behaviours))
+    for axes in panels[len(behaviours) :]:
+        axes.set_axis_off()
+    for axes, each in zip(panels, behaviours, strict=False):
+        shown = np.ma.masked_equal(each.places.T, 0)
+        mesh = axes.pcolormesh(each.edges, each.edges, shown, norm=norm, cmap="viridis")
+        mesh.set_rasterized(True)
+        _draw_target(axes, each.edges[-1], target_yaw)
+        title = f"{each.name}\nreturn {np.median(each.returns):.0f}"
+        axes.set_title(plain(title.replace(", ", "\n")), size=6.5)
+        axes.set(aspect="equal", xlabel="x [m]")
+        axes.set_ylabel("y [m]" if axes in panels[::across] else "")
+    figure.colorbar(mesh, ax=panels.tolist(), label="share of time", shrink=0.85, aspect=30)
+    return figure
+
+
+def _draw_target(axes: Axes, reach: float, yaw: float) -> None:
+    """The start, and an arrow at the border."""
+    axes.plot(0, 0, "o", color=ink(), ms=8, mfc="none", mew=0.8)
+    tip, tail = (
+        (share * reach * np.cos(yaw), share * reach * np.sin(yaw)) for share in (0.95, 0.7)
+    )
+    style = {"arrowstyle": "-|>", "color": ink(), "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", tip, tail, arrowprops=style)

@@ -1,0 +1,254 @@
+"""Figures say what their tables say, and tables what the statistics say."""
+
+import csv
+import io
+import json
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from PIL import Image
+
+from jbrep.behaviour import SPEEDS, observe
+from jbrep.errors import InputError
+from jbrep.figures import behaviour_plots, encoder_plots, study_plots, write
+from jbrep.figures.curves import Return
+from jbrep.figures.plot import picture
+from jbrep.figures.style import COLUMN, DARK_PAGE, LIGHT_PAGE, PAGE, PAPER
+from jbrep.stats import RunCurve, analyse
+
+STEPS = np.arange(0, 50_001, 10_000)
+FINAL = {"full": 900, "dae-8": 500, "pca-4": 300}
+GROUPS = [("face_direction", "ddpg"), ("face_direction", "sac"), ("move_to_pose", "sac")]
+LABELS = {
+    "face_direction/sac/dae-8": {
+        "settings": {"task": "face_direction", "algorithm": "sac", "hidden": [350, 250]},
+        "encoder": {
+            "name": "dae-8",
+            "kind": "dae",
+            "size": 16,
+            "encoder": [[128, "relu"], [8, "tanh"]],
+            "decoder": [[128, "relu"], [16, "linear"]],
+            "training": {"noise": 0.1},
+        },
+    }
+}
+
+
+def runs():
+    random = np.random.default_rng(0)
+    for task, algorithm in GROUPS:
+        for label, final in FINAL.items():
+            for seed in range(4):
+                end = final + random.normal(0, 20)
+                returns = np.linspace(100, end, len(STEPS))[:, None] + random.normal(0, 5, (6, 3))
+                yield RunCurve(
+                    *(task, algorithm, label, seed, "s", STEPS, returns.clip(0, 1000)),
+                    total_steps=50_000,
+                    failed_at=30_000 if (label, seed) == ("pca-4", 3) else None,
+                )
+
+
+@pytest.fixture(scope="module")
+def statistics():
+    return json.loads(analyse(list(runs())).to_json())
+
+
+@pytest.fixture(scope="module")
+def returns():
+    return [
+        Return(run.task, run.algorithm, run.representation, run.seed, int(step), i, float(each))
+        for run in runs()
+        for step, episodes in zip(run.steps, run.returns, strict=True)
+        for i, each in enumerate(episodes)
+    ]
+
+
+@pytest.fixture(scope="module")
+def plots(statistics, returns):
+    found = study_plots(statistics, returns, {"face_direction": [910, 950, 990]}, LABELS)
+    return {plot.name: plot for plot in found}
+
+
+def drawn(plot, style=PAPER):
+    with mpl.rc_context(style):
+        return plot.draw()
+
+
+def panels(figure):
+    return {axes.get_title(loc="left"): axes for axes in figure.axes}
+
+
+def test_a_study_has_every_figure(plots):
+    assert list(plots) == [
+        *("representations", "final_return", "variance_ratio", "learning_rate", "profiles"),
+        *("training_curves", "every_run", "system", "autoencoders"),
+    ]
+
+
+def test_each_figure_is_written_as_pdf_and_png_beside_its_table(plots, tmp_path):
+    pictures = write(plots.values(), tmp_path / "figures")
+    assert [path.stem for path in pictures] == list(plots)
+    for path, plot in zip(pictures, plots.values(), strict=True):
+        width = Image.open(io.BytesIO(path.read_bytes())).size[0] / PAPER["savefig.dpi"]
+        assert width == pytest.approx(COLUMN, abs=0.01) or width == pytest.approx(PAGE, abs=0.01)
+        assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+        header, *rows = csv.reader(path.with_suffix(".csv").read_text().splitlines())
+        assert header == list(plot.columns)
+        assert len(rows) == len(plot.rows) > 0
+    before = {path: path.read_bytes() for path in (tmp_path / "figures").iterdir()}
+    write(plots.values(), tmp_path / "figures")
+    assert {path: path.read_bytes() for path in (tmp_path / "figures").iterdir()} == before
+
+
+def test_curves_are_the_medians_of_the_statistics(plots, statistics):
+    group = statistics["groups"][1]
+    assert (group["task"], group["algorithm"]) == GROUPS[1]
+    axes = panels(drawn(plots["representations"]))["face_direction, sac"]
+    lines = {line.get_label(): line for line in axes.lines}
+    for label in group["labels"]:
+        np.testing.assert_array_equal(
+            lines[label["representation"]].get_ydata(), label["curve"]["p50"]
+        )
+    assert set(lines["hand-written"].get_ydata()) == {950}
+    assert any(set(line.get_ydata()) == {900} for line in axes.lines)
+    bands = [path.get_paths()[0].get_extents() for path in axes.collections]
+    assert bands[0].y1 == pytest.approx(max(group["labels"][0]["curve"]["p90"]))
+
+
+def test_the_grid_has_tasks_by_algorithms_and_the_baseline_alone(plots):
+    figure = drawn(plots["training_curves"])
+    shown = {title for title, axes in panels(figure).items() if axes.axison}
+    assert shown == {", ".join(group) for group in GROUPS}
+    for axes in figure.axes:
+        labels = {line.get_label() for line in axes.lines}
+        assert not {"dae-8", "pca-4"} & labels
+    medians = {tuple(row[:3]) for row in plots["training_curves"].rows}
+    assert medians == {(*group, "full") for group in GROUPS}
+
+
+def test_every_run_is_drawn(plots, returns):
+    axes = drawn(plots["every_run"]).axes[0]
+    assert len(axes.lines) == 4 + 1  # and the median
+    (first,) = [row for row in plots["every_run"].rows if row[:5] == (*GROUPS[0], "full", 0, 0)]
+    episodes = [r.episode_return for r in returns if r[:5] == first[:5]]
+    assert float(first[5]) == pytest.approx(np.mean(episodes), abs=1e-3)
+
+
+def test_a_point_for_each_run_and_an_interval_for_each_label(plots, statistics):
+    labels = statistics["groups"][0]["labels"]
+    axes = drawn(plots["final_return"]).axes[0]
+    points = [line for line in axes.lines if line.get_marker() == "."]
+    for line, label in zip(points, labels, strict=True):
+        np.testing.assert_array_equal(line.get_ydata(), label["by_run"]["final_return"])
+    means = [bar.lines[0].get_ydata()[0] for bar in axes.containers]
+    assert means == [label["numbers"]["final_return_mean"][0] for label in labels]
+    segments = axes.containers[0].lines[2][0].get_segments()[0]
+    np.testing.assert_allclose(segments[:, 1], labels[0]["numbers"]["final_return_mean"][1:])
+
+
+def test_variance_ratios_stand_with_both_intervals(plots, statistics):
+    axes = drawn(plots["variance_ratio"]).axes[0]
+    comparison = statistics["groups"][0]["comparisons"][0]
+    verdict = next(v for v in comparison["verdicts"] if v["claim"] == "less variance")
+    thin, thick, point = axes.lines[:3]
+    np.testing.assert_array_equal(thin.get_xdata(), verdict["simultaneous"][1:])
+    np.testing.assert_array_equal(thick.get_xdata(), comparison["numbers"]["variance_ratio"][1:])
+    assert point.get_xdata()[0] == comparison["numbers"]["variance_ratio"][0]
+    names = [text.get_text() for text in axes.get_yticklabels()]
+    assert names[0] == "face_direction, ddpg: dae-8"
+
+
+def test_a_profile_falls_from_all_runs_to_none(statistics, plots):
+    label = statistics["groups"][0]["labels"][0]
+    share = np.array([each[0] for each in label["profile"]])
+    final = np.array(label["by_run"]["final_return"])
+    assert share[0] == 1
+    assert share[-1] == 0
+    at = statistics["profile_returns"].index(900)
+    assert share[at] == (final > 900).mean()
+    assert np.all(np.diff(share) <= 0)
+
+
+def test_without_statistics_the_runs_are_drawn_all_the_same(returns):
+    names = [plot.name for plot in study_plots(None, returns, {}, {})]
+    assert names == ["every_run"]
+
+
+def test_diagrams_have_the_real_sizes(plots):
+    texts = [text.get_text() for text in drawn(plots["autoencoders"]).axes[0].texts]
+    assert {"16 scaled", "128 relu", "8 tanh", "16 linear"} <= set(texts)
+    assert ("agent", "SAC, hidden 350-250") in plots["system"].rows
+
+
+def test_pages_have_a_light_and_a_dark_style(plots):
+    light, dark = (picture(plots["profiles"], "svg", style) for style in (LIGHT_PAGE, DARK_PAGE))
+    assert b"#dddddd" in dark.lower()
+    assert b"#dddddd" not in light.lower()
+    assert picture(plots["profiles"], "svg", DARK_PAGE) == dark
+
+
+def test_names_with_dollar_signs_are_no_formulas(returns):
+    odd = [row._replace(representation="$x^{") for row in returns]
+    (plot, *_) = study_plots(None, odd, {}, {})
+    assert Image.open(io.BytesIO(picture(plot, "png", PAPER))).size[0] > 0
+
+
+def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
+    path = "results/encoders/face_direction/evaluation.json"
+    with open(path) as file:  # noqa: PTH123
+        evaluation = json.load(file)
+    found = {plot.name: plot for plot in encoder_plots(evaluation)}
+    assert list(found) == [
+        *("error_by_feature", "error_by_latent", "error_by_corruption", "latent_correlation"),
+    ]
+    error = evaluation["encoders"]["dae-8"]["reconstruction"]["mse"]
+    (row,) = [row for row in found["error_by_latent"].rows if row[0] == "dae-8"]
+    assert list(row[2:5]) == error
+    axes = drawn(found["error_by_latent"]).axes[0]
+    assert any(error[0] in container.lines[0].get_ydata() for container in axes.containers)
+    matrix = drawn(found["latent_correlation"]).axes[0].images[0].get_array()
+    expected = evaluation["encoders"]["dae-12"]["latent_units"]["correlation"]
+    np.testing.assert_array_equal(matrix, np.array(expected, float))
+    write(found.values(), tmp_path)
+
+
+@pytest.fixture(scope="module")
+def behaviours():
+    sources = ("constant:drive=0.5", "heuristic")
+    return observe(sources, "move_in_direction", episodes=3, target_yaw=np.pi / 4)[1]
+
+
+def test_a_constant_drive_turns_the_motor_one_way(behaviours):
+    constant, heuristic = behaviours
+    middles = (SPEEDS[1:] + SPEEDS[:-1]) / 2
+    assert constant.motor.sum() == pytest.approx(1)
+    assert constant.motor[middles > 50].sum() > 0.9  # 145 rad/s at full drive
+    assert heuristic.motor[middles < -20].sum() > 0.2
+    assert heuristic.motor[middles > 20].sum() > 0.2
+
+
+def test_the_heuristic_goes_where_the_target_points(behaviours):
+    _, heuristic = behaviours
+    assert heuristic.places.sum() == pytest.approx(1)
+    middles = (heuristic.edges[1:] + heuristic.edges[:-1]) / 2
+    x, y = heuristic.places.sum(axis=1) @ middles, heuristic.places.sum(axis=0) @ middles
+    assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(45, abs=15)
+    assert len(heuristic.returns) == 3
+
+
+def test_behaviour_is_drawn_from_its_tables(behaviours, tmp_path):
+    motor, places = behaviour_plots("move_in_direction", behaviours, SPEEDS, np.pi / 4)
+    assert len(motor.rows) == 2 * 72
+    axes = drawn(motor).axes[0]
+    np.testing.assert_allclose(axes.patches[0].get_data().values, 100 * behaviours[0].motor)
+    seen = [float(row[3]) for row in places.rows if row[0] == "heuristic"]
+    assert sum(seen) == pytest.approx(1)
+    mesh = drawn(places).axes[1].collections[0].get_array()
+    assert mesh.sum() == pytest.approx(1)
+    write((motor, places), tmp_path)
+
+
+def test_the_task_of_a_policy_is_needed():
+    with pytest.raises(InputError, match="policy heuristic needs a --task"):
+        observe(("heuristic",), None, 1, 0)
