@@ -3,9 +3,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DEMO := demo
+DEMO_RUN := $(DEMO)/study/runs/face_direction/sac-modern/dae-8/seed-0
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
-.PHONY: help setup demo test check bench pictures samples data encoders first clean
+.PHONY: help setup demo test check bench pictures figures samples data encoders first behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -26,6 +27,10 @@ demo: $(READY) ## the whole job in minutes: collect, train and judge encoders, l
 	$(BIN)/jbrep train-encoder --kind random --data $(DEMO)/data --latent 8 --out $(DEMO)/encoders
 	$(BIN)/jbrep evaluate --encoder $(addprefix $(DEMO)/encoders/,$(addsuffix .safetensors,dae-12 dae-8 dae-4 dae-deep-8 random-8)) --data $(DEMO)/data --out $(DEMO)/evaluation
 	$(BIN)/jbrep study studies/smoke.toml --out $(DEMO)/study
+	$(BIN)/jbrep inspect $(DEMO_RUN) --out $(DEMO)/dae-8.rrd
+	@echo
+	@echo "the report: $(DEMO)/study/report.html"
+	@echo "an agent at work on its latent: $(BIN)/rerun $(DEMO)/dae-8.rrd"
 
 test: $(READY) ## the test suite
 	$(BIN)/python -m pytest
@@ -41,10 +46,18 @@ bench: $(READY) ## speed as ratios in one run, and what the hand-written policie
 	$(BIN)/python benchmarks/dataset.py
 	$(BIN)/python benchmarks/encoders.py
 	$(BIN)/python benchmarks/learning.py
+	$(BIN)/python benchmarks/inspection.py
 	$(BIN)/python benchmarks/heuristics.py
 
 pictures: $(READY) ## the pictures in docs/, drawn anew
 	MUJOCO_GL=egl $(BIN)/python tools/pictures.py docs
+	rm -f docs/jitterbug.gif
+	$(BIN)/jbrep render uniform heuristic --task move_to_pose --episode 10 --seconds 3.5 --speed 0.7 --fps 10 --size 240x180 --out docs/jitterbug.gif
+	$(BIN)/jbrep inspect data/sample/face_direction --episode 1 --encoder dae-8 --out inspect/shown.rrd
+	$(BIN)/python tools/screenshots.py results/first/report.html inspect/shown.rrd docs
+
+figures: $(READY) ## figures and reports in results/ anew, from the tables there
+	$(BIN)/python tools/figures.py
 
 samples: $(READY) ## the sample data sets in data/, made anew
 	for task in $(TASKS); do \
@@ -61,8 +74,13 @@ encoders: data ## results/encoders/ from these: hours; goes on where it was stop
 
 first: $(READY) ## results/first/ anew: an hour or two; goes on where it was stopped
 	$(BIN)/jbrep study studies/first.toml --out runs/first
-	$(BIN)/jbrep report runs/first > results/first/tables.txt
-	cp runs/first/returns.csv runs/first/statistics.json results/first/
+	cp runs/first/returns.csv runs/first/runs.json runs/first/statistics.json runs/first/heuristics.csv results/first/
+	$(BIN)/jbrep report results/first
+
+behaviour: $(READY) ## results/behaviour/ anew: half an hour
+	$(BIN)/jbrep rl --task move_in_direction --preset modern --steps 100k --out runs/mid/full
+	$(BIN)/jbrep rl --task move_in_direction --preset modern --encoder dae-4 --steps 40k --out runs/mid/dae-4
+	$(BIN)/jbrep behaviour runs/mid/full runs/mid/dae-4 --out results/behaviour
 
 clean: ## remove the environment and the demo's files
 	rm -rf $(VENV) $(DEMO) *.egg-info

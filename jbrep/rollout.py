@@ -111,7 +111,7 @@ def replay(dataset: Dataset, episode: int) -> Rollout:
     simulation = Simulation(dataset.task, 1, num_threads=1)
     simulation.restore(*(own[name][episode : episode + 1] for name in names))
     actions = iter(dataset["action"][first : first + length])
-    tape = _play(simulation, lambda observation: next(actions)[None], length)
+    tape = _play(simulation, lambda: next(actions)[None], length)
     name = f"{dataset.folder}, episode {episode}"
     return tape.rollout(0, name, int(own["seed"][episode]))
 
@@ -142,7 +142,8 @@ def play(
         simulation.restore(
             **simulation.state | {"target_quaternion": np.tile(turned, (len(seeds), 1))}
         )
-    tape = _play(simulation, begin(task, randoms), EPISODE_STEPS, show)
+    act = begin(task, randoms)
+    tape = _play(simulation, lambda: act(simulation.observe()), EPISODE_STEPS, show)
     return [tape.rollout(lane, name, seed) for lane, seed in enumerate(seeds)]
 
 
@@ -180,11 +181,13 @@ class _Tape:
         )
 
 
-def _play(simulation: Simulation, act: Actor, steps: int, show: bool = False) -> _Tape:
+def _play(
+    simulation: Simulation, act: Callable[[], Array], steps: int, show: bool = False
+) -> _Tape:
     tape = _Tape(simulation, steps)
     tape.record_state(0)
     for step in tqdm(range(steps), unit="step", leave=False, delay=1, disable=not show):
-        action = act(simulation.observe())
+        action = act()
         tape.record_step(step, action, simulation.step(action))
         tape.record_state(step + 1)
     return tape

@@ -5,6 +5,7 @@ import click
 from jbrep.cli.base import Cli
 from jbrep.cli.data import collect, data
 from jbrep.cli.encoders import encoder, evaluate, train_dae, train_encoder
+from jbrep.cli.inspect import inspect
 from jbrep.cli.render import render
 from jbrep.cli.runs import behaviour, evaluate_policy, report, rl, study
 
@@ -17,7 +18,7 @@ def main() -> None:
 
 _COMMANDS = (
     *(collect, data, train_dae, train_encoder, evaluate, encoder),
-    *(rl, evaluate_policy, behaviour, study, report),
+    *(rl, evaluate_policy, behaviour, study, report, inspect),
     render,
 )
 for _command in _COMMANDS:

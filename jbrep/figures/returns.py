@@ -59,7 +59,7 @@ def variance_ratio(groups: Sequence[Group], baseline: str, level: float) -> Plot
         "variance_ratio",
         "Variance against the full observation's",
         f"Ratio of the variance of final returns to that on {baseline}. Thick: 95 % interval; "
-        f"thin: {level:.2%}, at which all verdicts hold together. Below 1 varies less.",
+        f"thin: {100 * level:.2f} %, at which all verdicts hold together. Below 1 varies less.",
         (*_LABEL, "ratio", *_ENDS, "low_together", "high_together", "verdict"),
         [
             (*key, *values, *verdict["simultaneous"][1:], verdict["verdict"])

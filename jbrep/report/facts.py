@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from jbrep.evaluate.evaluation import FULL
@@ -35,18 +35,22 @@ def outline(tables: Tables) -> str:
 def notices(tables: Tables) -> list[str]:
     """What keeps the report from being whole."""
     found = []
-    if missing := tables.record["missing"]:
-        names = ", ".join(list(missing)[:3]) + (" and others" if len(missing) > 3 else "")
+    if missing := list(tables.record["missing"]):
+        names = ", ".join(missing[:3]) + (" and others" if len(missing) > 3 else "")
         found.append(
-            f"This study is not finished: {len(missing)} runs are missing ({names}). The same "
-            "jbrep study goes on with them."
+            f"This study is not finished: {len(missing)} {_runs(missing)} missing ({names}). The "
+            "same jbrep study goes on."
         )
-    if failed := [run for run in tables.record["runs"] if run["status"] == FAILED]:
+    if failed := failed_rows(tables):
         found.append(
-            f"{len(failed)} runs failed; from there on they count as return 0. Their reasons stand "
-            "below."
+            f"{len(failed)} {_runs(failed)} counted as return 0 from the step on at which they "
+            "failed; why stands below."
         )
     return [*found, *(f"No statistics: {line}." for line in tables.record["left_out"])]
+
+
+def _runs(which: Sequence[object]) -> str:
+    return "run is" if len(which) == 1 else "runs are"
 
 
 def run_rows(tables: Tables) -> Rows:

@@ -21,7 +21,7 @@ _MEASURES = {
 }
 
 _BOUNDARIES = {
-    "similar reward": f"the margin of {MARGIN:.0%}, ",
+    "similar reward": f"the margin of {100 * MARGIN:.0f} %, ",
     "less variance": "",
     "faster learning": "",
 }
@@ -80,7 +80,7 @@ def _sentence(verdict: Plain, representation: str, statistics: Plain) -> str:
     """The numbers behind a verdict, and what would decide where nothing does."""
     nominal = interval(verdict["nominal"], ",.3g")
     _, *ends = verdict["simultaneous"]
-    level = f"{statistics['simultaneous_level']:.2%}"
+    level = f"{100 * statistics['simultaneous_level']:.2f} %"
     pair = f"{representation} against {statistics['baseline']}"
     said = f"{pair}: {_MEASURES[verdict['claim']]} {nominal}"
     if None not in ends:

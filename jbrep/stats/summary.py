@@ -43,7 +43,7 @@ def group_tables(group: Plain, statistics: Plain) -> list[tuple[str, Rows]]:
         ),
     ]
     if group["comparisons"]:
-        level = f"{statistics['simultaneous_level']:.2%}"
+        level = f"{100 * statistics['simultaneous_level']:.2f} %"
         found += [
             (f"Against {statistics['baseline']}", comparison_rows(group)),
             (

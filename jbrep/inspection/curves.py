@@ -1,0 +1,87 @@
+"""A recording of the training curves of a study."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from functools import reduce
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from jbrep.evaluate.evaluation import FULL
+from jbrep.inspection.blueprint import TRAINING_STEP, curves_layout
+from jbrep.inspection.recording import Colour, Recording, palette
+from jbrep.jitterbug.tasks import Array
+from jbrep.stats import RunCurve
+from jbrep.stats.runs import in_order
+
+_RUN_WIDTH = 1.0  # [points]
+_MEDIAN_WIDTH = 4.0  # [points]
+
+
+def curve(run: RunCurve) -> tuple[NDArray[np.int64], Array]:
+    """Training steps and mean returns over the episodes, (k,) each; a failed run ends with 0."""
+    steps, returns = run.steps, run.returns.mean(axis=1)
+    if run.failed_at is None:
+        return steps, returns
+    before = steps < run.failed_at
+    return np.append(steps[before], run.failed_at), np.append(returns[before], 0.0)
+
+
+def median_curve(runs: Sequence[RunCurve]) -> tuple[NDArray[np.int64], Array]:
+    """Median over runs, where all were evaluated; a failed run counts as 0 from there on."""
+    whole = [run.steps for run in runs if run.failed_at is None] or [curve(runs[0])[0]]
+    steps: NDArray[np.int64] = reduce(np.intersect1d, whole)
+    each = [np.interp(steps, *curve(run)) for run in runs]
+    return steps, np.median(each, axis=0)
+
+
+def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
+    """Write the training curves of runs, a colour for each representation.
+
+    Args:
+        runs: of one study, or of several.
+        source: where they come from, in words.
+        path: the .rrd file.
+
+    Raises:
+        InputError: the file can't be written.
+    """
+    labels = defaultdict(list)
+    for run in sorted(runs, key=lambda run: (run.label, run.seed)):
+        labels[run.label].append(run)
+    representations = in_order((run.representation for run in runs), FULL)
+    colours = dict(zip(representations, palette(len(representations)), strict=True))
+    numbers = [number for run in runs for number in (run.steps, run.returns)]
+    recording = Recording(source, _about(source, labels), *numbers)
+    for label, group in labels.items():
+        name = group[0].representation
+        for run in group:
+            path_of_run = f"{label}/seed-{run.seed}"
+            _send(recording, path_of_run, curve(run), name, colours[name], _RUN_WIDTH)
+        _send(recording, f"{label}/median", median_curve(group), name, colours[name], _MEDIAN_WIDTH)
+    groups = sorted({label.rpartition("/")[0] for label in labels})
+    recording.write(path, curves_layout(groups, max(int(curve(run)[0][-1]) for run in runs)))
+
+
+def _send(
+    recording: Recording,
+    path: str,
+    points: tuple[NDArray[np.int64], Array],
+    name: str,
+    colour: Colour,
+    width: float,
+) -> None:
+    steps, returns = points
+    times = [rr.TimeColumn(TRAINING_STEP, sequence=steps)]
+    recording.send_series(path, times, returns[:, None], [name], [colour], width)
+
+
+def _about(source: str, labels: dict[str, list[RunCurve]]) -> str:
+    """The runs and their last returns, as Markdown."""
+    lines = [f"# {source}", "", "| runs | seeds | median return at the end |", "|---|---|---|"]
+    for label, runs in labels.items():
+        last = np.median([curve(run)[1][-1] for run in runs])
+        lines.append(f"| {label} | {len(runs)} | {last:.0f} |")
+    return "\n".join(lines)

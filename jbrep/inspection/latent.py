@@ -1,0 +1,58 @@
+"""An encoder's numbers: what it decodes, its errors, its latent and the latent's path."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+
+from jbrep.encoders import Encoder
+from jbrep.inspection.ghost import Ghost
+from jbrep.inspection.recording import Recording
+from jbrep.inspection.signals import send_decoded, send_features
+from jbrep.jitterbug.tasks import Array
+from jbrep.rollout import Rollout
+
+PATH = "latent/path"
+_ALL_COLOUR, _PATH_COLOUR, _NOW_COLOUR = (90, 98, 112), (86, 180, 233), (240, 228, 66)
+_ALL_RADIUS, _PATH_RADIUS, _NOW_RADIUS = -1.2, -1.0, -6.0  # [points]: Rerun's sign for these
+
+
+def send_encoding(
+    recording: Recording,
+    times: Sequence[rr.TimeColumn],
+    rollout: Rollout,
+    encoder: Encoder,
+    ghost: Ghost,
+) -> None:
+    """Decoded features, their errors with the features scaled, and the latent."""
+    task = rollout.task
+    send_decoded(recording, times, task, ghost.observation)
+    errors = (ghost.observation - rollout.observation) / encoder.scaler.half_width
+    send_features(recording, "error", times, task, errors.astype(np.float32), "scaled")
+    total = np.sqrt(np.square(errors).mean(axis=1, keepdims=True))
+    recording.send_series("error/total", times, total, ["root mean square [scaled]"])
+    names = [f"unit {i}" for i in range(encoder.latent_size)]
+    recording.send_series("latent/units", times, ghost.latent, names)
+    _send_path(recording, times, ghost.latent.astype(np.float64))
+
+
+def principal_components(latent: Array) -> Array:
+    """Latents (n, l) along the first two directions in which they vary, (n, 2)."""
+    centred = latent - latent.mean(axis=0)
+    _, _, directions = np.linalg.svd(centred, full_matrices=False)
+    two = np.zeros((2, latent.shape[1]))
+    two[: len(directions)] = directions[:2]
+    largest = two[[0, 1], np.abs(two).argmax(axis=1)]
+    return centred @ (two * np.where(largest < 0, -1, 1)[:, None]).T  # a sign of its own
+
+
+def _send_path(recording: Recording, times: Sequence[rr.TimeColumn], latent: Array) -> None:
+    """All latents as points, the way from each to the next, and where it is now."""
+    path = principal_components(latent)
+    recording.send(f"{PATH}/all", rr.Points2D(path, colors=[_ALL_COLOUR], radii=[_ALL_RADIUS]))
+    pieces = np.stack((np.concatenate((path[:1], path[:-1])), path), axis=1)
+    recording.send_columns(PATH, times, rr.LineStrips2D.columns(strips=pieces.astype(np.float32)))
+    recording.send(PATH, rr.LineStrips2D.from_fields(colors=[_PATH_COLOUR], radii=[_PATH_RADIUS]))
+    now = rr.Points2D.from_fields(colors=[_NOW_COLOUR], radii=[_NOW_RADIUS])
+    recording.send_columns(f"{PATH}/now", times, rr.Points2D.columns(positions=path))
+    recording.send(f"{PATH}/now", now)

@@ -1,0 +1,126 @@
+"""A Rerun recording, built up in memory column by column and written whole."""
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from jbrep.dataset.storage import exists, make_folder, write_whole
+from jbrep.errors import InputError
+
+PROVENANCE = "provenance"
+SUFFIX = ".rrd"
+_APPLICATION = "jbrep"
+_MAGIC = b"RRF"  # what a Rerun recording begins with, whatever its version
+_COLOURS = (  # Okabe and Ito's, for the colour-blind too, with grey for black on a dark viewer
+    *((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167)),
+    *((213, 94, 0), (240, 228, 66), (0, 114, 178), (160, 160, 160)),
+)
+
+Colour = tuple[int, int, int]
+GREY: Colour = (160, 160, 160)  # seen on a light viewer and on a dark one
+
+
+def palette(count: int) -> list[Colour]:
+    """So many colours; they come again after eight."""
+    return [_COLOURS[i % len(_COLOURS)] for i in range(count)]
+
+
+def lighten(colour: Colour) -> Colour:
+    """Half way to white."""
+    red, green, blue = ((part + 255) // 2 for part in colour)
+    return red, green, blue
+
+
+class Recording:
+    """What is sent stays in memory until it is written.
+
+    Args:
+        name: what the viewer calls it.
+        about: Markdown, shown beside it.
+        numbers: with the text they name the recording: the same content has the same id.
+    """
+
+    def __init__(self, name: str, about: str, *numbers: NDArray[Any]):
+        digest = hashlib.sha256(about.encode())
+        for array in numbers:
+            digest.update(array.tobytes())
+        self._stream = rr.RecordingStream(
+            _APPLICATION, recording_id=digest.hexdigest()[:32], send_properties=False
+        )
+        self._memory = self._stream.memory_recording()
+        self._stream.send_recording_name(name)
+        self.send_text(PROVENANCE, about)
+
+    def send(self, path: str, *parts: rr.AsComponents) -> None:
+        """What holds at all times."""
+        self._stream.log(path, *parts, static=True, strict=True)
+
+    def send_text(self, path: str, markdown: str) -> None:
+        """A page of text."""
+        self.send(path, rr.TextDocument(markdown, media_type="text/markdown"))
+
+    def send_columns(
+        self, path: str, times: Sequence[rr.TimeColumn], *columns: Iterable[rr.ComponentColumn]
+    ) -> None:
+        """What changes, a row for each time."""
+        flat = [column for each in columns for column in each]
+        self._stream.send_columns(path, times, flat, strict=True)
+
+    def send_series(
+        self,
+        path: str,
+        times: Sequence[rr.TimeColumn],
+        values: NDArray[Any],
+        names: Sequence[str],
+        colours: Sequence[Colour] | None = None,
+        width: float = 2.0,
+    ) -> None:
+        """Lines in one plot.
+
+        Args:
+            path: of the entity.
+            times: of the rows.
+            values: (rows, lines).
+            names: of the lines, with their units.
+            colours: of the lines; the first of `palette` if not given.
+            width: of the lines [points].
+        """
+        lines = len(names)
+        style = rr.SeriesLines(
+            names=names, colors=colours or palette(lines), widths=[width] * lines
+        )
+        self.send(path, style)
+        self.send_columns(path, times, rr.Scalars.columns(scalars=values))
+
+    def write(self, path: Path, blueprint: rrb.Blueprint) -> None:
+        """Write it with its layout, whole or not at all.
+
+        Raises:
+            InputError: something else stands there, or it can't be written.
+        """
+        check_out(path)
+        make_folder(path.parent)
+        self._stream.send_blueprint(blueprint)
+        write_whole(path, self._memory.drain_as_bytes())
+
+
+def check_out(path: Path) -> None:
+    """Make sure that nothing but an earlier recording is overwritten.
+
+    Raises:
+        InputError: something else stands there.
+    """
+    if not exists(path):
+        return
+    try:
+        with path.open("rb") as file:
+            earlier = file.read(len(_MAGIC)) == _MAGIC
+    except OSError as error:
+        raise InputError(f"can't write {path}: {error.strerror}") from None
+    if not earlier:
+        raise InputError(f"{path} is there and is no Rerun recording: choose another --out")

@@ -1,0 +1,121 @@
+"""A recording of what each unit of a latent moves."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from jbrep.encoders import Encoder
+from jbrep.inspection.blueprint import TRAVERSE, traversal_layout
+from jbrep.inspection.episode import provenance
+from jbrep.inspection.ghost import Ghost, legs
+from jbrep.inspection.recording import GREY, Recording
+from jbrep.inspection.robot import Robot
+from jbrep.inspection.scene import WORLD, send_floor
+from jbrep.jitterbug.tasks import Array
+from jbrep.rollout import Rollout
+
+POINTS = 101
+SPACING = 0.12  # [m] between the robots
+_ENDS = (1, 99)  # [%] of the episode's latents
+_LABEL_HEIGHT = 0.1  # [m]
+_MOST = 3  # features that the summary names
+
+
+def sweep(latent: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Each unit from end to end, the others at their medians: (n, l) to (l, 101, l)."""
+    low, high = np.percentile(latent, _ENDS, axis=0)
+    units = latent.shape[1]
+    swept = np.tile(np.median(latent, axis=0), (units, POINTS, 1))
+    swept[range(units), :, range(units)] = np.linspace(low, high, POINTS, axis=1)
+    return swept.astype(np.float32)
+
+
+def record_traversal(rollout: Rollout, path: Path, encoder: Encoder) -> None:
+    """Write the recording of a robot for each unit, which shows what is decoded as it moves.
+
+    Args:
+        rollout: the episode that says how far the units go.
+        path: the .rrd file.
+        encoder: made for the episode's task.
+
+    Raises:
+        InputError: the file can't be written.
+    """
+    swept = sweep(encoder.encode(rollout.observation.astype(np.float32)))
+    about = provenance(rollout, encoder)
+    name = f"{encoder.name} on {rollout.name}: each unit of the latent"
+    recording = Recording(name, about, swept)
+    times = [rr.TimeColumn(TRAVERSE, sequence=np.arange(POINTS))]
+    robot, places = Robot(), _places(len(swept))
+    recording.send(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    send_floor(recording, places[:, :2])
+    moved = []
+    for unit, (latent, place) in enumerate(zip(swept, places, strict=True)):
+        ghost = Ghost.of(encoder, rollout.task, latent)
+        _send_robot(recording, robot, times, ghost.qpos, unit, place)
+        scaled = encoder.scaler.scale(ghost.observation)
+        moved.append(np.argsort(-np.ptp(scaled, axis=0))[:_MOST])
+        _send_features(recording, times, scaled, unit, moved[-1], encoder.feature_names)
+    recording.send_text(f"{TRAVERSE}/summary", _summary(encoder, rollout, swept, moved))
+    recording.write(path, traversal_layout(places))
+
+
+def _places(units: int) -> Array:
+    """A row in which each unit has its place, (units, 3)."""
+    places = np.zeros((units, 3))
+    places[:, 0] = SPACING * (np.arange(units) - (units - 1) / 2)
+    return places
+
+
+def _send_robot(
+    recording: Recording,
+    robot: Robot,
+    times: list[rr.TimeColumn],
+    qpos: Array,
+    unit: int,
+    place: Array,
+) -> None:
+    """A unit's robot at its place, under its name: in x and y it would leave the row."""
+    here = np.concatenate((np.tile(place[:2], (len(qpos), 1)), qpos[:, 2:]), axis=1)
+    path = f"{WORLD}/unit_{unit}"
+    robot.draw(recording, path, times, here, still=legs(robot))
+    above = [(*place[:2], _LABEL_HEIGHT)]
+    label = rr.Points3D(
+        above, labels=[f"unit {unit}"], colors=[GREY], radii=[0.0], show_labels=True
+    )
+    recording.send(f"{path}/label", label)
+
+
+def _send_features(
+    recording: Recording,
+    times: list[rr.TimeColumn],
+    scaled: Array,
+    unit: int,
+    most: NDArray[np.int64],
+    names: Sequence[str],
+) -> None:
+    """All decoded features, and those that move most."""
+    path = f"{TRAVERSE}/unit_{unit}"
+    labels = [f"{name} [scaled]" for name in names]
+    recording.send_series(f"{path}/decoded", times, scaled, labels)
+    recording.send_series(f"{path}/most", times, scaled[:, most], [labels[i] for i in most])
+
+
+def _summary(
+    encoder: Encoder, rollout: Rollout, swept: NDArray[np.float32], moved: list[NDArray[np.int64]]
+) -> str:
+    """What each unit moves most, as a table in Markdown."""
+    lines = ["| unit | from | to | moves most |", "|---|---|---|---|"]
+    for unit, (latent, most) in enumerate(zip(swept, moved, strict=True)):
+        spans = np.ptp(encoder.decode(latent), axis=0)
+        features = [rollout.task.features[i] for i in most]
+        told = [
+            f"{feature.name} {spans[i]:.3g} {feature.unit}".removesuffix(" 1")
+            for i, feature in zip(most, features, strict=True)
+        ]
+        ends = f"{latent[0, unit]:.2f} | {latent[-1, unit]:.2f}"
+        lines.append(f"| {unit} | {ends} | {', '.join(told)} |")
+    return "\n".join(lines)

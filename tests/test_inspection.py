@@ -1,0 +1,496 @@
+"""Recordings hold what they were made from, as Rerun's own reader finds it."""
+
+import re
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from rerun.chunk import RrdReader
+
+from jbrep.cli import main
+from jbrep.encoders import find, save
+from jbrep.encoders.file import fingerprint
+from jbrep.errors import InputError
+from jbrep.inspection import inspect
+from jbrep.inspection.ghost import shades
+from jbrep.inspection.latent import principal_components
+from jbrep.inspection.robot import Robot
+from jbrep.inspection.scene import contacts
+from jbrep.inspection.traversal import POINTS, SPACING, sweep
+from jbrep.jitterbug.tasks import TASKS
+from jbrep.rl.files import ENCODER, FAILED, Evaluation, read_evaluations, write_rows, write_run
+from jbrep.sources import find_episode
+
+FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
+ROWS = 1001
+
+
+def read(path):
+    """The columns of each entity by name, as Rerun reads them."""
+    found = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        named = dict(zip(batch.schema.names, batch.columns, strict=True))
+        found.setdefault(chunk.entity_path, {}).update(named)
+    return found
+
+
+def values(entity, name):
+    return np.array(entity[name].to_pylist())
+
+
+def scalars(entity):
+    return values(entity, "Scalars:scalars")
+
+
+def names(entity):
+    return entity["SeriesLines:names"].to_pylist()[0]
+
+
+def text(entity):
+    return entity["TextDocument:text"].to_pylist()[0][0]
+
+
+def poses(entity):
+    """Positions (n, 3) and quaternions (n, 4), w first."""
+    turned = values(entity, "Transform3D:quaternion")[:, 0]
+    return values(entity, "Transform3D:translation")[:, 0], turned[:, [3, 0, 1, 2]]
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return Robot()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("inspection")
+
+
+@pytest.fixture(scope="module")
+def rollout():
+    return find_episode(FACE, 1)
+
+
+@pytest.fixture(scope="module")
+def recorded(folder):
+    return inspect(FACE, 1, encoder="dae-8", out=folder / "dae-8.rrd")
+
+
+@pytest.fixture(scope="module")
+def entities(recorded):
+    return read(recorded)
+
+
+@pytest.fixture(scope="module")
+def unchanged(folder):
+    """Of an encoder that gives back what it took, on the task that observes most."""
+    return inspect(POSE, encoder="identity", out=folder / "identity.rrd")
+
+
+@pytest.fixture(scope="module")
+def traversed(folder):
+    return inspect(FACE, 1, encoder="dae-8", traverse=True, out=folder / "traverse.rrd")
+
+
+def test_every_body_and_geom_of_the_model_is_there(entities, robot):
+    assert len(robot.bodies) == 10
+    for name, path in robot.paths.items():
+        entity = entities[f"/world/robot/{path}"]
+        for part in (*poses(entity), entity["step"], entity["time"]):
+            assert len(part) == ROWS
+        body = robot.model.body(name)
+        for geom in range(body.geomadr[0], body.geomadr[0] + body.geomnum[0]):
+            assert f"/world/robot/{path}/{robot.model.geom(geom).name}" in entities
+    assert {"/world/floor", "/world/target/target", "/world/target/target_pointer"} <= {*entities}
+
+
+def test_shapes_are_the_models(entities, robot):
+    weight = entities["/world/robot/jitterbug/weight/weight"]
+    geom = robot.model.geom("weight")
+    np.testing.assert_allclose(values(weight, "Ellipsoids3D:half_sizes")[0, 0], geom.size)
+    np.testing.assert_allclose(values(weight, "Ellipsoids3D:centers")[0, 0], geom.pos, rtol=1e-6)
+    assert values(weight, "Ellipsoids3D:colors").item() == 0xD93326FF  # .85 .2 .15
+    leg = entities["/world/robot/jitterbug/leg1_upper/leg1_lower/leg1_lower"]
+    assert values(leg, "Cylinders3D:lengths").item() == pytest.approx(0.065)
+    foot = entities["/world/robot/jitterbug/leg1_upper/leg1_lower/leg1_foot"]
+    np.testing.assert_allclose(values(foot, "Ellipsoids3D:half_sizes")[0, 0], [0.003] * 3)
+    box = entities["/world/robot/jitterbug/core_lower"]
+    np.testing.assert_allclose(values(box, "Boxes3D:half_sizes")[0, 0], [0.008, 0.006, 0.008])
+
+
+def test_poses_are_mujocos(robot, rollout):
+    data, rows = mujoco.MjData(robot.model), range(0, ROWS, 100)
+    local, world = robot.poses(rollout.qpos), robot.origins(rollout.qpos)
+    for row in rows:
+        data.qpos[:] = rollout.qpos[row]
+        mujoco.mj_kinematics(robot.model, data)
+        for name in robot.bodies:
+            body = robot.model.body(name)
+            np.testing.assert_allclose(world[name][row], data.xpos[body.id], atol=1e-12)
+            back, turned = np.empty(4), np.empty(4)
+            mujoco.mju_negQuat(back, data.xquat[body.parentid[0]])
+            mujoco.mju_mulQuat(turned, back, data.xquat[body.id])
+            np.testing.assert_allclose(abs(turned @ local[name][1][row]), 1, atol=1e-12)
+
+
+def test_poses_are_the_episodes(entities, rollout):
+    position, quaternion = poses(entities["/world/robot/jitterbug"])
+    np.testing.assert_array_equal(position, rollout.qpos[:, :3].astype(np.float32))
+    np.testing.assert_array_equal(quaternion, rollout.qpos[:, 3:7].astype(np.float32))
+    _, weight = poses(entities["/world/robot/jitterbug/weight"])
+    np.testing.assert_allclose(weight[:, 0], np.cos(rollout.qpos[:, 15] / 2), atol=1e-6)
+    target, turned = poses(entities["/world/target"])
+    np.testing.assert_array_equal(target[0], rollout.target_position.astype(np.float32))
+    np.testing.assert_allclose(turned[0], rollout.target_quaternion, atol=1e-7)
+
+
+def test_the_timelines(entities):
+    entity = entities["/observation/position"]
+    np.testing.assert_array_equal(entity["step"].to_numpy(), np.arange(ROWS))
+    np.testing.assert_array_equal(
+        entity["time"].to_numpy(zero_copy_only=False) / np.timedelta64(10, "ms"), np.arange(ROWS)
+    )
+    assert entities["/action"]["step"].to_numpy()[-1] == ROWS - 2
+    assert entities["/reward/total"]["step"].to_numpy()[0] == 1
+
+
+def test_series_are_the_episodes(entities, rollout):
+    for observable, part in zip(
+        rollout.task.observables, rollout.task.split(rollout.observation).values(), strict=True
+    ):
+        entity = entities[f"/observation/{observable.name}"]
+        np.testing.assert_array_equal(scalars(entity), part)
+        assert names(entity) == [f"{f.name} [{f.unit}]" for f in observable.features]
+    np.testing.assert_array_equal(scalars(entities["/action"]), rollout.action)
+    np.testing.assert_array_equal(scalars(entities["/reward/total"])[:, 0], rollout.reward)
+    terms = entities["/reward/terms"]
+    np.testing.assert_array_equal(scalars(terms), np.transpose([*rollout.terms.values()]))
+    assert names(terms) == ["upright [1]", "heading [1]"]
+
+
+def test_contacts_carry_the_robot(entities, robot, rollout):
+    found = contacts(robot, rollout)
+    weight = robot.model.body("jitterbug").subtreemass[0] * 9.81
+    lift = found.forces[:, 2].sum() / ROWS
+    assert lift == pytest.approx(weight, rel=0.1)  # over ten seconds, as it stays on the floor
+    assert np.abs(found.points[:, 2]).max() < 3e-3  # [m] half of how far a foot sinks in
+    assert len({*found.counts}) > 1
+    entity = entities["/world/contacts"]
+    np.testing.assert_array_equal(
+        [len(each) for each in entity["Points3D:positions"].to_pylist()], found.counts
+    )
+    sent = np.concatenate([p for p in entity["Points3D:positions"].to_pylist() if p])
+    np.testing.assert_allclose(sent, found.points, atol=1e-7)
+
+
+def test_what_is_decoded(entities, rollout):
+    encoder, task = find("dae-8", "face_direction"), rollout.task
+    latent = encoder.encode(rollout.observation.astype(np.float32))
+    decoded = encoder.decode(latent).astype(float)
+    np.testing.assert_array_equal(scalars(entities["/latent/units"]), latent)
+    errors = (decoded - rollout.observation) / encoder.scaler.half_width
+    for name, part in task.split(decoded).items():
+        np.testing.assert_array_equal(scalars(entities[f"/reconstruction/{name}"]), part)
+        error = scalars(entities[f"/error/{name}"])
+        np.testing.assert_allclose(error, task.split(errors)[name], rtol=1e-5, atol=1e-7)
+    total = np.sqrt(np.mean(errors**2, axis=1))
+    np.testing.assert_allclose(scalars(entities["/error/total"])[:, 0], total)
+    position, quaternion = poses(entities["/world/ghost/jitterbug"])
+    np.testing.assert_array_equal(position, decoded[:, :3].astype(np.float32))
+    length = np.linalg.norm(decoded[:, 3:7], axis=1, keepdims=True)
+    np.testing.assert_allclose(quaternion, decoded[:, 3:7] / length, atol=1e-6)
+    _, weight = poses(entities["/world/ghost/jitterbug/weight"])
+    half = (decoded[:, 13] - np.pi / 2) / 2
+    np.testing.assert_allclose(weight[:, [0, 3]].T, (np.cos(half), np.sin(half)), atol=1e-6)
+    apart = np.linalg.norm(decoded[:, :3] - rollout.qpos[:, :3], axis=1)
+    bodies = entities["/error/bodies"]
+    assert names(bodies)[0] == "jitterbug [mm]"
+    np.testing.assert_allclose(scalars(bodies)[:, 0], 1e3 * apart)
+    aligned, attitude = poses(entities["/world/aligned/jitterbug"])
+    np.testing.assert_array_equal(aligned, rollout.qpos[:, :3].astype(np.float32))
+    np.testing.assert_array_equal(attitude, quaternion)
+
+
+def test_an_encoder_that_keeps_all_gives_the_robot_back(unchanged):
+    found, true = read(unchanged), find_episode(POSE)
+    for path in ("jitterbug", "jitterbug/weight"):
+        for ours, theirs in zip(
+            poses(found[f"/world/ghost/{path}"]), poses(found[f"/world/robot/{path}"]), strict=True
+        ):
+            up_to_sign = np.where((ours * theirs).sum(axis=1, keepdims=True) < 0, -1, 1)
+            np.testing.assert_allclose(ours * up_to_sign, theirs, atol=1e-5)
+    leg = found["/world/ghost/jitterbug/leg1_upper"]
+    assert len(leg["Transform3D:translation"]) == 1  # static: legs are at rest
+    target = values(found["/world/ghost/target"], "Points3D:positions")[:, 0]
+    np.testing.assert_allclose(target, np.tile(true.target_position, (ROWS, 1)), atol=1e-5)
+    heading = values(found["/world/ghost/heading"], "Arrows3D:vectors")[:, 0, :2]
+    axis = true.readings.target_axis
+    np.testing.assert_allclose(heading, np.linalg.norm(heading[0]) * axis, atol=1e-5)
+
+
+def test_colours_go_from_small_errors_to_large():
+    shown = shades(np.array([0, 1e-3, 1e-2, 1e-1, 1]))
+    np.testing.assert_array_equal(shown[[0, 3], :3], [(59, 82, 139), (253, 231, 37)])
+    np.testing.assert_array_equal(shown[[0, 3]], shown[[1, 4]])
+    assert (np.diff(shown[:4, 1].astype(int)) >= 0).all()
+    assert (shown[:, 3] == shown[0, 3]).all()
+    assert shown[0, 3] < 255
+
+
+def test_principal_components():
+    random = np.random.default_rng(0)
+    latent = random.normal(size=(200, 5)) * (0.1, 3, 0.1, 1, 0.1)
+    path = principal_components(latent)
+    np.testing.assert_allclose(np.corrcoef(path.T), np.eye(2), atol=1e-12)
+    assert path[:, 0].std() > path[:, 1].std() > 0.9
+    two = latent[:, [1, 3]]
+    apart = np.linalg.norm(two[1:] - two[:-1], axis=1)
+    kept = principal_components(two)
+    np.testing.assert_allclose(np.linalg.norm(kept[1:] - kept[:-1], axis=1), apart)
+    assert not principal_components(latent[:, :1])[:, 1].any()
+
+
+@pytest.mark.parametrize("recording", ["recorded", "unchanged", "traversed"])
+def test_recordings_are_small_and_bring_their_layout(recording, request):
+    path = request.getfixturevalue(recording)
+    limit = 3e6
+    assert path.stat().st_size < limit
+    assert [store.application_id for store in RrdReader(path).blueprints()] == ["jbrep"]
+
+
+def test_the_provenance(entities, rollout):
+    told = text(entities["/provenance"])
+    encoder = find("dae-8", "face_direction")
+    for fact in (
+        f"# {FACE}, episode 1",
+        "- task: face_direction",
+        f"- seed: {rollout.seed}",
+        f"- return: {rollout.reward.sum():.1f}",
+        "- encoder: dae-8 (dae)",
+        "- sizes: 16 features, 8 units",
+        fingerprint(encoder),
+        "- jbrep: ",
+        "- mujoco: ",
+    ):
+        assert fact in told
+
+
+def test_the_same_inputs_give_the_same_content(recorded, entities, folder):
+    def identity(path):
+        return RrdReader(path).recordings()[0].recording_id
+
+    again = inspect(FACE, 1, encoder="dae-8", out=folder / "again.rrd")
+    other = inspect(FACE, 1, out=folder / "other.rrd")
+    assert identity(again) == identity(recorded) != identity(other)
+    found = read(again)
+    assert {*found} == {*entities}
+    for path, entity in entities.items():
+        for name, column in entity.items():
+            assert name == "rerun.controls.RowId" or column.equals(found[path][name]), (path, name)
+
+
+def test_a_traversal_shows_what_each_unit_decodes_to(traversed, rollout):
+    encoder, found = find("dae-8", "face_direction"), read(traversed)
+    latent = encoder.encode(rollout.observation.astype(np.float32))
+    swept = sweep(latent)
+    assert swept.shape == (8, POINTS, 8)
+    for unit in range(8):
+        ends = np.percentile(latent[:, unit], (1, 99))
+        np.testing.assert_allclose(swept[unit, [0, -1], unit], ends, rtol=1e-5, atol=1e-6)
+        others = np.delete(np.median(latent, axis=0), unit)
+        still = np.delete(swept[unit], unit, axis=1)
+        np.testing.assert_allclose(still, np.tile(others, (POINTS, 1)), rtol=1e-6)
+        decoded = encoder.decode(swept[unit])
+        scaled = encoder.scaler.scale(decoded)
+        series = found[f"/traverse/unit_{unit}/decoded"]
+        np.testing.assert_allclose(scalars(series), scaled, rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(series["traverse"].to_numpy(), np.arange(POINTS))
+        most = encoder.feature_names[np.ptp(scaled, axis=0).argmax()]
+        assert names(found[f"/traverse/unit_{unit}/most"])[0] == f"{most} [scaled]"
+        row = re.search(rf"^\| {unit} \|.*$", text(found["/traverse/summary"]), re.M)[0]
+        assert f"| {most} " in row
+        position, quaternion = poses(found[f"/world/unit_{unit}/jitterbug"])
+        np.testing.assert_allclose(position[:, 0], SPACING * (unit - 3.5), atol=1e-6)
+        np.testing.assert_allclose(position[:, 2], decoded[:, 2])
+        assert len(quaternion) == POINTS
+
+
+def write_study(folder):
+    """Two representations with two runs each, of which one failed."""
+    random = np.random.default_rng(0)
+    for representation in ("full", "dae-8"):
+        for seed in (0, 1):
+            failed = (representation, seed) == ("dae-8", 1)
+            run = folder / "runs" / representation / f"seed-{seed}"
+            run.mkdir(parents=True)
+            settings = {
+                "task": "face_direction",
+                "algorithm": "sac",
+                "preset": "paper",
+                "representation": representation,
+                "steps": 300,
+                "seed": seed,
+            }
+            end = {"status": FAILED, "steps": 150} if failed else {"status": "ok", "steps": 300}
+            write_run(run, {"settings": settings, **end, "seconds": 1.0})
+            rows = [
+                Evaluation(step, episode, float(random.uniform(0, 1000)))
+                for step in ((0, 100) if failed else (0, 100, 200, 300))
+                for episode in (0, 1)
+            ]
+            write_rows(run / "evaluations.csv", rows, Evaluation)
+    return folder
+
+
+def test_training_curves_are_the_evaluations(tmp_path):
+    study = write_study(tmp_path / "study")
+    found = read(inspect(str(study), out=tmp_path / "curves.rrd"))
+    curves = {}
+    for seed in (0, 1):
+        rows = read_evaluations(study / "runs" / "full" / f"seed-{seed}")
+        entity = found[f"/face_direction/sac/full/seed-{seed}"]
+        np.testing.assert_array_equal(entity["training_step"].to_numpy(), [0, 100, 200, 300])
+        curves[seed] = scalars(entity)[:, 0]
+        for step, mean in zip((0, 100, 200, 300), curves[seed], strict=True):
+            assert mean == pytest.approx(
+                np.mean([r.episode_return for r in rows if r.step == step])
+            )
+    median = found["/face_direction/sac/full/median"]
+    np.testing.assert_allclose(scalars(median)[:, 0], (curves[0] + curves[1]) / 2)
+    failed = found["/face_direction/sac/dae-8/seed-1"]
+    assert failed["training_step"].to_pylist() == [0, 100, 150]
+    assert scalars(failed)[-1] == 0
+    median = found["/face_direction/sac/dae-8/median"]
+    assert median["training_step"].to_pylist() == [0, 100, 200, 300]
+    whole = scalars(found["/face_direction/sac/dae-8/seed-0"])
+    np.testing.assert_allclose(scalars(median)[2:], whole[2:] / 2)
+    runs = {path: names(entity) for path, entity in found.items() if "seed" in path}
+    assert {tuple(label) for label in runs.values()} == {("full",), ("dae-8",)}
+    colours = {
+        path.split("/")[3]: entity["SeriesLines:colors"].to_pylist()
+        for path, entity in found.items()
+        if "seed" in path
+    }
+    assert colours["full"] != colours["dae-8"]
+    assert "| face_direction/sac/full | 2 |" in text(found["/provenance"])
+
+
+def test_a_run_shows_its_own_encoder(tmp_path, rollout, monkeypatch):
+    monkeypatch.setattr("jbrep.inspection.subject.find_episode", lambda *given: rollout)
+    for name in ("dae-4", "identity"):
+        write_run(tmp_path, {"settings": {}, "status": "finished", "seconds": 1.0})
+        save(find(name, "face_direction"), tmp_path / ENCODER)
+        found = read(inspect(str(tmp_path), out=tmp_path / f"{name}.rrd"))
+        assert ("/world/ghost/jitterbug" in found) == (name == "dae-4")
+        other = read(inspect(str(tmp_path), encoder="dae-8", out=tmp_path / "other.rrd"))
+        assert "- encoder: dae-8 (dae)" in text(other["/provenance"])
+
+
+def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
+    file = Path("jbrep/encoders/shipped/face_direction/dae-4.safetensors")
+    by_name = inspect(encoder="dae-4", task="face_direction", out=tmp_path / "name.rrd")
+    by_file = inspect(str(file), out=tmp_path / "file.rrd")
+    ours, theirs = read(by_name), read(by_file)
+    assert "# uniform" in text(ours["/provenance"])
+    np.testing.assert_array_equal(scalars(ours["/latent/units"]), scalars(theirs["/latent/units"]))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "give a SOURCE to inspect, or one encoder with its --task"),
+        ({"source": "tests"}, "tests is no data set and no run, and none is over below it"),
+        ({"source": "nowhere"}, "nowhere is no data set, no folder of a run that is over, and no"),
+        ({"source": FACE, "episode": 9}, "has no episode 9: it has 4, from 0"),
+        ({"source": FACE, "task": "move_to_pose"}, "is of face_direction, not of move_to_pose"),
+        ({"source": FACE, "encoder": "dae-9"}, "no encoder 'dae-9'"),
+        ({"source": FACE, "traverse": True}, "--traverse moves the units of a latent: give an"),
+        ({"encoder": "dae-8"}, "no encoder at dae-8: of one that ships, the --task is needed"),
+        ({"source": "none.safetensors"}, "no encoder at none.safetensors"),
+        (
+            {
+                "source": POSE,
+                "encoder": "jbrep/encoders/shipped/face_direction/dae-4.safetensors",
+            },
+            "dae-4 was made for face_direction",
+        ),
+        (
+            {"source": FACE, "out": Path("README.md")},
+            "README.md is there and is no Rerun recording",
+        ),
+        ({"source": FACE, "out": Path("docs")}, "can't write docs: Is a directory"),
+    ],
+)
+def test_mistakes(given, message):
+    with pytest.raises(InputError, match=re.escape(message)):
+        inspect(**given)
+
+
+def test_a_study_has_no_episodes(tmp_path):
+    study = str(write_study(tmp_path / "study"))
+    for given in ({"episode": 0}, {"encoder": "dae-8"}, {"traverse": True}, {"task": TASKS}):
+        with pytest.raises(InputError, match="holds several runs: of these training curves"):
+            inspect(study, **given)
+
+
+def test_an_earlier_recording_is_overwritten_and_nothing_else(tmp_path):
+    out = tmp_path / "it.rrd"
+    out.write_text("mine")
+    with pytest.raises(InputError, match="is no Rerun recording: choose another --out"):
+        inspect(FACE, out=out)
+    assert out.read_text() == "mine"
+    assert list(tmp_path.iterdir()) == [out]
+    out.write_bytes(b"RRF2 an earlier one")
+    inspect(FACE, out=out)
+    assert "/world/robot/jitterbug" in read(out)
+
+
+def jbrep(*arguments):
+    result = CliRunner().invoke(main, [str(a) for a in arguments], prog_name="jbrep")
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result
+
+
+def test_the_command_names_the_file_after_its_content(tmp_path, monkeypatch):
+    (tmp_path / "data").symlink_to(Path("data").resolve())
+    monkeypatch.chdir(tmp_path)
+    told = jbrep("inspect", FACE, "--episode", 1, "--encoder", "dae-8").output
+    path = "inspect/face_direction-data-sample-episode-1-dae-8.rrd"
+    assert told == f"{path}; open it with: rerun {path}\n"
+    assert len(read(tmp_path / path)["/observation/position"]["step"]) == ROWS
+    told = jbrep("inspect", "--encoder", "dae-4", "--task", "move_to_pose", "--traverse").output
+    assert "inspect/move_to_pose-uniform-episode-0-dae-4-traverse.rrd;" in told
+    refused = jbrep("inspect", FACE, "--view", "--serve")
+    assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
+    assert "Example: jbrep inspect " in jbrep("inspect", "--help").output
+
+
+@pytest.mark.parametrize("code", [0, 3])
+def test_the_viewer_is_rerun_itself_and_serves_this_machine_alone(code, tmp_path, monkeypatch):
+    class Viewer:
+        pid = 1 << 30  # nobody's
+
+        def __init__(self, command, process_group):
+            commands.append(command)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            return None
+
+        def wait(self):
+            return code
+
+    commands = []
+    monkeypatch.setattr("subprocess.Popen", Viewer)
+    out = tmp_path / "it.rrd"
+    shown = jbrep("inspect", FACE, "--out", out, "--view")
+    served = jbrep("inspect", FACE, "--out", out, "--serve")
+    assert commands[0][1:] == ["-m", "rerun", "--bind", "127.0.0.1", str(out)]
+    assert commands[1][3:6] == ["--bind", "127.0.0.1", "--serve-web"]
+    assert f"http://127.0.0.1:{commands[1][7]}/" in served.output
+    assert (shown.exit_code, served.exit_code) == ((2, 2) if code else (0, 0))

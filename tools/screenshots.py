@@ -1,0 +1,64 @@
+"""Screenshots for the README: python tools/screenshots.py REPORT RECORDING FOLDER.
+
+The report takes Chromium; the recording Rerun's viewer without a window, and so a Vulkan driver.
+"""
+
+import io
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import rerun_cli
+from PIL import Image
+from playwright.sync_api import sync_playwright
+from rerun.experimental import ViewerClient
+
+SIZE = (1180, 1750)  # of the report [pixels]
+WINDOW = "1760x1080"
+BAR = 36  # the viewer's own, at the top [pixels]
+SECONDS = 5.8  # of the episode
+PORT = 9977
+START, DRAW = 10, 4  # [s]
+
+
+def report(page: Path, out: Path) -> None:
+    with sync_playwright() as started:
+        path = shutil.which("chromium") or shutil.which("google-chrome")
+        browser = started.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        opened = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
+        opened.goto(page.resolve().as_uri())
+        save(Image.open(io.BytesIO(opened.screenshot())), out)
+        browser.close()
+
+
+def recording(path: Path, out: Path) -> None:
+    program = Path(rerun_cli.__file__).with_name("rerun")
+    options = ("--headless", "--window-size", WINDOW, "--port", str(PORT))
+    viewer = subprocess.Popen([program, *options, path])
+    try:
+        time.sleep(START)
+        client = ViewerClient.connect(f"rerun+http://127.0.0.1:{PORT}/proxy")
+        client.set_time("time", duration=SECONDS, play_state="paused")
+        time.sleep(DRAW)
+        client.save_screenshot(str(out))
+    finally:
+        viewer.terminate()
+        viewer.wait()
+    shown = Image.open(io.BytesIO(out.read_bytes()))
+    save(shown.crop((0, BAR, *shown.size)), out)
+
+
+def save(picture: Image.Image, out: Path) -> None:
+    """In few colours, by coverage, so that small things keep theirs."""
+    shown = picture.convert("RGB")
+    few = shown.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+    few.save(out, optimize=True)
+    print(out)
+
+
+if __name__ == "__main__":
+    page, episode, folder = map(Path, sys.argv[1:])
+    report(page, folder / "report.png")
+    recording(episode, folder / "rerun.png")
