@@ -14,9 +14,10 @@ from jbrep.errors import InputError
 from jbrep.report import write_report
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, SUMMARY
 from jbrep.report.tables import read_tables
-from jbrep.rl.files import ENCODER, Evaluation, write_rows, write_run
+from jbrep.rl.files import ENCODER, Evaluation, write_csv, write_rows, write_run
+from jbrep.sources import find_episode
 from jbrep.study.config import Study
-from jbrep.study.heuristics import write_heuristics
+from jbrep.study.heuristics import HEURISTIC_RETURNS, write_heuristics
 from jbrep.study.plan import Plan
 from jbrep.study.results import read_results, write_results
 
@@ -78,7 +79,8 @@ def whole(tmp_path_factory):
     """The folder of a study at its end, with one failed run, and its report."""
     folder = tmp_path_factory.mktemp("whole") / "a-study"
     make_study(folder, failed=(1,))
-    write_heuristics(STUDY.tasks, folder)
+    rows = [("face_direction", episode, 940 + episode) for episode in range(20)]
+    write_csv(folder / HEURISTIC_RETURNS, ("task", "episode", "return"), rows)
     conclude(folder)
     return folder
 
@@ -248,13 +250,14 @@ def test_of_single_runs_it_shows_what_there_is(tmp_path):
     assert drawn == ["autoencoders", "every_run", "system"]
 
 
-def test_heuristics_are_played_on_the_starts_of_evaluation(whole, monkeypatch):
-    rows = list(csv.reader((whole / "heuristics.csv").read_text().splitlines()))
+def test_heuristics_are_played_once_on_the_starts_of_evaluation(tmp_path, monkeypatch):
+    rows = list(csv.reader(write_heuristics(STUDY.tasks, tmp_path).read_text().splitlines()))
     assert rows[0] == ["task", "episode", "return"]
     assert len(rows) == 1 + 20
-    assert np.median([float(row[2]) for row in rows[1:]]) > 900
-    monkeypatch.setattr("jbrep.study.heuristics.episode_returns", None)  # nor played again
-    write_heuristics(STUDY.tasks, whole)
+    alone = find_episode("heuristic", 3, "face_direction").reward.sum()
+    assert float(rows[4][2]) == pytest.approx(alone, abs=1e-3)
+    monkeypatch.setattr("jbrep.study.heuristics.episode_returns", None)
+    write_heuristics(STUDY.tasks, tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Learning curves: returns over training."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from jbrep.figures.style import COLUMN, LINE, PAGE, ink, plain, reference, style
 from jbrep.stats.runs import in_order
 
 Group = dict[str, Any]  # of statistics.json: what was found for a task and an algorithm
+Evaluated = tuple[str, str, str, int, int]  # task, algorithm, representation, seed, step
 Heuristics = Mapping[str, Sequence[float]]  # returns of the hand-written policy, by task
 
 _BAND = ("p10", "p50", "p90")
@@ -67,34 +69,17 @@ _CAPTION = (
 
 def every_run(returns: Sequence[Return], baseline: str) -> Plot:
     """Each run by itself: a row for each task and algorithm, a panel for each representation."""
-    runs: dict[tuple[str, str], dict[str, dict[int, dict[int, list[float]]]]] = {}
+    episodes = defaultdict(list)
     for row in returns:
-        of_label = runs.setdefault((row.task, row.algorithm), {}).setdefault(row.representation, {})
-        steps = of_label.setdefault(row.seed, {}).setdefault(row.step, [])
-        steps.append(row.episode_return)
-    means = {
-        key: {
-            label: {
-                seed: {step: float(np.mean(each)) for step, each in steps.items()}
-                for seed, steps in of_label.items()
-            }
-            for label, of_label in labels.items()
-        }
-        for key, labels in runs.items()
-    }
-    table = [
-        (*key, label, seed, step, f"{mean:.3f}")
-        for key, labels in means.items()
-        for label, of_label in labels.items()
-        for seed, steps in of_label.items()
-        for step, mean in steps.items()
-    ]
+        key = (row.task, row.algorithm, row.representation, row.seed, row.step)
+        episodes[key].append(row.episode_return)
+    means = {key: float(np.mean(each)) for key, each in episodes.items()}
     return Plot(
         "every_run",
         "Every run",
-        "Mean return of each evaluation, a line for each run; thick: their median.",
+        "Mean return of each evaluation, a line for each run; thick: the median of all.",
         ("task", "algorithm", "representation", "seed", "step", "mean_return"),
-        table,
+        [(*key, f"{mean:.3f}") for key, mean in means.items()],
         lambda: _draw_runs(means, baseline),
     )
 
@@ -156,11 +141,11 @@ def grid(
     return figure
 
 
-def training_axes(axes: Axes, last: float) -> None:
+def training_axes(axes: Axes, last: float, ticks: int = 5) -> None:
     """Steps from 0 on, returns from 0 to 1,000."""
     axes.set(xlim=(0, last), ylim=(-15, 1015), yticks=range(0, 1001, 250))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_locator(MaxNLocator(ticks))
 
 
 def below(figure: Figure, panels: Iterable[Axes], columns: int | None = None) -> None:
@@ -179,22 +164,26 @@ def _is_broken(handle: Any) -> bool:
     return isinstance(handle, Line2D) and handle.get_linestyle() not in ("-", "None")
 
 
-def _draw_runs(means: Mapping[tuple[str, str], Mapping[str, Any]], baseline: str) -> Figure:
-    names = in_order((label for labels in means.values() for label in labels), baseline)
+def _draw_runs(means: Mapping[Evaluated, float], baseline: str) -> Figure:
+    names = in_order((key[2] for key in means), baseline)
+    groups = list(dict.fromkeys(key[:2] for key in means))
     look = styles(names, first=baseline)
-    figure = Figure(figsize=(PAGE, 0.35 + 1.35 * len(means)))
-    panels = figure.subplots(len(means), len(names), squeeze=False, sharey=True, sharex="row")
+    figure = Figure(figsize=(PAGE, 0.35 + 1.35 * len(groups)))
+    panels = figure.subplots(len(groups), len(names), squeeze=False, sharey=True, sharex="row")
     for (i, j), axes in np.ndenumerate(panels):
-        (task, algorithm), labels = list(means.items())[i]
-        runs = labels.get(names[j])
-        if runs is None:
+        runs: dict[int, dict[int, float]] = defaultdict(dict)
+        for (*label, seed, step), mean in means.items():
+            if label == [*groups[i], names[j]]:
+                runs[seed][step] = mean
+        if not runs:
             axes.set_axis_off()
             continue
         _draw_label(axes, runs, look[names[j]]["color"])
-        title = f"{task}, {algorithm}\n{names[j]}" if j == 0 else names[j]
+        title = f"{', '.join(groups[i])}\n{names[j]}" if j == 0 else names[j]
         axes.set_title(plain(title))
-        training_axes(axes, max(max(steps) for of in labels.values() for steps in of.values()))
-        axes.set_xlabel("training step" if i == len(means) - 1 else "")
+        last = max(key[4] for key in means if key[:2] == groups[i])
+        training_axes(axes, last, ticks=5 if len(names) < 5 else 3)
+        axes.set_xlabel("training step" if i == len(groups) - 1 else "")
         axes.set_ylabel("" if j else "return")
     return figure
 

@@ -22,15 +22,17 @@ def diagrams(labels: Labels) -> list[Plot]:
     """The paper's Fig. 6 and Fig. 2; nothing of a study without reduced states."""
     reduced = {name: shared for name, shared in labels.items() if shared["encoder"]["encoder"]}
     denoising = {n: s for n, s in reduced.items() if s["encoder"]["kind"] == "dae"} or reduced
-    by_name = {shared["encoder"]["name"]: shared["encoder"] for shared in denoising.values()}
-    if not by_name:
+    if not denoising:
         return []
     first = next(iter(denoising.values()))
-    return [system(first["settings"], first["encoder"]), autoencoders(by_name)]
+    task = first["settings"]["task"]
+    alike = [each for each in denoising.values() if each["settings"]["task"] == task]
+    encoders = {each["encoder"]["name"]: each["encoder"] for each in alike}
+    return [system(first["settings"], first["encoder"]), autoencoders(task, encoders)]
 
 
-def autoencoders(encoders: Mapping[str, Any]) -> Plot:
-    """Encoders with their decoders, unit by unit."""
+def autoencoders(task: str, encoders: Mapping[str, Any]) -> Plot:
+    """The encoders of a task with their decoders, unit by unit."""
     rows = [
         (name, part, i, *layer)
         for name, encoder in encoders.items()
@@ -39,7 +41,7 @@ def autoencoders(encoders: Mapping[str, Any]) -> Plot:
     ]
     return Plot(
         "autoencoders",
-        "The encoders",
+        f"The encoders of {task}",
         "Layers with their units; agents see the latent, and the decoder only serves training and "
         f"diagnosis. Of more than {_MOST} units some are left out.",
         ("encoder", "part", "layer", "units", "activation"),

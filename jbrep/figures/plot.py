@@ -3,11 +3,13 @@
 import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+from tqdm import tqdm
 
 from jbrep.dataset.storage import make_folder, write_whole
 from jbrep.figures.style import PAPER
@@ -40,6 +42,34 @@ class Plot:
     rows: Sequence[Sequence[Any]]
     draw: Callable[[], Figure]
 
+    @cached_property
+    def on_paper(self) -> "Drawing":
+        """Drawn for a paper."""
+        return Drawing(self, PAPER)
+
+
+class Drawing:
+    """A figure drawn and laid out once, in a style, for any number of files."""
+
+    def __init__(self, plot: Plot, style: Any):
+        self._style = style
+        with mpl.rc_context(style):
+            self._figure = plot.draw()
+            self._figure.draw_without_rendering()
+        self._figure.set_layout_engine("none")
+
+    @property
+    def width(self) -> float:
+        """In inches."""
+        return float(self._figure.get_figwidth())
+
+    def picture(self, kind: str) -> bytes:
+        """As pdf, png or svg."""
+        content = io.BytesIO()
+        with mpl.rc_context(self._style):
+            self._figure.savefig(content, format=kind, metadata=_UNDATED[kind])
+        return content.getvalue()
+
 
 def write(plots: Iterable[Plot], folder: Path) -> list[Path]:
     """Write each figure as PDF and PNG, and its table as CSV.
@@ -52,17 +82,9 @@ def write(plots: Iterable[Plot], folder: Path) -> list[Path]:
     """
     make_folder(folder)
     pictures = []
-    for plot in plots:
+    for plot in tqdm(list(plots), unit="figure", delay=1, leave=False):
         for kind in ("pdf", "png"):
-            write_whole(folder / f"{plot.name}.{kind}", picture(plot, kind, PAPER))
+            write_whole(folder / f"{plot.name}.{kind}", plot.on_paper.picture(kind))
         write_whole(folder / f"{plot.name}.csv", csv_text(plot.columns, plot.rows).encode())
         pictures.append(folder / f"{plot.name}.png")
     return pictures
-
-
-def picture(plot: Plot, kind: str, style: Any) -> bytes:
-    """A figure as pdf, png or svg in a style."""
-    content = io.BytesIO()
-    with mpl.rc_context(style):
-        plot.draw().savefig(content, format=kind, metadata=_UNDATED[kind])
-    return content.getvalue()

@@ -176,28 +176,38 @@ def _interval(axes: Axes, at: float, values: Sequence[float | None], style: dict
 
 
 def _draw_ratios(groups: Sequence[Group], baseline: str) -> Figure:
-    rows = list(_ratios(groups))
+    """A panel for each group, a row for each representation, all to one scale."""
+    compared = [group for group in groups if group["comparisons"]]
+    most = max(len(group["comparisons"]) for group in compared)
+    figure, panels = _panels(compared, 1, 0.45 + 0.19 * most)
     look = styles(_names(groups), first=baseline)
-    figure = Figure(figsize=(COLUMN, 0.75 + 0.19 * len(rows) + 0.1 * len(groups)))
-    axes: Axes = figure.subplots()
-    ends = [np.array((*values[1:], *v["simultaneous"][1:], 1), float) for _, values, v in rows]
-    limit = max(np.nanmax(np.abs(np.log10(each))) for each in ends)
-    for i, (key, values, verdict) in enumerate(rows):
-        colour, marker = look[key[2]]["color"], look[key[2]]["marker"]
-        for (_, low, high), width in ((verdict["simultaneous"], 0.8), (values, 2)):
-            axes.plot(np.array([low, high], float), [i, i], color=colour, linewidth=width)
-        axes.plot(np.array(values[:1], float), [i], marker, color=colour, ms=4)
-    axes.axvline(1, **reference())
-    several = len(groups) > 1
-    names = [plain(f"{k[0]}, {k[1]}: {k[2]}" if several else k[2]) for k, _, _ in rows]
-    axes.set_yticks(range(len(rows)), names)
-    axes.set(ylim=(len(rows) - 0.4, -0.6), xscale="log", xlabel="variance ratio of final returns")
-    axes.set_xlim(10 ** -(limit + 0.1), 10 ** (limit + 0.1))
-    _few_decades(axes, limit)
-    axes.grid(visible=False, axis="y")
-    if not several:
-        axes.set_title(plain(f"{groups[0]['task']}, {groups[0]['algorithm']}"))
+    limit = max(_reach(values, verdict) for _, values, verdict in _ratios(groups))
+    for (axes,), group in zip(panels, compared, strict=True):
+        rows = list(_ratios([group]))
+        for i, (key, values, verdict) in enumerate(rows):
+            _draw_ratio(axes, i, values, verdict, look[key[2]])
+        axes.axvline(1, **reference())
+        axes.set_yticks(range(len(rows)), [plain(key[2]) for key, _, _ in rows])
+        axes.set(ylim=(len(rows) - 0.4, -0.6), xscale="log", xlabel="variance ratio")
+        axes.set_xlim(10 ** -(limit + 0.1), 10 ** (limit + 0.1))
+        _few_decades(axes, limit)
+        axes.grid(visible=False, axis="y")
+        axes.set_title(plain(f"{group['task']}, {group['algorithm']}"))
     return figure
+
+
+def _reach(values: Sequence[float | None], verdict: Group) -> float:
+    """How many powers of ten the intervals go from 1."""
+    ends = np.array((*values, *verdict["simultaneous"], 1), float)
+    return float(np.nanmax(np.abs(np.log10(ends))))
+
+
+def _draw_ratio(
+    axes: Axes, row: int, values: Sequence[float | None], verdict: Group, style: dict[str, Any]
+) -> None:
+    for (_, low, high), width in ((verdict["simultaneous"], 0.8), (values, 2)):
+        axes.plot(np.array([low, high], float), [row, row], color=style["color"], linewidth=width)
+    axes.plot(np.array(values[:1], float), [row], style["marker"], color=style["color"], ms=4)
 
 
 def _few_decades(axes: Axes, limit: float) -> None:

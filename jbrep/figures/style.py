@@ -39,9 +39,9 @@ PAPER: Any = {
     "ytick.labelsize": 6.5,
     "ytick.major.width": 0.6,
 }
-LIGHT_PAGE: Any = {**PAPER, "savefig.transparent": True}
-DARK_PAGE: Any = {
-    **LIGHT_PAGE,
+DARK: Any = {
+    **PAPER,
+    "savefig.transparent": True,
     "axes.prop_cycle": cycler(color=_ON_DARK),
     **dict.fromkeys(
         ("axes.edgecolor", "axes.labelcolor", "grid.color", "text.color", "xtick.color"), "#DDDDDD"

@@ -174,8 +174,9 @@ def reproduce(tables: Tables) -> list[tuple[str, str]]:
         if package != "jbrep"
     )
     first = (
-        "With these versions of the packages (the same bits need the same kind of processor, too):",
-        f"pip install 'jbrep[learn]=={tables.record['versions'][0]['jbrep']}' {versions}",
+        f"In a checkout of jbrep {tables.record['versions'][0]['jbrep']}, with these versions (the "
+        "same bits need the same kind of processor, too):",
+        f"pip install '.[learn]' {versions}",
     )
     report = ("The tables, figures and this page from the runs:", f"jbrep report {tables.name}")
     study = tables.record["study"]

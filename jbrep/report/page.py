@@ -8,9 +8,10 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
+from tqdm import tqdm
 
-from jbrep.figures.plot import Plot, picture
-from jbrep.figures.style import DARK_PAGE, LIGHT_PAGE, PAGE
+from jbrep.figures.plot import Drawing, Plot
+from jbrep.figures.style import DARK, PAGE
 from jbrep.report import facts
 from jbrep.report.tables import Tables
 from jbrep.report.words import Answer
@@ -29,7 +30,7 @@ def page(tables: Tables, answers: Sequence[Answer], plots: Sequence[Plot]) -> st
         outline=facts.outline(tables),
         notices=facts.notices(tables),
         answers=answers,
-        figures=[_figure(plot) for plot in plots],
+        figures=[_figure(plot) for plot in tqdm(plots, unit="figure", delay=1, leave=False)],
         tables=_tables(tables.statistics) if tables.statistics else [],
         runs=facts.run_rows(tables),
         failed=facts.failed_rows(tables),
@@ -55,14 +56,13 @@ def _tables(statistics: Mapping[str, Any]) -> list[tuple[str, Rows]]:
 
 
 def _figure(plot: Plot) -> dict[str, Any]:
-    width = plot.draw().get_figwidth()
     return {
         "name": plot.name,
         "title": plot.title,
         "caption": plot.caption,
-        "width": round(min(_WIDEST, _WIDEST * max(width, 0.62 * PAGE) / PAGE)),
-        "light": _base64(picture(plot, "svg", LIGHT_PAGE)),
-        "dark": _base64(picture(plot, "svg", DARK_PAGE)),
+        "width": round(min(_WIDEST, _WIDEST * max(plot.on_paper.width, 0.62 * PAGE) / PAGE)),
+        "light": _base64(plot.on_paper.picture("svg")),
+        "dark": _base64(Drawing(plot, DARK).picture("svg")),
         "table": _base64(csv_text(plot.columns, plot.rows).encode()),
     }
 
