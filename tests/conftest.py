@@ -29,3 +29,11 @@ def collected(tmp_path_factory):
 def copied(collected, tmp_path):
     """A copy of it to spoil."""
     return shutil.copytree(collected, tmp_path / "copied")
+
+
+LONGEST = ("test_study", "test_rl", "test_cli", "test_report")
+
+
+def pytest_collection_modifyitems(items):
+    """The longest first, so that no worker is left with one while the others are done."""
+    items.sort(key=lambda item: item.module.__name__ not in LONGEST)

@@ -134,7 +134,7 @@ def layers(encoder: Mapping[str, Any]) -> str:
 
 
 def setting_rows(tables: Tables) -> tuple[Row, Rows]:
-    """Settings in which labels differ, a column for each label of another task or algorithm."""
+    """What agents share besides their seeds, a column for each task and algorithm."""
     columns: dict[str, Mapping[str, Any]] = {}
     for label, shared in tables.record["labels"].items():
         columns.setdefault(label.rpartition("/")[0], dict(_flat(shared["settings"])))
@@ -157,13 +157,9 @@ def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _said(value: Any) -> str:
-    return (
-        "-"
-        if value is None
-        else ", ".join(map(str, value))
-        if isinstance(value, list)
-        else str(value)
-    )
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    return "-" if value is None else str(value)
 
 
 def reproduce(tables: Tables) -> list[tuple[str, str]]:

@@ -46,7 +46,7 @@ def write_report(folder: Path, out: Path | None = None) -> list[Path]:
             SUMMARY: json.dumps(_summary(tables, found), indent=1, allow_nan=False) + "\n",
             MARKDOWN: markdown(tables, found),
         }
-    except (KeyError, TypeError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InputError(f"the tables in {folder} don't fit together: {error!r}") from error
     write(plots, out / FIGURES)
     for name, text in texts.items():
