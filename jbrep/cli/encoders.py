@@ -197,8 +197,9 @@ _task = click.option("--task", help="Its task, for an encoder that ships.")
 def info(encoder: str, task: str | None) -> None:
     """Show what an encoder is and where it comes from."""
     from jbrep.encoders.card import card
+    from jbrep.encoders.shipped import find_alone
 
-    for line in card(_open(encoder, task)).splitlines():
+    for line in card(find_alone(encoder, task)).splitlines():
         click.echo(printable(line))
 
 
@@ -214,18 +215,7 @@ def export(encoder: str, task: str | None, out: Path) -> None:
     The input is `observation`, in physical units; the outputs are `latent` and `reconstruction`.
     """
     from jbrep.encoders.onnx import export as run
+    from jbrep.encoders.shipped import find_alone
 
-    run(_open(encoder, task), out)
+    run(find_alone(encoder, task), out)
     click.echo(f"open it with onnxruntime.InferenceSession({str(out)!r})")
-
-
-def _open(encoder: str, task: str | None) -> Any:
-    """An encoder by name and task, or by file alone."""
-    from jbrep.dataset.storage import exists
-    from jbrep.encoders import find, load
-
-    if task:
-        return find(encoder, task)
-    if not exists(encoder):
-        raise InputError(f"no encoder at {encoder}: of one that ships, the --task is needed, too")
-    return load(Path(encoder))

@@ -41,3 +41,16 @@ def find(name: str | Path, task: str) -> Encoder:
     encoder = load(Path(name))
     encoder.check_task(get_task(task))
     return encoder
+
+
+def find_alone(name: str, task: str | None) -> Encoder:
+    """An encoder by name and task, or by its file alone.
+
+    Raises:
+        InputError: as `find`; or no task, and no such file.
+    """
+    if task:
+        return find(name, task)
+    if not exists(name):
+        raise InputError(f"no encoder at {name}: of one that ships, the --task is needed, too")
+    return load(Path(name))

@@ -7,6 +7,7 @@ from jbrep.dataset.manifest import MANIFEST
 from jbrep.dataset.storage import exists
 from jbrep.encoders import Encoder, find, load
 from jbrep.encoders.file import SUFFIX as ENCODER_SUFFIX
+from jbrep.encoders.shipped import find_alone
 from jbrep.errors import InputError
 from jbrep.inspection.curves import record_curves
 from jbrep.inspection.episode import record_episode
@@ -16,7 +17,7 @@ from jbrep.jitterbug.tasks import get_task
 from jbrep.rl.files import ENCODER, RUN
 from jbrep.rollout import Rollout
 from jbrep.sources import find_episode
-from jbrep.study.results import read_runs
+from jbrep.study.results import has_runs, read_runs
 
 FOLDER = Path("inspect")  # of recordings whose file isn't named
 _POLICY = "uniform"  # of an encoder's episode
@@ -78,7 +79,7 @@ def _is_study(folder: Path) -> bool:
     """Whether runs stand below it, and it is none itself."""
     if not _is_folder(folder) or exists(folder / MANIFEST) or exists(folder / RUN):
         return False
-    return next(folder.rglob(RUN), None) is not None
+    return has_runs(folder)
 
 
 def _is_folder(path: Path) -> bool:
@@ -109,12 +110,8 @@ def _find(
 
 
 def _load(encoder: str, task: str | None) -> Encoder:
-    """An encoder by name and task, or by file alone."""
-    if task:
-        return find(encoder, task)
-    if not exists(encoder):
-        raise InputError(f"no encoder at {encoder}: of one that ships, the --task is needed, too")
-    found = load(Path(encoder))
+    """An encoder whose features are those of its own task."""
+    found = find_alone(encoder, task)
     found.check_task(get_task(found.header["task"]))
     return found
 
