@@ -4,6 +4,7 @@ import click
 
 from jbrep.cli.base import Cli
 from jbrep.cli.data import collect, data
+from jbrep.cli.doctor import doctor
 from jbrep.cli.encoders import encoder, evaluate, train_dae, train_encoder
 from jbrep.cli.inspect import inspect
 from jbrep.cli.render import render
@@ -19,7 +20,7 @@ def main() -> None:
 _COMMANDS = (
     *(collect, data, train_dae, train_encoder, evaluate, encoder),
     *(rl, evaluate_policy, behaviour, study, report, inspect),
-    render,
+    *(render, doctor),
 )
 for _command in _COMMANDS:
     main.add_command(_command)

@@ -1,6 +1,5 @@
 """Agents, and what came of them."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -168,6 +167,8 @@ def study(
     STUDY is a TOML file, such as those in studies/. Data sets and encoders are made first. What is
     finished is never run again: stopped or killed, the same command goes on.
     """
+    from joblib import cpu_count
+
     from jbrep.report import write_report
     from jbrep.study.config import read_study
     from jbrep.study.plan import Plan
@@ -175,7 +176,7 @@ def study(
     from jbrep.study.study import conduct, outline
 
     plan = Plan(read_study(study), out or Path("runs") / study.stem)
-    run, count = get_backend(backend), workers or os.cpu_count() or 1
+    run, count = get_backend(backend), workers or cpu_count()
     if dry_run:
         click.echo(outline(plan, count))
         return

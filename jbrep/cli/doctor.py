@@ -1,0 +1,27 @@
+"""This machine."""
+
+import textwrap
+
+import click
+
+from jbrep.cli.base import example, printable
+
+_INDENT, _WIDTH = 9, 100
+
+
+@click.command(epilog=example("jbrep doctor"))
+@click.pass_context
+def doctor(context: click.Context) -> None:
+    """Show what of this machine is used, and what is missing for what.
+
+    Cores, memory, disk, GPU, OpenGL, and the packages of each extra with their versions. The exit
+    code is 1 where a package that all needs is missing, or one has a version that won't do.
+    """
+    from jbrep.doctor import examine
+
+    findings = list(examine())
+    for finding in findings:
+        line = f"{finding.what:{_INDENT}}{printable(finding.said)}"
+        indent = " " * _INDENT
+        click.echo(textwrap.fill(line, _WIDTH, subsequent_indent=indent, break_on_hyphens=False))
+    context.exit(any(finding.is_wrong for finding in findings))

@@ -1,0 +1,114 @@
+"""What of this machine jbrep can use, and what is missing for what."""
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import NamedTuple
+
+from packaging.requirements import Requirement
+
+EXTRAS = {  # what each is for; the empty one is always installed
+    "": "the robot and its environments, collect, data",
+    "learn": "train-dae, train-encoder, evaluate, rl, study, report",
+    "export": "data export, encoder export",
+    "cluster": "study --backend ray",
+    "render": "render",
+    "view": "inspect",
+    "dev": "make check, test and bench",
+}
+_RENDER = """
+from jbrep.render.opengl import find_opengl
+find_opengl()
+import mujoco
+from OpenGL import GL
+with mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8):
+    print(GL.glGetString(GL.GL_RENDERER).decode())
+"""
+
+
+class Finding(NamedTuple):
+    """A line of the examination."""
+
+    what: str
+    said: str
+    is_wrong: bool = False  # so that commands will fail, not only be missing
+
+
+def examine() -> Iterator[Finding]:
+    """The machine first, then the packages, by extra."""
+    where = f"Python {platform.python_version()}, {platform.platform()}"
+    yield Finding("jbrep", f"{version('jbrep')} on {where}")
+    yield Finding("cores", f"{_cores()}: collect steps robots on all, a study has a run on each")
+    if hasattr(os, "sysconf"):  # not on Windows
+        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        yield Finding("memory", f"{memory / 2**30:.0f} GiB")
+    free = shutil.disk_usage(Path.cwd()).free
+    yield Finding("disk", f"{free / 2**30:.0f} GiB free here; 5 million states take 0.4 to 1.9")
+    yield Finding("GPU", _gpu())
+    yield Finding("OpenGL", _opengl())
+    address = os.environ.get("RAY_ADDRESS")
+    yield Finding("Ray", address or "no RAY_ADDRESS: study --backend ray starts one of its own")
+    for extra, purpose in EXTRAS.items():
+        yield _packages(extra, purpose)
+
+
+def _cores() -> int:
+    try:
+        from joblib import cpu_count  # heeds affinity and a container's limits
+    except ModuleNotFoundError:
+        return os.cpu_count() or 1
+    return int(cpu_count())
+
+
+def _gpu() -> str:
+    try:
+        import torch
+    except ModuleNotFoundError:
+        return "not looked for, without torch"
+    if not torch.cuda.is_available():
+        return "none: train-dae takes the CPU, as rl and study always do"
+    device = torch.cuda.get_device_properties(0)
+    memory = f"{device.total_memory / 2**30:.0f} GiB"
+    return f"{device.name}, {memory}, CUDA {torch.version.cuda}: train-dae takes it"
+
+
+def _opengl() -> str:
+    """By drawing something, in a process of its own: where there is none, some drivers crash."""
+    done = subprocess.run([sys.executable, "-c", _RENDER], capture_output=True, text=True)
+    if done.returncode == 0:
+        return f"{done.stdout.strip()}: render draws with it"
+    reason = (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[-1]
+    return reason.partition("InputError: ")[2] or f"rendering fails: {reason}"
+
+
+def _packages(extra: str, purpose: str) -> Finding:
+    """Whether all that an extra asks for is there, in versions that will do."""
+    name, asked = extra or "core", list(_requirements(extra))
+    wrong = [f"{r.name} {v} ({r.specifier} is needed)" for r, v in asked if v and not _fits(r, v)]
+    missing = [r.name for r, v in asked if not v]
+    if not wrong and not missing:
+        return Finding(name, f"{purpose}: {', '.join(f'{r.name} {v}' for r, v in asked)}")
+    problems = [*wrong, *([f"no {', '.join(missing)}"] if missing else [])]
+    package = f"jbrep[{extra}]" if extra else "jbrep"
+    said = f"{', '.join(problems)}, for {purpose}: pip install '{package}'"
+    return Finding(name, said, is_wrong=bool(wrong) or not extra)
+
+
+def _fits(requirement: Requirement, found: str) -> bool:
+    return requirement.specifier.contains(found, prereleases=True)
+
+
+def _requirements(extra: str) -> Iterator[tuple[Requirement, str]]:
+    """What an extra asks for, and the version that is there: nothing if none is."""
+    for requirement in map(Requirement, requires("jbrep") or ()):
+        marker = requirement.marker
+        if marker.evaluate({"extra": extra}) if marker else not extra:
+            try:
+                yield requirement, version(requirement.name)
+            except PackageNotFoundError:
+                yield requirement, ""

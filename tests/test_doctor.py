@@ -1,0 +1,81 @@
+"""What is told of a machine."""
+
+import tomllib
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from conftest import needs_egl
+
+from jbrep import doctor
+from jbrep.cli import main
+
+
+def told():
+    """The command's exit code, and its text in one line."""
+    result = CliRunner().invoke(main, ["doctor"])
+    return result.exit_code, " ".join(result.output.split())
+
+
+def have(monkeypatch, **versions):
+    """Pretend that packages are of these versions, or missing."""
+
+    def pretended(name):
+        known = {key.replace("_", "-"): value for key, value in versions.items()}
+        found = known[name] if name in known else version(name)
+        if found is None:
+            raise PackageNotFoundError(name)
+        return found
+
+    monkeypatch.setattr(doctor, "version", pretended)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Without the seconds that trying OpenGL takes."""
+    monkeypatch.setattr(doctor, "_opengl", lambda: "not tried")
+
+
+@needs_egl
+def test_it_draws_something_to_see_whether_it_can(monkeypatch):
+    code, text = told()
+    assert code == 0
+    assert ": render draws with it" in text
+    monkeypatch.setenv("MUJOCO_GL", "crayons")
+    code, text = told()
+    assert code == 0
+    assert "OpenGL rendering needs EGL, and MuJoCo finds none (invalid value" in text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_every_extra_is_examined():
+    project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
+    assert set(doctor.EXTRAS) == {"", *project["optional-dependencies"]}
+    text = told()[1]
+    for name in ("numpy", "mujoco", "torch", "pillow"):
+        assert f"{name} {version(name)}" in text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_an_extra_left_out_is_named_with_what_it_is_for(monkeypatch):
+    have(monkeypatch, rerun_sdk=None)
+    code, text = told()
+    assert code == 0
+    assert "view no rerun-sdk, for inspect: pip install 'jbrep[view]'" in text
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize(
+    ("versions", "problem"),
+    [
+        ({"mujoco": "4.0.0"}, "core mujoco 4.0.0 (<4,>=3.17 is needed), for the robot and"),
+        ({"torch": "2.1.0"}, "learn torch 2.1.0 (>=2.8 is needed), for train-dae"),
+        ({"h5py": None, "numpy": "1.26.4"}, "core numpy 1.26.4 (>=2 is needed), no h5py, for"),
+    ],
+)
+def test_what_will_not_do_is_an_error(versions, problem, monkeypatch):
+    have(monkeypatch, **versions)
+    code, text = told()
+    assert code == 1
+    assert problem in text
