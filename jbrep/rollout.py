@@ -157,6 +157,9 @@ class _Tape:
             name: np.empty((steps + 1, *getattr(now, name).shape))
             for name in ("qpos", "qvel", "rotation", "velocity")
         }
+        # at the start: a lane that diverges loses its target
+        self._target_position = now.target_position.copy()
+        self._target_quaternion = simulation.target_quaternion.copy()
         self._action = np.empty((steps, n, 1))
         self._length = np.full(n, steps)
 
@@ -175,8 +178,8 @@ class _Tape:
             name=name,
             seed=seed,
             **{key: values[: length + 1, lane] for key, values in self._states.items()},
-            target_position=self._simulation.readings.target_position[lane].copy(),
-            target_quaternion=self._simulation.target_quaternion[lane].copy(),
+            target_position=self._target_position[lane],
+            target_quaternion=self._target_quaternion[lane],
             action=self._action[:length, lane],
         )
 

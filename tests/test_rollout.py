@@ -10,6 +10,7 @@ from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import Settings
 from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS, episode_returns
+from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, read_evaluations
@@ -79,6 +80,26 @@ def test_the_target_turns_where_it_is_told():
     faces = np.arctan2(-rollout.rotation[:, 4], -rollout.rotation[:, 1])
     np.testing.assert_allclose(np.cos(angles), np.cos(np.pi / 4 - faces), atol=1e-12)
     assert np.abs(angles[-200:]).mean() < np.abs(angles[0])
+
+
+def test_an_episode_that_diverges_when_played_ends_before_it_does(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs there
+    step, counts = Simulation.step, {}
+
+    def spoil(simulation, action):
+        counts[simulation] = counts.get(simulation, 0) + 1
+        if counts[simulation] == 11:
+            simulation.readings.qvel[1, 0] = np.nan
+        return step(simulation, action)
+
+    monkeypatch.setattr(Simulation, "step", spoil)
+    played = find_player("heuristic", "move_to_pose").play([0, 1])
+    assert [len(rollout) for rollout in played] == [1000, 10]
+    start = TASKS["move_to_pose"].start(np.random.default_rng(EVALUATION_SEED + 1))
+    np.testing.assert_array_equal(played[1].target_position, start.target_position)
+    np.testing.assert_array_equal(played[1].target_quaternion, start.target_quaternion)
+    returns = episode_returns("move_to_pose", HEURISTICS["move_to_pose"], 2, EVALUATION_SEED)
+    np.testing.assert_allclose(returns, [rollout.reward.sum() for rollout in played])
 
 
 def test_an_episode_that_diverged_ends_before_it_did(tmp_path):

@@ -149,6 +149,8 @@ def episode_returns(
 ) -> Array:
     """Returns of whole episodes under a policy of the observation, (episodes,).
 
+    One whose physics diverges ends there, as in the environments.
+
     Args:
         task: a key of `tasks.TASKS`.
         policy: observations in physical units, (n, d), to actions, (n, 1).
@@ -159,6 +161,6 @@ def episode_returns(
     simulation.reset(range(episodes), [np.random.default_rng(seed + i) for i in range(episodes)])
     total = np.zeros(episodes)
     for _ in range(EPISODE_STEPS):
-        simulation.step(policy(simulation.observe()))
-        total += simulation.reward()
+        diverged = simulation.step(policy(simulation.observe()))
+        total += np.where(diverged, 0, simulation.reward())
     return total

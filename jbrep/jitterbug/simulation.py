@@ -115,8 +115,8 @@ class Simulation:
         """Hold the actions (n, 1) for one control step.
 
         Returns:
-            (n,) whether the lane's physics diverged: it stands in its default state then, and
-            its episode is over.
+            (n,) whether the lane's physics diverged: it and its target stand in their default
+            states then, and its episode is over.
         """
         self._control[:] = action
         self._batch.step(nstep=model.PHYSICS_STEPS, stage=_UP_TO_VELOCITIES)
