@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from jbrep.dataset import Dataset
 from jbrep.dataset.storage import check_space
-from jbrep.errors import InputError
+from jbrep.errors import InputError, choose
 
 _MINARI_FOLDER = "MINARI_DATASETS_PATH"
 
@@ -36,16 +36,16 @@ def export(dataset: Dataset, to: str, out: Path) -> str:
     Raises:
         InputError: an unknown format, no rows, something there already, or it can't be written.
     """
-    if to not in FORMATS:
-        raise InputError(f"unknown format {to!r}: choose one of {', '.join(FORMATS)}")
+    write = choose(to, FORMATS, "format")
     if not len(dataset):
         raise InputError(f"{dataset.folder} has no rows yet")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         check_space(out.parent, len(dataset) * dataset.manifest.settings.row_bytes())
-        return FORMATS[to](dataset, out)
+        return write(dataset, out)
     except (OSError, RuntimeError) as error:  # HDF5 ends in the latter where space runs out
-        raise InputError(f"can't write {out}: {getattr(error, 'strerror', error)}") from error
+        reason = getattr(error, "strerror", None) or error  # some have only a text
+        raise InputError(f"can't write {out}: {reason}") from error
 
 
 def _to_npz(dataset: Dataset, out: Path) -> str:
@@ -73,7 +73,6 @@ def _to_parquet(dataset: Dataset, out: Path) -> str:
     import pyarrow.parquet as pq
 
     episodes = out.with_stem(f"{out.stem}-episodes")
-    _check_new(episodes)
     schema = pa.schema(
         [
             pa.field(name, pa.from_numpy_dtype(dtype), nullable=False, metadata={"unit": unit})
@@ -82,14 +81,14 @@ def _to_parquet(dataset: Dataset, out: Path) -> str:
         metadata={"jbrep": json.dumps(asdict(dataset.manifest.settings))},
     )
     coding = {"compression": "zstd", "use_dictionary": False, "use_byte_stream_split": True}
-    with _new_file(out) as partial, pq.ParquetWriter(partial, schema, **coding) as writer:
-        chunks = zip(*(dataset[name].chunks() for name in dataset.columns), strict=True)
-        for chunk in tqdm(chunks, unit="chunk", desc=out.name, leave=False):
-            arrays = [column for values in chunk for column in _flat(values)]
-            writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
-    with _new_file(episodes) as partial:
+    with _new_file(out) as partial, _new_file(episodes) as partial_episodes:
+        with pq.ParquetWriter(partial, schema, **coding) as writer:
+            chunks = zip(*(dataset[name].chunks() for name in dataset.columns), strict=True)
+            for chunk in tqdm(chunks, unit="chunk", desc=out.name, leave=False):
+                arrays = [column for values in chunk for column in _flat(values)]
+                writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
         columns = {name: list(values) for name, values in dataset.episodes.items()}
-        pq.write_table(pa.table(columns), partial)
+        pq.write_table(pa.table(columns), partial_episodes)
     return f"pandas.read_parquet({str(out)!r}), and {episodes.name} for the episodes"
 
 
@@ -181,15 +180,11 @@ def _minari_episodes(dataset: Dataset) -> Iterator[Any]:
         )
 
 
-def _check_new(path: Path) -> None:
-    if path.exists():
-        raise InputError(f"{path} exists already: choose another name")
-
-
 @contextmanager
 def _new_file(path: Path) -> Iterator[Path]:
     """A temporary name for a file that gets its own name when it is whole."""
-    _check_new(path)
+    if path.exists():
+        raise InputError(f"{path} exists already: choose another name")
     partial = path.with_name(path.name + ".partial")
     partial.unlink(missing_ok=True)  # it may be a link
     try:

@@ -87,6 +87,16 @@ def test_minari_lists_it_opens_it_and_recovers_the_environment(dataset, tmp_path
     assert done.stdout == "jitterbug/face_direction/uniform-v0 EpisodeData\n"
 
 
+def test_parquet_files_come_together_or_not_at_all(dataset, tmp_path, monkeypatch):
+    def fail(*arguments):
+        raise OSError("the disk is gone")
+
+    monkeypatch.setattr(pq, "write_table", fail)
+    with pytest.raises(InputError, match=r"can't write .*data\.parquet: the disk is gone"):
+        export(dataset, "parquet", tmp_path / "data.parquet")
+    assert not list(tmp_path.iterdir())
+
+
 def test_nothing_is_overwritten_and_no_half_is_left(dataset, tmp_path, monkeypatch):
     for to in FORMATS:
         export(dataset, to, tmp_path / to)
