@@ -12,6 +12,8 @@ from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, Array, Task
 
 Actor = Callable[[Array], Array]  # observations (n, d) to actions (n, 1), once for each step
 
+_MAX_SIGMA = 1e6  # far beyond full drive to and fro
+
 
 class Policy(Protocol):
     """How actions come about; a frozen dataclass of its constants."""
@@ -75,10 +77,10 @@ class OrnsteinUhlenbeck:
 
     def __post_init__(self) -> None:
         rate = self.theta * CONTROL_TIMESTEP
-        if not (-1 <= self.mu <= 1 and 0 <= rate <= 1 and 0 <= self.sigma < np.inf):
+        if not (-1 <= self.mu <= 1 and 0 <= rate <= 1 and 0 <= self.sigma <= _MAX_SIGMA):
             raise InputError(
                 f"{self}: mu must be in [-1, 1], theta in [0, {1 / CONTROL_TIMESTEP:g}], "
-                "sigma at least 0"
+                f"sigma in [0, {_MAX_SIGMA:g}]"
             )
 
     def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
