@@ -184,6 +184,8 @@ def test_mistakes_are_named():
         gymnasium.make(FACE, form="image")
     with pytest.raises(InputError, match="the number of robots is 0"):
         gymnasium.make_vec(FACE, num_envs=0)
+    with pytest.raises(InputError, match="steps in an episode is -1: it must be at least 1"):
+        gymnasium.make_vec(FACE, num_envs=1, max_episode_steps=-1)
     many = gymnasium.make_vec(FACE, num_envs=2)
     with pytest.raises(InputError, match="3 seeds for 2 lanes"):
         many.reset(seed=[1, 2, 3])

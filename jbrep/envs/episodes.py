@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation, check_actions
 from jbrep.jitterbug.tasks import EPISODE_STEPS, Array, get_task
 
@@ -26,6 +27,9 @@ class Episodes:
 
     An episode ends at the time limit or when its physics diverges. Neither is the robot's doing,
     so both truncate and none terminates.
+
+    Raises:
+        InputError: unknown task, or a number below 1.
     """
 
     def __init__(
@@ -35,6 +39,10 @@ class Episodes:
         num_threads: int | None = None,
         max_episode_steps: int = EPISODE_STEPS,
     ):
+        if max_episode_steps < 1:
+            raise InputError(
+                f"the number of steps in an episode is {max_episode_steps}: it must be at least 1"
+            )
         self.task = get_task(task)
         self.simulation = Simulation(self.task, num_envs, num_threads)
         self._max_steps = max_episode_steps
