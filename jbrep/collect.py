@@ -25,7 +25,7 @@ from jbrep.dataset.manifest import (
 from jbrep.dataset.schema import EPISODES, Columns, episode_returns, episode_seed
 from jbrep.dataset.storage import check_space, make_folder
 from jbrep.errors import InputError, differences
-from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.simulation import Simulation, check_counts
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
 from jbrep.policies import Policy, make_policy, policy_settings
 
@@ -66,17 +66,6 @@ def collect(
         return simulate_shard(settings, policy, shard, tick, lanes, num_threads)
 
     return write_shards(settings, folder, make)
-
-
-def check_counts(lanes: int, num_threads: int | None) -> None:
-    """Make sure that there is something to simulate on.
-
-    Raises:
-        InputError: a number below 1.
-    """
-    for count, what in ((lanes, "lanes"), (num_threads, "threads")):
-        if count is not None and count < 1:
-            raise InputError(f"the number of {what} is {count}: it must be at least 1")
 
 
 def write_shards(settings: Settings, folder: Path, make: Callable[[int, Tick], Columns]) -> Written:

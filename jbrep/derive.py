@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collect import Tick, Written, check_counts, write_shards
+from jbrep.collect import Tick, Written, write_shards
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import new_manifest, open_shard
 from jbrep.dataset.schema import (
@@ -19,7 +19,7 @@ from jbrep.dataset.schema import (
     episode_seed,
 )
 from jbrep.errors import InputError
-from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.simulation import Simulation, check_counts
 from jbrep.jitterbug.tasks import Task, get_task
 from jbrep.policies import make_policy
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from jbrep.collect import LANES, check_counts, simulate_shard
+from jbrep.collect import LANES, simulate_shard
 from jbrep.dataset.lock import exclusive
 from jbrep.dataset.manifest import (
     BACKUP,
@@ -25,6 +25,7 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.shard import DamageError, column_hashes
 from jbrep.errors import InputError
+from jbrep.jitterbug.simulation import check_counts
 from jbrep.jitterbug.tasks import EPISODE_STEPS
 from jbrep.policies import make_policy
 

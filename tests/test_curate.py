@@ -124,7 +124,7 @@ def test_repair_leaves_a_whole_data_set_alone(copied):
     before = contents(copied)
     assert not list(repair(copied))
     assert contents(copied) == before
-    with pytest.raises(InputError, match="number of lanes is 0"):
+    with pytest.raises(InputError, match="number of robots is 0"):
         list(repair(copied, lanes=0))
 
 

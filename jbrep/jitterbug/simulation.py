@@ -38,9 +38,7 @@ class Simulation:
     """
 
     def __init__(self, task: Task, num_lanes: int, num_threads: int | None = None):
-        for count, what in ((num_lanes, "robots"), (num_threads, "threads")):
-            if count is not None and count < 1:
-                raise InputError(f"the number of {what} is {count}: it must be at least 1")
+        check_counts(num_lanes, num_threads)
         model.stop_profiling()
         self.task = task
         self.num_lanes = num_lanes
@@ -136,6 +134,17 @@ class Simulation:
         data = self._batch.get_data(lane, data)
         mujoco.mj_fwdPosition(self.model, data)
         return data
+
+
+def check_counts(num_lanes: int, num_threads: int | None) -> None:
+    """Make sure that there is something to simulate, and to simulate it on.
+
+    Raises:
+        InputError: a number below 1.
+    """
+    for count, what in ((num_lanes, "robots"), (num_threads, "threads")):
+        if count is not None and count < 1:
+            raise InputError(f"the number of {what} is {count}: it must be at least 1")
 
 
 def check_actions(actions: ArrayLike, num_lanes: int) -> Array:
