@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import operator
 import re
 from collections.abc import Iterator, Mapping
@@ -99,7 +100,7 @@ class Settings:
     def row_bytes(self) -> int:
         """Bytes that a control step takes."""
         specs = step_specs(get_task(self.task), self.store_state).values()
-        return sum(spec.dtype.itemsize * max(1, sum(spec.row)) for spec in specs)
+        return sum(spec.dtype.itemsize * math.prod(spec.row) for spec in specs)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from jbrep.dataset.manifest import (
     shard_name,
 )
 from jbrep.dataset.reader import Dataset
-from jbrep.dataset.schema import EPISODES, episode_columns, episode_returns, episode_seed
+from jbrep.dataset.schema import EPISODES, Columns, episode_columns, episode_returns, episode_seed
 from jbrep.dataset.shard import MEND, DamageError, column_hash
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
@@ -27,8 +27,6 @@ from jbrep.jitterbug.tasks import EPISODE_STEPS, Task
 
 _LANES = 100
 _BOUNDED = ("rad", "1")  # angles are wrapped, quaternions are of length 1: their ranges are bounds
-
-Columns = dict[str, NDArray[Any]]
 
 
 def find_problems(folder: Path) -> Iterator[str]:
