@@ -25,7 +25,7 @@ class Player(NamedTuple):
     def play(self, episodes: Sequence[int], target_yaw: float | None = None) -> list[Rollout]:
         """Episodes of those that every run is evaluated on, by their numbers from 0."""
         seeds = [EVALUATION_SEED + episode for episode in episodes]
-        return play(self.task, self.begin, self.name, seeds, target_yaw, show=True)
+        return play(self.task, self.begin, self.name, seeds, target_yaw)
 
 
 def find_episode(source: str, episode: int = 0, task: str | None = None) -> Rollout:

@@ -82,10 +82,10 @@ class Column:
             for start in range(0, len(part), size):
                 yield part[start : start + size]
 
-    def parts(self, rows: NDArray[np.int64], size: int = _CHUNK) -> Iterator[Array]:
-        """Those rows in their order, copies of at most so many at a time."""
-        for start in range(0, len(rows), size):
-            yield self[rows[start : start + size]]
+    def parts(self, rows: NDArray[np.int64]) -> Iterator[Array]:
+        """Those rows in their order, copies of some at a time."""
+        for start in range(0, len(rows), _CHUNK):
+            yield self[rows[start : start + _CHUNK]]
 
     def __repr__(self) -> str:
         return f"Column(shape={self.shape}, dtype={self.dtype}, shards={len(self._ends)})"
