@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from operator import index
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,7 +60,13 @@ def collect(
             cut short, or no space.
     """
     policy = make_policy(settings.policy)
-    settings = replace(settings, policy=policy_settings(policy))
+    settings = replace(
+        settings,
+        policy=policy_settings(policy),
+        steps=index(settings.steps),  # it may be NumPy's, which JSON wouldn't take
+        seed=index(settings.seed),
+        shard_episodes=index(settings.shard_episodes),
+    )
     check_counts(lanes, num_threads)
 
     def make(shard: int, tick: Tick) -> Columns:

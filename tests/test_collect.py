@@ -68,6 +68,11 @@ def test_neither_lanes_nor_threads_change_a_byte(how, tmp_path):
     assert contents(tmp_path / "plain") == contents(tmp_path / "other")
 
 
+def test_a_number_may_be_one_of_numpys(collected, tmp_path):
+    collect(settings(steps=np.int64(5000), seed=np.int32(3)), tmp_path / "it")
+    assert contents(tmp_path / "it") == contents(collected)
+
+
 def test_shards_cut_the_same_rows(collected, tmp_path):
     collect(settings(shard_episodes=3, store_state=False), tmp_path / "wide")
     wide, narrow = Dataset(tmp_path / "wide"), Dataset(collected)

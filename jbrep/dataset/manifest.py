@@ -195,7 +195,7 @@ def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
             f"no data set in {folder}: a folder that jbrep collect wrote is expected"
         ) from None
     except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror}") from error
+        raise InputError(f"can't read {path}: {error.strerror or error}") from error
     damage = DamageError(f"{path} is damaged: it isn't what jbrep wrote; {MEND}")
     try:
         record = json.loads(raw)

@@ -77,13 +77,15 @@ def map_file(path: Path) -> mmap.mmap:
     """
     try:
         if not _regular_size(path):
-            raise DamageError(f"{path} is damaged: a regular file that isn't empty is expected")
+            raise DamageError(
+                f"{path} is damaged: a regular file that isn't empty is expected, and no link"
+            )
         with path.open("rb") as file:
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except FileNotFoundError:
         raise DamageError(f"{path} is missing: {MEND}") from None
     except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror}") from error
+        raise InputError(f"can't read {path}: {error.strerror or error}") from error
 
 
 class Shard(Mapping[str, NDArray[Any]]):

@@ -59,7 +59,7 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"can't make the folder {folder}: {error.strerror}") from None
+        raise InputError(f"can't make the folder {folder}: {error.strerror or error}") from None
 
 
 def check_space(folder: Path, needed: int) -> None:

@@ -44,7 +44,7 @@ def read(path: Path, what: str, most: int = _MAX_BYTES) -> tuple[Tensors, dict[s
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"no {what} at {path}") from None
     except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror}") from error
+        raise InputError(f"can't read {path}: {error.strerror or error}") from error
     if not raw:
         raise InputError(
             f"{path} is not a jbrep {what}: a regular file of 1 to {most:,} bytes is needed"

@@ -121,6 +121,6 @@ def check_out(path: Path) -> None:
         with path.open("rb") as file:
             earlier = file.read(len(_MAGIC)) == _MAGIC
     except OSError as error:
-        raise InputError(f"can't write {path}: {error.strerror}") from None
+        raise InputError(f"can't write {path}: {error.strerror or error}") from None
     if not earlier:
         raise InputError(f"{path} is there and is no Rerun recording: choose another --out")

@@ -78,4 +78,4 @@ def _text(path: Path) -> str:
     try:
         return read_regular(path, _MAX_BYTES).decode()
     except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror}") from error
+        raise InputError(f"can't read {path}: {error.strerror or error}") from error

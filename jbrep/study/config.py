@@ -124,7 +124,7 @@ def read_study(path: Path) -> Study:
     except FileNotFoundError:
         raise InputError(f"no study at {path}: a TOML file is needed") from None
     except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror}") from error
+        raise InputError(f"can't read {path}: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is no TOML: {error}") from None
     try:
