@@ -62,9 +62,9 @@ def _read(folder: Path, run: dict[str, Any], weights: dict[str, Any]) -> Trained
     encoder = load(folder / ENCODER)
     try:
         return _build(run["settings"], encoder, weights)
+    except InputError:
+        raise
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"the files in {folder} don't fit together: {_line(error)}") from None
 
 
@@ -128,9 +128,9 @@ def _weights(path: Path) -> dict[str, Any]:
                 raise InputError(f"{path} is larger than a policy")
             content = io.BytesIO(file.read(_WEIGHTS))
         return torch.load(content, map_location="cpu", weights_only=True)
-    except (OSError, KeyError, EOFError, RuntimeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
+    except InputError:
+        raise
+    except (OSError, KeyError, EOFError, RuntimeError, ValueError):
         raise InputError(f"{path} is missing or damaged") from None
     except (zipfile.BadZipFile, pickle.UnpicklingError):
         raise InputError(f"{path} is damaged: it holds no policy's weights") from None

@@ -114,8 +114,8 @@ def groups(runs: Sequence[RunCurve], baseline: str) -> dict[tuple[str, str], Gro
     In the order of names and seeds, whatever the order given.
 
     Raises:
-        InputError: what isn't a run, a label of one run, a seed or a curve twice under a label,
-            settings that differ under a label, a group without its baseline, or no run.
+        InputError: what isn't a run, a label of one run, a seed twice or settings that differ under
+            a label, a group without its baseline, or no run.
     """
     found: dict[tuple[str, str], Group] = defaultdict(lambda: defaultdict(list))
     for run in runs:

@@ -88,9 +88,9 @@ def _curve(folder: Path) -> RunCurve:
     run = read_run(folder)
     try:
         return _as_curve(run, folder)
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError):
         raise InputError(f"{folder / RUN} is damaged, or not of a run") from None
 
 
