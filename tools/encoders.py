@@ -11,7 +11,7 @@ from typing import Any
 
 from jbrep.dae.training import NOISE, Training
 from jbrep.dataset import Dataset, ScaledDataset
-from jbrep.evaluate.evaluation import FULL
+from jbrep.encoders import FULL
 from jbrep.evaluate.files import write
 from jbrep.evaluate.summary import summary
 from jbrep.figures import encoder_plots

@@ -1,7 +1,7 @@
 """Encoders: from observations to latents and back, their file, and the ones that ship."""
 
-from jbrep.encoders.encoder import ACTIVATIONS, Encoder, Layer
+from jbrep.encoders.encoder import ACTIVATIONS, FULL, Encoder, Layer
 from jbrep.encoders.file import load, save
 from jbrep.encoders.shipped import find
 
-__all__ = ["ACTIVATIONS", "Encoder", "Layer", "find", "load", "save"]
+__all__ = ["ACTIVATIONS", "FULL", "Encoder", "Layer", "find", "load", "save"]

@@ -14,6 +14,7 @@ from jbrep.jitterbug.tasks import Task
 Float32 = NDArray[np.float32]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 
+FULL = "full"  # what the identity is called beside encoders to fewer numbers
 _WIDEST = 4096
 _MOST = 1e12  # what float32 arithmetic stays clear of
 

@@ -8,7 +8,7 @@ from tqdm import tqdm
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
-from jbrep.encoders import Encoder
+from jbrep.encoders import FULL, Encoder
 from jbrep.errors import InputError
 from jbrep.evaluate.bootstrap import RESAMPLES
 from jbrep.evaluate.held_out import HeldOut
@@ -18,7 +18,6 @@ from jbrep.evaluate.reconstruction import corruption, reconstruction
 
 FORMAT = "jbrep evaluation"
 FORMAT_VERSION = 1
-FULL = "full"  # the label of the scaled observation itself
 _DIAGNOSTICS: dict[str, Callable[[Encoder, HeldOut], Any]] = {
     "reconstruction": reconstruction,
     "corruption": corruption,

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from jbrep.evaluate.evaluation import FULL
+from jbrep.encoders import FULL
 from jbrep.tables import table
 
 _NOISE = 0.1  # the corruption to show

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from jbrep.evaluate.evaluation import FULL
+from jbrep.encoders import FULL
 from jbrep.figures.curves import below
 from jbrep.figures.plot import Plot
 from jbrep.figures.style import COLUMN, PAGE, ink, plain, reference, styles

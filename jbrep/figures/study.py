@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jbrep.evaluate.evaluation import FULL
+from jbrep.encoders import FULL
 from jbrep.figures.curves import Heuristics, Return, baseline_curves, curves, every_run
 from jbrep.figures.diagrams import Labels, diagrams
 from jbrep.figures.plot import Plot

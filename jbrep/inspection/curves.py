@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.evaluate.evaluation import FULL
+from jbrep.encoders import FULL
 from jbrep.inspection.blueprint import TRAINING_STEP, curves_layout
 from jbrep.inspection.recording import Colour, Recording, palette
 from jbrep.jitterbug.tasks import Array

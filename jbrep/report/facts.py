@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from jbrep.evaluate.evaluation import FULL
+from jbrep.encoders import FULL
 from jbrep.report.tables import Tables
 from jbrep.rl.files import FAILED
 from jbrep.stats.runs import in_order

@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import Logger
 from jbrep.dae.training import one_thread
 from jbrep.dataset.lock import exclusive
 from jbrep.dataset.storage import exists, make_folder, write_whole
-from jbrep.encoders import Encoder, find, save
+from jbrep.encoders import FULL, Encoder, find, save
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError, differences
 from jbrep.jitterbug.tasks import get_task
@@ -39,7 +39,6 @@ from jbrep.rl.files import (
 from jbrep.rl.presets import get_preset
 from jbrep.rl.recorder import NotFiniteError, Recorder, Scalars, Watch
 
-FULL = "full"  # what the identity is called beside what is smaller
 _CHECKPOINT = "checkpoint.safetensors"
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 _MOST_SEED = 1 << 31

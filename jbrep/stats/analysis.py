@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jbrep.encoders import FULL
 from jbrep.evaluate.bootstrap import Array, Interval, without_nan
 from jbrep.stats.claims import CLAIMS
 from jbrep.stats.comparison import Comparison, adjusted, compare, simultaneous_level
@@ -67,7 +68,7 @@ class Analysis:
         return {**_plain(self), "profile_returns": PROFILE_RETURNS.tolist()}
 
 
-def analyse(runs: Sequence[RunCurve], baseline: str = "full", seed: int = 0) -> Analysis:
+def analyse(runs: Sequence[RunCurve], baseline: str = FULL, seed: int = 0) -> Analysis:
     """All numbers and verdicts of a study; they don't depend on the order of its runs.
 
     Args:

@@ -9,11 +9,11 @@ from typing import Any
 
 from jbrep.dae.training import Training
 from jbrep.dataset.shard import read_regular
+from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.fit import get_kind
 from jbrep.jitterbug.tasks import get_task
 from jbrep.rl.presets import get_preset
-from jbrep.rl.run import FULL
 
 _MAX_BYTES = 1 << 20
 

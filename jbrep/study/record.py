@@ -6,9 +6,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from jbrep.encoders import Encoder, load
+from jbrep.encoders import FULL, Encoder, load
 from jbrep.rl.files import ENCODER, read_run
-from jbrep.rl.run import FULL, plain
+from jbrep.rl.run import plain
 from jbrep.stats.runs import in_order
 from jbrep.study.plan import read_plan
 from jbrep.study.work import read_progress

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jbrep.dataset.storage import write_whole
+from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, write_csv
-from jbrep.rl.run import FULL
 from jbrep.stats import Analysis, RunCurve, analyse, summary
 from jbrep.study.record import RECORD, as_json, learner, record
 from jbrep.tables import table
