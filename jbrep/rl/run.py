@@ -47,7 +47,11 @@ _NOT_FINITE = ("found invalid values", "actions are not finite")
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """What to train; together with the versions it decides every number, on one kind of CPU."""
+    """What to train; together with the versions it decides every number, on one kind of CPU.
+
+    Raises:
+        InputError: a number out of range.
+    """
 
     task: str
     algorithm: str = "sac"
@@ -58,12 +62,19 @@ class Run:
     evaluate_every: int = 10_000  # steps
     evaluation_episodes: int = 10
 
+    def __post_init__(self) -> None:
+        for name in ("steps", "evaluate_every", "evaluation_episodes"):
+            if getattr(self, name) < 1:
+                said = name.replace("_", " ")
+                raise InputError(f"{said} is {getattr(self, name)}: a number from 1 is needed")
+        if not 0 <= self.seed < _MOST_SEED:
+            raise InputError(f"the seed is {self.seed}: from 0 to {_MOST_SEED - 1} is needed")
+
     def check(self) -> None:
         """Make sure that it can be run.
 
         Raises:
-            InputError: an unknown task, algorithm or preset, an encoder that can't be used, or a
-                number out of range.
+            InputError: an unknown task, algorithm or preset, or an encoder that can't be used.
         """
         self.describe(find(self.encoder, get_task(self.task).name))
 
@@ -73,12 +84,6 @@ class Run:
         Raises:
             InputError: as `check`.
         """
-        for name in ("steps", "evaluate_every", "evaluation_episodes"):
-            if getattr(self, name) < 1:
-                said = name.replace("_", " ")
-                raise InputError(f"{said} is {getattr(self, name)}: a number from 1 is needed")
-        if not 0 <= self.seed < _MOST_SEED:
-            raise InputError(f"the seed is {self.seed}: from 0 to {_MOST_SEED - 1} is needed")
         return {
             "task": get_task(self.task).name,
             "algorithm": self.algorithm,

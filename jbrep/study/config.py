@@ -14,6 +14,7 @@ from jbrep.errors import InputError
 from jbrep.fit import get_kind
 from jbrep.jitterbug.tasks import get_task
 from jbrep.rl.presets import get_preset
+from jbrep.rl.run import Run
 
 _MAX_BYTES = 1 << 20
 
@@ -107,6 +108,14 @@ class Study:
             Learner.of(algorithm)
         for name in self.representations:
             Representation.of(name, self.training)
+        for seed in self.seeds:
+            Run(  # whose numbers are in range
+                task=self.tasks[0],
+                seed=seed,
+                steps=self.steps,
+                evaluate_every=self.evaluate_every,
+                evaluation_episodes=self.evaluation_episodes,
+            )
         if self.data and bool(self.data.steps) == bool(self.data.folder):
             raise InputError("data needs either steps, to collect, or the folder of a data set")
         if self.training and not self.data:
