@@ -569,6 +569,19 @@ def test_a_representation_that_did_not_learn_is_not_steadier():
     assert (steadier.verdict, steadier.reason) == ("undecided", "dae-8 didn't learn")
 
 
+def test_a_representation_that_did_not_learn_is_no_faster():
+    runs = study({"full": [498, 499, 500, 501, 502], "dae-8": [0] * 5})
+    runs = [
+        run
+        if run.representation == "full"
+        else replace(run, returns=np.full_like(run.returns, 450 + run.seed / 10))
+        for run in runs
+    ]
+    _, _, faster = analyse(runs).groups[0].comparisons[0].verdicts
+    assert faster.simultaneous.low > 0
+    assert (faster.verdict, faster.reason) == ("undecided", "dae-8 didn't learn")
+
+
 def test_two_runs_are_too_few_for_a_variance():
     found = analyse(study({"full": [500, 510], "dae-8": [480, 520]}))
     steadier = found.groups[0].comparisons[0].verdicts[1]

@@ -132,9 +132,10 @@ def _judge(claim: Claim, label: Label, baseline: Label, family: int, seed: int) 
     reason = _reason(claim, x, y)
     if not baseline.learned:  # then all do nothing alike
         decided, reason = 0, f"{baseline.representation} didn't learn"
-    elif decided > 0 and not claim.despite_failures and (label.failed or not label.learned):
-        decided = 0
-        reason = "failed runs" if label.failed else f"{label.representation} didn't learn"
+    elif decided > 0 and label.failed and not claim.despite_failures:
+        decided, reason = 0, "failed runs"
+    elif decided > 0 and not label.learned and not claim.despite_idleness:
+        decided, reason = 0, f"{label.representation} didn't learn"
     needed = None if decided or reason else seeds_needed(claim, x, y, level, seed)
     p = claim.p_value(x, y, boundary, seed)
     return Verdict(
