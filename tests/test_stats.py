@@ -582,6 +582,16 @@ def test_a_representation_that_did_not_learn_is_no_faster():
     assert (faster.verdict, faster.reason) == ("undecided", "dae-8 didn't learn")
 
 
+def test_runs_that_failed_to_learn_by_chance_decide_no_variance():
+    """Two of ten on one side and none on the other: one in seven times, if one in ten fails."""
+    most = np.linspace(880, 920, 10)
+    runs = study({"full": [50, 60, *most[2:]], "dae-8": most})
+    steadier = analyse(runs).groups[0].comparisons[0].verdicts[1]
+    assert steadier.simultaneous.high < 1
+    assert (steadier.verdict, steadier.reason) == ("undecided", "its p-value doesn't agree")
+    assert steadier.seeds_needed is None
+
+
 def test_two_runs_are_too_few_for_a_variance():
     found = analyse(study({"full": [500, 510], "dae-8": [480, 520]}))
     steadier = found.groups[0].comparisons[0].verdicts[1]

@@ -26,7 +26,10 @@ class Verdict:
 
     Args:
         claim: in words.
-        verdict: supported, contradicted or undecided, by the simultaneous interval alone.
+        verdict: supported, contradicted or undecided, by the simultaneous interval, with which the
+            p-value must agree: where a run in ten failed to learn, Bonett's interval decides on
+            equal variances in 19 % of comparisons of 10 runs at a level of 0.56 %, the permutation
+            test in 0.3 %.
         boundary: the value that the interval must exclude.
         nominal: the number that the claim is about, with its 95 % interval.
         simultaneous: the same with the interval of the level that all of a study's verdicts share.
@@ -129,6 +132,7 @@ def _judge(claim: Claim, label: Label, baseline: Label, family: int, seed: int) 
     boundary = float(claim.boundary(y))
     simultaneous = claim.interval(x, y, level)
     decided = int(decide(claim, simultaneous, claim.boundary(y)))
+    p = claim.p_value(x, y, boundary, seed)
     reason = _reason(claim, x, y)
     if not baseline.learned:  # then all do nothing alike
         decided, reason = 0, f"{baseline.representation} didn't learn"
@@ -136,8 +140,9 @@ def _judge(claim: Claim, label: Label, baseline: Label, family: int, seed: int) 
         decided, reason = 0, "failed runs"
     elif decided > 0 and not label.learned and not claim.despite_idleness:
         decided, reason = 0, f"{label.representation} didn't learn"
+    elif decided and p > 1 - level:
+        decided, reason = 0, "its p-value doesn't agree"
     needed = None if decided or reason else seeds_needed(claim, x, y, level, seed)
-    p = claim.p_value(x, y, boundary, seed)
     return Verdict(
         claim=claim.name,
         verdict=in_words(decided),
