@@ -4,12 +4,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.dataset.storage import exists
+from jbrep.encoders import Encoder
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import Task, get_task
-from jbrep.policies import POLICIES, parse_policy
+from jbrep.policies import POLICIES, Actor, parse_policy
 from jbrep.rl.files import EVALUATION_SEED, RUN, read_run
 from jbrep.rollout import Begin, Rollout, play, replay
 
@@ -26,6 +29,22 @@ class Player(NamedTuple):
         """Episodes of those that every run is evaluated on, by their numbers from 0."""
         seeds = [EVALUATION_SEED + episode for episode in episodes]
         return play(self.task, self.begin, self.name, seeds, target_yaw)
+
+    def through(self, encoder: Encoder) -> "Player":
+        """The same policy, but that it observes what an encoder's latent is decoded to.
+
+        What it loses by that is what the latent lacks for it.
+
+        Raises:
+            InputError: an encoder for other observations.
+        """
+        encoder.check_task(self.task)
+
+        def begin(task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
+            act = self.begin(task, randoms)
+            return lambda seen: act(encoder.decode(encoder.encode(seen.astype(np.float32))))
+
+        return self._replace(name=f"{self.name} on {encoder.name}, decoded", begin=begin)
 
 
 def find_episode(source: str, episode: int = 0, task: str | None = None) -> Rollout:

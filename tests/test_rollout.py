@@ -8,6 +8,7 @@ import pytest
 from jbrep.collect import collect
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import Settings
+from jbrep.encoders import find
 from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS, episode_returns
 from jbrep.jitterbug.simulation import Simulation
@@ -80,6 +81,22 @@ def test_the_target_turns_where_it_is_told():
     faces = np.arctan2(-rollout.rotation[:, 4], -rollout.rotation[:, 1])
     np.testing.assert_allclose(np.cos(angles), np.cos(np.pi / 4 - faces), atol=1e-12)
     assert np.abs(angles[-200:]).mean() < np.abs(angles[0])
+
+
+def test_a_policy_plays_through_an_encoder():
+    player = find_player("heuristic", "face_direction")
+    direct, whole, blurred = (
+        p.play([0])[0]
+        for p in (
+            player,
+            *(player.through(find(e, "face_direction")) for e in ("identity", "pca-4")),
+        )
+    )
+    np.testing.assert_allclose(whole.action[:20], direct.action[:20], atol=1e-4)
+    assert np.abs(blurred.action[:20] - direct.action[:20]).max() > 0.01
+    assert blurred.name == "heuristic on pca-4, decoded"
+    with pytest.raises(InputError, match="move_to_pose"):
+        player.through(find("pca-4", "move_to_pose"))
 
 
 def test_an_episode_that_diverges_when_played_ends_before_it_does(monkeypatch, tmp_path):

@@ -74,39 +74,58 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
 
 
 @click.command(epilog=example("jbrep evaluate-policy runs/a --episodes 100"))
-@click.argument("policy", type=click.Path(path_type=Path))
+@click.argument("policy")
 @click.option(
     "--episodes", default=20, show_default=True, type=COUNT, help="How many, the same each time."
 )
 @click.option("--trust", is_flag=True, help="Read a zip file from elsewhere, which can run code.")
-@click.option("--task", default="face_direction", help="Of such a file.")
-@click.option("--algorithm", default="sac", help="Of such a file.")
-@click.option("--encoder", default="identity", help="That such a file was trained on.")
+@click.option("--task", default="face_direction", help="Of a zip file, or of a policy by name.")
+@click.option("--algorithm", default="sac", help="Of a zip file.")
+@click.option("--encoder", help="That a zip file was trained on; or between robot and policy.")
 def evaluate_policy(
-    policy: Path, episodes: int, trust: bool, task: str, algorithm: str, encoder: str
+    policy: str, episodes: int, trust: bool, task: str, algorithm: str, encoder: str | None
 ) -> None:
-    """Show the returns of a trained policy.
+    """Show the returns of a policy.
 
-    POLICY is a folder of jbrep rl, or a zip file that stable-baselines3 wrote. Of a folder only
-    numbers are read. Such a zip file runs as code when it is opened, so it needs --trust.
+    POLICY is a folder of jbrep rl, a zip file that stable-baselines3 wrote, or a policy by its
+    name, such as heuristic. Of a folder only numbers are read. A zip file runs as code when it is
+    opened, so it needs --trust. A policy by name may act on what an encoder's latent is decoded
+    to: what it loses by that is what the latent lacks for it.
     """
     import numpy as np
 
-    from jbrep.rl.agent import Evaluator
-    from jbrep.rl.policy import load_run, load_zip
-
-    if policy.is_dir():
-        trained = load_run(policy)
-    else:
-        trained = load_zip(policy, task, algorithm, encoder, trust)
-    returns = Evaluator(trained.task, trained.encoder, episodes).returns(trained.policy)
+    name, returns = _play(policy, episodes, trust, task, algorithm, encoder)
     low, median, high = np.percentile(returns, (10, 50, 90))
     click.echo(
         printable(
-            f"{trained.task} on {trained.encoder.name}: median return {median:.0f} "
-            f"[{low:.0f}, {high:.0f}] (10th and 90th percentile of {episodes} episodes)"
+            f"{name}: median return {median:.0f} [{low:.0f}, {high:.0f}] "
+            f"(10th and 90th percentile of {episodes} episodes)"
         )
     )
+
+
+def _play(
+    policy: str, episodes: int, trust: bool, task: str, algorithm: str, encoder: str | None
+) -> tuple[str, Any]:
+    """What was played, and the returns."""
+    from jbrep.encoders import find
+    from jbrep.policies import POLICIES
+    from jbrep.rl.agent import Evaluator
+    from jbrep.rl.policy import load_run, load_zip
+    from jbrep.sources import find_player
+
+    if policy.partition(":")[0] in POLICIES:
+        player = find_player(policy, task)
+        if encoder:
+            player = player.through(find(encoder, player.task.name))
+        played = player.play(range(episodes))
+        return f"{task}, {player.name}", [rollout.reward.sum() for rollout in played]
+    if Path(policy).is_dir():
+        trained = load_run(Path(policy))
+    else:
+        trained = load_zip(Path(policy), task, algorithm, encoder or "identity", trust)
+    returns = Evaluator(trained.task, trained.encoder, episodes).returns(trained.policy)
+    return f"{trained.task} on {trained.encoder.name}", returns
 
 
 @click.command(epilog=example("jbrep behaviour runs/full runs/dae-4 --out behaviour"))
