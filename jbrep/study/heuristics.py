@@ -9,7 +9,7 @@ from jbrep.jitterbug.heuristics import HEURISTICS, episode_returns
 from jbrep.rl.files import EVALUATION_SEED, write_csv
 
 HEURISTIC_RETURNS = "heuristics.csv"
-_EPISODES = 20  # the first of those that every run is evaluated on
+_EPISODES = 20  # from the start on that every run's evaluation begins with
 _COLUMNS = ("task", "episode", "return")
 
 
