@@ -431,6 +431,19 @@ def power_of_t(n, effect, alpha=0.05):
     return stats.nct.sf(edge, freedom, apart) + stats.nct.cdf(-edge, freedom, apart)
 
 
+def test_no_verdict_is_promised_that_the_permutation_test_can_not_give():
+    random = np.random.default_rng(0)
+    steady, wild = random.normal(size=5), 1e6 * random.normal(size=5)
+    assert seeds_needed(STEADIER, steady, wild, 0.95) == 5  # p can be 2 / 252
+    assert seeds_needed(STEADIER, steady, wild, 0.999) == 10
+
+
+def test_a_part_of_a_study_is_judged_as_strictly_as_the_whole():
+    runs = study({"full": (500, 510, 520), "dae-8": (500, 480, 530)})
+    levels = [analyse(runs, planned=n).simultaneous_level for n in (0, 1, 10)]
+    assert levels == pytest.approx([1 - 0.05 / 3, 1 - 0.05 / 3, 1 - 0.05 / 30])
+
+
 @pytest.mark.parametrize("ratio", [0.5, 0.25, 0.1])
 def test_seeds_needed_are_those_of_the_f_test(ratio):
     def power_of_f(n):

@@ -6,16 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jbrep.dataset.shard import read_regular
 from jbrep.dataset.storage import exists
 from jbrep.errors import InputError, check_version
 from jbrep.figures.curves import Return
+from jbrep.rl.files import read_text
 from jbrep.stats import analysis
 from jbrep.study import record
 from jbrep.study.heuristics import HEURISTIC_RETURNS
 from jbrep.study.results import RETURNS, STATISTICS
-
-_MAX_BYTES = 1 << 28
 
 
 class Tables(NamedTuple):
@@ -53,7 +51,7 @@ def read_tables(folder: Path) -> Tables:
 
 def _read_json(path: Path, kind: str, known: int) -> dict[str, Any]:
     try:
-        found = json.loads(_text(path))
+        found = json.loads(read_text(path))
         if found["format"] != kind:
             raise ValueError
         version = found["format_version"]
@@ -68,14 +66,7 @@ def _read_csv(path: Path, kinds: tuple[Callable[[str], Any], ...]) -> list[tuple
     try:
         return [
             tuple(kind(cell) for kind, cell in zip(kinds, row, strict=True))
-            for row in csv.reader(_text(path).splitlines()[1:])
+            for row in csv.reader(read_text(path).splitlines()[1:])
         ]
     except ValueError:
         raise InputError(f"{path} is damaged, or cut short") from None
-
-
-def _text(path: Path) -> str:
-    try:
-        return read_regular(path, _MAX_BYTES).decode()
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from error

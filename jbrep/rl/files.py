@@ -64,7 +64,7 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     """
     path = folder / EVALUATIONS
     try:
-        rows = list(csv.reader(_text(path).splitlines()))
+        rows = list(csv.reader(read_text(path).splitlines()))
         if rows[0] != ["step", "episode", "return"]:
             raise ValueError
         return [Evaluation(int(step), int(e), float(r)) for step, e, r in rows[1:]]
@@ -88,7 +88,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     if not exists(path):
         raise InputError(f"no run that is over in {folder}: a {RUN} is expected")
     try:
-        run = json.loads(_text(path))
+        run = json.loads(read_text(path))
         version = run.get("format_version", 1)  # the first ones didn't say
         fields = (run["settings"], run["status"], run["seconds"])
         kinds = (dict, str, float)
@@ -100,7 +100,12 @@ def read_run(folder: Path) -> dict[str, Any]:
     return {name: run[name] for name in run if name not in ("format", "format_version")}
 
 
-def _text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """A table's text.
+
+    Raises:
+        InputError: it can't be read.
+    """
     try:
         return read_regular(path, _MAX_BYTES).decode()
     except OSError as error:

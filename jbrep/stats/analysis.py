@@ -68,19 +68,23 @@ class Analysis:
         return {**_plain(self), "profile_returns": PROFILE_RETURNS.tolist()}
 
 
-def analyse(runs: Sequence[RunCurve], baseline: str = FULL, seed: int = 0) -> Analysis:
+def analyse(
+    runs: Sequence[RunCurve], baseline: str = FULL, seed: int = 0, planned: int = 0
+) -> Analysis:
     """All numbers and verdicts of a study; they don't depend on the order of its runs.
 
     Args:
         runs: every run of the study.
         baseline: the representation that the others are compared with.
         seed: of all that is drawn.
+        planned: comparisons with the baseline that the whole study has, for when only a part of
+            its runs is there: the verdicts of that part are as strict as those of the whole.
 
     Raises:
         InputError: runs that can't be compared, or would mislead; see jbrep.stats.runs.groups.
     """
     found = groups(runs, baseline)
-    family = len(CLAIMS) * sum(len(group) - 1 for group in found.values())
+    family = len(CLAIMS) * max(planned, sum(len(group) - 1 for group in found.values()))
     analysed = [_analyse_group(group, family, seed) for group in found.values()]
     comparisons = iter(adjusted([c for group in analysed for c in group.comparisons]))
     return Analysis(

@@ -121,6 +121,12 @@ class Study:
         if self.training and not self.data:
             raise InputError("training is of encoders made for the study, so data is needed, too")
 
+    @property
+    def comparisons(self) -> int:
+        """How many times a representation is compared with the full observation."""
+        smaller = set(self.representations) - {FULL}
+        return len(self.tasks) * len(self.algorithms) * len(smaller)
+
 
 def read_study(path: Path) -> Study:
     """A study from its TOML file.

@@ -14,6 +14,7 @@ from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, write_csv
 from jbrep.stats import Analysis, RunCurve, analyse, summary
+from jbrep.study.plan import read_plan
 from jbrep.study.record import RECORD, as_json, learner, record
 from jbrep.tables import table
 
@@ -40,8 +41,10 @@ def read_results(folder: Path) -> Results:
     folders = _folders(folder)
     runs = [_curve(each) for each in folders]
     compared, left_out = _comparable(runs)
+    planned = plan.study.comparisons if (plan := read_plan(folder)) else 0
     try:
-        return Results(folders, runs, analyse(compared) if compared else None, left_out)
+        analysis = analyse(compared, planned=planned) if compared else None
+        return Results(folders, runs, analysis, left_out)
     except InputError as error:
         return Results(folders, runs, None, [*left_out, str(error)])
 
