@@ -1,6 +1,7 @@
 """Draw the figures and reports in results/ anew, from the tables there: python tools/figures.py."""
 
 import json
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from jbrep.figures import encoder_plots, write
@@ -9,14 +10,18 @@ from jbrep.report import write_report
 RESULTS = Path("results")
 
 
+def draw(tables: Path) -> list[Path]:
+    if tables.name == "runs.json":
+        return write_report(tables.parent)
+    return write(encoder_plots(json.loads(tables.read_text())), tables.parent)
+
+
 def main() -> None:
-    for evaluation in sorted(RESULTS.glob("encoders/*/evaluation.json")):
-        plots = encoder_plots(json.loads(evaluation.read_text()))
-        for path in write(plots, evaluation.parent):
-            print(path)
-    for tables in sorted(RESULTS.glob("*/runs.json")):
-        for path in write_report(tables.parent):
-            print(path)
+    reports = sorted(RESULTS.glob("*/runs.json"))  # first, as they take longest
+    with ProcessPoolExecutor() as processes:
+        tables = (*reports, *sorted(RESULTS.glob("encoders/*/evaluation.json")))
+        for paths in processes.map(draw, tables):
+            print(*paths, sep="\n")
 
 
 if __name__ == "__main__":

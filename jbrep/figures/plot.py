@@ -52,11 +52,13 @@ class Drawing:
     """A figure drawn and laid out once, in a style, for any number of files."""
 
     def __init__(self, plot: Plot, style: Any):
-        self._style = style
         with mpl.rc_context(style):
             self._figure = plot.draw()
             self._figure.draw_without_rendering()
-        self._figure.set_layout_engine("none")
+        # a layout engine, even one that does nothing, has savefig draw everything twice
+        self._style = {**style, "figure.constrained_layout.use": False}
+        with mpl.rc_context(self._style):
+            self._figure.set_layout_engine(None)
 
     @property
     def width(self) -> float:
