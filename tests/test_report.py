@@ -12,8 +12,10 @@ import pytest
 from jbrep.encoders import find, save
 from jbrep.errors import InputError
 from jbrep.report import write_report
+from jbrep.report.facts import reproduce
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, SUMMARY
 from jbrep.report.tables import read_tables
+from jbrep.report.words import answers
 from jbrep.rl.files import ENCODER, Evaluation, write_csv, write_rows, write_run
 from jbrep.sources import find_episode
 from jbrep.study.config import Study
@@ -223,6 +225,21 @@ def test_the_page_says_how_to_reproduce_it(whole):
         "a processor",
     ):
         assert line in text
+
+
+def test_runs_without_a_study_are_made_again_each_in_a_folder_of_its_own(whole):
+    tables = read_tables(whole)
+    labels = tables.record["labels"]
+    labels["move_to_pose/sac/full"] = labels["face_direction/sac/full"]
+    tables.record["study"] = None
+    typed = [line for _, code in reproduce(tables) for line in code.splitlines()]
+    folders = [line.split()[-1] for line in typed if line.startswith("jbrep rl")]
+    assert sorted(folders) == sorted(f"a-study/{label}/seed-0" for label in labels)
+
+
+def test_where_nothing_was_compared_no_verdict_is_missing():
+    (similar, *_) = answers({"groups": [{"comparisons": []}]})
+    assert similar.headline.endswith("at a similar reward: no reduced state was compared")
 
 
 def test_an_unfinished_study_says_what_is_missing(tmp_path):

@@ -179,7 +179,10 @@ def reproduce(tables: Tables) -> list[tuple[str, str]]:
     if study:
         toml = ("This file, as study.toml:", _toml(study))
         return [first, toml, ("All runs:", f"jbrep study study.toml --out {tables.name}"), report]
-    commands = "\n".join(_command(shared, tables) for shared in tables.record["labels"].values())
+    commands = "\n".join(
+        _command(shared, f"{tables.name}/{label}/seed-0")
+        for label, shared in tables.record["labels"].items()
+    )
     return [first, ("Each run; these are of one seed:", commands), report]
 
 
@@ -197,9 +200,8 @@ def _toml(study: Mapping[str, Any]) -> str:
     return "\n".join(lines + below)
 
 
-def _command(shared: Mapping[str, Any], tables: Tables) -> str:
+def _command(shared: Mapping[str, Any], out: str) -> str:
     settings = shared["settings"]
     options = ("task", "algorithm", "preset", "steps", "evaluate_every", "evaluation_episodes")
     given = " ".join(f"--{name.replace('_', '-')} {settings[name]}" for name in options)
-    encoder, out = shared["encoder"]["name"], f"{tables.name}/{settings['representation']}"
-    return f"jbrep rl {given} --encoder {encoder} --seed 0 --out {out}"
+    return f"jbrep rl {given} --encoder {shared['encoder']['name']} --seed 0 --out {out}"

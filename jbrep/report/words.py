@@ -57,7 +57,9 @@ def answers(statistics: Plain) -> list[Answer]:
 
 
 def _overall(counts: Counter[str]) -> str:
-    """Supported, if all agree; else how many say what."""
+    """The verdict, if all agree; else how many say what."""
+    if not counts:
+        return "no reduced state was compared"
     if len(counts) == 1:
         (verdict,) = counts
         return verdict
