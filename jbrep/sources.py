@@ -76,6 +76,8 @@ def find_player(source: str, task: str | None = None) -> Player:
     Raises:
         InputError: neither, or no task to a name, or a run of another task.
     """
+    if exists(Path(source) / MANIFEST):
+        raise InputError(f"{source} is a data set: the folder of a run or a policy is needed")
     if exists(Path(source) / RUN):
         return _of_run(Path(source), task)
     if source.partition(":")[0] not in POLICIES:

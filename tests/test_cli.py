@@ -106,6 +106,13 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
     assert not (tmp_path / "dry").exists()
 
 
+@pytest.mark.parametrize("group", ["", *GROUPS])
+def test_lists_of_commands_say_what_each_does_in_whole_sentences(group):
+    _, _, below = jbrep(*group.split(), "--help").output.partition("Commands:")
+    assert below
+    assert "..." not in below
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_an_example(command):
     text = jbrep(*command.split(), "--help").output
@@ -129,6 +136,15 @@ def test_every_command_has_help_with_an_example(command):
         (("data", "derive", "none", "--task", "fly", "--out", "x"), "no data set in none"),
         (("data", "export", "none", "--to", "npz", "--out", "x"), "no data set in none"),
         (("data", "fly"), "No such command 'fly'. See jbrep data --help."),
+        (
+            ("render", "uniform", "--size", "640", "--out", "x.gif"),
+            "write it as 640x480. See jbrep render --help.",
+        ),
+        (("evaluate-policy", "none"), "no policy at none: a folder of jbrep rl is needed"),
+        (
+            ("behaviour", "uniform", "--task", "fly", "--episodes", "0", "--out", "x"),
+            "'0' is too small: at least 1 is needed. See",
+        ),
         (
             ("collect", "--task", "fly", "--steps", "1", "--policy", "sprint", "--out", "x"),
             "unknown policy 'sprint'",

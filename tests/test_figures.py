@@ -252,6 +252,8 @@ def test_behaviour_is_drawn_from_its_tables(behaviours, tmp_path):
     write((motor, places), tmp_path)
 
 
-def test_the_task_of_a_policy_is_needed():
+def test_the_task_of_a_policy_is_needed_and_no_data_set():
+    with pytest.raises(InputError, match="sample/face_direction is a data set: the folder of a"):
+        observe(("data/sample/face_direction",), None, 1, 0)
     with pytest.raises(InputError, match="policy heuristic needs a --task"):
         observe(("heuristic",), None, 1, 0)

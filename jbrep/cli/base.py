@@ -29,9 +29,18 @@ class _Count(click.ParamType[int]):
 
     name = "number"
 
+    def __init__(self, least: int | None = None):
+        self._least = least
+
     def convert(
         self, value: str | int, param: click.Parameter | None, ctx: click.Context | None
     ) -> int:
+        number = self._number(value)
+        if self._least is not None and number < self._least:
+            self.fail(f"{value!r} is too small: at least {self._least} is needed")
+        return number
+
+    def _number(self, value: str | int) -> int:
         text = str(value).replace("_", "").lower()
         factor = {"k": 1_000, "m": 1_000_000}.get(text[-1:], 1)
         digits = text[:-1] if factor > 1 else text
@@ -46,7 +55,7 @@ class _Count(click.ParamType[int]):
         return int(number)
 
 
-COUNT = _Count()
+COUNT, POSITIVE = _Count(), _Count(least=1)
 GOES_ON = "the same command goes on where it stopped"
 
 
@@ -92,7 +101,9 @@ class Cli(click.Group):
             raise _Mistake(str(error)) from None
         except click.UsageError as error:
             command = error.ctx.command_path if error.ctx else "jbrep"
-            raise _Mistake(f"{error.format_message()} See {command} --help.") from None
+            message = error.format_message()
+            stop = "" if message.endswith((".", "?")) else "."
+            raise _Mistake(f"{message}{stop} See {command} --help.") from None
         except ModuleNotFoundError as error:
             if error.name not in _EXTRAS:
                 raise

@@ -12,7 +12,7 @@ _INDENT, _WIDTH = 9, 100
 @click.command(epilog=example("jbrep doctor"))
 @click.pass_context
 def doctor(context: click.Context) -> None:
-    """Show what of this machine is used, and what is missing for what.
+    """Show what this machine has, and what is missing.
 
     Cores, memory, disk, GPU, OpenGL, and the packages of each extra with their versions. The exit
     code is 1 where a package that all needs is missing, or one has a version that won't do.

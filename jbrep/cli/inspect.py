@@ -37,7 +37,7 @@ def inspect(
     view: bool,
     serve: bool,
 ) -> None:
-    """Record an episode, an encoder or a study for the Rerun viewer.
+    """Record an episode, encoder or study to see in Rerun.
 
     SOURCE is a data set, a run, a folder with several runs, an encoder's file, or a policy such as
     heuristic. With an encoder the robot that comes back stands beside the true one.

@@ -55,7 +55,7 @@ def render(
     speed: float,
     seconds: float,
 ) -> None:
-    """Make a video of an episode; of several SOURCES, side by side.
+    """Make a video of episodes, side by side.
 
     A source is the folder of a data set or of a run that is over, or a policy by its name, such as
     uniform, heuristic or constant:drive=0.5. The motor turns up to 23 times a second: at full

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, GOES_ON, example, printable, stoppable
+from jbrep.cli.base import COUNT, GOES_ON, POSITIVE, example, printable, stoppable
 
 
 @click.command(
@@ -76,11 +76,16 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
 @click.command(epilog=example("jbrep evaluate-policy runs/a --episodes 100"))
 @click.argument("policy")
 @click.option(
-    "--episodes", default=20, show_default=True, type=COUNT, help="How many, the same each time."
+    "--episodes", default=20, show_default=True, type=POSITIVE, help="How many, the same each time."
 )
 @click.option("--trust", is_flag=True, help="Read a zip file from elsewhere, which can run code.")
-@click.option("--task", default="face_direction", help="Of a zip file, or of a policy by name.")
-@click.option("--algorithm", default="sac", help="Of a zip file.")
+@click.option(
+    "--task",
+    default="face_direction",
+    show_default=True,
+    help="Of a zip file, or of a policy by name.",
+)
+@click.option("--algorithm", default="sac", show_default=True, help="Of a zip file.")
 @click.option("--encoder", help="That a zip file was trained on; or between robot and policy.")
 def evaluate_policy(
     policy: str, episodes: int, trust: bool, task: str, algorithm: str, encoder: str | None
@@ -131,7 +136,7 @@ def _play(
 @click.command(epilog=example("jbrep behaviour runs/full runs/dae-4 --out behaviour"))
 @click.argument("policies", nargs=-1, required=True)
 @click.option("--task", help="Of policies by name, such as move_in_direction.")
-@click.option("--episodes", default=100, show_default=True, type=COUNT, help="Of each policy.")
+@click.option("--episodes", default=100, show_default=True, type=POSITIVE, help="Of each policy.")
 @click.option(
     "--target-yaw", default=45.0, show_default=True, help="Where every target points [degrees]."
 )
@@ -139,7 +144,7 @@ def _play(
 def behaviour(
     policies: tuple[str, ...], task: str | None, episodes: int, target_yaw: float, out: Path
 ) -> None:
-    """Draw what policies do: how the motor turns, where the robot goes.
+    """Draw how policies turn the motor and where they go.
 
     A policy is the folder of a run, shown before and after training, or goes by its name, such as
     heuristic. All play the same episodes.
@@ -181,10 +186,11 @@ def study(
     backend: str,
     dry_run: bool,
 ) -> None:
-    """Run a grid of tasks, algorithms, representations and seeds, and judge it.
+    """Train a grid of agents, and judge the paper's claims.
 
-    STUDY is a TOML file, such as those in studies/. Data sets and encoders are made first. What is
-    finished is never run again: stopped or killed, the same command goes on.
+    STUDY is a TOML file of tasks, algorithms, representations and seeds, such as those in studies/.
+    Data sets and encoders are made first. What is finished is never run again: stopped or killed,
+    the same command goes on.
     """
     from joblib import cpu_count
 
@@ -213,7 +219,7 @@ def study(
     "--out", type=click.Path(path_type=Path), help="A folder for it; the study's own if not given."
 )
 def report(folder: Path, out: Path | None) -> None:
-    """Show what a study says: tables, a page, a summary, figures.
+    """Show what a study says, as a page, tables and figures.
 
     FOLDER is of a study, finished or not, or any with runs below it. Where there are no runs, as
     in results/first, the report is made from the tables alone.

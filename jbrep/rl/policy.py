@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.policies import BasePolicy
 
+from jbrep.dataset.storage import exists
 from jbrep.encoders import Encoder, find, load
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError, choose
@@ -90,6 +91,8 @@ def load_zip(path: Path, task: str, algorithm: str, encoder: str, trust: bool) -
     Raises:
         InputError: it isn't trusted, or is no such file, or fits neither task nor encoder.
     """
+    if not exists(path):
+        raise InputError(f"no policy at {path}: a folder of jbrep rl is needed, or a zip file")
     if not trust:
         raise InputError(
             f"{path} is not in a folder of jbrep rl: stable-baselines3 files hold pickled Python, "
