@@ -20,20 +20,11 @@ _RUN_WIDTH = 1.0  # [points]
 _MEDIAN_WIDTH = 4.0  # [points]
 
 
-def curve(run: RunCurve) -> tuple[NDArray[np.int64], Array]:
-    """Training steps and mean returns over the episodes, (k,) each; a failed run ends with 0."""
-    steps, returns = run.steps, run.returns.mean(axis=1)
-    if run.failed_at is None:
-        return steps, returns
-    before = steps < run.failed_at
-    return np.append(steps[before], run.failed_at), np.append(returns[before], 0.0)
-
-
 def median_curve(runs: Sequence[RunCurve]) -> tuple[NDArray[np.int64], Array]:
     """Median over runs, where all were evaluated; a failed run counts as 0 from there on."""
-    whole = [run.steps for run in runs if run.failed_at is None] or [curve(runs[0])[0]]
+    whole = [run.steps for run in runs if run.failed_at is None] or [runs[0].curve()[0]]
     steps: NDArray[np.int64] = reduce(np.intersect1d, whole)
-    each = [np.interp(steps, *curve(run)) for run in runs]
+    each = [np.interp(steps, *run.curve()) for run in runs]
     return steps, np.median(each, axis=0)
 
 
@@ -59,10 +50,10 @@ def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
         name = group[0].representation
         for run in group:
             path_of_run = f"{label}/seed-{run.seed}"
-            _send(recording, path_of_run, curve(run), name, colours[name], _RUN_WIDTH)
+            _send(recording, path_of_run, run.curve(), name, colours[name], _RUN_WIDTH)
         _send(recording, f"{label}/median", median_curve(group), name, colours[name], _MEDIAN_WIDTH)
     groups = sorted({label.rpartition("/")[0] for label in labels})
-    recording.write(path, curves_layout(groups, max(int(curve(run)[0][-1]) for run in runs)))
+    recording.write(path, curves_layout(groups, max(int(run.curve()[0][-1]) for run in runs)))
 
 
 def _send(
@@ -82,6 +73,6 @@ def _about(source: str, labels: dict[str, list[RunCurve]]) -> str:
     """The runs and their last returns, as Markdown."""
     lines = [f"# {source}", "", "| runs | seeds | median return at the end |", "|---|---|---|"]
     for label, runs in labels.items():
-        last = np.median([curve(run)[1][-1] for run in runs])
+        last = np.median([run.curve()[1][-1] for run in runs])
         lines.append(f"| {label} | {len(runs)} | {last:.0f} |")
     return "\n".join(lines)

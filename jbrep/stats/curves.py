@@ -32,16 +32,22 @@ def common_grid(group: Group) -> tuple[Array, str | None]:
     """
     runs = list(chain.from_iterable(group.values()))
     whole = [run for run in runs if run.failed_at is None]
-    start = max(_curve(run)[0][0] for run in runs)
+    start = max(_first(run) for run in runs)
     end = min(_last(run) for run in whole or runs)
     if start >= end:
         raise InputError(
             f"{runs[0].task}/{runs[0].algorithm}: the evaluations of one run end at step {end}, "
-            f"those of another begin at {start:g}; train runs that overlap"
+            f"those of another begin at {start}; train runs that overlap"
         )
     inside = [run.steps[(start < run.steps) & (run.steps < end)] for run in whole or runs]
     fewest = min(inside, key=lambda steps: (len(steps), *steps))
     return np.array([start, *fewest, end], float), _cut(whole, end)
+
+
+def _first(run: RunCurve) -> int:
+    """Where its curve begins: at 0 if it failed before it was evaluated."""
+    steps, _ = run.curve()
+    return 0 if steps[0] == run.failed_at else int(steps[0])
 
 
 def _last(run: RunCurve) -> int:
@@ -61,18 +67,7 @@ def _cut(runs: list[RunCurve], end: int) -> str | None:
 
 def on_grid(run: RunCurve, grid: Array) -> Array:
     """The mean return of a run's evaluations at each step of the grid, (g,)."""
-    return np.interp(grid, *_curve(run))
-
-
-def _curve(run: RunCurve) -> tuple[Array, Array]:
-    """Steps and mean returns, with a failed run's zeros; it ends at one that interp carries on."""
-    steps, returns = run.steps.astype(float), run.returns.mean(axis=1)
-    if run.failed_at is None:
-        return steps, returns
-    before = steps < run.failed_at
-    if not before.any():
-        return np.zeros(1), np.zeros(1)
-    return np.append(steps[before], run.failed_at), np.append(returns[before], 0)
+    return np.interp(grid, *run.curve())
 
 
 def bands(curves: Array, seed: int) -> dict[str, Array | Interval]:

@@ -97,6 +97,14 @@ class RunCurve:
         """Task, algorithm and representation: what runs that differ by seed alone share."""
         return f"{self.task}/{self.algorithm}/{self.representation}"
 
+    def curve(self) -> tuple[NDArray[np.int64], Array]:
+        """Training steps and mean returns over episodes, (k,) each; a failed run ends with 0."""
+        steps, returns = self.steps, self.returns.mean(axis=1)
+        if self.failed_at is None:
+            return steps, returns
+        before = steps < self.failed_at
+        return np.append(steps[before], self.failed_at), np.append(returns[before], 0.0)
+
     def _error(self, found: str, expected: str) -> InputError:
         return InputError(f"run {self.label}, seed {self.seed}: {found}; {expected}")
 
