@@ -8,7 +8,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from jbrep.encoders import Encoder
-from jbrep.inspection.recording import Recording
+from jbrep.inspection.recording import ORANGE, SKY, Recording
 from jbrep.inspection.robot import Robot, rotate
 from jbrep.jitterbug.tasks import Array, Task
 from jbrep.rollout import Rollout
@@ -16,7 +16,7 @@ from jbrep.rollout import Rollout
 GHOST = "world/ghost"
 ALIGNED = "world/aligned"
 _OPACITY = 170  # of 255
-_ALIGNED_COLOUR = (86, 180, 233, _OPACITY)
+_ALIGNED_COLOUR = (*SKY, _OPACITY)
 _RANGE = (1e-3, 1e-1)  # [m] errors from one end of the colours to the other, logarithmically
 _VIRIDIS = (  # from its blue on: what is darker doesn't show; seen alike by the colour-blind
     *((59, 82, 139), (44, 114, 142), (33, 145, 140), (40, 174, 128)),
@@ -24,7 +24,6 @@ _VIRIDIS = (  # from its blue on: what is darker doesn't show; seen alike by the
 )
 _HEADING_LENGTH = 0.06  # [m]
 _HEADING_RADIUS = 0.001  # [m]
-_GOAL_COLOUR = (230, 159, 0)
 _TARGET_RADIUS = 0.006  # [m]
 
 
@@ -102,7 +101,7 @@ def _send_goal(
         recording.send_columns(f"{GHOST}/target", times, points)
         recording.send(
             f"{GHOST}/target",
-            rr.Points3D.from_fields(colors=[_GOAL_COLOUR], radii=[_TARGET_RADIUS]),
+            rr.Points3D.from_fields(colors=[ORANGE], radii=[_TARGET_RADIUS]),
         )
     if "angle_to_target" in parts:
         face = rotate(turned, np.tile((0.0, -1.0, 0.0), (len(turned), 1)))
@@ -112,5 +111,5 @@ def _send_goal(
         recording.send_columns(f"{GHOST}/heading", times, arrows)
         recording.send(
             f"{GHOST}/heading",
-            rr.Arrows3D.from_fields(colors=[_GOAL_COLOUR], radii=[_HEADING_RADIUS]),
+            rr.Arrows3D.from_fields(colors=[ORANGE], radii=[_HEADING_RADIUS]),
         )

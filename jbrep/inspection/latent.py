@@ -7,13 +7,13 @@ import rerun as rr
 
 from jbrep.encoders import Encoder
 from jbrep.inspection.ghost import Ghost
-from jbrep.inspection.recording import Recording
+from jbrep.inspection.recording import SKY, YELLOW, Recording
 from jbrep.inspection.signals import send_decoded, send_features
 from jbrep.jitterbug.tasks import Array
 from jbrep.rollout import Rollout
 
 PATH = "latent/path"
-_ALL_COLOUR, _PATH_COLOUR, _NOW_COLOUR = (90, 98, 112), (86, 180, 233), (240, 228, 66)
+_ALL_COLOUR = (90, 98, 112)
 _ALL_RADIUS, _PATH_RADIUS, _NOW_RADIUS = -1.2, -1.0, -6.0  # [points]: Rerun's sign for these
 
 
@@ -52,7 +52,7 @@ def _send_path(recording: Recording, times: Sequence[rr.TimeColumn], latent: Arr
     recording.send(f"{PATH}/all", rr.Points2D(path, colors=[_ALL_COLOUR], radii=[_ALL_RADIUS]))
     pieces = np.stack((np.concatenate((path[:1], path[:-1])), path), axis=1)
     recording.send_columns(PATH, times, rr.LineStrips2D.columns(strips=pieces.astype(np.float32)))
-    recording.send(PATH, rr.LineStrips2D.from_fields(colors=[_PATH_COLOUR], radii=[_PATH_RADIUS]))
-    now = rr.Points2D.from_fields(colors=[_NOW_COLOUR], radii=[_NOW_RADIUS])
+    recording.send(PATH, rr.LineStrips2D.from_fields(colors=[SKY], radii=[_PATH_RADIUS]))
+    now = rr.Points2D.from_fields(colors=[YELLOW], radii=[_NOW_RADIUS])
     recording.send_columns(f"{PATH}/now", times, rr.Points2D.columns(positions=path))
     recording.send(f"{PATH}/now", now)

@@ -16,13 +16,12 @@ PROVENANCE = "provenance"
 SUFFIX = ".rrd"
 _APPLICATION = "jbrep"
 _MAGIC = b"RRF"  # what a Rerun recording begins with, whatever its version
-_COLOURS = (  # Okabe and Ito's, for the colour-blind too, with grey for black on a dark viewer
-    *((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167)),
-    *((213, 94, 0), (240, 228, 66), (0, 114, 178), (160, 160, 160)),
-)
 
 Colour = tuple[int, int, int]
-GREY: Colour = (160, 160, 160)  # seen on a light viewer and on a dark one
+# Okabe and Ito's, for the colour-blind too; grey for black is seen on a light viewer and a dark one
+SKY, ORANGE, GREEN, PURPLE = (86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167)
+VERMILION, YELLOW, BLUE, GREY = (213, 94, 0), (240, 228, 66), (0, 114, 178), (160, 160, 160)
+_COLOURS: tuple[Colour, ...] = (SKY, ORANGE, GREEN, PURPLE, VERMILION, YELLOW, BLUE, GREY)
 
 
 def palette(count: int) -> list[Colour]:

@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.inspection.recording import Recording
+from jbrep.inspection.recording import GREEN, SKY, Recording
 from jbrep.inspection.robot import Robot, transform
 from jbrep.jitterbug.tasks import Array
 from jbrep.rollout import Rollout
@@ -20,9 +20,7 @@ CONTACTS = f"{WORLD}/contacts"
 _FLOOR_MARGIN = 0.3  # [m] beyond the path
 _FLOOR_THICKNESS = 0.001  # [m]
 _FLOOR_COLOUR = (58, 66, 80)
-_TRAIL_COLOUR = (86, 180, 233)
 _TRAIL_RADIUS = 0.0006  # [m]
-_CONTACT_COLOUR = (0, 158, 115)
 _CONTACT_RADIUS = 0.0012  # [m]
 _WEIGHT_LENGTH = 0.05  # [m] of the arrow of a force as large as the robot's weight
 
@@ -86,7 +84,7 @@ def _send_trail(recording: Recording, times: Sequence[rr.TimeColumn], path: Arra
     ground = np.column_stack((path, np.full(len(path), _TRAIL_RADIUS)))
     pieces = np.stack((np.concatenate((ground[:1], ground[:-1])), ground), axis=1)
     recording.send_columns(TRAIL, times, rr.LineStrips3D.columns(strips=pieces))
-    style = rr.LineStrips3D.from_fields(colors=[_TRAIL_COLOUR], radii=[_TRAIL_RADIUS])
+    style = rr.LineStrips3D.from_fields(colors=[SKY], radii=[_TRAIL_RADIUS])
     recording.send(TRAIL, style)
 
 
@@ -99,8 +97,8 @@ def _send_contacts(
     recording.send_columns(CONTACTS, times, points, forces)
     recording.send(
         CONTACTS,
-        rr.Points3D.from_fields(colors=[_CONTACT_COLOUR], radii=[_CONTACT_RADIUS]),
-        rr.Arrows3D.from_fields(colors=[_CONTACT_COLOUR], radii=[_CONTACT_RADIUS / 2]),
+        rr.Points3D.from_fields(colors=[GREEN], radii=[_CONTACT_RADIUS]),
+        rr.Arrows3D.from_fields(colors=[GREEN], radii=[_CONTACT_RADIUS / 2]),
     )
 
 
