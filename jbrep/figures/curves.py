@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from jbrep.figures.plot import Plot
-from jbrep.figures.style import COLUMN, LINE, PAGE, ink, plain, reference, styles
+from jbrep.figures.style import COLUMN, LINE, PAGE, plain, reference, solved, styles
 from jbrep.stats.runs import in_order
 
 Group = dict[str, Any]  # of statistics.json: what was found for a task and an algorithm
@@ -95,13 +95,12 @@ def _rows(groups: Sequence[Group]) -> Iterator[tuple[Any, ...]]:
 
 
 def _grid_of_curves(groups: Sequence[Group], heuristics: Heuristics) -> Figure:
-    names = [label["representation"] for group in groups for label in group["labels"]]
-    look = styles(names, first=groups[0]["labels"][0]["representation"])
+    look = looks(groups)
 
     def draw(axes: Axes, group: Group) -> None:
         if returns := heuristics.get(group["task"]):
             axes.axhline(float(np.median(returns)), label="hand-written", **reference())
-        axes.axhline(LINE, color=ink(), linestyle=":", linewidth=0.8, alpha=0.65)
+        axes.axhline(LINE, **solved())
         for label in group["labels"]:
             name, curve = label["representation"], label["curve"]
             low, median, high = (np.array(curve[key], float) for key in _BAND)
@@ -113,12 +112,16 @@ def _grid_of_curves(groups: Sequence[Group], heuristics: Heuristics) -> Figure:
                 markevery=max(1, len(median) // 8),
             )
 
-    return grid(groups, draw, legend=True)
+    return _grid(groups, draw)
 
 
-def grid(
-    groups: Sequence[Group], draw: Callable[[Axes, Group], None], legend: bool = False
-) -> Figure:
+def looks(groups: Sequence[Group]) -> dict[str, dict[str, Any]]:
+    """Colour and marker of each representation, the baseline in the colour of text."""
+    names = [label["representation"] for group in groups for label in group["labels"]]
+    return styles(names, first=names[0])
+
+
+def _grid(groups: Sequence[Group], draw: Callable[[Axes, Group], None]) -> Figure:
     """A panel for each task (rows) and algorithm (columns), over steps of training."""
     tasks = list(dict.fromkeys(group["task"] for group in groups))
     algorithms = list(dict.fromkeys(group["algorithm"] for group in groups))
@@ -133,22 +136,21 @@ def grid(
             continue
         draw(axes, group)
         axes.set_title(plain(f"{tasks[i]}, {algorithms[j]}"))
-        training_axes(axes, group["grid"][-1])
+        _training_axes(axes, group["grid"][-1])
         axes.set_xlabel("training step" if i == len(tasks) - 1 else "")
         axes.set_ylabel("" if j else "return")
-    if legend:
-        below(figure, panels.ravel())
+    below(figure, panels.ravel())
     return figure
 
 
-def training_axes(axes: Axes, last: float, ticks: int = 5) -> None:
+def _training_axes(axes: Axes, last: float, ticks: int = 5) -> None:
     """Steps from 0 on, returns from 0 to 1,000."""
     axes.set(xlim=(0, last), ylim=(-15, 1015), yticks=range(0, 1001, 250))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(ticks))
 
 
-def below(figure: Figure, panels: Iterable[Axes], columns: int | None = None) -> None:
+def below(figure: Figure, panels: Iterable[Axes]) -> None:
     """One legend under all panels, lines to compare with last; as many columns as usual fit."""
     entries = {
         name: handle
@@ -156,7 +158,7 @@ def below(figure: Figure, panels: Iterable[Axes], columns: int | None = None) ->
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     names = sorted(entries, key=lambda name: _is_broken(entries[name]))
-    columns = columns or (4 if figure.get_figwidth() < PAGE else 6)
+    columns = 4 if figure.get_figwidth() < PAGE else 6
     figure.legend([entries[n] for n in names], names, loc="outside lower center", ncols=columns)
 
 
@@ -182,7 +184,7 @@ def _draw_runs(means: Mapping[Evaluated, float], baseline: str) -> Figure:
         title = f"{', '.join(groups[i])}\n{names[j]}" if j == 0 else names[j]
         axes.set_title(plain(title))
         last = max(key[4] for key in means if key[:2] == groups[i])
-        training_axes(axes, last, ticks=5 if len(names) < 5 else 3)
+        _training_axes(axes, last, ticks=5 if len(names) < 5 else 3)
         axes.set_xlabel("training step" if i == len(groups) - 1 else "")
         axes.set_ylabel("" if j else "return")
     return figure

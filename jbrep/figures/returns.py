@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from jbrep.figures.curves import Group, below
+from jbrep.figures.curves import Group, below, looks
 from jbrep.figures.plot import Plot
-from jbrep.figures.style import COLUMN, LINE, PAGE, ink, plain, reference, styles
+from jbrep.figures.style import COLUMN, LINE, PAGE, plain, reference, solved
 
 _ENDS = ("low", "high")
 _LABEL = ("task", "algorithm", "representation")
@@ -65,7 +65,7 @@ def variance_ratio(groups: Sequence[Group], baseline: str, level: float) -> Plot
             (*key, *values, *verdict["simultaneous"][1:], verdict["verdict"])
             for key, values, verdict in _ratios(groups)
         ],
-        lambda: _draw_ratios(groups, baseline),
+        lambda: _draw_ratios(groups),
     )
 
 
@@ -108,10 +108,6 @@ def _ratios(groups: Sequence[Group]) -> Iterator[tuple[tuple[str, str, str], lis
             yield key, comparison["numbers"]["variance_ratio"], verdict
 
 
-def _names(groups: Sequence[Group]) -> list[str]:
-    return list(dict.fromkeys(la["representation"] for group in groups for la in group["labels"]))
-
-
 def _panels(groups: Sequence[Group], columns: int, height: float = 1.7) -> tuple[Figure, Any]:
     """A row of panels for each group; two groups side by side where a row has one panel."""
     across = 1 if columns > 1 or len(groups) == 1 else 2
@@ -127,10 +123,10 @@ def _panels(groups: Sequence[Group], columns: int, height: float = 1.7) -> tuple
 
 def _draw_final(groups: Sequence[Group]) -> Figure:
     figure, panels = _panels(groups, 2)
-    look = styles(_names(groups), first=groups[0]["labels"][0]["representation"])
+    look = looks(groups)
     for (left, right), group in zip(panels, groups, strict=True):
         _draw_runs(left, group, look, "final_return")
-        left.axhline(LINE, color=ink(), linestyle=":", linewidth=0.8, alpha=0.65)
+        left.axhline(LINE, **solved())
         left.set(ylabel="final return", ylim=(-15, 1015))
         _by_label(right, group)
         for i, label in enumerate(group["labels"]):
@@ -142,7 +138,7 @@ def _draw_final(groups: Sequence[Group]) -> Figure:
 
 def _draw_learning(groups: Sequence[Group]) -> Figure:
     figure, panels = _panels(groups, 1)
-    look = styles(_names(groups), first=groups[0]["labels"][0]["representation"])
+    look = looks(groups)
     for (axes,), group in zip(panels, groups, strict=True):
         _draw_runs(axes, group, look, "mean_return")
         axes.set(ylabel="mean return over training", ylim=(0, None))
@@ -175,12 +171,12 @@ def _interval(axes: Axes, at: float, values: Sequence[float | None], style: dict
     axes.errorbar([at], [value], spread, ms=4, lw=1.4, capsize=2.5, **style)
 
 
-def _draw_ratios(groups: Sequence[Group], baseline: str) -> Figure:
+def _draw_ratios(groups: Sequence[Group]) -> Figure:
     """A panel for each group, a row for each representation, all to one scale."""
     compared = [group for group in groups if group["comparisons"]]
     most = max(len(group["comparisons"]) for group in compared)
     figure, panels = _panels(compared, 1, 0.45 + 0.19 * most)
-    look = styles(_names(groups), first=baseline)
+    look = looks(groups)
     limit = max(_reach(values, verdict) for _, values, verdict in _ratios(groups))
     for (axes,), group in zip(panels, compared, strict=True):
         rows = list(_ratios([group]))
@@ -220,7 +216,7 @@ def _few_decades(axes: Axes, limit: float) -> None:
 
 def _draw_profiles(groups: Sequence[Group], returns: Sequence[float]) -> Figure:
     figure, panels = _panels(groups, 1, 2.0)
-    look = styles(_names(groups), first=groups[0]["labels"][0]["representation"])
+    look = looks(groups)
     for (axes,), group in zip(panels, groups, strict=True):
         for label in group["labels"]:
             colour = look[label["representation"]]["color"]
@@ -229,7 +225,7 @@ def _draw_profiles(groups: Sequence[Group], returns: Sequence[float]) -> Figure:
             axes.step(
                 returns, share, where="post", color=colour, label=plain(label["representation"])
             )
-        axes.axvline(LINE, color=ink(), linestyle=":", linewidth=0.8, alpha=0.65)
+        axes.axvline(LINE, **solved())
         axes.set_title(plain(f"{group['task']}, {group['algorithm']}"))
         axes.set(
             xlim=(0, 1000), ylim=(-0.02, 1.02), xlabel="final return", ylabel="share of runs above"

@@ -61,6 +61,11 @@ def reference() -> dict[str, Any]:
     return {"color": ink(), "linestyle": "--", "linewidth": 0.9, "alpha": 0.65}
 
 
+def solved() -> dict[str, Any]:
+    """The line at which the paper calls a task solved."""
+    return {"color": ink(), "linestyle": ":", "linewidth": 0.8, "alpha": 0.65}
+
+
 def styles(names: Iterable[str], first: str | None = None) -> dict[str, dict[str, Any]]:
     """Colour and marker of each name, in the style that holds.
 
