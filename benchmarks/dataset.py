@@ -7,7 +7,6 @@ slows down slows both sides.
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
@@ -19,6 +18,7 @@ import h5py
 import numpy as np
 import torch
 from mujoco.batch import Batch
+from timing import show, timed
 from torch.utils.data import DataLoader, TensorDataset
 
 from jbrep import jitterbug
@@ -47,17 +47,6 @@ Dataset({folder!r})["observation"][rows]
 COLD_MEMMAP = """
 np.memmap({flat!r}, np.float32, mode="r").reshape(-1, 16)[rows]
 """
-
-
-def timed(work: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
-def show(what: str, ratios: list[float], aim: str) -> None:
-    low, median, high = np.percentile(ratios, (10, 50, 90))
-    print(f"{what:66} {median:6.2f}  [{low:.2f}, {high:.2f}]   {aim}", flush=True)
 
 
 @cache  # its process makes it once
@@ -127,9 +116,9 @@ def compare_collectors(folder: Path) -> None:
     for name, values in rates.items():
         print(f"{name:8} {np.median(values):10,.0f} control steps/s")
     ours = np.array(rates["jbrep"])
-    show("collector to disk / bare batched physics", list(ours / rates["bare"]), ">= 0.95")
+    show("collector to disk / bare batched physics", ours / rates["bare"], ">= 0.95")
     loop = "collector to disk / dm_control loop that appends to HDF5"
-    show(loop, list(ours / rates["loop"]), ">= 2.8")
+    show(loop, ours / rates["loop"], ">= 2.8")
 
 
 def memory_of(steps: int, folder: Path) -> float:
@@ -203,7 +192,7 @@ def compare_readers(folder: Path) -> None:
         plain = flat_rows()
         first.append(plain_pass(plain) / our_pass(opened))
         later.append(plain_pass(plain) / our_pass(opened))
-    show("first sequential pass, which checks / np.memmap", first, "")
+    show("first sequential pass, which checks / np.memmap", first)
     show("sequential pass / np.memmap", later, ">= 0.9")
 
     tensors = TensorDataset(torch.from_numpy(np.asarray(data["observation"])))
@@ -218,9 +207,9 @@ def compare_readers(folder: Path) -> None:
             ratios["first"].append(whole / timed(lambda: [None for _ in memory]))
         ratios["later"].append(whole / timed(lambda: [None for _ in memory]))
         ratios["disk"].append(whole / timed(lambda: [None for _ in disk]))
-    show("first shuffled pass, which loads / torch DataLoader", ratios["first"], "")
+    show("first shuffled pass, which loads / torch DataLoader", ratios["first"])
     show("shuffled pass from memory / torch DataLoader", ratios["later"], ">= 20")
-    show("shuffled pass by runs from the disk, 64 MiB / torch DataLoader", ratios["disk"], "")
+    show("shuffled pass by runs from the disk, 64 MiB / torch DataLoader", ratios["disk"])
 
 
 def main() -> None:

@@ -4,12 +4,11 @@ python benchmarks/encoders.py; ratios are medians over rounds taken in turn, so 
 slows down slows both sides.
 """
 
-import time
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 import torch
+from timing import show, timed
 from torch import nn
 from torch.nn.functional import mse_loss
 from torch.utils.data import DataLoader, TensorDataset
@@ -27,17 +26,6 @@ BATCH = 8192
 ROUNDS = 3
 STEPS = 50
 CALLS = 5_000
-
-
-def timed(work: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
-def show(what: str, values: list[float], aim: str = "") -> None:
-    low, median, high = np.percentile(values, (10, 50, 90))
-    print(f"{what:72} {median:8.4g}  [{low:.4g}, {high:.4g}]   {aim}", flush=True)
 
 
 def usual_epoch(rows: torch.Tensor) -> None:

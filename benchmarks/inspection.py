@@ -4,11 +4,12 @@ python benchmarks/inspection.py; imports and the first use of a library aside. S
 fastest round, as others share the machine.
 """
 
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+from timing import timed
 
 from jbrep.encoders import find
 from jbrep.inspection.episode import record_episode
@@ -22,12 +23,7 @@ TASK = "move_to_pose"  # which observes most
 def fastest(work: Callable[[], object]) -> float:
     """Seconds; a first round doesn't count."""
     work()
-    rounds = []
-    for _ in range(ROUNDS):
-        start = time.perf_counter()
-        work()
-        rounds.append(time.perf_counter() - start)
-    return min(rounds)
+    return min(timed(work) for _ in range(ROUNDS))
 
 
 def show(what: str, seconds: float, size: float = 0, aim: str = "") -> None:

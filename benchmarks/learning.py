@@ -6,7 +6,6 @@ domain, each in a process of one thread, in rounds taken in turn; and a study ag
 
 import os
 import tempfile
-import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
@@ -19,6 +18,7 @@ from gymnasium.wrappers import FlattenObservation
 from shimmy import DmControlCompatibilityV0
 from stable_baselines3 import DDPG
 from stable_baselines3.common.base_class import BaseAlgorithm
+from timing import show, timed
 
 from jbrep import jitterbug
 from jbrep.encoders import find
@@ -66,17 +66,13 @@ def agent_on_jbrep() -> BaseAlgorithm:
 
 def seconds_a_step(make: Callable[[], BaseAlgorithm]) -> float:
     agent = make()
-    began = time.perf_counter()
-    agent.learn(STEPS, reset_num_timesteps=False)
-    return (time.perf_counter() - began) / STEPS
+    return timed(lambda: agent.learn(STEPS, reset_num_timesteps=False)) / STEPS
 
 
 def seconds_of_gradients(make: Callable[[], BaseAlgorithm]) -> float:
     """Of the gradient steps alone, for a step of the environment."""
     agent = make()
-    began = time.perf_counter()
-    agent.train(STEPS // 2, agent.batch_size)
-    return (time.perf_counter() - began) / STEPS
+    return timed(lambda: agent.train(STEPS // 2, agent.batch_size)) / STEPS
 
 
 def compare_loops() -> None:
@@ -95,30 +91,21 @@ def compare_loops() -> None:
         f"DDPG as in Table I: {1 / np.median(ours):.0f} steps/s, shimmy {1 / np.median(shimmy):.0f}"
     )
     show("times shimmy's rate", shimmy / ours, "aim 1.3")
-    show("the same without gradient steps", (shimmy - gradients_of_shimmy) / (ours - gradients), "")
-    show("part of a step that is gradient steps", gradients / ours, "")
-    show("times shimmy's rate if all else took no time", shimmy / gradients, "")
-
-
-def show(what: str, ratios: np.ndarray, aim: str) -> None:
-    low, median, high = np.percentile(ratios, (10, 50, 90))
-    print(f"{what:50} {median:6.2f} [{low:.2f}, {high:.2f}]  {aim}", flush=True)
+    show("the same without gradient steps", (shimmy - gradients_of_shimmy) / (ours - gradients))
+    show("part of a step that is gradient steps", gradients / ours)
+    show("times shimmy's rate if all else took no time", shimmy / gradients)
 
 
 def seconds_of_study(workers: int) -> float:
     with tempfile.TemporaryDirectory() as folder:
-        began = time.perf_counter()
-        conduct(Plan(STUDY, Path(folder) / "study"), on_this_machine, workers)
-        return time.perf_counter() - began
+        plan = Plan(STUDY, Path(folder) / "study")
+        return timed(lambda: conduct(plan, on_this_machine, workers))
 
 
 def seconds_of_runs() -> float:
     with tempfile.TemporaryDirectory() as folder:
         plan = Plan(STUDY, Path(folder) / "bare")
-        began = time.perf_counter()
-        for cell in plan.cells:
-            train(plan.run(cell), plan.folder_of(cell))
-        return time.perf_counter() - began
+        return timed(lambda: [train(plan.run(cell), plan.folder_of(cell)) for cell in plan.cells])
 
 
 def compare_studies() -> None:

@@ -18,6 +18,7 @@ from gymnasium.wrappers import FlattenObservation
 from mujoco.batch import Batch
 from shimmy import DmControlCompatibilityV0
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
+from timing import show
 
 import jbrep.envs  # noqa: F401 (registers the environments)
 from jbrep import jitterbug
@@ -133,21 +134,19 @@ def main() -> None:
     for name, values in rates.items():
         print(f"{name:40} {np.median(values):15,.0f}")
 
-    def ratio(one: str, other: str) -> str:
-        ratios = np.array(rates[one]) / np.array(rates[other])
-        low, median, high = np.percentile(ratios, (10, 50, 90))
-        return f"{median:.2f}  [{low:.2f}, {high:.2f}]"
+    def ratio(one: str, other: str) -> np.ndarray:
+        return np.array(rates[one]) / np.array(rates[other])
 
-    print(f"\n{'ratio, median [10 %, 90 %]':66} aim")
+    print("\nratio, median [10 %, 90 %], aim")
     best = max(
         (name for name in rates if name.startswith("SubprocVecEnv of dm")),
         key=lambda name: np.median(rates[name]),
     )
-    print(f"{'batched / dm_control in a loop':40} {ratio(batched, plain):25} >= 2.8")
-    print(f"{'batched / best SubprocVecEnv of dm_control':40} {ratio(batched, best):25} >= 2.4")
-    print(f"{'batched / bare physics':40} {ratio(batched, bare):25} >= 0.92")
+    show("batched / dm_control in a loop", ratio(batched, plain), ">= 2.8")
+    show("batched / best SubprocVecEnv of dm_control", ratio(batched, best), ">= 2.4")
+    show("batched / bare physics", ratio(batched, bare), ">= 0.92")
     single = ratio("bare physics, 1 lane", "jbrep, 1 lane")
-    print(f"{'cost of one lane / bare physics':40} {single:25} <= 1.25")
+    show("cost of one lane / bare physics", single, "<= 1.25")
 
 
 if __name__ == "__main__":
