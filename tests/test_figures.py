@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from dataclasses import replace
 
 import matplotlib as mpl
 import numpy as np
@@ -157,6 +158,18 @@ def test_variance_ratios_stand_with_both_intervals(plots, statistics):
     assert point.get_xdata()[0] == comparison["numbers"]["variance_ratio"][0]
     assert axes.get_title(loc="left") == "face_direction, ddpg"
     assert [text.get_text() for text in axes.get_yticklabels()] == ["dae-8", "pca-4"]
+
+
+def test_a_ratio_of_zero_is_beyond_the_axis():
+    still = [
+        replace(run, returns=0 * run.returns) if run.representation == "dae-8" else run
+        for run in runs()
+        if (run.task, run.algorithm) == GROUPS[0]
+    ]
+    found = study_plots(json.loads(analyse(still).to_json()), [], {}, {})
+    axes = drawn(next(plot for plot in found if plot.name == "variance_ratio")).axes[0]
+    assert axes.lines[2].get_xdata()[0] == 0
+    assert 0 < axes.get_xlim()[0] < 1
 
 
 def test_a_profile_falls_from_all_runs_to_none(statistics, plots):

@@ -193,9 +193,9 @@ def _draw_ratios(groups: Sequence[Group]) -> Figure:
 
 
 def _reach(values: Sequence[float | None], verdict: Group) -> float:
-    """How many powers of ten the intervals go from 1."""
+    """How many powers of ten the intervals go from 1, where they are above 0."""
     ends = np.array((*values, *verdict["simultaneous"], 1), float)
-    return float(np.nanmax(np.abs(np.log10(ends))))
+    return float(np.abs(np.log10(ends[ends > 0])).max())
 
 
 def _draw_ratio(
