@@ -5,10 +5,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.linear_model import Ridge
-from sklearn.neighbors import NearestNeighbors
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
@@ -76,6 +72,10 @@ def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
 
 
 def _ridge() -> Any:
+    from sklearn.linear_model import Ridge  # not at the top: it takes seconds
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
     return make_pipeline(StandardScaler(), Ridge(_PENALTY))
 
 
@@ -87,6 +87,8 @@ def neighbours(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
     five, over the whole state with every dimension standardised, and with neighbours from training
     episodes alone, never from the moments before and after. Unrelated rows have 2.
     """
+    from sklearn.neighbors import NearestNeighbors
+
     data = held_out.data
     test, train = sample(data.test, _QUERIES), sample(data.train, _REFERENCES)
     asked, known = (data.dataset["observation"][rows] for rows in (test, train))
