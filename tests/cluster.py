@@ -3,6 +3,7 @@
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import ray
@@ -22,9 +23,10 @@ NOTICE = {  # a dead node within seconds
 
 
 def main(out):
-    node = {"num_cpus": 1, "include_dashboard": False}
-    cluster = Cluster(initialize_head=True, head_node_args={**node, "_system_config": NOTICE})
-    other = cluster.add_node(num_cpus=1)
+    node = {"num_cpus": 1, "include_dashboard": False, "include_log_monitor": False}
+    head = {**node, "no_monitor": True, "_system_config": NOTICE}
+    cluster = Cluster(initialize_head=True, head_node_args=head)
+    other = cluster.add_node(**node)
     ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
 
     def kill():
@@ -35,7 +37,7 @@ def main(out):
 
     killer = threading.Thread(target=kill)
     killer.start()
-    crashed = conduct(Plan(TINY, out), on_ray, 2)
+    crashed = conduct(Plan(replace(TINY, seeds=(0,)), out), on_ray, 2)  # a run for each node
     killer.join()
     ray.shutdown()
     cluster.shutdown()

@@ -2,7 +2,9 @@
 
 import os
 import shutil
+from contextlib import contextmanager
 from ctypes.util import find_library
+from functools import partial
 
 import pytest
 import torch
@@ -31,7 +33,23 @@ def copied(collected, tmp_path):
     return shutil.copytree(collected, tmp_path / "copied")
 
 
-LONGEST = ("test_study", "test_rl", "test_cli", "test_report")
+@contextmanager
+def short_episodes(steps=100):
+    """Of agents in this process: theirs are what takes time, and little depends on their length."""
+    from jbrep.envs import sb3
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sb3, "Episodes", partial(sb3.Episodes, max_episode_steps=steps))
+        yield steps
+
+
+@pytest.fixture
+def episode_steps():
+    with short_episodes() as steps:
+        yield steps
+
+
+LONGEST = ("test_whole", "test_study", "test_rl", "test_cli", "test_report")
 
 
 def pytest_collection_modifyitems(items):

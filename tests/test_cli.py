@@ -6,10 +6,12 @@ import sys
 from dataclasses import replace
 
 import pytest
-from click.testing import CliRunner
+from command import jbrep
 from stable_baselines3 import A2C
+from test_study import TOML
 
 from jbrep.cli import main
+from jbrep.cli.base import COUNT
 
 GROUPS = ("data", "encoder")
 COMMANDS = sorted({*main.commands} - {*GROUPS}) + [
@@ -17,67 +19,39 @@ COMMANDS = sorted({*main.commands} - {*GROUPS}) + [
 ]
 
 
-def jbrep(*arguments):
-    result = CliRunner().invoke(main, [str(a) for a in arguments], prog_name="jbrep")
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result
-
-
-def test_the_whole_pipeline(tmp_path):
-    data, encoders, runs = tmp_path / "data", tmp_path / "encoders", tmp_path / "runs"
-    assert (
-        "2 episodes of face_direction"
-        in jbrep("collect", "--task", "face_direction", "--steps", "2k", "--out", data).output
+@pytest.mark.usefixtures("episode_steps")
+def test_a_run_from_training_to_its_returns(tmp_path, monkeypatch):
+    monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
+    run = tmp_path / "runs" / "dae-8"
+    settings = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 40)
+    for _ in range(2):  # the second time it is over
+        given = (*settings, "--encoder", "dae-8", "--evaluation-episodes", 1, "--out", run)
+        assert "returns on dae-8 at the end: " in jbrep("rl", *given).output
+    assert A2C.load(run / "policy.zip", device="cpu").observation_space.shape == (8,)
+    told = jbrep("evaluate-policy", run, "--episodes", 2).output
+    assert re.fullmatch(r"face_direction on dae-8: median return \d+ \[\d+, \d+\] .*\n", told)
+    policy = run / "policy.zip"
+    refused = jbrep("evaluate-policy", policy)
+    assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
+    assert "runs as code when it is read; --trust" in refused.output
+    zip_file = (
+        *("--trust", "--task", "face_direction"),
+        "--algorithm",
+        "a2c",
+        "--encoder",
+        "dae-8",
     )
-    made = ("--data", data, "--latent", 8, 4, "--out", encoders)
-    told = jbrep("train-dae", *made, "--epochs", 2).stdout
-    assert re.search(
-        r"^dae-8: held-out mean squared error [\d.]+, .*dae-8.safetensors$", told, re.M
-    )
-    assert re.search(r"^dae-4: .*dae-4.safetensors$", told, re.M)
-    assert "dae-4.safetensors, complete already" in jbrep("train-dae", *made, "--epochs", 2).output
-    assert "pca-4: held-out mean" in jbrep("train-encoder", "--kind", "pca", *made).output
-    encoder = encoders / "dae-8.safetensors"
-    files = (encoder, encoders / "pca-4.safetensors")
-    told = jbrep("evaluate", "--encoder", *files, "--data", data, "--out", tmp_path / "judged")
-    for label in ("full", "dae-8", "pca-4", "judged/evaluation.json", "error_by_feature.png"):
-        assert label in told.output
-    assert (tmp_path / "judged" / "error_by_latent.png").exists()
-    assert "16 -> 8 tanh" in jbrep("encoder", "info", encoder).output
-    told = jbrep("encoder", "export", encoder, "--out", tmp_path / "it.onnx").output
-    assert f"onnxruntime.InferenceSession('{tmp_path / 'it.onnx'}')" in told
-    for state, arguments in {"dae-8": ("--encoder", encoder), "full": ()}.items():
-        settings = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 80, *arguments)
-        given = (*settings, "--evaluation-episodes", 2, "--out", runs / state)
-        assert f"returns on {state} at the end: " in jbrep("rl", *given).output
-        assert f"returns on {state} at the end: " in jbrep("rl", *given).output  # it is over
-        agent = A2C.load(runs / state / "policy.zip", device="cpu")
-        assert agent.observation_space.shape == ((8,) if state == "dae-8" else (16,))
-    table = jbrep("report", runs).output.splitlines()
-    assert [line.split()[:3] for line in table[1:3]] == [
-        ["face_direction/a2c/dae-8", "0", "80"],
-        ["face_direction/a2c/full", "0", "80"],
-    ]
-    assert "no statistics: face_direction/a2c/full: one run is over, two are needed" in table
-    assert (runs / "returns.csv").exists()
-    again = jbrep("rl", "--task", "face_direction", "--seed", 1, "--out", runs / "full")
+    assert jbrep("evaluate-policy", policy, "--episodes", 2, *zip_file).output == told
+    table = jbrep("report", tmp_path / "runs").output.splitlines()
+    assert table[1].split()[:3] == ["face_direction/a2c/dae-8", "0", "40"]
+    assert "no statistics: face_direction/a2c/dae-8: one run is over, two are needed" in table
+    assert (tmp_path / "runs" / "returns.csv").exists()
+    again = jbrep("rl", "--task", "face_direction", "--seed", 1, "--out", run)
     assert (again.exit_code, again.output.count("\n")) == (2, 1)
     assert "holds another run: algorithm a2c (now: sac)" in again.output
 
 
-def test_a_policys_returns(tmp_path):
-    run = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 40)
-    jbrep("rl", *run, "--evaluation-episodes", 1, "--out", tmp_path / "run")
-    told = jbrep("evaluate-policy", tmp_path / "run", "--episodes", 2).output
-    assert re.fullmatch(r"face_direction on identity: median return \d+ \[\d+, \d+\] .*\n", told)
-    policy = tmp_path / "run" / "policy.zip"
-    refused = jbrep("evaluate-policy", policy)
-    assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
-    assert "runs as code when it is read; --trust" in refused.output
-    zip_file = ("--trust", "--task", "face_direction", "--algorithm", "a2c")
-    assert jbrep("evaluate-policy", policy, "--episodes", 2, *zip_file).output == told
-
-
+@pytest.mark.usefixtures("episode_steps")
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
 def test_a_run_that_fails_says_why_and_ends_with_1(tmp_path, monkeypatch):
     from jbrep.rl.presets import PRESETS, get_preset
@@ -92,9 +66,11 @@ def test_a_run_that_fails_says_why_and_ends_with_1(tmp_path, monkeypatch):
 
 
 def test_a_studys_dry_run_and_its_mistakes(tmp_path):
-    told = jbrep("study", "studies/first.toml", "--dry-run", "--out", tmp_path / "dry").output
-    assert told.count("face_direction/sac-modern/dae-8/seed-") == 5
-    assert "20 runs to go, 0 over; " in told
+    (tmp_path / "tiny.toml").write_text(TOML)
+    dry = ("study", tmp_path / "tiny.toml", "--dry-run", "--workers", 2, "--out", tmp_path / "dry")
+    told = jbrep(*dry).output
+    assert told.count("face_direction/a2c/pca-8/seed-") == 2
+    assert re.search(r"4 runs to go, 0 over; [\d.]+ \w+ of one core, [\d.]+ \w+ with 2 ", told)
     for arguments, message in (
         (("studies/none.toml",), "no study at studies/none.toml"),
         (("studies/first.toml", "--backend", "slurm"), "unknown backend 'slurm'"),
@@ -220,12 +196,16 @@ def test_a_data_set_from_collecting_to_exporting(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "steps"), [("1500", 2), ("1_000", 1), ("2k", 2), ("1e3", 1), ("0.001M", 1)]
+    ("text", "steps"), [("1500", 1500), ("1_000", 1000), ("2k", 2000), ("1e3", 1000), ("5M", 5e6)]
 )
-def test_steps_may_be_written_in_many_ways(text, steps, tmp_path):
+def test_steps_may_be_written_in_many_ways(text, steps):
+    assert COUNT.convert(text, None, None) == steps
+
+
+def test_a_part_of_an_episode_makes_a_whole_one(tmp_path):
     out = tmp_path / "data"
-    result = jbrep("collect", "--task", "move_to_pose", "--steps", text, "--out", out)
-    assert f"{steps} episode" in result.output
+    result = jbrep("collect", "--task", "move_to_pose", "--steps", "1.1k", "--out", out)
+    assert "2 episodes" in result.output
 
 
 @pytest.mark.parametrize("text", ["many", "1.5", "k", "1e999", "nan"])

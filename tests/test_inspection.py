@@ -6,10 +6,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import jbrep
 from rerun.chunk import RrdReader
 
-from jbrep.cli import main
 from jbrep.encoders import find, save
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError
@@ -446,12 +445,6 @@ def test_an_earlier_recording_is_overwritten_and_nothing_else(tmp_path):
     out.write_bytes(b"RRF2 an earlier one")
     inspect(FACE, out=out)
     assert "/world/robot/jitterbug" in read(out)
-
-
-def jbrep(*arguments):
-    result = CliRunner().invoke(main, [str(a) for a in arguments], prog_name="jbrep")
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result
 
 
 def test_the_command_names_the_file_after_its_content(tmp_path, monkeypatch):

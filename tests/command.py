@@ -1,0 +1,54 @@
+"""jbrep's commands, as a stranger would type them."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from click.testing import CliRunner
+
+from jbrep.cli import main
+
+
+def jbrep(*arguments):
+    """A command in this process; a mistake has its one line, anything else is a bug."""
+    result = CliRunner().invoke(main, [str(a) for a in arguments], prog_name="jbrep")
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result
+
+
+def start(*arguments):
+    """The same in a process of its own, which can be killed."""
+    command = [sys.executable, "-c", "from jbrep.cli import main; main()", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for(happened, process, seconds=120):
+    """Wait until something has happened that a process does; whether it is still at work then."""
+    deadline = time.monotonic() + seconds
+    while not (found := happened()) and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    return found and process.poll() is None
+
+
+def workers_of(pid):
+    """The loky workers that a process has."""
+    found = subprocess.run(["pgrep", "-P", str(pid), "-f", "popen_loky"], capture_output=True)
+    return [int(each) for each in found.stdout.split()]
+
+
+def wait_for_the_end_of(processes, seconds=60):
+    """Wait until none of them is left, as when their parent is gone."""
+    deadline = time.monotonic() + seconds
+    while any(map(_is_alive, processes)):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def _is_alive(pid):
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"

@@ -1,0 +1,110 @@
+"""From states to a study at toy size, in peace or killed: python tests/pipeline.py 20."""
+
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
+from small import contents
+
+from jbrep.report.report import SUMMARY
+from jbrep.study.heuristics import HEURISTIC_RETURNS
+from jbrep.study.results import RETURNS, STATISTICS
+
+STUDY = """
+tasks = ["face_direction"]
+algorithms = ["a2c"]
+representations = ["full", "dae-4"]
+seeds = 2
+steps = 80
+evaluate_every = 80
+evaluation_episodes = 1
+data = {{folder = "{data}"}}
+training = {{epochs = 30, batch_size = 50}}
+"""
+POINTS = {  # at which each stage may be killed: so many such files are there
+    "collect": [("data/.lock", 1), ("data/shard-*.h5", 1), ("data/shard-*.h5", 2)],
+    "train-dae": [("encoders/*.training", 1), ("encoders/*/checkpoint.safetensors", 1)],
+    "study": [("study/study.json", 1), ("study/**/run.json", 1), ("study/**/run.json", 2)],
+}
+_LONGEST = 0.2  # seconds from there to the kill
+
+
+def stages(folder, workers=1):
+    """The commands, each of which needs those before."""
+    data, study = folder / "data", folder / "tiny.toml"
+    study.write_text(STUDY.format(data=data))
+    states = ("--task", "face_direction", "--steps", "4k", "--shard-episodes", 1, "--lanes", 1)
+    training = ("--data", data, "--latent", 4, "--epochs", 30, "--batch-size", 50)
+    return {
+        "collect": ("collect", *states, "--out", data),
+        "train-dae": ("train-dae", *training, "--out", folder / "encoders"),
+        "study": ("study", study, "--workers", workers, "--out", folder / "study"),
+    }
+
+
+def in_peace(folder):
+    """Run all, the report by its own command; what each said."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jbrep.study.heuristics._EPISODES", 2)  # they would take as long as the rest
+        with pytest.MonkeyPatch.context() as once:
+            once.setattr("jbrep.report.write_report", lambda folder: [])
+            said = {stage: jbrep(*given).output for stage, given in stages(folder).items()}
+        return said | {"report": jbrep("report", folder / "study").output}
+
+
+def killed(folder, seed, peace):
+    """Kill each stage at a point that the seed draws, and start it again; where it was killed."""
+    random, told = np.random.default_rng(seed), []
+    (folder / "study").mkdir(parents=True)
+    shutil.copy(peace / "study" / HEURISTIC_RETURNS, folder / "study")
+    for stage, given in stages(folder, workers=2).items():
+        point, delay = (
+            POINTS[stage][random.integers(len(POINTS[stage]))],
+            random.uniform(0, _LONGEST),
+        )
+        told.append(f"seed {seed}: {stage} killed {delay:.3f} s after {point[1]} of {point[0]}")
+        _kill(given, folder, *point, delay, told[-1])
+        again = jbrep(*given)
+        assert again.exit_code == 0, f"{told}\n{again.output[-2000:]}"
+    return "; ".join(told)
+
+
+def _kill(given, folder, pattern, count, delay, told):
+    process = start(*given)
+    there = wait_for(lambda: len(list(folder.glob(pattern))) >= count, process)
+    workers = workers_of(process.pid)
+    try:
+        process.wait(delay)
+    except subprocess.TimeoutExpired:
+        process.kill()
+    said = process.communicate()[1]
+    assert there, f"{told}: it was over\n{said[-2000:]}"
+    assert process.returncode == -signal.SIGKILL, f"{told}: it was over\n{said[-2000:]}"
+    assert workers or "run.json" not in pattern
+    wait_for_the_end_of(workers)  # none is left behind
+
+
+def ends(folder):
+    """All bytes that kills must not change."""
+    made = "study/encoders/face_direction/dae-4.safetensors"
+    names = ["encoders/dae-4.safetensors", made]
+    names += [f"study/{name}" for name in (RETURNS, STATISTICS, SUMMARY)]
+    names += sorted(str(path.relative_to(folder)) for path in folder.rglob("episodes.csv"))
+    return contents(folder / "data") | {name: (folder / name).read_bytes() for name in names}
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as temporary:
+        peace = Path(temporary) / "peace"
+        peace.mkdir()
+        in_peace(peace)
+        for seed in range(int(sys.argv[1])):
+            told = killed(Path(temporary) / str(seed), seed, peace)
+            print(told, flush=True)
+            assert ends(Path(temporary) / str(seed)) == ends(peace), told
