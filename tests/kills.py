@@ -15,7 +15,7 @@ from jbrep.collect import collect
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 
-SETTINGS = settings(steps=12_000, store_state=False)
+SETTINGS = settings(steps=8_000, store_state=False)
 COMMAND = [
     *(sys.executable, "-c", "from jbrep.cli import main; main()", "collect"),
     *("--task", "face_direction", "--seed", "3", "--shard-episodes", "1", "--lanes", "1"),

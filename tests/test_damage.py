@@ -100,8 +100,8 @@ def scramble(random, files):
 DAMAGES = (flip, flip, flip, truncate, append, remove, swap, duplicate, rename, scramble)
 
 
-@pytest.mark.parametrize("seed", range(10))
-def test_none_of_500_random_damages_is_missed(seed, copied):
+@pytest.mark.parametrize("seed", range(4))
+def test_none_of_200_random_damages_is_missed(seed, copied):
     random = np.random.default_rng(seed)
     files = [*sorted(copied.glob("*.h5")), copied / MANIFEST]
     whole = {path: path.read_bytes() for path in files}

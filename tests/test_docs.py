@@ -16,6 +16,7 @@ BLOCKS = [
 ]
 
 
+@pytest.mark.usefixtures("episode_steps")
 @pytest.mark.parametrize("block", BLOCKS)
 def test_the_python_runs(block, monkeypatch, tmp_path):
     for name in ("data", "jbrep"):  # what the blocks read; what they write stays out of here

@@ -108,7 +108,8 @@ def test_starts_are_random(task):
 
 
 def test_no_feature_is_constant(task):
-    steps = [np.concatenate(list(s.observation.values())) for s in episodes(load(task), count=2)]
+    some = episodes(load(task), count=2, steps=300)
+    steps = [np.concatenate(list(step.observation.values())) for step in some]
     assert (np.ptp(steps, axis=0) > 0).all()
 
 
@@ -162,8 +163,8 @@ def test_physics_says_what_the_tasks_read(task):
 
 
 def test_every_lane_has_the_same_episode_bit_for_bit(task):
-    """A plain dm_control environment and a lane among others, over two whole episodes."""
-    environment = jitterbug.load(task, seed=5)
+    """A plain dm_control environment and a lane among others, over two episodes."""
+    environment = jitterbug.load(task, seed=5, time_limit=3)
     lanes = Simulation(get_task(task), 3, 2)
     randoms = [np.random.default_rng(seed) for seed in (4, 5, 6)]
     actions = np.random.default_rng(0)
@@ -187,9 +188,9 @@ def test_an_unknown_task_is_refused(task):
 
 
 @needs_egl
-@pytest.mark.parametrize("camera", ["overhead", "tracking", "egocentric"])
-def test_cameras_show_something(task, camera):
+def test_cameras_show_something(task):
     environment = jitterbug.load(task, seed=0)
     environment.reset()
-    frame = environment.physics.render(120, 160, camera_id=camera)
-    assert frame.std() > 10
+    for camera in ("overhead", "tracking", "egocentric"):
+        frame = environment.physics.render(120, 160, camera_id=camera)
+        assert frame.std() > 10, camera

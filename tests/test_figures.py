@@ -87,7 +87,10 @@ def test_a_study_has_every_figure(plots):
     ]
 
 
-def test_each_figure_is_written_as_pdf_and_png_beside_its_table(plots, tmp_path):
+def test_each_figure_is_written_as_pdf_and_png_beside_its_table(statistics, returns, tmp_path):
+    one = {**statistics, "groups": statistics["groups"][:1]}
+    some = [row for row in returns if row[:2] == GROUPS[0]]
+    plots = {plot.name: plot for plot in study_plots(one, some, {}, LABELS)}
     pictures = write(plots.values(), tmp_path / "figures")
     assert [path.stem for path in pictures] == list(plots)
     for path, plot in zip(pictures, plots.values(), strict=True):

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import short_episodes
 from stable_baselines3 import SAC
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
@@ -28,6 +29,8 @@ from jbrep.rl.presets import ALGORITHMS, PRESETS, get_preset
 
 TASK = "face_direction"
 SHORT = Run(task=TASK, algorithm="a2c", encoder="dae-8", steps=80, evaluation_episodes=1)
+
+pytestmark = pytest.mark.usefixtures("episode_steps")
 
 
 def agent_of(algorithm, preset="paper", encoder="dae-8"):
@@ -54,7 +57,13 @@ def assert_same_run(one, other):
 
 
 @pytest.fixture(scope="module")
-def short(tmp_path_factory):
+def episode_steps():
+    with short_episodes() as steps:
+        yield steps
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory, episode_steps):
     folder = tmp_path_factory.mktemp("short")
     train(SHORT, folder)
     return folder
@@ -144,12 +153,12 @@ def test_plain_sb3_loads_the_policy_that_was_evaluated(short):
     np.testing.assert_allclose(returns, at_end, atol=5e-4)
 
 
-def test_evaluation_is_the_deterministic_policys_return():
+def test_evaluation_is_the_deterministic_policys_return(episode_steps):
     agent = agent_of("ppo")
     encoder = find("dae-8", TASK)
     lanes = Episodes(TASK, 2)
     observation, total = lanes.reset([EVALUATION_SEED, EVALUATION_SEED + 1]), np.zeros(2)
-    for _ in range(1000):
+    for _ in range(episode_steps):
         latent = encoder(observation.astype(np.float32))
         outcome = lanes.step(agent.predict(latent, deterministic=True)[0])
         observation, total = outcome.observation, total + outcome.reward
@@ -158,18 +167,18 @@ def test_evaluation_is_the_deterministic_policys_return():
         np.testing.assert_allclose(evaluator.returns(agent), total, rtol=1e-5)
 
 
-def test_training_episodes_are_recorded_and_evaluation_leaves_no_trace(tmp_path):
-    run = dataclasses.replace(SHORT, steps=8080)
-    for name, every in (("often", 4000), ("never", 10_000)):
+def test_training_episodes_are_recorded_and_evaluation_leaves_no_trace(tmp_path, episode_steps):
+    run = dataclasses.replace(SHORT, steps=880)
+    for name, every in (("often", 400), ("never", 10_000)):
         train(dataclasses.replace(run, evaluate_every=every), tmp_path / name)
     often, never = tmp_path / "often", tmp_path / "never"
     assert (often / "episodes.csv").read_bytes() == (never / "episodes.csv").read_bytes()
     torch.testing.assert_close(weights(often), weights(never), rtol=0, atol=0)
-    steps = [0, 4000, 8000, 8080]
+    steps = [0, 400, 800, 880]
     assert sorted({e.step for e in read_evaluations(often)}) == steps
     rows = [line.split(",") for line in (often / "episodes.csv").read_text().splitlines()[1:]]
     assert [(row[0], row[1], row[3], row[4]) for row in rows] == [
-        ("8000", str(lane), "1000", "0") for lane in range(8)
+        ("800", str(lane), f"{episode_steps}", "0") for lane in range(8)
     ]
     assert len({row[2] for row in rows}) > 4
 
@@ -227,21 +236,23 @@ def test_mid_episode_the_environment_goes_on_bit_for_bit():
 
 
 KILLED = {
-    "ddpg": Run(task=TASK, algorithm="ddpg", encoder="dae-8", steps=500, evaluation_episodes=1),
+    "ddpg": Run(task=TASK, algorithm="ddpg", encoder="dae-8", steps=300, evaluation_episodes=1),
     "sac": Run(task=TASK, algorithm="sac", preset="modern", steps=1100, evaluation_episodes=1),
-    "ppo": Run(task=TASK, algorithm="ppo", encoder="dae-4", steps=6144, evaluation_episodes=1),
+    "ppo": Run(task=TASK, algorithm="ppo", encoder="dae-4", steps=4096, evaluation_episodes=1),
 }
 
 
-def go(run, folder, stop):
-    """Train in another process; kill it when so many checkpoints have been written."""
+def kill(run, folder, episode_steps, checkpoints=2):
+    """Train in another process; kill it when so many have been written."""
     text = (
-        "import sys; from pathlib import Path; from jbrep.rl import Run, train;"
+        "from functools import partial; from pathlib import Path; from jbrep.envs import sb3;"
+        f"sb3.Episodes = partial(sb3.Episodes, max_episode_steps={episode_steps});"
+        "from jbrep.rl import Run, train;"
         f"train({run!r}, Path({str(folder)!r}), save_every=0.05)"
     )
     process = subprocess.Popen([sys.executable, "-c", text], stderr=subprocess.PIPE, text=True)
     seen, checkpoint = set(), folder / "checkpoint.safetensors"
-    while process.poll() is None and len(seen) < stop:
+    while process.poll() is None and len(seen) < checkpoints:
         if checkpoint.exists():
             seen.add(checkpoint.stat().st_mtime_ns)
         time.sleep(0.005)
@@ -251,13 +262,12 @@ def go(run, folder, stop):
 
 
 @pytest.mark.parametrize("algorithm", KILLED)
-def test_a_killed_run_goes_on_to_the_same_bits(algorithm, tmp_path):
+def test_a_killed_run_goes_on_to_the_same_bits(algorithm, tmp_path, episode_steps):
     run, folder = KILLED[algorithm], tmp_path / "killed"
-    killed, error = go(run, folder, stop=2)
+    killed, error = kill(run, folder, episode_steps)
     assert killed == -signal.SIGKILL, error
     checkpoint = (folder / "checkpoint.safetensors").read_bytes()
-    again, error = go(run, folder, stop=10**9)
-    assert again == 0, error
+    train(run, folder)
     train(run, tmp_path / "peace")
     assert_same_run(tmp_path / "peace", folder)
     (tmp_path / "spoilt").mkdir()
