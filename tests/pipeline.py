@@ -64,10 +64,8 @@ def killed(folder, seed, peace):
     (folder / "study").mkdir(parents=True)
     shutil.copy(peace / "study" / HEURISTIC_RETURNS, folder / "study")
     for stage, given in stages(folder, workers=2).items():
-        point, delay = (
-            POINTS[stage][random.integers(len(POINTS[stage]))],
-            random.uniform(0, _LONGEST),
-        )
+        point = POINTS[stage][random.integers(len(POINTS[stage]))]
+        delay = random.uniform(0, _LONGEST)
         told.append(f"seed {seed}: {stage} killed {delay:.3f} s after {point[1]} of {point[0]}")
         _kill(given, folder, *point, delay, told[-1])
         again = jbrep(*given)
