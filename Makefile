@@ -6,7 +6,7 @@ DEMO := demo
 DEMO_RUN := $(DEMO)/study/runs/face_direction/sac-modern/dae-8/seed-0
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
-.PHONY: help setup demo test check bench pictures figures samples data encoders first behaviour clean
+.PHONY: help setup demo test check bench pictures figures samples data encoders decoded desk first behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -71,6 +71,20 @@ data: $(READY) ## data sets of five million states in data/: half an hour, 4 GB
 encoders: data ## results/encoders/ from these: hours; goes on where it was stopped
 	rm -rf $(addprefix results/encoders/,$(TASKS))
 	$(BIN)/python tools/encoders.py data encoders results/encoders $(TASKS)
+
+decoded: $(READY) ## results/decoded.txt anew: hand-written policies on what encoders give back
+	for task in $(TASKS); do \
+	  $(BIN)/jbrep evaluate-policy heuristic --task $$task || exit; \
+	  for name in dae pca random; do for latent in 12 8 4; do \
+	    $(BIN)/jbrep evaluate-policy heuristic --task $$task --encoder $$name-$$latent || exit; \
+	  done; done; \
+	done > results/decoded.txt
+
+desk: $(READY) ## results/desk/ anew: a night or two; goes on where it was stopped
+	$(BIN)/jbrep study studies/desk.toml --out runs/desk
+	mkdir -p results/desk
+	cp $(addprefix runs/desk/,returns.csv runs.json statistics.json heuristics.csv) results/desk/
+	$(BIN)/jbrep report results/desk
 
 first: $(READY) ## results/first/ anew: an hour or two; goes on where it was stopped
 	$(BIN)/jbrep study studies/first.toml --out runs/first

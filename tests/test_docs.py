@@ -1,28 +1,51 @@
 """The Python in README and docs runs as it stands; the commands there exist."""
 
 import re
+import shlex
+import tomllib
 from pathlib import Path
 
+import click
 import pytest
 
 from jbrep.cli import main
+from jbrep.study.config import as_study
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", ROOT / "data" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-BLOCKS = [
-    pytest.param(block, id=f"{page.name}-{i}")
-    for page in PAGES
-    for i, block in enumerate(re.findall(r"^```python\n(.*?)^```", page.read_text(), re.M | re.S))
-]
+PAGES = [ROOT / name for name in ("README.md", "data/README.md", "CONTRIBUTING.md")]
+PAGES += [*sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("results/**/*.md"))]
+
+
+def found(pattern):
+    """What matches in each page, as parameters of a test."""
+    return [
+        pytest.param(match, id=f"{page.name}-{i}")
+        for page in PAGES
+        for i, match in enumerate(re.findall(pattern, page.read_text(), re.M | re.S))
+    ]
 
 
 @pytest.mark.usefixtures("episode_steps")
-@pytest.mark.parametrize("block", BLOCKS)
+@pytest.mark.parametrize("block", found(r"^```python\n(.*?)^```"))
 def test_the_python_runs(block, monkeypatch, tmp_path):
     for name in ("data", "jbrep"):  # what the blocks read; what they write stays out of here
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     exec(compile(block, "block", "exec"), {})
+
+
+@pytest.mark.parametrize("block", found(r"^```toml\n(.*?)^```"))
+def test_the_studies_are_studies(block):
+    assert as_study(tomllib.loads(block)).seeds == tuple(range(10))
+
+
+@pytest.mark.parametrize("line", found(r"^ {4}jbrep ([^\n]*)"))
+def test_the_commands_are_typed_as_they_are_understood(line):
+    words, command = shlex.split(line, comments=True), main
+    while isinstance(command, click.Group):
+        name, *words = words
+        command = command.commands[name]
+    command.make_context(name, words)  # refuses what it doesn't know
 
 
 def test_every_command_is_shown_and_every_command_shown_exists():
@@ -40,3 +63,8 @@ def test_every_data_command_is_shown_and_every_one_shown_exists():
 def test_links_and_pictures_lead_somewhere(page):
     targets = re.findall(r"\]\(([^)#]+)\)", page.read_text())
     assert not [t for t in targets if "://" not in t and not (page.parent / t).exists()]
+
+
+def test_the_citation_is_of_this_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text()
