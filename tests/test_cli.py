@@ -89,6 +89,17 @@ def test_lists_of_commands_say_what_each_does_in_whole_sentences(group):
     assert "..." not in below
 
 
+def test_what_policies_do_is_drawn(tmp_path):
+    policies = ("heuristic", "constant:drive=0.5", "--task", "move_in_direction")
+    told = jbrep("behaviour", *policies, "--episodes", 2, "--out", tmp_path / "drawn").stdout
+    for name in ("heuristic", "constant"):
+        assert re.search(rf"^{name}.*: median return \d+ \[\d+, \d+\]$", told, re.M)
+    for path in (tmp_path / "drawn").glob("*.png"):
+        assert str(path) in told
+        assert path.with_suffix(".csv").exists()
+    assert "drawn/motor_velocity.png" in told
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_an_example(command):
     text = jbrep(*command.split(), "--help").output

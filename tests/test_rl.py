@@ -267,7 +267,7 @@ def test_a_killed_run_goes_on_to_the_same_bits(algorithm, tmp_path, episode_step
     killed, error = kill(run, folder, episode_steps)
     assert killed == -signal.SIGKILL, error
     checkpoint = (folder / "checkpoint.safetensors").read_bytes()
-    train(run, folder)
+    train(run, folder, save_every=0.05)
     train(run, tmp_path / "peace")
     assert_same_run(tmp_path / "peace", folder)
     (tmp_path / "spoilt").mkdir()

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,13 +13,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import start, wait_for, wait_for_the_end_of, workers_of
+from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
+from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from jbrep.encoders import load
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl.files import RUN, read_run, write_run
 from jbrep.rl.presets import PRESETS, get_preset
+from jbrep.study import runner
 from jbrep.study.config import Data, Study, read_study
 from jbrep.study.plan import Plan
 from jbrep.study.prepare import prepare
@@ -271,6 +274,29 @@ def test_on_a_cluster_that_loses_a_node(done, tmp_path):
     for ours, theirs in zip(found, expected, strict=True):
         assert (ours.label, ours.settings) == (theirs.label, theirs.settings)
         np.testing.assert_array_equal(ours.returns, theirs.returns)
+
+
+def test_workers_that_are_killed_again_and_again(done, monkeypatch):
+    def killed(*arguments, **settings):
+        tries.append(settings)
+        raise TerminatedWorkerError
+
+    tries = []
+    monkeypatch.setattr(runner, "Parallel", killed)
+    with pytest.raises(InputError, match=r"workers were killed 5 times, .* take fewer --workers"):
+        list(on_this_machine(done, done.cells, 1))
+    assert len(tries) == 5
+
+
+def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
+    (tmp_path / "tiny.toml").write_text(TOML)
+    out = shutil.copytree(done.folder, tmp_path / "out")
+    monkeypatch.setattr("jbrep.study.study.conduct", lambda *given: 2)
+    monkeypatch.setattr("jbrep.report.write_report", lambda folder: [])
+    monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
+    told = jbrep("study", tmp_path / "tiny.toml", "--out", out)
+    assert told.exit_code == 1
+    assert told.stderr.endswith("2 runs crashed: the same command tries them again\n")
 
 
 def test_one_study_at_a_time(done):
