@@ -115,8 +115,6 @@ def _play(
     """What was played, and the returns."""
     from jbrep.encoders import find
     from jbrep.policies import POLICIES
-    from jbrep.rl.agent import Evaluator
-    from jbrep.rl.policy import load_run, load_zip
     from jbrep.sources import find_player
 
     if policy.partition(":")[0] in POLICIES:
@@ -125,6 +123,10 @@ def _play(
             player = player.through(find(encoder, player.task.name))
         played = player.play(range(episodes))
         return f"{task}, {player.name}", [rollout.reward.sum() for rollout in played]
+
+    from jbrep.rl.agent import Evaluator  # brings torch, which no policy by name needs
+    from jbrep.rl.policy import load_run, load_zip
+
     if Path(policy).is_dir():
         trained = load_run(Path(policy))
     else:
