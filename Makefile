@@ -6,7 +6,7 @@ DEMO := demo
 DEMO_RUN := $(DEMO)/study/runs/face_direction/sac-modern/dae-8/seed-0
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
-.PHONY: help setup demo test check bench pictures figures samples data encoders decoded desk first behaviour clean
+.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk first behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -34,6 +34,9 @@ demo: $(READY) ## the whole job in minutes: collect, train and judge encoders, l
 
 test: $(READY) ## the test suite
 	$(BIN)/python -m pytest
+
+coverage: $(READY) ## the test suite, with the lines of jbrep/ that no test runs
+	$(BIN)/python -m pytest --cov
 
 check: $(READY) ## lint, types, import direction
 	$(BIN)/ruff check .
