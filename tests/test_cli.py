@@ -73,7 +73,7 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
     assert re.search(r"4 runs to go, 0 over; [\d.]+ \w+ of one core, [\d.]+ \w+ with 2 ", told)
     for arguments, message in (
         (("studies/none.toml",), "no study at studies/none.toml"),
-        (("studies/first.toml", "--backend", "slurm"), "unknown backend 'slurm'"),
+        (("studies/desk.toml", "--backend", "slurm"), "unknown backend 'slurm'"),
         (("README.md",), "README.md is no TOML"),
     ):
         refused = jbrep("study", *arguments, "--out", tmp_path / "dry")

@@ -26,6 +26,7 @@ from jbrep.stats.curves import (
 from jbrep.stats.intervals import deviation, difference, mean, percentile, variance_ratio
 from jbrep.stats.power import POWER, SEEDS, seeds_needed
 from jbrep.stats.reliability import drawdown, expected_shortfall, fixed_policy, within_runs
+from jbrep.tables import SIGNIFICANT, interval
 
 SIMILAR, STEADIER, FASTER = CLAIMS
 GRID = np.arange(0, 10_001, 1000)
@@ -659,3 +660,9 @@ def test_rliable_gives_the_same_numbers():
     found = percentile(probability_of_improvement, x, y)
     assert found.value == pytest.approx(values["xy"][0])
     assert found[1:] == pytest.approx(intervals["xy"][:, 0], abs=0.05)
+
+
+def test_three_digits_are_shown_without_powers_of_ten():
+    assert interval([-826.4, -1194.0, -0.00919], SIGNIFICANT) == "-826 [-1,194, -0.00919]"
+    assert interval([99999.9, None, None], SIGNIFICANT) == "100,000"
+    assert interval([None, None, None], SIGNIFICANT) == "-"

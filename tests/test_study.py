@@ -67,12 +67,13 @@ def done(tmp_path_factory):
 
 def test_the_presets_are_studies():
     found = {p.stem: read_study(p) for p in Path("studies").glob("*.toml")}
-    assert set(found) == {"smoke", "desk", "first", "paper"}
+    assert set(found) == {"smoke", "ddpg", "desk", "paper"}
     paper = found["paper"]
     assert (paper.steps, len(paper.seeds), paper.data) == (5_000_000, 10, Data(steps=5_000_000))
     assert {"dae-12", "dae-8", "dae-4", "full"} <= set(paper.representations)
-    assert len(found["first"].seeds) >= 5
-    assert found["first"].steps == 50_000
+    desk = found["desk"]
+    assert (desk.steps, len(desk.seeds), desk.data) == (50_000, 10, None)
+    assert {"dae-12", "dae-8", "dae-4", "full", "pca-8", "random-8"} == set(desk.representations)
 
 
 def test_a_study_from_toml(tmp_path):

@@ -224,7 +224,7 @@ def report(folder: Path, out: Path | None) -> None:
     """Show what a study says, as a page, tables and figures.
 
     FOLDER is of a study, finished or not, or any with runs below it. Where there are no runs, as
-    in results/first, the report is made from the tables alone.
+    in results/desk, the report is made from the tables alone.
     """
     from jbrep.report import write_report
     from jbrep.study.results import has_runs

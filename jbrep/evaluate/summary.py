@@ -3,7 +3,7 @@
 from typing import Any
 
 from jbrep.encoders import FULL
-from jbrep.tables import table
+from jbrep.tables import interval, number, table
 
 _NOISE = 0.1  # the corruption to show
 
@@ -88,14 +88,3 @@ def _units(encoders: dict[str, Any]) -> str:
         )
     header = ("encoder", "dead", "saturated", "participation", "TwoNN", "max. likelihood")
     return table(header, rows)
-
-
-def interval(values: list[float | None], form: str) -> str:
-    """A value with its interval, if it has one: 1.08 [1.07, 1.09]."""
-    value, low, high = (number(v, form) for v in values)
-    return value if values[1] is None else f"{value} [{low}, {high}]"
-
-
-def number(value: float | None, form: str) -> str:
-    """A number in that format, or a dash where there is none."""
-    return "-" if value is None else format(value, f"z{form}")  # no negative zero

@@ -4,8 +4,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from jbrep.evaluate.summary import interval
 from jbrep.stats.claims import MARGIN
+from jbrep.tables import SIGNIFICANT, interval, number
 
 Plain = Mapping[str, Any]  # statistics.json, or a part of it
 
@@ -80,14 +80,14 @@ def _findings(claim: str, statistics: Plain) -> Iterator[Finding]:
 
 def _sentence(verdict: Plain, representation: str, statistics: Plain) -> str:
     """The numbers behind a verdict, and what would decide where nothing does."""
-    nominal = interval(verdict["nominal"], ",.3g")
+    nominal = interval(verdict["nominal"], SIGNIFICANT)
     _, *ends = verdict["simultaneous"]
     level = f"{100 * statistics['simultaneous_level']:.2f} %"
     pair = f"{representation} against {statistics['baseline']}"
     said = f"{pair}: {_MEASURES[verdict['claim']]} {nominal}"
     if None not in ends:
-        low, high = (f"{end:,.3g}" for end in ends)
-        bound = f"{_BOUNDARIES[verdict['claim']]}{verdict['boundary']:,.3g}"
+        low, high = (number(end, SIGNIFICANT) for end in ends)
+        bound = _BOUNDARIES[verdict["claim"]] + number(verdict["boundary"], SIGNIFICANT)
         said += f"; at {level}, [{low}, {high}] {_place(verdict)} {bound}"
     if verdict["reason"]:
         return f"{said}; not decided: {verdict['reason']}."

@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from jbrep.evaluate.summary import interval, number
 from jbrep.stats.labels import STEPS_TO
-from jbrep.tables import table
+from jbrep.tables import SIGNIFICANT, interval, number, table
 
 Plain = Mapping[str, Any]  # statistics.json, or a part of it
 Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]  # a header, and the lines under it
@@ -85,7 +84,7 @@ def spread_rows(group: Plain) -> Rows:
 
 
 def _of(label: Plain, name: str, form: str = ",.0f") -> str:
-    return _shown(label["numbers"][name], form)
+    return interval(label["numbers"][name], form)
 
 
 def _steps(label: Plain, name: str) -> str:
@@ -104,11 +103,11 @@ def comparison_rows(group: Plain) -> Rows:
     return header, [
         (
             comparison["representation"],
-            _shown(comparison["numbers"]["final_return_difference"], ",.0f"),
-            _shown(comparison["numbers"]["mean_return_difference"], ",.0f"),
-            _shown(comparison["numbers"]["probability_of_improvement"], ".2f"),
-            _shown(comparison["numbers"]["variance_ratio"], ",.3g"),
-            _shown(comparison["numbers"]["variance_ratio_bootstrap"], ",.3g"),
+            interval(comparison["numbers"]["final_return_difference"], ",.0f"),
+            interval(comparison["numbers"]["mean_return_difference"], ",.0f"),
+            interval(comparison["numbers"]["probability_of_improvement"], ".2f"),
+            interval(comparison["numbers"]["variance_ratio"], SIGNIFICANT),
+            interval(comparison["numbers"]["variance_ratio_bootstrap"], SIGNIFICANT),
             next(
                 _probability(v["p"])
                 for v in comparison["verdicts"]
@@ -128,8 +127,8 @@ def verdict_rows(group: Plain) -> Rows:
             comparison["representation"],
             verdict["claim"],
             verdict["verdict"] + (f" ({verdict['reason']})" if verdict["reason"] else ""),
-            _shown(verdict["simultaneous"], ",.3g"),
-            f"{verdict['boundary']:,.3g}",
+            interval(verdict["simultaneous"], SIGNIFICANT),
+            number(verdict["boundary"], SIGNIFICANT),
             _probability(verdict["p"]),
             _probability(verdict["p_holm"]),
             "-" if verdict["seeds_needed"] is None else str(verdict["seeds_needed"]),
@@ -137,10 +136,6 @@ def verdict_rows(group: Plain) -> Rows:
         for comparison in group["comparisons"]
         for verdict in comparison["verdicts"]
     ]
-
-
-def _shown(found: list[Any], form: str) -> str:
-    return interval(found, form)
 
 
 def _probability(p: float | None) -> str:
