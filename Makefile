@@ -6,7 +6,7 @@ DEMO := demo
 DEMO_RUN := $(DEMO)/study/runs/face_direction/sac-modern/dae-8/seed-0
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
-.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg behaviour clean
+.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -57,7 +57,7 @@ pictures: $(READY) ## the pictures in docs/, drawn anew
 	rm -f docs/jitterbug.gif
 	$(BIN)/jbrep render uniform heuristic --task move_to_pose --episode 10 --seconds 3.5 --speed 0.7 --fps 10 --size 240x180 --out docs/jitterbug.gif
 	$(BIN)/jbrep inspect data/sample/face_direction --episode 1 --encoder dae-8 --out inspect/shown.rrd
-	$(BIN)/python tools/screenshots.py results/desk/report.html inspect/shown.rrd docs
+	$(BIN)/python tools/screenshots.py results/yaw/report.html inspect/shown.rrd docs
 
 figures: $(READY) ## figures and reports in results/ anew, from the tables there
 	$(BIN)/python tools/figures.py
@@ -85,7 +85,8 @@ decoded: $(READY) ## results/decoded.txt anew: hand-written policies on what enc
 
 desk: ## results/desk/ anew: a night or two; goes on where it was stopped
 ddpg: ## results/ddpg/ anew: a night
-desk ddpg: $(READY)
+yaw: data ## results/yaw/ anew: hours
+desk ddpg yaw: $(READY)
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
 	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json heuristics.csv) results/$@/
