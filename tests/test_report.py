@@ -23,6 +23,7 @@ from jbrep.study.config import Study, read_study
 from jbrep.study.heuristics import HEURISTIC_RETURNS, write_heuristics
 from jbrep.study.plan import Plan
 from jbrep.study.results import read_results, write_results
+from jbrep.tables import SIGNIFICANT, number
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 FINAL = {"full": 800, "dae-8": 300, "pca-8": 820}
@@ -193,7 +194,7 @@ def test_each_claim_has_its_verdicts_with_the_numbers_of_the_statistics(whole):
                 if each["representation"] == comparison["representation"]
             ]
             assert found["verdict"] == verdict["verdict"]
-            assert f"{verdict['nominal'][0]:,.3g}" in found["sentence"]
+            assert number(verdict["nominal"][0], SIGNIFICANT) in found["sentence"]
             assert found["sentence"].replace("'", "&#39;") in text.replace("&gt;", ">")
     similar = summary["claims"]["similar reward"]["counts"]
     assert sum(similar.values()) == 2

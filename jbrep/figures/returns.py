@@ -127,12 +127,13 @@ def _draw_final(groups: Sequence[Group]) -> Figure:
     for (left, right), group in zip(panels, groups, strict=True):
         _draw_runs(left, group, look, "final_return")
         left.axhline(LINE, **solved())
-        left.set(ylabel="final return", ylim=(-15, 1015))
+        left.set(ylabel="final return", ylim=(-40, 1040))
         _by_label(right, group)
         for i, label in enumerate(group["labels"]):
             style = look[label["representation"]]
             _interval(right, i, label["numbers"]["final_return_sd"], style)
-        right.set(ylabel="SD over runs", ylim=(0, None))
+        right.set_ylabel("SD over runs")
+        _from_zero(right)
     return figure
 
 
@@ -141,8 +142,15 @@ def _draw_learning(groups: Sequence[Group]) -> Figure:
     look = looks(groups)
     for (axes,), group in zip(panels, groups, strict=True):
         _draw_runs(axes, group, look, "mean_return")
-        axes.set(ylabel="mean return over training", ylim=(0, None))
+        axes.set_ylabel("mean return over training")
+        _from_zero(axes)
     return figure
+
+
+def _from_zero(axes: Axes) -> None:
+    """From zero up, with room for whole markers."""
+    _, top = axes.get_ylim()
+    axes.set_ylim(-0.04 * top, 1.04 * top)
 
 
 def _draw_runs(axes: Axes, group: Group, look: dict[str, Any], value: str) -> None:
@@ -167,7 +175,7 @@ def _by_label(axes: Axes, group: Group) -> None:
 def _interval(axes: Axes, at: float, values: Sequence[float | None], style: dict[str, Any]) -> None:
     """A value with its interval, upright; no bar where there is none."""
     value, low, high = np.array(values, float)
-    spread = np.nan_to_num([[value - low], [high - value]]).clip(0)
+    spread = None if np.isnan(low) else np.clip([[value - low], [high - value]], 0, None)
     axes.errorbar([at], [value], spread, ms=4, lw=1.4, capsize=2.5, **style)
 
 
