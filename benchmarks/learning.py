@@ -28,7 +28,7 @@ from jbrep.rl.presets import get_preset
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan
 from jbrep.study.runner import on_this_machine
-from jbrep.study.study import conduct
+from jbrep.study.study import run_study
 
 TASK = "face_direction"
 ROUNDS = 12
@@ -99,7 +99,7 @@ def compare_loops() -> None:
 def seconds_of_study(workers: int) -> float:
     with tempfile.TemporaryDirectory() as folder:
         plan = Plan(STUDY, Path(folder) / "study")
-        return timed(lambda: conduct(plan, on_this_machine, workers))
+        return timed(lambda: run_study(plan, on_this_machine, workers))
 
 
 def seconds_of_runs() -> float:

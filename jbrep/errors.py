@@ -1,4 +1,4 @@
-"""The one exception that means "the user can mend this"."""
+"""The exceptions that mean "the user can mend this"."""
 
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -8,6 +8,10 @@ _Choice = TypeVar("_Choice")
 
 class InputError(ValueError):
     """A user's mistake: one line with what was wrong, what was expected, and the choices."""
+
+
+class DamageError(InputError):
+    """A file is not what jbrep wrote; the message names it."""
 
 
 def check_version(path: object, found: Any, known: int) -> None:

@@ -12,7 +12,7 @@ from test_study import TINY
 
 from jbrep.study.plan import Plan
 from jbrep.study.runner import on_ray
-from jbrep.study.study import conduct
+from jbrep.study.study import run_study
 from jbrep.study.work import PROGRESS
 
 NOTICE = {  # a dead node within seconds
@@ -37,7 +37,7 @@ def main(out):
 
     killer = threading.Thread(target=kill)
     killer.start()
-    crashed = conduct(Plan(replace(TINY, seeds=(0,)), out), on_ray, 2)  # a run for each node
+    crashed = run_study(Plan(replace(TINY, seeds=(0,)), out), on_ray, 2)  # a run for each node
     killer.join()
     ray.shutdown()
     cluster.shutdown()

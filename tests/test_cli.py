@@ -228,7 +228,7 @@ def test_steps_that_are_no_number_are_refused(text, tmp_path):
 
 def test_a_missing_extra_is_named(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "torch", None)
-    for name in [n for n in sys.modules if n.startswith(("jbrep.dae", "jbrep.fit"))]:
+    for name in [n for n in sys.modules if n.startswith(("jbrep.dae", "jbrep.methods.fit"))]:
         monkeypatch.delitem(sys.modules, name)
     result = jbrep("train-dae", "--data", tmp_path, "--latent", 8, "--out", tmp_path / "x")
     assert (result.exit_code, result.output) == (

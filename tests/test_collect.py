@@ -15,17 +15,18 @@ import pytest
 from kills import COMMAND, kill_and_resume
 from small import contents, settings, write_again
 
-from jbrep import collect as collecting
 from jbrep import jitterbug
 from jbrep.collect import collect, write_shards
+from jbrep.collect import collector as collecting
+from jbrep.collect.derive import derive
+from jbrep.collect.replay import replay_problems
 from jbrep.dataset import DamageError, Dataset
-from jbrep.dataset.lock import exclusive
 from jbrep.dataset.manifest import open_shard, read_manifest, write_manifest
 from jbrep.dataset.schema import episode_seed
-from jbrep.dataset.verify import find_problems, replay
-from jbrep.derive import derive
+from jbrep.dataset.verify import find_problems
 from jbrep.envs import environment_id
 from jbrep.errors import InputError
+from jbrep.files.lock import exclusive
 from jbrep.jitterbug.simulation import Simulation
 
 
@@ -95,7 +96,7 @@ def test_other_policies_are_collected_and_replayed(kind, tmp_path):
     constants = {"heuristic": 0, "constant": 1, "ornstein-uhlenbeck": 3}[kind]
     assert len(dataset.manifest.settings.policy) == 1 + constants  # defaults written down, too
     assert not list(find_problems(dataset.folder))
-    assert not list(replay(dataset, 1))
+    assert not list(replay_problems(dataset, 1))
     if kind == "heuristic":
         assert dataset.episodes["return"].min() > 700
 
@@ -220,7 +221,7 @@ def test_an_episode_ends_before_its_physics_goes_non_finite(tmp_path, collected)
     np.testing.assert_array_equal(final[1], whole["observation"][1300])
     np.testing.assert_array_equal(final[2], whole["observation"][2000])
     assert not list(find_problems(dataset.folder))
-    assert not list(replay(dataset, 4))
+    assert not list(replay_problems(dataset, 4))
     derive(dataset.folder, "move_to_pose", tmp_path / "derived")
     derived = Dataset(tmp_path / "derived")
     np.testing.assert_array_equal(derived.episodes["length"], [1000, 300, 0, 1000])
@@ -364,7 +365,7 @@ def test_a_second_collector_is_refused_until_the_first_is_dead(collected, tmp_pa
     folder = tmp_path / "data"
     folder.mkdir()
     script = (
-        "import sys, time; from pathlib import Path; from jbrep.dataset.lock import exclusive\n"
+        "import sys, time; from pathlib import Path; from jbrep.files.lock import exclusive\n"
         "with exclusive(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
     holder = subprocess.Popen([sys.executable, "-c", script, folder], stdout=subprocess.PIPE)

@@ -9,8 +9,8 @@ from torch import nn
 from jbrep.dae.gradient import Gradient
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.scaled import Moments
-from jbrep.encoders.controls import linear_code, linear_denoiser, pca, random_projection
 from jbrep.encoders.encoder import run
+from jbrep.methods.controls import linear_code, linear_denoiser, pca, random_projection
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,9 @@ import pytest
 from small import contents, settings
 
 from jbrep.collect import collect
+from jbrep.collect.derive import derive
+from jbrep.collect.repair import repair
+from jbrep.collect.replay import replay_problems
 from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.manifest import (
     MANIFEST,
@@ -16,19 +19,17 @@ from jbrep.dataset.manifest import (
     read_manifest,
     write_manifest,
 )
-from jbrep.dataset.verify import find_problems, replay
-from jbrep.derive import derive
+from jbrep.dataset.verify import find_problems
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.repair import repair
 
 
 def test_replayed_episodes_are_equal_bit_for_bit(collected):
     dataset = Dataset(collected)
-    assert not list(replay(dataset, 5, num_threads=1))
-    assert not list(replay(dataset, 0))
+    assert not list(replay_problems(dataset, 5, num_threads=1))
+    assert not list(replay_problems(dataset, 0))
     with pytest.raises(InputError, match="6 episodes can't be replayed: the data set has 5"):
-        list(replay(dataset, 6))
+        list(replay_problems(dataset, 6))
 
 
 @pytest.mark.parametrize(
@@ -55,7 +56,7 @@ def test_replay_finds_one_bit_of_difference(name, row, collected, tmp_path):
             values.reshape(len(values), -1)[row].view(np.uint8)[0] ^= 1
             columns[name] = values
         spoiled = commit(tmp_path, spoiled, columns)
-    (problem,) = replay(Dataset(tmp_path), 2)
+    (problem,) = replay_problems(Dataset(tmp_path), 2)
     assert "episode 1 simulated again differs" in problem
 
 

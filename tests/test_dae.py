@@ -8,10 +8,10 @@ from torch.nn.functional import mse_loss
 from jbrep.dae import checkpoint
 from jbrep.dae.gradient import Gradient
 from jbrep.dae.network import ARCHITECTURES, Autoencoder, layers
-from jbrep.dae.training import Trainer, Training, ahead, get_device
-from jbrep.encoders import container
+from jbrep.dae.training import Trainer, Training, get_device, prefetch
 from jbrep.encoders.encoder import run
 from jbrep.errors import InputError
+from jbrep.files import container
 
 
 def rows(count=600, size=16, seed=0):
@@ -205,15 +205,15 @@ def test_the_learning_rate_of_deep_falls_to_zero_and_that_of_paper_stays():
     assert {paper._learning_rate(epoch, 3) for epoch in (1, 2, 3)} == {3e-3}
 
 
-def test_ahead_keeps_order_and_errors():
-    assert list(ahead(iter(range(5)))) == [0, 1, 2, 3, 4]
-    assert list(ahead(())) == []
+def test_prefetch_keeps_order_and_errors():
+    assert list(prefetch(iter(range(5)))) == [0, 1, 2, 3, 4]
+    assert list(prefetch(())) == []
 
     def fails():
         yield 1
         raise ValueError("no more")
 
-    items = ahead(fails())
+    items = prefetch(fails())
     assert next(items) == 1
     with pytest.raises(ValueError, match="no more"):
         next(items)

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 from small import write_again
 
+from jbrep.collect.derive import derive
+from jbrep.collect.repair import repair
 from jbrep.dataset import DamageError, Dataset
+from jbrep.dataset.export import export
 from jbrep.dataset.manifest import (
     MANIFEST,
     Entry,
@@ -22,10 +25,7 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.shard import column_hashes, file_hash, shard_image
 from jbrep.dataset.verify import find_problems
-from jbrep.derive import derive
 from jbrep.errors import InputError
-from jbrep.export import export
-from jbrep.repair import repair
 
 
 def read_all(folder):

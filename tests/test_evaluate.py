@@ -14,19 +14,19 @@ from sklearn.preprocessing import StandardScaler
 from jbrep.dataset import Dataset, ScaledDataset, Scaler
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder, Layer
-from jbrep.encoders.controls import pca, random_projection
 from jbrep.errors import InputError
 from jbrep.evaluate import evaluate
-from jbrep.evaluate.bootstrap import bootstrap, by_episode
 from jbrep.evaluate.files import EVALUATION, write
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import intrinsic_dimension, latent
 from jbrep.evaluate.readout import correlation, dynamics, neighbours, probes
 from jbrep.evaluate.reconstruction import NOISES, corruption, reconstruction
-from jbrep.evaluate.summary import summary
+from jbrep.evaluate.summary import evaluation_text
 from jbrep.evaluate.truth import quantities, state
 from jbrep.figures import encoder_plots
 from jbrep.jitterbug.tasks import TASKS
+from jbrep.methods.controls import pca, random_projection
+from jbrep.stats.bootstrap import bootstrap, by_episode
 
 
 @pytest.fixture(scope="module")
@@ -387,7 +387,7 @@ def test_an_evaluation_is_plain_json_and_repeats(data, tmp_path):
     with pytest.raises(InputError, match="holds something else than the evaluation of these"):
         write({"r-4": encoders["r-4"]}, data, tmp_path / "it")
     assert (tmp_path / "it" / EVALUATION).read_text() == text
-    shown = summary(json.loads(text))
+    shown = evaluation_text(json.loads(text))
     assert "pca-4" in shown
     assert "nan" not in shown
 

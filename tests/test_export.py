@@ -10,8 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from jbrep.dataset import Dataset
+from jbrep.dataset.export import FORMATS, export
 from jbrep.errors import InputError
-from jbrep.export import FORMATS, export
 from jbrep.jitterbug.tasks import TASKS
 
 

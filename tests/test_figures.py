@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jbrep.behaviour import SPEEDS, observe
 from jbrep.errors import InputError
 from jbrep.figures import behaviour_plots, encoder_plots, study_plots, write
 from jbrep.figures.curves import Return
 from jbrep.figures.plot import Drawing
 from jbrep.figures.style import COLUMN, DARK, PAGE, PAPER
+from jbrep.rollouts.behaviour import SPEEDS, observe
 from jbrep.stats import RunCurve, analyse
 
 STEPS = np.arange(0, 50_001, 10_000)

@@ -12,11 +12,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from jbrep.collect import write_shards
 from jbrep.dae.training import Training
 from jbrep.dataset import Dataset, ScaledDataset
-from jbrep.dataset.lock import exclusive
 from jbrep.dataset.manifest import open_shard, read_manifest
 from jbrep.encoders import load
 from jbrep.errors import InputError
-from jbrep.fit import KINDS, Fitter
+from jbrep.files.lock import exclusive
+from jbrep.methods.fit import KINDS, Fitter
 
 
 @pytest.fixture(scope="module")

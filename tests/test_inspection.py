@@ -20,7 +20,7 @@ from jbrep.inspection.scene import contacts
 from jbrep.inspection.traversal import POINTS, SPACING, sweep
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl.files import ENCODER, FAILED, Evaluation, read_evaluations, write_rows, write_run
-from jbrep.sources import find_episode
+from jbrep.rollouts.sources import find_episode
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
 ROWS = 1001

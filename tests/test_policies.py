@@ -1,10 +1,7 @@
 import numpy as np
 import pytest
 
-from jbrep.errors import InputError
-from jbrep.jitterbug.heuristics import HEURISTICS
-from jbrep.jitterbug.tasks import TASKS
-from jbrep.policies import (
+from jbrep.collect.policies import (
     POLICIES,
     Constant,
     Heuristic,
@@ -14,6 +11,9 @@ from jbrep.policies import (
     parse_policy,
     policy_settings,
 )
+from jbrep.errors import InputError
+from jbrep.jitterbug.heuristics import HEURISTICS
+from jbrep.jitterbug.tasks import TASKS
 
 TASK = TASKS["face_direction"]
 

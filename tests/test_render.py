@@ -18,7 +18,7 @@ from jbrep.jitterbug.model import plain_model
 from jbrep.render.film import Film, Pace
 from jbrep.render.formats import encode_gif, encode_mp4, get_format
 from jbrep.render.pictures import Camera, add_caption, band_height
-from jbrep.sources import find_episode
+from jbrep.rollouts.sources import find_episode
 
 SIZE = (96, 64)
 SAMPLE = "data/sample/move_to_pose"

@@ -1,4 +1,4 @@
-"""One run: settings, files, evaluation, kills, failures, and files from strangers."""
+"""One run: settings, files, evaluation, kills, failures, and files from unlisted_files."""
 
 import dataclasses
 import io

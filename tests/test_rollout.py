@@ -16,8 +16,8 @@ from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, read_evaluations
 from jbrep.rl.policy import load_untrained
-from jbrep.rollout import replay
-from jbrep.sources import Player, find_episode, find_player
+from jbrep.rollouts.rollout import replay
+from jbrep.rollouts.sources import Player, find_episode, find_player
 
 
 @pytest.fixture(scope="module")
@@ -89,14 +89,14 @@ def test_a_policy_plays_through_an_encoder():
         p.play([0])[0]
         for p in (
             player,
-            *(player.through(find(e, "face_direction")) for e in ("identity", "pca-4")),
+            *(player.with_reconstruction(find(e, "face_direction")) for e in ("identity", "pca-4")),
         )
     )
     np.testing.assert_allclose(whole.action[:20], direct.action[:20], atol=1e-4)
     assert np.abs(blurred.action[:20] - direct.action[:20]).max() > 0.01
     assert blurred.name == "heuristic on pca-4, decoded"
     with pytest.raises(InputError, match="move_to_pose"):
-        player.through(find("pca-4", "move_to_pose"))
+        player.with_reconstruction(find("pca-4", "move_to_pose"))
 
 
 def test_an_episode_that_diverges_when_played_ends_before_it_does(monkeypatch, tmp_path):

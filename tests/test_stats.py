@@ -10,8 +10,9 @@ import pytest
 from scipy import stats
 
 from jbrep.errors import InputError
-from jbrep.evaluate.bootstrap import Interval
-from jbrep.stats import RunCurve, analyse, summary
+from jbrep.files.tables import SIGNIFICANT, interval
+from jbrep.stats import RunCurve, analyse, statistics_text
+from jbrep.stats.bootstrap import Interval
 from jbrep.stats.claims import CLAIMS, decide, in_words, mean_p, variance_p
 from jbrep.stats.comparison import holm, probability_of_improvement
 from jbrep.stats.curves import (
@@ -26,7 +27,6 @@ from jbrep.stats.curves import (
 from jbrep.stats.intervals import deviation, difference, mean, percentile, variance_ratio
 from jbrep.stats.power import POWER, SEEDS, seeds_needed
 from jbrep.stats.reliability import drawdown, expected_shortfall, fixed_policy, within_runs
-from jbrep.tables import SIGNIFICANT, interval
 
 SIMILAR, STEADIER, FASTER = CLAIMS
 GRID = np.arange(0, 10_001, 1000)
@@ -613,7 +613,7 @@ def test_two_runs_are_too_few_for_a_variance():
 
 
 def test_tables_have_a_line_for_each_label_comparison_and_verdict(analysis):
-    text = summary(analysis.tolist())
+    text = statistics_text(analysis.tolist())
     assert text.startswith("face_direction, sac: 18 runs over 10,000 steps")
     assert "nan" not in text
     assert "inf" not in text

@@ -28,7 +28,7 @@ from jbrep.study.prepare import prepare
 from jbrep.study.progress import in_words
 from jbrep.study.results import RETURNS, STATISTICS, read_results, read_runs, write_results
 from jbrep.study.runner import get_backend, on_this_machine
-from jbrep.study.study import conduct
+from jbrep.study.study import run_study
 from jbrep.study.work import PROGRESS
 
 TINY = Study(
@@ -61,7 +61,7 @@ def tables(folder):
 def done(tmp_path_factory):
     """The tiny study on one worker, at its end."""
     plan = Plan(TINY, tmp_path_factory.mktemp("study") / "done")
-    assert conduct(plan, on_this_machine, 1) == 0
+    assert run_study(plan, on_this_machine, 1) == 0
     return plan
 
 
@@ -153,7 +153,7 @@ def test_two_workers_of_which_one_is_killed_give_the_same_tables(done, tmp_path)
 
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()
-    assert conduct(plan, on_this_machine, 2) == 0
+    assert run_study(plan, on_this_machine, 2) == 0
     killer.join()
     assert killed
     assert tables(plan.folder) == tables(done.folder)
@@ -166,11 +166,11 @@ def test_what_is_finished_is_not_run_again_and_seeds_may_come(done, tmp_path, mo
         "face_direction/a2c/pca-8/seed-2",
     ]
     before = {p: p.stat().st_mtime_ns for p in (done.folder / "runs").rglob("*.*")}
-    assert conduct(done, None, 1) == 0  # nothing is left to run
+    assert run_study(done, None, 1) == 0  # nothing is left to run
     assert {p: p.stat().st_mtime_ns for p in (done.folder / "runs").rglob("*.*")} == before
     other = Plan(dataclasses.replace(TINY, steps=90), done.folder)
     with pytest.raises(InputError, match=r"another study: steps 80 \(now: 90\)"):
-        conduct(other, None, 1)
+        run_study(other, None, 1)
 
 
 def test_it_makes_data_and_encoders(tmp_path):
@@ -207,9 +207,9 @@ def test_a_data_set_from_elsewhere(collected, tmp_path):
     for name, message in (("pca-16", "no reduction of face_direction"), ("pca-99", "no reduction")):
         wrong = dataclasses.replace(study, representations=("full", name))
         with pytest.raises(InputError, match=message):
-            conduct(Plan(wrong, tmp_path / "wrong"), None, 1)
+            run_study(Plan(wrong, tmp_path / "wrong"), None, 1)
     with pytest.raises(InputError, match="no encoder 'pca-5'"):
-        conduct(
+        run_study(
             Plan(dataclasses.replace(TINY, representations=("full", "pca-5")), tmp_path / "w"),
             *(None, 1),
         )
@@ -227,13 +227,13 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     blocked = plan.folder_of(plan.cells[0])
     blocked.mkdir(parents=True)
     (blocked / "encoder.safetensors").mkdir()  # where a file is to be
-    assert conduct(plan, on_this_machine, 1) == 1
+    assert run_study(plan, on_this_machine, 1) == 1
     assert "can't write" in (blocked / "error.txt").read_text()
     over = {cell.name: read_run(plan.folder_of(cell))["status"] for cell in plan.cells[1:]}
     for name, status in over.items():
         assert status == ("failed" if "a2c-modern" in name else "finished")
     (blocked / "encoder.safetensors").rmdir()
-    assert conduct(plan, on_this_machine, 1) == 0
+    assert run_study(plan, on_this_machine, 1) == 0
     analysis = read_results(plan.folder).analysis
     failed = {group.algorithm: [len(x.failed) for x in group.labels] for group in analysis.groups}
     assert failed == {"a2c": [0, 0], "a2c-modern": [2, 2]}
@@ -254,7 +254,7 @@ def test_a_stopped_study_goes_on(done, tmp_path):
     assert "the same command goes on" in told
     assert "Traceback" not in told
     assert len(list(out.rglob(RUN))) < 4
-    assert conduct(Plan(TINY, out), on_this_machine, 1) == 0
+    assert run_study(Plan(TINY, out), on_this_machine, 1) == 0
     assert tables(out) == tables(done.folder)
 
 
@@ -292,7 +292,7 @@ def test_workers_that_are_killed_again_and_again(done, monkeypatch):
 def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     (tmp_path / "tiny.toml").write_text(TOML)
     out = shutil.copytree(done.folder, tmp_path / "out")
-    monkeypatch.setattr("jbrep.study.study.conduct", lambda *given: 2)
+    monkeypatch.setattr("jbrep.study.study.run_study", lambda *given: 2)
     monkeypatch.setattr("jbrep.report.write_report", lambda folder: [])
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
     told = jbrep("study", tmp_path / "tiny.toml", "--out", out)
@@ -301,10 +301,10 @@ def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
 
 
 def test_one_study_at_a_time(done):
-    from jbrep.dataset.lock import exclusive
+    from jbrep.files.lock import exclusive
 
     with exclusive(done.folder), pytest.raises(InputError, match="is being written by process"):
-        conduct(done, on_this_machine, 1)
+        run_study(done, on_this_machine, 1)
 
 
 def test_the_long_table_holds_every_evaluation(done):

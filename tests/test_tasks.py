@@ -35,7 +35,7 @@ def readings(position=(0, 0, 0.035), yaw=0.0, tilt=0.0, velocity=(0, 0, 0), targ
         (turn @ lean).reshape(1, 9),
         np.array([velocity], dtype=float),
         np.array([[*target, 0.035]]),
-        tasks.turned_x(about_z(aim)[None]),
+        tasks.yaw_direction(about_z(aim)[None]),
     )
 
 

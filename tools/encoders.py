@@ -13,10 +13,10 @@ from jbrep.dae.training import NOISE, Training
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import FULL
 from jbrep.evaluate.files import write
-from jbrep.evaluate.summary import summary
+from jbrep.evaluate.summary import evaluation_text
 from jbrep.figures import encoder_plots
 from jbrep.figures import write as write_plots
-from jbrep.fit import Fitter
+from jbrep.methods.fit import Fitter
 
 LATENTS = (12, 8, 4)
 KINDS = (
@@ -39,9 +39,9 @@ def compare(data: ScaledDataset, encoders: Path, results: Path) -> None:
         for latent in LATENTS
     ]
     evaluation = write({encoder.name: encoder for encoder in fitted}, data, results)
-    (results / "tables.txt").write_text(summary(evaluation) + "\n")
+    (results / "tables.txt").write_text(evaluation_text(evaluation) + "\n")
     write_plots(encoder_plots(evaluation), results)
-    print(summary(evaluation))
+    print(evaluation_text(evaluation))
 
 
 def overview(results: Path) -> str:

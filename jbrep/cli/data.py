@@ -52,8 +52,8 @@ def collect(
     lanes nor threads change the data.
     """
     from jbrep.collect import collect as run
+    from jbrep.collect.policies import parse_policy, policy_settings
     from jbrep.dataset.manifest import Settings
-    from jbrep.policies import parse_policy, policy_settings
 
     how = policy_settings(parse_policy(policy))
     settings = Settings(
@@ -107,9 +107,9 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
 
     Exit code 1 if anything is wrong, with a line for each problem.
     """
+    from jbrep.collect.replay import replay_problems
     from jbrep.dataset import Dataset
     from jbrep.dataset.verify import find_problems
-    from jbrep.dataset.verify import replay as replay_episodes
 
     problems = 0
     for problem in find_problems(data):
@@ -117,7 +117,7 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
         problems += 1
     if not problems:
         dataset = Dataset(data)
-        for problem in replay_episodes(dataset, replay, threads):
+        for problem in replay_problems(dataset, replay, threads):
             click.echo(printable(problem))
             problems += 1
     if problems:
@@ -138,7 +138,7 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
 @_threads
 def repair(data: Path, lanes: int, threads: int | None) -> None:
     """Make damaged and missing files again, as they were."""
-    from jbrep.repair import repair as run
+    from jbrep.collect.repair import repair as run
 
     with stoppable(GOES_ON):
         done = 0
@@ -164,7 +164,7 @@ def derive(data: Path, task: str, store_state: bool, threads: int | None, out: P
     bit. The data set needs its states (collect --store-state) and a policy that doesn't act on
     observations.
     """
-    from jbrep.derive import derive as run
+    from jbrep.collect.derive import derive as run
 
     with stoppable(GOES_ON):
         _tell(out, run(data, task, out, store_state, threads))
@@ -180,7 +180,7 @@ def export(data: Path, to: str, out: Path) -> None:
     For minari, --out is a folder of Minari data sets, as MINARI_DATASETS_PATH names it.
     """
     from jbrep.dataset import Dataset
-    from jbrep.export import export as run
+    from jbrep.dataset.export import export as run
 
     with stoppable("nothing is left of it"):
         click.echo(f"open it with {run(Dataset(data), to, out)}")

@@ -103,8 +103,8 @@ def _fit(
 ) -> None:
     from jbrep.dae.training import Training
     from jbrep.dataset import Dataset, ScaledDataset
-    from jbrep.encoders.file import ERROR
-    from jbrep.fit import Fitter, get_kind
+    from jbrep.encoders.file import HELD_OUT_MSE
+    from jbrep.methods.fit import Fitter, get_kind
 
     given = {name: value for name, value in how.items() if value is not None}
     settings = get_kind(kind).settings
@@ -123,7 +123,7 @@ def _fit(
     with stoppable(f"{GOES_ON}; what is best so far is in {out}"):
         for training in trainings:
             found = fitter.fit(kind, training)
-            error = found.encoder.header["metrics"][ERROR]
+            error = found.encoder.header["metrics"][HELD_OUT_MSE]
             there = "" if found.anew else ", complete already"
             click.echo(
                 f"{found.encoder.name}: held-out mean squared error {error:.5f}, features scaled "
@@ -158,7 +158,7 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path) -> None:
     from jbrep.encoders import find
     from jbrep.encoders.file import SUFFIX
     from jbrep.evaluate.files import EVALUATION, write
-    from jbrep.evaluate.summary import summary
+    from jbrep.evaluate.summary import evaluation_text
     from jbrep.figures import encoder_plots
     from jbrep.figures import write as write_plots
 
@@ -178,7 +178,7 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path) -> None:
                 f"note: {label} was trained on other data of the same seed, so these episodes may "
                 "not be new to it"
             )
-    click.echo(summary(evaluation))
+    click.echo(evaluation_text(evaluation))
     click.echo("\n" + "\n".join(map(str, (out / EVALUATION, *pictures))))
 
 

@@ -67,7 +67,7 @@ def render(
     from jbrep.render.film import Film, Pace
     from jbrep.render.formats import get_format
     from jbrep.render.pictures import Camera
-    from jbrep.sources import find_episode
+    from jbrep.rollouts.sources import find_episode
 
     form = get_format(out)
     pace = Pace(form.fps if fps is None else fps, speed, seconds)

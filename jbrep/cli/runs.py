@@ -113,14 +113,14 @@ def _play(
     policy: str, episodes: int, trust: bool, task: str, algorithm: str, encoder: str | None
 ) -> tuple[str, Any]:
     """What was played, and the returns."""
+    from jbrep.collect.policies import POLICIES
     from jbrep.encoders import find
-    from jbrep.policies import POLICIES
-    from jbrep.sources import find_player
+    from jbrep.rollouts.sources import find_player
 
     if policy.partition(":")[0] in POLICIES:
         player = find_player(policy, task)
         if encoder:
-            player = player.through(find(encoder, player.task.name))
+            player = player.with_reconstruction(find(encoder, player.task.name))
         played = player.play(range(episodes))
         return f"{task}, {player.name}", [rollout.reward.sum() for rollout in played]
 
@@ -153,8 +153,8 @@ def behaviour(
     """
     import numpy as np
 
-    from jbrep.behaviour import SPEEDS, observe
     from jbrep.figures import behaviour_plots, write
+    from jbrep.rollouts.behaviour import SPEEDS, observe
 
     yaw = np.deg2rad(target_yaw)
     with stoppable("the same command starts anew"):
@@ -200,15 +200,16 @@ def study(
     from jbrep.study.config import read_study
     from jbrep.study.plan import Plan
     from jbrep.study.runner import get_backend
-    from jbrep.study.study import conduct, outline
+    from jbrep.study.study import dry_run as dry_run_text
+    from jbrep.study.study import run_study
 
     plan = Plan(read_study(study), out or Path("runs") / study.stem)
     run, count = get_backend(backend), workers or cpu_count()
     if dry_run:
-        click.echo(outline(plan, count))
+        click.echo(dry_run_text(plan, count))
         return
     with stoppable(GOES_ON):
-        crashed = conduct(plan, run, count)
+        crashed = run_study(plan, run, count)
     _tell([*_conclude(plan.folder), *write_report(plan.folder)])
     if crashed:
         click.echo(f"{crashed} runs crashed: the same command tries them again", err=True)

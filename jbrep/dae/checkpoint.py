@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from jbrep.dae.training import Epoch, Trainer
-from jbrep.encoders import container
 from jbrep.errors import InputError, differences
+from jbrep.files import container
 
 
 def save(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:

@@ -149,7 +149,7 @@ class Trainer:
 
     def epochs(self) -> Iterator[Epoch]:
         """Train to the end, an epoch for each that is asked for."""
-        with one_thread():
+        with single_torch_thread():
             while len(self.history) < self.training.epochs:
                 self._epoch()
                 yield self.history[-1]
@@ -193,7 +193,7 @@ class Trainer:
     def _batches(self, number: int) -> Iterator[tuple[Tensor, Tensor]]:
         """Every row once, (d, rows): clean, and with noise of its own on each feature."""
         size = self._batch_size
-        for clean, corrupted in ahead(self._draws(number)):
+        for clean, corrupted in prefetch(self._draws(number)):
             yield from zip(clean.split(size, 1), corrupted.split(size, 1), strict=True)
 
     def _draws(self, number: int) -> Iterator[tuple[Tensor, Tensor]]:
@@ -215,7 +215,7 @@ def _copy(network: Autoencoder) -> dict[str, Tensor]:
     return {name: p.clone() for name, p in network.state_dict().items()}
 
 
-def ahead(items: Iterable[_Item]) -> Iterator[_Item]:
+def prefetch(items: Iterable[_Item]) -> Iterator[_Item]:
     """The items in order, each made in another thread while the one before it is used."""
     iterator = iter(items)
     with ThreadPoolExecutor(1) as executor:
@@ -226,7 +226,7 @@ def ahead(items: Iterable[_Item]) -> Iterator[_Item]:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def single_torch_thread() -> Iterator[None]:
     """Torch on one: networks so small gain little from more, which move the last bits and wait."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -4,7 +4,7 @@ from jbrep.dataset.columns import Batches, Column, Scaler
 from jbrep.dataset.manifest import Settings
 from jbrep.dataset.reader import Dataset, Split
 from jbrep.dataset.scaled import ScaledDataset
-from jbrep.dataset.shard import DamageError
+from jbrep.errors import DamageError
 
 __all__ = [
     "Batches",

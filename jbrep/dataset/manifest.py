@@ -22,16 +22,14 @@ from jbrep.dataset.schema import (
 )
 from jbrep.dataset.shard import (
     MEND,
-    DamageError,
     Shard,
     column_hashes,
     file_hash,
     map_file,
-    read_regular,
     shard_image,
 )
-from jbrep.dataset.storage import write_whole
-from jbrep.errors import InputError, check_version
+from jbrep.errors import DamageError, InputError, check_version
+from jbrep.files.storage import read_regular, write_whole
 from jbrep.jitterbug.tasks import EPISODE_STEPS, Task, get_task
 
 MANIFEST = "manifest.json"
@@ -301,11 +299,11 @@ def file_problems(folder: Path, manifest: Manifest, files: list[Path]) -> Iterat
             yield (
                 f"{path} is damaged: it has {size:,} bytes, {entry.bytes:,} were committed; {MEND}"
             )
-    for path in strangers(manifest, files):
+    for path in unlisted_files(manifest, files):
         yield f"{path} is not one of the {len(manifest.shards)} shards of the data set"
 
 
-def strangers(manifest: Manifest, files: list[Path]) -> list[Path]:
+def unlisted_files(manifest: Manifest, files: list[Path]) -> list[Path]:
     """Files that the manifest doesn't name, nor are they the shard whose commit is under way."""
     known = {shard_name(shard) for shard in range(len(manifest.shards))}
     if not manifest.complete:

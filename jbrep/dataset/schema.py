@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.errors import InputError
-from jbrep.jitterbug.tasks import Task
+from jbrep.jitterbug.tasks import QPOS_SIZE, QVEL_SIZE, Task
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -16,7 +16,6 @@ FORMAT = "jbrep data set"
 FORMAT_VERSION = 1
 EPISODES = "episodes/"  # the HDF5 group of the columns with one row for each episode
 
-_QPOS, _QVEL = 16, 15  # sizes of MuJoCo's position and velocity
 _MAX_ROOT = 2**31 - 2
 
 
@@ -46,7 +45,7 @@ def step_specs(task: Task, store_state: bool) -> dict[str, Spec]:
         "step": _spec("<i4"),  # from 0 in the episode
     }
     if store_state:  # with the observation
-        specs |= {"qpos": _spec("<f8", _QPOS), "qvel": _spec("<f8", _QVEL)}
+        specs |= {"qpos": _spec("<f8", QPOS_SIZE), "qvel": _spec("<f8", QVEL_SIZE)}
     return specs
 
 
@@ -58,14 +57,14 @@ def episode_specs(task: Task, store_state: bool) -> dict[str, Spec]:
         "length": _spec("<i4"),  # rows stored
         "return": _spec("<f8"),  # sum of the rewards stored
         "diverged": _spec("|u1"),  # 1 where the physics went non-finite after the last row
-        "initial_qpos": _spec("<f8", _QPOS),
-        "initial_qvel": _spec("<f8", _QVEL),
+        "initial_qpos": _spec("<f8", QPOS_SIZE),
+        "initial_qvel": _spec("<f8", QVEL_SIZE),
         "target_position": _spec("<f8", 3),
         "target_quaternion": _spec("<f8", 4),
         "final_observation": _spec("<f4", task.size),  # after the last action
     }
     if store_state:
-        specs |= {"final_qpos": _spec("<f8", _QPOS), "final_qvel": _spec("<f8", _QVEL)}
+        specs |= {"final_qpos": _spec("<f8", QPOS_SIZE), "final_qvel": _spec("<f8", QVEL_SIZE)}
     return {EPISODES + name: spec for name, spec in specs.items()}
 
 

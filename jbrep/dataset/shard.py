@@ -3,7 +3,6 @@
 import hashlib
 import math
 import mmap
-import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,15 +14,12 @@ import xxhash
 from numpy.typing import NDArray
 
 from jbrep.dataset.schema import EPISODES, Columns, Spec
-from jbrep.errors import InputError
+from jbrep.errors import DamageError, InputError
+from jbrep.files.storage import regular_size
 from jbrep.jitterbug.tasks import EPISODE_STEPS
 
 MEND = "jbrep data repair makes it again"
 _HASH = "sha256"  # attribute of every column
-
-
-class DamageError(InputError):
-    """A file of a data set is not what was committed; the message names it."""
 
 
 def column_hash(column: NDArray[Any]) -> str:
@@ -53,21 +49,6 @@ def shard_image(
         return file.id.get_file_image()
 
 
-def _regular_size(path: Path) -> int:
-    """Bytes of a file; 0 of a link, a pipe or anything else that isn't one."""
-    status = path.lstat()
-    return status.st_size if stat.S_ISREG(status.st_mode) else 0
-
-
-def read_regular(path: Path, most: int) -> bytes:
-    """A file's bytes; none of something else than a file, or of one that is larger than `most`.
-
-    Raises:
-        OSError: it can't be read.
-    """
-    return path.read_bytes() if 0 < _regular_size(path) <= most else b""
-
-
 def map_file(path: Path) -> mmap.mmap:
     """A file's bytes as they are on disk.
 
@@ -76,7 +57,7 @@ def map_file(path: Path) -> mmap.mmap:
         InputError: it can't be read.
     """
     try:
-        if not _regular_size(path):
+        if not regular_size(path):
             raise DamageError(
                 f"{path} is damaged: a regular file that isn't empty is expected, and no link"
             )

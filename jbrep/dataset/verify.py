@@ -1,12 +1,11 @@
-"""Is a data set what it says it is? Hashes, shapes, numbers, ranges, and the physics itself."""
+"""Is a data set what it says it is? Hashes, shapes, numbers and ranges."""
 
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from jbrep.dataset.manifest import (
@@ -18,14 +17,11 @@ from jbrep.dataset.manifest import (
     read_manifest,
     shard_name,
 )
-from jbrep.dataset.reader import Dataset
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns, episode_returns, episode_seed
-from jbrep.dataset.shard import MEND, DamageError, column_hash
-from jbrep.errors import InputError
-from jbrep.jitterbug.simulation import Simulation
+from jbrep.dataset.shard import MEND, column_hash
+from jbrep.errors import DamageError, InputError
 from jbrep.jitterbug.tasks import EPISODE_STEPS, Task
 
-_LANES = 100
 _BOUNDED = ("rad", "1")  # angles are wrapped, quaternions are of length 1: their ranges are bounds
 
 
@@ -122,73 +118,3 @@ def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Itera
     for what, (found, expected) in checks.items():
         if not np.array_equal(found, expected):
             yield f"{what} are not what seeds, lengths and rewards make of them"
-
-
-def replay(dataset: Dataset, episodes: int, num_threads: int | None = None) -> Iterator[str]:
-    """Simulate some episodes again from their stored start and actions, and compare every bit.
-
-    Args:
-        dataset: where they are.
-        episodes: how many; they are drawn evenly at random, the same ones each time.
-        num_threads: threads to simulate on; None takes one for each core.
-
-    Yields:
-        A line for each episode that comes out otherwise.
-
-    Raises:
-        InputError: fewer episodes are there.
-    """
-    total = len(dataset.episodes["episode"])
-    if not 0 <= episodes <= total:
-        raise InputError(f"{episodes} episodes can't be replayed: the data set has {total:,}")
-    if not len(dataset):
-        return
-    chosen = np.sort(np.random.default_rng(0).permutation(total)[:episodes])
-    with tqdm(total=episodes * EPISODE_STEPS, unit="step", unit_scale=True, leave=False) as bar:
-        for start in range(0, episodes, _LANES):
-            for episode in _replay_some(dataset, chosen[start : start + _LANES], num_threads, bar):
-                yield (
-                    f"{dataset.folder}: episode {episode} simulated again differs: another "
-                    f"machine, or other versions than {dict(dataset.manifest.versions)}?"
-                )
-
-
-def _replay_some(
-    dataset: Dataset, chosen: NDArray[Any], num_threads: int | None, bar: "tqdm[None]"
-) -> list[int]:
-    own = {name: column[chosen] for name, column in dataset.episodes.items()}
-    simulation = Simulation(dataset.task, len(chosen), num_threads)
-    simulation.restore(
-        *(own[n] for n in ("initial_qpos", "initial_qvel", "target_position", "target_quaternion"))
-    )
-    first = (np.cumsum(dataset.episodes["length"]) - dataset.episodes["length"])[chosen]
-    names = [name for name in dataset.columns if name not in ("episode", "step")]
-    columns = {name: dataset[name] for name in names}
-    equal = np.ones(len(chosen), dtype=bool)
-    for step in range(EPISODE_STEPS + 1):
-        running = own["length"] > step
-        rows = np.where(running, first + step, 0)
-        stored = {name: column[rows] for name, column in columns.items()}
-        ending = own["length"] == step
-        seen: Columns = {
-            "observation": simulation.observe().astype(np.float32),
-            "qpos": simulation.readings.qpos,
-            "qvel": simulation.readings.qvel,
-        }
-        for name, values in seen.items():
-            if name in stored:
-                equal &= _same(values, stored[name]) | ~running
-                equal &= _same(values, own[f"final_{name}"]) | ~ending
-        if step < EPISODE_STEPS:
-            simulation.step(np.where(running[:, None], stored["action"], 0))
-            reward = simulation.reward().astype(np.float32)
-            equal &= _same(reward, stored["reward"]) | ~running
-            bar.update(len(chosen))
-    return chosen[~equal].tolist()
-
-
-def _same(values: NDArray[Any], stored: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which lanes are equal in every bit."""
-    one, other = (np.ascontiguousarray(a).reshape(len(a), -1) for a in (values, stored))
-    same: NDArray[np.bool_] = (one.view(np.uint8) == other.view(np.uint8)).all(axis=1)
-    return same

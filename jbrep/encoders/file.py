@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from jbrep.dataset import DamageError, Scaler
-from jbrep.encoders import container
-from jbrep.encoders.container import Tensors
+from jbrep.dataset import Scaler
 from jbrep.encoders.encoder import Encoder, Layer
-from jbrep.errors import InputError, check_version
+from jbrep.errors import DamageError, InputError, check_version
+from jbrep.files import container
+from jbrep.files.container import Tensors
 
 FORMAT = "jbrep encoder"
 FORMAT_VERSION = 1
 SUFFIX = ".safetensors"
-ERROR = "held_out_mse"  # the metric that every encoder has
+HELD_OUT_MSE = "held_out_mse"  # the metric that every encoder has
 _HASH = "sha256"  # of the rest of the header and all tensors
 _TEXTS = ("kind", "name", "task")
 _RECORDS = ("training", "data", "metrics", "versions")
@@ -105,8 +105,8 @@ def _check(header: dict[str, Any]) -> None:
             raise InputError(f"its header has no {name}")
     if not re.fullmatch("[a-z0-9-]+", header["name"]):
         raise InputError(f"its name {header['name']!r} is none")
-    if not isinstance(header["metrics"].get(ERROR), float):
-        raise InputError(f"its header has no {ERROR} among its metrics")
+    if not isinstance(header["metrics"].get(HELD_OUT_MSE), float):
+        raise InputError(f"its header has no {HELD_OUT_MSE} among its metrics")
     for name in ("features", "encoder", "decoder"):
         if not all(isinstance(word, str) for word in header[name]):
             raise InputError(f"its header's {name} are no words")

@@ -7,9 +7,9 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from jbrep.dataset.storage import exists, write_whole
 from jbrep.encoders.encoder import Encoder, Layer
 from jbrep.errors import InputError
+from jbrep.files.storage import exists, write_whole
 
 _OPSET = 17
 _OPERATORS = {"relu": "Relu", "tanh": "Tanh", "linear": "Identity"}

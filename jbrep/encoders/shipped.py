@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from jbrep.dataset.storage import exists
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.file import SUFFIX, load
 from jbrep.errors import InputError
+from jbrep.files.storage import exists
 from jbrep.jitterbug.tasks import get_task
 
 _FOLDER = Path(__file__).parent / "shipped"

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jbrep.envs.gym import JitterbugEnv, JitterbugVectorEnv
-    from jbrep.envs.registration import environment_id
     from jbrep.envs.sb3 import JitterbugVecEnv
+    from jbrep.jitterbug.tasks import environment_id
 
 __all__ = ["JitterbugEnv", "JitterbugVecEnv", "JitterbugVectorEnv", "environment_id"]
 

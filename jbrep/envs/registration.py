@@ -1,13 +1,6 @@
 """The Jitterbug's ids in Gymnasium's registry."""
 
-from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS
-
-SOLVED = 900  # the return at which the paper calls a task solved
-
-
-def environment_id(task: str) -> str:
-    """Gymnasium's id of a task: `face_direction` is `Jitterbug/FaceDirection-v0`."""
-    return f"Jitterbug/{task.title().replace('_', '')}-v0"
+from jbrep.jitterbug.tasks import EPISODE_STEPS, SOLVED_RETURN, TASKS, environment_id
 
 
 def register() -> None:
@@ -20,6 +13,6 @@ def register() -> None:
             entry_point="jbrep.envs.gym:JitterbugEnv",
             vector_entry_point="jbrep.envs.gym:JitterbugVectorEnv",
             max_episode_steps=EPISODE_STEPS,
-            reward_threshold=SOLVED,
+            reward_threshold=SOLVED_RETURN,
             kwargs={"task": task},
         )

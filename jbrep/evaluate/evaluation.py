@@ -10,11 +10,11 @@ from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import FULL, Encoder
 from jbrep.errors import InputError
-from jbrep.evaluate.bootstrap import RESAMPLES
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import latent
 from jbrep.evaluate.readout import correlation, dynamics, neighbours, probes
 from jbrep.evaluate.reconstruction import corruption, reconstruction
+from jbrep.stats.bootstrap import RESAMPLES
 
 FORMAT = "jbrep evaluation"
 FORMAT_VERSION = 1

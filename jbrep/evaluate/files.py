@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.dataset import ScaledDataset
-from jbrep.dataset.storage import exists, make_folder, write_whole
 from jbrep.encoders import Encoder
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import evaluate
+from jbrep.files.storage import exists, make_folder, write_whole
 
 EVALUATION = "evaluation.json"
 _DIGITS = 6

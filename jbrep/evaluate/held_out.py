@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
-from jbrep.evaluate.bootstrap import Array, by_episode
+from jbrep.stats.bootstrap import Array, by_episode
 
 Rows = NDArray[np.int64]
 

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
-from jbrep.evaluate.bootstrap import without_nan
 from jbrep.evaluate.held_out import HeldOut
+from jbrep.stats.bootstrap import without_nan
 
 _ROWS = 200_000
 _POINTS = 5_000  # for intrinsic dimensions

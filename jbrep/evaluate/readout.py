@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
-from jbrep.evaluate.bootstrap import Array, Interval, bootstrap, r_squared, variation
 from jbrep.evaluate.held_out import HeldOut, Rows
 from jbrep.evaluate.truth import quantities, state
+from jbrep.stats.bootstrap import Array, Interval, bootstrap, r_squared, variation
 
 _ROWS = 100_000  # to fit on, and to judge on
 _CORRELATED = 50_000

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
-from jbrep.encoders.controls import Layers, linear_denoiser, pca
-from jbrep.evaluate.bootstrap import Array, bootstrap, r_squared, variation
 from jbrep.evaluate.held_out import HeldOut, Rows
+from jbrep.methods.controls import Layers, linear_denoiser, pca
+from jbrep.stats.bootstrap import Array, bootstrap, r_squared, variation
 
 NOISES = (0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # of features scaled to [-1, 1]
 _QUANTILES = (0.5, 0.9, 0.99, 0.999, 1)

@@ -3,12 +3,12 @@
 from typing import Any
 
 from jbrep.encoders import FULL
-from jbrep.tables import interval, number, table
+from jbrep.files.tables import interval, number, table
 
 _NOISE = 0.1  # the corruption to show
 
 
-def summary(evaluation: dict[str, Any]) -> str:
+def evaluation_text(evaluation: dict[str, Any]) -> str:
     """What is lost, and what the latent keeps, an encoder to a line."""
     data = evaluation["data"]
     return "\n".join(

@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from jbrep.evaluate.bootstrap import Array
 from jbrep.figures.plot import Plot
 from jbrep.figures.style import COLUMN, PAGE, ink, plain, styles
+from jbrep.stats.bootstrap import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from jbrep.figures.plot import Plot
-from jbrep.figures.style import COLUMN, LINE, PAGE, plain, reference, solved, styles
+from jbrep.figures.style import COLUMN, PAGE, plain, reference, solved_line_style, styles
+from jbrep.jitterbug.tasks import SOLVED_RETURN
 from jbrep.stats.runs import in_order
 
 Group = dict[str, Any]  # of statistics.json: what was found for a task and an algorithm
@@ -63,7 +64,7 @@ def curves(groups: Sequence[Group], heuristics: Heuristics) -> Plot:
 _CAPTION = (
     "Return of the deterministic policy over training: median and 10 to 90 % over runs. Dashed: "
     "the hand-written policy's median on the same starts; dotted: "
-    f"{LINE}, where the paper calls a task solved."
+    f"{SOLVED_RETURN:.0f}, where the paper calls a task solved."
 )
 
 
@@ -100,7 +101,7 @@ def _grid_of_curves(groups: Sequence[Group], heuristics: Heuristics) -> Figure:
     def draw(axes: Axes, group: Group) -> None:
         if returns := heuristics.get(group["task"]):
             axes.axhline(float(np.median(returns)), label="hand-written", **reference())
-        axes.axhline(LINE, **solved())
+        axes.axhline(SOLVED_RETURN, **solved_line_style())
         for label in group["labels"]:
             name, curve = label["representation"], label["curve"]
             low, median, high = (np.array(curve[key], float) for key in _BAND)

@@ -11,9 +11,9 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from jbrep.dataset.storage import make_folder, write_whole
 from jbrep.figures.style import PAPER
-from jbrep.tables import csv_text
+from jbrep.files.storage import make_folder, write_whole
+from jbrep.files.tables import csv_text
 
 _UNDATED: dict[str, dict[str, Any]] = {  # the same bytes each time
     "pdf": {"CreationDate": None},

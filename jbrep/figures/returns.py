@@ -10,7 +10,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from jbrep.figures.curves import Group, below, looks
 from jbrep.figures.plot import Plot
-from jbrep.figures.style import COLUMN, LINE, PAGE, plain, reference, solved
+from jbrep.figures.style import COLUMN, PAGE, plain, reference, solved_line_style
+from jbrep.jitterbug.tasks import SOLVED_RETURN
 
 _ENDS = ("low", "high")
 _LABEL = ("task", "algorithm", "representation")
@@ -126,7 +127,7 @@ def _draw_final(groups: Sequence[Group]) -> Figure:
     look = looks(groups)
     for (left, right), group in zip(panels, groups, strict=True):
         _draw_runs(left, group, look, "final_return")
-        left.axhline(LINE, **solved())
+        left.axhline(SOLVED_RETURN, **solved_line_style())
         left.set(ylabel="final return", ylim=(-40, 1040))
         _by_label(right, group)
         for i, label in enumerate(group["labels"]):
@@ -233,7 +234,7 @@ def _draw_profiles(groups: Sequence[Group], returns: Sequence[float]) -> Figure:
             axes.step(
                 returns, share, where="post", color=colour, label=plain(label["representation"])
             )
-        axes.axvline(LINE, **solved())
+        axes.axvline(SOLVED_RETURN, **solved_line_style())
         axes.set_title(plain(f"{group['task']}, {group['algorithm']}"))
         axes.set(
             xlim=(0, 1000), ylim=(-0.02, 1.02), xlabel="final return", ylabel="share of runs above"

@@ -7,7 +7,6 @@ import matplotlib as mpl
 from cycler import cycler
 
 COLUMN, PAGE = 3.45, 7.1  # widths in a paper of two columns [inches]
-LINE = 900  # the return at which the paper calls a task solved
 MARKERS = "osD^vPX*"
 
 # Okabe and Ito's colours; on dark paper, lighter ones in the same order of hues
@@ -61,7 +60,7 @@ def reference() -> dict[str, Any]:
     return {"color": ink(), "linestyle": "--", "linewidth": 0.9, "alpha": 0.65}
 
 
-def solved() -> dict[str, Any]:
+def solved_line_style() -> dict[str, Any]:
     """The line at which the paper calls a task solved."""
     return {"color": ink(), "linestyle": ":", "linewidth": 0.8, "alpha": 0.65}
 

@@ -14,7 +14,7 @@ from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import send_scene
 from jbrep.inspection.signals import send_signals, times_at
-from jbrep.rollout import Rollout
+from jbrep.rollouts.rollout import Rollout
 
 
 def record_episode(rollout: Rollout, path: Path, encoder: Encoder | None = None) -> None:

@@ -11,7 +11,7 @@ from jbrep.encoders import Encoder
 from jbrep.inspection.recording import ORANGE, SKY, Recording
 from jbrep.inspection.robot import Robot, rotate
 from jbrep.jitterbug.tasks import Array, Task
-from jbrep.rollout import Rollout
+from jbrep.rollouts.rollout import Rollout
 
 GHOST = "world/ghost"
 ALIGNED = "world/aligned"

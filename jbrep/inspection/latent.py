@@ -10,7 +10,7 @@ from jbrep.inspection.ghost import Ghost
 from jbrep.inspection.recording import SKY, YELLOW, Recording
 from jbrep.inspection.signals import send_decoded, send_features
 from jbrep.jitterbug.tasks import Array
-from jbrep.rollout import Rollout
+from jbrep.rollouts.rollout import Rollout
 
 PATH = "latent/path"
 _ALL_COLOUR = (90, 98, 112)

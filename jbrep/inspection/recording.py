@@ -9,8 +9,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from jbrep.dataset.storage import exists, make_folder, write_whole
 from jbrep.errors import InputError
+from jbrep.files.storage import exists, make_folder, write_whole
 
 PROVENANCE = "provenance"
 SUFFIX = ".rrd"

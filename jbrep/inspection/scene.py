@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jbrep.inspection.recording import GREEN, SKY, Recording
 from jbrep.inspection.robot import Robot, transform
 from jbrep.jitterbug.tasks import Array
-from jbrep.rollout import Rollout
+from jbrep.rollouts.rollout import Rollout
 
 WORLD = "world"
 ROBOT = f"{WORLD}/robot"

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from jbrep.inspection.recording import GREY, Recording, lighten, palette
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, Array, Task
-from jbrep.rollout import Rollout
+from jbrep.rollouts.rollout import Rollout
 
 STEP = "step"
 TIME = "time"

@@ -4,19 +4,19 @@ import re
 from pathlib import Path
 
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.dataset.storage import exists
 from jbrep.encoders import Encoder, find, load
 from jbrep.encoders.file import SUFFIX as ENCODER_SUFFIX
 from jbrep.encoders.shipped import find_alone
 from jbrep.errors import InputError
+from jbrep.files.storage import exists
 from jbrep.inspection.curves import record_curves
 from jbrep.inspection.episode import record_episode
 from jbrep.inspection.recording import SUFFIX, check_out
 from jbrep.inspection.traversal import record_traversal
 from jbrep.jitterbug.tasks import get_task
 from jbrep.rl.files import ENCODER, RUN
-from jbrep.rollout import Rollout
-from jbrep.sources import find_episode
+from jbrep.rollouts.rollout import Rollout
+from jbrep.rollouts.sources import find_episode
 from jbrep.study.results import has_runs, read_runs
 
 FOLDER = Path("inspect")  # of recordings whose file isn't named

@@ -15,7 +15,7 @@ from jbrep.inspection.recording import GREY, Recording
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import WORLD, send_floor
 from jbrep.jitterbug.tasks import Array
-from jbrep.rollout import Rollout
+from jbrep.rollouts.rollout import Rollout
 
 POINTS = 101
 SPACING = 0.12  # [m] between the robots

@@ -31,7 +31,7 @@ class Physics(mujoco.Physics):
             named.xmat["jitterbug"][None],
             data.sensordata[None],
             data.mocap_pos,
-            tasks.turned_x(data.mocap_quat),
+            tasks.yaw_direction(data.mocap_quat),
         )
 
     def uprightness(self) -> float:

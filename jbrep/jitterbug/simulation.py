@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jbrep.errors import InputError
 from jbrep.jitterbug import model
-from jbrep.jitterbug.tasks import Array, Readings, Task, turned_x
+from jbrep.jitterbug.tasks import Array, Readings, Task, yaw_direction
 
 _UP_TO_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
 # on a position, velocity or acceleration that is not finite, MuJoCo warns and resets the lane
@@ -105,7 +105,7 @@ class Simulation:
         self._forward(lanes)
 
     def _forward(self, lanes: Sequence[int]) -> None:
-        self.readings.target_axis[:] = turned_x(self.target_quaternion)
+        self.readings.target_axis[:] = yaw_direction(self.target_quaternion)
         self._batch.forward(lanes, stage=_UP_TO_VELOCITIES)
         self.readings = Readings(*self._views)
 

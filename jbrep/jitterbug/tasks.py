@@ -19,6 +19,8 @@ _Float = TypeVar("_Float", bound=np.floating[Any])
 
 CONTROL_TIMESTEP = 0.01  # [s]
 EPISODE_STEPS = 1000  # control steps
+SOLVED_RETURN = 900.0  # of an episode: from there on the paper calls a task solved
+QPOS_SIZE, QVEL_SIZE = 16, 15  # numbers in the robot's position and velocity
 
 _MAX_TILT = 0.025  # of the start's turning axis, in x and y
 _TARGET_HEIGHT = 0.035  # [m]
@@ -36,7 +38,7 @@ def wrap(angle: Array) -> Array:
     return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
 
 
-def turned_x(quaternion: Array) -> Array:
+def yaw_direction(quaternion: Array) -> Array:
     """Where a turn about z, (n, 4), takes the x axis: x and y, (n, 2)."""
     w, z = quaternion[:, 0], quaternion[:, 3]
     return np.stack((w * w - z * z, 2 * w * z), axis=1)
@@ -315,3 +317,8 @@ def get_task(name: str) -> Task:
         InputError: there is none; the message lists the tasks.
     """
     return choose(name, TASKS, "task")
+
+
+def environment_id(task: str) -> str:
+    """Gymnasium's id of a task: `face_direction` is `Jitterbug/FaceDirection-v0`."""
+    return f"Jitterbug/{task.title().replace('_', '')}-v0"

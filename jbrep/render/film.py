@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from jbrep.dataset.storage import make_folder, write_whole
 from jbrep.errors import InputError
+from jbrep.files.storage import make_folder, write_whole
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS
 from jbrep.render.formats import get_format
 from jbrep.render.pictures import Camera, add_caption, join
-from jbrep.rollout import Rollout
+from jbrep.rollouts.rollout import Rollout
 
 _LONGEST = EPISODE_STEPS * CONTROL_TIMESTEP  # [s]
 _SPEEDS = (0.01, 100)

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from jbrep.dataset.storage import exists
 from jbrep.errors import InputError
+from jbrep.files.storage import exists
 
 _X264 = {"crf": "18", "preset": "medium"}  # to the eye as good as the frames
 _TICK = 0.01  # in which GIF counts [s]

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from jbrep.errors import InputError, choose
 from jbrep.jitterbug.model import plain_model
 from jbrep.render.opengl import no_opengl
-from jbrep.rollout import Rollout
+from jbrep.rollouts.rollout import Rollout
 
 Pixels = NDArray[np.uint8]
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont

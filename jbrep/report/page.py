@@ -12,11 +12,11 @@ from tqdm import tqdm
 
 from jbrep.figures.plot import Drawing, Plot
 from jbrep.figures.style import DARK, PAGE
+from jbrep.files.tables import csv_text
 from jbrep.report import facts
 from jbrep.report.tables import Tables
 from jbrep.report.words import Answer
 from jbrep.stats.summary import Rows, group_tables
-from jbrep.tables import csv_text
 
 _WIDEST = 1000  # of a figure [CSS pixels]
 

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jbrep.dataset.storage import make_folder, write_whole
 from jbrep.errors import InputError
 from jbrep.figures import study_plots, write
+from jbrep.files.storage import make_folder, write_whole
 from jbrep.report import facts
 from jbrep.report.page import page
 from jbrep.report.tables import Tables, read_tables

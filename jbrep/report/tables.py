@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jbrep.dataset.storage import exists
 from jbrep.errors import InputError, check_version
 from jbrep.figures.curves import Return
+from jbrep.files.storage import exists
 from jbrep.rl.files import read_text
 from jbrep.stats import analysis
 from jbrep.study import record

@@ -12,9 +12,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
 
-from jbrep.encoders import container
-from jbrep.encoders.container import Tensors
 from jbrep.errors import InputError, differences
+from jbrep.files import container
+from jbrep.files.container import Tensors
 
 _MAX_BYTES = 1 << 34
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")

@@ -6,10 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jbrep.dataset.shard import read_regular
-from jbrep.dataset.storage import exists, write_whole
 from jbrep.errors import InputError, check_version
-from jbrep.tables import csv_text
+from jbrep.files.storage import exists, read_regular, write_whole
+from jbrep.files.tables import csv_text
 
 FORMAT = "jbrep run"
 FORMAT_VERSION = 1

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from stable_baselines3.common.policies import BasePolicy
 
-from jbrep.dataset.storage import exists
+from jbrep.collect.policies import Actor
 from jbrep.encoders import Encoder, find, load
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError, choose
+from jbrep.files.storage import exists
 from jbrep.jitterbug.tasks import Array, Task, get_task
-from jbrep.policies import Actor
 from jbrep.rl.agent import make_agent, make_env
 from jbrep.rl.files import ENCODER, FINISHED, POLICY, read_run
 from jbrep.rl.presets import ALGORITHMS, Preset

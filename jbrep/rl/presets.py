@@ -17,7 +17,7 @@ from stable_baselines3.common.noise import (
 from jbrep.errors import choose
 
 
-class Normal(NamedTuple):
+class NormalNoise(NamedTuple):
     """Independent noise on each action, of mean 0."""
 
     sigma: float
@@ -27,7 +27,7 @@ class Normal(NamedTuple):
         return NormalActionNoise(np.zeros(1), np.full(1, self.sigma))
 
 
-class OrnsteinUhlenbeck(NamedTuple):
+class OrnsteinUhlenbeckNoise(NamedTuple):
     """Noise that drifts back to its mean, from 0 at each episode's start."""
 
     mean: float
@@ -48,7 +48,7 @@ class Preset:
     hidden: tuple[int, ...]  # units of each hidden layer, of actor and of critic, with ReLU
     settings: Mapping[str, Any]  # what the algorithm's class is given
     num_envs: int = 1  # robots that learn together
-    noise: Normal | OrnsteinUhlenbeck | None = None  # on the actions, in [-1, 1]
+    noise: NormalNoise | OrnsteinUhlenbeckNoise | None = None  # on the actions, in [-1, 1]
     optimizer: Mapping[str, Any] = field(default_factory=dict)  # of Adam
 
 
@@ -75,14 +75,16 @@ _PAPER = {
             "buffer_size": 1_000_000,
             "tau": 1e-3,
         },
-        noise=OrnsteinUhlenbeck(mean=0.3, sigma=0.3, theta=0.15),
+        noise=OrnsteinUhlenbeckNoise(mean=0.3, sigma=0.3, theta=0.15),
     ),
     "td3": Preset(
         _HIDDEN,
         {**_SHARED, "learning_starts": 10_000, "gradient_steps": 1000, "train_freq": 1000},
-        noise=Normal(0.2),
+        noise=NormalNoise(0.2),
     ),
-    "sac": Preset(_HIDDEN, {**_SHARED, "batch_size": 256, "ent_coef": "auto"}, noise=Normal(0.2)),
+    "sac": Preset(
+        _HIDDEN, {**_SHARED, "batch_size": 256, "ent_coef": "auto"}, noise=NormalNoise(0.2)
+    ),
     "ppo": Preset(
         _HIDDEN,
         {
@@ -106,8 +108,8 @@ _PAPER = {
 
 _OFF_POLICY = {"learning_rate": 3e-4, "learning_starts": 1000, "train_freq": 4}  # 25 Hz
 _MODERN = {
-    "ddpg": Preset((256, 256), _OFF_POLICY, noise=Normal(0.2)),
-    "td3": Preset((256, 256), _OFF_POLICY, noise=Normal(0.2)),
+    "ddpg": Preset((256, 256), _OFF_POLICY, noise=NormalNoise(0.2)),
+    "td3": Preset((256, 256), _OFF_POLICY, noise=NormalNoise(0.2)),
     "sac": Preset((256, 256), _OFF_POLICY),
     "ppo": Preset(
         (64, 64),

@@ -13,12 +13,12 @@ from typing import Any
 
 from stable_baselines3.common.logger import Logger
 
-from jbrep.dae.training import one_thread
-from jbrep.dataset.lock import exclusive
-from jbrep.dataset.storage import exists, make_folder, write_whole
+from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import FULL, Encoder, find, save
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError, differences
+from jbrep.files.lock import exclusive
+from jbrep.files.storage import exists, make_folder, write_whole
 from jbrep.jitterbug.tasks import get_task
 from jbrep.rl import checkpoint
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
@@ -122,7 +122,7 @@ def train(
     if exists(folder / RUN):
         return _check_same(folder, settings)
     make_folder(folder)
-    with exclusive(folder), one_thread():
+    with exclusive(folder), single_torch_thread():
         save(encoder, folder / ENCODER)
         return _Training(run, encoder, settings, folder, watch, save_every).finish()
 

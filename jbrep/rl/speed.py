@@ -6,7 +6,7 @@ from typing import Any
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from jbrep.dae.training import one_thread
+from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import find
 from jbrep.rl.agent import Evaluator, make_agent, make_env
 from jbrep.rl.presets import ALGORITHMS, get_preset
@@ -29,7 +29,7 @@ def estimate(run: Run) -> float:
         make_env(run.task, preset.num_envs, 0, encoder),
         0,
     )
-    with one_thread():
+    with single_torch_thread():
         began = time.perf_counter()
         agent.learn(max(rollout, _LEAST_STEPS))
         learned = time.perf_counter()

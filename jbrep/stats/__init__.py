@@ -2,6 +2,6 @@
 
 from jbrep.stats.analysis import Analysis, analyse
 from jbrep.stats.runs import RunCurve
-from jbrep.stats.summary import summary
+from jbrep.stats.summary import statistics_text
 
-__all__ = ["Analysis", "RunCurve", "analyse", "summary"]
+__all__ = ["Analysis", "RunCurve", "analyse", "statistics_text"]

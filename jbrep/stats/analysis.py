@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from jbrep.encoders import FULL
-from jbrep.evaluate.bootstrap import Array, Interval, without_nan
+from jbrep.stats.bootstrap import Array, Interval, without_nan
 from jbrep.stats.claims import CLAIMS
 from jbrep.stats.comparison import Comparison, adjusted, compare, simultaneous_level
 from jbrep.stats.curves import common_grid
-from jbrep.stats.labels import PROFILE_RETURNS, Label, describe, thresholds
+from jbrep.stats.labels import PROFILE_RETURNS, RepresentationResult, describe, thresholds
 from jbrep.stats.runs import Group, RunCurve, groups
 
 FORMAT = "jbrep statistics"
@@ -38,7 +38,7 @@ class GroupAnalysis:
     grid: Array
     cut: str | None
     thresholds: Mapping[str, float]
-    labels: tuple[Label, ...]
+    labels: tuple[RepresentationResult, ...]
     comparisons: tuple[Comparison, ...]
 
 

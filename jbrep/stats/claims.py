@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import stdtr
 from scipy.stats import permutation_test
 
-from jbrep.evaluate.bootstrap import Array, Interval
+from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.intervals import constant, difference, variance_ratio, welch
 
 MARGIN = 0.05  # of the baseline's mean final return: a loss that small counts as similar
@@ -27,7 +27,7 @@ class Claim(NamedTuple):
         side: 1 if an interval above the boundary supports it, -1 if one below.
         p_value: two-sided, of lying on the boundary, from x (n,), y (m,), the boundary and a seed.
         despite_failures: whether it may be supported where runs of the representation failed.
-        despite_idleness: whether it may be supported where they learned nothing.
+        allow_no_learning: whether it may be supported where they learned nothing.
         least_p: what the p-value can come to with n runs of each.
     """
 
@@ -38,7 +38,7 @@ class Claim(NamedTuple):
     side: int
     p_value: Callable[[Array, Array, float, int], float]
     despite_failures: bool
-    despite_idleness: bool
+    allow_no_learning: bool
     least_p: Callable[[int], float] = lambda runs: 0.0
 
 
@@ -118,7 +118,7 @@ CLAIMS = (
         -1,
         variance_p,
         despite_failures=False,
-        despite_idleness=False,
+        allow_no_learning=False,
         least_p=_least_of_permutations,
     ),
     Claim("faster learning", "mean_return", difference, _nothing, 1, mean_p, True, False),

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import levene
 
-from jbrep.evaluate.bootstrap import Array, Interval
+from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.claims import CLAIMS, Claim, decide, in_words
 from jbrep.stats.intervals import FEWEST, LEVEL, constant, difference, percentile, variance_ratio
-from jbrep.stats.labels import STEPS_TO, Label, median
+from jbrep.stats.labels import STEPS_TO, RepresentationResult, median
 from jbrep.stats.power import seeds_needed
 
 _ERROR = 0.05  # how often any of a study's verdicts may be wrong
@@ -68,7 +68,9 @@ class Comparison:
     verdicts: tuple[Verdict, ...]
 
 
-def compare(label: Label, baseline: Label, family: int, seed: int) -> Comparison:
+def compare(
+    label: RepresentationResult, baseline: RepresentationResult, family: int, seed: int
+) -> Comparison:
     """A label against the baseline; the p-values of its verdicts are yet to be adjusted.
 
     Args:
@@ -126,7 +128,13 @@ def _brown_forsythe(x: Array, y: Array) -> float:
     return float(levene(x, y, center="median").pvalue)
 
 
-def _judge(claim: Claim, label: Label, baseline: Label, family: int, seed: int) -> Verdict:
+def _judge(
+    claim: Claim,
+    label: RepresentationResult,
+    baseline: RepresentationResult,
+    family: int,
+    seed: int,
+) -> Verdict:
     x, y = label.by_run[claim.measure], baseline.by_run[claim.measure]
     level = simultaneous_level(family)
     boundary = float(claim.boundary(y))
@@ -138,7 +146,7 @@ def _judge(claim: Claim, label: Label, baseline: Label, family: int, seed: int) 
         decided, reason = 0, f"{baseline.representation} didn't learn"
     elif decided > 0 and label.failed and not claim.despite_failures:
         decided, reason = 0, "failed runs"
-    elif decided > 0 and not label.learned and not claim.despite_idleness:
+    elif decided > 0 and not label.learned and not claim.allow_no_learning:
         decided, reason = 0, f"{label.representation} didn't learn"
     elif decided and p > 1 - level:
         decided, reason = 0, "its p-value doesn't agree"

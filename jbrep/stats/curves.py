@@ -6,7 +6,7 @@ import numpy as np
 from scipy.stats import trim_mean
 
 from jbrep.errors import InputError
-from jbrep.evaluate.bootstrap import Array, Interval
+from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.intervals import percentile
 from jbrep.stats.runs import Group, RunCurve
 

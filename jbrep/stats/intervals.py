@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 from scipy.stats import norm, trim_mean, ttest_1samp
 
-from jbrep.evaluate.bootstrap import Array, Interval
+from jbrep.stats.bootstrap import Array, Interval
 
 LEVEL = 0.95
 RESAMPLES = 2000

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binomtest, iqr, median_abs_deviation
 
-from jbrep.evaluate.bootstrap import Array, Interval
+from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.curves import bands, final_return, iqm, mean_return, on_grid, steps_to
 from jbrep.stats.intervals import LEVEL, UNDEFINED, deviation, mean, percentile
 from jbrep.stats.reliability import TAIL_OF_RUNS, expected_shortfall, fixed_policy, within_runs
@@ -27,7 +27,7 @@ WITHIN = (  # of one run
 
 
 @dataclass(frozen=True, eq=False)
-class Label:
+class RepresentationResult:
     """The runs of one representation, with one task and algorithm.
 
     Args:
@@ -64,7 +64,9 @@ def thresholds(baseline: list[RunCurve], grid: Array) -> dict[str, float]:
     return dict(zip(STEPS_TO, returns, strict=True))
 
 
-def describe(runs: list[RunCurve], grid: Array, reach: Mapping[str, float], seed: int) -> Label:
+def describe(
+    runs: list[RunCurve], grid: Array, reach: Mapping[str, float], seed: int
+) -> RepresentationResult:
     """A label's numbers.
 
     Args:
@@ -83,7 +85,7 @@ def describe(runs: list[RunCurve], grid: Array, reach: Mapping[str, float], seed
         **within_runs(curves, failed),
         **fixed_policy(runs, grid[-1]),
     }
-    return Label(
+    return RepresentationResult(
         representation=runs[0].representation,
         settings=runs[0].settings,
         seeds=tuple(int(run.seed) for run in runs),

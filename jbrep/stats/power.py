@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jbrep.evaluate.bootstrap import Array
+from jbrep.stats.bootstrap import Array
 from jbrep.stats.claims import Claim, decide
 
 SEEDS = (5, 10, 20, 40, 80, 160, 320)

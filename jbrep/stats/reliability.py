@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import iqr
 
-from jbrep.evaluate.bootstrap import Array
+from jbrep.stats.bootstrap import Array
 from jbrep.stats.runs import RunCurve
 
 TAIL = 0.05  # of a run's evaluations, or episodes

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.errors import InputError
-from jbrep.evaluate.bootstrap import Array
+from jbrep.stats.bootstrap import Array
 
 MAX_RETURN = 1000.0  # an episode's 1,000 steps, each with a reward in [0, 1]
 _ROUNDING = 1e-6 * MAX_RETURN

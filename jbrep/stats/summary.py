@@ -3,15 +3,15 @@
 from collections.abc import Mapping
 from typing import Any
 
+from jbrep.files.tables import SIGNIFICANT, interval, number, table
 from jbrep.stats.labels import STEPS_TO
-from jbrep.tables import SIGNIFICANT, interval, number, table
 
 Plain = Mapping[str, Any]  # statistics.json, or a part of it
 Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]  # a header, and the lines under it
 _KEY = "representation"
 
 
-def summary(statistics: Plain) -> str:
+def statistics_text(statistics: Plain) -> str:
     """All tables of an analysis, by task and algorithm.
 
     Args:

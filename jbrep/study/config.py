@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.dae.training import Training
-from jbrep.dataset.shard import read_regular
 from jbrep.encoders import FULL
 from jbrep.errors import InputError
-from jbrep.fit import get_kind
+from jbrep.files.storage import read_regular
 from jbrep.jitterbug.tasks import get_task
+from jbrep.methods.fit import get_kind
 from jbrep.rl.presets import get_preset
 from jbrep.rl.run import Run
 

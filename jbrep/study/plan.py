@@ -6,10 +6,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from jbrep.dataset.shard import read_regular
-from jbrep.dataset.storage import exists, make_folder, write_whole
 from jbrep.encoders.file import SUFFIX
 from jbrep.errors import InputError, differences
+from jbrep.files.storage import exists, make_folder, read_regular, write_whole
 from jbrep.rl import Run
 from jbrep.rl.files import RUN
 from jbrep.rl.run import plain

@@ -3,14 +3,14 @@
 from pathlib import Path
 
 from jbrep.collect import collect
+from jbrep.collect.derive import derive
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.manifest import MANIFEST, Settings
-from jbrep.dataset.storage import exists
-from jbrep.derive import derive
 from jbrep.encoders import find
 from jbrep.errors import InputError
-from jbrep.fit import Fitter
+from jbrep.files.storage import exists
 from jbrep.jitterbug.tasks import get_task
+from jbrep.methods.fit import Fitter
 from jbrep.study.config import Data
 from jbrep.study.plan import Plan
 

@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jbrep.dataset.storage import write_whole
 from jbrep.encoders import FULL
 from jbrep.errors import InputError
+from jbrep.files.storage import write_whole
+from jbrep.files.tables import table
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, write_csv
-from jbrep.stats import Analysis, RunCurve, analyse, summary
+from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.study.plan import read_plan
 from jbrep.study.record import RECORD, as_json, learner, record
-from jbrep.tables import table
 
 RETURNS = "returns.csv"
 STATISTICS = "statistics.json"
@@ -135,7 +135,11 @@ def write_results(results: Results, folder: Path) -> list[Path]:
 
 def as_text(results: Results) -> str:
     """Tables to read: the statistics, or each run's end where there are none."""
-    shown = summary(results.analysis.tolist()) if results.analysis else table(*_ends(results.runs))
+    shown = (
+        statistics_text(results.analysis.tolist())
+        if results.analysis
+        else table(*_ends(results.runs))
+    )
     return "\n".join((shown, *(f"\nno statistics: {line}" for line in results.left_out)))
 
 

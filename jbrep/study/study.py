@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import replace
 
-from jbrep.dataset.lock import exclusive
+from jbrep.files.lock import exclusive
 from jbrep.rl import train
 from jbrep.rl.speed import estimate
 from jbrep.study.plan import Cell, Plan
@@ -13,7 +13,7 @@ from jbrep.study.runner import Backend
 from jbrep.study.work import CRASHED
 
 
-def conduct(plan: Plan, backend: Backend, workers: int) -> int:
+def run_study(plan: Plan, backend: Backend, workers: int) -> int:
     """Prepare a study and bring all its runs to their end; how many crashed.
 
     Raises:
@@ -39,7 +39,7 @@ def conduct(plan: Plan, backend: Backend, workers: int) -> int:
     return outcomes[CRASHED]
 
 
-def outline(plan: Plan, workers: int) -> str:
+def dry_run(plan: Plan, workers: int) -> str:
     """The runs that are left, and the time that they would take, from a short try of each kind.
 
     Raises:

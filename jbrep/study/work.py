@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from jbrep.dataset.storage import make_folder
+from jbrep.files.storage import make_folder
 from jbrep.rl import Run, train
 
 PROGRESS = "progress"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from jbrep.collect import LANES, simulate_shard
-from jbrep.dataset.lock import exclusive
+from jbrep.collect.collector import LANES, simulate_shard
+from jbrep.collect.policies import make_policy
 from jbrep.dataset.manifest import (
     BACKUP,
     MANIFEST,
@@ -19,15 +19,15 @@ from jbrep.dataset.manifest import (
     open_shard,
     read_manifest,
     shard_name,
-    strangers,
+    unlisted_files,
     write_manifest,
     write_shard,
 )
-from jbrep.dataset.shard import DamageError, column_hashes
-from jbrep.errors import InputError
+from jbrep.dataset.shard import column_hashes
+from jbrep.errors import DamageError, InputError
+from jbrep.files.lock import exclusive
 from jbrep.jitterbug.simulation import check_counts
 from jbrep.jitterbug.tasks import EPISODE_STEPS
-from jbrep.policies import make_policy
 
 
 def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> Iterator[str]:
@@ -46,7 +46,7 @@ def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> 
     good = _good_manifest(folder)
     with exclusive(folder):
         manifest = before = read_manifest(folder, good)
-        for path in strangers(manifest, hdf5_files(folder)):
+        for path in unlisted_files(manifest, hdf5_files(folder)):
             aside = _set_aside(path)
             yield f"{path} set aside as {aside.name}: it is not one of the data set's shards"
         for shard in range(len(manifest.shards)):

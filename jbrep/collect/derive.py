@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collect import Tick, Written, write_shards
+from jbrep.collect.collector import Tick, Written, write_shards
+from jbrep.collect.policies import make_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import new_manifest, open_shard
 from jbrep.dataset.schema import (
@@ -21,7 +22,6 @@ from jbrep.dataset.schema import (
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation, check_counts
 from jbrep.jitterbug.tasks import Task, get_task
-from jbrep.policies import make_policy
 
 _LANES = 500
 

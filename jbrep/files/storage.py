@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import stat
 from contextlib import suppress
 from pathlib import Path
 
@@ -73,3 +74,18 @@ def check_space(folder: Path, needed: int) -> None:
         raise InputError(
             f"no space in {folder}: about {needed:,} bytes are needed, {free:,} are free"
         )
+
+
+def regular_size(path: Path) -> int:
+    """Bytes of a file; 0 of a link, a pipe or anything else that isn't one."""
+    status = path.lstat()
+    return status.st_size if stat.S_ISREG(status.st_mode) else 0
+
+
+def read_regular(path: Path, most: int) -> bytes:
+    """A file's bytes; none of something else than a file, or of one that is larger than `most`.
+
+    Raises:
+        OSError: it can't be read.
+    """
+    return path.read_bytes() if 0 < regular_size(path) <= most else b""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from jbrep.collect.policies import Actor
 from jbrep.dataset import Dataset
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
@@ -17,10 +18,9 @@ from jbrep.jitterbug.tasks import (
     Array,
     Readings,
     Task,
-    turned_x,
     upright_term,
+    yaw_direction,
 )
-from jbrep.policies import Actor
 
 Begin = Callable[[Task, Sequence[np.random.Generator]], Actor]  # as `Policy.begin`
 
@@ -71,7 +71,7 @@ class Rollout:
             self.rotation,
             self.velocity,
             np.tile(self.target_position, states),
-            np.tile(turned_x(self.target_quaternion[None]), states),
+            np.tile(yaw_direction(self.target_quaternion[None]), states),
         )
 
     @cached_property

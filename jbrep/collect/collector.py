@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from jbrep.dataset.lock import exclusive
+from jbrep.collect.policies import Policy, make_policy, policy_settings
 from jbrep.dataset.manifest import (
     MANIFEST,
     Manifest,
@@ -24,11 +24,11 @@ from jbrep.dataset.manifest import (
     write_manifest,
 )
 from jbrep.dataset.schema import EPISODES, Columns, episode_returns, episode_seed
-from jbrep.dataset.storage import check_space, make_folder
 from jbrep.errors import InputError, differences
+from jbrep.files.lock import exclusive
+from jbrep.files.storage import check_space, make_folder
 from jbrep.jitterbug.simulation import Simulation, check_counts
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
-from jbrep.policies import Policy, make_policy, policy_settings
 
 LANES = 100
 

@@ -9,9 +9,8 @@ import safetensors.numpy
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
-from jbrep.dataset.shard import read_regular
-from jbrep.dataset.storage import write_whole
 from jbrep.errors import InputError
+from jbrep.files.storage import read_regular, write_whole
 
 Tensors = dict[str, NDArray[Any]]
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.dataset.storage import exists
 from jbrep.figures.behaviour import Behaviour
+from jbrep.files.storage import exists
 from jbrep.jitterbug.tasks import Array, Task
 from jbrep.rl.files import RUN
-from jbrep.sources import Player, find_player
+from jbrep.rollouts.sources import Player, find_player
 
 SPEEDS = np.linspace(-180, 180, 73)  # edges of bins of the motor's velocity [rad/s]
 _CELL = 0.02  # edge of a cell of the floor [m]

@@ -17,13 +17,13 @@ from jbrep.dae import checkpoint
 from jbrep.dae.network import Autoencoder, get_architecture, layers
 from jbrep.dae.training import Epoch, Trainer, Training, get_device
 from jbrep.dataset import ScaledDataset
-from jbrep.dataset.lock import exclusive
 from jbrep.dataset.scaled import sample
-from jbrep.dataset.storage import exists, make_folder
 from jbrep.encoders import Encoder, load, save
-from jbrep.encoders.controls import Layers, pca, random_projection
-from jbrep.encoders.file import ERROR, SUFFIX
+from jbrep.encoders.file import HELD_OUT_MSE, SUFFIX
 from jbrep.errors import InputError, choose, differences
+from jbrep.files.lock import exclusive
+from jbrep.files.storage import exists, make_folder
+from jbrep.methods.controls import Layers, pca, random_projection
 
 _WATCHED = 100_000  # held-out rows whose error is shown after each epoch
 _EVERY = ("latent", "architecture", "epochs", "batch_size", "learning_rate", "seed")
@@ -186,7 +186,7 @@ class Fitter:
         """Write the file, with the error on all held-out rows."""
         encoder = Encoder(header, self._data.scaler, *parts)
         error = held_out_error(encoder, self._data)
-        save(replace(encoder, header={**header, "metrics": {**metrics, ERROR: error}}), path)
+        save(replace(encoder, header={**header, "metrics": {**metrics, HELD_OUT_MSE: error}}), path)
 
     @cached_property
     def _rows(self) -> tuple[Tensor, Tensor]:

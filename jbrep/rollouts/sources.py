@@ -6,15 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jbrep.collect.policies import POLICIES, Actor, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.dataset.storage import exists
 from jbrep.encoders import Encoder
 from jbrep.errors import InputError
+from jbrep.files.storage import exists
 from jbrep.jitterbug.tasks import Task, get_task
-from jbrep.policies import POLICIES, Actor, parse_policy
 from jbrep.rl.files import EVALUATION_SEED, RUN, read_run
-from jbrep.rollout import Begin, Rollout, play, replay
+from jbrep.rollouts.rollout import Begin, Rollout, play, replay
 
 
 class Player(NamedTuple):
@@ -23,14 +23,14 @@ class Player(NamedTuple):
     name: str
     task: Task
     begin: Begin
-    together: int = 1  # episodes that its evaluation played at once
+    evaluation_batch: int = 1  # episodes that its evaluation played at once
 
     def play(self, episodes: Sequence[int], target_yaw: float | None = None) -> list[Rollout]:
         """Episodes of those that every run is evaluated on, by their numbers from 0."""
         seeds = [EVALUATION_SEED + episode for episode in episodes]
         return play(self.task, self.begin, self.name, seeds, target_yaw)
 
-    def through(self, encoder: Encoder) -> "Player":
+    def with_reconstruction(self, encoder: Encoder) -> "Player":
         """The same policy, but that it observes what an encoder's latent is decoded to.
 
         What it loses by that is what the latent lacks for it.
@@ -61,8 +61,8 @@ def find_episode(source: str, episode: int = 0, task: str | None = None) -> Roll
     player = find_player(source, task)
     if episode < 0:
         raise InputError(f"there is no episode {episode}: they count from 0")
-    if episode < player.together:
-        return player.play(range(player.together))[episode]
+    if episode < player.evaluation_batch:
+        return player.play(range(player.evaluation_batch))[episode]
     return player.play([episode])[0]
 
 
@@ -96,5 +96,5 @@ def _of_run(folder: Path, task: str | None) -> Player:
     trained = load_run(folder)
     if task not in (None, trained.task):
         raise InputError(f"{folder} is a run of {trained.task}, not of {task}")
-    together = read_run(folder)["settings"]["evaluation_episodes"]
-    return Player(str(folder), get_task(trained.task), trained.begin, together)
+    evaluation_batch = read_run(folder)["settings"]["evaluation_episodes"]
+    return Player(str(folder), get_task(trained.task), trained.begin, evaluation_batch)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from jbrep.dataset import Dataset
-from jbrep.dataset.storage import check_space
 from jbrep.errors import InputError, choose
+from jbrep.files.storage import check_space
 
 _MINARI_FOLDER = "MINARI_DATASETS_PATH"
 
@@ -116,7 +116,7 @@ def _to_minari(dataset: Dataset, out: Path) -> str:
     import gymnasium
     import minari
 
-    from jbrep.envs.registration import environment_id
+    from jbrep.jitterbug.tasks import environment_id
 
     settings, versions = dataset.manifest.settings, dataset.manifest.versions
     name = f"jitterbug/{settings.task}/{settings.policy['kind']}-v0"
