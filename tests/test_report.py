@@ -12,18 +12,19 @@ import pytest
 from jbrep.encoders import find, save
 from jbrep.errors import InputError
 from jbrep.figures import write
-from jbrep.files.tables import SIGNIFICANT, number
+from jbrep.files.tables import write_csv
 from jbrep.report import report, write_report
 from jbrep.report.facts import reproduce
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, SUMMARY
 from jbrep.report.tables import read_tables
 from jbrep.report.words import answers
-from jbrep.rl.files import ENCODER, Evaluation, write_csv, write_rows, write_run
+from jbrep.rl.files import ENCODER, Evaluation, write_rows, write_run
 from jbrep.rollouts.sources import find_episode
 from jbrep.study.config import Study, read_study
 from jbrep.study.heuristics import HEURISTIC_RETURNS, write_heuristics
 from jbrep.study.plan import Plan
 from jbrep.study.results import read_results, write_results
+from jbrep.text import SIGNIFICANT, number
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 FINAL = {"full": 800, "dae-8": 300, "pca-8": 820}

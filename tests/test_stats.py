@@ -10,7 +10,6 @@ import pytest
 from scipy import stats
 
 from jbrep.errors import InputError
-from jbrep.files.tables import SIGNIFICANT, interval
 from jbrep.stats import RunCurve, analyse, statistics_text
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.claims import CLAIMS, decide, in_words, mean_p, variance_p
@@ -27,6 +26,7 @@ from jbrep.stats.curves import (
 from jbrep.stats.intervals import deviation, difference, mean, percentile, variance_ratio
 from jbrep.stats.power import POWER, SEEDS, seeds_needed
 from jbrep.stats.reliability import drawdown, expected_shortfall, fixed_policy, within_runs
+from jbrep.text import SIGNIFICANT, interval
 
 SIMILAR, STEADIER, FASTER = CLAIMS
 GRID = np.arange(0, 10_001, 1000)

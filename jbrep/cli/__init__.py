@@ -7,8 +7,10 @@ from jbrep.cli.data import collect, data
 from jbrep.cli.doctor import doctor
 from jbrep.cli.encoders import encoder, evaluate, train_dae, train_encoder
 from jbrep.cli.inspect import inspect
+from jbrep.cli.policies import behaviour, evaluate_policy
 from jbrep.cli.render import render
-from jbrep.cli.runs import behaviour, evaluate_policy, report, rl, study
+from jbrep.cli.rl import rl
+from jbrep.cli.study import report, study
 
 
 @click.group(cls=Cli, context_settings={"help_option_names": ["-h", "--help"]})

@@ -1,11 +1,13 @@
 """What the commands share: mistakes, Ctrl-C, numbers as people write them."""
 
+import json
 import math
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 
@@ -114,3 +116,16 @@ class Cli(click.Group):
 def example(text: str) -> str:
     """The end of a command's help."""
     return f"Example: {text}"
+
+
+as_json = click.option("--json", "as_json", is_flag=True, help="As JSON, for programs.")
+
+
+def echo_json(value: Any) -> None:
+    """Print plain dictionaries, lists, numbers and texts as JSON."""
+    click.echo(json.dumps(value, indent=2, allow_nan=False))
+
+
+def echo_paths(paths: Iterable[Path]) -> None:
+    """Print where files are, after an empty line."""
+    click.echo("\n" + "\n".join(printable(str(path)) for path in paths))

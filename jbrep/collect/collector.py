@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from jbrep.collect.policies import Policy, make_policy, policy_settings
 from jbrep.dataset.manifest import (
@@ -29,6 +28,7 @@ from jbrep.files.lock import exclusive
 from jbrep.files.storage import check_space, make_folder
 from jbrep.jitterbug.simulation import Simulation, check_counts
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
+from jbrep.progress import Progress
 
 LANES = 100
 
@@ -87,7 +87,7 @@ def write_shards(settings: Settings, folder: Path, make: Callable[[int, Tick], C
     with exclusive(folder):
         manifest = _begin(settings, folder)
         rows = sum(entry.rows for entry in manifest.shards)
-        with tqdm(
+        with Progress(
             total=settings.episodes * EPISODE_STEPS,
             initial=rows,
             unit="step",

@@ -6,8 +6,6 @@ from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
-from tqdm import tqdm
-
 from jbrep.collect.collector import LANES, simulate_shard
 from jbrep.collect.policies import make_policy
 from jbrep.dataset.manifest import (
@@ -28,6 +26,7 @@ from jbrep.errors import DamageError, InputError
 from jbrep.files.lock import exclusive
 from jbrep.jitterbug.simulation import check_counts
 from jbrep.jitterbug.tasks import EPISODE_STEPS
+from jbrep.progress import Progress
 
 
 def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> Iterator[str]:
@@ -104,7 +103,7 @@ def _make_again(
 ) -> Entry:
     settings, known = manifest.settings, manifest.shards[shard].sha256
     total = len(settings.shard_range(shard)) * EPISODE_STEPS
-    with tqdm(total=total, unit="step", unit_scale=True, desc=shard_name(shard)) as progress:
+    with Progress(total=total, unit="step", unit_scale=True, desc=shard_name(shard)) as progress:
         columns = simulate_shard(
             settings,
             make_policy(settings.policy),

@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from jbrep.dataset import Dataset
 from jbrep.dataset.schema import Columns
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import EPISODE_STEPS
+from jbrep.progress import Progress
 
 _LANES = 100
 
@@ -38,7 +38,7 @@ def replay_problems(
     if not len(dataset):
         return
     chosen = np.sort(np.random.default_rng(0).permutation(total)[:episodes])
-    with tqdm(total=episodes * EPISODE_STEPS, unit="step", unit_scale=True, leave=False) as bar:
+    with Progress(total=episodes * EPISODE_STEPS, unit="step", unit_scale=True, leave=False) as bar:
         for start in range(0, episodes, _LANES):
             for episode in _replay_some(dataset, chosen[start : start + _LANES], num_threads, bar):
                 yield (
@@ -48,7 +48,7 @@ def replay_problems(
 
 
 def _replay_some(
-    dataset: Dataset, chosen: NDArray[Any], num_threads: int | None, bar: "tqdm[None]"
+    dataset: Dataset, chosen: NDArray[Any], num_threads: int | None, bar: Progress
 ) -> list[int]:
     own = {name: column[chosen] for name, column in dataset.episodes.items()}
     simulation = Simulation(dataset.task, len(chosen), num_threads)

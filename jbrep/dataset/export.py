@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from jbrep.dataset import Dataset
 from jbrep.errors import InputError, choose
 from jbrep.files.storage import check_space
+from jbrep.progress import Progress
 
 _MINARI_FOLDER = "MINARI_DATASETS_PATH"
 
@@ -51,7 +51,7 @@ def export(dataset: Dataset, to: str, out: Path) -> str:
 def _to_npz(dataset: Dataset, out: Path) -> str:
     """All columns as arrays in one uncompressed zip, streamed."""
     with _new_file(out) as partial, zipfile.ZipFile(partial, "w", allowZip64=True) as archive:
-        for name in tqdm(dataset.columns, unit="column", desc=out.name):
+        for name in Progress(dataset.columns, unit="column", desc=out.name):
             column = dataset[name]
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 header = {"descr": column.dtype.str, "fortran_order": False, "shape": column.shape}
@@ -84,7 +84,7 @@ def _to_parquet(dataset: Dataset, out: Path) -> str:
     with _new_file(out) as partial, _new_file(episodes) as partial_episodes:
         with pq.ParquetWriter(partial, schema, **coding) as writer:
             chunks = zip(*(dataset[name].chunks() for name in dataset.columns), strict=True)
-            for chunk in tqdm(chunks, unit="chunk", desc=out.name, leave=False):
+            for chunk in Progress(chunks, unit="chunk", desc=out.name, leave=False):
                 arrays = [column for values in chunk for column in _flat(values)]
                 writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
         columns = {name: list(values) for name, values in dataset.episodes.items()}
@@ -162,7 +162,7 @@ def _minari_episodes(dataset: Dataset) -> Iterator[Any]:
     from minari.data_collector import EpisodeBuffer
 
     own, start = dataset.episodes, 0
-    for i, length in enumerate(tqdm(own["length"], unit="episode", desc="minari")):
+    for i, length in enumerate(Progress(own["length"], unit="episode", desc="minari")):
         rows, start = slice(start, start + length), start + length
         if not length:
             continue  # it diverged in its first step: Minari has no episodes without steps

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tqdm import tqdm
 
 from jbrep.dataset.manifest import (
     BACKUP,
@@ -21,6 +20,7 @@ from jbrep.dataset.schema import EPISODES, Columns, episode_columns, episode_ret
 from jbrep.dataset.shard import MEND, column_hash
 from jbrep.errors import DamageError, InputError
 from jbrep.jitterbug.tasks import EPISODE_STEPS, Task
+from jbrep.progress import Progress
 
 _BOUNDED = ("rad", "1")  # angles are wrapped, quaternions are of length 1: their ranges are bounds
 
@@ -39,7 +39,7 @@ def find_problems(folder: Path) -> Iterator[str]:
         return
     yield from file_problems(folder, manifest, files)
     yield from _backup_problems(folder, manifest)
-    for shard in tqdm(range(len(manifest.shards)), unit="shard", desc="verify", leave=False):
+    for shard in Progress(range(len(manifest.shards)), unit="shard", desc="verify", leave=False):
         path = folder / shard_name(shard)
         try:
             columns = dict(open_shard(folder, manifest, shard))

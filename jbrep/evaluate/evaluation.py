@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
@@ -14,6 +13,7 @@ from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import latent
 from jbrep.evaluate.readout import correlation, dynamics, neighbours, probes
 from jbrep.evaluate.reconstruction import corruption, reconstruction
+from jbrep.progress import Progress
 from jbrep.stats.bootstrap import RESAMPLES
 
 FORMAT = "jbrep evaluation"
@@ -49,7 +49,7 @@ def evaluate(encoders: Mapping[str, Encoder], data: ScaledDataset) -> dict[str, 
     full = Encoder({"kind": "identity", "name": FULL}, data.scaler, (), ())
     found = {}
     everything = {FULL: full, **encoders}
-    with tqdm(total=len(everything) * len(_DIAGNOSTICS), unit="diagnostic") as progress:
+    with Progress(total=len(everything) * len(_DIAGNOSTICS), unit="diagnostic") as progress:
         for label, encoder in everything.items():
             found[label] = {"kind": encoder.header["kind"], "latent": encoder.latent_size}
             for name, diagnose in _DIAGNOSTICS.items():

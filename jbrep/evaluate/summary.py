@@ -3,7 +3,7 @@
 from typing import Any
 
 from jbrep.encoders import FULL
-from jbrep.files.tables import interval, number, table
+from jbrep.text import interval, number, table
 
 _NOISE = 0.1  # the corruption to show
 

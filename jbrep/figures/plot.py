@@ -9,11 +9,11 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from jbrep.figures.style import PAPER
 from jbrep.files.storage import make_folder, write_whole
 from jbrep.files.tables import csv_text
+from jbrep.progress import Progress
 
 _UNDATED: dict[str, dict[str, Any]] = {  # the same bytes each time
     "pdf": {"CreationDate": None},
@@ -84,7 +84,7 @@ def write(plots: Iterable[Plot], folder: Path) -> list[Path]:
     """
     make_folder(folder)
     pictures = []
-    for plot in tqdm(list(plots), unit="figure", delay=1, leave=False):
+    for plot in Progress(list(plots), unit="figure", delay=1, leave=False):
         for kind in ("pdf", "png"):
             write_whole(folder / f"{plot.name}.{kind}", plot.on_paper.picture(kind))
         write_whole(folder / f"{plot.name}.csv", csv_text(plot.columns, plot.rows).encode())

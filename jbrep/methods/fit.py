@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 from jbrep.dae import checkpoint
 from jbrep.dae.network import Autoencoder, get_architecture, layers
@@ -24,6 +23,7 @@ from jbrep.errors import InputError, choose, differences
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder
 from jbrep.methods.controls import Layers, pca, random_projection
+from jbrep.progress import Progress
 
 _WATCHED = 100_000  # held-out rows whose error is shown after each epoch
 _EVERY = ("latent", "architecture", "epochs", "batch_size", "learning_rate", "seed")
@@ -245,7 +245,7 @@ def _identity(header: Mapping[str, Any]) -> dict[str, Any]:
 def _shown(trainer: Trainer, name: str) -> Iterator[Epoch]:
     """The epochs, with progress."""
     total, done = trainer.training.epochs, len(trainer.history)
-    with tqdm(total=total, initial=done, desc=name, unit="epoch") as progress:
+    with Progress(total=total, initial=done, desc=name, unit="epoch") as progress:
         for epoch in trainer.epochs():
             progress.set_postfix(train=f"{epoch.train_loss:.5f}", test=f"{epoch.test_loss:.5f}")
             progress.update()

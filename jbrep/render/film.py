@@ -8,11 +8,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from tqdm import tqdm
 
 from jbrep.errors import InputError
 from jbrep.files.storage import make_folder, write_whole
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS
+from jbrep.progress import Progress
 from jbrep.render.formats import get_format
 from jbrep.render.pictures import Camera, add_caption, join
 from jbrep.rollouts.rollout import Rollout
@@ -134,7 +134,9 @@ class Film:
         make_folder(path.parent)
         with (
             TemporaryDirectory() as folder,
-            tqdm(self.frames(), total=len(self), unit="frame", delay=0.5, disable=not show) as bar,
+            Progress(
+                self.frames(), total=len(self), unit="frame", delay=0.5, disable=not show
+            ) as bar,
         ):
             encoded = Path(folder) / path.name
             form.encode(bar, encoded, self.pace.fps)

@@ -8,11 +8,11 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
-from tqdm import tqdm
 
 from jbrep.figures.plot import Drawing, Plot
 from jbrep.figures.style import DARK, PAGE
 from jbrep.files.tables import csv_text
+from jbrep.progress import Progress
 from jbrep.report import facts
 from jbrep.report.tables import Tables
 from jbrep.report.words import Answer
@@ -30,7 +30,7 @@ def page(tables: Tables, answers: Sequence[Answer], plots: Sequence[Plot]) -> st
         outline=facts.outline(tables),
         notices=facts.notices(tables),
         answers=answers,
-        figures=[_figure(plot) for plot in tqdm(plots, unit="figure", delay=1, leave=False)],
+        figures=[_figure(plot) for plot in Progress(plots, unit="figure", delay=1, leave=False)],
         tables=_tables(tables.statistics) if tables.statistics else [],
         runs=facts.run_rows(tables),
         failed=facts.failed_rows(tables),

@@ -4,8 +4,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from jbrep.files.tables import SIGNIFICANT, interval, number
 from jbrep.stats.claims import MARGIN
+from jbrep.text import SIGNIFICANT, interval, number
 
 Plain = Mapping[str, Any]  # statistics.json, or a part of it
 

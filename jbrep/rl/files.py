@@ -2,18 +2,19 @@
 
 import csv
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jbrep.errors import InputError, check_version
 from jbrep.files.storage import exists, read_regular, write_whole
-from jbrep.files.tables import csv_text
+from jbrep.files.tables import write_csv
 
 FORMAT = "jbrep run"
 FORMAT_VERSION = 1
 RUN = "run.json"  # written last: the run is over where it is
 POLICY = "policy.zip"
+CHECKPOINT = "checkpoint.safetensors"  # while the run is under way
 ENCODER = "encoder.safetensors"
 EPISODES = "episodes.csv"
 EVALUATIONS = "evaluations.csv"
@@ -48,11 +49,6 @@ def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -
 
 def _shown(value: float) -> str | int:
     return f"{value:.3f}" if isinstance(value, float) else int(value)
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a table, whole or not at all."""
-    write_whole(path, csv_text(columns, rows).encode())
 
 
 def read_evaluations(folder: Path) -> list[Evaluation]:

@@ -23,6 +23,7 @@ from jbrep.jitterbug.tasks import get_task
 from jbrep.rl import checkpoint
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.files import (
+    CHECKPOINT,
     ENCODER,
     EPISODES,
     EVALUATIONS,
@@ -39,7 +40,6 @@ from jbrep.rl.files import (
 from jbrep.rl.presets import get_preset
 from jbrep.rl.recorder import NotFiniteError, Recorder, Scalars, Watch
 
-_CHECKPOINT = "checkpoint.safetensors"
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 _MOST_SEED = 1 << 31
 _NOT_FINITE = ("found invalid values", "actions are not finite")
@@ -166,7 +166,7 @@ class _Training:
 
     @property
     def _checkpoint(self) -> Path:
-        return self._folder / _CHECKPOINT
+        return self._folder / CHECKPOINT
 
     @property
     def _identity(self) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from jbrep.collect.policies import Actor
 from jbrep.dataset import Dataset
@@ -21,6 +20,7 @@ from jbrep.jitterbug.tasks import (
     upright_term,
     yaw_direction,
 )
+from jbrep.progress import Progress
 
 Begin = Callable[[Task, Sequence[np.random.Generator]], Actor]  # as `Policy.begin`
 
@@ -187,7 +187,7 @@ def _play(
 ) -> _Tape:
     tape = _Tape(simulation, steps)
     tape.record_state(0)
-    for step in tqdm(range(steps), unit="step", leave=False, delay=1, disable=not show):
+    for step in Progress(range(steps), unit="step", leave=False, delay=1, disable=not show):
         action = act()
         tape.record_step(step, action, simulation.step(action))
         tape.record_state(step + 1)

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from jbrep.files.tables import SIGNIFICANT, interval, number, table
 from jbrep.stats.labels import STEPS_TO
+from jbrep.text import SIGNIFICANT, interval, number, table
 
 Plain = Mapping[str, Any]  # statistics.json, or a part of it
 Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]  # a header, and the lines under it

@@ -5,8 +5,9 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
+from jbrep.files.tables import write_csv
 from jbrep.jitterbug.heuristics import HEURISTICS, episode_returns
-from jbrep.rl.files import EVALUATION_SEED, write_csv
+from jbrep.rl.files import EVALUATION_SEED
 
 HEURISTIC_RETURNS = "heuristics.csv"
 _EPISODES = 20  # from the start on that every run's evaluation begins with

@@ -12,11 +12,12 @@ import numpy as np
 from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.files.storage import write_whole
-from jbrep.files.tables import table
-from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, write_csv
+from jbrep.files.tables import write_csv
+from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.study.plan import read_plan
 from jbrep.study.record import RECORD, as_json, learner, record
+from jbrep.text import table
 
 RETURNS = "returns.csv"
 STATISTICS = "statistics.json"

@@ -1,0 +1,39 @@
+"""Progress of long work: a bar on a terminal, a line now and then in a log."""
+
+import sys
+from typing import Any, TextIO
+
+from tqdm import tqdm
+
+_LOG_EVERY = 30.0  # seconds between two lines where there is no terminal
+_LOG_LINE = "{desc}: {n_fmt} of {total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
+
+
+class Progress(tqdm):
+    """tqdm on standard error: a bar on a terminal, lines elsewhere, nothing where it is closed.
+
+    It takes tqdm's arguments. What `initial` counts was done before, so the rate and the time left
+    come from the rest.
+    """
+
+    def __init__(self, *args: Any, **options: Any):
+        if sys.stderr is None:
+            options |= {"disable": True}
+        elif not sys.stderr.isatty():
+            options |= {"file": _Log(sys.stderr), "bar_format": _LOG_LINE, "leave": False}
+            options |= {"mininterval": _LOG_EVERY, "delay": _LOG_EVERY, "miniters": 1}
+        super().__init__(*args, **options)
+
+
+class _Log:
+    """A stream that tqdm's bars are written to as lines: nothing returns to a line's start."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def write(self, text: str) -> None:
+        if line := text.strip():
+            self._stream.write(f"{line}\n")
+
+    def flush(self) -> None:
+        self._stream.flush()

@@ -1,0 +1,81 @@
+"""Text for a terminal: numbers, tables and facts that fit its width."""
+
+import shutil
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+
+SIGNIFICANT = ",.3g"  # a format for `number`: three digits
+_GAP = "  "  # between columns
+
+
+def terminal_width() -> int:
+    """Columns of the terminal; 80 where there is none, unless COLUMNS says otherwise."""
+    return shutil.get_terminal_size().columns
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]], width: int | None = None) -> str:
+    """Columns side by side: the first aligned on the left, the others on the right.
+
+    Args:
+        header: a name for each column.
+        rows: a cell for each column.
+        width: to fit: a wider table is cut into several, one below the other, each with the first
+            column; None leaves it whole.
+    """
+    lines = [header, *rows]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    return "\n\n".join(
+        "\n".join(_line(line, columns, widths) for line in lines)
+        for columns in _fitting(widths, width)
+    )
+
+
+def _fitting(widths: Sequence[int], width: int | None) -> list[list[int]]:
+    """The columns of each part of a table; the first column comes in each."""
+    parts, used = [[0]], widths[0]
+    for column in range(1, len(widths)):
+        taken = len(_GAP) + widths[column]
+        if width is not None and used + taken > width and len(parts[-1]) > 1:
+            parts.append([0])
+            used = widths[0]
+        parts[-1].append(column)
+        used += taken
+    return parts
+
+
+def _line(cells: Sequence[str], columns: Sequence[int], widths: Sequence[int]) -> str:
+    aligned = (
+        cells[column].rjust(widths[column]) if column else cells[0].ljust(widths[0])
+        for column in columns
+    )
+    return _GAP.join(aligned).rstrip()
+
+
+def facts(named: Mapping[str, str], width: int, indent: int = 2) -> str:
+    """A line for each fact: its name, then what it is, wrapped below itself where it is long."""
+    left = indent + max(map(len, named)) + 1
+    return "\n".join(
+        textwrap.fill(
+            what,
+            width,
+            initial_indent=f"{'':{indent}}{name}".ljust(left),
+            subsequent_indent=" " * left,
+            break_on_hyphens=False,
+        )
+        for name, what in named.items()
+    )
+
+
+def interval(values: Sequence[float | None], form: str) -> str:
+    """A value with its interval, if it has one: 1.08 [1.07, 1.09]."""
+    value, low, high = (number(v, form) for v in values)
+    return value if values[1] is None else f"{value} [{low}, {high}]"
+
+
+def number(value: float | None, form: str) -> str:
+    """A number in that format, or a dash where there is none."""
+    if value is None:
+        return "-"
+    if form == SIGNIFICANT and abs(value) >= 1000:
+        form = ",.0f"  # 1,190, not 1.19e+03
+    return format(value, f"z{form}")  # no negative zero

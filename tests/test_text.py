@@ -1,0 +1,56 @@
+"""Tables and facts that fit a terminal; progress on a terminal and in a log."""
+
+import subprocess
+import sys
+
+from jbrep.text import facts, table
+
+HEADER = ("encoder", "error", "ratio", "worst feature")
+ROWS = [("dae-8", "0.01", "1.10", "velocity_x"), ("dae-12", "0.002", "1.05", "motor_angle")]
+STEPS = """
+import jbrep.progress as p, time
+p._LOG_EVERY = 0.2
+for _ in p.Progress(range(10), desc="steps", unit="step", initial=5, total=15):
+    time.sleep(0.05)
+"""
+
+
+def test_a_table_without_a_width_is_whole():
+    assert table(HEADER, ROWS).splitlines()[0] == "encoder  error  ratio  worst feature"
+
+
+def test_a_table_that_is_too_wide_is_cut_into_parts_that_fit_with_every_cell_once():
+    shown = table(HEADER, ROWS, width=24)
+    assert max(map(len, shown.splitlines())) <= 24
+    parts = [part.splitlines() for part in shown.split("\n\n")]
+    assert [part[1].split()[0] for part in parts] == ["dae-8"] * len(parts)
+    assert len(parts) > 1
+    for cell in (cell for row in (HEADER, *ROWS) for cell in row[1:]):
+        assert shown.count(cell) == 1
+
+
+def test_a_column_wider_than_the_width_stands_alone_beside_the_first():
+    assert [len(part.splitlines()) for part in table(HEADER, ROWS, 5).split("\n\n")] == [3] * 3
+
+
+def test_facts_are_wrapped_below_themselves():
+    shown = facts({"task": "face_direction", "data": "word " * 20}, 40).splitlines()
+    assert shown[0] == "  task face_direction"
+    assert all(len(line) <= 40 for line in shown)
+    assert all(line.startswith(" " * 7) for line in shown[2:])
+
+
+def test_in_a_log_progress_is_a_line_now_and_then():
+    done = subprocess.run([sys.executable, "-c", STEPS], capture_output=True, text=True, check=True)
+    lines = done.stderr.splitlines()
+    assert 1 <= len(lines) <= 3
+    assert all(line.startswith("steps: ") and " of 15 [" in line for line in lines)
+    assert "\r" not in done.stderr
+
+
+def test_short_work_leaves_nothing_in_a_log_and_closed_streams_stop_nothing():
+    code = STEPS.replace("0.2", "30")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    shell = f"{sys.executable} -c '{STEPS}' 2>&-".replace('"', '"')
+    subprocess.run(["bash", "-c", shell], check=True)
