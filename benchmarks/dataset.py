@@ -24,8 +24,8 @@ from torch.utils.data import DataLoader, TensorDataset
 from jbrep import jitterbug
 from jbrep.collect.collector import simulate_shard, write_shards
 from jbrep.collect.policies import Uniform
-from jbrep.dataset import Dataset
-from jbrep.dataset.manifest import Settings, commit, new_manifest
+from jbrep.dataset import Dataset, Settings
+from jbrep.dataset.manifest import commit, new_manifest
 from jbrep.dataset.schema import EPISODES
 from jbrep.jitterbug.model import PHYSICS_STEPS, fast_model, stop_profiling
 from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS

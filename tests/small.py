@@ -1,7 +1,8 @@
 """Small data sets, and shards without the wait for physics."""
 
 from jbrep.collect import write_shards
-from jbrep.dataset.manifest import Settings, open_shard, read_manifest
+from jbrep.dataset import Settings
+from jbrep.dataset.manifest import open_shard, read_manifest
 
 
 def settings(**changes):

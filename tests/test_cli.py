@@ -201,8 +201,8 @@ def test_a_data_set_from_collecting_to_exporting(tmp_path):
     (data / "shard-00001.h5").unlink()
     told = jbrep("data", "verify", data)
     assert (told.exit_code, told.output.count("\n")) == (1, 1)
-    assert "shard-00001.h5 is missing: jbrep data repair makes it again" in told.output
-    assert "shard-00001.h5 made again" in jbrep("data", "repair", data).output
+    assert "shard-00001.h5 is missing: run jbrep data repair to restore it" in told.output
+    assert "shard-00001.h5 restored" in jbrep("data", "repair", data).output
     assert jbrep("data", "verify", data).exit_code == 0
 
 
@@ -239,6 +239,7 @@ def test_a_missing_extra_is_named(monkeypatch, tmp_path):
 
 def test_a_missing_package_for_an_export_is_named(monkeypatch, tmp_path, collected):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.delitem(sys.modules, "jbrep.dataset.export.parquet", raising=False)
     result = jbrep("data", "export", collected, "--to", "parquet", "--out", tmp_path / "x")
     assert (result.exit_code, result.output) == (
         2,

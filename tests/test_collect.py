@@ -123,7 +123,7 @@ def test_what_is_there_already_is_left_alone(copied):
 )
 def test_other_settings_on_the_same_folder_are_refused_by_name(name, value, copied):
     before = contents(copied)
-    with pytest.raises(InputError, match=f"other settings: {name} .* \\(now: ") as refusal:
+    with pytest.raises(InputError, match=f"with other settings: {name} .* \\(now: ") as refusal:
         collect(settings(**{name: value}), copied)
     assert str(value) in str(refusal.value)
     assert contents(copied) == before
@@ -135,7 +135,7 @@ def test_versions_are_not_mixed_in_a_data_set(copied):
     older = replace(manifest, versions={**manifest.versions, "mujoco": "3.16.9"})
     write_manifest(copied, replace(older, shards=older.shards[:4]))
     (copied / "shard-00004.h5").unlink()
-    with pytest.raises(InputError, match=r"begun with other versions: mujoco 3.16.9 \(now: "):
+    with pytest.raises(InputError, match=r"started with other versions: mujoco 3.16.9 \(now: "):
         collect(settings(), copied)
     write_manifest(copied, replace(manifest, shards=manifest.shards[:4]))
     assert collect(settings(), copied).rows == 1000

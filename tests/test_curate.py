@@ -109,12 +109,12 @@ def test_what_can_t_be_derived(collected, copied, tmp_path):
     with pytest.raises(InputError, match="has no states: collect it with --store-state"):
         derive(tmp_path / "stateless", "move_to_pose", tmp_path / "x")
     collect(settings(steps=1000, policy={"kind": "heuristic"}), tmp_path / "heuristic")
-    with pytest.raises(InputError, match="made by a heuristic policy, which acts on what it"):
+    with pytest.raises(InputError, match="collected by a heuristic policy, which acts on"):
         derive(tmp_path / "heuristic", "move_to_pose", tmp_path / "x")
     manifest = read_manifest(copied)
     (copied / "shard-00004.h5").unlink()
     write_manifest(copied, replace(manifest, shards=manifest.shards[:4]))
-    with pytest.raises(InputError, match="is not finished"):
+    with pytest.raises(InputError, match="is unfinished"):
         derive(copied, "move_to_pose", tmp_path / "x")
     assert not (tmp_path / "x").exists()
 
@@ -133,7 +133,7 @@ def test_repair_leaves_a_whole_data_set_alone(copied):
     before = contents(copied)
     assert not list(repair(copied))
     assert contents(copied) == before
-    with pytest.raises(InputError, match="number of robots is 0"):
+    with pytest.raises(InputError, match="number of lanes is 0"):
         list(repair(copied, lanes=0))
 
 
@@ -145,11 +145,10 @@ def test_repair_makes_everything_again_as_it_was(copied, collected):
     (copied / "shard-00004.h5").rename(copied / "shard-00009.h5")
     told = list(repair(copied, lanes=3, num_threads=1))
     assert [line.split("/")[-1] for line in told] == [
-        "shard-00009.h5 set aside as shard-00009.h5.unlisted: it is not one of the data set's "
-        "shards",
-        "shard-00001.h5 made again",
-        "shard-00003.h5 made again",
-        "shard-00004.h5 made again",
+        "shard-00009.h5 renamed to shard-00009.h5.unlisted: it is not one of the data set's shards",
+        "shard-00001.h5 restored",
+        "shard-00003.h5 restored",
+        "shard-00004.h5 restored",
     ]
     aside = copied / "shard-00009.h5.unlisted"
     assert aside.read_bytes() == (collected / "shard-00004.h5").read_bytes()
@@ -166,7 +165,7 @@ def test_repair_reads_the_manifest_from_its_backup(loss, copied, collected):
         path.write_bytes(path.read_bytes().replace(b"uniform", b"uniforn"))
     (copied / "shard-00000.h5").write_bytes(b"and a shard is damaged, too")
     told = [line.split("/")[-1] for line in repair(copied)]
-    assert told == ["shard-00000.h5 made again", "manifest.json and its backup written again"]
+    assert told == ["shard-00000.h5 restored", "manifest.json and its backup restored"]
     assert contents(copied) == contents(collected)
 
 
@@ -179,7 +178,7 @@ def test_what_can_t_be_repaired(copied, tmp_path):
     shards = (*manifest.shards[:2], entry, *manifest.shards[3:])
     write_manifest(copied, replace(manifest, shards=shards))
     (copied / "shard-00002.h5").unlink()
-    with pytest.raises(InputError, match=r"00002\.h5 can't be made again here.*'mujoco'"):
+    with pytest.raises(InputError, match=r"00002\.h5 can't be restored here.*'mujoco'"):
         list(repair(copied))
     assert not (copied / "shard-00002.h5").exists()
     (copied / MANIFEST).unlink()

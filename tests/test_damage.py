@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import threading
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -146,6 +147,34 @@ def test_rows_of_a_damaged_shard_are_not_returned_but_others_are(copied):
             dataset["observation"][rows]
 
 
+@pytest.mark.parametrize("damage", [truncate, flip, remove])
+def test_a_shard_that_changes_while_it_is_open_is_checked_again(damage, copied):
+    """Reading a memory map of a file that has become shorter would end the process."""
+    dataset = Dataset(copied)
+    read_all(copied)
+    dataset["reward"][:]
+    batches = dataset.batches(size=1000, memory=1000)
+    damage(np.random.default_rng(0), [copied / "shard-00003.h5"])
+    assert dataset["reward"][2999].shape == ()
+    for use in (
+        lambda: dataset["reward"][3000],
+        lambda: list(dataset["velocity"].chunks()),
+        lambda: list(batches),
+    ):
+        with pytest.raises(DamageError, match=r"shard-00003\.h5 is (damaged|missing)"):
+            use()
+
+
+def test_a_shard_that_is_repaired_while_it_is_open_is_read_on(copied):
+    dataset = Dataset(copied)
+    rewards = dataset["reward"][:]
+    path = copied / "shard-00003.h5"
+    content = path.read_bytes()
+    path.unlink()
+    path.write_bytes(content)
+    np.testing.assert_array_equal(dataset["reward"], rewards)
+
+
 def test_a_file_that_is_left_over_or_not_a_shard_is_named(copied, collected):
     (copied / "notes.txt").write_text("collected on a Tuesday")
     (copied / "manifest.json.partial").write_text("{")
@@ -178,6 +207,8 @@ def entry_of(**changes):
     ("change", "message"),
     [
         (manifest_of(format_version=2), "has format version 2: this jbrep reads up to 1"),
+        (manifest_of(format_version=0), "has format version 0"),
+        (manifest_of(format_version=-1), "has format version -1"),
         (manifest_of(format="other"), "is damaged"),
         (manifest_of(shards={}), "is not one of the 0 shards"),
         (manifest_of(shards=[[]]), "is damaged"),
@@ -419,6 +450,28 @@ def test_lengths_that_rows_can_t_be_found_by_are_refused(length, copied, tmp_pat
             use()
 
 
+def test_a_backup_of_nothing_calls_for_collecting_again(collected, tmp_path):
+    """As a collector leaves it that is killed before its first manifest is there."""
+    write_manifest(tmp_path, replace(read_manifest(collected), shards=()))
+    (tmp_path / MANIFEST).unlink()
+    for use in (Dataset, lambda folder: list(find_problems(folder)), lambda f: list(repair(f))):
+        with pytest.raises(InputError, match="run the same jbrep collect again"):
+            use(tmp_path)
+    write_again(collected, tmp_path)
+    assert not list(find_problems(tmp_path))
+
+
+def test_shards_without_any_manifest_are_called_so(copied):
+    for name in (MANIFEST, "manifest.backup.json"):
+        (copied / name).unlink()
+    message = r"has 5 HDF5 files but neither manifest\.json nor manifest\.backup\.json, without"
+    with pytest.raises(DamageError, match=message):
+        Dataset(copied)
+    assert [re.search(message, problem) is not None for problem in find_problems(copied)] == [True]
+    with pytest.raises(DamageError, match="collect again in another folder"):
+        list(repair(copied))
+
+
 def test_the_backup_of_the_manifest_is_looked_after(copied, collected):
     backup = copied / "manifest.backup.json"
     for spoiling in (backup.unlink, lambda: backup.write_bytes(b"{}")):
@@ -483,19 +536,19 @@ def spoil(name, place, value):
     [
         (spoil("observation", (3, 2), np.nan), "observation has values that are not finite"),
         (spoil("qvel", (3, 2), np.inf), "qvel has values that are not finite"),
-        (spoil("action", 5, 1.5), r"action goes from .* to 1.5, beyond \[-1, 1\]"),
-        (spoil("reward", 5, -0.5), r"reward goes from -0.5"),
-        (spoil("observation", (5, 13), 4), "motor_angle goes from"),
-        (spoil("observation", (5, 3), 2), "orientation_w goes from"),
-        (spoil("episodes/final_observation", (0, 15), 9), "angle_to_target goes from"),
+        (spoil("action", 5, 1.5), r"action ranges from .* to 1.5, beyond \[-1, 1\]"),
+        (spoil("reward", 5, -0.5), r"reward ranges from -0.5"),
+        (spoil("observation", (5, 13), 4), "motor_angle ranges from"),
+        (spoil("observation", (5, 3), 2), "orientation_w ranges from"),
+        (spoil("episodes/final_observation", (0, 15), 9), "angle_to_target ranges from"),
         (spoil("episode", 5, 1), "the rows' episode"),
         (spoil("step", 5, 6), "the rows' step"),
-        (spoil("reward", 5, 0.123), "returns are not"),
-        (spoil("episodes/seed", 0, 5), "seeds are not"),
+        (spoil("reward", 5, 0.123), "returns: inconsistent with"),
+        (spoil("episodes/seed", 0, 5), "seeds: inconsistent with"),
         (spoil("episodes/length", 0, 999), "lengths of its episodes don't add up to 1,000 rows"),
         (spoil("episodes/length", 0, -1), "lengths of its episodes don't add up to 1,000 rows"),
         (spoil("episodes/episode", 0, 7), "episode numbers"),
-        (spoil("episodes/diverged", 0, 1), "diverged"),
+        (spoil("episodes/diverged", 0, 1), "divergence"),
         (spoil("episodes/return", 0, 1), "returns"),
         (spoil("episodes/initial_qpos", (0, 4), 0.5), "initial orientations"),
         (spoil("episodes/target_quaternion", (0, 0), 0.5), "target orientations"),

@@ -76,14 +76,14 @@ def test_a_column_as_an_array(column, parts):
     for dtype in (np.uint8, np.int8, np.int64):
         np.testing.assert_array_equal(column[np.array([2, 1], dtype)], whole[[2, 1]])
     assert column[()].shape == whole[()].shape == (12, 3)
-    with pytest.raises(IndexError, match="only the first axis takes an array"):
+    with pytest.raises(IndexError, match="only the first axis can be indexed by an array"):
         column[[0, 1], [0, 1]]
-    with pytest.raises(IndexError, match="a slice or a mask are needed"):
+    with pytest.raises(IndexError, match="a slice or a mask, not by"):
         column["motor"]
     for key in (12, -13, [3, 12]):
         with pytest.raises(IndexError, match="there are 12"):
             column[key]
-    with pytest.raises(IndexError, match="a mask of shape"):
+    with pytest.raises(IndexError, match="the mask has shape"):
         column[np.ones(5, dtype=bool)]
 
 
@@ -132,7 +132,7 @@ def test_a_shard_is_read_through_once_however_often_it_is_opened(collected, monk
 
 def test_batches_that_can_t_be_are_refused(dataset):
     for wrong in ({"size": 0}, {"seed": -1}):
-        with pytest.raises(InputError, match="at least 1 and 0 are needed"):
+        with pytest.raises(InputError, match="must be at least 1 and 0"):
             dataset.batches(**wrong)
 
 
@@ -149,6 +149,19 @@ def test_episodes_have_columns_of_their_own(dataset):
     np.testing.assert_allclose(episodes["return"], reward.sum(axis=1), rtol=1e-12)
     np.testing.assert_array_equal(episodes["initial_qpos"], dataset["qpos"][::1000])
     assert not np.array_equal(episodes["final_qpos"], dataset["qpos"][999::1000])
+
+
+def test_an_episode_is_its_rows_and_what_is_stored_once_for_it(dataset):
+    episode = dataset.episode(3)
+    assert (episode.number, episode.rows, len(episode)) == (3, slice(3000, 4000), 1000)
+    for name in ("reward", "qpos", "velocity", "motor_angle"):
+        np.testing.assert_array_equal(episode[name], dataset[name][3000:4000])
+    assert episode.record["seed"] == 4 * 2**32 + 3
+    np.testing.assert_array_equal(episode.record["initial_qpos"], dataset["qpos"][3000])
+    assert repr(episode).startswith("Episode(3 of ")
+    for number in (5, -1):
+        with pytest.raises(InputError, match=f"no episode {number}: it has 5, numbered from 0"):
+            dataset.episode(number)
 
 
 def test_the_split_is_by_episode_and_seeded(dataset):
@@ -276,7 +289,7 @@ def test_an_unfinished_data_set_is_called_so(collected, tmp_path):
     empty = Dataset(tmp_path)
     assert len(empty) == len(empty["observation"][:]) == 0
     assert "0 of 5 shards, 0.0 MB; unfinished" in card(empty)
-    with pytest.raises(InputError, match="0 episode can't be split"):
+    with pytest.raises(InputError, match="a split needs at least 2 episodes"):
         empty.split()
 
 
@@ -316,5 +329,21 @@ def test_mistakes_are_named(tmp_path):
         Dataset(tmp_path)
     with pytest.raises(InputError, match="no data set in"):
         Dataset(tmp_path / "none")
-    with pytest.raises(InputError, match="must be from 0 to"):
-        settings(seed=-1).check()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"task": 3}, "the task is 3: it must be a name"),
+        ({"seed": -1}, "the seed is -1: it must be from 0 to 2,147,483,646"),
+        ({"seed": "one"}, "the seed is 'one': it must be a whole number"),
+        ({"steps": 1.5}, "the number of steps is 1.5: it must be a whole number"),
+        ({"shard_episodes": None}, "episodes in a shard is None: it must be a whole number"),
+        ({"store_state": "yes"}, "store_state is 'yes': it must be true or false"),
+        ({"policy": "uniform"}, "the policy is 'uniform': it must be a kind and its constants"),
+        ({"policy": {"kind": "constant", "drive": "fast"}}, "it must be a kind and its constants"),
+    ],
+)
+def test_invalid_settings_are_refused_in_words(change, message):
+    with pytest.raises(InputError, match=message):
+        settings(**change)

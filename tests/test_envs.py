@@ -182,7 +182,7 @@ def test_missing_opengl_is_said_in_one_line_and_all_else_works(monkeypatch):
 def test_mistakes_are_named():
     with pytest.raises(InputError, match="unknown form 'image': choose one of flat, dict"):
         gymnasium.make(FACE, form="image")
-    with pytest.raises(InputError, match="the number of robots is 0"):
+    with pytest.raises(InputError, match="the number of lanes is 0"):
         gymnasium.make_vec(FACE, num_envs=0)
     with pytest.raises(InputError, match="steps in an episode is -1: it must be at least 1"):
         gymnasium.make_vec(FACE, num_envs=1, max_episode_steps=-1)
@@ -190,7 +190,7 @@ def test_mistakes_are_named():
     with pytest.raises(InputError, match="3 seeds for 2 lanes"):
         many.reset(seed=[1, 2, 3])
     many.reset()
-    with pytest.raises(InputError, match=r"shape \(2,\): \(2, 1\) is needed"):
+    with pytest.raises(InputError, match=r"shape \(2,\): it must be \(2, 1\)"):
         many.step(np.zeros(2))
     single = gymnasium.make(FACE).unwrapped
     single.reset()

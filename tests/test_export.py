@@ -2,6 +2,8 @@
 
 import json
 import os
+import pydoc
+import signal
 import subprocess
 import sys
 
@@ -12,6 +14,7 @@ import pytest
 from jbrep.dataset import Dataset
 from jbrep.dataset.export import FORMATS, export
 from jbrep.errors import InputError
+from jbrep.files.lock import exclusive_file
 from jbrep.jitterbug.tasks import TASKS
 
 
@@ -113,5 +116,78 @@ def test_nothing_is_overwritten_and_no_half_is_left(dataset, tmp_path, monkeypat
     for to in FORMATS:
         with pytest.raises(InputError, match=r"can't write .*: No space left on device"):
             export(dataset, to, tmp_path / "new" / to)
-    left = [path.name for path in (tmp_path / "new").rglob("*") if path.is_file()]
-    assert set(left) == {"namespace_metadata.json"}  # Minari's, beside its data sets
+    assert not [path.name for path in (tmp_path / "new").rglob("*") if path.is_file()]
+
+
+def exported(to, folder):
+    """What an export to `folder / to` writes: its files, or the folder of its data set."""
+    minari = folder / "minari" / "jitterbug" / "face_direction" / "uniform-v0"
+    return minari if to == "minari" else folder / to
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_what_came_after_the_check_is_not_overwritten(to, dataset, tmp_path, monkeypatch):
+    path = exported(to, tmp_path)
+    publish = f"jbrep.dataset.export.{to}.publish_{'folder' if to == 'minari' else 'file'}"
+    original = pydoc.locate(publish)
+
+    def come_first(partial, name):
+        if name == path and to == "minari":
+            path.mkdir()
+            (path / "precious").write_text("precious")
+        elif name == path:
+            path.write_text("precious")
+        original(partial, name)
+
+    monkeypatch.setattr(publish, come_first)
+    with pytest.raises(InputError, match=r"exists already|can't write .*: Directory not empty"):
+        export(dataset, to, tmp_path / to)
+    (left,) = (p for p in tmp_path.rglob("*") if p.is_file() and "namespace" not in p.name)
+    assert left.read_text() == "precious"
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from jbrep.dataset import Dataset
+from jbrep.dataset.columns import Column
+from jbrep.dataset.export import export
+for method in ("chunks", "__getitem__"):
+    def die(*arguments, left=[3], call=getattr(Column, method)):
+        left[0] -= 1
+        if not left[0]:
+            os.kill(os.getpid(), 9)
+        return call(*arguments)
+    setattr(Column, method, die)
+export(Dataset(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))
+"""
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_a_killed_export_leaves_nothing_under_the_final_name(to, dataset, tmp_path):
+    out = tmp_path / to
+    command = [sys.executable, "-W", "ignore", "-c", KILLED, dataset.folder, to, out]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    assert not exported(to, tmp_path).exists()
+    assert [path for path in tmp_path.rglob("*") if ".partial" in path.name]
+    export(dataset, to, out)
+    assert exported(to, tmp_path).exists()
+    assert not list(tmp_path.rglob(".*"))
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_an_export_is_on_the_disk_and_has_one_writer(to, dataset, tmp_path, monkeypatch):
+    path, synced, sync = exported(to, tmp_path), set(), os.fsync
+
+    def note(descriptor):
+        synced.add(os.fstat(descriptor).st_ino)
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", note)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with exclusive_file(path), pytest.raises(InputError, match="is being written by process"):
+        export(dataset, to, tmp_path / to)
+    assert not synced
+    export(dataset, to, tmp_path / to)
+    for written in (path.parent, path, *path.rglob("*")):
+        assert written.stat().st_ino in synced, written

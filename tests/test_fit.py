@@ -185,11 +185,11 @@ def test_a_number_that_is_not_finite_is_named(collected, tmp_path):
 
     dataset = changed(collected, tmp_path / "data", broken)
     names = "orientation_w, orientation_x, orientation_y, orientation_z, velocity_x"
-    with pytest.raises(InputError, match=f"numbers that aren't finite in {names}: look with"):
+    with pytest.raises(InputError, match=f"values that aren't finite in {names}: run"):
         ScaledDataset(dataset)
 
 
 def test_one_episode_is_too_few(collected, tmp_path):
     dataset = changed(collected, tmp_path / "data", lambda rows: rows, episodes=1)
-    with pytest.raises(InputError, match="1 episode can't be split: collect at least 2"):
+    with pytest.raises(InputError, match="a split needs at least 2 episodes with rows"):
         ScaledDataset(dataset)

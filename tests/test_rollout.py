@@ -1,13 +1,14 @@
 """Episodes to look at are the very ones that were stored or evaluated."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from jbrep.collect import collect
-from jbrep.dataset import Dataset
-from jbrep.dataset.manifest import Settings
+from jbrep.collect.policies import Heuristic
+from jbrep.dataset import Dataset, Settings
 from jbrep.encoders import find
 from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS, episode_returns
@@ -16,7 +17,7 @@ from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, read_evaluations
 from jbrep.rl.policy import load_untrained
-from jbrep.rollouts.rollout import replay
+from jbrep.rollouts.rollout import play, replay
 from jbrep.rollouts.sources import Player, find_episode, find_player
 
 
@@ -129,6 +130,23 @@ def test_an_episode_that_diverged_ends_before_it_did(tmp_path):
     assert rollout.observation.shape == (301, 16)
 
 
+def test_arrays_of_the_wrong_shape_are_named_with_both_shapes():
+    rollout = replay(Dataset("data/sample/face_direction"), 0)
+    with pytest.raises(
+        InputError, match=r"1000 actions has qvel of shape \(999, 15\): it must be \(1001, 15\)"
+    ):
+        replace(rollout, qvel=rollout.qvel[:999])
+    assert repr(rollout) == (
+        "Rollout('data/sample/face_direction, episode 0': face_direction, 1,000 steps)"
+    )
+
+
+def test_episodes_may_be_shorter():
+    (rollout,) = play(TASKS["face_direction"], Heuristic().begin, "heuristic", [0], steps=20)
+    assert len(rollout) == 20
+    assert rollout.qpos.shape == (21, 16)
+
+
 @pytest.mark.parametrize(
     ("source", "episode", "task", "message"),
     [
@@ -137,7 +155,7 @@ def test_an_episode_that_diverged_ends_before_it_did(tmp_path):
         ("heuristic", 0, "fly", "unknown task 'fly'"),
         ("heuristic", -1, "face_direction", "there is no episode -1"),
         ("constant:drive=2", 0, "face_direction", "the constant drive is 2.0"),
-        ("data/sample/face_direction", 4, None, "has no episode 4: it has 4, from 0"),
+        ("data/sample/face_direction", 4, None, "has no episode 4: it has 4, numbered from 0"),
         ("data/sample/face_direction", -1, None, "has no episode -1"),
     ],
 )

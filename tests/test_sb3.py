@@ -168,7 +168,7 @@ def test_attributes_are_shared_by_the_lanes():
 def test_mistakes_are_named():
     with pytest.raises(InputError, match=r"unknown task 'fly': choose one of move_from_origin"):
         JitterbugVecEnv("fly", 1)
-    with pytest.raises(InputError, match="the number of robots is 0: it must be at least 1"):
+    with pytest.raises(InputError, match="the number of lanes is 0: it must be at least 1"):
         JitterbugVecEnv("face_direction", 0)
 
     class Liar(Halves):

@@ -84,6 +84,10 @@ def test_copied_data_are_the_lane_s():
     np.testing.assert_allclose(data.geom("target").xpos, simulation.readings.target_position[2])
 
 
+def test_a_simulation_is_shown_on_one_line():
+    assert repr(Simulation(get_task("move_to_pose"), 3, 1)) == "Simulation(move_to_pose, 3 lanes)"
+
+
 @pytest.mark.parametrize(("lanes", "threads"), [(0, 1), (-1, None), (1, 0)])
 def test_numbers_below_one_are_refused(lanes, threads):
     with pytest.raises(InputError, match="must be at least 1"):
@@ -92,7 +96,7 @@ def test_numbers_below_one_are_refused(lanes, threads):
 
 @pytest.mark.parametrize("actions", [np.zeros(2), np.zeros((2, 2)), np.zeros((3, 1)), 0.5])
 def test_actions_of_another_shape_are_refused(actions):
-    with pytest.raises(InputError, match=r"actions have shape .*\(2, 1\) is needed"):
+    with pytest.raises(InputError, match=r"actions have shape .*: it must be \(2, 1\)"):
         check_actions(actions, 2)
 
 

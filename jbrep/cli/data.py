@@ -53,7 +53,7 @@ def collect(
     """
     from jbrep.collect import collect as run
     from jbrep.collect.policies import parse_policy, policy_settings
-    from jbrep.dataset.manifest import Settings
+    from jbrep.dataset import Settings
 
     how = policy_settings(parse_policy(policy))
     settings = Settings(

@@ -1,4 +1,4 @@
-"""Another task's data set from a collected one: the same motion, observed and rewarded anew."""
+"""Deriving another task's data set: the same motion, with its observations and rewards."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -8,18 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collect.collector import Tick, Written, write_shards
+from jbrep.collect.collector import Written, write_shards
 from jbrep.collect.policies import make_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import new_manifest, open_shard
 from jbrep.dataset.schema import (
     EPISODES,
+    STATE_COLUMNS,
     Columns,
     episode_columns,
     episode_returns,
     episode_seed,
 )
-from jbrep.errors import InputError
+from jbrep.errors import InputError, differences
+from jbrep.jitterbug.episodes import Tick
 from jbrep.jitterbug.simulation import Simulation, check_counts
 from jbrep.jitterbug.tasks import Task, get_task
 
@@ -44,52 +46,52 @@ def derive(
     store_state: bool = False,
     num_threads: int | None = None,
 ) -> Written:
-    """Make the data set that collecting the task with the same settings would, bit for bit.
+    """Write the data set that collecting another task with the same settings gives, bit for bit.
 
-    Actions that don't depend on what is observed lead to the same states whatever the task.
+    Actions that don't depend on observations lead to the same states in every task.
 
     Args:
-        source: a complete data set with its states stored.
+        source: a finished data set with stored states.
         task_name: the task to observe and reward.
-        folder: where to write; a derivation that was stopped goes on.
-        store_state: keep the states.
-        num_threads: threads to work on; None takes one for each core.
+        folder: where to write; an unfinished derivation is resumed.
+        store_state: store the states as well.
+        num_threads: threads to use; None takes one for each core.
 
     Raises:
-        InputError: the source has no states, is unfinished or damaged, or was made by a policy
-            that looks at observations; or as `collect` does.
+        InputError: the source has no states, is unfinished or damaged, or was collected by a
+            policy that depends on observations; or as `collect` does.
     """
     dataset = Dataset(source)
     settings = dataset.manifest.settings
     if not settings.store_state:
         raise InputError(f"{source} has no states: collect it with --store-state")
     if not dataset.manifest.complete:
-        raise InputError(f"{source} is not finished: the same jbrep collect goes on with it")
+        raise InputError(f"{source} is unfinished: resume it with the same jbrep collect")
     if not make_policy(settings.policy).open_loop:
         raise InputError(
-            f"{source} was made by a {settings.policy['kind']} policy, which acts on what it "
-            f"observes: collect {task_name} itself"
+            f"{source} was collected by a {settings.policy['kind']} policy, which acts on "
+            f"observations: run jbrep collect --task {task_name} instead"
         )
     check_counts(1, num_threads)
     task = get_task(task_name)
-    settings = replace(settings, task=task_name, store_state=store_state)
-
-    if dataset.manifest.versions != (ours := new_manifest(settings).versions):
+    settings = replace(settings, task=task.name, store_state=store_state)
+    differing = differences(dataset.manifest.versions, new_manifest(settings).versions)
+    if differing:
         raise InputError(
-            f"{source} was made with {dict(dataset.manifest.versions)}, here are {dict(ours)}: "
-            "a derived data set needs the same"
+            f"{source} was collected with other versions: {differing}; a derived data set needs "
+            "the same"
         )
 
     def make(shard: int, tick: Tick) -> Columns:
         columns = open_shard(source, dataset.manifest, shard)
         numbers = settings.shard_range(shard)
         seeds = [episode_seed(settings.seed, number) for number in numbers]
-        return _observe_anew(columns, task, seeds, settings.specs(), tick, num_threads)
+        return _as_task(columns, task, seeds, settings.specs(), tick, num_threads)
 
     return write_shards(settings, folder, make)
 
 
-def _observe_anew(
+def _as_task(
     columns: Columns,
     task: Task,
     seeds: Sequence[int],
@@ -97,7 +99,7 @@ def _observe_anew(
     tick: Tick,
     num_threads: int | None,
 ) -> Columns:
-    """The columns of a shard as another task has them."""
+    """The columns of a shard as another task observes and rewards them."""
     own = episode_columns(columns)
     length = own["length"]
     starts = [task.start(np.random.default_rng(seed)) for seed in seeds]
@@ -105,23 +107,23 @@ def _observe_anew(
         "target_position": np.stack([start.target_position for start in starts]),
         "target_quaternion": np.stack([start.target_quaternion for start in starts]),
     }
-    owner = np.repeat(np.arange(len(length)), length)
-    row = np.arange(len(owner)) + owner  # where it stands once final states are put in
+    episode = np.repeat(np.arange(len(length)), length)
+    row = np.arange(len(episode)) + episode  # its place once final states are inserted
     ends = np.cumsum(length)
     final = ends + np.arange(len(length))
     states = Stored(
-        *(np.insert(columns[n], ends, own[f"final_{n}"], axis=0) for n in ("qpos", "qvel")),
+        *(np.insert(columns[n], ends, own[f"final_{n}"], axis=0) for n in STATE_COLUMNS),
         *(np.repeat(values, length + 1, axis=0) for values in target.values()),
     )
     observation, reward = _read(states, task, num_threads)
     tick(len(row))
-    anew = {
+    changed = {
         "observation": observation[row],
         "reward": reward[row + 1],
         EPISODES + "final_observation": observation[final],
         EPISODES + "return": episode_returns(reward[row + 1], length),
     } | {EPISODES + name: values for name, values in target.items()}
-    return {name: anew.get(name, columns[name]) for name in names}
+    return {name: changed.get(name, columns[name]) for name in names}
 
 
 def _read(states: Stored, task: Task, num_threads: int | None) -> tuple[Array, Array]:

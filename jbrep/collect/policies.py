@@ -1,34 +1,28 @@
-"""Policies to collect with, each a few constants that name it in a command and in a manifest."""
+"""Policies to collect with, each determined by its kind and a few constants."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from jbrep.errors import InputError, choose
+from jbrep.jitterbug.episodes import Actor as Actor
+from jbrep.jitterbug.episodes import open_loop
 from jbrep.jitterbug.heuristics import HEURISTICS
-from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, Array, Task
+from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, Task
 
-Actor = Callable[[Array], Array]  # observations (n, d) to actions (n, 1), once for each step
-
-_MAX_SIGMA = 1e6  # far beyond full drive to and fro
+_MAX_SIGMA = 1e6  # far beyond what alternates between full drives
 
 
 class Policy(Protocol):
-    """How actions come about; a frozen dataclass of its constants."""
+    """How actions are chosen; a frozen dataclass of its constants."""
 
     kind: ClassVar[str]
     open_loop: ClassVar[bool]  # whether actions don't depend on what is observed
 
     def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
         """Act in n new episodes, drawing from each one's generator only."""
-
-
-def _recite(actions: Array) -> Actor:
-    """Give actions (T, n, 1) one step after the other."""
-    following = iter(actions)
-    return lambda observation: next(following)
 
 
 @dataclass(frozen=True)
@@ -40,7 +34,7 @@ class Uniform:
 
     def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
         """Draw all actions of the episodes."""
-        return _recite(np.stack([r.uniform(-1, 1, (EPISODE_STEPS, 1)) for r in randoms], axis=1))
+        return open_loop(np.stack([r.uniform(-1, 1, (EPISODE_STEPS, 1)) for r in randoms], axis=1))
 
 
 @dataclass(frozen=True)
@@ -63,10 +57,10 @@ class Constant:
 
 @dataclass(frozen=True)
 class OrnsteinUhlenbeck:
-    """Noise that wanders about a mean, from the mean on, cut to [-1, 1].
+    """An Ornstein-Uhlenbeck process that starts at its mean, clipped to [-1, 1].
 
     dx = theta (mu - x) dt + sigma dW, in steps of the control timestep (Uhlenbeck and Ornstein,
-    1930); after a while x has the standard deviation sigma / sqrt(2 theta).
+    1930); its stationary standard deviation is sigma / sqrt(2 theta).
     """
 
     kind: ClassVar[str] = "ornstein-uhlenbeck"
@@ -86,13 +80,13 @@ class OrnsteinUhlenbeck:
     def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
         """Draw all actions of the episodes."""
         noise = np.stack([r.standard_normal((EPISODE_STEPS, 1)) for r in randoms], axis=1)
-        walk = np.empty_like(noise)
+        drives = np.empty_like(noise)
         drive = np.full_like(noise[0], self.mu)
-        for step, kick in enumerate(noise):
-            walk[step] = drive
+        for step, increment in enumerate(noise):
+            drives[step] = drive
             drive = drive + self.theta * CONTROL_TIMESTEP * (self.mu - drive)
-            drive = drive + self.sigma * np.sqrt(CONTROL_TIMESTEP) * kick
-        return _recite(np.clip(walk, -1, 1))
+            drive = drive + self.sigma * np.sqrt(CONTROL_TIMESTEP) * increment
+        return open_loop(np.clip(drives, -1, 1))
 
 
 @dataclass(frozen=True)
@@ -111,7 +105,7 @@ POLICIES = {policy.kind: policy for policy in (Uniform, Heuristic, Constant, Orn
 
 
 def parse_policy(text: str) -> Policy:
-    """A policy as people write it: `uniform`, `constant:drive=0.5`.
+    """Make a policy from text such as `uniform` or `constant:drive=0.5`.
 
     Raises:
         InputError: as `make_policy` does.
@@ -122,10 +116,10 @@ def parse_policy(text: str) -> Policy:
 
 
 def make_policy(settings: Mapping[str, Any]) -> Policy:
-    """The policy of those settings, as a manifest has them.
+    """Make a policy from its settings, as in a manifest.
 
     Raises:
-        InputError: an unknown policy, a constant that it doesn't have, or one out of range.
+        InputError: an unknown policy, an unknown constant, or one out of range.
     """
     constants = {name: value for name, value in settings.items() if name != "kind"}
     return _make(settings["kind"], constants)
@@ -144,12 +138,12 @@ def _make(kind: str, constants: dict[str, Any]) -> Policy:
             constants[name] = float(value) + 0.0  # -0 is 0
         except (TypeError, ValueError, OverflowError):
             raise InputError(
-                f"policy {kind}: {name} is {value!r}, a number is expected, as in "
+                f"policy {kind}: {name} is {value!r}, but must be a number, as in "
                 "constant:drive=0.5"
             ) from None
     return policy(**constants)
 
 
 def policy_settings(policy: Policy) -> dict[str, Any]:
-    """What makes the policy again."""
+    """The settings that `make_policy` takes."""
     return {"kind": policy.kind, **asdict(policy)}  # type: ignore[call-overload]

@@ -1,4 +1,4 @@
-"""Mending a data set: damaged or missing files are made again as they were."""
+"""Repairing a data set: damaged or missing files are restored as they were."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -30,41 +30,47 @@ from jbrep.progress import Progress
 
 
 def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> Iterator[str]:
-    """Make damaged and missing shards again, and the manifest from its backup or the other way.
+    """Simulate damaged and missing shards again, and restore the manifest from its backup.
 
-    What isn't part of the data set is set aside under another name, never deleted.
+    A damaged backup is restored from the manifest. A file that isn't part of the data set is
+    renamed, never deleted.
+
+    Args:
+        folder: of the data set.
+        lanes: robots stepped at once.
+        num_threads: threads to step them on; None takes one for each core.
 
     Yields:
-        A line for each thing done.
+        A line for each file restored or renamed.
 
     Raises:
-        InputError: no data set there, or a shard that comes out otherwise than it was: another
-            machine or other versions made it.
+        InputError: there is no data set, or a shard comes out differently here, as it does if
+            another machine or other versions made it.
     """
     check_counts(lanes, num_threads)
-    good = _good_manifest(folder)
+    intact = _intact_manifest(folder)
     with exclusive(folder):
-        manifest = before = read_manifest(folder, good)
+        manifest = before = read_manifest(folder, intact)
         for path in unlisted_files(manifest, hdf5_files(folder)):
             aside = _set_aside(path)
-            yield f"{path} set aside as {aside.name}: it is not one of the data set's shards"
+            yield f"{path} renamed to {aside.name}: it is not one of the data set's shards"
         for shard in range(len(manifest.shards)):
-            if _is_whole(folder, manifest, shard):
+            if _is_intact(folder, manifest, shard):
                 continue
-            entry = _make_again(folder, manifest, shard, lanes, num_threads)
+            entry = _restore(folder, manifest, shard, lanes, num_threads)
             shards = (*manifest.shards[:shard], entry, *manifest.shards[shard + 1 :])
             manifest = replace(manifest, shards=shards)
-            yield f"{folder / shard_name(shard)} made again"
-        if manifest != before or not _is_double(folder, manifest):
+            yield f"{folder / shard_name(shard)} restored"
+        if manifest != before or not _is_backed_up(folder, manifest):
             write_manifest(folder, manifest)
-            yield f"{folder / MANIFEST} and its backup written again"
+            yield f"{folder / MANIFEST} and its backup restored"
 
 
-def _good_manifest(folder: Path) -> str:
-    """The name of the manifest, or of its backup where that is damaged.
+def _intact_manifest(folder: Path) -> str:
+    """The name of the manifest, or of its backup if the manifest is damaged.
 
     Raises:
-        DamageError: both are.
+        DamageError: both are damaged.
     """
     for name in (MANIFEST, BACKUP):
         with suppress(DamageError):
@@ -72,11 +78,11 @@ def _good_manifest(folder: Path) -> str:
             return name
     raise DamageError(
         f"{folder} can't be repaired: {MANIFEST} and {BACKUP} are both damaged or missing; collect "
-        "it again in another folder"
+        "again in another folder"
     )
 
 
-def _is_double(folder: Path, manifest: Manifest) -> bool:
+def _is_backed_up(folder: Path, manifest: Manifest) -> bool:
     try:
         return read_manifest(folder) == read_manifest(folder, BACKUP) == manifest
     except InputError:
@@ -84,13 +90,13 @@ def _is_double(folder: Path, manifest: Manifest) -> bool:
 
 
 def _set_aside(path: Path) -> Path:
-    """Rename a file to a name that is free."""
+    """Rename a file to an unused name."""
     names = (f"{path.name}.unlisted{number or ''}" for number in count())
     aside = next(path.with_name(name) for name in names if not path.with_name(name).exists())
     return path.rename(aside)
 
 
-def _is_whole(folder: Path, manifest: Manifest, shard: int) -> bool:
+def _is_intact(folder: Path, manifest: Manifest, shard: int) -> bool:
     try:
         dict(open_shard(folder, manifest, shard))
     except DamageError:
@@ -98,10 +104,10 @@ def _is_whole(folder: Path, manifest: Manifest, shard: int) -> bool:
     return True
 
 
-def _make_again(
+def _restore(
     folder: Path, manifest: Manifest, shard: int, lanes: int, num_threads: int | None
 ) -> Entry:
-    settings, known = manifest.settings, manifest.shards[shard].sha256
+    settings, committed = manifest.settings, manifest.shards[shard].sha256
     total = len(settings.shard_range(shard)) * EPISODE_STEPS
     with Progress(total=total, unit="step", unit_scale=True, desc=shard_name(shard)) as progress:
         columns = simulate_shard(
@@ -112,10 +118,9 @@ def _make_again(
             lanes,
             num_threads,
         )
-    if column_hashes(columns) != known:
+    if column_hashes(columns) != committed:
         raise InputError(
-            f"{folder / shard_name(shard)} can't be made again here: it comes out otherwise than "
-            f"it was with {dict(manifest.versions)}; use these versions and the machine it was "
-            "made on"
+            f"{folder / shard_name(shard)} can't be restored here: it comes out differently; use "
+            f"the machine it was made on, and these versions: {dict(manifest.versions)}"
         )
     return write_shard(folder, manifest, shard, columns)

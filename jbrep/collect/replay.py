@@ -1,14 +1,15 @@
-"""Does a data set's physics come out again? Episodes simulated from their starts and actions."""
+"""Simulating stored episodes again, from their starts and actions."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.dataset import Dataset
-from jbrep.dataset.schema import Columns
+from jbrep.dataset import Dataset, Episode
+from jbrep.dataset.schema import STATE_COLUMNS
 from jbrep.errors import InputError
+from jbrep.jitterbug.episodes import Recording, Tick, open_loop, record
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import EPISODE_STEPS
 from jbrep.progress import Progress
@@ -19,70 +20,72 @@ _LANES = 100
 def replay_problems(
     dataset: Dataset, episodes: int, num_threads: int | None = None
 ) -> Iterator[str]:
-    """Simulate some episodes again from their stored start and actions, and compare every bit.
+    """Simulate some episodes again and compare every bit.
 
     Args:
-        dataset: where they are.
-        episodes: how many; they are drawn evenly at random, the same ones each time.
+        dataset: with the episodes.
+        episodes: how many; they are drawn at random, always the same ones.
         num_threads: threads to simulate on; None takes one for each core.
 
     Yields:
-        A line for each episode that comes out otherwise.
+        A line for each episode that differs.
 
     Raises:
-        InputError: fewer episodes are there.
+        InputError: there are fewer episodes.
     """
-    total = len(dataset.episodes["episode"])
+    total = len(dataset.episodes["length"])
     if not 0 <= episodes <= total:
         raise InputError(f"{episodes} episodes can't be replayed: the data set has {total:,}")
-    if not len(dataset):
-        return
-    chosen = np.sort(np.random.default_rng(0).permutation(total)[:episodes])
+    numbers = np.sort(np.random.default_rng(0).permutation(total)[:episodes])
+    chosen = [dataset.episode(int(number)) for number in numbers]
     with Progress(total=episodes * EPISODE_STEPS, unit="step", unit_scale=True, leave=False) as bar:
-        for start in range(0, episodes, _LANES):
-            for episode in _replay_some(dataset, chosen[start : start + _LANES], num_threads, bar):
-                yield (
-                    f"{dataset.folder}: episode {episode} simulated again differs: another "
-                    f"machine, or other versions than {dict(dataset.manifest.versions)}?"
-                )
+        for first in range(0, episodes, _LANES):
+            some = chosen[first : first + _LANES]
+            names = [name for name in STATE_COLUMNS if name in dataset.columns]
+            recording = simulate_again(some, names, num_threads, bar.update)
+            for lane, episode in enumerate(some):
+                if not _is_equal(recording, lane, episode):
+                    versions = dict(dataset.manifest.versions)
+                    yield (
+                        f"{dataset.folder}: episode {episode.number} simulated again differs: "
+                        f"another machine, or other versions than {versions}?"
+                    )
 
 
-def _replay_some(
-    dataset: Dataset, chosen: NDArray[Any], num_threads: int | None, bar: Progress
-) -> list[int]:
-    own = {name: column[chosen] for name, column in dataset.episodes.items()}
-    simulation = Simulation(dataset.task, len(chosen), num_threads)
+def simulate_again(
+    episodes: Sequence[Episode], readings: Sequence[str], num_threads: int | None, tick: Tick
+) -> Recording:
+    """Simulate stored episodes, one in each lane; after its last action a lane gets zeros.
+
+    Args:
+        episodes: of one data set, at least one.
+        readings: names of the fields of `Readings` to record.
+        num_threads: threads to simulate on; None takes one for each core.
+        tick: called after each step.
+    """
+    records = [episode.record for episode in episodes]
+    simulation = Simulation(episodes[0].dataset.task, len(episodes), num_threads)
     simulation.restore(
-        *(own[n] for n in ("initial_qpos", "initial_qvel", "target_position", "target_quaternion"))
+        qpos=np.stack([stored["initial_qpos"] for stored in records]),
+        qvel=np.stack([stored["initial_qvel"] for stored in records]),
+        target_position=np.stack([stored["target_position"] for stored in records]),
+        target_quaternion=np.stack([stored["target_quaternion"] for stored in records]),
     )
-    first = (np.cumsum(dataset.episodes["length"]) - dataset.episodes["length"])[chosen]
-    names = [name for name in dataset.columns if name not in ("episode", "step")]
-    columns = {name: dataset[name] for name in names}
-    equal = np.ones(len(chosen), dtype=bool)
-    for step in range(EPISODE_STEPS + 1):
-        running = own["length"] > step
-        rows = np.where(running, first + step, 0)
-        stored = {name: column[rows] for name, column in columns.items()}
-        ending = own["length"] == step
-        seen: Columns = {
-            "observation": simulation.observe().astype(np.float32),
-            "qpos": simulation.readings.qpos,
-            "qvel": simulation.readings.qvel,
-        }
-        for name, values in seen.items():
-            if name in stored:
-                equal &= _same(values, stored[name]) | ~running
-                equal &= _same(values, own[f"final_{name}"]) | ~ending
-        if step < EPISODE_STEPS:
-            simulation.step(np.where(running[:, None], stored["action"], 0))
-            reward = simulation.reward().astype(np.float32)
-            equal &= _same(reward, stored["reward"]) | ~running
-            bar.update(len(chosen))
-    return chosen[~equal].tolist()
+    actions = np.zeros((max(map(len, episodes)), len(episodes), 1))
+    for lane, episode in enumerate(episodes):
+        actions[: len(episode), lane] = episode["action"]
+    return record(simulation, open_loop(actions), len(actions), readings, tick)
 
 
-def _same(values: NDArray[Any], stored: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which lanes are equal in every bit."""
-    one, other = (np.ascontiguousarray(a).reshape(len(a), -1) for a in (values, stored))
-    same: NDArray[np.bool_] = (one.view(np.uint8) == other.view(np.uint8)).all(axis=1)
-    return same
+def _is_equal(recording: Recording, lane: int, episode: Episode) -> bool:
+    """Whether a lane went through what is stored of an episode, to the last bit."""
+    length, ends = len(episode), episode.record
+    pairs = [(recording.reward[:length, lane], episode["reward"])]
+    for name, values in recording.states.items():
+        pairs.append((values[:length, lane], episode[name]))
+        pairs.append((values[length, lane], ends[f"final_{name}"]))
+    return all(_same_bits(*pair) for pair in pairs)
+
+
+def _same_bits(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    return one.dtype == other.dtype and one.tobytes() == other.tobytes()

@@ -1,9 +1,9 @@
 """Data sets: folders of HDF5 shards of flat columns, named by a manifest."""
 
 from jbrep.dataset.columns import Batches, Column, Scaler
-from jbrep.dataset.manifest import Settings
-from jbrep.dataset.reader import Dataset, Split
+from jbrep.dataset.reader import Dataset, Episode, Split
 from jbrep.dataset.scaled import ScaledDataset
+from jbrep.dataset.settings import Settings
 from jbrep.errors import DamageError
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "Column",
     "DamageError",
     "Dataset",
+    "Episode",
     "ScaledDataset",
     "Scaler",
     "Settings",

@@ -1,43 +1,90 @@
-"""A data set on one screen."""
+"""A data set on one screen, or as JSON."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
 from jbrep.dataset.reader import Dataset
+from jbrep.text import facts, number, table
 
-_FEATURE = "  {:<28} {:<6} {:>10} {:>10} {:>10} {:>10}   {:<16}"
+_HEADER = ("feature", "unit", "min", "mean", "max", "std", "nominal")
 
 
-def card(dataset: Dataset) -> str:
-    """What a data set holds, how it was made, its returns and its features' ranges."""
-    settings, manifest = dataset.manifest.settings, dataset.manifest
-    shards = f"{len(manifest.shards):,} of {settings.num_shards:,} shards"
-    size = sum(entry.bytes for entry in manifest.shards) / 1e6
-    constants = [f"{name} {value}" for name, value in settings.policy.items() if name != "kind"]
-    episodes = dataset.episodes
-    lines = {
-        "task": f"{settings.task}, {dataset.task.size} features",
-        "policy": ", ".join([settings.policy["kind"], *constants]),
-        "seed": f"{settings.seed}",
-        "rows": f"{len(dataset):,} in {len(episodes['length']):,} episodes",
-        "ended early": f"{episodes['diverged'].sum():,} episodes, where the physics diverged",
-        "columns": ", ".join(dataset.columns),
-        "files": f"{shards}, {size:,.1f} MB" + ("" if manifest.complete else "; unfinished"),
-        "made with": ", ".join(f"{name} {v}" for name, v in manifest.versions.items()),
+def describe(dataset: Dataset) -> dict[str, Any]:
+    """What a data set holds, how it was made, its returns and the ranges of its features.
+
+    Returns:
+        Plain values, as JSON takes them; numbers that aren't finite are None.
+    """
+    manifest, episodes = dataset.manifest, dataset.episodes
+    return {
+        "folder": str(dataset.folder),
+        **asdict(manifest.settings),
+        "rows": len(dataset),
+        "episodes": len(episodes["length"]),
+        "diverged": int(episodes["diverged"].sum()),
+        "return": _returns(episodes["return"]),
+        "columns": list(dataset.columns),
+        "shards": len(manifest.shards),
+        "num_shards": manifest.settings.num_shards,
+        "complete": manifest.complete,
+        "bytes": sum(entry.bytes for entry in manifest.shards),
+        "versions": dict(manifest.versions),
         "fingerprint": manifest.fingerprint,
+        "features": _features(dataset) if len(dataset) else [],
     }
-    if len(episodes["return"]):
-        low, median, high = np.percentile(episodes["return"], (10, 50, 90))
-        lines["return"] = (
-            f"median {median:.1f} [10 % {low:.1f}, 90 % {high:.1f}], "
-            f"mean {episodes['return'].mean():.1f}, "
-            f"from {episodes['return'].min():.1f} to {episodes['return'].max():.1f}"
+
+
+def card(dataset: Dataset, width: int = 80) -> str:
+    """`describe` as text of at most `width` columns."""
+    about = describe(dataset)
+    policy, returns = about["policy"], about["return"]
+    constants = (f"{name} {value}" for name, value in policy.items() if name != "kind")
+    named = {
+        "task": f"{about['task']}, {dataset.task.size} features",
+        "policy": ", ".join([policy["kind"], *constants]),
+        "seed": f"{about['seed']}",
+        "rows": f"{about['rows']:,} in {about['episodes']:,} episodes",
+        "ended early": f"{about['diverged']:,} episodes, where the physics diverged",
+        "columns": ", ".join(about["columns"]),
+        "files": f"{about['shards']:,} of {about['num_shards']:,} shards, "
+        f"{about['bytes'] / 1e6:,.1f} MB" + ("" if about["complete"] else "; unfinished"),
+        "made with": ", ".join(f"{name} {version}" for name, version in about["versions"].items()),
+        "fingerprint": about["fingerprint"],
+    }
+    if returns:
+        of = {name: number(value, ".1f") for name, value in returns.items()}
+        named["return"] = (
+            f"median {of['median']} [10 % {of['p10']}, 90 % {of['p90']}], mean {of['mean']}, "
+            f"from {of['min']} to {of['max']}"
         )
-    text = [str(dataset.folder), *(f"  {name:<12} {value}" for name, value in lines.items())]
-    return "\n".join([*text, "", *_feature_lines(dataset)]) if len(dataset) else "\n".join(text)
+    parts = [f"{dataset.folder}\n{facts(named, width)}"]
+    if about["features"]:
+        parts.append(table(_HEADER, map(_cells, about["features"]), width))
+    return "\n\n".join(parts)
 
 
-def _feature_lines(dataset: Dataset) -> list[str]:
-    """Unit, extrema, mean and standard deviation of each feature beside its nominal range."""
+def _cells(feature: Mapping[str, Any]) -> list[str]:
+    values = [number(feature[name], ".4g") for name in _HEADER[2:6]]
+    low, high = (number(value, ".4g") for value in feature["nominal"])
+    return [feature["feature"], feature["unit"], *values, f"[{low}, {high}]"]
+
+
+def _returns(returns: Any) -> dict[str, float | None]:
+    """Median, 10 % and 90 % quantiles, mean and extrema over the episodes, if there are any."""
+    if not len(returns):
+        return {}
+    median, p10, p90 = np.percentile(returns, (50, 10, 90))
+    values = {"median": median, "p10": p10, "p90": p90, "mean": returns.mean()}
+    return {
+        n: _finite(v) for n, v in (values | {"min": returns.min(), "max": returns.max()}).items()
+    }
+
+
+def _features(dataset: Dataset) -> list[dict[str, Any]]:
+    """Unit, extrema, mean and standard deviation of each feature, and its nominal range."""
     size = dataset.task.size
     low, high = np.full(size, np.inf), np.full(size, -np.inf)
     total, squares = np.zeros(size), np.zeros(size)
@@ -49,10 +96,20 @@ def _feature_lines(dataset: Dataset) -> list[str]:
         total += shifted.sum(axis=0)
         squares += np.square(shifted).sum(axis=0)
     mean = total / len(dataset)
-    spread = np.sqrt(np.maximum(squares / len(dataset) - mean**2, 0))
-    lines = [_FEATURE.format("feature", "unit", "min", "mean", "max", "std", "nominal")]
-    for i, feature in enumerate(dataset.task.features):
-        values = (f"{v:.4g}" for v in (low[i], first[i] + mean[i], high[i], spread[i]))
-        nominal = f"[{feature.low:.4g}, {feature.high:.4g}]"
-        lines.append(_FEATURE.format(feature.name, feature.unit, *values, nominal).rstrip())
-    return lines
+    std = np.sqrt(np.maximum(squares / len(dataset) - mean**2, 0))
+    return [
+        {
+            "feature": feature.name,
+            "unit": feature.unit,
+            **{
+                name: _finite(values[i])
+                for name, values in zip(_HEADER[2:6], (low, first + mean, high, std), strict=True)
+            },
+            "nominal": [feature.low, feature.high],
+        }
+        for i, feature in enumerate(dataset.task.features)
+    ]
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Views over all shards of a data set, and the scaling that is fitted to them."""
+"""Columns over all shards of a data set, scaling fitted to them, and shuffled batches."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
@@ -13,18 +13,18 @@ from jbrep.errors import InputError
 
 Array = NDArray[Any]
 
-_CHUNK = 1 << 16  # rows at a time where all are looked at
+_CHUNK = 1 << 16  # rows processed at a time
 
 
 class Column:
     """A column of a data set as one array over its shards; nothing is copied before it is indexed.
 
-    Index it like an array: rows by number, slice, array of numbers in any order, or mask, then
-    the rest. `numpy.asarray(column)` copies all of it.
+    Index it like an array: first the rows, by number, slice, array of numbers in any order, or
+    mask, then the other axes. `numpy.asarray(column)` copies all of it.
 
     Args:
-        part: gives the column's part in a shard of that number, (rows, ...).
-        ends: row number after each shard's last.
+        part: returns the column's rows in the shard of a given number, (rows, ...).
+        ends: cumulative number of rows after each shard.
         dtype: of the values.
         row: shape of one row.
     """
@@ -48,7 +48,7 @@ class Column:
         if isinstance(rows, tuple):
             first, *others = rows or (slice(None),)
             if any(np.ndim(other) for other in others if not isinstance(other, slice)):
-                raise IndexError("only the first axis takes an array: index its result again")
+                raise IndexError("only the first axis can be indexed by an array: index the result")
             before = () if np.ndim(first) == 0 and not isinstance(first, slice) else (slice(None),)
             return self[first][(*before, *others)]
         if isinstance(rows, slice):
@@ -56,18 +56,22 @@ class Column:
         numbers = np.asarray(rows)
         if numbers.dtype == bool:
             if numbers.shape != (len(self),):
-                raise IndexError(f"a mask of shape {numbers.shape}: {(len(self),)} is needed")
+                raise IndexError(f"the mask has shape {numbers.shape}: it must be {(len(self),)}")
             numbers = numbers.nonzero()[0]
         if numbers.size and numbers.dtype.kind not in "iu":
-            raise IndexError(f"rows of type {numbers.dtype}: numbers, a slice or a mask are needed")
+            raise IndexError(
+                f"rows are indexed by integers, a slice or a mask, not by {numbers.dtype}"
+            )
         numbers = numbers.astype(np.int64)
         if numbers.size and (numbers.min() < -len(self) or numbers.max() >= len(self)):
-            raise IndexError(f"rows from {numbers.min()} to {numbers.max()}: there are {len(self)}")
+            raise IndexError(
+                f"rows {numbers.min()} to {numbers.max()} are out of range: there are {len(self)}"
+            )
         return self._take(np.where(numbers < 0, numbers + len(self), numbers))
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         if copy is False:
-            raise ValueError("a column over shards is copied when made an array")
+            raise ValueError("a column can't become an array without a copy")
         values = self[:]
         return values.astype(dtype or self.dtype, copy=not values.flags.owndata)
 
@@ -76,14 +80,15 @@ class Column:
             yield from chunk
 
     def chunks(self, size: int = _CHUNK) -> Iterator[Array]:
-        """All rows in order, in views of at most that many."""
-        for shard in range(len(self._ends)):
-            part = self._part(shard)
-            for start in range(0, len(part), size):
-                yield part[start : start + size]
+        """All rows in order, in views of at most `size` rows."""
+        first = 0
+        for shard, end in enumerate(self._ends):
+            for start in range(0, end - first, size):
+                yield self._part(shard)[start : start + size]  # its file is looked at each time
+            first = end
 
     def parts(self, rows: NDArray[np.int64]) -> Iterator[Array]:
-        """Those rows in their order, copies of some at a time."""
+        """The given rows in their order, copied some at a time."""
         for start in range(0, len(rows), _CHUNK):
             yield self[rows[start : start + _CHUNK]]
 
@@ -119,14 +124,14 @@ class Column:
 
 @dataclass(frozen=True)
 class Scaler:
-    """Scales each feature to [-1, 1] over the rows it was fitted on; a constant one to 0."""
+    """Scales each feature to [-1, 1] over the rows it was fitted to, and a constant one to 0."""
 
     low: NDArray[np.float32]  # (d,)
     high: NDArray[np.float32]  # (d,)
 
     @classmethod
     def fit(cls, column: Column, rows: NDArray[np.int64]) -> "Scaler":
-        """The extrema of those rows of a column (N, d)."""
+        """Fit to the minima and maxima of some rows of a column (N, d)."""
         low = np.full(column.shape[1:], np.inf, column.dtype)
         high = -low
         for values in column.parts(rows):
@@ -136,18 +141,18 @@ class Scaler:
 
     @cached_property
     def half_width(self) -> Array:
-        """What a feature is divided by, (d,); 1 for a constant one."""
+        """What each feature is divided by, (d,); 1 for a constant one."""
         half_width = (self.high - self.low) / 2
         half_width[half_width == 0] = 1
         return half_width
 
     @cached_property
     def centre(self) -> Array:
-        """What becomes 0, (d,)."""
+        """The value of each feature that is scaled to 0, (d,)."""
         return (self.high + self.low) / 2
 
     def scale(self, values: Array) -> Array:
-        """Physical units (n, d) to [-1, 1]; beyond it where the fitted rows didn't reach."""
+        """Physical units (n, d) to [-1, 1]; values outside the fitted range go beyond it."""
         return (values - self.centre) / self.half_width
 
     def unscale(self, scaled: Array) -> Array:
@@ -156,27 +161,32 @@ class Scaler:
 
 
 class Batches:
-    """Passes over rows of some columns, in batches, each pass in another seeded order.
+    """Passes over rows of some columns in shuffled batches; each iteration is the next pass.
 
-    Where the rows fit in memory they are loaded once and a pass is a uniform permutation. Where
-    they don't, runs of consecutive rows are drawn in random order, as many as fit, and shuffled
-    among themselves; every row still comes once in a pass. Iterate for the next pass.
+    If the rows fit in memory, they are loaded once and a pass is a uniform permutation. If they
+    don't, runs of consecutive rows are drawn in random order, as many as fit, and shuffled
+    together; every row still comes exactly once in a pass.
 
     Args:
         columns: by name.
-        rows: row numbers to go over, sorted.
-        size: rows in a batch; the last of a pass may be smaller.
+        rows: sorted row numbers.
+        size: rows per batch; the last of a pass may be smaller.
         seed: of the order.
-        memory: how many bytes may be held.
+        memory: limit of the rows held in memory [bytes].
+
+    Raises:
+        InputError: `size` is below 1, or `seed` below 0.
     """
 
-    _RUN = 1024  # rows read together when they don't all fit
+    _RUN = 1024  # consecutive rows read together if they don't all fit
 
     def __init__(
         self, columns: dict[str, Column], rows: NDArray[np.int64], size: int, seed: int, memory: int
     ):
         if size < 1 or seed < 0:
-            raise InputError(f"batches of {size} with seed {seed}: at least 1 and 0 are needed")
+            raise InputError(
+                f"the batch size is {size} and the seed {seed}: they must be at least 1 and 0"
+            )
         self._columns = columns
         self._rows = rows
         self._size = size
@@ -191,7 +201,7 @@ class Batches:
 
     @property
     def in_memory(self) -> bool:
-        """Whether the rows fit."""
+        """Whether the rows fit in memory."""
         return len(self._rows) <= self._fitting
 
     def __iter__(self) -> Iterator[dict[str, Array]]:

@@ -2,103 +2,34 @@
 
 import hashlib
 import json
-import math
 import operator
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from jbrep.dataset.schema import (
-    EPISODES,
-    FORMAT,
-    FORMAT_VERSION,
-    Columns,
-    Spec,
-    all_specs,
-    check_root_seed,
-    step_specs,
-)
+from jbrep.dataset.schema import EPISODES, FORMAT, FORMAT_VERSION, Columns
+from jbrep.dataset.settings import Settings
 from jbrep.dataset.shard import (
-    MEND,
+    REPAIR,
+    FileState,
     Shard,
     column_hashes,
     file_hash,
+    file_state,
     map_file,
     shard_image,
 )
 from jbrep.errors import DamageError, InputError, check_version
-from jbrep.files.storage import read_regular, write_whole
-from jbrep.jitterbug.tasks import EPISODE_STEPS, Task, get_task
+from jbrep.files.storage import exists, read_regular, write_whole
+from jbrep.jitterbug.tasks import EPISODE_STEPS, Task
 
 MANIFEST = "manifest.json"
 BACKUP = "manifest.backup.json"
 _PACKAGES = ("jbrep", "mujoco", "numpy", "h5py")
-_HASH = "sha256"  # of all else in the manifest
-_MAX_STEPS = 10**12  # episodes have 32-bit numbers
-_MAX_BYTES = 1 << 25  # of a manifest; a shard takes 1.5 kB of it
-_MAX_SHARDS = 10_000
-_MAX_SHARD_EPISODES = 10_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What decides the data, and how it is cut into shards."""
-
-    task: str
-    policy: Mapping[str, Any] = field(default_factory=lambda: {"kind": "uniform"})  # and constants
-    steps: int  # asked for; rounded up to whole episodes
-    seed: int = 0  # the root of all episodes' seeds
-    shard_episodes: int = 100
-    store_state: bool = False
-
-    def check(self) -> None:
-        """Make sure that it can be collected.
-
-        Raises:
-            InputError: unknown task, a seed out of range, or a number below 1.
-            TypeError: a value of another type.
-        """
-        get_task(self.task)
-        check_root_seed(operator.index(self.seed))
-        for count, most, what in (
-            (self.steps, _MAX_STEPS, "steps"),
-            (self.shard_episodes, _MAX_SHARD_EPISODES, "episodes in a shard"),
-        ):
-            if not 1 <= operator.index(count) <= most:
-                raise InputError(f"the number of {what} is {count}: it must be from 1 to {most:,}")
-        if self.num_shards > _MAX_SHARDS:
-            raise InputError(
-                f"{self.num_shards:,} shards are more than {_MAX_SHARDS:,}: put more than "
-                f"{self.shard_episodes} episodes in a shard"
-            )
-        if type(self.store_state) is not bool or not _is_policy(self.policy):
-            raise TypeError
-
-    @property
-    def episodes(self) -> int:
-        """How many episodes."""
-        return -(-self.steps // EPISODE_STEPS)
-
-    @property
-    def num_shards(self) -> int:
-        """How many shards hold them."""
-        return -(-self.episodes // self.shard_episodes)
-
-    def shard_range(self, shard: int) -> range:
-        """The episodes in a shard."""
-        start = shard * self.shard_episodes
-        return range(start, min(start + self.shard_episodes, self.episodes))
-
-    def specs(self) -> dict[str, Spec]:
-        """The columns of each shard."""
-        return all_specs(get_task(self.task), self.store_state)
-
-    def row_bytes(self) -> int:
-        """Bytes that a control step takes."""
-        specs = step_specs(get_task(self.task), self.store_state).values()
-        return sum(spec.dtype.itemsize * math.prod(spec.row) for spec in specs)
+_HASH = "sha256"  # of the rest of the manifest
+_MAX_BYTES = 1 << 25  # of a manifest; each shard takes 1.5 kB of it
 
 
 @dataclass(frozen=True)
@@ -113,7 +44,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a data set's folder holds."""
+    """What has been committed to a data set's folder."""
 
     settings: Settings
     versions: Mapping[str, str]  # of the packages that made it
@@ -122,7 +53,7 @@ class Manifest:
     @property
     def task(self) -> Task:
         """The task whose features the observations hold."""
-        return get_task(self.settings.task)
+        return self.settings.definition
 
     @property
     def complete(self) -> bool:
@@ -131,17 +62,17 @@ class Manifest:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 over the hashes of all columns: it names the data."""
+        """SHA-256 over the hashes of all columns: it identifies the data."""
         parts = (f"{name} {digest}\n" for e in self.shards for name, digest in e.sha256.items())
         return hashlib.sha256("".join(parts).encode()).hexdigest()
 
     def row_counts(self, shard: int, rows: int) -> dict[str, int]:
-        """How many rows each column of a shard has."""
+        """Number of rows of each column of a shard."""
         episodes = len(self.settings.shard_range(shard))
         return {n: episodes if n.startswith(EPISODES) else rows for n in self.settings.specs()}
 
     def attributes(self, shard: int, rows: int) -> dict[str, Any]:
-        """What a shard's file says of itself."""
+        """The HDF5 attributes of a shard's file."""
         return {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
@@ -156,45 +87,33 @@ class Manifest:
         }
 
 
-def _is_policy(settings: Mapping[str, Any]) -> bool:
-    """A kind, which is a word, and numbers."""
-    constants = {name: value for name, value in settings.items() if name != "kind"}
-    return re.fullmatch("[a-z-]+", settings["kind"]) is not None and all(
-        type(value) in (int, float) and abs(value) < _MAX_STEPS for value in constants.values()
-    )
-
-
 def shard_name(shard: int) -> str:
-    """File name of the shard of that number."""
+    """File name of a shard."""
     return f"shard-{shard:05d}.h5"
 
 
 def new_manifest(settings: Settings) -> Manifest:
-    """A manifest without shards, of the versions that are installed."""
-    from importlib.metadata import version  # not at the top: readers needn't wait for it
+    """A manifest without shards, with the installed versions."""
+    from importlib.metadata import version  # slow to import, and readers don't need it
 
     return Manifest(settings, {name: version(name) for name in _PACKAGES})
 
 
 def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
-    """The manifest of a data set, or its backup, checked to the last bit.
+    """Read the manifest of a data set, or its backup, and check every byte of it.
 
     Raises:
-        InputError: no data set there, or one that a newer jbrep wrote.
-        DamageError: not what jbrep wrote.
+        InputError: there is no data set, or a newer jbrep wrote it.
+        DamageError: it isn't what jbrep wrote.
     """
     path = folder / name
     try:
         raw = read_regular(path, _MAX_BYTES)
     except (FileNotFoundError, NotADirectoryError):
-        if (folder / BACKUP).exists() or any(hdf5_files(folder)):
-            raise DamageError(f"{path} is missing: {MEND}") from None
-        raise InputError(
-            f"no data set in {folder}: a folder that jbrep collect wrote is expected"
-        ) from None
+        raise _explain_missing(path) from None
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error
-    damage = DamageError(f"{path} is damaged: it isn't what jbrep wrote; {MEND}")
+    damage = DamageError(f"{path} is damaged: it isn't what jbrep wrote; {REPAIR}")
     try:
         record = json.loads(raw)
         if raw != _text(record) or record["format"] != FORMAT:
@@ -209,8 +128,34 @@ def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
         raise damage from None
 
 
+def _explain_missing(path: Path) -> InputError:
+    """The error for a manifest, or its backup, that isn't there: with what helps."""
+    folder, other = path.parent, BACKUP if path.name == MANIFEST else MANIFEST
+    files = hdf5_files(folder)
+    if exists(folder / other):
+        if path.name == MANIFEST and not files and _is_empty_backup(folder):
+            return InputError(
+                f"nothing has been collected in {folder} yet: run the same jbrep collect again"
+            )
+        return DamageError(f"{path} is missing: {REPAIR}")
+    if files:
+        return DamageError(
+            f"{folder} has {len(files)} HDF5 files but neither {MANIFEST} nor {BACKUP}, without "
+            "which they can't be checked: collect again in another folder"
+        )
+    return InputError(f"no data set in {folder}: expected a folder that jbrep collect wrote")
+
+
+def _is_empty_backup(folder: Path) -> bool:
+    """Whether the collector was killed before its first manifest, once the backup was there."""
+    try:
+        return not read_manifest(folder, BACKUP).shards
+    except InputError:
+        return False
+
+
 def _text(record: dict[str, Any]) -> bytes:
-    """The one way to write a record: any other byte is damage."""
+    """The bytes of a record as jbrep writes it; any other byte is damage."""
     body = {key: value for key, value in record.items() if key != _HASH}
     digest = hashlib.sha256(json.dumps(body).encode()).hexdigest()
     return (json.dumps({**body, _HASH: digest}, indent=1) + "\n").encode()
@@ -218,7 +163,6 @@ def _text(record: dict[str, Any]) -> bytes:
 
 def _parse(record: dict[str, Any]) -> Manifest:
     settings = Settings(**record["settings"])
-    settings.check()
     shards = tuple(Entry(**entry) for entry in record["shards"])
     columns = set(settings.specs())
     if len(shards) > settings.num_shards or any(e.sha256.keys() != columns for e in shards):
@@ -236,39 +180,38 @@ def _parse(record: dict[str, Any]) -> Manifest:
 
 
 def open_shard(
-    folder: Path, manifest: Manifest, shard: int, known: set[tuple[int, ...]] | None = None
+    folder: Path, manifest: Manifest, shard: int, checked: set[FileState] | None = None
 ) -> Shard:
-    """A shard's columns, once its bytes are found to be those committed.
+    """Open a shard once its bytes have been checked against the manifest.
 
     Args:
         folder: of the data set.
-        manifest: which bytes they are.
+        manifest: with the size and the hash of the shard.
         shard: its number.
-        known: marks of files that were found so before, to be added to: while a file stays the
-            same one, it isn't read through again.
+        checked: states of files that have been checked before; this one's is added. A file in one
+            of these states isn't hashed again.
 
     Raises:
-        DamageError: they aren't, or it is missing.
+        DamageError: the bytes differ, or the file is missing.
     """
     path, entry = folder / shard_name(shard), manifest.shards[shard]
+    state = file_state(path)  # before it is mapped: a file replaced in between is hashed again
     content = map_file(path)
-    status = path.stat()
-    mark = (shard, status.st_ino, status.st_size, status.st_mtime_ns)
-    if known is None or mark not in known:
+    if checked is None or state not in checked:
         if len(content) != entry.bytes or file_hash(content) != entry.xxh3:
             raise DamageError(
-                f"{path} is damaged: {len(content):,} bytes that aren't the {entry.bytes:,} that "
-                f"were committed; {MEND}"
+                f"{path} is damaged: its {len(content):,} bytes aren't the {entry.bytes:,} bytes "
+                f"that were committed; {REPAIR}"
             )
-        if known is not None:
-            known.add(mark)
+        if checked is not None:
+            checked.add(state)
     return Shard(path, content, manifest.settings.specs(), manifest.row_counts(shard, entry.rows))
 
 
 def hdf5_files(folder: Path) -> list[Path]:
-    """The files that should be shards; list them before the manifest is read.
+    """The files that should be shards.
 
-    Then whatever a collector commits in between is in the manifest at least.
+    List them before reading the manifest: it then names all those that a collector has committed.
     """
     try:
         return sorted(folder.glob("*.h5"))
@@ -277,34 +220,32 @@ def hdf5_files(folder: Path) -> list[Path]:
 
 
 def check_files(folder: Path, manifest: Manifest, files: list[Path]) -> None:
-    """Make sure that the files are the shards of the manifest, by name and size.
+    """Check that the files are the shards of the manifest, by name and size.
 
     Raises:
-        DamageError: one is missing, cut short, or not one of them.
+        DamageError: one is missing, has another size, or isn't in the manifest.
     """
     for problem in file_problems(folder, manifest, files):
         raise DamageError(problem)
 
 
 def file_problems(folder: Path, manifest: Manifest, files: list[Path]) -> Iterator[str]:
-    """What `check_files` finds wrong, a line for each file."""
+    """What `check_files` raises, as a line for each file."""
     for shard, entry in enumerate(manifest.shards):
         path = folder / shard_name(shard)
         try:
             size = path.lstat().st_size
         except FileNotFoundError:
-            yield f"{path} is missing: {MEND}"
+            yield f"{path} is missing: {REPAIR}"
             continue
         if size != entry.bytes:
-            yield (
-                f"{path} is damaged: it has {size:,} bytes, {entry.bytes:,} were committed; {MEND}"
-            )
+            yield (f"{path} is damaged: it has {size:,} bytes instead of {entry.bytes:,}; {REPAIR}")
     for path in unlisted_files(manifest, files):
         yield f"{path} is not one of the {len(manifest.shards)} shards of the data set"
 
 
 def unlisted_files(manifest: Manifest, files: list[Path]) -> list[Path]:
-    """Files that the manifest doesn't name, nor are they the shard whose commit is under way."""
+    """Files that are neither in the manifest nor the shard being committed."""
     known = {shard_name(shard) for shard in range(len(manifest.shards))}
     if not manifest.complete:
         known.add(shard_name(len(manifest.shards)))
@@ -315,7 +256,7 @@ def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
     """Write the next shard, then the manifest that names it.
 
     Raises:
-        InputError: it can't be written; the message says where and how much.
+        InputError: it can't be written.
     """
     shard = len(manifest.shards)
     entry = write_shard(folder, manifest, shard, columns)
@@ -325,7 +266,7 @@ def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
 
 
 def write_shard(folder: Path, manifest: Manifest, shard: int, columns: Columns) -> Entry:
-    """Write a shard's file; it doesn't count before a manifest names it.
+    """Write a shard's file; it counts once a manifest names it.
 
     Raises:
         InputError: it can't be written.
@@ -338,7 +279,7 @@ def write_shard(folder: Path, manifest: Manifest, shard: int, columns: Columns) 
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Put the manifest in place of the one before, and its backup, which is written first.
+    """Write the backup, then the manifest, in place of the previous ones.
 
     Raises:
         InputError: it can't be written.

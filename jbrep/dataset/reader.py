@@ -1,6 +1,7 @@
-"""A data set as a reader sees it."""
+"""Reading a data set."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate
 from pathlib import Path
@@ -10,9 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.columns import Batches, Column, Scaler
-from jbrep.dataset.manifest import check_files, hdf5_files, open_shard, read_manifest
-from jbrep.dataset.schema import EPISODES, step_specs
-from jbrep.dataset.shard import Shard
+from jbrep.dataset.manifest import (
+    check_files,
+    hdf5_files,
+    open_shard,
+    read_manifest,
+    shard_name,
+)
+from jbrep.dataset.schema import EPISODES, episode_bounds, step_specs
+from jbrep.dataset.shard import FileState, Shard, file_state
 from jbrep.errors import InputError
 
 _OPEN_SHARDS = 256  # memory-mapped at a time: each takes a file descriptor
@@ -26,25 +33,56 @@ class Split(NamedTuple):
     test: NDArray[np.int64]
 
 
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One episode of a data set.
+
+    Attributes:
+        dataset: the data set.
+        number: of the episode, from 0.
+        rows: its rows in the columns of the data set.
+    """
+
+    dataset: "Dataset"
+    number: int
+    rows: slice
+
+    def __len__(self) -> int:
+        return int(self.rows.stop - self.rows.start)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Its rows of a column, an observable or a feature, (len(self), ...)."""
+        return self.dataset[name][self.rows]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What is stored once per episode: seed, length, return, initial_qpos and more."""
+        return {name: column[self.number] for name, column in self.dataset.episodes.items()}
+
+    def __repr__(self) -> str:
+        return f"Episode({self.number} of {str(self.dataset.folder)!r}, {len(self):,} rows)"
+
+
 class Dataset:
-    """A collected data set; a shard is checked against the manifest before a row of it is seen.
+    """A collected data set; every shard is checked against the manifest before it is read.
 
     `dataset["observation"]` is a `Column`: one array over all shards that copies only what is
     asked for. So are the other columns, the observables (`dataset["velocity"]`) and the single
     features (`dataset["velocity_x"]`). While a collector writes, it is the part committed when
-    the data set was opened.
+    the data set was opened. A shard that changes on disk is checked again when it is next used;
+    arrays taken from it before are views of the file, and may change with it.
 
     Args:
-        folder: where `jbrep collect` wrote it.
+        folder: that `jbrep collect` wrote.
 
     Attributes:
         manifest: settings, versions and hashes.
         task: the task whose features the observations hold.
 
     Raises:
-        InputError: no data set there.
-        DamageError: a file is damaged, missing or not one of the data set; also later, when
-            rows of a damaged shard are asked for.
+        InputError: there is no data set.
+        DamageError: a file is damaged, missing or not part of the data set; also later, when
+            rows of a damaged shard are read.
     """
 
     def __init__(self, folder: str | Path):
@@ -53,13 +91,17 @@ class Dataset:
         self.manifest = read_manifest(self.folder)
         check_files(self.folder, self.manifest, files)
         self.task = self.manifest.task
-        self._known: set[tuple[int, ...]] = set()
-        self._shard = lru_cache(_OPEN_SHARDS)(self._open)
+        self._checked: set[FileState] = set()
+        self._opened = lru_cache(_OPEN_SHARDS)(self._open)
         self._ends = list(accumulate(entry.rows for entry in self.manifest.shards))
         self._specs = step_specs(self.task, self.manifest.settings.store_state)
 
-    def _open(self, shard: int) -> Shard:
-        return open_shard(self.folder, self.manifest, shard, self._known)
+    def _shard(self, shard: int) -> Shard:
+        """A shard as it is on disk now: another state of its file is another entry of the cache."""
+        return self._opened(shard, file_state(self.folder / shard_name(shard)))
+
+    def _open(self, shard: int, state: FileState) -> Shard:
+        return open_shard(self.folder, self.manifest, shard, self._checked)
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -91,7 +133,7 @@ class Dataset:
 
     @cached_property
     def _places(self) -> dict[str, tuple[int | slice, tuple[int, ...]]]:
-        """Where observables and features stand in an observation, and the shape of their rows."""
+        """Index in an observation, and shape of a row, of each observable and feature."""
         places: dict[str, tuple[int | slice, tuple[int, ...]]] = {}
         start = 0
         for observable in self.task.observables:
@@ -115,11 +157,29 @@ class Dataset:
             if name.startswith(EPISODES)
         }
 
+    @cached_property
+    def _bounds(self) -> NDArray[np.int64]:
+        return episode_bounds(self.episodes["length"])
+
+    def episode(self, number: int) -> Episode:
+        """One episode: its rows, its part of each column, and what is stored once for it.
+
+        Raises:
+            InputError: there is no such episode.
+        """
+        count = len(self.episodes["length"])
+        if not 0 <= number < count:
+            raise InputError(
+                f"{self.folder} has no episode {number}: it has {count:,}, numbered from 0"
+            )
+        start, stop = self._bounds[number : number + 2].tolist()
+        return Episode(self, number, slice(start, stop))
+
     def split(self, test: float = 0.2, seed: int = 0) -> Split:
         """Rows to train on and rows held out; no episode is in both.
 
         Args:
-            test: share of the episodes to hold out, in (0, 1); at least one episode.
+            test: share of the episodes to hold out, in (0, 1); at least one is held out.
             seed: of the draw.
 
         Raises:
@@ -130,7 +190,9 @@ class Dataset:
         lengths = self.episodes["length"]
         filled = np.flatnonzero(lengths)
         if len(filled) < 2:
-            raise InputError(f"{len(filled)} episode can't be split: collect at least 2")
+            raise InputError(
+                f"a split needs at least 2 episodes with rows: {self.folder} has {len(filled)}"
+            )
         count = min(max(1, round(test * len(filled))), len(filled) - 1)
         held_out = np.zeros(len(lengths), dtype=bool)
         held_out[np.random.default_rng(seed).permutation(filled)[:count]] = True
@@ -138,7 +200,7 @@ class Dataset:
         return Split(np.flatnonzero(~is_test), np.flatnonzero(is_test))
 
     def fit_scaler(self, rows: NDArray[np.int64]) -> Scaler:
-        """The scaling of observations to [-1, 1] over those rows: the training part's, say."""
+        """The scaling of observations to [-1, 1] over some rows, such as the training part."""
         return Scaler.fit(self["observation"], rows)
 
     def batches(
@@ -149,14 +211,14 @@ class Dataset:
         seed: int = 0,
         memory: int = _MEMORY,
     ) -> Batches:
-        """Shuffled passes over rows, from memory or, where they don't fit, from the disk.
+        """Shuffled passes over rows, from memory or, if they don't fit, from disk.
 
         Args:
-            rows: sorted row numbers; all if not given.
+            rows: sorted row numbers; None takes all.
             columns: names of columns, observables or features.
-            size: rows in a batch.
+            size: rows per batch.
             seed: of the order.
-            memory: bytes that may be held.
+            memory: limit of the rows held in memory [bytes].
         """
         rows = np.arange(len(self)) if rows is None else rows
         return Batches({name: self[name] for name in columns}, rows, size, seed, memory)

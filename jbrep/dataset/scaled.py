@@ -1,4 +1,4 @@
-"""A data set as representations are learned from it: split by episode, scaled to [-1, 1]."""
+"""A data set prepared for learning representations: split by episode, scaled to [-1, 1]."""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -12,14 +12,14 @@ from jbrep.errors import InputError
 
 
 def sample(rows: NDArray[Any], most: int) -> NDArray[Any]:
-    """At most so many of them, in order; always the same draw, and of any step of an episode."""
+    """At most `most` of the rows, drawn at random, always the same ones, in order."""
     if len(rows) <= most:
         return rows
     return rows[np.sort(np.random.default_rng(0).choice(len(rows), most, replace=False))]
 
 
 class Moments(NamedTuple):
-    """What linear methods need to know of the training part."""
+    """Mean and covariance, which is all that linear methods need."""
 
     mean: NDArray[np.float64]  # (d,)
     covariance: NDArray[np.float64]  # (d, d)
@@ -29,13 +29,14 @@ class ScaledDataset:
     """Observations scaled to [-1, 1] by the extrema of the training part.
 
     Attributes:
-        dataset: where they are.
+        dataset: the data set itself.
+        task: the task of the observations.
         train: sorted rows of 80 % of the episodes.
         test: sorted rows of the others.
-        scaler: fitted on the training rows alone.
+        scaler: fitted to the training rows only.
 
     Raises:
-        InputError: fewer than two episodes, or a number that is not finite.
+        InputError: fewer than two episodes, or numbers that aren't finite.
     """
 
     def __init__(self, dataset: Dataset):
@@ -45,24 +46,26 @@ class ScaledDataset:
         self.scaler = dataset.fit_scaler(self.train)
         unseen = dataset.fit_scaler(self.test)
         extrema = (self.scaler.low, self.scaler.high, unseen.low, unseen.high)
-        broken = np.asarray(~np.isfinite(extrema).all(axis=0))
-        if broken.any():
-            bad = ", ".join(self._names(broken))
+        not_finite = np.asarray(~np.isfinite(extrema).all(axis=0))
+        if not_finite.any():
+            bad = ", ".join(self._names(not_finite))
             raise InputError(
-                f"{dataset.folder} holds numbers that aren't finite in {bad}: look with jbrep data "
-                "verify"
+                f"{dataset.folder} has values that aren't finite in {bad}: run jbrep data verify"
             )
+
+    def __repr__(self) -> str:
+        return f"ScaledDataset({self.dataset!r}, {len(self.train):,} rows to train on)"
 
     @property
     def constant_features(self) -> tuple[str, ...]:
-        """Features that never vary over the training rows; they are scaled to 0."""
+        """Features that are constant over the training rows; they are scaled to 0."""
         return self._names(self.scaler.low == self.scaler.high)
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
         return tuple(np.array(self.task.feature_names)[which].tolist())
 
     def observations(self, rows: NDArray[np.int64]) -> Iterator[NDArray[np.float32]]:
-        """Observations of those rows in physical units, in order, some (n, d) at a time."""
+        """Observations of the rows in physical units, in order, in chunks (n, d)."""
         return self.dataset["observation"].parts(rows)
 
     def chunks(self, rows: NDArray[np.int64]) -> Iterator[NDArray[np.float32]]:
@@ -70,7 +73,7 @@ class ScaledDataset:
         return map(self.scaler.scale, self.observations(rows))
 
     def load(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Scaled observations of those rows, (n, d)."""
+        """Scaled observations of the rows, (n, d)."""
         loaded = np.empty((len(rows), self.task.size), np.float32)
         start = 0
         for chunk in self.chunks(rows):

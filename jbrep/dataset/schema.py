@@ -1,4 +1,4 @@
-"""What a data set holds: the columns, and how an episode's seed follows from the root seed."""
+"""The columns of a data set, and how an episode's seed follows from the root seed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import QPOS_SIZE, QVEL_SIZE, Task
 
 Columns = Mapping[str, NDArray[Any]]
 
 FORMAT = "jbrep data set"
 FORMAT_VERSION = 1
+STATE_COLUMNS = ("qpos", "qvel")  # stored on request
 EPISODES = "episodes/"  # the HDF5 group of the columns with one row for each episode
 
-_MAX_ROOT = 2**31 - 2
+MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def all_specs(task: Task, store_state: bool) -> dict[str, Spec]:
 
 
 def episode_columns(columns: Columns) -> dict[str, NDArray[Any]]:
-    """Those of a shard's columns that have a row for each episode, by their names in the group."""
+    """The columns of a shard with a row for each episode, by their names in the group."""
     return {
         name.removeprefix(EPISODES): column
         for name, column in columns.items()
@@ -82,27 +82,22 @@ def episode_columns(columns: Columns) -> dict[str, NDArray[Any]]:
     }
 
 
-def check_root_seed(seed: int) -> None:
-    """Make sure that `episode_seed` can take it.
-
-    Raises:
-        InputError: it is out of range.
-    """
-    if not 0 <= seed <= _MAX_ROOT:
-        raise InputError(f"the seed is {seed}: it must be from 0 to {_MAX_ROOT:,}")
-
-
 def episode_seed(root: int, episode: int) -> int:
     """The seed of an episode: (root + 1) * 2**32 + episode.
 
     No two episodes share one, within a data set or between data sets of different root seeds,
-    and none is small enough to be one that people give an environment. `env.reset(seed=...)`
-    with it starts the same episode.
+    and none is as small as the seeds that people choose. `env.reset(seed=...)` with it starts
+    the same episode.
     """
     return ((root + 1) << 32) + episode
 
 
+def episode_bounds(lengths: NDArray[Any]) -> NDArray[np.int64]:
+    """Where episodes begin and end: episode i has rows bounds[i] to bounds[i + 1], (n + 1,)."""
+    return np.concatenate(([0], np.cumsum(lengths, dtype=np.int64)))
+
+
 def episode_returns(reward: NDArray[np.float32], lengths: NDArray[Any]) -> NDArray[np.float64]:
-    """Sums over the episodes of the rewards stored, in double precision, in the order of rows."""
+    """Sum of the stored rewards of each episode, in double precision, in the order of rows."""
     owner = np.repeat(np.arange(len(lengths)), lengths)
     return np.bincount(owner, reward, len(lengths)).astype(np.float64)

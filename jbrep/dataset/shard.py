@@ -18,7 +18,8 @@ from jbrep.errors import DamageError, InputError
 from jbrep.files.storage import regular_size
 from jbrep.jitterbug.tasks import EPISODE_STEPS
 
-MEND = "jbrep data repair makes it again"
+REPAIR = "run jbrep data repair to restore it"
+FileState = tuple[int, ...] | None  # see `file_state`
 _HASH = "sha256"  # attribute of every column
 
 
@@ -33,7 +34,7 @@ def column_hashes(columns: Columns) -> dict[str, str]:
 
 
 def file_hash(content: Any) -> str:
-    """XXH3 of a whole file: it finds damage at the speed of memory, each time a file is read."""
+    """XXH3 of a whole file: fast enough to look for damage whenever a file is opened."""
     return xxhash.xxh3_128_hexdigest(content)
 
 
@@ -49,40 +50,49 @@ def shard_image(
         return file.id.get_file_image()
 
 
+def file_state(path: Path) -> FileState:
+    """What changes with a file's content: inode, size and modification time; None if it's gone."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
 def map_file(path: Path) -> mmap.mmap:
-    """A file's bytes as they are on disk.
+    """Map a file into memory, read-only.
 
     Raises:
-        DamageError: no such file, not a regular one, or an empty one.
+        DamageError: there is no such file, or it is empty or not a regular file.
         InputError: it can't be read.
     """
     try:
         if not regular_size(path):
             raise DamageError(
-                f"{path} is damaged: a regular file that isn't empty is expected, and no link"
+                f"{path} is damaged: it must be a regular file, not empty and not a link"
             )
         with path.open("rb") as file:
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except FileNotFoundError:
-        raise DamageError(f"{path} is missing: {MEND}") from None
+        raise DamageError(f"{path} is missing: {REPAIR}") from None
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error
 
 
 class Shard(Mapping[str, NDArray[Any]]):
-    """The columns of a shard as read-only views of its bytes, each checked when first asked for.
+    """The columns of a shard as read-only views of its bytes, each checked at its first use.
 
-    Nothing but contiguous data inside this very file is accepted, so HDF5 is never asked to read
-    any: no link, external file, virtual data set or filter is followed.
+    Only contiguous data inside the file itself is accepted, so HDF5 never reads any data: no link,
+    external file, virtual data set or filter is followed.
 
     Args:
-        path: of the shard, for the messages and for HDF5's structure.
+        path: of the shard, for messages and for reading HDF5's structure.
         content: its bytes.
-        specs: the columns that are expected, no more and no fewer.
-        rows: how many rows each has.
+        specs: the expected columns, no more and no fewer.
+        rows: number of rows of each.
 
     Raises:
-        DamageError: when a column is asked for, if the file's structure is another.
+        DamageError: at the use of a column, if the file is structured differently.
     """
 
     def __init__(
@@ -110,7 +120,7 @@ class Shard(Mapping[str, NDArray[Any]]):
                 offset = self._offset(h5py.h5d.open(file, name.encode()), name, spec.dtype, shape)
             count = math.prod(shape)
             if offset + count * spec.dtype.itemsize > len(self._content):
-                raise self._damage(f"{name} goes beyond its end")
+                raise self._damage(f"{name} extends beyond the end of the file")
             view = np.frombuffer(self._content, spec.dtype, count, offset).reshape(shape)
             if name == EPISODES + "length":
                 self._check_lengths(view)
@@ -118,7 +128,7 @@ class Shard(Mapping[str, NDArray[Any]]):
         return self._views[name]
 
     def _check_lengths(self, lengths: NDArray[Any]) -> None:
-        """Rows are found by them."""
+        """Check that the episodes have as many rows as the shard: they locate its rows."""
         rows = self._rows["step"]
         if lengths.min() < 0 or lengths.max() > EPISODE_STEPS or lengths.sum() != rows:
             raise self._damage(f"the lengths of its episodes don't add up to {rows:,} rows")
@@ -128,7 +138,7 @@ class Shard(Mapping[str, NDArray[Any]]):
 
     @contextmanager
     def _structure(self) -> Iterator[h5py.h5f.FileID]:
-        """The file as HDF5 sees it; what HDF5 can't make sense of is damage."""
+        """The file as HDF5 sees it; anything that HDF5 can't parse is damage."""
         try:
             with h5py.File(self._path, "r", locking=False) as file:
                 yield file.id
@@ -138,7 +148,7 @@ class Shard(Mapping[str, NDArray[Any]]):
             raise self._damage("it isn't an HDF5 file of flat columns") from error
 
     def _check_names(self, file: h5py.h5f.FileID) -> None:
-        """The file holds the columns that are expected, by hard links, and nothing else."""
+        """Check that the file holds the expected columns, by hard links, and nothing else."""
         names = {name.encode() for name in self._specs}
         self._check_links(h5py.h5g.open(file, b"/"), {n.partition(b"/")[0] for n in names})
         for group in {name.rpartition(b"/")[0] for name in names} - {b""}:
@@ -148,24 +158,24 @@ class Shard(Mapping[str, NDArray[Any]]):
     def _check_links(self, group: h5py.h5g.GroupID, names: set[bytes]) -> None:
         if group.get_num_objs() != len(names):
             raise self._damage(
-                f"{group.get_num_objs()} entries beside {b', '.join(sorted(names)).decode()}, "
-                f"which are {len(names)}"
+                f"it has {group.get_num_objs()} entries instead of the {len(names)} expected: "
+                f"{b', '.join(sorted(names)).decode()}"
             )
         for name in names:
             if group.links.get_info(name).type != h5py.h5l.TYPE_HARD:
-                raise self._damage(f"{name.decode()} is a link to elsewhere, which is refused")
+                raise self._damage(f"{name.decode()} is a link, which isn't accepted")
 
     def _offset(
         self, column: h5py.h5d.DatasetID, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]
     ) -> int:
-        """Where the column begins in the file, once its layout is found to be plain."""
+        """Where the column begins in the file, after checking that its layout is plain."""
         layout = column.get_create_plist()
         if layout.get_layout() != h5py.h5d.CONTIGUOUS or layout.get_external_count():
             raise self._damage(f"{name} is not stored contiguously in this file")
         if column.shape != shape or column.dtype != dtype:
             raise self._damage(
-                f"{name} has shape {column.shape} and type {column.dtype}: {shape} and {dtype} "
-                "are expected"
+                f"{name} has shape {column.shape} and type {column.dtype} instead of {shape} and "
+                f"{dtype}"
             )
         offset: int | None = column.get_offset()
         if offset is None and 0 not in shape:

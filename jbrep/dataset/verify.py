@@ -1,4 +1,4 @@
-"""Is a data set what it says it is? Hashes, shapes, numbers and ranges."""
+"""Verifying a data set: hashes, shapes, numbers and ranges."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,17 +16,27 @@ from jbrep.dataset.manifest import (
     read_manifest,
     shard_name,
 )
-from jbrep.dataset.schema import EPISODES, Columns, episode_columns, episode_returns, episode_seed
-from jbrep.dataset.shard import MEND, column_hash
+from jbrep.dataset.schema import (
+    EPISODES,
+    Columns,
+    episode_bounds,
+    episode_columns,
+    episode_returns,
+    episode_seed,
+)
+from jbrep.dataset.shard import REPAIR, column_hash
 from jbrep.errors import DamageError, InputError
 from jbrep.jitterbug.tasks import EPISODE_STEPS, Task
 from jbrep.progress import Progress
 
-_BOUNDED = ("rad", "1")  # angles are wrapped, quaternions are of length 1: their ranges are bounds
+_BOUNDED = ("rad", "1")  # units of wrapped angles and unit quaternions: their ranges are bounds
 
 
 def find_problems(folder: Path) -> Iterator[str]:
-    """Everything about the files of a data set that isn't as it should be, a line for each.
+    """Check the files of a data set.
+
+    Yields:
+        A line for each problem.
 
     Raises:
         InputError: there is no data set.
@@ -45,7 +55,7 @@ def find_problems(folder: Path) -> Iterator[str]:
             columns = dict(open_shard(folder, manifest, shard))
         except DamageError as damage:
             if path.exists() and path.lstat().st_size == manifest.shards[shard].bytes:
-                yield str(damage)  # else its size or absence has been told
+                yield str(damage)  # a wrong size or absence has been reported above
             continue
         for problem in _hash_problems(manifest, shard, columns):
             yield f"{path}: {problem}"
@@ -54,7 +64,7 @@ def find_problems(folder: Path) -> Iterator[str]:
 
 
 def _backup_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
-    """The backup may be a shard ahead of the manifest of an unfinished data set, no more."""
+    """The backup equals the manifest, or is one shard ahead while the data set is unfinished."""
     try:
         backup = read_manifest(folder, BACKUP)
     except InputError as error:
@@ -63,17 +73,17 @@ def _backup_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
     ahead = len(backup.shards) - len(manifest.shards)
     known = replace(backup, shards=backup.shards[: len(manifest.shards)])
     if known != manifest or ahead not in (0, 1):
-        yield f"{folder / BACKUP} is of another data set: {MEND}"
+        yield f"{folder / BACKUP} is of another data set: {REPAIR}"
 
 
 def _hash_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
     for name, expected in manifest.shards[shard].sha256.items():
         if column_hash(columns[name]) != expected:
-            yield f"the SHA-256 of {name} is another than the manifest's"
+            yield f"the SHA-256 of {name} differs from the manifest's"
 
 
 def _content_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
-    """What the numbers themselves must fulfil."""
+    """Numbers that aren't finite, out of range, or inconsistent with each other."""
     for name, values in columns.items():
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             yield f"{name} has values that are not finite"
@@ -91,23 +101,23 @@ def _range_problems(task: Task, columns: Columns) -> Iterator[str]:
         ]
     for name, values, low, high in ranges:
         if len(values) and not np.float32(low) <= values.min() <= values.max() <= np.float32(high):
-            reach = f"goes from {values.min():g} to {values.max():g}"
-            yield f"{name} {reach}, beyond [{low:g}, {high:g}]"
+            extent = f"ranges from {values.min():g} to {values.max():g}"
+            yield f"{name} {extent}, beyond [{low:g}, {high:g}]"
 
 
 def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
-    """Numbers, seeds, starts, lengths and returns fit the settings and each other."""
+    """Episode columns that are inconsistent with the settings or with each other."""
     settings, rows = manifest.settings, manifest.shards[shard].rows
     own = episode_columns(columns)
     numbers = np.array(settings.shard_range(shard))
     seeds = [episode_seed(settings.seed, int(number)) for number in numbers]
     lengths = own["length"]
-    first = np.cumsum(lengths) - lengths
+    first = episode_bounds(lengths)[:-1]
     starts = [manifest.task.start(np.random.default_rng(seed)) for seed in seeds]
     checks: dict[str, tuple[ArrayLike, ArrayLike]] = {
         "episode numbers": (own["episode"], numbers),
         "seeds": (own["seed"], np.array(seeds)),
-        "diverged": (own["diverged"], lengths < EPISODE_STEPS),
+        "divergence": (own["diverged"], lengths < EPISODE_STEPS),
         "the rows' episode": (columns["episode"], np.repeat(numbers, lengths)),
         "the rows' step": (columns["step"], np.arange(rows) - np.repeat(first, lengths)),
         "returns": (own["return"], episode_returns(columns["reward"], lengths)),
@@ -115,6 +125,6 @@ def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Itera
         "target positions": (own["target_position"], [s.target_position for s in starts]),
         "target orientations": (own["target_quaternion"], [s.target_quaternion for s in starts]),
     }
-    for what, (found, expected) in checks.items():
-        if not np.array_equal(found, expected):
-            yield f"{what} are not what seeds, lengths and rewards make of them"
+    for what, (stored, expected) in checks.items():
+        if not np.array_equal(stored, expected):
+            yield f"{what}: inconsistent with the settings, or with other columns"

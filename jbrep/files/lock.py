@@ -1,4 +1,4 @@
-"""A folder with one writer."""
+"""Locks: a folder or a file with one writer at a time."""
 
 import os
 import socket
@@ -11,29 +11,55 @@ import filelock
 
 from jbrep.errors import InputError
 
-_LOCK = ".lock"
-
 
 @contextmanager
 def exclusive(folder: Path) -> Iterator[None]:
-    """Be the only one to write to the folder; the lock goes with the process that holds it.
+    """Be the only writer in a folder; the lock is released when its process ends.
 
     Raises:
-        InputError: another process writes there; the message names it.
+        InputError: another process is writing there; the message names it.
     """
-    path = folder / _LOCK
+    with _hold(folder / ".lock", folder):
+        yield
+
+
+@contextmanager
+def exclusive_file(path: Path) -> Iterator[None]:
+    """Be the only writer of a file or folder that may not exist yet; the lock stands beside it.
+
+    Raises:
+        InputError: another process is writing it; the message names it.
+    """
+    lock = path.with_name(f".{path.name}.lock")
+    with _hold(lock, path):
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)  # filelock notices that a lock it gets was removed
+
+
+@contextmanager
+def _hold(path: Path, locked: Path) -> Iterator[None]:
     lock = filelock.FileLock(path)
     now = datetime.now().astimezone().isoformat(" ", "seconds")
     try:
         lock.acquire(blocking=False)
         path.write_text(f"process {os.getpid()} on {socket.gethostname()} since {now}")
     except filelock.Timeout:
-        holder = path.read_text() or "another process"
-        raise InputError(f"{folder} is being written by {holder}: wait for it or stop it") from None
+        raise InputError(
+            f"{locked} is being written by {_holder(path)}: wait for it or stop it"
+        ) from None
     except OSError as error:
         lock.release()
-        raise InputError(f"can't write in {folder}: {error.strerror or error}") from error
+        raise InputError(f"can't write in {path.parent}: {error.strerror or error}") from error
     try:
         yield
     finally:
         lock.release()
+
+
+def _holder(path: Path) -> str:
+    try:
+        return path.read_text() or "another process"
+    except OSError:  # released and removed meanwhile
+        return "another process"

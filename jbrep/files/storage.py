@@ -27,7 +27,7 @@ def write_whole(path: Path, content: bytes) -> None:
         if partial.read_bytes() != content:
             raise OSError("it reads back otherwise")
         partial.replace(path)
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
     except OSError as error:
         raise InputError(
             f"can't write {path}: {error.strerror or error}; {len(content):,} bytes are needed"
@@ -37,7 +37,7 @@ def write_whole(path: Path, content: bytes) -> None:
             partial.unlink(missing_ok=True)
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Bring a rename to the disk."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:

@@ -20,7 +20,7 @@ _TIME_LIMIT = tasks.EPISODE_STEPS * tasks.CONTROL_TIMESTEP  # [s]
 
 
 class Physics(mujoco.Physics):
-    """The robot, its target, and what the tasks read of them."""
+    """The robot and its target."""
 
     def readings(self) -> Readings:
         """What the tasks read, as a batch of one; the arrays are views."""
@@ -35,7 +35,7 @@ class Physics(mujoco.Physics):
         )
 
     def uprightness(self) -> float:
-        """Cosine between the bug's z axis and the world's."""
+        """Cosine of the angle between the bug's z axis and the world's."""
         return float(self.readings().uprightness[0])
 
     def angle_to_target(self) -> float:
@@ -52,8 +52,8 @@ class Jitterbug(base.Task):
 
     Args:
         task: its name, a key of `tasks.TASKS`.
-        random: a `RandomState`, a seed, or None. A seed gives the same episodes as it does in
-            the Gymnasium environment.
+        random: a `RandomState`, a seed, or None. A seed gives the same episodes as in the
+            Gymnasium environment.
 
     Raises:
         InputError: unknown task.
@@ -66,9 +66,9 @@ class Jitterbug(base.Task):
         super().__init__(random=random)
 
     def initialize_episode(self, physics: Physics) -> None:
-        """Turn the robot and place the target, both drawn from the task's generator."""
+        """Draw the robot's orientation and the target from the task's generator."""
         start = self._task.start(self.random)
-        physics.data.qpos[3:7] = start.quaternion
+        physics.data.qpos[tasks.QUATERNION] = start.quaternion
         physics.data.mocap_pos[0] = start.target_position
         physics.data.mocap_quat[0] = start.target_quaternion
         physics.forward()
@@ -115,7 +115,7 @@ def load(
     environment_kwargs: dict[str, Any] | None = None,
     visualize_reward: bool = False,
 ) -> control.Environment:
-    """A dm_control environment of the task.
+    """Make a dm_control environment of a task.
 
     Args:
         task: a key of `tasks.TASKS`.
@@ -134,7 +134,7 @@ def load(
 
 
 def register_with_suite() -> None:
-    """Make `suite.load("jitterbug", task)` and all of the suite's task lists know the tasks."""
+    """Add the tasks to `suite.load` and to all task lists of dm_control's suite."""
     suite._DOMAINS[DOMAIN] = sys.modules[__name__]
     suite.ALL_TASKS = suite._get_tasks(tag=None)
     suite.BENCHMARKING = suite._get_tasks("benchmarking")

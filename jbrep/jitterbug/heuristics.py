@@ -1,9 +1,9 @@
 """Hand-written policies, one for each task: observations (n, d) to actions (n, 1).
 
-The bug goes where its weight swings. Swing the weight to and fro about a bearing and the bug hops
-that way, whichever way it faces. Spin the weight in bursts and the bug turns after it. A policy
-only says where to go or how far to turn. Bearings are in the bug's frame, 0 forward and counter-
-clockwise; tools/tune_heuristics.py searches over the constants.
+The bug hops toward the bearing that its weight swings back and forth about, whichever way it faces,
+and turns when the weight spins in bursts. A policy chooses the bearing or the angle to turn by.
+Bearings are in the bug's frame, 0 forward and counter-clockwise; tools/tune_heuristics.py searches
+over the constants.
 """
 
 from collections.abc import Callable
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jbrep.jitterbug.episodes import Actor, run
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import EPISODE_STEPS, Array, get_task, wrap
 
@@ -22,24 +23,24 @@ class Walk:
     pull: float = 0.88  # drive back to the bearing, at a right angle to it
     push: float = 0.47  # drive along the swing, at the bearing
     keep: float = 0.41  # drive along the swing, everywhere
-    limit: float = 0.81  # more tips the bug over
-    late: float = 0.006  # turn back that much later [s]
-    ahead: float = 0.004  # foresee the bug's own turning [s]
-    rise: float = 2.6  # more drive while the body rises, for each m/s
-    nod: float = 0.026  # and while it nods toward the bearing, for each rad/s
+    limit: float = 0.81  # largest drive; more would tip the bug over
+    late: float = 0.006  # delay of turning back [s]
+    ahead: float = 0.004  # prediction of the bug's own turning [s]
+    rise: float = 2.6  # additional drive while the body rises, per m/s
+    nod: float = 0.026  # additional drive while it pitches toward the bearing, per rad/s
 
 
 @dataclass(frozen=True)
 class Turn:
     """Constants of the gait that turns on the spot."""
 
-    burst: float = 0.73  # drive, at most
-    gentle: float = 0.42  # drive of the last touch
-    hurry: float = 0.8  # more drive for each radian to go
-    coast: float = 0.0  # drive of a weight that is fast enough
+    burst: float = 0.73  # largest drive
+    gentle: float = 0.42  # smallest drive of a burst
+    hurry: float = 0.8  # additional drive per radian to go
+    coast: float = 0.0  # drive while the weight is faster than `fast`
     fast: float = 65.0  # [rad/s]
-    near: float = 0.06  # rest when that close [rad]
-    ahead: float = 0.055  # foresee the turn under way [s]
+    near: float = 0.06  # rest when closer than this [rad]
+    ahead: float = 0.055  # prediction of the current turn [s]
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,8 @@ class Approach:
     """Constants of slowing down toward a point."""
 
     gentle: float = 0.65  # share of the drive on arrival
-    hurry: float = 3.8  # more of it for each metre to go
-    there: float = 0.0035  # rest, or turn, when that close [m]
+    hurry: float = 3.8  # additional share per metre to go
+    there: float = 0.0035  # rest, or turn, when closer than this [m]
 
 
 WALK = Walk()
@@ -59,7 +60,7 @@ POSE_TURN = Turn(burst=0.60, gentle=0.60, hurry=0.0, coast=0.12, fast=38.0, near
 
 
 def walk_toward(state: dict[str, Array], bearing: Array, walk: Walk) -> Array:
-    """The drive that hops toward the bearing; (n, 1) as all arrays here."""
+    """The drive that hops toward the bearing; this and the bearing are (n, 1)."""
     speed = state["motor_velocity"]
     spin_x, spin_y, spin_z = np.split(state["angular_velocity"], 3, axis=1)
     bearing = bearing - walk.ahead * spin_z
@@ -72,7 +73,7 @@ def walk_toward(state: dict[str, Array], bearing: Array, walk: Walk) -> Array:
 
 
 def turn_by(state: dict[str, Array], angle: Array, turn: Turn) -> Array:
-    """The drive that turns the bug by the angle, in bursts of a spinning weight."""
+    """The drive that turns the bug by the angle, (n, 1), in bursts of spinning the weight."""
     angle = angle - turn.ahead * state["angular_velocity"][:, 2:]
     side = np.sign(angle)
     burst = np.minimum(turn.gentle + turn.hurry * np.abs(angle), turn.burst)
@@ -144,23 +145,20 @@ HEURISTICS: dict[str, Callable[..., Array]] = {
 }
 
 
-def episode_returns(
-    task: str, policy: Callable[[Array], Array], episodes: int = 50, seed: int = 0
-) -> Array:
-    """Returns of whole episodes under a policy of the observation, (episodes,).
+def episode_returns(task: str, policy: Actor, episodes: int = 50, seed: int = 0) -> Array:
+    """Returns of whole episodes under a policy, (episodes,).
 
-    One whose physics diverges ends there, as in the environments.
+    An episode ends when its physics diverges, as in the environments.
 
     Args:
         task: a key of `tasks.TASKS`.
         policy: observations in physical units, (n, d), to actions, (n, 1).
         episodes: how many.
-        seed: episode i starts as a Gymnasium environment reset with seed + i.
+        seed: episode i starts like a Gymnasium environment reset with seed + i.
     """
     simulation = Simulation(get_task(task), episodes)
     simulation.reset(range(episodes), [np.random.default_rng(seed + i) for i in range(episodes)])
     total = np.zeros(episodes)
-    for _ in range(EPISODE_STEPS):
-        diverged = simulation.step(policy(simulation.observe()))
-        total += np.where(diverged, 0, simulation.reward())
+    for step in run(simulation, policy, EPISODE_STEPS):
+        total += np.where(step.diverged, 0, simulation.reward())
     return total

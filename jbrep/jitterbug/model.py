@@ -10,7 +10,7 @@ from jbrep.jitterbug.tasks import CONTROL_TIMESTEP
 
 PHYSICS_TIMESTEP = 0.0002  # [s]
 PHYSICS_STEPS = round(CONTROL_TIMESTEP / PHYSICS_TIMESTEP)  # in a control step
-_ARENA = 1 << 20  # [bytes] for each robot; MuJoCo's own choice is 14 times as much
+_ARENA = 1 << 20  # [bytes] per robot; MuJoCo's own choice is 14 times as large
 
 
 def read_xml() -> str:
@@ -24,9 +24,10 @@ def plain_model() -> mujoco.MjModel:
 
 
 def fast_model() -> mujoco.MjModel:
-    """The model with only the contacts that occur, robot on floor; trajectories are bit-identical.
+    """The model with only the contacts that occur; trajectories are bit-identical.
 
-    Listing these pairs spares the search for others, and one body on a floor needs no islands.
+    Listing the pairs of robot and floor avoids the search for others, and a single robot needs no
+    constraint islands.
     """
     spec = mujoco.MjSpec.from_string(read_xml())
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
@@ -40,10 +41,10 @@ def fast_model() -> mujoco.MjModel:
 
 
 def stop_profiling() -> None:
-    """Take away MuJoCo's profiling clock, read at every stage, in this process.
+    """Turn off MuJoCo's profiling clock, read at every stage, in this process.
 
-    `mjData.timer` then stays zero; nothing else changes. Where the symbol can't be reached the
-    clock stays.
+    `mjData.timer` then stays zero; nothing else changes. If the symbol can't be found, the clock
+    stays on.
     """
     try:
         clock = ctypes.c_void_p.in_dll(ctypes.CDLL(_batch.__file__), "mjcb_time")

@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from jbrep.errors import InputError
 from jbrep.jitterbug import model
-from jbrep.jitterbug.tasks import Array, Readings, Task, yaw_direction
+from jbrep.jitterbug.tasks import QUATERNION, Array, Readings, Task, yaw_direction
 
 _UP_TO_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
-# on a position, velocity or acceleration that is not finite, MuJoCo warns and resets the lane
+# on a position, velocity or acceleration that isn't finite, MuJoCo warns and resets the lane
 _NOT_FINITE = slice(
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1
 )
@@ -25,11 +25,11 @@ class Simulation:
 
     Args:
         task: what is observed and rewarded.
-        num_lanes: n, how many robots.
+        num_lanes: n, the number of robots.
         num_threads: threads to step them on; None takes one for each core.
 
     Attributes:
-        readings: what the tasks read of the lanes now; new after each step.
+        readings: what the tasks read of the current states; a new object after each step.
         model: the compiled MuJoCo model.
         target_quaternion: of the lanes' targets, (n, 4).
 
@@ -43,7 +43,7 @@ class Simulation:
         self.task = task
         self.num_lanes = num_lanes
         self.model = model.fast_model()
-        # persistent: a lane's next step goes on from what reading it has computed already
+        # persistent: a step reuses what has already been computed for the readings
         self._batch = Batch(self.model, num_lanes, num_threads or 0, persistent=True)
         self._control = self._batch.bind("ctrl")
         body = self.model.body("jitterbug").id
@@ -60,12 +60,15 @@ class Simulation:
         self._warmstart = self._batch.bind("qacc_warmstart")
         self.readings = Readings(*self._views)
 
+    def __repr__(self) -> str:
+        return f"Simulation({self.task.name}, {self.num_lanes:,} lanes)"
+
     def reset(self, lanes: Sequence[int], randoms: Iterable[np.random.Generator]) -> None:
-        """Start an episode in each of the lanes, drawn from the generator that goes with it."""
+        """Start an episode in each of the lanes, drawn from its own generator."""
         self._batch.reset(lanes, stage=mujoco.mjtStage.mjSTAGE_NONE)
         for lane, random in zip(lanes, randoms, strict=True):
             start = self.task.start(random)
-            self.readings.qpos[lane, 3:7] = start.quaternion
+            self.readings.qpos[lane, QUATERNION] = start.quaternion
             self.readings.target_position[lane] = start.target_position
             self.target_quaternion[lane] = start.target_quaternion
         self._forward(lanes)
@@ -90,10 +93,10 @@ class Simulation:
         target_quaternion: Array,
         warmstart: ArrayLike = 0.0,
     ) -> None:
-        """Put the lanes in stored states: (n, 16), (n, 15), (n, 3) and (n, 4).
+        """Put all lanes in stored states: (n, 16), (n, 15), (n, 3) and (n, 4).
 
-        The same actions lead from there through the same states, bit for bit. Past an episode's
-        first state that needs the warm start, (n, 15), where MuJoCo's solver starts its search.
+        The same actions then lead through the same states, bit for bit. After an episode's first
+        state this also takes the warm start (n, 15) of MuJoCo's solver.
         """
         lanes = range(self.num_lanes)
         self._batch.reset(lanes, stage=mujoco.mjtStage.mjSTAGE_NONE)
@@ -113,8 +116,8 @@ class Simulation:
         """Hold the actions (n, 1) for one control step.
 
         Returns:
-            (n,) whether the lane's physics diverged: it and its target stand in their default
-            states then, and its episode is over.
+            Whether each lane's physics has diverged since its reset, (n,). Such a lane and its
+            target were put in their default states, and its episode has ended.
         """
         self._control[:] = action
         self._batch.step(nstep=model.PHYSICS_STEPS, stage=_UP_TO_VELOCITIES)
@@ -126,23 +129,23 @@ class Simulation:
         return self.task.observe(self.readings)
 
     def reward(self) -> Array:
-        """The rewards of the states that the lanes are in, (n,)."""
+        """The rewards of the current states, (n,)."""
         return self.task.reward(self.readings)
 
     def copy_data(self, lane: int, data: mujoco.MjData | None = None) -> mujoco.MjData:
-        """A lane as a MuJoCo data object with its positions current, to render or inspect."""
+        """A lane as a MuJoCo data object with positions up to date, to render or inspect."""
         data = self._batch.get_data(lane, data)
         mujoco.mj_fwdPosition(self.model, data)
         return data
 
 
 def check_counts(num_lanes: int, num_threads: int | None) -> None:
-    """Make sure that there is something to simulate, and to simulate it on.
+    """Check the numbers of lanes and threads.
 
     Raises:
         InputError: a number below 1.
     """
-    for count, what in ((num_lanes, "robots"), (num_threads, "threads")):
+    for count, what in ((num_lanes, "lanes"), (num_threads, "threads")):
         if count is not None and count < 1:
             raise InputError(f"the number of {what} is {count}: it must be at least 1")
 
@@ -156,8 +159,8 @@ def check_actions(actions: ArrayLike, num_lanes: int) -> Array:
     checked: Array = np.asarray(actions, dtype=np.float64)
     if checked.shape != (num_lanes, 1):
         raise InputError(
-            f"actions have shape {checked.shape}: ({num_lanes}, 1) is needed, one motor drive "
-            "in [-1, 1] for each robot"
+            f"actions have shape {checked.shape}: it must be ({num_lanes}, 1), one motor drive "
+            "in [-1, 1] per lane"
         )
     if not np.isfinite(checked).all():
         raise InputError(f"actions are not finite: {checked.ravel()}; they must be in [-1, 1]")

@@ -1,4 +1,4 @@
-"""The five Jitterbug tasks: features, starts and rewards, once, over a leading batch axis.
+"""The five Jitterbug tasks: features, starts and rewards, over a leading batch axis.
 
 Nothing here steps a simulation: the dm_control domain calls these functions with a batch of one,
 the batched simulation with n. Lengths in m, angles in rad, times in s; n is the batch size.
@@ -19,15 +19,20 @@ _Float = TypeVar("_Float", bound=np.floating[Any])
 
 CONTROL_TIMESTEP = 0.01  # [s]
 EPISODE_STEPS = 1000  # control steps
-SOLVED_RETURN = 900.0  # of an episode: from there on the paper calls a task solved
-QPOS_SIZE, QVEL_SIZE = 16, 15  # numbers in the robot's position and velocity
+SOLVED_RETURN = 900.0  # of an episode: the paper calls a task solved from there
 
-_MAX_TILT = 0.025  # of the start's turning axis, in x and y
+# MuJoCo's qpos: root position and quaternion, 8 leg joints, motor; qvel likewise
+QPOS_SIZE, QVEL_SIZE = 16, 15
+POSITION, QUATERNION = slice(0, 3), slice(3, 7)  # of the root, in qpos
+VELOCITY, SPIN = slice(0, 3), slice(3, 6)  # linear and angular, of the root, in qvel
+MOTOR_QPOS, MOTOR_QVEL = QPOS_SIZE - 1, QVEL_SIZE - 1
+
+_MAX_TILT = 0.025  # of the axis that the start is turned about, in x and y
 _TARGET_HEIGHT = 0.035  # [m]
 _TARGET_RADIUS = (0.05, 0.2)  # [m]
 _TURN = (-np.pi, np.pi)  # [rad]
 
-_UPRIGHT_MARGIN = 0.5  # of the cosine of the tilt
+_UPRIGHT_MARGIN = 0.5  # in the cosine of the tilt
 _POSITION_MARGIN = 0.05  # [m]
 _VALUE_AT_MARGIN = 0.1
 _TARGET_SPEED = 0.1  # [m/s]
@@ -39,50 +44,50 @@ def wrap(angle: Array) -> Array:
 
 
 def yaw_direction(quaternion: Array) -> Array:
-    """Where a turn about z, (n, 4), takes the x axis: x and y, (n, 2)."""
+    """The x and y of the x axis after a rotation about z, (n, 4) to (n, 2)."""
     w, z = quaternion[:, 0], quaternion[:, 3]
     return np.stack((w * w - z * z, 2 * w * z), axis=1)
 
 
 @dataclass(frozen=True)
 class Readings:
-    """What the tasks read of n simulations: their states, and quantities worked out when asked for.
+    """What the tasks read of n simulations: their states, and quantities derived from them.
 
-    The arrays may be views of a running simulation; take new readings after each step.
+    The arrays may be views of a running simulation; make new readings after each step.
     """
 
-    qpos: Array  # (n, 16) root position, root quaternion, 8 leg joints, motor
-    qvel: Array  # (n, 15) root velocity (world), root angular velocity (body), joints
+    qpos: Array  # (n, 16)
+    qvel: Array  # (n, 15); the root's velocity in the world, its angular velocity in the body
     rotation: Array  # (n, 9) body to world, row by row
     velocity: Array  # (n, 3) of the body's centre of mass, world frame [m/s]
     target_position: Array  # (n, 3)
-    target_axis: Array  # (n, 2) its +X in the world's x and y
+    target_axis: Array  # (n, 2) its x axis in the world's x and y
 
     @property
     def uprightness(self) -> Array:
-        """Cosine between the bug's z axis and the world's, (n,)."""
+        """Cosine of the angle between the bug's z axis and the world's, (n,)."""
         return self.rotation[:, 8]
 
     @property
     def motor_angle(self) -> Array:
         """Where the weight points in the bug's frame, 0 forward, counter-clockwise, (n,)."""
-        return wrap(self.qpos[:, 15] + np.pi / 2)
+        return wrap(self.qpos[:, MOTOR_QPOS] + np.pi / 2)
 
     @cached_property
     def angle_to_target(self) -> Array:
-        """Target yaw less the yaw of the bug's face (its -Y axis), wrapped, (n,)."""
+        """Yaw of the target minus yaw of the bug's face (its -y axis), wrapped, (n,)."""
         x, y = -self.rotation[:, 1], -self.rotation[:, 4]  # where the face looks
         target_x, target_y = self.target_axis.T
         return np.arctan2(x * target_y - y * target_x, x * target_x + y * target_y)
 
     @property
     def target_in_bug_frame(self) -> Array:
-        """Target position seen from the bug: +X its left, -Y its front, (n, 3)."""
+        """Target position in the bug's frame: +x is its left, -y its front, (n, 3)."""
         return (self.rotation.reshape(-1, 3, 3) * self._offset[:, :, None]).sum(axis=1)
 
     @cached_property
     def velocity_in_target_frame(self) -> Array:
-        """Velocity of the body's centre of mass, +X along the target's yaw, (n, 3)."""
+        """Velocity of the body's centre of mass, x along the target's yaw, (n, 3)."""
         cosine, sine = self.target_axis.T
         x, y = self.velocity[:, 0], self.velocity[:, 1]
         turned = self.velocity.copy()
@@ -98,7 +103,7 @@ class Readings:
 
     @cached_property
     def _offset(self) -> Array:
-        return self.target_position - self.qpos[:, :3]
+        return self.target_position - self.qpos[:, POSITION]
 
 
 class Start(NamedTuple):
@@ -121,7 +126,7 @@ class Feature:
 
 @dataclass(frozen=True)
 class Observable:
-    """A named group of features and how it is read: a batch of readings to (n, len(features))."""
+    """A named group of features; `read` maps n readings to (n, len(features))."""
 
     name: str
     features: tuple[Feature, ...]
@@ -143,15 +148,15 @@ _POSITION = Observable(
         Feature("position_y", "m", -2, 2),
         Feature("position_z", "m", 0, 0.1),
     ),
-    lambda r: r.qpos[:, 0:3],
+    lambda r: r.qpos[:, POSITION],
 )
 _SHARED = (
     _POSITION,
-    _observable("orientation", "w x y z", "1", (1, 1, 1, 1), lambda r: r.qpos[:, 3:7]),
-    _observable("velocity", "x y z", "m/s", (1, 1, 1), lambda r: r.qvel[:, 0:3]),
-    _observable("angular_velocity", "x y z", "rad/s", (35, 35, 35), lambda r: r.qvel[:, 3:6]),
+    _observable("orientation", "w x y z", "1", (1, 1, 1, 1), lambda r: r.qpos[:, QUATERNION]),
+    _observable("velocity", "x y z", "m/s", (1, 1, 1), lambda r: r.qvel[:, VELOCITY]),
+    _observable("angular_velocity", "x y z", "rad/s", (35, 35, 35), lambda r: r.qvel[:, SPIN]),
     _observable("motor_angle", "", "rad", (np.pi,), lambda r: r.motor_angle[:, None]),
-    _observable("motor_velocity", "", "rad/s", (180,), lambda r: r.qvel[:, 14:15]),
+    _observable("motor_velocity", "", "rad/s", (180,), lambda r: r.qvel[:, MOTOR_QVEL, None]),
 )
 _ANGLE_TO_TARGET = _observable(
     "angle_to_target", "", "rad", (np.pi,), lambda r: r.angle_to_target[:, None]
@@ -162,32 +167,44 @@ _TARGET_VELOCITY = _observable(
 _TARGET_POSITION = _observable("target", "x y z", "m", (3, 3, 0.1), lambda r: r.target_in_bug_frame)
 
 
-# Each term equals `dm_control.utils.rewards.tolerance` with the bounds, margin and sigmoid that its
-# docstring names, with fewer array operations; called once a step, that shows.
+# Each term equals the call of `dm_control.utils.rewards.tolerance` in its docstring, with fewer
+# array operations: terms are evaluated at every step.
 
 
 def upright_term(r: Readings) -> Array:
-    """1 standing, 0.1 at a tilt of 60 degrees: bounds (1, 1), margin 0.5, Gaussian."""
+    """1 standing, 0.1 at a tilt of 60 degrees.
+
+    tolerance(uprightness, bounds=(1, 1), margin=0.5, sigmoid="gaussian", value_at_margin=0.1)
+    """
     return _VALUE_AT_MARGIN ** ((1 - r.uprightness) / _UPRIGHT_MARGIN) ** 2
 
 
 def position_term(r: Readings) -> Array:
-    """1 at the target, 0.1 at 5 cm from it: bounds (0, 0), margin 0.05 m, Gaussian."""
+    """1 at the target, 0.1 at 5 cm from it.
+
+    tolerance(distance, bounds=(0, 0), margin=0.05, sigmoid="gaussian", value_at_margin=0.1)
+    """
     return _VALUE_AT_MARGIN ** (r.distance_to_target / _POSITION_MARGIN) ** 2
 
 
 def away_term(r: Readings) -> Array:
-    """0 at the target, 0.9 at 5 cm from it."""
+    """0 at the target, 0.9 at 5 cm from it: 1 - position_term."""
     return 1 - position_term(r)
 
 
 def heading_term(r: Readings) -> Array:
-    """1 facing along the target's yaw, 0 from 90 degrees on: margin pi/2, cosine, 0 there."""
+    """1 facing along the target's yaw, 0 from 90 degrees on.
+
+    tolerance(angle, bounds=(0, 0), margin=pi / 2, sigmoid="cosine", value_at_margin=0)
+    """
     return np.maximum(np.cos(r.angle_to_target), 0) ** 2
 
 
 def velocity_term(r: Readings) -> Array:
-    """0 at rest, 1 from 0.1 m/s along the target's yaw on: margin 0.1 m/s, linear, 0 there."""
+    """0 at rest, 1 from 0.1 m/s along the target's yaw on.
+
+    tolerance(velocity_x, bounds=(0.1, inf), margin=0.1, sigmoid="linear", value_at_margin=0)
+    """
     return np.minimum(np.maximum(r.velocity_in_target_frame[:, 0] / _TARGET_SPEED, 0), 1)
 
 
@@ -217,7 +234,7 @@ class Task:
 
     @property
     def feature_names(self) -> tuple[str, ...]:
-        """Their names, in that order."""
+        """Names of all features, in the same order."""
         return tuple(f.name for f in self.features)
 
     @cached_property
@@ -245,7 +262,7 @@ class Task:
         return reward
 
     def scale(self, observation: Array) -> Array:
-        """Physical units to about [-1, 1], by the nominal ranges; (n, d) to (n, d)."""
+        """Scale by the nominal ranges: physical units (n, d) to about [-1, 1]."""
         return (observation - self._centre) / self._half_width
 
     def unscale(self, scaled: Array) -> Array:
@@ -253,7 +270,7 @@ class Task:
         return scaled * self._half_width + self._centre
 
     def split(self, observation: NDArray[_Float]) -> dict[str, NDArray[_Float]]:
-        """A flat observation (..., d) as a dictionary by observable; the parts are views."""
+        """Split flat observations (..., d) by observable; the parts are views."""
         ends = np.cumsum([len(o.features) for o in self.observables])[:-1]
         parts = np.split(observation, ends, axis=-1)
         return {o.name: part for o, part in zip(self.observables, parts, strict=True)}
@@ -261,7 +278,7 @@ class Task:
     def start(self, random: np.random.Generator | np.random.RandomState) -> Start:
         """Draw how an episode begins.
 
-        Every task takes the same six draws, so one seed gives one motion whatever the task.
+        Every task makes the same six draws, so a seed gives the same motion in all tasks.
         """
         low, high = self._start_ranges
         turn, tilt_x, tilt_y, radius, bearing, yaw = random.uniform(low, high)
@@ -311,7 +328,7 @@ TASKS = {
 
 
 def get_task(name: str) -> Task:
-    """The task of that name.
+    """Look up a task by its name.
 
     Raises:
         InputError: there is none; the message lists the tasks.

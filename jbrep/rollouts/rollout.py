@@ -1,19 +1,21 @@
-"""Single episodes with all there is to see of them: replayed from a data set, or played anew."""
+"""Single episodes to look at: replayed from a data set, or played by a policy."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jbrep.collect.policies import Actor
+from jbrep.collect.replay import simulate_again
 from jbrep.dataset import Dataset
 from jbrep.errors import InputError
+from jbrep.jitterbug.episodes import Actor, Recording, record
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import (
     CONTROL_TIMESTEP,
     EPISODE_STEPS,
+    QPOS_SIZE,
+    QVEL_SIZE,
     Array,
     Readings,
     Task,
@@ -24,15 +26,17 @@ from jbrep.progress import Progress
 
 Begin = Callable[[Task, Sequence[np.random.Generator]], Actor]  # as `Policy.begin`
 
+_STATES = {"qpos": QPOS_SIZE, "qvel": QVEL_SIZE, "rotation": 9, "velocity": 3}  # and their widths
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
-    """An episode of n control steps; states come before, between and after the steps.
+    """An episode of n control steps; states are before, between and after the steps.
 
     Args:
         task: what is observed and rewarded.
-        name: where it comes from, in words.
-        seed: that the episode starts from.
+        name: where the episode comes from, for titles.
+        seed: of the episode's start.
         qpos: (n + 1, 16).
         qvel: (n + 1, 15).
         rotation: body to world, row by row, (n + 1, 9).
@@ -40,6 +44,9 @@ class Rollout:
         target_position: (3,).
         target_quaternion: (4,).
         action: the drives, (n, 1).
+
+    Raises:
+        InputError: an array of another shape.
     """
 
     task: Task
@@ -53,17 +60,34 @@ class Rollout:
     target_quaternion: Array
     action: Array
 
+    def __post_init__(self) -> None:
+        steps = len(self.action)
+        shapes: dict[str, tuple[int, ...]] = {
+            "action": (steps, 1),
+            **{name: (steps + 1, width) for name, width in _STATES.items()},
+            "target_position": (3,),
+            "target_quaternion": (4,),
+        }
+        for name, shape in shapes.items():
+            if (actual := getattr(self, name).shape) != shape:
+                raise InputError(
+                    f"a rollout of {steps} actions has {name} of shape {actual}: it must be {shape}"
+                )
+
     def __len__(self) -> int:
         return len(self.action)
 
+    def __repr__(self) -> str:
+        return f"Rollout({self.name!r}: {self.task.name}, {len(self):,} steps)"
+
     @property
     def time(self) -> Array:
-        """Simulated time of the states [s], (n + 1,)."""
+        """Time of each state [s], (n + 1,)."""
         return CONTROL_TIMESTEP * np.arange(len(self.qpos), dtype=np.float64)
 
     @cached_property
     def readings(self) -> Readings:
-        """What the tasks read of the states."""
+        """The readings of all states, as a batch of n + 1."""
         states = (len(self.qpos), 1)
         return Readings(
             self.qpos,
@@ -76,12 +100,12 @@ class Rollout:
 
     @cached_property
     def observation(self) -> Array:
-        """In physical units, (n + 1, d)."""
+        """Of each state, in physical units, (n + 1, d)."""
         return self.task.observe(self.readings)
 
     @property
     def reward(self) -> Array:
-        """Of the states that the steps led to, (n,)."""
+        """Of the state that each step led to, (n,)."""
         return self.task.reward(self.readings)[1:]
 
     @property
@@ -94,26 +118,17 @@ class Rollout:
 
 
 def replay(dataset: Dataset, episode: int) -> Rollout:
-    """An episode of a data set, simulated again from its start and actions, bit for bit.
+    """Simulate an episode of a data set again from its start and actions, bit for bit.
 
     Raises:
         InputError: the data set has no such episode, or it has no steps.
     """
-    own = dataset.episodes
-    if not 0 <= episode < len(own["episode"]):
-        raise InputError(
-            f"{dataset.folder} has no episode {episode}: it has {len(own['episode']):,}, from 0"
-        )
-    length, first = int(own["length"][episode]), int(own["length"][:episode].sum())
-    if not length:
+    stored = dataset.episode(episode)
+    if not len(stored):
         raise InputError(f"episode {episode} of {dataset.folder} has no steps: choose another")
-    names = ("initial_qpos", "initial_qvel", "target_position", "target_quaternion")
-    simulation = Simulation(dataset.task, 1, num_threads=1)
-    simulation.restore(*(own[name][episode : episode + 1] for name in names))
-    actions = iter(dataset["action"][first : first + length])
-    tape = _play(simulation, lambda: next(actions)[None], length)
-    name = f"{dataset.folder}, episode {episode}"
-    return tape.rollout(0, name, int(own["seed"][episode]))
+    recording = simulate_again([stored], tuple(_STATES), num_threads=1, tick=lambda steps: None)
+    name, seed = f"{dataset.folder}, episode {episode}", int(stored.record["seed"])
+    return _rollout(dataset.task, recording, 0, name, seed)
 
 
 def play(
@@ -122,15 +137,17 @@ def play(
     name: str,
     seeds: Sequence[int],
     target_yaw: float | None = None,
+    steps: int = EPISODE_STEPS,
 ) -> list[Rollout]:
-    """Episodes under a policy, an episode for each seed; one that diverges ends before it does.
+    """Play one episode for each seed; an episode ends before its physics diverges.
 
     Args:
-        task: what is observed.
-        begin: the policy's.
-        name: what the policy is called.
-        seeds: an episode starts as a Gymnasium environment reset with its seed.
-        target_yaw: turns the target of every episode there [rad].
+        task: what is observed and rewarded.
+        begin: of the policy.
+        name: of the policy.
+        seeds: an episode starts like a Gymnasium environment reset with its seed.
+        target_yaw: orientation of the target in every episode [rad]; None draws it.
+        steps: length of an episode in control steps.
     """
     simulation = Simulation(task, len(seeds))
     randoms = [np.random.default_rng(seed) for seed in seeds]
@@ -141,54 +158,21 @@ def play(
             **simulation.state | {"target_quaternion": np.tile(turned, (len(seeds), 1))}
         )
     act = begin(task, randoms)
-    tape = _play(simulation, lambda: act(simulation.observe()), EPISODE_STEPS, show=True)
-    return [tape.rollout(lane, name, seed) for lane, seed in enumerate(seeds)]
+    total = steps * len(seeds)
+    with Progress(total=total, unit="step", unit_scale=True, leave=False, delay=1) as progress:
+        recording = record(simulation, act, steps, tuple(_STATES), progress.update)
+    return [_rollout(task, recording, lane, name, seed) for lane, seed in enumerate(seeds)]
 
 
-class _Tape:
-    """What n lanes go through, time first."""
-
-    def __init__(self, simulation: Simulation, steps: int):
-        n, now = simulation.num_lanes, simulation.readings
-        self._simulation = simulation
-        self._states = {
-            name: np.empty((steps + 1, *getattr(now, name).shape))
-            for name in ("qpos", "qvel", "rotation", "velocity")
-        }
+def _rollout(task: Task, recording: Recording, lane: int, name: str, seed: int) -> Rollout:
+    length = recording.length[lane]
+    return Rollout(
+        task=task,
+        name=name,
+        seed=seed,
+        **{key: recording.states[key][: length + 1, lane] for key in _STATES},
         # at the start: a lane that diverges loses its target
-        self._target_position = now.target_position.copy()
-        self._target_quaternion = simulation.target_quaternion.copy()
-        self._action = np.empty((steps, n, 1))
-        self._length = np.full(n, steps)
-
-    def record_state(self, step: int) -> None:
-        for name, values in self._states.items():
-            values[step] = getattr(self._simulation.readings, name)
-
-    def record_step(self, step: int, action: Array, diverged: NDArray[np.bool_]) -> None:
-        self._action[step] = action
-        self._length[diverged] = np.minimum(self._length[diverged], step)
-
-    def rollout(self, lane: int, name: str, seed: int) -> Rollout:
-        length = self._length[lane]
-        return Rollout(
-            task=self._simulation.task,
-            name=name,
-            seed=seed,
-            **{key: values[: length + 1, lane] for key, values in self._states.items()},
-            target_position=self._target_position[lane],
-            target_quaternion=self._target_quaternion[lane],
-            action=self._action[:length, lane],
-        )
-
-
-def _play(
-    simulation: Simulation, act: Callable[[], Array], steps: int, show: bool = False
-) -> _Tape:
-    tape = _Tape(simulation, steps)
-    tape.record_state(0)
-    for step in Progress(range(steps), unit="step", leave=False, delay=1, disable=not show):
-        action = act()
-        tape.record_step(step, action, simulation.step(action))
-        tape.record_state(step + 1)
-    return tape
+        target_position=recording.start["target_position"][lane],
+        target_quaternion=recording.start["target_quaternion"][lane],
+        action=recording.action[:length, lane],
+    )

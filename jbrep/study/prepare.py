@@ -4,8 +4,8 @@ from pathlib import Path
 
 from jbrep.collect import collect
 from jbrep.collect.derive import derive
-from jbrep.dataset import Dataset, ScaledDataset
-from jbrep.dataset.manifest import MANIFEST, Settings
+from jbrep.dataset import Dataset, ScaledDataset, Settings
+from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import find
 from jbrep.errors import InputError
 from jbrep.files.storage import exists

@@ -1,0 +1,84 @@
+"""Exporting to Minari's HDF5 storage, with the environment that it recovers."""
+
+import json
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import gymnasium
+import minari
+import numpy as np
+from minari.data_collector import EpisodeBuffer
+from minari.namespace import NAMESPACE_METADATA_FILENAME
+
+import jbrep.jitterbug.simulation  # noqa: F401  Minari makes the environment: load MuJoCo before
+from jbrep.dataset import Dataset
+from jbrep.files.publish import publish_folder, unfinished
+from jbrep.files.storage import exists, write_whole
+from jbrep.jitterbug.tasks import environment_id
+from jbrep.progress import Progress
+
+_ROOT = "MINARI_DATASETS_PATH"  # Minari takes the folder of its data sets from the environment only
+
+
+def write(dataset: Dataset, out: Path) -> str:
+    """Add a data set to a folder of Minari data sets; returns how to open it."""
+    settings = dataset.manifest.settings
+    name = f"jitterbug/{settings.task}/{settings.policy['kind']}-v0"
+    path = out / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with unfinished(path) as root:  # Minari ignores hidden folders
+        root.mkdir()
+        with _datasets_in(root.resolve()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on the missing author and address
+            _create(dataset, name)
+        for namespace in Path(name).parents[:-1]:
+            metadata = namespace / NAMESPACE_METADATA_FILENAME
+            if not exists(out / metadata):
+                write_whole(out / metadata, (root / metadata).read_bytes())
+        publish_folder(root / name, path)
+    return f"{_ROOT}={out} and minari.load_dataset({name!r})"
+
+
+def _create(dataset: Dataset, name: str) -> None:
+    settings, versions = dataset.manifest.settings, dataset.manifest.versions
+    minari.create_dataset_from_buffers(
+        name,
+        _episodes(dataset),
+        env=gymnasium.spec(environment_id(settings.task)),
+        algorithm_name=settings.policy["kind"],
+        description=f"{json.dumps(asdict(settings))} {dataset.manifest.fingerprint}",
+        requirements=[f"{package}=={versions[package]}" for package in ("jbrep", "mujoco")],
+    )
+
+
+@contextmanager
+def _datasets_in(folder: Path) -> Iterator[None]:
+    before = os.environ.get(_ROOT)
+    os.environ[_ROOT] = str(folder)
+    try:
+        yield
+    finally:
+        del os.environ[_ROOT]
+        if before is not None:
+            os.environ[_ROOT] = before
+
+
+def _episodes(dataset: Dataset) -> Iterator[EpisodeBuffer]:
+    for number in Progress(range(len(dataset.episodes["length"])), unit="episode", desc="minari"):
+        episode = dataset.episode(number)
+        if not len(episode):
+            continue  # it diverged in its first step: Minari has no episodes without steps
+        ends = episode.record
+        yield EpisodeBuffer(
+            seed=int(ends["seed"]),
+            observations=np.append(episode["observation"], ends["final_observation"][None], axis=0),
+            actions=episode["action"],
+            rewards=episode["reward"].astype(np.float64),
+            terminations=np.zeros(len(episode), dtype=bool),
+            truncations=np.arange(len(episode)) == len(episode) - 1,
+            infos={},
+        )
