@@ -1,5 +1,6 @@
 """Reading: columns over shards, splits, scaling, batches, and tools that know nothing of jbrep."""
 
+import json
 import pickle
 from dataclasses import replace
 from itertools import accumulate
@@ -7,10 +8,11 @@ from itertools import accumulate
 import h5py
 import numpy as np
 import pytest
+from command import jbrep
 from small import settings, write_again
 
 from jbrep.collect import collect, write_shards
-from jbrep.dataset import Dataset, Scaler, manifest, reader
+from jbrep.dataset import Dataset, ScaledDataset, Scaler, manifest, reader
 from jbrep.dataset.card import card
 from jbrep.dataset.columns import Column
 from jbrep.errors import InputError
@@ -281,6 +283,33 @@ def test_the_card_tells_what_is_there(dataset, collected):
         [speed.min(), speed.mean(), speed.max(), speed.std()], rel=1e-3
     )
     assert dataset.manifest.fingerprint in text
+
+
+@pytest.mark.parametrize("width", [60, 80, 200])
+def test_the_card_fits_the_terminal(width, dataset):
+    text = card(dataset, width).replace(str(dataset.folder), "face").splitlines()
+    facts = [line for line in text if dataset.manifest.fingerprint not in line]
+    assert max(map(len, facts)) <= width
+    assert len([line for line in text if line.startswith("feature ")]) == (1 if width == 200 else 2)
+
+
+def test_a_data_set_as_json(dataset):
+    about = json.loads(jbrep("data", "info", dataset.folder, "--json").stdout)
+    assert (about["task"], about["rows"], about["episodes"]) == ("face_direction", 5000, 5)
+    assert about["return"]["mean"] == pytest.approx(dataset.episodes["return"].mean())
+    speed = about["features"][14]
+    assert (speed["feature"], speed["unit"], speed["nominal"]) == (
+        "motor_velocity",
+        "rad/s",
+        [-180, 180],
+    )
+    assert speed["max"] == dataset["motor_velocity"][:].max()
+
+
+def test_data_sets_are_shown_on_one_line(dataset):
+    for shown in (dataset, dataset["reward"], dataset.episode(0), ScaledDataset(dataset)):
+        assert "\n" not in repr(shown)
+        assert len(repr(shown)) < 250
 
 
 def test_an_unfinished_data_set_is_called_so(collected, tmp_path):

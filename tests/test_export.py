@@ -191,3 +191,25 @@ def test_an_export_is_on_the_disk_and_has_one_writer(to, dataset, tmp_path, monk
     export(dataset, to, tmp_path / to)
     for written in (path.parent, path, *path.rglob("*")):
         assert written.stat().st_ino in synced, written
+
+
+STOPPED = """
+import os, signal, sys
+
+class Stop:
+    def find_spec(self, name, path, target=None):
+        if name == "mujoco._enums":  # imported while another of MuJoCo's modules is initialised
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Stop())
+from jbrep.cli import main
+main(["data", "export", *sys.argv[1:]])
+"""
+
+
+def test_ctrl_c_while_extension_modules_are_imported_ends_it_in_a_line(dataset, tmp_path):
+    arguments = (dataset.folder, "--to", "minari", "--out", tmp_path / "minari")
+    command = [sys.executable, "-W", "ignore", "-c", STOPPED, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "stopped; the export was discarded\n")
+    assert not list(tmp_path.iterdir())

@@ -1,14 +1,18 @@
-"""Collecting, and what is done with a data set."""
+"""Collecting data sets, and working with them."""
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, GOES_ON, example, printable, stoppable
+from jbrep.cli.base import COUNT, GOES_ON, as_json, echo_json, example, printable, stoppable
+from jbrep.text import terminal_width
 
 _threads = click.option(
-    "--threads", type=click.IntRange(1, 4096), help="To work on; all cores if not given."
+    "--threads", type=click.IntRange(1, 4096), help="Threads to use; all cores by default."
 )
 _lanes = click.option(
     "--lanes",
@@ -22,7 +26,12 @@ _data = click.argument("data", type=click.Path(path_type=Path))
 
 @click.command(epilog=example("jbrep collect --task face_direction --steps 5M --out data/face"))
 @click.option("--task", required=True, help="A Jitterbug task, such as face_direction.")
-@click.option("--steps", required=True, type=COUNT, help="Control steps, in whole episodes.")
+@click.option(
+    "--steps",
+    required=True,
+    type=COUNT,
+    help="Control steps, rounded up to whole episodes of 1,000.",
+)
 @click.option("--seed", default=0, show_default=True, help="Root of every episode's seed.")
 @click.option(
     "--policy",
@@ -30,8 +39,8 @@ _data = click.argument("data", type=click.Path(path_type=Path))
     show_default=True,
     help="uniform, heuristic, constant:drive=0.5 or ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3.",
 )
-@click.option("--store-state", is_flag=True, help="Keep qpos and qvel, for jbrep data derive.")
-@click.option("--shard-episodes", default=100, show_default=True, help="Episodes in a shard.")
+@click.option("--store-state", is_flag=True, help="Store qpos and qvel, for jbrep data derive.")
+@click.option("--shard-episodes", default=100, show_default=True, help="Episodes per shard.")
 @_lanes
 @_threads
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A folder.")
@@ -48,12 +57,13 @@ def collect(
 ) -> None:
     """Collect the states that a policy visits.
 
-    The same command goes on with what it began; a finished data set is left as it is. Neither
-    lanes nor threads change the data.
+    The same command resumes an unfinished data set and leaves a finished one as it is. The numbers
+    of lanes and threads don't change the data.
     """
     from jbrep.collect import collect as run
     from jbrep.collect.policies import parse_policy, policy_settings
     from jbrep.dataset import Settings
+    from jbrep.jitterbug.tasks import EPISODE_STEPS
 
     how = policy_settings(parse_policy(policy))
     settings = Settings(
@@ -64,18 +74,24 @@ def collect(
         shard_episodes=shard_episodes,
         store_state=store_state,
     )
+    whole = settings.episodes * EPISODE_STEPS
+    if whole != settings.steps:
+        click.echo(
+            f"{settings.steps:,} steps are rounded up to {whole:,}: episodes have {EPISODE_STEPS:,}"
+        )
     with stoppable(GOES_ON):
-        _tell(out, run(settings, out, lanes, threads))
+        _report(out, run(settings, out, lanes, threads))
 
 
-def _tell(out: Path, written: Any) -> None:
-    """What is in the folder now, and how fast it came there."""
+def _report(out: Path, written: Any) -> None:
+    """Print what the folder holds now, and how fast it was written."""
     manifest, rows, seconds = written
     size = sum(entry.bytes for entry in manifest.shards) / 1e6
     total = sum(entry.rows for entry in manifest.shards)
     settings = manifest.settings
-    what = f"{settings.episodes:,} episodes of {settings.task}, {total:,} rows, {size:,.1f} MB"
-    click.echo(f"{what} in {out}")
+    plural = "s" if settings.episodes > 1 else ""
+    what = f"{settings.episodes:,} episode{plural} of {settings.task}, {total:,} rows"
+    click.echo(printable(f"{what}, {size:,.1f} MB in {out}"))
     if rows:
         click.echo(f"{rows:,} rows in {seconds:,.0f} s, {rows / seconds:,.0f} a second")
     else:
@@ -84,17 +100,22 @@ def _tell(out: Path, written: Any) -> None:
 
 @click.group()
 def data() -> None:
-    """Look at, check, mend, derive and export data sets."""
+    """Inspect, verify, repair, derive and export data sets."""
 
 
 @data.command(epilog=example("jbrep data info data/face"))
 @_data
-def info(data: Path) -> None:
+@as_json
+def info(data: Path, as_json: bool) -> None:
     """Show what a data set holds."""
     from jbrep.dataset import Dataset
-    from jbrep.dataset.card import card
+    from jbrep.dataset.card import card, describe
 
-    click.echo(card(Dataset(data)))
+    if as_json:
+        echo_json(describe(Dataset(data)))
+        return
+    for line in card(Dataset(data), terminal_width()).splitlines():
+        click.echo(printable(line))
 
 
 @data.command(epilog=example("jbrep data verify data/face --replay 50"))
@@ -105,7 +126,7 @@ def info(data: Path) -> None:
 def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> None:
     """Check every hash, shape, number and range.
 
-    Exit code 1 if anything is wrong, with a line for each problem.
+    Prints a line for each problem; the exit code is 1 if there are any.
     """
     from jbrep.collect.replay import replay_problems
     from jbrep.dataset import Dataset
@@ -124,10 +145,7 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
         ctx.exit(1)
     manifest = dataset.manifest
     shards = f"{len(manifest.shards)} of {manifest.settings.num_shards} shards"
-    click.echo(
-        f"{data}: {len(dataset):,} rows in {shards}, every hash, shape, number and range as it "
-        "should be"
-    )
+    click.echo(printable(f"{data}: no problems in {len(dataset):,} rows, {shards}"))
     if replay:
         click.echo(f"{replay} episodes simulated again: equal in every bit")
 
@@ -137,16 +155,16 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
 @_lanes
 @_threads
 def repair(data: Path, lanes: int, threads: int | None) -> None:
-    """Make damaged and missing files again, as they were."""
+    """Restore damaged and missing files as they were."""
     from jbrep.collect.repair import repair as run
 
     with stoppable(GOES_ON):
-        done = 0
+        repaired = False
         for line in run(data, lanes, threads):
             click.echo(printable(line))
-            done += 1
-    if not done:
-        click.echo(f"{data} is whole: nothing to repair")
+            repaired = True
+    if not repaired:
+        click.echo(printable(f"{data} is whole: nothing to repair"))
 
 
 @data.command(
@@ -154,20 +172,20 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
 )
 @_data
 @click.option("--task", required=True, help="The task to observe and reward.")
-@click.option("--store-state", is_flag=True, help="Keep qpos and qvel.")
+@click.option("--store-state", is_flag=True, help="Store qpos and qvel.")
 @_threads
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A folder.")
 def derive(data: Path, task: str, store_state: bool, threads: int | None, out: Path) -> None:
-    """Make another task's data set of the same motion.
+    """Make another task's data set from the same motion.
 
-    Nothing is simulated again, and it equals collecting that task with the same settings, bit for
-    bit. The data set needs its states (collect --store-state) and a policy that doesn't act on
+    It equals collecting that task with the same settings, bit for bit, without simulating again.
+    The source needs its states (collect --store-state) and a policy that doesn't depend on
     observations.
     """
     from jbrep.collect.derive import derive as run
 
     with stoppable(GOES_ON):
-        _tell(out, run(data, task, out, store_state, threads))
+        _report(out, run(data, task, out, store_state, threads))
 
 
 @data.command(epilog=example("jbrep data export data/face --to parquet --out face.parquet"))
@@ -181,6 +199,24 @@ def export(data: Path, to: str, out: Path) -> None:
     """
     from jbrep.dataset import Dataset
     from jbrep.dataset.export import export as run
+    from jbrep.dataset.export import load_format
 
-    with stoppable("nothing is left of it"):
+    with stoppable("the export was discarded"):
+        with _deferred_stop():
+            load_format(to)
         click.echo(f"open it with {run(Dataset(data), to, out)}")
+
+
+@contextmanager
+def _deferred_stop() -> Iterator[None]:
+    """Deliver Ctrl-C and SIGTERM at the end: an extension module turns them into ImportError."""
+    pending: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda got, frame: pending.append(got)) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+        if pending:
+            signal.raise_signal(pending[0])
