@@ -1,7 +1,6 @@
 """The container of encoders and checkpoints: whatever changes in one is noticed."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -63,10 +62,6 @@ def test_a_changed_bit_in_a_checkpoint_of_an_encoder_is_noticed(tmp_path):
     checkpoint.restore(trainer, {}, path)
 
 
-class Stopped(Exception):
-    """As by a kill."""
-
-
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
     """A run that has written a checkpoint, and the folder that has it."""
@@ -75,9 +70,9 @@ def stopped(tmp_path_factory):
 
     def watch(step, mean):
         if (folder / CHECKPOINT).exists():
-            raise Stopped
+            raise KeyboardInterrupt
 
-    with pytest.raises(Stopped):
+    with pytest.raises(KeyboardInterrupt):
         train(run, folder, watch, save_every=0)
     return run, folder
 
@@ -92,7 +87,7 @@ def test_a_changed_bit_in_a_checkpoint_of_a_run_is_noticed(stopped):
             container.read(path, "checkpoint")
         path.write_bytes(whole)
     flip(path, 8 * len(whole) - 1)
-    with pytest.raises(DamageError, match="is damaged .*: delete it to start over"):
+    with pytest.raises(DamageError, match=r"is damaged .*: delete it to start over"):
         train(run, folder)
 
 

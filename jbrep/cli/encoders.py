@@ -124,7 +124,7 @@ def _fit(
         for training in trainings:
             found = fitter.fit(kind, training)
             error = found.encoder.header["metrics"][HELD_OUT_MSE]
-            there = "" if found.anew else ", complete already"
+            there = "" if found.is_new else ", complete already"
             click.echo(
                 f"{found.encoder.name}: held-out mean squared error {error:.5f}, features scaled "
                 f"to [-1, 1]; {found.path}{there}"
