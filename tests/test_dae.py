@@ -247,7 +247,7 @@ def test_mistakes_are_named():
     ):
         Training.of(4, seed=10**20)
     for rate in (0, np.nan, np.inf, 1e9):
-        with pytest.raises(InputError, match=r"learning rate is .*: it must be above 0 and at most"):
+        with pytest.raises(InputError, match=r"learning rate is .*: it must be above 0 and at"):
             Training.of(4, learning_rate=rate)
     for noise in (-1, np.nan, np.inf):
         with pytest.raises(InputError, match=r"noise is .*: it must be at least 0, and finite"):

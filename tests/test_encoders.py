@@ -254,8 +254,8 @@ def forged(encoder, path, **changes):
         ({"header": {"metrics": 3}}, "the header has no metrics"),
         ({"header": {"metrics": {"held_out_mse": float("inf")}}}, "number that is not finite"),
         ({"header": {"format_version": 2}}, "has format version 2"),
-        ({"header": {"format_version": 0}}, "has format version 0"),
-        ({"header": {"format_version": -1}}, "has format version -1"),
+        ({"header": {"format_version": 0}}, "its format version is 0"),
+        ({"header": {"format_version": -1}}, "its format version is -1"),
         ({"header": {"format": "other"}}, "is not a jbrep encoder"),
     ],
 )
@@ -341,7 +341,7 @@ def test_onnx_gives_what_torch_gives(encoder, rows, tmp_path):
     np.testing.assert_allclose(back, encoder.decode(tensor).numpy(), rtol=1e-4, atol=1e-4)
     stored = session.get_modelmeta().custom_metadata_map["jbrep"]
     assert json.loads(stored)["features"] == list(TASK.feature_names)
-    with pytest.raises(InputError, match=r"it.onnx is there already"):
+    with pytest.raises(InputError, match=r"it.onnx exists already"):
         export(encoder, tmp_path / "it.onnx")
 
 

@@ -73,9 +73,9 @@ def load(path: Path) -> Encoder:
         DamageError: it isn't what was written.
     """
     tensors, header = container.read(path, "encoder")
-    if header.get("format") != FORMAT or not isinstance(header.get("format_version"), int):
+    if header.get("format") != FORMAT:
         raise InputError(f"{path} is not a jbrep encoder")
-    check_version(path, header["format_version"], FORMAT_VERSION)
+    check_version(path, header.get("format_version"), FORMAT_VERSION)
     try:
         return _encoder(header, tensors)
     except InputError as error:
