@@ -2,20 +2,23 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from command import jbrep
 from sklearn.decomposition import PCA
 from sklearn.linear_model import Ridge
 from sklearn.metrics import r2_score
 from sklearn.preprocessing import StandardScaler
 
+from jbrep import figures
 from jbrep.dataset import Dataset, ScaledDataset, Scaler
 from jbrep.dataset.scaled import sample
-from jbrep.encoders import Encoder, Layer
+from jbrep.encoders import Encoder, Layer, find, save
 from jbrep.errors import InputError
-from jbrep.evaluate import diagnose
+from jbrep.evaluate import diagnose, files
 from jbrep.evaluate.files import EVALUATION, write
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import intrinsic_dimension, latent
@@ -390,6 +393,31 @@ def test_an_evaluation_is_plain_json_and_repeats(data, tmp_path):
     shown = evaluation_text(json.loads(text))
     assert "pca-4" in shown
     assert "nan" not in shown
+
+
+def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
+    collected, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(figures, "encoder_plots", lambda evaluation: [])  # they take seconds
+    shipped = find("pca-4", "face_direction")
+    save(replace(shipped, header={**shipped.header, "name": "dae-4"}), Path("dae-4"))
+    chosen = ("--encoder", "dae-4", "./dae-4", "full")
+    command = ("evaluate", *chosen, "--data", collected, "--out", "judged")
+    shown = jbrep(*command).stdout
+    assert shown.startswith("dae-4, shipped\n./dae-4\nfull, shipped\n\nError on 1 held-out")
+    assert max(map(len, shown.splitlines())) <= 80
+    evaluation = json.loads((tmp_path / "judged" / EVALUATION).read_text())
+    whole = evaluation_text(evaluation)
+    assert set(whole.split()) < set(shown.split())
+    assert max(map(len, whole.splitlines())) > 80
+    monkeypatch.setattr(files, "diagnose", lambda encoders, data: evaluation)
+    again = jbrep(*command, "--json")
+    assert json.loads(again.stdout) == evaluation
+    labels = ["full", "dae-4, shipped", "./dae-4", "full, shipped"]
+    assert list(evaluation["encoders"]) == labels
+    assert "dae-4, shipped\n./dae-4\nfull, shipped\n" in again.stderr
 
 
 def test_whether_an_encoder_may_have_seen_the_episodes(data):

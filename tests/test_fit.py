@@ -1,5 +1,6 @@
 """Encoders of every kind from a data set: scaling, files, kills, mistakes."""
 
+import re
 import shutil
 import signal
 from contextlib import contextmanager
@@ -160,6 +161,26 @@ def test_an_encoder_is_compared_with_pca(data, tmp_path):
 def test_the_header_has_the_batch_size_that_was_chosen(data, tmp_path):
     training = Fitter(data, tmp_path).fit("dae", how(batch_size=None)).encoder.header["training"]
     assert training["batch_size"] == 128
+
+
+def test_the_command_takes_sizes_in_any_form_and_warns_of_what_is_worse_than_pca(
+    collected, tmp_path
+):
+    out = ("--data", collected, "--out", tmp_path / "it")
+    result = jbrep("train-dae", "--latent", "5,4", 3, "--epochs", 1, *out)
+    lines = result.stdout.splitlines()
+    assert [line.partition(":")[0] for line in lines] == ["dae-5", "dae-4", "dae-3"]
+    assert all(re.search(r"error [.\d]+, [.\d]+ times PCA's", line) for line in lines)
+    assert "warning: dae-3 reconstructs worse than PCA with as many components" in result.stderr
+    again = jbrep("train-encoder", "--kind", "random", "--latent", "3,", *out)
+    assert "times PCA's" in again.stdout
+    assert "warning" not in again.stderr
+    assert jbrep("train-encoder", "--kind", "full", *out).exit_code == 0
+    assert load(tmp_path / "it" / "identity.safetensors").representation == "full"
+    for nonsense in ("8x", ",", "8,,4", "1e3", "8;4"):
+        refused = jbrep("train-dae", "--latent", nonsense, *out)
+        assert refused.exit_code == 2
+        assert f"{nonsense!r} is not a list of sizes: write 12 8 4 or 12,8,4." in refused.stderr
 
 
 def test_other_settings_or_data_are_refused_and_nothing_is_lost(data, collected, tmp_path):

@@ -217,12 +217,14 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path, as_json: bool) -> 
     scaled = ScaledDataset(Dataset(data))
     encoders = [find(name, scaled.task.name) for name in encoder]
     sources = [source_of(name, scaled.task.name) for name in encoder]
-    labelled = dict(zip(_labels([each.name for each in encoders], sources), encoders, strict=True))
+    labels = _labels([each.representation for each in encoders], sources)
+    labelled = dict(zip(labels, encoders, strict=True))
     with stoppable("the same command starts over"):
         evaluation = write(labelled, scaled, out)
         pictures = write_plots(encoder_plots(evaluation), out)
-    for label, source in zip(labelled, sources, strict=True):
-        click.echo(printable(f"{label}: {source}"), err=as_json)
+    for label, source in zip(labels, sources, strict=True):
+        line = source if source.startswith(label) else f"{label}: {source}"
+        click.echo(printable(line), err=as_json)
     for label, seen in evaluation["seen"].items():
         if seen == "maybe":
             click.echo(
@@ -239,11 +241,13 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path, as_json: bool) -> 
 
 
 def _labels(names: list[str], sources: list[str]) -> list[str]:
-    """What tables call encoders: by name, or by source where several have the same name."""
+    """What tables call encoders: their names, or their sources where a name is taken."""
+    from jbrep.encoders import FULL
     from jbrep.encoders.file import SUFFIX
 
+    taken = [FULL, *names]
     return [
-        name if names.count(name) == 1 else source.removesuffix(SUFFIX)
+        name if taken.count(name) == 1 else source.removesuffix(SUFFIX)
         for name, source in zip(names, sources, strict=True)
     ]
 

@@ -55,7 +55,7 @@ def diagnose(encoders: Mapping[str, Encoder], data: ScaledDataset) -> dict[str, 
         for label, encoder in everything.items():
             results[label] = {"kind": encoder.header["kind"], "latent": encoder.latent_size}
             for name, diagnostic in _DIAGNOSTICS.items():
-                progress.set_description(f"{label} {name}")
+                progress.set_description_str(f"{label} {name}", refresh=False)
                 results[label][name] = diagnostic(encoder, held_out)
                 progress.update()
     return {

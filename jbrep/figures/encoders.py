@@ -123,7 +123,7 @@ def _error_by_corruption(task: str, encoders: Encoders) -> Plot:
     """Error in restoring clean rows from corrupted ones, a panel for each latent size."""
     return Plot(
         "error_by_corruption",
-        f"{task}: does denoising denoise?",
+        f"{task}: error on corrupted observations",
         "Mean squared error of clean observations reconstructed from corrupted ones, against the "
         "standard deviation of the noise. Dashed: the best linear denoiser of that size; dotted: "
         "the corrupted input itself.",
@@ -156,7 +156,7 @@ def _draw_corruption(task: str, encoders: Encoders) -> Figure:
         axes.set(title=f"latent size {size}", xlabel="noise (standard deviation)", yscale="log")
     panels[0].set_ylabel("mean squared error")
     below(figure, panels)
-    figure.suptitle(f"{task}: does denoising denoise?", size=8)
+    figure.suptitle(f"{task}: error on corrupted observations", size=8)
     return figure
 
 
@@ -197,12 +197,12 @@ def _draw_correlation(task: str, encoders: Encoders) -> Figure:
         values = np.array(e["latent_units"]["correlation"], float)
         picture = axes.imshow(values, cmap="RdBu_r", vmin=-1, vmax=1)
         names = _unit_names(e)
-        axes.set_xticks(range(len(names)), names, rotation=0 if names[0] == "0" else 90)
-        axes.set_yticks(range(len(names)), names)
-        unit = "feature" if e["kind"] == IDENTITY else "latent unit"
+        unit, size, angle = ("feature", 5, 90) if e["kind"] == IDENTITY else ("latent unit", 6.5, 0)
+        axes.set_xticks(range(len(names)), names, size=size, rotation=angle)
+        axes.set_yticks(range(len(names)), names, size=size)
         axes.set(title=plain(label), xlabel=unit, ylabel=unit)
         _bare(axes)
-    figure.colorbar(picture, ax=panels.tolist(), label="correlation", shrink=0.8, aspect=30)
+    figure.colorbar(picture, ax=panels.tolist(), label="correlation", shrink=0.8, aspect=15 * rows)
     figure.suptitle(f"{task}: correlation between latent units", size=8)
     return figure
 
@@ -210,10 +210,11 @@ def _draw_correlation(task: str, encoders: Encoders) -> Figure:
 def _families(encoders: Encoders) -> dict[str, dict[int, Mapping[str, Any]]]:
     """Encoders that differ in latent size only, by that size; PCA is the reference, drawn apart."""
     families: dict[str, dict[int, Mapping[str, Any]]] = {}
+    sizes = _sizes(encoders)
     for label, e in encoders.items():
-        name = label.removesuffix(f"-{e['latent']}")
-        if name not in ("pca", label):
-            families.setdefault(name, {})[e["latent"]] = e
+        family = label.removesuffix(f"-{e['latent']}")
+        if family != "pca" and e["latent"] in sizes:
+            families.setdefault(family, {})[e["latent"]] = e
     return families
 
 

@@ -49,7 +49,7 @@ class Representation:
             InputError: it is none, or can't be trained so.
         """
         if name == FULL:
-            return cls(name, "identity", Training.of())
+            return cls(name, "identity", Training.of(0))
         parts = re.fullmatch(r"([a-z]+)(?:-([a-z]+))?-(\d{1,3})", name)
         if not parts or "latent" not in get_kind(parts[1]).settings:
             raise InputError(
