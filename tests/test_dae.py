@@ -150,7 +150,7 @@ def test_the_best_epoch_is_that_of_the_lowest_training_loss():
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_a_checkpoint_goes_on_to_the_same_weights(architecture, tmp_path):
+def test_a_checkpoint_resumes_to_the_same_weights(architecture, tmp_path):
     whole = trained(architecture=architecture, epochs=5)
     first = trainer(architecture=architecture, epochs=5)
     steps = first.epochs()

@@ -373,15 +373,15 @@ def test_encoders_ship_for_every_task(task):
     assert names(task) == (*sizes[:3], "full", *sizes[3:])
     errors = {}
     for name in names(task):
-        it = find(name, task)
-        it.check_task(TASKS[task])
-        source = it.header["data"]
+        encoder = find(name, task)
+        encoder.check_task(TASKS[task])
+        source = encoder.header["data"]
         assert source["train_rows"] + source["test_rows"] == 5_000_000
         assert source["fingerprint"] == find("full", task).header["data"]["fingerprint"]
-        errors[name] = it.header["metrics"]["held_out_mse"]
-        if it.header["kind"] == "dae":
-            training = it.header["training"]
-            assert training["epochs"] == it.header["metrics"]["epochs"] == 200
+        errors[name] = encoder.header["metrics"]["held_out_mse"]
+        if encoder.header["kind"] == "dae":
+            training = encoder.header["training"]
+            assert training["epochs"] == encoder.header["metrics"]["epochs"] == 200
     for kind in ("dae", "pca", "random"):
         assert errors["full"] < errors[f"{kind}-12"] < errors[f"{kind}-8"] < errors[f"{kind}-4"]
 
@@ -404,7 +404,7 @@ def test_an_encoder_is_shown_on_one_line(encoder):
     assert repr(encoder) == "Encoder(dae-3, face_direction, 16 to 3)"
 
 
-def test_a_name_that_ships_comes_before_a_file(encoder, tmp_path, monkeypatch):
+def test_a_name_that_ships_takes_precedence_over_a_file(encoder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save(encoder, tmp_path / "dae-8")
     assert source_of("dae-8", TASK.name) == "dae-8, shipped"

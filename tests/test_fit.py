@@ -95,8 +95,8 @@ def whole(data, tmp_path_factory):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stopped_training_goes_on_to_the_same_file(whole, collected, number, tmp_path):
-    """Of one that is killed, test_whole says so."""
+def test_a_stopped_training_resumes_to_the_same_file(whole, collected, number, tmp_path):
+    """test_whole has the same for one that is killed."""
     out, work = tmp_path / "stopped", tmp_path / "stopped" / "dae-4.training"
     training = ("--latent", 4, "--batch-size", 50, "--epochs", 30)
     command = ("train-dae", *training, "--data", collected, "--out", out)
@@ -106,7 +106,7 @@ def test_a_stopped_training_goes_on_to_the_same_file(whole, collected, number, t
     told = process.communicate()[1]
     path = out / "dae-4.safetensors"
     assert process.returncode == 128 + number
-    assert f"the same command goes on where it stopped; what is best so far is in {out}" in told
+    assert f"the best so far is in {out}" in told
     kept = load(path).header["metrics"]
     assert 1 <= kept["best_epoch"] <= kept["epochs"] < 30
     assert "dae-4: held-out mean squared error" in jbrep(*command).output

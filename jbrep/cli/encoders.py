@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,6 +19,10 @@ from jbrep.cli.base import (
 )
 from jbrep.errors import InputError
 from jbrep.text import terminal_width
+
+if TYPE_CHECKING:
+    from jbrep.dataset import ScaledDataset
+    from jbrep.methods.fit import Fitted
 
 _POOR = 1.5  # times PCA's error, from which a trained encoder deserves a warning
 
@@ -161,7 +165,7 @@ def _fit(
             _report(fitter.fit(kind, training), scaled)
 
 
-def _report(fitted: Any, data: Any) -> None:
+def _report(fitted: "Fitted", data: "ScaledDataset") -> None:
     """Say how an encoder that was fitted to that data compares with PCA."""
     from jbrep.encoders.file import HELD_OUT_MSE
     from jbrep.methods.fit import KINDS
