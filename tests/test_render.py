@@ -195,7 +195,7 @@ def test_an_mp4_keeps_what_it_is_given(tmp_path):
         (("--fps", 0), "frames a second: 0, it must be from 1 to 50"),
         (("--speed", "nan"), "speed: nan, it must be from 0.01 to 100"),
         (("--seconds", 11), "simulated seconds: 11, it must be from 0.01 to 10"),
-        (("--episode", 1, "uniform"), "differ in their task or start: side by side go"),
+        (("--episode", 1, "uniform"), "differ in their task or start: only episodes"),
         (("--episode", 4), "has no episode 4: it has 4, from 0"),
         (("nowhere",), "nowhere is no data set, no folder of a run that is over, and no policy"),
         (("--size", "3840x64", *["uniform"] * 2), "are 11,520 pixels wide: at most 7,680"),
