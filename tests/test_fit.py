@@ -106,7 +106,7 @@ def test_a_stopped_training_resumes_to_the_same_file(whole, collected, number, t
     told = process.communicate()[1]
     path = out / "dae-4.safetensors"
     assert process.returncode == 128 + number
-    assert f"the best so far is in {out}" in told
+    assert f"the same command resumes it; the best so far is in {out}" in told
     kept = load(path).header["metrics"]
     assert 1 <= kept["best_epoch"] <= kept["epochs"] < 30
     assert "dae-4: held-out mean squared error" in jbrep(*command).output
