@@ -207,8 +207,8 @@ def entry_of(**changes):
     ("change", "message"),
     [
         (manifest_of(format_version=2), "has format version 2: this jbrep reads up to 1"),
-        (manifest_of(format_version=0), "has format version 0"),
-        (manifest_of(format_version=-1), "has format version -1"),
+        (manifest_of(format_version=0), "its format version is 0"),
+        (manifest_of(format_version=-1), "its format version is -1"),
         (manifest_of(format="other"), "is damaged"),
         (manifest_of(shards={}), "is not one of the 0 shards"),
         (manifest_of(shards=[[]]), "is damaged"),

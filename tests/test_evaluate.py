@@ -2,20 +2,23 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from command import jbrep
 from sklearn.decomposition import PCA
 from sklearn.linear_model import Ridge
 from sklearn.metrics import r2_score
 from sklearn.preprocessing import StandardScaler
 
+from jbrep import figures
 from jbrep.dataset import Dataset, ScaledDataset, Scaler
 from jbrep.dataset.scaled import sample
-from jbrep.encoders import Encoder, Layer
+from jbrep.encoders import Encoder, Layer, find, save
 from jbrep.errors import InputError
-from jbrep.evaluate import evaluate
+from jbrep.evaluate import diagnose, files
 from jbrep.evaluate.files import EVALUATION, write
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import intrinsic_dimension, latent
@@ -70,9 +73,9 @@ def test_intervals_cover_the_truth_as_often_as_they_say():
     covered = 0
     for _ in range(300):
         episodes = random.normal(3, 2, size=(60, 1))
-        found = bootstrap(lambda s, n: (s / n)[..., 0], episodes, np.ones((60, 1)))
-        assert found.value == pytest.approx(episodes.mean())
-        covered += found.low <= 3 <= found.high
+        result = bootstrap(lambda s, n: (s / n)[..., 0], episodes, np.ones((60, 1)))
+        assert result.value == pytest.approx(episodes.mean())
+        covered += result.low <= 3 <= result.high
     assert 0.9 <= covered / 300 <= 0.98
 
 
@@ -85,10 +88,10 @@ def test_resamples_are_the_same_for_all_that_is_compared():
 
 
 def test_one_episode_has_no_interval():
-    found = bootstrap(lambda s: s[..., 0], np.ones((1, 1)))
-    assert found.value == 1
-    assert np.isnan([found.low, found.high]).all()
-    assert found.tolist() == [1.0, None, None]
+    result = bootstrap(lambda s: s[..., 0], np.ones((1, 1)))
+    assert result.value == 1
+    assert np.isnan([result.low, result.high]).all()
+    assert result.tolist() == [1.0, None, None]
 
 
 def test_sums_by_episode():
@@ -118,13 +121,13 @@ def test_a_sample_is_in_order_and_of_any_step(held_out):
 
 
 def test_errors_are_those_of_encode_and_decode(held_out, coder):
-    found = reconstruction(coder, held_out)
+    result = reconstruction(coder, held_out)
     rows = observed(held_out, "test")
     lost = coder.decode(coder.encode(rows)).astype(float) - rows
     scaled = lost / held_out.data.scaler.half_width
-    assert found["mse"][0] == pytest.approx(np.mean(scaled**2), rel=1e-5)
-    assert found["mse"][1] < found["mse"][0] < found["mse"][2]
-    for i, feature in enumerate(found["features"]):
+    assert result["mse"][0] == pytest.approx(np.mean(scaled**2), rel=1e-5)
+    assert result["mse"][1] < result["mse"][0] < result["mse"][2]
+    for i, feature in enumerate(result["features"]):
         assert feature["name"] == held_out.data.task.feature_names[i]
         assert feature["mse"][0] == pytest.approx(np.mean(scaled[:, i] ** 2), rel=1e-4)
         rmse = np.sqrt(np.mean(lost[:, i] ** 2))
@@ -132,9 +135,9 @@ def test_errors_are_those_of_encode_and_decode(held_out, coder):
         r2 = r2_score(rows[:, i].astype(float), rows[:, i] + lost[:, i])
         assert feature["r2"][0] == pytest.approx(r2, rel=1e-3, abs=1e-4)
     by_row = (scaled**2).mean(axis=1)
-    assert found["quantiles"]["0.9"] == pytest.approx(np.quantile(by_row, 0.9), rel=1e-3)
-    assert found["quantiles"]["1"] == pytest.approx(by_row.max(), rel=1e-3)
-    worst = found["worst_episodes"][0]
+    assert result["quantiles"]["0.9"] == pytest.approx(np.quantile(by_row, 0.9), rel=1e-3)
+    assert result["quantiles"]["1"] == pytest.approx(by_row.max(), rel=1e-3)
+    worst = result["worst_episodes"][0]
     errors = by_row.reshape(3, 1000).mean(axis=1)
     assert worst["episode"] == held_out.numbers[errors.argmax()]
     assert worst["mse"] == pytest.approx(errors.max(), rel=1e-4)
@@ -177,13 +180,13 @@ def test_dead_and_saturated_units_are_found(held_out):
         (Layer(weight, np.zeros(4, np.float32), "tanh"),),
         (Layer(weight.T, np.zeros(16, np.float32), "linear"),),
     )
-    found = latent(make(held_out.data, parts), held_out)
-    assert found["dead"] == [2, 3]
-    assert found["saturation"][1] > 0.9
-    assert found["saturation"][0] == 0
-    assert found["correlation"][2] == [None] * 4
-    assert found["correlation"][0][0] == pytest.approx(1)
-    assert 1 < found["participation_ratio"] < 2
+    result = latent(make(held_out.data, parts), held_out)
+    assert result["dead"] == [2, 3]
+    assert result["saturation"][1] > 0.9
+    assert result["saturation"][0] == 0
+    assert result["correlation"][2] == [None] * 4
+    assert result["correlation"][0][0] == pytest.approx(1)
+    assert 1 < result["participation_ratio"] < 2
 
 
 def test_the_participation_ratio_counts_equal_variances(held_out):
@@ -192,10 +195,10 @@ def test_the_participation_ratio_counts_equal_variances(held_out):
     weight = (vectors[:, -5:] / np.sqrt(values[-5:])).T.astype(np.float32)
     whitened = (Layer(weight, np.zeros(5, np.float32), "linear"),)
     back = (Layer(weight.T.copy(), np.zeros(16, np.float32), "linear"),)
-    found = latent(make(data, (whitened, back)), HeldOut(train_as_test(data)))
-    assert found["participation_ratio"] == pytest.approx(5, rel=1e-3)
-    np.testing.assert_allclose(found["variance"], 1, rtol=1e-3)
-    assert found["saturation"] is None
+    result = latent(make(data, (whitened, back)), HeldOut(train_as_test(data)))
+    assert result["participation_ratio"] == pytest.approx(5, rel=1e-3)
+    np.testing.assert_allclose(result["variance"], 1, rtol=1e-3)
+    assert result["saturation"] is None
 
 
 def train_as_test(data):
@@ -223,20 +226,20 @@ def test_quantities_are_those_of_the_simulated_body():
     random = np.random.default_rng(0)
     rows = random.normal(size=(50, task.size))
     rows[:, 3:7] /= np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
-    found = quantities(task, rows)
+    result = quantities(task, rows)
     for i, row in enumerate(rows):
         rotation = np.empty(9)
         mujoco.mju_quat2Mat(rotation, row[3:7])
         face = -rotation.reshape(3, 3)[:2, 1]
         face /= np.linalg.norm(face)
-        np.testing.assert_allclose(found["heading"][i], face, atol=1e-9)
-        assert found["uprightness"][i, 0] == pytest.approx(rotation[8])
-        assert found["forward_speed"][i, 0] == pytest.approx(face @ row[7:9])
-        np.testing.assert_allclose(found["motor_phase"][i], (np.cos(row[13]), np.sin(row[13])))
+        np.testing.assert_allclose(result["heading"][i], face, atol=1e-9)
+        assert result["uprightness"][i, 0] == pytest.approx(rotation[8])
+        assert result["forward_speed"][i, 0] == pytest.approx(face @ row[7:9])
+        np.testing.assert_allclose(result["motor_phase"][i], (np.cos(row[13]), np.sin(row[13])))
         ahead, left = -row[16], row[15]
-        bearing = np.arctan2(*found["bearing_of_target"][i][::-1])
+        bearing = np.arctan2(*result["bearing_of_target"][i][::-1])
         assert bearing == pytest.approx(np.arctan2(left, ahead))
-        np.testing.assert_allclose(found["angle_to_target"][i], (np.cos(row[18]), np.sin(row[18])))
+        np.testing.assert_allclose(result["angle_to_target"][i], (np.cos(row[18]), np.sin(row[18])))
     names = list(state(task, rows))
     assert names[:3] == ["heading_cos", "heading_sin", "uprightness"]
     assert "orientation_w" not in names
@@ -255,10 +258,10 @@ def test_every_task_has_its_quantities():
 
 def test_probes_are_ridge_regressions(held_out, coder):
     train, test = observed(held_out, "train"), observed(held_out, "test")
-    found = probes(coder, held_out)
+    result = probes(coder, held_out)
     scaler = StandardScaler().fit(coder.encode(train))
     wanted, true = (quantities(held_out.data.task, rows) for rows in (train, test))
-    for name, values in found.items():
+    for name, values in result.items():
         fitted = Ridge(1.0).fit(scaler.transform(coder.encode(train)), wanted[name])
         predicted = fitted.predict(scaler.transform(coder.encode(test))).reshape(len(test), -1)
         expected = r2_score(true[name], predicted, multioutput="variance_weighted")
@@ -278,12 +281,12 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     known, unseen = (np.column_stack((whiten(v[:, :4]), v[:, 4])) for v in (known, unseen))
     scaler = StandardScaler().fit(known)
     predicted = Ridge(1.0).fit(scaler.transform(known), after).predict(scaler.transform(unseen))
-    found = dynamics(coder, held_out)
+    result = dynamics(coder, held_out)
     expected = r2_score(true, predicted, multioutput="variance_weighted")
-    assert found["linear"][0] == pytest.approx(expected, abs=1e-3)
+    assert result["linear"][0] == pytest.approx(expected, abs=1e-3)
     still = r2_score(true, unseen[:, :4], multioutput="variance_weighted")
-    assert found["persistence"][0] == pytest.approx(still, abs=1e-3)
-    assert found["linear"][0] > found["persistence"][0]
+    assert result["persistence"][0] == pytest.approx(still, abs=1e-3)
+    assert result["linear"][0] > result["persistence"][0]
 
 
 def test_mixing_the_units_does_not_change_how_well_the_next_is_read(held_out, coder):
@@ -305,20 +308,20 @@ def test_neighbours_come_from_training_episodes(held_out, coder, everything):
     apart = coder.encode(test)[:, None] - coder.encode(train)[None]
     nearest = np.argsort((apart**2).sum(axis=-1), axis=1)[:, :5]
     expected = (((true[nearest] - wanted[:, None]) / true.std(axis=0)) ** 2).mean()
-    found = neighbours(coder, held_out)
-    assert found["mse"][0] == pytest.approx(expected, rel=1e-2)
-    assert np.mean([v[0] for v in found["dimensions"].values()]) == pytest.approx(found["mse"][0])
-    assert neighbours(everything, held_out)["mse"][0] < found["mse"][0]
+    result = neighbours(coder, held_out)
+    assert result["mse"][0] == pytest.approx(expected, rel=1e-2)
+    assert np.mean([v[0] for v in result["dimensions"].values()]) == pytest.approx(result["mse"][0])
+    assert neighbours(everything, held_out)["mse"][0] < result["mse"][0]
 
 
 def test_correlation_takes_units_alone_as_candidates(held_out, coder, everything):
     rows = observed(held_out, "test")
     truth = state(held_out.data.task, rows)
     latents = coder.encode(rows)
-    found = correlation(coder, held_out)
+    result = correlation(coder, held_out)
     for name, values in truth.items():
         expected = max(abs(np.corrcoef(unit, values)[0, 1]) for unit in latents.T)
-        assert found["dimensions"][name][0] == pytest.approx(expected, abs=1e-4)
+        assert result["dimensions"][name][0] == pytest.approx(expected, abs=1e-4)
     shown = correlation(everything, held_out)["dimensions"]
     assert shown["motor_velocity"][0] == pytest.approx(1)
     assert shown["uprightness"][0] < 0.99  # though other dimensions of the state are related
@@ -336,11 +339,11 @@ def still(units, weight=0.0):
 
 @pytest.mark.parametrize("parts", [still(3), still(3, 1.0), still(1), still(1, 1.0)])
 def test_dead_and_single_units_can_be_judged(held_out, parts, tmp_path):
-    found = write({"it": make(held_out.data, parts)}, held_out.data, tmp_path)["encoders"]["it"]
-    gtc = found["correlation"]
+    result = write({"it": make(held_out.data, parts)}, held_out.data, tmp_path)["encoders"]["it"]
+    gtc = result["correlation"]
     assert all(0 <= value[0] <= 1 + 1e-9 for value in gtc["dimensions"].values())
-    units = len(found["latent_units"]["variance"])
-    assert len(found["latent_units"]["dead"]) in (units, units - 1)
+    units = len(result["latent_units"]["variance"])
+    assert len(result["latent_units"]["dead"]) in (units, units - 1)
 
 
 def test_the_observation_alone_can_be_judged(held_out, everything, tmp_path):
@@ -356,10 +359,10 @@ def test_a_constant_feature_can_be_judged(data):
         np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.low),
         np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.high),
     )
-    found = evaluate({"pca-4": make(flat, pca(flat, 4))}, flat)["encoders"]["pca-4"]
-    assert found["reconstruction"]["features"][2]["r2"] == [None, None, None]
-    assert found["corruption"][0]["linear_mse"][0] == pytest.approx(
-        found["reconstruction"]["mse"][0], rel=1e-3
+    result = diagnose({"pca-4": make(flat, pca(flat, 4))}, flat)["encoders"]["pca-4"]
+    assert result["reconstruction"]["features"][2]["r2"] == [None, None, None]
+    assert result["corruption"][0]["linear_mse"][0] == pytest.approx(
+        result["reconstruction"]["mse"][0], rel=1e-3
     )
 
 
@@ -370,11 +373,11 @@ def still_height(data, rows):
 
 
 def test_labels_and_numbers_that_cannot_be_judged(data):
-    with pytest.raises(InputError, match="the label full is that of the observation itself"):
-        evaluate({"full": make(data, ((), ()))}, data)
+    with pytest.raises(InputError, match="the label full is reserved for the observation itself"):
+        diagnose({"full": make(data, ((), ()))}, data)
     huge = Layer(np.full((16, 16), 1e11, np.float32), np.zeros(16, np.float32), "linear")
-    with pytest.raises(InputError, match="it gives numbers that aren't finite"):
-        evaluate({"it": make(data, ((), (huge,) * 4))}, data)
+    with pytest.raises(InputError, match="it gives numbers that are not finite"):
+        diagnose({"it": make(data, ((), (huge,) * 4))}, data)
 
 
 def test_an_evaluation_is_plain_json_and_repeats(data, tmp_path):
@@ -384,12 +387,37 @@ def test_an_evaluation_is_plain_json_and_repeats(data, tmp_path):
     assert list(json.loads(text)["encoders"]) == ["full", "pca-4", "r-4"]
     assert write(encoders, data, tmp_path / "it") == one
     assert (tmp_path / "it" / EVALUATION).read_text() == text
-    with pytest.raises(InputError, match="holds something else than the evaluation of these"):
+    with pytest.raises(InputError, match="is not an evaluation of these encoders"):
         write({"r-4": encoders["r-4"]}, data, tmp_path / "it")
     assert (tmp_path / "it" / EVALUATION).read_text() == text
     shown = evaluation_text(json.loads(text))
     assert "pca-4" in shown
     assert "nan" not in shown
+
+
+def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
+    collected, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(figures, "encoder_plots", lambda evaluation: [])  # they take seconds
+    shipped = find("pca-4", "face_direction")
+    save(replace(shipped, header={**shipped.header, "name": "dae-4"}), Path("dae-4"))
+    chosen = ("--encoder", "dae-4", "./dae-4", "full")
+    command = ("evaluate", *chosen, "--data", collected, "--out", "judged")
+    shown = jbrep(*command).stdout
+    assert shown.startswith("dae-4, shipped\n./dae-4\nfull, shipped\n\nError on 1 held-out")
+    assert max(map(len, shown.splitlines())) <= 80
+    evaluation = json.loads((tmp_path / "judged" / EVALUATION).read_text())
+    whole = evaluation_text(evaluation)
+    assert set(whole.split()) < set(shown.split())
+    assert max(map(len, whole.splitlines())) > 80
+    monkeypatch.setattr(files, "diagnose", lambda encoders, data: evaluation)
+    again = jbrep(*command, "--json")
+    assert json.loads(again.stdout) == evaluation
+    labels = ["full", "dae-4, shipped", "./dae-4", "full, shipped"]
+    assert list(evaluation["encoders"]) == labels
+    assert "dae-4, shipped\n./dae-4\nfull, shipped\n" in again.stderr
 
 
 def test_whether_an_encoder_may_have_seen_the_episodes(data):
@@ -400,13 +428,13 @@ def test_whether_an_encoder_may_have_seen_the_episodes(data):
         "apart": {"fingerprint": "other", "seed": 4},
     }
     encoders = {n: make(data, pca(data, 2), data=source) for n, source in sources.items()}
-    found = evaluate(encoders, data)["seen"]
-    assert found == {"same": "no test row", "overlaps": "maybe", "apart": "none"}
+    result = diagnose(encoders, data)["seen"]
+    assert result == {"same": "no test row", "overlaps": "maybe", "apart": "none"}
 
 
 def test_other_features_are_refused(data):
     with pytest.raises(InputError, match="made for move_to_pose, whose features differ"):
-        evaluate({"it": make(data, ((), ()), task="move_to_pose", features=["a"] * 16)}, data)
+        diagnose({"it": make(data, ((), ()), task="move_to_pose", features=["a"] * 16)}, data)
     permuted = list(reversed(data.task.feature_names))
     with pytest.raises(InputError, match="has angle_to_target as feature 0"):
-        evaluate({"it": make(data, ((), ()), features=permuted)}, data)
+        diagnose({"it": make(data, ((), ()), features=permuted)}, data)

@@ -1,7 +1,7 @@
-"""Train encoders of every kind for some tasks, and put them side by side.
+"""Train encoders of every kind for some tasks, and compare them.
 
-python tools/encoders.py DATA ENCODERS RESULTS TASK...; what is there already is kept. Without a
-task it prints the overview of RESULTS alone.
+python tools/encoders.py DATA ENCODERS RESULTS TASK...; existing encoders are kept. Without a task
+it only prints the overview of RESULTS.
 """
 
 import json
@@ -31,7 +31,7 @@ KINDS = (
 
 
 def compare(data: ScaledDataset, encoders: Path, results: Path) -> None:
-    """Fit all kinds for a task, and write evaluation.json, tables.txt and the figures."""
+    """Make encoders of all kinds for a task; write evaluation.json, tables.txt and the figures."""
     fitter = Fitter(data, encoders)
     fitted = [
         fitter.fit(kind, Training.of(latent, architecture)).encoder
@@ -45,13 +45,13 @@ def compare(data: ScaledDataset, encoders: Path, results: Path) -> None:
 
 
 def overview(results: Path) -> str:
-    """All tasks side by side: times PCA's error, and at noise 0.1 times the best linear's."""
+    """A table by task: error as a multiple of PCA's, and at noise 0.1 of the best linear code's."""
     files = sorted(results.glob("*/evaluation.json"))
-    found = {file.parent.name: json.loads(file.read_text())["encoders"] for file in files}
-    names = [n for n in dict.fromkeys(n for e in found.values() for n in e) if n != FULL]
-    lines = [f"| | {' | '.join(found)} |", "|---" * (len(found) + 1) + "|"]
+    tasks = {file.parent.name: json.loads(file.read_text())["encoders"] for file in files}
+    names = [n for n in dict.fromkeys(n for e in tasks.values() for n in e) if n != FULL]
+    lines = [f"| | {' | '.join(tasks)} |", "|---" * (len(tasks) + 1) + "|"]
     for name in names:
-        cells = [_cell(encoders[name]) if name in encoders else "-" for encoders in found.values()]
+        cells = [_cell(encoders[name]) if name in encoders else "-" for encoders in tasks.values()]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

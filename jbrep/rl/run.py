@@ -14,7 +14,7 @@ from typing import Any
 from stable_baselines3.common.logger import Logger
 
 from jbrep.dae.training import single_torch_thread
-from jbrep.encoders import FULL, Encoder, find, save
+from jbrep.encoders import Encoder, find, save
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError, differences
 from jbrep.files.lock import exclusive
@@ -89,7 +89,7 @@ class Run:
             "algorithm": self.algorithm,
             "preset": self.preset,
             **asdict(get_preset(self.preset, self.algorithm)),
-            "representation": FULL if encoder.name == "identity" else encoder.name,
+            "representation": encoder.representation,
             "encoder": fingerprint(encoder),
             "seed": self.seed,
             "steps": self.steps,
