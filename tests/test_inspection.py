@@ -403,7 +403,7 @@ def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
         ({}, "give a SOURCE to inspect, or one encoder with its --task"),
         ({"source": "tests"}, "tests is no data set and no run, and none is over below it"),
         ({"source": "nowhere"}, "nowhere is no data set, no folder of a run that is over, and no"),
-        ({"source": FACE, "episode": 9}, "has no episode 9: it has 4, from 0"),
+        ({"source": FACE, "episode": 9}, "has no episode 9: it has 4, numbered from 0"),
         ({"source": FACE, "task": "move_to_pose"}, "is of face_direction, not of move_to_pose"),
         ({"source": FACE, "encoder": "dae-9"}, "no encoder 'dae-9'"),
         ({"source": FACE, "traverse": True}, "--traverse moves the units of a latent: give an"),
