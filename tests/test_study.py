@@ -96,7 +96,7 @@ def test_a_study_from_toml(tmp_path):
         ("seeds = 2", "seeds = []", "seeds is .*one or more"),
         ("seeds = 2", "seeds = 0", "seeds is 0: a list of int"),
         ("seeds = 2", "seeds = [0.5]", r"seeds is \[0.5\]: a list of int"),
-        ("seeds = 2", "seeds = [-1]", "the seed is -1: from 0 to"),
+        ("seeds = 2", "seeds = [-1]", "the seed is -1: it must be"),
         ("steps = 80", "steps = 0", "steps is 0: it must be"),
         ("evaluate_every = 80", "evaluate_every = 0", "evaluate every is 0: it must be"),
         ("steps = 80", "steps = '80'", "steps is '80': int is needed"),
