@@ -450,6 +450,14 @@ def test_episodes_are_as_long_as_the_run_s(run):
     assert len(rollout) == 30
 
 
+def test_more_episodes_than_memory_holds_are_not_played(run):
+    settings = json.loads((run / RUN).read_text())["settings"]
+    change(run, settings={**settings, "evaluation_episodes": 10_000, "episode_steps": 10**6})
+    told = jbrep("inspect", run, "--out", run / "it.rrd")
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    assert "plays 10,000 episodes of 1,000,000 steps at once" in told.output
+
+
 def test_another_encoder_is_not_the_run_s(run):
     save(find("pca-8", TASK), run / ENCODER)
     assert "not the encoder that the run was made with" in refused(load_run, run)

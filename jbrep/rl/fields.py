@@ -9,7 +9,7 @@ from jbrep.errors import DamageError
 
 FINISHED, FAILED = "finished", "failed"
 MAX_STEPS = 10**12  # of training
-MAX_EPISODE_STEPS = 100_000
+MAX_EPISODE_STEPS = 1_000_000
 MAX_EVALUATION_EPISODES = 10_000
 _MAX_SEED = (1 << 31) - 1
 _MAX_LAYERS, _MAX_UNITS = 8, 1024  # of a policy's network

@@ -20,7 +20,8 @@ from jbrep.rollouts.rollout import Begin, Rollout, play, replay
 if TYPE_CHECKING:
     from jbrep.rl.policy import Trained
 
-_BATCH = 1000  # episodes in memory at once
+_BATCH_STEPS = 10**6  # control steps that `play_first` holds in memory at once
+_MAX_STEPS = 10**7  # the same, that `play` may return: about 350 bytes each
 
 
 class Player(NamedTuple):
@@ -40,7 +41,15 @@ class Player(NamedTuple):
         Args:
             episodes: their numbers, from 0.
             target_yaw: where every target points [rad]; where it points in the episode if None.
+
+        Raises:
+            InputError: too many steps to hold in memory.
         """
+        if len(episodes) * self.episode_steps > _MAX_STEPS:
+            raise InputError(
+                f"{self.name} plays {len(episodes):,} episodes of {self.episode_steps:,} steps at "
+                f"once: at most {_MAX_STEPS:,} steps are possible"
+            )
         seeds = [EVALUATION_SEED + episode for episode in episodes]
         return play(self.task, self.begin, self.name, seeds, target_yaw, self.episode_steps)
 
@@ -54,8 +63,9 @@ class Player(NamedTuple):
             raise InputError(
                 f"{count:,} episodes are too many: at most {MAX_EVALUATION_EPISODES:,} are played"
             )
-        for start in range(0, count, _BATCH):
-            yield from self.play(range(start, min(start + _BATCH, count)), target_yaw)
+        batch = max(1, _BATCH_STEPS // self.episode_steps)
+        for start in range(0, count, batch):
+            yield from self.play(range(start, min(start + batch, count)), target_yaw)
 
     def with_reconstruction(self, encoder: Encoder) -> "Player":
         """The same policy, which now observes what an encoder's latent is decoded to.
