@@ -464,7 +464,7 @@ def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
         ),
         (
             {"source": FACE, "out": Path("README.md")},
-            "README.md is there and is no Rerun recording",
+            "README.md exists and is not a Rerun recording",
         ),
         ({"source": FACE, "out": Path("docs")}, "can't write docs: Is a directory"),
     ],
@@ -484,7 +484,7 @@ def test_a_study_has_no_episodes(tmp_path):
 def test_an_earlier_recording_is_overwritten_and_nothing_else(tmp_path):
     out = tmp_path / "it.rrd"
     out.write_text("mine")
-    with pytest.raises(InputError, match="is no Rerun recording: choose another --out"):
+    with pytest.raises(InputError, match="is not a Rerun recording: choose another --out"):
         inspect(FACE, out=out)
     assert out.read_text() == "mine"
     assert list(tmp_path.iterdir()) == [out]

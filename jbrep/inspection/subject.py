@@ -1,4 +1,4 @@
-"""From what a user names to its recording."""
+"""Recordings of whatever a user names: an episode, an encoder or a study."""
 
 import re
 from pathlib import Path
