@@ -439,7 +439,7 @@ def test_which_encoder_a_policy_by_name_observes_through(tmp_path):
     told = jbrep(*played, "dae-8").output
     assert told.startswith("encoder: dae-8, shipped\nface_direction, heuristic on dae-8, decoded: ")
     record = json.loads(jbrep(*played, file, "--json").output)
-    assert record["encoder"] == f"the file {file}"
+    assert record["encoder"] == str(file)
     assert record["representation"] == "dae-8, decoded"
     assert f"median return {record['median']:.0f} [" in told
 

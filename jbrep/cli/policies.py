@@ -123,12 +123,12 @@ def _find(
 
 
 def origin(encoder: str) -> str:
-    """An encoder as a user gave it, and whether it ships or is a file."""
+    """Where an encoder is taken from: "dae-8, shipped", or its file."""
     from jbrep.encoders.shipped import names
     from jbrep.jitterbug.tasks import TASKS
 
     ships = any(encoder in names(task) for task in TASKS)
-    return f"{encoder}, shipped" if ships else f"the file {encoder}"
+    return f"{encoder}, shipped" if ships else encoder
 
 
 @click.command(epilog=example("jbrep behaviour runs/full runs/dae-4 --out behaviour"))
