@@ -35,18 +35,16 @@ SETTINGS = Run(task=TASK, algorithm="a2c", encoder="dae-8", steps=80, evaluation
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A short run, and beside it the checkpoint that it had after 40 steps."""
-    from jbrep.rl import checkpoint
-
     folder = tmp_path_factory.mktemp("runs") / "a2c"
-    keep, kept = checkpoint.save, folder.with_name(CHECKPOINT)
+    write = container.write
 
-    def keep_one(agent, *rest):
-        keep(agent, *rest)
-        if agent.num_timesteps == 40:
-            shutil.copy(folder / CHECKPOINT, kept)
+    def keep(path, tensors, header):
+        write(path, tensors, header)
+        if path.name == CHECKPOINT and header["counters"]["num_timesteps"] == 40:
+            shutil.copy(path, folder.parent)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(checkpoint, "save", keep_one)
+        patch.setattr(container, "write", keep)
         train(SETTINGS, folder, save_every=0)
     return folder
 
