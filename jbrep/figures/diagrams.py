@@ -131,7 +131,7 @@ def _draw_layers(axes: Axes, encoder: EncoderRecord, colour: str) -> None:
     names = {0: "observation", latent: "latent", len(sizes) - 1: "reconstruction"}
     for x, name in names.items():
         shade = colour if x == latent else ink()
-        axes.text(x, -0.17, name, ha="center", va="top", size=6.5, color=shade, weight="bold")
+        axes.text(x, -0.17, name, ha="center", va="top", size=6, color=shade, weight="bold")
     axes.set(xlim=(-0.45, len(sizes) - 0.55), ylim=(-0.26, 1.04))
 
 

@@ -153,7 +153,7 @@ def _draw_learning(groups: Groups, looks: Looks) -> Figure:
         means = [label.numbers["mean_return_mean"] for label in group.labels]
         values = np.concatenate([label.by_run["mean_return"] for label in group.labels])
         _from_zero(axes, [*means, Interval(values.max(), np.nan, np.nan)], MAX_RETURN)
-        axes.set_ylabel("mean return over training")
+        axes.set_ylabel("mean return")
         _draw_runs(axes, group, look, "mean_return")
     return figure
 
