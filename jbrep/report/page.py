@@ -1,4 +1,4 @@
-"""A report as one HTML page that needs nothing besides itself."""
+"""A report as one self-contained HTML page."""
 
 import base64
 import hashlib
@@ -82,5 +82,5 @@ def _base64(content: bytes) -> str:
 
 
 def _own(name: str) -> str:
-    """A part of the page that lies beside this module."""
+    """A file of the page, from beside this module."""
     return resources.files(__package__).joinpath(name).read_text()

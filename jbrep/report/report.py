@@ -1,4 +1,4 @@
-"""A study's report: a page to read, a summary for a README and one for programs, figures."""
+"""A study's report: a page, figures, and summaries for READMEs and for programs."""
 
 import json
 from collections.abc import Sequence
@@ -25,10 +25,10 @@ def write_report(folder: Path, out: Path | None = None) -> list[Path]:
 
     Args:
         folder: with the tables of a study.
-        out: where to write it; the same folder if not given.
+        out: folder for the report; the same one if not given.
 
     Returns:
-        The page, the summaries, the folder of the figures.
+        The paths of the page, the summaries and the folder of the figures.
 
     Raises:
         InputError: the folder is not that of a study, a table is damaged, or the report can't be
@@ -51,7 +51,7 @@ def write_report(folder: Path, out: Path | None = None) -> list[Path]:
 
 
 def _summary(tables: Tables, verdicts: Sequence[Answer]) -> dict[str, Any]:
-    """For programs."""
+    """The summary for programs."""
     record = tables.record
     return {
         "format": FORMAT,
