@@ -152,7 +152,7 @@ def test_a_representation_has_one_colour_in_all_figures(analysis, returns):
     """Also where the statistics leave out a representation that comes before it."""
     kept = [run for run in runs() if run.representation != "dae-8"]
     part = Analysis.from_json(analyse(kept).to_json(), Path("statistics.json"))
-    of_part = study_plots(part, returns, {}, LABELS)
+    of_part = study_plots(part, returns, {}, {})
     of_all = study_plots(analysis, returns, {}, LABELS)
     for plots in (of_part, of_all):
         colours = set()
