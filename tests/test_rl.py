@@ -19,6 +19,7 @@ import pytest
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import VecMonitor
 
 from jbrep.cli.rl import _Bar
 from jbrep.encoders import find
@@ -177,6 +178,14 @@ def test_runs_of_two_seeds_share_no_start_with_each_other_or_evaluation():
     seeds = [training_seed(seed) for seed in range(1000)]
     assert min(np.diff(sorted(seeds))) > 64
     assert max(seeds) + 64 < EVALUATION_SEED
+
+
+def test_training_starts_from_these_seeds_whatever_the_agent_seeds(tmp_path, monkeypatch):
+    reset, starts = VecMonitor.reset, []
+    monkeypatch.setattr(VecMonitor, "reset", lambda env: starts.append(reset(env)) or starts[-1])
+    train(dataclasses.replace(SHORT, seed=3), tmp_path / "run")
+    expected = make_env(TASK, 8, training_seed(3), find("dae-8", TASK)).venv.reset()
+    assert [np.array_equal(start, expected) for start in starts if len(start) == 8] == [True]
 
 
 def test_the_full_observation_is_scaled_as_encoders_scale_it():

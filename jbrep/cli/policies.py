@@ -117,9 +117,10 @@ def _find(
             f"no policy at {policy}: a folder of jbrep rl is needed, a zip file of "
             f"stable-baselines3, or a name: {', '.join(POLICIES)}"
         )
+    from jbrep.encoders import FULL
     from jbrep.rl.policy import load_zip  # imports torch
 
-    return as_player(policy, load_zip(path, task, algorithm, encoder or "identity", trust))
+    return as_player(policy, load_zip(path, task, algorithm, encoder or FULL, trust))
 
 
 def origin(encoder: str) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, example
+from jbrep.cli.base import COUNT, example, printable
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
@@ -32,8 +32,9 @@ _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again end
 )
 @click.option(
     "--encoder",
-    default="identity",
-    help="A file, or a shipped encoder's name. Default: the full observation, scaled alike.",
+    default="full",
+    show_default=True,
+    help="A file, or a shipped encoder's name; full is the whole observation, scaled alike.",
 )
 @click.option("--steps", default=100_000, show_default=True, type=COUNT, help="Control steps.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
@@ -59,11 +60,13 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
     resumes from it, to the same result.
     """
     with _stop_signals() as received:
+        from jbrep.encoders.shipped import source_of
         from jbrep.rl import Run, StoppedError, train
         from jbrep.rl.files import EVALUATIONS, read_evaluations
 
         run = Run(**settings)
         run.check()
+        click.echo(printable(f"encoder: {source_of(run.encoder, run.task)}"))
         try:
             with closing(_Bar(run.steps, f"{run.algorithm} on {run.encoder}")) as bar:
                 result = train(run, out, bar.show, stop=lambda: bool(received))

@@ -11,7 +11,7 @@ FINISHED, FAILED = "finished", "failed"
 MAX_STEPS = 10**12  # of training
 MAX_EPISODE_STEPS = 1_000_000
 MAX_EVALUATION_EPISODES = 10_000
-_MAX_SEED = (1 << 31) - 1
+MAX_SEED = (1 << 31) - 1
 _MAX_LAYERS, _MAX_UNITS = 8, 1024  # of a policy's network
 _MAX_ENVS = 4096
 _MAX_SECONDS = 1e12
@@ -84,7 +84,7 @@ _SETTINGS = {
     "optimizer": _OBJECT,
     "representation": _NAME,
     "encoder": _SHA256,
-    "seed": whole_number(0, _MAX_SEED),
+    "seed": whole_number(0, MAX_SEED),
     "steps": whole_number(1, MAX_STEPS),
     "evaluate_every": whole_number(1, MAX_STEPS),
     "evaluation_episodes": whole_number(1, MAX_EVALUATION_EPISODES),

@@ -10,7 +10,7 @@ import torch
 from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.collect.policies import Actor
-from jbrep.encoders import FULL, Encoder, find, load
+from jbrep.encoders import Encoder, find, load
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import DamageError, InputError, choose
 from jbrep.files import container
@@ -39,7 +39,7 @@ class Trained(NamedTuple):
     @property
     def representation(self) -> str:
         """What the policy observes."""
-        return FULL if self.encoder.header["kind"] == "identity" else self.encoder.name
+        return self.encoder.representation
 
     def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
         """Act deterministically; nothing is drawn."""

@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import Logger
 from torch.distributions import Distribution
 
 from jbrep.dae.training import single_torch_thread
-from jbrep.encoders import Encoder, find, save
+from jbrep.encoders import FULL, Encoder, find, save
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError, differences
 from jbrep.files.lock import exclusive
@@ -24,6 +24,7 @@ from jbrep.jitterbug.simulation import NonFiniteActionError
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.checkpoint import Checkpointer
+from jbrep.rl.fields import MAX_EPISODE_STEPS, MAX_EVALUATION_EPISODES, MAX_SEED, MAX_STEPS
 from jbrep.rl.files import (
     CHECKPOINT,
     ENCODER,
@@ -44,12 +45,11 @@ from jbrep.rl.presets import get_preset
 from jbrep.rl.recorder import DivergedError, History, Recorder, Scalars, Watch
 
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
-_MAX_SEED = (1 << 31) - 1
 _LIMITS = {
-    "steps": 10**12,
-    "evaluate_every": 10**12,
-    "evaluation_episodes": 10_000,
-    "episode_steps": 1_000_000,
+    "steps": MAX_STEPS,
+    "evaluate_every": MAX_STEPS,
+    "evaluation_episodes": MAX_EVALUATION_EPISODES,
+    "episode_steps": MAX_EPISODE_STEPS,
 }
 
 
@@ -64,7 +64,7 @@ class Run:
     task: str
     algorithm: str = "sac"
     preset: str = "paper"
-    encoder: str = "identity"  # a file, or a shipped encoder's name; identity: full observation
+    encoder: str = FULL  # a file, or a shipped encoder's name; full: the whole observation
     seed: int = 0
     steps: int = 100_000
     evaluate_every: int = 10_000  # steps
@@ -78,8 +78,8 @@ class Run:
                 raise InputError(
                     f"{words} is {getattr(self, name)}: it must be between 1 and {limit:,}"
                 )
-        if not 0 <= self.seed <= _MAX_SEED:
-            raise InputError(f"the seed is {self.seed}: it must be between 0 and {_MAX_SEED:,}")
+        if not 0 <= self.seed <= MAX_SEED:
+            raise InputError(f"the seed is {self.seed}: it must be between 0 and {MAX_SEED:,}")
 
     def check(self) -> None:
         """Check that the run can start.
@@ -158,8 +158,7 @@ def _read_ended(folder: Path, settings: dict[str, Any]) -> dict[str, Any] | None
     if not exists(folder / RUN):
         return None
     result = read_run(folder)
-    before = {"episode_steps": EPISODE_STEPS, **result["settings"]}  # earlier versions had no other
-    if differing := differences(before, settings):
+    if differing := differences(result["settings"], settings):
         raise InputError(f"{folder} holds another run: {differing}; choose another folder")
     return result
 
@@ -185,6 +184,7 @@ def _train(
     seed = training_seed(run.seed)
     env = make_env(run.task, preset.num_envs, seed, encoder, run.episode_steps)
     agent = make_agent(run.algorithm, preset, env, run.seed)
+    env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
     agent.set_logger(Logger(None, [Scalars(folder / "tensorboard", history.first_step)]))
 
     evaluator = Evaluator(
