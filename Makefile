@@ -28,8 +28,8 @@ demo: $(READY_DEMO) ## the whole job in minutes: collect, train and judge encode
 	rm -rf $(DEMO)
 	$(BIN)/jbrep collect --task face_direction --steps 20k --out $(DEMO)/data
 	$(BIN)/jbrep data info $(DEMO)/data
-	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 12 8 4 --epochs 200 --batch-size 128 --out $(DEMO)/encoders
-	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 8 --architecture deep --epochs 40 --batch-size 128 --out $(DEMO)/encoders
+	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 12 8 4 --out $(DEMO)/encoders
+	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 8 --architecture deep --epochs 40 --out $(DEMO)/encoders
 	$(BIN)/jbrep train-encoder --kind random --data $(DEMO)/data --latent 8 --out $(DEMO)/encoders
 	$(BIN)/jbrep evaluate --encoder $(addprefix $(DEMO)/encoders/,$(addsuffix .safetensors,dae-12 dae-8 dae-4 dae-deep-8 random-8)) --data $(DEMO)/data --out $(DEMO)/evaluation
 	$(BIN)/jbrep study studies/smoke.toml --out $(DEMO)/study

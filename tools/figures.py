@@ -1,4 +1,4 @@
-"""Draw the figures and reports in results/ anew, from the tables there: python tools/figures.py."""
+"""Redraw the figures and reports in results/ from the tables there: python tools/figures.py."""
 
 import json
 from concurrent.futures import ProcessPoolExecutor
@@ -17,7 +17,7 @@ def draw(tables: Path) -> list[Path]:
 
 
 def main() -> None:
-    reports = sorted(RESULTS.glob("*/runs.json"))  # first, as they take longest
+    reports = sorted(RESULTS.glob("*/runs.json"))  # these take longest
     with ProcessPoolExecutor() as processes:
         tables = (*reports, *sorted(RESULTS.glob("encoders/*/evaluation.json")))
         for paths in processes.map(draw, tables):

@@ -1,4 +1,4 @@
-"""Draw the pictures that the README and docs/ show: python tools/pictures.py docs."""
+"""Draw the pictures in the README and in docs/: python tools/pictures.py docs."""
 
 import sys
 from pathlib import Path

@@ -1,6 +1,6 @@
 """Screenshots for the README: python tools/screenshots.py REPORT RECORDING FOLDER.
 
-The report takes Chromium; the recording Rerun's viewer without a window, and so a Vulkan driver.
+The report needs Chromium; the recording needs a Vulkan driver for Rerun's viewer without a window.
 """
 
 import io
@@ -17,8 +17,8 @@ from rerun.experimental import ViewerClient
 
 SIZE = (1180, 1750)  # of the report [pixels]
 WINDOW = "1760x1080"
-BAR = 36  # the viewer's own, at the top [pixels]
-SECONDS = 5.8  # of the episode
+BAR = 36  # height of the viewer's title bar [pixels]
+SECONDS = 5.8  # into the episode
 PORT = 9977
 START, DRAW = 10, 4  # [s]
 
@@ -51,7 +51,7 @@ def recording(path: Path, out: Path) -> None:
 
 
 def save(picture: Image.Image, out: Path) -> None:
-    """In few colours, by coverage, so that small things keep theirs."""
+    """With 256 colours, chosen by coverage so that small details keep theirs."""
     shown = picture.convert("RGB")
     few = shown.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
     few.save(out, optimize=True)

@@ -15,14 +15,14 @@ from jbrep.stats.bootstrap import Array
 
 @dataclass(frozen=True, eq=False)
 class Behaviour:
-    """What a policy did in some episodes.
+    """The behaviour of a policy over some episodes.
 
     Args:
         name: of the policy.
         returns: of each episode, (episodes,).
-        motor: share of time in each bin of the motor's velocity, (b,).
-        edges: of the cells of the floor, the same in x and y [m], (k + 1,).
-        places: share of time in each cell, (k, k), x first.
+        motor: share of time in each bin of the motor velocity, (b,).
+        edges: edges of the floor's cells, the same in x and y [m], (k + 1,).
+        places: share of time in each cell, x first, (k, k).
     """
 
     name: str
@@ -35,20 +35,20 @@ class Behaviour:
 def behaviour_plots(
     task: str, behaviours: Sequence[Behaviour], speeds: Array, target_yaw: float
 ) -> list[Plot]:
-    """A histogram of the motor's velocity, and heat maps of position.
+    """Histograms of the motor velocity, and heat maps of position.
 
     Args:
-        task: that the policies are for.
+        task: of the policies.
         behaviours: of each policy.
-        speeds: edges of the bins of the motor's velocity [rad/s], (b + 1,).
-        target_yaw: where the targets pointed [rad].
+        speeds: edges of the bins of motor velocity [rad/s], (b + 1,).
+        target_yaw: the direction of the targets [rad].
     """
     episodes = len(behaviours[0].returns)
     return [
         Plot(
             "motor_velocity",
             f"{task}: how the motor turns",
-            f"Share of time at each motor velocity over {episodes} episodes, and their median "
+            f"Share of time at each motor velocity over {episodes} episodes, with their median "
             "return.",
             ("policy", "low", "high", "share"),
             [
@@ -61,8 +61,8 @@ def behaviour_plots(
         Plot(
             "positions",
             f"{task}: where the robot goes",
-            f"Share of time in each cell of 2 cm over {episodes} episodes from the ring; arrow: "
-            "where the target points.",
+            f"Share of time in each 2 cm cell over {episodes} episodes that start at the circle; "
+            "the arrow points in the target's direction.",
             ("policy", "x", "y", "share"),
             [row for each in behaviours for row in _cells(each)],
             lambda: _draw_places(task, behaviours, target_yaw),
@@ -71,7 +71,7 @@ def behaviour_plots(
 
 
 def _cells(each: Behaviour) -> list[tuple[str, str, str, float]]:
-    """The cells that were visited, by their middles."""
+    """The cells that were visited, by their centres."""
     middles = (each.edges[:-1] + each.edges[1:]) / 2
     return [
         (each.name, f"{middles[i]:.3f}", f"{middles[j]:.3f}", each.places[i, j])
@@ -80,7 +80,7 @@ def _cells(each: Behaviour) -> list[tuple[str, str, str, float]]:
 
 
 def _draw_motor(task: str, behaviours: Sequence[Behaviour], speeds: Array) -> Figure:
-    """A panel for each policy, each with its own scale: some stand still nearly all the time."""
+    """A panel for each policy with a scale of its own, as some stand still most of the time."""
     figure = Figure(figsize=(COLUMN, 0.65 + 0.85 * len(behaviours)))
     panels = figure.subplots(len(behaviours), sharex=True, squeeze=False)[:, 0]
     look = styles(each.name for each in behaviours)
@@ -119,7 +119,7 @@ def _draw_places(task: str, behaviours: Sequence[Behaviour], target_yaw: float) 
 
 
 def _draw_target(axes: Axes, reach: float, yaw: float) -> None:
-    """The start, and an arrow at the border."""
+    """A circle at the start, and an arrow at the border."""
     axes.plot(0, 0, "o", color=ink(), ms=8, mfc="none", mew=0.8)
     tip, tail = (
         (share * reach * np.cos(yaw), share * reach * np.sin(yaw)) for share in (0.95, 0.7)

@@ -1,4 +1,4 @@
-"""A figure with the table that it is drawn from, and the files that both become."""
+"""A figure with the table that it is drawn from, and the files of both."""
 
 import io
 from collections.abc import Callable, Iterable, Sequence
@@ -29,10 +29,10 @@ class Plot:
     Args:
         name: of its files.
         title: a few words.
-        caption: what is to be seen.
+        caption: what the figure shows.
         columns: of the table that it is drawn from.
         rows: of that table.
-        draw: makes the figure, in the style that holds at the time.
+        draw: makes the figure in the style in use.
     """
 
     name: str
@@ -44,12 +44,12 @@ class Plot:
 
     @cached_property
     def on_paper(self) -> "Drawing":
-        """Drawn for a paper."""
+        """The figure in the style of a paper."""
         return Drawing(self, PAPER)
 
 
 class Drawing:
-    """A figure drawn and laid out once, in a style, for any number of files."""
+    """A figure drawn and laid out once in a style, for any number of files."""
 
     def __init__(self, plot: Plot, style: Any):
         with mpl.rc_context(style):
@@ -62,11 +62,11 @@ class Drawing:
 
     @property
     def width(self) -> float:
-        """In inches."""
+        """Width in inches."""
         return float(self._figure.get_figwidth())
 
     def picture(self, kind: str) -> bytes:
-        """As pdf, png or svg."""
+        """The figure as pdf, png or svg."""
         content = io.BytesIO()
         with mpl.rc_context(self._style):
             self._figure.savefig(content, format=kind, metadata=_UNDATED[kind])
@@ -77,7 +77,7 @@ def write(plots: Iterable[Plot], folder: Path) -> list[Path]:
     """Write each figure as PDF and PNG, and its table as CSV.
 
     Returns:
-        The pictures.
+        The paths of the PNG files.
 
     Raises:
         InputError: they can't be written.

@@ -1,4 +1,4 @@
-"""How the viewer lays recordings out."""
+"""The viewer's layout of each recording."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,17 +15,17 @@ from jbrep.inspection.signals import STEP, TIME
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, Array, Task
 from jbrep.stats.runs import MAX_RETURN
 
-TRAVERSE = "traverse"  # a timeline, and the entity above its series
+TRAVERSE = "traverse"  # a timeline, and the parent entity of its series
 TRAINING_STEP = "training_step"
 _BACKGROUND = (38, 42, 50)
 _CHECKS = rrb.LineGrid3D(spacing=0.01, color=(255, 255, 255, 24), stroke_width=0.7)
-_TAIL = 0.3  # [s] of the latent's path
-_NEAR = 1.0  # [s] to either side of the time that is shown, for what swings with the motor
+_TAIL = 0.3  # [s] of the latent's path that are drawn as a line
+_NEAR = 1.0  # [s] shown before and after the current time: plots of signals at motor frequency
 _ROOT = f"{ROBOT}/jitterbug"
 
 
 def episode_layout(task: Task, encoder: Encoder | None) -> rrb.Blueprint:
-    """The robot large, its numbers beside it."""
+    """The robot on the left, its signals on the right."""
     about = rrb.TextDocumentView(origin=PROVENANCE, name="provenance")
     near = _window(_NEAR, _NEAR)
     action = _series("action", ["action"], time_ranges=near)
@@ -40,7 +40,7 @@ def episode_layout(task: Task, encoder: Encoder | None) -> rrb.Blueprint:
     errors = _features("error", task, ["error"], "scaled", ("error/bodies", "error/total"))
     latent = _series("latent", ["latent/units"], time_ranges=near)
     scene = rrb.Vertical(
-        _world("robot, and what is decoded: from blue, 1 mm off, to yellow, 10 cm off"),
+        _world("robot and decoded robot: blue is 1 mm off, yellow 10 cm"),
         rrb.Horizontal(_aligned(), _path()),
         row_shares=[1.6, 1],
     )
@@ -49,7 +49,7 @@ def episode_layout(task: Task, encoder: Encoder | None) -> rrb.Blueprint:
 
 
 def traversal_layout(places: Array) -> rrb.Blueprint:
-    """The row of robots above, what their units move below."""
+    """The row of robots above, plots of the features that their units move below."""
     half = places[:, 0].max() + 0.1
     eye = rrb.EyeControls3D(position=(0, -0.75 * half, 0.25 * half), look_target=(0, 0, 0.04))
     view = rrb.Spatial3DView(
@@ -98,12 +98,12 @@ def _blueprint(layout: rrb.Container, timeline: str) -> rrb.Blueprint:
 
 
 def _column(numbers: Sequence[rrb.Container | rrb.View]) -> rrb.Vertical:
-    """The first takes more than half of the height."""
+    """Stacked views, of which the first takes more than half of the height."""
     return rrb.Vertical(*numbers, row_shares=[1.2 * len(numbers), *[1.2] * (len(numbers) - 2), 1])
 
 
 def _world(name: str) -> rrb.Spatial3DView:
-    """The scene, seen by an eye that goes along with the robot."""
+    """The scene, seen by a camera that follows the robot."""
     eye = rrb.EyeControls3D(
         position=(0.1, -0.19, 0.12), look_target=(0, 0, 0.03), tracking_entity=_ROOT
     )
@@ -119,12 +119,12 @@ def _world(name: str) -> rrb.Spatial3DView:
 
 
 def _aligned() -> rrb.Spatial3DView:
-    """Seen from the robot: what is decoded of its attitude and its weight."""
+    """Seen from the robot: its decoded orientation and motor angle."""
     eye = rrb.EyeControls3D(position=(0.07, -0.1, 0.05), look_target=(0, 0, 0.002))
     return rrb.Spatial3DView(
         origin=_ROOT,
         contents=[f"{ROBOT}/**", f"{ALIGNED}/**"],
-        name="decoded attitude, laid upon the robot",
+        name="decoded orientation, overlaid on the robot",
         eye_controls=eye,
         background=_BACKGROUND,
         line_grid=False,
@@ -132,6 +132,7 @@ def _aligned() -> rrb.Spatial3DView:
 
 
 def _path() -> rrb.Spatial2DView:
+    """The latent's first two principal components."""
     return rrb.Spatial2DView(
         origin="latent",
         contents=[f"{PATH}/**"],
@@ -142,7 +143,7 @@ def _path() -> rrb.Spatial2DView:
 
 
 def _window(before: float | None, after: float = 0.0) -> rrb.VisibleTimeRanges:
-    """What was sent in the seconds before and after the time that is shown; None takes all."""
+    """The seconds shown before and after the current time; None shows all before."""
     edge = rrb.TimeRangeBoundary
     ends = []
     for seconds in (-before if before is not None else None, after):
@@ -163,7 +164,7 @@ def _window(before: float | None, after: float = 0.0) -> rrb.VisibleTimeRanges:
 def _features(
     name: str, task: Task, roots: Sequence[str], unit: str = "", others: Sequence[str] = ()
 ) -> rrb.Grid:
-    """A plot for each observable, then others."""
+    """A plot for each observable, then one for each of the other entities."""
     plots = [
         _series(
             f"{observable.name} [{unit or observable.features[0].unit}]",

@@ -21,7 +21,10 @@ _MEDIAN_WIDTH = 4.0  # [points]
 
 
 def median_curve(runs: Sequence[RunCurve]) -> tuple[NDArray[np.int64], Array]:
-    """Median over runs, where all were evaluated; a failed run counts as 0 from there on."""
+    """Median over runs at the steps at which all were evaluated.
+
+    A failed run counts as return 0 from the step at which it failed.
+    """
     whole = [run.steps for run in runs if run.failed_at is None] or [runs[0].curve()[0]]
     steps: NDArray[np.int64] = reduce(np.intersect1d, whole)
     each = [np.interp(steps, *run.curve()) for run in runs]
@@ -29,11 +32,11 @@ def median_curve(runs: Sequence[RunCurve]) -> tuple[NDArray[np.int64], Array]:
 
 
 def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
-    """Write the training curves of runs, a colour for each representation.
+    """Write the training curves of runs, with a colour for each representation.
 
     Args:
         runs: of one study, or of several.
-        source: where they come from, in words.
+        source: their folder, as the recording's title.
         path: the .rrd file.
 
     Raises:
@@ -70,7 +73,7 @@ def _send(
 
 
 def _about(source: str, labels: dict[str, list[RunCurve]]) -> str:
-    """The runs and their last returns, as Markdown."""
+    """The runs and their final returns, as Markdown."""
     lines = [f"# {source}", "", "| runs | seeds | median return at the end |", "|---|---|---|"]
     for label, runs in labels.items():
         last = np.median([run.curve()[1][-1] for run in runs])

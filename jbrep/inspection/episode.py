@@ -1,4 +1,4 @@
-"""A recording of an episode, with what an encoder makes of it."""
+"""A recording of an episode, with an encoder's reconstruction of it."""
 
 from importlib.metadata import version
 from pathlib import Path
@@ -23,7 +23,7 @@ def record_episode(rollout: Rollout, path: Path, encoder: Encoder | None = None)
     Args:
         rollout: the episode.
         path: the .rrd file.
-        encoder: shown beside the episode if given; made for its task.
+        encoder: for the episode's task; its reconstruction is shown beside the episode.
 
     Raises:
         InputError: the file can't be written.
@@ -43,7 +43,7 @@ def record_episode(rollout: Rollout, path: Path, encoder: Encoder | None = None)
 
 
 def provenance(rollout: Rollout, encoder: Encoder | None) -> str:
-    """Where an episode and its encoder come from, as Markdown."""
+    """The origin of an episode and its encoder, as Markdown."""
     facts = {
         "task": rollout.task.name,
         "seed": f"{rollout.seed}",

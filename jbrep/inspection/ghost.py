@@ -1,4 +1,4 @@
-"""What an encoder keeps of an episode: the robot that comes back, its errors, its latents."""
+"""An encoder's reconstruction of an episode: the decoded robot, a ghost, and its errors."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -17,8 +17,8 @@ GHOST = "world/ghost"
 ALIGNED = "world/aligned"
 _OPACITY = 170  # of 255
 _ALIGNED_COLOUR = (*SKY, _OPACITY)
-_RANGE = (1e-3, 1e-1)  # [m] errors from one end of the colours to the other, logarithmically
-_VIRIDIS = (  # from its blue on: what is darker doesn't show; seen alike by the colour-blind
+_RANGE = (1e-3, 1e-1)  # [m] errors at the ends of the colour scale, which is logarithmic
+_VIRIDIS = (  # without its dark end, which is invisible here; safe for colour blindness
     *((59, 82, 139), (44, 114, 142), (33, 145, 140), (40, 174, 128)),
     *((94, 201, 98), (173, 220, 48), (253, 231, 37)),
 )
@@ -28,21 +28,21 @@ _TARGET_RADIUS = 0.006  # [m]
 
 
 class Ghost(NamedTuple):
-    """An episode of n states through an encoder with l units."""
+    """An episode of n states, encoded to l units and decoded again."""
 
     latent: NDArray[np.float32]  # (n, l)
     observation: Array  # decoded, (n, d) in physical units
-    qpos: Array  # (n, 16) the robot of the decoded numbers
+    qpos: Array  # (n, 16) of the decoded robot
 
     @classmethod
     def of(cls, encoder: Encoder, task: Task, latent: NDArray[np.float32]) -> "Ghost":
-        """What latents (n, l) are decoded to."""
+        """The decoded states of latents (n, l)."""
         decoded = encoder.decode(latent).astype(np.float64)
         return cls(latent, decoded, as_qpos(task, decoded))
 
 
 def as_qpos(task: Task, observation: Array) -> Array:
-    """States (n, 16) with what observations (n, d) say of them; legs, unobserved, are at rest."""
+    """Positions (n, 16) from observations (n, d); the legs, which they lack, are at rest."""
     parts = task.split(observation)
     given = parts["orientation"].any(axis=1, keepdims=True)
     turned = np.where(given, parts["orientation"], (1.0, 0.0, 0.0, 0.0))
@@ -54,7 +54,7 @@ def as_qpos(task: Task, observation: Array) -> Array:
 
 
 def shades(errors: Array) -> NDArray[np.uint8]:
-    """Translucent colours (n, 4) of distances (n,) [m]."""
+    """Translucent colours (n, 4) for distances (n,) [m]."""
     low, high = np.log(_RANGE)
     place = (np.log(np.clip(errors, *_RANGE)) - low) / (high - low)
     knots = np.linspace(0, 1, len(_VIRIDIS))
@@ -69,7 +69,7 @@ def send_ghost(
     rollout: Rollout,
     ghost: Ghost,
 ) -> None:
-    """The robot that comes back, where it says it is, and laid upon the true one."""
+    """Send the decoded robot at its decoded position, and again at the true one."""
     there = robot.origins(rollout.qpos)
     apart = {
         name: np.linalg.norm(origin - there[name], axis=1)
@@ -86,14 +86,14 @@ def send_ghost(
 
 
 def legs(robot: Robot) -> list[str]:
-    """The bodies that no observation tells of."""
+    """The bodies that no task observes."""
     return [name for name in robot.bodies if name.startswith("leg")]
 
 
 def _send_goal(
     recording: Recording, times: Sequence[rr.TimeColumn], task: Task, ghost: Ghost
 ) -> None:
-    """What the decoded numbers say of the target, where the task observes it."""
+    """Send the decoded target, if the task observes it."""
     parts = task.split(ghost.observation)
     origin, turned = ghost.qpos[:, :3], ghost.qpos[:, 3:7]
     if "target" in parts:

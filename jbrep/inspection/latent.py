@@ -1,4 +1,4 @@
-"""An encoder's numbers: what it decodes, its errors, its latent and the latent's path."""
+"""An encoder's signals: decoded features, their errors, the latent and its path."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from jbrep.rollouts.rollout import Rollout
 
 PATH = "latent/path"
 _ALL_COLOUR = (90, 98, 112)
-_ALL_RADIUS, _PATH_RADIUS, _NOW_RADIUS = -1.2, -1.0, -6.0  # [points]: Rerun's sign for these
+_ALL_RADIUS, _PATH_RADIUS, _NOW_RADIUS = -1.2, -1.0, -6.0  # negative: Rerun's [points]
 
 
 def send_encoding(
@@ -24,7 +24,7 @@ def send_encoding(
     encoder: Encoder,
     ghost: Ghost,
 ) -> None:
-    """Decoded features, their errors with the features scaled, and the latent."""
+    """Send decoded features, their errors in scaled units, and the latent."""
     task = rollout.task
     send_decoded(recording, times, task, ghost.observation)
     errors = (ghost.observation - rollout.observation) / encoder.scaler.half_width
@@ -37,17 +37,18 @@ def send_encoding(
 
 
 def principal_components(latent: Array) -> Array:
-    """Latents (n, l) along the first two directions in which they vary, (n, 2)."""
+    """The first two principal components (n, 2) of latents (n, l)."""
     centred = latent - latent.mean(axis=0)
     _, _, directions = np.linalg.svd(centred, full_matrices=False)
     two = np.zeros((2, latent.shape[1]))
     two[: len(directions)] = directions[:2]
     largest = two[[0, 1], np.abs(two).argmax(axis=1)]
-    return centred @ (two * np.where(largest < 0, -1, 1)[:, None]).T  # a sign of its own
+    signs = np.where(largest < 0, -1, 1)  # the SVD's are arbitrary
+    return centred @ (two * signs[:, None]).T
 
 
 def _send_path(recording: Recording, times: Sequence[rr.TimeColumn], latent: Array) -> None:
-    """All latents as points, the way from each to the next, and where it is now."""
+    """Send all latents as points, lines between successive ones, and the current one."""
     path = principal_components(latent)
     recording.send(f"{PATH}/all", rr.Points2D(path, colors=[_ALL_COLOUR], radii=[_ALL_RADIUS]))
     pieces = np.stack((np.concatenate((path[:1], path[:-1])), path), axis=1)

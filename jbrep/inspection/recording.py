@@ -15,33 +15,33 @@ from jbrep.files.storage import exists, make_folder, write_whole
 PROVENANCE = "provenance"
 SUFFIX = ".rrd"
 _APPLICATION = "jbrep"
-_MAGIC = b"RRF"  # what a Rerun recording begins with, whatever its version
+_MAGIC = b"RRF"  # the first bytes of a Rerun recording of any version
 
 Colour = tuple[int, int, int]
-# Okabe and Ito's, for the colour-blind too; grey for black is seen on a light viewer and a dark one
+# Okabe and Ito's colours, safe for colour blindness; grey for black, as viewers may be dark
 SKY, ORANGE, GREEN, PURPLE = (86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167)
 VERMILION, YELLOW, BLUE, GREY = (213, 94, 0), (240, 228, 66), (0, 114, 178), (160, 160, 160)
 _COLOURS: tuple[Colour, ...] = (SKY, ORANGE, GREEN, PURPLE, VERMILION, YELLOW, BLUE, GREY)
 
 
 def palette(count: int) -> list[Colour]:
-    """So many colours; they come again after eight."""
+    """As many colours as asked for; they repeat after eight."""
     return [_COLOURS[i % len(_COLOURS)] for i in range(count)]
 
 
 def lighten(colour: Colour) -> Colour:
-    """Half way to white."""
+    """A colour halfway to white."""
     red, green, blue = ((part + 255) // 2 for part in colour)
     return red, green, blue
 
 
 class Recording:
-    """What is sent stays in memory until it is written.
+    """A recording in memory, until it is written.
 
     Args:
-        name: what the viewer calls it.
+        name: its title in the viewer.
         about: Markdown, shown beside it.
-        numbers: with the text they name the recording: the same content has the same id.
+        numbers: hashed with the text into the recording's id: the same content has the same id.
     """
 
     def __init__(self, name: str, about: str, *numbers: NDArray[Any]):
@@ -56,17 +56,17 @@ class Recording:
         self.send_text(PROVENANCE, about)
 
     def send(self, path: str, *parts: rr.AsComponents) -> None:
-        """What holds at all times."""
+        """Send components that hold at all times."""
         self._stream.log(path, *parts, static=True, strict=True)
 
     def send_text(self, path: str, markdown: str) -> None:
-        """A page of text."""
+        """Send a page of text."""
         self.send(path, rr.TextDocument(markdown, media_type="text/markdown"))
 
     def send_columns(
         self, path: str, times: Sequence[rr.TimeColumn], *columns: Iterable[rr.ComponentColumn]
     ) -> None:
-        """What changes, a row for each time."""
+        """Send components that change, with a row for each time."""
         flat = [column for each in columns for column in each]
         self._stream.send_columns(path, times, flat, strict=True)
 
@@ -79,14 +79,14 @@ class Recording:
         colours: Sequence[Colour] | None = None,
         width: float = 2.0,
     ) -> None:
-        """Lines in one plot.
+        """Send the lines of one plot.
 
         Args:
             path: of the entity.
             times: of the rows.
             values: (rows, lines).
             names: of the lines, with their units.
-            colours: of the lines; the first of `palette` if not given.
+            colours: of the lines; those of `palette` if not given.
             width: of the lines [points].
         """
         lines = len(names)
@@ -97,10 +97,10 @@ class Recording:
         self.send_columns(path, times, rr.Scalars.columns(scalars=values))
 
     def write(self, path: Path, blueprint: rrb.Blueprint) -> None:
-        """Write it with its layout, whole or not at all.
+        """Write the recording with its layout, whole or not at all.
 
         Raises:
-            InputError: something else stands there, or it can't be written.
+            InputError: another kind of file exists there, or it can't be written.
         """
         check_out(path)
         make_folder(path.parent)
@@ -109,10 +109,10 @@ class Recording:
 
 
 def check_out(path: Path) -> None:
-    """Make sure that nothing but an earlier recording is overwritten.
+    """Make sure that only an earlier recording would be overwritten.
 
     Raises:
-        InputError: something else stands there.
+        InputError: another kind of file exists there.
     """
     if not exists(path):
         return
@@ -122,4 +122,4 @@ def check_out(path: Path) -> None:
     except OSError as error:
         raise InputError(f"can't write {path}: {error.strerror or error}") from None
     if not earlier:
-        raise InputError(f"{path} is there and is no Rerun recording: choose another --out")
+        raise InputError(f"{path} exists and is not a Rerun recording: choose another --out")

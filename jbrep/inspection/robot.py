@@ -1,4 +1,4 @@
-"""The robot as a tree of Rerun entities, by the names of its MuJoCo model."""
+"""The robot as a tree of Rerun entities, named as in its MuJoCo model."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -15,18 +15,18 @@ from jbrep.jitterbug.model import plain_model
 from jbrep.jitterbug.tasks import Array
 
 ROOT = "jitterbug"
-_XYZW = [1, 2, 3, 0]  # Rerun's order of a quaternion, from MuJoCo's
+_XYZW = [1, 2, 3, 0]  # Rerun's order of a quaternion's components, from MuJoCo's
 
 
 def rotate(quaternion: Array, vector: Array) -> Array:
-    """Vectors (..., 3) turned by quaternions (..., 4)."""
+    """Vectors (..., 3) rotated by quaternions (..., 4)."""
     scalar, axis = quaternion[..., :1], quaternion[..., 1:]
     across = np.cross(axis, vector)
     return vector + 2 * (scalar * across + np.cross(axis, across))
 
 
 def multiply(first: Array, second: Array) -> Array:
-    """Quaternions (..., 4) that turn by the second, then by the first."""
+    """Products (..., 4) of quaternions: the rotation by the second, then by the first."""
     scalar, axis = first[..., :1], first[..., 1:]
     other, along = second[..., :1], second[..., 1:]
     real = scalar * other - (axis * along).sum(-1, keepdims=True)
@@ -34,16 +34,16 @@ def multiply(first: Array, second: Array) -> Array:
 
 
 def transform(position: Array, quaternion: Array) -> rr.ComponentColumnList:
-    """Poses (n, 3) and (n, 4) as columns."""
+    """Positions (n, 3) and quaternions (n, 4) as columns."""
     return rr.Transform3D.columns(translation=position, quaternion=quaternion[:, _XYZW])
 
 
 class Robot:
-    """Bodies and geoms of the model, and where they are in a state.
+    """Bodies and geoms of the model, and their poses in a state.
 
     Attributes:
         model: the MuJoCo model.
-        bodies: the robot's, by name, each after the one it hangs on.
+        bodies: names of the robot's bodies, each after its parent.
     """
 
     def __init__(self) -> None:
@@ -53,32 +53,35 @@ class Robot:
 
     @cached_property
     def paths(self) -> dict[str, str]:
-        """Where each body hangs below the root's entity."""
-        found = {ROOT: ROOT}
+        """The path of each body's entity, from the root's."""
+        paths = {ROOT: ROOT}
         for name in self.bodies[1:]:
-            found[name] = f"{found[self._parent(name)]}/{name}"
-        return found
+            paths[name] = f"{paths[self._parent(name)]}/{name}"
+        return paths
 
     def _parent(self, body: str) -> str:
         return self.model.body(self.model.body(body).parentid[0]).name
 
     def poses(self, qpos: Array) -> dict[str, tuple[Array, Array]]:
-        """Of each body in its parent's frame, the root in the world, for states (n, 16).
+        """The pose of each body in its parent's frame, the root's in the world.
+
+        Args:
+            qpos: n states, (n, 16).
 
         Returns:
             Positions (n, 3) and quaternions (n, 4).
         """
-        found = {ROOT: (qpos[:, :3], qpos[:, 3:7])}
+        poses = {ROOT: (qpos[:, :3], qpos[:, 3:7])}
         for name in self.bodies[1:]:  # each turns about an axis through its origin
             body = self.model.body(name)
             joint = self.model.joint(body.jntadr[0])
             half = qpos[:, joint.qposadr] / 2
             turned = np.concatenate((np.cos(half), np.sin(half) * joint.axis), axis=1)
-            found[name] = np.tile(body.pos, (len(qpos), 1)), turned
-        return found
+            poses[name] = np.tile(body.pos, (len(qpos), 1)), turned
+        return poses
 
     def origins(self, qpos: Array) -> dict[str, Array]:
-        """Of each body in the world, (n, 3), for states (n, 16)."""
+        """The position of each body in the world, (n, 3), in states (n, 16)."""
         poses = self.poses(qpos)
         world = {ROOT: poses[ROOT]}
         for name in self.bodies[1:]:
@@ -95,15 +98,15 @@ class Robot:
         colours: Mapping[str, NDArray[np.uint8]] | None = None,
         still: Sequence[str] = (),
     ) -> None:
-        """The robot below an entity, in states (n, 16).
+        """Draw the robot below an entity.
 
         Args:
-            recording: where to.
+            recording: to draw in.
             root: the entity.
             times: of the states.
-            qpos: the states.
+            qpos: the states, (n, 16).
             colours: of each body, (n, 4), or (4,) at all times; the materials' if not given.
-            still: bodies that don't move against their parents.
+            still: bodies that don't move relative to their parents.
         """
         for name, (position, quaternion) in self.poses(qpos).items():
             path, columns = f"{root}/{self.paths[name]}", []
@@ -115,21 +118,21 @@ class Robot:
             if colours is None:
                 self.draw_geoms(recording, path, name)
             else:
-                columns += self._draw_together(recording, path, name, colours[name])
+                columns += self._draw_merged(recording, path, name, colours[name])
             if columns:
                 recording.send_columns(path, times, *columns)
 
     def draw_geoms(self, recording: Recording, path: str, body: str) -> None:
-        """The geoms of a body below its entity, in the colours of their materials."""
+        """Draw a body's geoms as entities below its own, in their materials' colours."""
         for geom in self._geoms(body):
             colour = np.round(255 * self.model.mat_rgba[geom.matid[0]]).astype(np.uint8)
             shape = _kind(geom).from_fields(**_fields([geom]), colors=[colour])
             recording.send(f"{path}/{geom.name}", shape)
 
-    def _draw_together(
+    def _draw_merged(
         self, recording: Recording, path: str, body: str, colours: NDArray[np.uint8]
     ) -> list[rr.ComponentColumnList]:
-        """The geoms of a body on its own entity, which takes less room.
+        """Draw a body's geoms on its own entity, which takes less space.
 
         Returns:
             Their colours as columns, if they change.
@@ -143,18 +146,18 @@ class Robot:
         return [] if still else [kind.columns(colors=colours) for kind in kinds]
 
     def _geoms(self, body: str) -> list[Any]:
-        there = self.model.body(body)
-        return [self.model.geom(there.geomadr[0] + i) for i in range(there.geomnum[0])]
+        address, count = self.model.body(body).geomadr[0], self.model.body(body).geomnum[0]
+        return [self.model.geom(address + i) for i in range(count)]
 
 
 def _kind(geom: Any) -> Any:
-    """Rerun's archetype of a geom."""
+    """Rerun's archetype for a geom."""
     kinds = {mujoco.mjtGeom.mjGEOM_BOX: rr.Boxes3D, mujoco.mjtGeom.mjGEOM_CYLINDER: rr.Cylinders3D}
     return kinds.get(mujoco.mjtGeom(geom.type[0]), rr.Ellipsoids3D)
 
 
 def _fields(geoms: Sequence[Any]) -> dict[str, Any]:
-    """All of an archetype but its colours, for geoms of one kind."""
+    """All fields of an archetype but its colours, for geoms of one kind."""
     sizes = np.array([geom.size for geom in geoms])
     fields = {
         "quaternions": [geom.quat[_XYZW] for geom in geoms],
@@ -163,5 +166,5 @@ def _fields(geoms: Sequence[Any]) -> dict[str, Any]:
     }
     if _kind(geoms[0]) is rr.Cylinders3D:
         return {**fields, "radii": sizes[:, 0], "lengths": 2 * sizes[:, 1]}
-    round_ones = [geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE for geom in geoms]
-    return {**fields, "half_sizes": np.where(np.transpose([round_ones]), sizes[:, :1], sizes)}
+    is_sphere = [geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE for geom in geoms]
+    return {**fields, "half_sizes": np.where(np.transpose([is_sphere]), sizes[:, :1], sizes)}

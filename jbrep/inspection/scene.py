@@ -22,32 +22,32 @@ _FLOOR_THICKNESS = 0.001  # [m]
 _FLOOR_COLOUR = (58, 66, 80)
 _TRAIL_RADIUS = 0.0006  # [m]
 _CONTACT_RADIUS = 0.0012  # [m]
-_WEIGHT_LENGTH = 0.05  # [m] of the arrow of a force as large as the robot's weight
+_WEIGHT_LENGTH = 0.05  # [m] of the arrow for a force of the robot's weight
 
 
 class Contacts(NamedTuple):
-    """What carries the robot in each state."""
+    """The contacts with the floor in each of n states."""
 
     counts: NDArray[np.int64]  # (n,)
     points: Array  # (sum of the counts, 3) in the world [m]
-    forces: Array  # (sum of the counts, 3) on the robot, in the world [N]
+    forces: Array  # (sum of the counts, 3) on the robot, in world axes [N]
 
 
 def contacts(robot: Robot, rollout: Rollout) -> Contacts:
-    """Where the floor touches the robot in each state, and how hard."""
+    """Find the contact points and forces in each state."""
     model = robot.model
     data, force = mujoco.MjData(model), np.zeros(6)
     counts: list[int] = []
     points: list[Array] = []
     forces: list[Array] = []
-    drive = np.append(rollout.action[:, 0], rollout.action[-1:, 0])  # the last one holds on
+    drive = np.append(rollout.action[:, 0], rollout.action[-1:, 0])  # the last is held
     for qpos, qvel, control in zip(rollout.qpos, rollout.qvel, drive, strict=True):
         data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, control
         mujoco.mj_forward(model, data)
-        found = data.contact
+        touching = data.contact
         counts.append(data.ncon)
-        points.append(found.pos.copy())
-        for i, frame in enumerate(found.frame.reshape(-1, 3, 3)):
+        points.append(touching.pos.copy())
+        for i, frame in enumerate(touching.frame.reshape(-1, 3, 3)):
             mujoco.mj_contactForce(model, data, i, force)
             forces.append(force[:3] @ frame)
     return Contacts(np.array(counts), np.concatenate(points), np.reshape(forces, (-1, 3)))
@@ -56,7 +56,7 @@ def contacts(robot: Robot, rollout: Rollout) -> Contacts:
 def send_scene(
     recording: Recording, robot: Robot, times: Sequence[rr.TimeColumn], rollout: Rollout
 ) -> None:
-    """The robot and what is around it."""
+    """Send the robot, floor, target, trail and contacts."""
     recording.send(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     robot.draw(recording, ROBOT, times, rollout.qpos)
     send_floor(recording, rollout.qpos[:, :2])
@@ -68,7 +68,7 @@ def send_scene(
 
 
 def send_floor(recording: Recording, path: Array) -> None:
-    """A slab below all places (n, 2) that something stands at."""
+    """Send a slab that reaches beyond all points (n, 2) of a path."""
     low, high = path.min(axis=0) - _FLOOR_MARGIN, path.max(axis=0) + _FLOOR_MARGIN
     slab = rr.Boxes3D(
         half_sizes=[(*(high - low) / 2, _FLOOR_THICKNESS / 2)],
@@ -80,7 +80,7 @@ def send_floor(recording: Recording, path: Array) -> None:
 
 
 def _send_trail(recording: Recording, times: Sequence[rr.TimeColumn], path: Array) -> None:
-    """The way below the root's origin, (n, 2), a piece for each step."""
+    """Send the path of the robot's origin, (n, 2), on the floor: a line for each step."""
     ground = np.column_stack((path, np.full(len(path), _TRAIL_RADIUS)))
     pieces = np.stack((np.concatenate((ground[:1], ground[:-1])), ground), axis=1)
     recording.send_columns(TRAIL, times, rr.LineStrips3D.columns(strips=pieces))
@@ -89,11 +89,11 @@ def _send_trail(recording: Recording, times: Sequence[rr.TimeColumn], path: Arra
 
 
 def _send_contacts(
-    recording: Recording, times: Sequence[rr.TimeColumn], found: Contacts, weight: float
+    recording: Recording, times: Sequence[rr.TimeColumn], touching: Contacts, weight: float
 ) -> None:
-    arrows = found.forces * (_WEIGHT_LENGTH / weight)
-    points = rr.Points3D.columns(positions=found.points).partition(found.counts)
-    forces = rr.Arrows3D.columns(origins=found.points, vectors=arrows).partition(found.counts)
+    arrows = touching.forces * (_WEIGHT_LENGTH / weight)
+    points = rr.Points3D.columns(positions=touching.points).partition(touching.counts)
+    forces = rr.Arrows3D.columns(origins=touching.points, vectors=arrows).partition(touching.counts)
     recording.send_columns(CONTACTS, times, points, forces)
     recording.send(
         CONTACTS,
@@ -103,5 +103,5 @@ def _send_contacts(
 
 
 def _weight(robot: Robot) -> float:
-    """Of the robot [N]."""
+    """The robot's weight [N]."""
     return float(robot.model.body("jitterbug").subtreemass[0] * -robot.model.opt.gravity[2])

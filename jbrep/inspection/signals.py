@@ -1,4 +1,4 @@
-"""An episode's numbers as lines, an entity for each group."""
+"""An episode's signals as lines, with an entity for each group."""
 
 from collections.abc import Sequence
 
@@ -17,13 +17,13 @@ _NANOSECONDS = round(1e9 * CONTROL_TIMESTEP)  # in a control step
 
 
 def times_at(steps: NDArray[np.int64]) -> list[rr.TimeColumn]:
-    """The timelines of an episode at its control steps, (n,)."""
+    """The timelines of an episode at control steps (n,)."""
     simulated = (_NANOSECONDS * steps).astype("timedelta64[ns]")
     return [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=simulated)]
 
 
 def send_signals(recording: Recording, rollout: Rollout) -> None:
-    """Observation and terms of each state, the action in it, the reward of what it led to."""
+    """Send the observation and reward terms of each state, the actions and the rewards."""
     states = np.arange(len(rollout) + 1)
     send_features(recording, "observation", times_at(states), rollout.task, rollout.observation)
     recording.send_series("action", times_at(states[:-1]), rollout.action, ["drive [1]"])
@@ -43,7 +43,10 @@ def send_features(
     values: Array,
     unit: str | None = None,
 ) -> None:
-    """Features (n, d), an entity for each observable; of one unit, or in their own."""
+    """Send features (n, d), an entity for each observable.
+
+    Their unit is the one given, or each feature's own.
+    """
     for observable, part in zip(task.observables, task.split(values).values(), strict=True):
         names = [f"{feature.name} [{unit or feature.unit}]" for feature in observable.features]
         recording.send_series(f"{path}/{observable.name}", times, part, names)
@@ -52,7 +55,7 @@ def send_features(
 def send_decoded(
     recording: Recording, times: Sequence[rr.TimeColumn], task: Task, values: Array
 ) -> None:
-    """Decoded features (n, d): lighter, thinner lines than the observation's."""
+    """Send decoded features (n, d), as lighter and thinner lines than the observation's."""
     for observable, part in zip(task.observables, task.split(values).values(), strict=True):
         names = [f"{feature.name} decoded [{feature.unit}]" for feature in observable.features]
         colours = [lighten(colour) for colour in palette(len(names))]

@@ -1,4 +1,4 @@
-"""A recording of what each unit of a latent moves."""
+"""A recording of the features that each unit of a latent moves."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,11 +21,14 @@ POINTS = 101
 SPACING = 0.12  # [m] between the robots
 _ENDS = (1, 99)  # [%] of the episode's latents
 _LABEL_HEIGHT = 0.1  # [m]
-_MOST = 3  # features that the summary names
+_MOST = 3  # features that the summary lists for a unit
 
 
 def sweep(latent: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Each unit from end to end, the others at their medians: (n, l) to (l, 101, l)."""
+    """Latents (l, 101, l) that vary one unit at a time, with the others at their medians.
+
+    The range of each unit is that of the latents (n, l), from their 1st to their 99th percentile.
+    """
     low, high = np.percentile(latent, _ENDS, axis=0)
     units = latent.shape[1]
     swept = np.tile(np.median(latent, axis=0), (units, POINTS, 1))
@@ -34,12 +37,12 @@ def sweep(latent: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def record_traversal(rollout: Rollout, path: Path, encoder: Encoder) -> None:
-    """Write the recording of a robot for each unit, which shows what is decoded as it moves.
+    """Write a recording with a robot for each unit, decoded while that unit alone varies.
 
     Args:
-        rollout: the episode that says how far the units go.
+        rollout: the episode whose latents give the range of each unit.
         path: the .rrd file.
-        encoder: made for the episode's task.
+        encoder: for the episode's task.
 
     Raises:
         InputError: the file can't be written.
@@ -64,7 +67,7 @@ def record_traversal(rollout: Rollout, path: Path, encoder: Encoder) -> None:
 
 
 def _places(units: int) -> Array:
-    """A row in which each unit has its place, (units, 3)."""
+    """Positions of the robots in a row, (units, 3)."""
     places = np.zeros((units, 3))
     places[:, 0] = SPACING * (np.arange(units) - (units - 1) / 2)
     return places
@@ -78,7 +81,7 @@ def _send_robot(
     unit: int,
     place: Array,
 ) -> None:
-    """A unit's robot at its place, under its name: in x and y it would leave the row."""
+    """Send a unit's robot and label; decoded x and y are left out, to keep it in the row."""
     here = np.concatenate((np.tile(place[:2], (len(qpos), 1)), qpos[:, 2:]), axis=1)
     path = f"{WORLD}/unit_{unit}"
     robot.draw(recording, path, times, here, still=legs(robot))
@@ -97,7 +100,7 @@ def _send_features(
     most: NDArray[np.int64],
     names: Sequence[str],
 ) -> None:
-    """All decoded features, and those that move most."""
+    """Send all decoded features, and those that move most."""
     path = f"{TRAVERSE}/unit_{unit}"
     labels = [f"{name} [scaled]" for name in names]
     recording.send_series(f"{path}/decoded", times, scaled, labels)
@@ -107,7 +110,7 @@ def _send_features(
 def _summary(
     encoder: Encoder, rollout: Rollout, swept: NDArray[np.float32], moved: list[NDArray[np.int64]]
 ) -> str:
-    """What each unit moves most, as a table in Markdown."""
+    """The features that each unit moves most, as a table in Markdown."""
     lines = ["| unit | from | to | moves most |", "|---|---|---|---|"]
     for unit, (latent, most) in enumerate(zip(swept, moved, strict=True)):
         spans = np.ptp(encoder.decode(latent), axis=0)

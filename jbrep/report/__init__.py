@@ -1,4 +1,4 @@
-"""A study's tables as a page, a summary and figures to look at."""
+"""Reports: a study's tables as a page, summaries and figures."""
 
 from jbrep.report.report import write_report
 

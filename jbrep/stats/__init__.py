@@ -1,4 +1,4 @@
-"""Statistics over runs: whether a smaller state helps, with a run as the unit of replication."""
+"""Statistics over runs: does a smaller state help? The run is the unit of replication."""
 
 from jbrep.stats.analysis import Analysis, analyse
 from jbrep.stats.runs import RunCurve

@@ -136,11 +136,7 @@ def write_results(results: Results, folder: Path) -> list[Path]:
 
 def as_text(results: Results) -> str:
     """Tables to read: the statistics, or each run's end where there are none."""
-    shown = (
-        statistics_text(results.analysis.tolist())
-        if results.analysis
-        else table(*_ends(results.runs))
-    )
+    shown = statistics_text(results.analysis) if results.analysis else table(*_ends(results.runs))
     return "\n".join((shown, *(f"\nno statistics: {line}" for line in results.left_out)))
 
 
