@@ -1,4 +1,4 @@
-"""What of this machine jbrep can use, and what is missing for what."""
+"""What jbrep can use of this machine, and what is missing."""
 
 import os
 import platform
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from packaging.requirements import Requirement
 
-EXTRAS = {  # what each is for; the empty one is always installed
+EXTRAS = {  # what each extra is for; the empty name stands for the core
     "": "the robot and its environments, collect, data",
     "learn": "train-dae, train-encoder, evaluate, rl, study, report",
     "export": "data export, encoder export",
@@ -32,15 +32,15 @@ with mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8):
 
 
 class Finding(NamedTuple):
-    """A line of the examination."""
+    """A line of the result."""
 
     what: str
     said: str
-    is_wrong: bool = False  # so that commands will fail, not only be missing
+    is_wrong: bool = False  # a fault, not just a missing extra
 
 
 def examine() -> Iterator[Finding]:
-    """The machine first, then the packages, by extra."""
+    """Describe the machine, then the packages of each extra."""
     where = f"Python {platform.python_version()}, {platform.platform()}"
     yield Finding("jbrep", f"{version('jbrep')} on {where}")
     yield Finding("cores", f"{_cores()}: collect steps robots on all, a study has a run on each")
@@ -78,7 +78,7 @@ def _gpu() -> str:
 
 
 def _opengl() -> str:
-    """By drawing something, in a process of its own: where there is none, some drivers crash."""
+    """Try to render, in a separate process, since some drivers crash without OpenGL."""
     done = subprocess.run([sys.executable, "-c", _RENDER], capture_output=True, text=True)
     if done.returncode == 0:
         return f"{done.stdout.strip()}: render draws with it"
@@ -87,7 +87,7 @@ def _opengl() -> str:
 
 
 def _packages(extra: str, purpose: str) -> Finding:
-    """Whether all that an extra asks for is there, in versions that will do."""
+    """Whether all requirements of an extra are installed, in versions that fit."""
     name, asked = extra or "core", list(_requirements(extra))
     wrong = [f"{r.name} {v} ({r.specifier} is needed)" for r, v in asked if v and not _fits(r, v)]
     missing = [r.name for r, v in asked if not v]
@@ -104,7 +104,7 @@ def _fits(requirement: Requirement, found: str) -> bool:
 
 
 def _requirements(extra: str) -> Iterator[tuple[Requirement, str]]:
-    """What an extra asks for, and the version that is there: nothing if none is."""
+    """The requirements of an extra, each with the installed version, empty if there is none."""
     for requirement in map(Requirement, requires("jbrep") or ()):
         marker = requirement.marker
         if marker.evaluate({"extra": extra}) if marker else not extra:

@@ -1,4 +1,4 @@
-"""The exceptions that mean "the user can mend this"."""
+"""Exceptions for what a user can fix, and words for their messages."""
 
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -21,8 +21,8 @@ def check_version(path: object, version: Any, newest: int) -> None:
     """Make sure that a file's format version is one that this jbrep reads: 1 to the newest.
 
     Raises:
-        InputError: it is a newer one.
-        DamageError: it is none.
+        InputError: it is newer.
+        DamageError: it isn't a version number.
     """
     if type(version) is not int or version < 1:
         raise DamageError(f"{path} is damaged: its format version is {version!r}")
@@ -36,7 +36,7 @@ def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:
     """The choice of that name.
 
     Raises:
-        InputError: there is none; the message lists the names.
+        InputError: the name is unknown; the message lists the names.
     """
     if name not in choices:
         raise InputError(f"unknown {what} {name!r}: choose one of {', '.join(choices)}")

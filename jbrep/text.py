@@ -9,7 +9,7 @@ _GAP = "  "  # between columns
 
 
 def terminal_width() -> int:
-    """Columns of the terminal; 80 where there is none, unless COLUMNS says otherwise."""
+    """The width of the terminal in characters; without one COLUMNS, or else 80."""
     return shutil.get_terminal_size().columns
 
 
@@ -19,8 +19,8 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], width: int | Non
     Args:
         header: a name for each column.
         rows: a cell for each column.
-        width: to fit: a wider table is cut into several, one below the other, each with the first
-            column; None leaves it whole.
+        width: a wider table is cut into parts, one below the other, each with the first column;
+            None leaves it whole.
     """
     lines = [header, *rows]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
@@ -52,7 +52,7 @@ def _line(cells: Sequence[str], columns: Sequence[int], widths: Sequence[int]) -
 
 
 def facts(named: Mapping[str, str], width: int, indent: int = 2) -> str:
-    """A line for each fact: its name, then what it is, wrapped below itself where it is long."""
+    """A line for each fact, its name and its text; long texts are wrapped and indented."""
     left = indent + max(map(len, named)) + 1
     return "\n".join(
         textwrap.fill(
@@ -73,7 +73,7 @@ def interval(values: Sequence[float | None], form: str) -> str:
 
 
 def number(value: float | None, form: str) -> str:
-    """A number in that format, or a dash where there is none."""
+    """A number in that format, or a dash for None."""
     if value is None:
         return "-"
     if form == SIGNIFICANT and abs(value) >= 1000:

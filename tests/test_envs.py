@@ -220,8 +220,8 @@ def test_a_window_without_a_display_is_refused_in_one_line():
     done = without_a_display(f"gymnasium.make('{FACE}', render_mode='human')")
     assert done.returncode == 1  # an abort of the process has another
     assert done.stderr.splitlines()[-1] == (
-        "jbrep.errors.InputError: render_mode 'human' can't be had here: choose one of "
-        "rgb_array, depth_array; human takes a display"
+        "jbrep.errors.InputError: render_mode 'human' is not possible here: choose one of "
+        "rgb_array, depth_array; human needs a display"
     )
 
 

@@ -59,7 +59,7 @@ class _Count(click.ParamType[int]):
 
 
 COUNT, POSITIVE = _Count(), _Count(least=1)
-GOES_ON = "the same command resumes it"
+RESUMES = "the same command resumes it"
 
 
 class _Mistake(click.ClickException):

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, GOES_ON, as_json, echo_json, example, printable, stoppable
+from jbrep.cli.base import COUNT, RESUMES, as_json, echo_json, example, printable, stoppable
 from jbrep.text import terminal_width
 
 _threads = click.option(
@@ -79,7 +79,7 @@ def collect(
         click.echo(
             f"{settings.steps:,} steps are rounded up to {whole:,}: episodes have {EPISODE_STEPS:,}"
         )
-    with stoppable(GOES_ON):
+    with stoppable(RESUMES):
         _report(out, run(settings, out, lanes, threads))
 
 
@@ -158,7 +158,7 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
     """Restore damaged and missing files as they were."""
     from jbrep.collect.repair import repair as run
 
-    with stoppable(GOES_ON):
+    with stoppable(RESUMES):
         repaired = False
         for line in run(data, lanes, threads):
             click.echo(printable(line))
@@ -184,7 +184,7 @@ def derive(data: Path, task: str, store_state: bool, threads: int | None, out: P
     """
     from jbrep.collect.derive import derive as run
 
-    with stoppable(GOES_ON):
+    with stoppable(RESUMES):
         _report(out, run(data, task, out, store_state, threads))
 
 

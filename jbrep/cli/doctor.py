@@ -15,7 +15,7 @@ def doctor(context: click.Context) -> None:
     """Show what this machine has, and what is missing.
 
     Cores, memory, disk, GPU, OpenGL, and the packages of each extra with their versions. The exit
-    code is 1 where a package that all needs is missing, or one has a version that won't do.
+    code is 1 if a core package is missing or a package has an unsuitable version.
     """
     from jbrep.doctor import examine
 

@@ -9,7 +9,7 @@ import click
 
 from jbrep.cli.base import (
     COUNT,
-    GOES_ON,
+    RESUMES,
     as_json,
     echo_json,
     echo_paths,
@@ -160,7 +160,7 @@ def _fit(
     fitter = Fitter(scaled, out, device)
     for training in trainings:  # every mistake is reported before the first training
         fitter.check(kind, training)
-    with stoppable(f"{GOES_ON}; the best so far is in {out}"):
+    with stoppable(f"{RESUMES}; the best so far is in {out}"):
         for training in trainings:
             _report(fitter.fit(kind, training), scaled)
 

@@ -20,7 +20,7 @@ class _Size(click.ParamType[tuple[int, int]]):
     ) -> tuple[int, int]:
         width, _, height = str(value).partition("x")
         if not (width.isdecimal() and height.isdecimal()):
-            self.fail(f"{value!r} is no size: write it as 640x480")
+            self.fail(f"{value!r} isn't a size: write it as 640x480")
         return int(width), int(height)
 
 
@@ -31,18 +31,16 @@ class _Size(click.ParamType[tuple[int, int]]):
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="A new file, .mp4 or .gif."
 )
-@click.option("--task", help="Of policies by name, such as move_to_pose.")
+@click.option("--task", help="The task of policies by name, such as move_to_pose.")
 @click.option("--episode", default=0, show_default=True, type=COUNT, help="Its number, from 0.")
 @click.option(
     "--camera", default="tracking", show_default=True, help="overhead, tracking or egocentric."
 )
-@click.option(
-    "--size", type=_Size(), help="Of each picture; if not given 640x480, in a GIF 320x240."
-)
-@click.option("--fps", type=float, help="Frames a second; 25 if not given, in a GIF 12.5.")
+@click.option("--size", type=_Size(), help="Of each picture; default 640x480, in a GIF 320x240.")
+@click.option("--fps", type=float, help="Frames per second; default 25, in a GIF 12.5.")
 @click.option("--speed", default=1.0, show_default=True, help="0.25 is slow motion.")
 @click.option(
-    "--seconds", default=10.0, show_default=True, help="Simulated ones to show, from the start."
+    "--seconds", default=10.0, show_default=True, help="Simulated seconds to show, from the start."
 )
 def render(
     sources: tuple[str, ...],
@@ -57,9 +55,9 @@ def render(
 ) -> None:
     """Make a video of episodes, side by side.
 
-    A source is the folder of a data set or of a run that is over, or a policy by its name, such as
-    uniform, heuristic or constant:drive=0.5. The motor turns up to 23 times a second: at full
-    speed and 25 frames a second it seems to creep backwards; --speed 0.25 shows how it turns.
+    A source is the folder of a data set or of a run, or the name of a policy, such as uniform,
+    heuristic or constant:drive=0.5. The motor turns up to 23 times a second: at full speed and 25
+    frames per second it seems to creep backwards; --speed 0.25 shows how it turns.
     """
     from jbrep.opengl import find_opengl
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from jbrep.cli.base import GOES_ON, echo_paths, example, printable, stoppable
+from jbrep.cli.base import RESUMES, echo_paths, example, printable, stoppable
 
 
 @click.command(epilog=example("jbrep study studies/smoke.toml --out runs/smoke"))
@@ -50,7 +50,7 @@ def study(
     if dry_run:
         click.echo(dry_run_text(plan, count))
         return
-    with stoppable(GOES_ON):
+    with stoppable(RESUMES):
         crashed = run_study(plan, run, count)
     echo_paths([*_conclude(plan.folder), *write_report(plan.folder)])
     if crashed:

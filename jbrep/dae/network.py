@@ -34,7 +34,7 @@ def get_architecture(name: str) -> Architecture:
     """The architecture of that name.
 
     Raises:
-        InputError: there is none; the message lists them.
+        InputError: the name is unknown; the message lists the architectures.
     """
     return choose(name, ARCHITECTURES, "architecture")
 

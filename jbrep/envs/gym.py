@@ -1,4 +1,4 @@
-"""Gymnasium environments: one robot, and many stepped together."""
+"""Gymnasium environments: one robot, or many stepped together."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _ACTIONS = spaces.Box(-1, 1, (1,), np.float32)
 
 @dataclass(frozen=True)
 class _View:
-    """How observations are handed out: in which units and which form."""
+    """How observations are given: scaled or not, and in which form."""
 
     task: Task
     scaled: bool
@@ -43,7 +43,7 @@ class _View:
         return spaces.Dict([(o.name, _box(len(o.features))) for o in self.task.observables])
 
     def __call__(self, observation: Array) -> Observation:
-        """Observations in physical units, (..., d), as the space has them."""
+        """Convert observations in physical units, (..., d), to the form of the space."""
         if self.scaled:
             observation = self.task.scale(observation)
         single = observation.astype(np.float32)
@@ -51,7 +51,7 @@ class _View:
 
 
 def _render_modes() -> list[str]:
-    """Those that this machine allows: without a display GLFW's window aborts the process."""
+    """The render modes possible here: without a display, opening a window aborts the process."""
     modes = JitterbugEnv.metadata["render_modes"]
     return [mode for mode in modes if mode != "human" or has_display()]
 
@@ -65,7 +65,8 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Args:
         task: a key of `jbrep.jitterbug.tasks.TASKS`.
-        scaled: features divided by their nominal ranges, about [-1, 1], not in physical units.
+        scaled: scale features by their nominal ranges to about [-1, 1] instead of giving physical
+            units.
         form: "flat" for one array (d,), "dict" for a dictionary of observables.
         render_mode: "rgb_array", "depth_array", "human" or None.
         camera: "overhead", "tracking" or "egocentric".
@@ -99,8 +100,8 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.metadata = {**self.metadata, "render_modes": _render_modes()}
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(
-                f"render_mode {render_mode!r} can't be had here: choose one of "
-                f"{', '.join(self.metadata['render_modes'])}; human takes a display"
+                f"render_mode {render_mode!r} is not possible here: choose one of "
+                f"{', '.join(self.metadata['render_modes'])}; human needs a display"
             )
         self._simulation = Simulation(self.task, 1, 1)
         self.model = self._simulation.model
@@ -120,7 +121,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; there are no options."""
+        """Start an episode; `options` are ignored."""
         super().reset(seed=seed)
         self._simulation.reset([0], [self.np_random])
         self._observation = self._simulation.observe()[0]
@@ -142,7 +143,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """A frame, as Gymnasium's own MuJoCo environments give it.
 
         Raises:
-            InputError: no OpenGL to render with, or a package that rendering takes is missing.
+            InputError: no OpenGL to render with, or a package for rendering is missing.
         """
         if self.render_mode is None:
             return None
@@ -156,7 +157,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             return self._renderer.render(self.render_mode)
         except ModuleNotFoundError as error:
             raise InputError(
-                f"rendering takes {error.name}: pip install 'jbrep[render]'"
+                f"rendering needs {error.name}: pip install 'jbrep[render]'"
             ) from error
         except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
             raise no_opengl(error) from error
@@ -172,10 +173,10 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
     """Many Jitterbugs stepped together; what `gymnasium.make_vec` gives.
 
     Lane i of an environment that is reset with seed s has the episodes of a single environment
-    reset with seed s + i. An episode that ends starts anew in the same step.
+    reset with seed s + i. A lane whose episode ends is reset in the same step.
 
     Args:
-        task, scaled, form: as of `JitterbugEnv`.
+        task, scaled, form: as for `JitterbugEnv`.
         num_envs: how many robots.
         max_episode_steps: the time limit, in control steps.
         num_threads: threads to step them on; None takes one for each core.
@@ -210,11 +211,11 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode in every lane; there are no options."""
+        """Start an episode in every lane; `options` are ignored."""
         if seed is None or isinstance(seed, int):
             seed = [None if seed is None else seed + lane for lane in range(self.num_envs)]
         if len(seed) != self.num_envs:
-            raise InputError(f"{len(seed)} seeds for {self.num_envs} lanes: one for each is needed")
+            raise InputError(f"{len(seed)} seeds for {self.num_envs} lanes: give one for each lane")
         return self._view(self._episodes.reset(seed)), {}
 
     def step(

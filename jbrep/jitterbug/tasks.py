@@ -331,7 +331,7 @@ def get_task(name: str) -> Task:
     """Look up a task by its name.
 
     Raises:
-        InputError: there is none; the message lists the tasks.
+        InputError: the name is unknown; the message lists the tasks.
     """
     return choose(name, TASKS, "task")
 

@@ -69,7 +69,7 @@ def get_kind(name: str) -> Kind:
     """The kind of encoder of that name.
 
     Raises:
-        InputError: there is none; the message lists them.
+        InputError: the name is unknown; the message lists the kinds.
     """
     return choose(name, KINDS, "kind")
 
