@@ -61,6 +61,7 @@ class Run:
     steps: int = 100_000
     evaluate_every: int = 10_000  # steps
     evaluation_episodes: int = 10
+    episode_steps: int = 1000
 
     def __post_init__(self) -> None:
         for name in ("steps", "evaluate_every", "evaluation_episodes"):
