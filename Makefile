@@ -1,7 +1,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-READY := $(VENV)/.ready
+VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+READY_DEMO := $(VENV)/.ready-$(VERSION)-for-the-demo
+READY := $(VENV)/.ready-$(VERSION)
 DEMO := demo
 DEMO_RUN := $(DEMO)/study/runs/face_direction/sac-modern/dae-8/seed-0
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
@@ -11,14 +13,18 @@ help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
 setup: $(READY) ## a virtual environment with everything in it
-$(READY): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
-	  || { echo "jbrep needs Python 3.11 or newer: make PYTHON=python3.11 ..."; exit 2; }
-	$(PYTHON) -m venv $(VENV)
+$(READY): $(READY_DEMO)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[cluster,export,learn,render,view,dev]'
 	@touch $@
 
-demo: $(READY) ## the whole job in minutes: collect, train and judge encoders, learn on latent and full state
+$(READY_DEMO): pyproject.toml constraints.txt
+	@case "$(VERSION)" in 3.11|3.12) ;; *) echo "jbrep needs Python 3.11 or 3.12, and $(PYTHON) is" \
+	  "'$(VERSION)' (dm-control's labmaze has no wheels for newer ones): make PYTHON=python3.12 ..."; exit 2;; esac
+	test -d $(VENV)/lib/python$(VERSION) || $(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[learn,view]'
+	@touch $@
+
+demo: $(READY_DEMO) ## the whole job in minutes: collect, train and judge encoders, learn on latent and full state
 	rm -rf $(DEMO)
 	$(BIN)/jbrep collect --task face_direction --steps 20k --out $(DEMO)/data
 	$(BIN)/jbrep data info $(DEMO)/data

@@ -22,7 +22,7 @@ EXTRAS = {  # what each is for; the empty one is always installed
     "dev": "make check, test and bench",
 }
 _RENDER = """
-from jbrep.render.opengl import find_opengl
+from jbrep.opengl import find_opengl
 find_opengl()
 import mujoco
 from OpenGL import GL

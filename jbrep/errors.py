@@ -5,6 +5,9 @@ from typing import Any, TypeVar
 
 _Choice = TypeVar("_Choice")
 
+_MOST_SHOWN = 3  # settings that differ
+_MOST_LETTERS = 40  # of a value
+
 
 class InputError(ValueError):
     """A user's mistake: one line with what was wrong, what was expected, and the choices."""
@@ -14,24 +17,26 @@ class DamageError(InputError):
     """A file is not what jbrep wrote; the message names it."""
 
 
-def check_version(path: object, found: Any, known: int) -> None:
-    """Make sure that a file's format isn't newer than the one known here.
+def check_version(path: object, version: Any, newest: int) -> None:
+    """Make sure that a file's format version is one that this jbrep reads: 1 to the newest.
 
     Raises:
-        InputError: it is.
+        InputError: it is a newer one.
+        DamageError: it is none.
     """
-    if not isinstance(found, int) or found > known:
+    if type(version) is not int or version < 1:
+        raise DamageError(f"{path} is damaged: its format version is {version!r}")
+    if version > newest:
         raise InputError(
-            f"{path} has format version {found}: this jbrep reads up to {known}, so a newer one is "
-            "needed"
+            f"{path} has format version {version}: this jbrep reads up to {newest}; update jbrep"
         )
 
 
 def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:
-    """What goes by that name.
+    """The choice of that name.
 
     Raises:
-        InputError: nothing does; the message lists the names.
+        InputError: there is none; the message lists the names.
     """
     if name not in choices:
         raise InputError(f"unknown {what} {name!r}: choose one of {', '.join(choices)}")
@@ -39,9 +44,16 @@ def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:
 
 
 def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """What is wanted and isn't there, for a message; nothing if all is."""
-    return ", ".join(
-        f"{name} {there.get(name)} (now: {value})"
-        for name, value in wanted.items()
-        if there.get(name) != value
-    )
+    """The settings that differ, as text for a message: at most three; empty if none does."""
+    differing = [name for name, value in wanted.items() if there.get(name) != value]
+    shown = [
+        f"{name} {_shown(there.get(name))} (now: {_shown(wanted[name])})"
+        for name in differing[:_MOST_SHOWN]
+    ]
+    more = len(differing) - _MOST_SHOWN
+    return ", ".join([*shown, f"and {more} more"] if more > 0 else shown)
+
+
+def _shown(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= _MOST_LETTERS else f"{text[: _MOST_LETTERS - 3]}..."

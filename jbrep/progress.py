@@ -24,6 +24,14 @@ class Progress(tqdm):
             options |= {"mininterval": _LOG_EVERY, "delay": _LOG_EVERY, "miniters": 1}
         super().__init__(*args, **options)
 
+    def set_postfix(self, *args: Any, refresh: bool = False, **values: Any) -> None:
+        """What stands behind the rate, from the next time on that anything is shown."""
+        super().set_postfix(*args, refresh=refresh, **values)
+
+    def set_postfix_str(self, s: str = "", refresh: bool = False) -> None:
+        """The same, as text."""
+        super().set_postfix_str(s, refresh=refresh)
+
 
 class _Log:
     """A stream that tqdm's bars are written to as lines: nothing returns to a line's start."""

@@ -9,9 +9,13 @@ from functools import partial
 import pytest
 import torch
 
+from jbrep.opengl import prepare_opengl
+
 torch.set_num_threads(1)  # the workers share the cores
 HEADLESS = find_library("EGL") is not None
-os.environ.setdefault("MUJOCO_GL", "egl" if HEADLESS else "disable")
+if not HEADLESS:
+    os.environ.setdefault("MUJOCO_GL", "disable")
+prepare_opengl()
 needs_egl = pytest.mark.skipif(not HEADLESS, reason="no EGL: install libegl1 and libgl1")
 
 

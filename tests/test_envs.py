@@ -1,12 +1,13 @@
 """Gymnasium: ids, checkers, forms, time limit, seeds and divergence."""
 
+import os
 import subprocess
 import sys
 
 import gymnasium
 import numpy as np
 import pytest
-from conftest import needs_egl
+from conftest import HEADLESS, needs_egl
 from gymnasium.envs.mujoco.utils import check_mujoco_reset_state
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
@@ -64,7 +65,7 @@ def test_rl_zoo3_s_way_of_importing_registers_them():
 @pytest.mark.parametrize("env_id", IDS)
 def test_checkers(env_id, form):
     environment = gymnasium.make(env_id, form=form)
-    check_env(environment.unwrapped, skip_render_check=True)
+    check_env(environment.unwrapped, skip_render_check=not HEADLESS)
     check_mujoco_reset_state(environment)
     sb3_check_env(environment)
 
@@ -174,7 +175,7 @@ def test_missing_opengl_is_said_in_one_line_and_all_else_works(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
     environment = gymnasium.make(FACE, render_mode="rgb_array").unwrapped
     environment.reset(seed=0)
-    with pytest.raises(InputError, match=r"no OpenGL to render with .* set MUJOCO_GL=egl"):
+    with pytest.raises(InputError, match=r"rendering needs EGL.* set MUJOCO_GL=egl"):
         environment.render()
     assert environment.step(np.zeros(1))[0].shape == (16,)
 
@@ -196,3 +197,48 @@ def test_mistakes_are_named():
     single.reset()
     with pytest.raises(InputError, match="not finite"):
         single.step(np.array([np.nan]))
+
+
+def without_a_display(code):
+    """Run it as on a machine without a display, where nobody has set MUJOCO_GL."""
+    hidden = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM")
+    env = {name: value for name, value in os.environ.items() if name not in hidden}
+    command = [sys.executable, "-c", f"import gymnasium, jbrep\n{code}"]
+    return subprocess.run(command, env=env, capture_output=True, text=True)
+
+
+@needs_egl
+def test_frames_need_neither_a_display_nor_a_setting():
+    done = without_a_display(
+        f"env = gymnasium.make('{FACE}', render_mode='rgb_array', width=64, height=48)\n"
+        "env.reset(seed=0)\nprint(env.render().shape)\nenv.close()"
+    )
+    assert done.stdout == "(48, 64, 3)\n", done.stderr
+
+
+def test_a_window_without_a_display_is_refused_in_one_line():
+    done = without_a_display(f"gymnasium.make('{FACE}', render_mode='human')")
+    assert done.returncode == 1  # an abort of the process has another
+    assert done.stderr.splitlines()[-1] == (
+        "jbrep.errors.InputError: render_mode 'human' can't be had here: choose one of "
+        "rgb_array, depth_array; human takes a display"
+    )
+
+
+_RENDERS = {
+    "gymnasium": f"env = gymnasium.make('{FACE}', render_mode='rgb_array')\n"
+    "env.reset(); env.render()",
+    "dm_control": "from jbrep import jitterbug\n"
+    "jitterbug.load('face_direction').physics.render(48, 64)",
+    "camera": "from jbrep.opengl import find_opengl; find_opengl()\n"
+    "from jbrep.render.pictures import Camera; Camera()",
+}
+
+
+@needs_egl
+@pytest.mark.parametrize("renders", _RENDERS)
+def test_triton_can_be_imported_after_rendering(renders):
+    """Torch does so with its first optimiser; where Mesa renders, the process crashed."""
+    pytest.importorskip("triton")
+    done = without_a_display(f"{_RENDERS[renders]}\nimport triton")
+    assert done.returncode == 0, done.stderr

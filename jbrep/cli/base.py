@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 import click
 
+from jbrep.cli.output import lasting_output
 from jbrep.errors import InputError
 
 _EXTRAS = {  # what a missing package is installed with
@@ -94,6 +95,11 @@ def stoppable(how_to_go_on: str) -> Iterator[None]:
 
 class Cli(click.Group):
     """A user's mistake is one line and exit code 2; anything else shows its traceback."""
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        """Run the command line."""
+        with lasting_output():
+            return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> None:
         """Run a command."""

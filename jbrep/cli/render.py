@@ -61,7 +61,7 @@ def render(
     uniform, heuristic or constant:drive=0.5. The motor turns up to 23 times a second: at full
     speed and 25 frames a second it seems to creep backwards; --speed 0.25 shows how it turns.
     """
-    from jbrep.render.opengl import find_opengl
+    from jbrep.opengl import find_opengl
 
     find_opengl()
     from jbrep.render.film import Film, Pace

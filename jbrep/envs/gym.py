@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -15,15 +16,12 @@ from jbrep.envs.episodes import Episodes
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation, check_actions
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, Array, Task, get_task
+from jbrep.opengl import has_display, no_opengl, prepare_opengl
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
 _FORMS = ("flat", "dict")
 _ACTIONS = spaces.Box(-1, 1, (1,), np.float32)
-_NO_OPENGL = (
-    "no OpenGL to render with ({}): without a display, install libegl1 and libgl1 and set "
-    "MUJOCO_GL=egl; also pip install 'jbrep[render]'"
-)
 
 
 @dataclass(frozen=True)
@@ -52,6 +50,12 @@ class _View:
         return single if self.form == "flat" else self.task.split(single)
 
 
+def _render_modes() -> list[str]:
+    """Those that this machine allows: without a display GLFW's window aborts the process."""
+    modes = JitterbugEnv.metadata["render_modes"]
+    return [mode for mode in modes if mode != "human" or has_display()]
+
+
 def _box(size: int) -> spaces.Box:
     return spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
@@ -71,7 +75,8 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     0 and `info["non_finite"]` true.
 
     Raises:
-        InputError: unknown task or form; an action of another shape than (1,), or not finite.
+        InputError: unknown task, form or render mode, or "human" without a display; an action of
+            another shape than (1,), or not finite.
     """
 
     metadata = {  # noqa: RUF012 (Gymnasium's own convention)
@@ -91,6 +96,12 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ):
         self.task = get_task(task)
         self._view = _View(self.task, scaled, form)
+        self.metadata = {**self.metadata, "render_modes": _render_modes()}
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError(
+                f"render_mode {render_mode!r} can't be had here: choose one of "
+                f"{', '.join(self.metadata['render_modes'])}; human takes a display"
+            )
         self._simulation = Simulation(self.task, 1, 1)
         self.model = self._simulation.model
         self.observation_space = self._view.space
@@ -131,19 +142,24 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """A frame, as Gymnasium's own MuJoCo environments give it.
 
         Raises:
-            InputError: no OpenGL to render with.
+            InputError: no OpenGL to render with, or a package that rendering takes is missing.
         """
         if self.render_mode is None:
             return None
         data = self.data
+        prepare_opengl()
         try:
             if self._renderer is None:
                 from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
                 self._renderer = MujocoRenderer(self.model, data, **self._frame)
             return self._renderer.render(self.render_mode)
-        except (ImportError, AttributeError, RuntimeError) as error:
-            raise InputError(_NO_OPENGL.format(error)) from error
+        except ModuleNotFoundError as error:
+            raise InputError(
+                f"rendering takes {error.name}: pip install 'jbrep[render]'"
+            ) from error
+        except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+            raise no_opengl(error) from error
 
     def close(self) -> None:
         """Free the renderer."""

@@ -6,13 +6,17 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from dm_control import mujoco, suite
-from dm_control.rl import control
-from dm_control.suite import base
-from dm_control.utils import containers
 
 from jbrep.jitterbug import model, tasks
 from jbrep.jitterbug.tasks import Array, Readings
+from jbrep.opengl import prepare_opengl
+
+prepare_opengl()  # dm_control chooses its platform, and opens EGL, when it is imported
+
+from dm_control import mujoco, suite  # noqa: E402
+from dm_control.rl import control  # noqa: E402
+from dm_control.suite import base  # noqa: E402
+from dm_control.utils import containers  # noqa: E402
 
 DOMAIN = "jitterbug"
 SUITE = containers.TaggedTasks()

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from jbrep.errors import InputError, choose
 from jbrep.jitterbug.model import plain_model
-from jbrep.render.opengl import no_opengl
+from jbrep.opengl import no_opengl, prepare_opengl
 from jbrep.rollouts.rollout import Rollout
 
 Pixels = NDArray[np.uint8]
@@ -55,6 +55,7 @@ class Camera:
         model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_PIXELS, _SAMPLES
         model.vis.map.shadowscale = _SHADOW_CONE
         self._model, self._data = model, mujoco.MjData(model)
+        prepare_opengl()
         try:
             self._renderer = mujoco.Renderer(model, height, width)
         except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:

@@ -1,0 +1,26 @@
+"""What messages say of settings and versions."""
+
+import pytest
+
+from jbrep.errors import DamageError, InputError, check_version, differences
+
+
+def test_at_most_three_settings_are_named_and_long_values_are_cut():
+    there = dict.fromkeys("abcde", 1) | {"same": 2}
+    wanted = {"same": 2, "a": "x" * 100, "b": 2, "c": 3, "d": 4, "e": 5}
+    text = differences(there, wanted)
+    assert text == f"a 1 (now: {'x' * 37}...), b 1 (now: 2), c 1 (now: 3), and 2 more"
+    assert differences(there, there) == ""
+    assert differences({}, {"a": 1}) == "a None (now: 1)"
+
+
+@pytest.mark.parametrize("version", [0, -1, True, 1.0, "1", None])
+def test_a_version_that_is_none_is_damage(version):
+    with pytest.raises(DamageError, match="its format version is"):
+        check_version("file", version, 3)
+
+
+def test_a_newer_version_asks_for_a_newer_jbrep():
+    check_version("file", 3, 3)
+    with pytest.raises(InputError, match="file has format version 4: this jbrep reads up to 3"):
+        check_version("file", 4, 3)
