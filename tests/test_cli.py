@@ -138,7 +138,10 @@ def test_every_command_has_help_with_an_example(command):
         ),
         (("rl", "--task", "fly", "--out", "x"), "choose one of move_from_origin"),
         (("rl", "--task", "face_direction", "--algorithm", "dqn", "--out", "x"), "ddpg, td3"),
-        (("train-dae", "--data", "none", "--out", "x"), "needs latent sizes: --latent 12 8 4, say"),
+        (
+            ("train-dae", "--data", "none", "--out", "x"),
+            "needs latent sizes, such as --latent 12 8 4",
+        ),
         (
             (
                 "train-encoder",

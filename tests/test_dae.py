@@ -8,7 +8,7 @@ from torch.nn.functional import mse_loss
 from jbrep.dae import checkpoint
 from jbrep.dae.gradient import Gradient
 from jbrep.dae.network import ARCHITECTURES, Autoencoder, layers
-from jbrep.dae.training import Trainer, Training, get_device, prefetch
+from jbrep.dae.training import Trainer, Training, default_batch_size, get_device, prefetch
 from jbrep.encoders.encoder import run
 from jbrep.errors import InputError
 from jbrep.files import container
@@ -57,8 +57,22 @@ def test_the_papers_architecture_has_two_layers_with_tanh():
     shapes += [(layer.weight.shape, layer.activation) for layer in layers(network.decoder)]
     assert shapes == [((12, 16), "tanh"), ((16, 12), "tanh")]
     usual = Training.of(12)
-    assert (usual.epochs, usual.batch_size, usual.learning_rate) == (200, 8192, 5e-4)
-    assert (usual.noise, usual.seed) == (0.1, 0)
+    assert (usual.epochs, usual.learning_rate, usual.noise, usual.seed) == (200, 5e-4, 0.1, 0)
+
+
+@pytest.mark.parametrize(
+    ("count", "size"), [(1, 128), (16_000, 128), (102_400, 256), (1_000_000, 2048)]
+)
+def test_the_batch_size_is_chosen_from_the_rows(count, size):
+    assert default_batch_size(count) == size
+
+
+def test_the_papers_batch_size_is_chosen_for_its_five_million_states():
+    assert default_batch_size(4_000_000) == default_batch_size(10**9) == 8192
+    data = rows(300)
+    assert torch.equal(
+        weights(trained(train=data, batch_size=None)), weights(trained(train=data, batch_size=128))
+    )
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
@@ -155,7 +169,9 @@ def test_a_checkpoint_goes_on_to_the_same_weights(architecture, tmp_path):
 def test_a_checkpoint_of_something_else_is_refused(tmp_path):
     it = trained()
     checkpoint.save(it, {"seed": 0, "noise": 0.1}, tmp_path / "at")
-    with pytest.raises(InputError, match=r"begun otherwise: noise 0\.1 \(now: 0\.2\); take"):
+    with pytest.raises(
+        InputError, match=r"belongs to another configuration: noise 0\.1 \(now: 0\.2\); choose"
+    ):
         checkpoint.restore(trainer(), {"seed": 0, "noise": 0.2}, tmp_path / "at")
     whole = (tmp_path / "at").read_bytes()
     for content in (b"", whole[:50], whole[:-1], b"\x80" + whole[1:]):
@@ -163,7 +179,7 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path):
         with pytest.raises(InputError, match="is not a jbrep checkpoint"):
             checkpoint.restore(trainer(), {"seed": 0, "noise": 0.1}, tmp_path / "at")
     checkpoint.save(it, {"seed": 0}, tmp_path / "at")
-    with pytest.raises(InputError, match="is damaged: delete it to begin anew"):
+    with pytest.raises(InputError, match="is damaged: delete it to start over"):
         checkpoint.restore(trainer(latent=5), {"seed": 0}, tmp_path / "at")
 
 
@@ -222,24 +238,30 @@ def test_prefetch_keeps_order_and_errors():
 def test_mistakes_are_named():
     with pytest.raises(InputError, match="unknown architecture 'wide': choose one of paper, deep"):
         Training.of(4, "wide")
-    with pytest.raises(InputError, match="batch size is 0: from 1 to"):
+    with pytest.raises(InputError, match="batch size is 0: it must be from 1 to"):
         Training.of(4, batch_size=0)
-    with pytest.raises(InputError, match="epochs is -1: from 1 to"):
+    with pytest.raises(InputError, match="epochs is -1: it must be from 1 to"):
         Training.of(4, epochs=-1)
-    with pytest.raises(InputError, match=r"seed is 1000+: from 0 to 9223372036854775807"):
+    with pytest.raises(
+        InputError, match=r"seed is 1000+: it must be from 0 to 9223372036854775807"
+    ):
         Training.of(4, seed=10**20)
-    for bad in ({"learning_rate": 0}, {"learning_rate": np.nan}, {"noise": -1}, {"noise": np.inf}):
-        with pytest.raises(InputError, match="a positive number and one from 0 are needed"):
-            Training.of(4, **bad)
+    for rate in (0, np.nan, np.inf, 1e9):
+        with pytest.raises(InputError, match=r"learning rate is .*: it must be above 0 and at"):
+            Training.of(4, learning_rate=rate)
+    for noise in (-1, np.nan, np.inf):
+        with pytest.raises(InputError, match=r"noise is .*: it must be at least 0, and finite"):
+            Training.of(4, noise=noise)
+    with pytest.raises(InputError, match="an autoencoder needs a latent size"):
+        trainer(latent=None)
     for name in ("quantum", "meta"):
-        with pytest.raises(InputError, match=f"no device '{name}' here: take auto"):
+        with pytest.raises(InputError, match=f"no device '{name}' on this machine: choose auto"):
             get_device(name)
 
 
-@pytest.mark.parametrize("how", [{"learning_rate": 1e38}, {"noise": 1e38}])
-def test_losses_that_overflow_end_the_training_and_leave_the_best(how):
-    it = trainer(**how, architecture="deep", batch_size=600)
-    with pytest.raises(InputError, match=r"the losses are .* or a learning rate below .*, is need"):
+def test_losses_that_overflow_end_the_training_and_leave_the_best():
+    it = trainer(noise=1e38, architecture="deep", batch_size=600)
+    with pytest.raises(InputError, match=r"diverged in epoch 1, .*: use less noise than 1e\+38"):
         list(it.epochs())
     assert all(p.isfinite().all() for p in it.best.values())
 

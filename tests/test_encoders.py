@@ -7,6 +7,7 @@ import pickle
 import struct
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import onnxruntime
@@ -15,14 +16,14 @@ import safetensors.numpy
 import torch
 
 from jbrep.dataset import DamageError, Scaler
-from jbrep.encoders import Encoder, Layer, find, load, save
-from jbrep.encoders import file as encoder_file
+from jbrep.encoders import Encoder, Layer, find, load, save, shipped
 from jbrep.encoders.card import card
 from jbrep.encoders.file import fingerprint
 from jbrep.encoders.onnx import export
-from jbrep.encoders.shipped import names
+from jbrep.encoders.shipped import names, source_of
 from jbrep.envs import JitterbugVecEnv
 from jbrep.errors import InputError
+from jbrep.files import container
 from jbrep.jitterbug.tasks import TASKS
 
 TASK = TASKS["face_direction"]
@@ -97,9 +98,11 @@ def test_gradients_flow_through_torch(encoder):
 
 
 def test_another_length_is_refused(encoder):
-    with pytest.raises(InputError, match=r"takes observations of 16 numbers: shape \(2, 15\)"):
+    with pytest.raises(
+        InputError, match=r"takes observations of 16 numbers, but got shape \(2, 15\)"
+    ):
         encoder.encode(np.zeros((2, 15)))
-    with pytest.raises(InputError, match=r"takes latents of 3 numbers: shape \(4,\)"):
+    with pytest.raises(InputError, match=r"takes latents of 3 numbers, but got shape \(4,\)"):
         encoder.decode(torch.zeros(4))
 
 
@@ -194,12 +197,11 @@ def test_hostile_sizes_end_at_once(tmp_path):
 
 
 def forged(encoder, path, **changes):
-    """A file with right hashes and what a forger chose."""
+    """A file with a valid checksum over whatever a forger chose."""
     head = {"format": "jbrep encoder", "format_version": 1, **encoder.header}
     head |= {"encoder": ["relu", "tanh"], "decoder": ["linear"], **changes.pop("header", {})}
     tensors = {n: t for n, t in {**encoder.tensors(), **changes}.items() if t is not None}
-    head["sha256"] = encoder_file._digest(head, tensors)
-    path.write_bytes(safetensors.numpy.save(tensors, {"jbrep": json.dumps(head)}))
+    container.write(path, tensors, head)
     return path
 
 
@@ -212,39 +214,48 @@ def forged(encoder, path, **changes):
             r"encoder.1.weight has shape \(3, 4\)",
         ),
         ({"encoder.0.weight": np.zeros(16, np.float32)}, r"encoder.0.weight has shape \(16,\)"),
-        ({"encoder.0.bias": np.zeros(5)}, "tensor encoder.0.bias holds float64"),
+        (
+            {"encoder.0.bias": np.zeros(5)},
+            "tensor encoder.0.bias has type float64, expected float32",
+        ),
         (
             {"high": np.full(16, np.nan, np.float32)},
-            "tensor high holds a number that is not finite, or beyond",
+            "tensor high holds a number that is not finite or not below",
         ),
-        ({"low": np.zeros(15, np.float32)}, r"tensor low has shape \(15,\): \(16,\)"),
-        ({"low": np.zeros((), np.float32)}, r"tensor low has shape \(\): \(16,\)"),
-        ({"low": np.zeros((16, 1), np.float32)}, r"tensor low has shape \(16, 1\): \(16,\)"),
-        ({"high": np.zeros(15, np.float32)}, r"tensor high has shape \(15,\): \(16,\)"),
+        ({"low": np.zeros(15, np.float32)}, r"tensor low has shape \(15,\), expected \(16,\)"),
+        ({"low": np.zeros((), np.float32)}, r"tensor low has shape \(\), expected \(16,\)"),
+        (
+            {"low": np.zeros((16, 1), np.float32)},
+            r"tensor low has shape \(16, 1\), expected \(16,\)",
+        ),
+        ({"high": np.zeros(15, np.float32)}, r"tensor high has shape \(15,\), expected \(16,\)"),
         (
             {"decoder.0.weight": np.full((16, 3), 3e38, np.float32)},
-            "not finite, or beyond 1000000000000",
+            "not finite or not below 1e\\+12",
         ),
         (
             {
                 "encoder.1.weight": np.zeros((0, 5), np.float32),
                 "encoder.1.bias": np.zeros(0, np.float32),
             },
-            r"encoder.1.weight has shape \(0, 5\): \(1, 5\)",
+            r"encoder.1.weight has shape \(0, 5\), expected \(1, 5\)",
         ),
-        ({"header": {"metrics": {}}}, "its header has no held_out_mse among its metrics"),
+        ({"header": {"metrics": {}}}, "the header's metrics have no held_out_mse"),
         (
             {"header": {"encoder": ["relu", "tanh"], "decoder": ["linear"], "data": []}},
-            "has no data",
+            "the header has no data, or not as a dict",
         ),
         ({"encoder.1.bias": None}, "tensor encoder.1.bias is missing"),
-        ({"spy": np.zeros(1, np.float32)}, "tensor spy is none of an encoder's"),
+        ({"spy": np.zeros(1, np.float32)}, "unexpected tensor spy"),
         ({"header": {"encoder": ["relu", "sine"]}}, "unknown activation 'sine'"),
-        ({"header": {"decoder": []}}, "is none of an encoder's"),
-        ({"header": {"features": ["a", 1]}}, "its header's features are no words"),
-        ({"header": {"name": "\x1b[2J"}}, "its name .* is none"),
-        ({"header": {"metrics": 3}}, "its header has no metrics"),
-        ({"header": {"format_version": 2}}, "has format version 2: this jbrep reads up to 1"),
+        ({"header": {"decoder": []}}, "unexpected tensor decoder"),
+        ({"header": {"features": ["a", 1]}}, "the header's features must be strings"),
+        ({"header": {"name": "\x1b[2J"}}, "invalid encoder name .*: use lower-case letters"),
+        ({"header": {"metrics": 3}}, "the header has no metrics"),
+        ({"header": {"metrics": {"held_out_mse": float("inf")}}}, "number that is not finite"),
+        ({"header": {"format_version": 2}}, "has format version 2"),
+        ({"header": {"format_version": 0}}, "its format version is 0"),
+        ({"header": {"format_version": -1}}, "its format version is -1"),
         ({"header": {"format": "other"}}, "is not a jbrep encoder"),
     ],
 )
@@ -253,10 +264,34 @@ def test_a_forgery_is_refused_and_the_tensor_named(encoder, changes, message, tm
         load(forged(encoder, tmp_path / "forged", **changes))
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"name": "My encoder"}, "invalid encoder name 'My encoder'"),
+        ({"metrics": {}}, "metrics have no held_out_mse"),
+        ({"metrics": {"held_out_mse": float("nan")}}, "number that is not finite"),
+        ({"features": ["a"]}, r"tensor low has shape \(16,\), expected \(1,\)"),
+        ({"data": {"rows": np.float32(3)}}, "float32 is not JSON serializable"),
+        ({"sha256": "0"}, "the header must not have sha256"),
+        ({"format": "other"}, "the header must not have format"),
+    ],
+)
+def test_saving_refuses_what_loading_would(changes, message, tmp_path):
+    with pytest.raises(InputError, match=f"can't save an encoder in .*{message}"):
+        save(make(**changes), tmp_path / "it")
+    assert not list(tmp_path.iterdir())
+
+
+def test_saving_refuses_a_file_too_large_to_load(tmp_path):
+    wide = (layer(16, 2048, "relu"), layer(2048, 2048, "relu"), layer(2048, 3, "tanh"))
+    with pytest.raises(InputError, match="bytes are more than 16,777,216"):
+        save(make(wide), tmp_path / "it")
+
+
 def test_wide_layers_and_latents_larger_than_observations_are_refused():
-    with pytest.raises(InputError, match="at most 4096, and no more in the latent than"):
+    with pytest.raises(InputError, match="a layer has 5000 units: the limit is 4096"):
         make((layer(16, 5000, "relu"), layer(5000, 3, "tanh")))
-    with pytest.raises(InputError, match="no more in the latent than there are features, 16"):
+    with pytest.raises(InputError, match="latent has 17 units: there must not be more than the 16"):
         make((layer(16, 17, "tanh"),), (layer(17, 16, "linear"),))
 
 
@@ -265,7 +300,7 @@ def test_tampering_with_a_weight_is_found(encoder, tmp_path):
     whole = (tmp_path / "encoder").read_bytes()
     number = encoder.encoder[0].weight[0, 0].tobytes()
     (tmp_path / "encoder").write_bytes(whole.replace(number, np.float32(1).tobytes()))
-    with pytest.raises(DamageError, match="is damaged: its numbers or header aren't those written"):
+    with pytest.raises(DamageError, match=r"is damaged \(its checksum doesn't match"):
         load(tmp_path / "encoder")
 
 
@@ -306,7 +341,7 @@ def test_onnx_gives_what_torch_gives(encoder, rows, tmp_path):
     np.testing.assert_allclose(back, encoder.decode(tensor).numpy(), rtol=1e-4, atol=1e-4)
     stored = session.get_modelmeta().custom_metadata_map["jbrep"]
     assert json.loads(stored)["features"] == list(TASK.feature_names)
-    with pytest.raises(InputError, match=r"it.onnx is there already"):
+    with pytest.raises(InputError, match=r"it.onnx exists already"):
         export(encoder, tmp_path / "it.onnx")
 
 
@@ -320,25 +355,46 @@ def test_the_card_tells_layers_and_ranges(encoder):
 @pytest.mark.parametrize("task", TASKS)
 def test_encoders_ship_for_every_task(task):
     sizes = [f"{kind}-{latent}" for kind in ("dae", "pca", "random") for latent in (12, 8, 4)]
-    assert names(task) == (*sizes[:3], "identity", *sizes[3:])
+    assert names(task) == (*sizes[:3], "full", *sizes[3:])
     errors = {}
     for name in names(task):
-        shipped = find(name, task)
-        shipped.check_task(TASKS[task])
-        source = shipped.header["data"]
+        it = find(name, task)
+        it.check_task(TASKS[task])
+        source = it.header["data"]
         assert source["train_rows"] + source["test_rows"] == 5_000_000
-        assert source["fingerprint"] == find("identity", task).header["data"]["fingerprint"]
-        errors[name] = shipped.header["metrics"]["held_out_mse"]
-        if shipped.header["kind"] == "dae":
-            training = shipped.header["training"]
-            assert training["epochs"] == shipped.header["metrics"]["epochs"] == 200
+        assert source["fingerprint"] == find("full", task).header["data"]["fingerprint"]
+        errors[name] = it.header["metrics"]["held_out_mse"]
+        if it.header["kind"] == "dae":
+            training = it.header["training"]
+            assert training["epochs"] == it.header["metrics"]["epochs"] == 200
     for kind in ("dae", "pca", "random"):
-        assert errors["identity"] < errors[f"{kind}-12"] < errors[f"{kind}-8"] < errors[f"{kind}-4"]
+        assert errors["full"] < errors[f"{kind}-12"] < errors[f"{kind}-8"] < errors[f"{kind}-4"]
+
+
+def test_shipped_files_keep_their_bytes_when_saved_again(tmp_path):
+    for name in ("dae-8", "pca-4", "identity"):
+        path = Path(shipped.__file__).parent / "shipped" / TASK.name / f"{name}.safetensors"
+        save(load(path), tmp_path / name)
+        assert (tmp_path / name).read_bytes() == path.read_bytes()
+
+
+def test_the_full_observation_goes_by_one_name(encoder):
+    full = find("full", TASK.name)
+    assert fingerprint(full) == fingerprint(find("identity", TASK.name))
+    assert (full.representation, encoder.representation) == ("full", "dae-3")
+    assert source_of("full", TASK.name) == "full, shipped"
+
+
+def test_an_encoder_is_shown_on_one_line(encoder):
+    assert repr(encoder) == "Encoder(dae-3, face_direction, 16 to 3)"
 
 
 def test_a_name_that_ships_comes_before_a_file(encoder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save(encoder, tmp_path / "dae-8")
+    assert source_of("dae-8", TASK.name) == "dae-8, shipped"
+    assert source_of("./dae-8", TASK.name) == "./dae-8"
+    assert source_of("dae-8", None) == "dae-8"
     assert find("dae-8", TASK.name).latent_size == 8
     assert find("./dae-8", TASK.name).latent_size == 3
     with pytest.raises(

@@ -15,7 +15,7 @@ from jbrep.dataset import Dataset, ScaledDataset, Scaler
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder, Layer
 from jbrep.errors import InputError
-from jbrep.evaluate import evaluate
+from jbrep.evaluate import diagnose
 from jbrep.evaluate.files import EVALUATION, write
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import intrinsic_dimension, latent
@@ -356,7 +356,7 @@ def test_a_constant_feature_can_be_judged(data):
         np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.low),
         np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.high),
     )
-    found = evaluate({"pca-4": make(flat, pca(flat, 4))}, flat)["encoders"]["pca-4"]
+    found = diagnose({"pca-4": make(flat, pca(flat, 4))}, flat)["encoders"]["pca-4"]
     assert found["reconstruction"]["features"][2]["r2"] == [None, None, None]
     assert found["corruption"][0]["linear_mse"][0] == pytest.approx(
         found["reconstruction"]["mse"][0], rel=1e-3
@@ -370,11 +370,11 @@ def still_height(data, rows):
 
 
 def test_labels_and_numbers_that_cannot_be_judged(data):
-    with pytest.raises(InputError, match="the label full is that of the observation itself"):
-        evaluate({"full": make(data, ((), ()))}, data)
+    with pytest.raises(InputError, match="the label full is reserved for the observation itself"):
+        diagnose({"full": make(data, ((), ()))}, data)
     huge = Layer(np.full((16, 16), 1e11, np.float32), np.zeros(16, np.float32), "linear")
-    with pytest.raises(InputError, match="it gives numbers that aren't finite"):
-        evaluate({"it": make(data, ((), (huge,) * 4))}, data)
+    with pytest.raises(InputError, match="it gives numbers that are not finite"):
+        diagnose({"it": make(data, ((), (huge,) * 4))}, data)
 
 
 def test_an_evaluation_is_plain_json_and_repeats(data, tmp_path):
@@ -384,7 +384,7 @@ def test_an_evaluation_is_plain_json_and_repeats(data, tmp_path):
     assert list(json.loads(text)["encoders"]) == ["full", "pca-4", "r-4"]
     assert write(encoders, data, tmp_path / "it") == one
     assert (tmp_path / "it" / EVALUATION).read_text() == text
-    with pytest.raises(InputError, match="holds something else than the evaluation of these"):
+    with pytest.raises(InputError, match="is not an evaluation of these encoders"):
         write({"r-4": encoders["r-4"]}, data, tmp_path / "it")
     assert (tmp_path / "it" / EVALUATION).read_text() == text
     shown = evaluation_text(json.loads(text))
@@ -400,13 +400,13 @@ def test_whether_an_encoder_may_have_seen_the_episodes(data):
         "apart": {"fingerprint": "other", "seed": 4},
     }
     encoders = {n: make(data, pca(data, 2), data=source) for n, source in sources.items()}
-    found = evaluate(encoders, data)["seen"]
+    found = diagnose(encoders, data)["seen"]
     assert found == {"same": "no test row", "overlaps": "maybe", "apart": "none"}
 
 
 def test_other_features_are_refused(data):
     with pytest.raises(InputError, match="made for move_to_pose, whose features differ"):
-        evaluate({"it": make(data, ((), ()), task="move_to_pose", features=["a"] * 16)}, data)
+        diagnose({"it": make(data, ((), ()), task="move_to_pose", features=["a"] * 16)}, data)
     permuted = list(reversed(data.task.feature_names))
     with pytest.raises(InputError, match="has angle_to_target as feature 0"):
-        evaluate({"it": make(data, ((), ()), features=permuted)}, data)
+        diagnose({"it": make(data, ((), ()), features=permuted)}, data)

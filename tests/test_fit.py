@@ -2,6 +2,8 @@
 
 import shutil
 import signal
+from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,7 +18,10 @@ from jbrep.dataset.manifest import open_shard, read_manifest
 from jbrep.encoders import load
 from jbrep.errors import InputError
 from jbrep.files.lock import exclusive
+from jbrep.methods import fit
 from jbrep.methods.fit import KINDS, Fitter
+from jbrep.methods.held_out import ratio_to_pca
+from jbrep.methods.rows import training_rows
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +37,7 @@ def how(latent=4, **changes):
 def test_every_kind_has_the_error_that_its_file_says(data, kind, tmp_path):
     fitted = Fitter(data, tmp_path).fit(kind, how())
     encoder = load(fitted.path)
-    assert fitted.anew
+    assert fitted.is_new
     assert fitted.path.name == ("identity" if kind == "identity" else f"{kind}-4") + ".safetensors"
     rows = data.dataset["observation"][data.test]
     lost = (encoder.decode(encoder.encode(rows)) - rows) / data.scaler.half_width
@@ -43,7 +48,7 @@ def test_every_kind_has_the_error_that_its_file_says(data, kind, tmp_path):
     assert set(encoder.header["training"]) == set(KINDS[kind].settings)
     bytes_before = fitted.path.read_bytes()
     again = Fitter(data, tmp_path).fit(kind, how())
-    assert not again.anew
+    assert not again.is_new
     assert fitted.path.read_bytes() == bytes_before
 
 
@@ -113,33 +118,80 @@ def test_only_one_may_train_it(data, tmp_path):
     work.mkdir()
     with exclusive(work), pytest.raises(InputError, match="is being written by process"):
         fitter.fit("dae", how())
-    assert fitter.fit("dae", how()).anew
+    assert fitter.fit("dae", how()).is_new
+
+
+def test_what_another_process_finished_before_the_lock_is_left_as_it_is(
+    data, tmp_path, monkeypatch
+):
+    @contextmanager
+    def after_another(work):
+        with monkeypatch.context() as patch:
+            patch.setattr(fit, "exclusive", exclusive)
+            Fitter(data, tmp_path).fit("dae", how())
+        with exclusive(work):
+            yield
+
+    monkeypatch.setattr(fit, "exclusive", after_another)
+    fitter = Fitter(data, tmp_path)
+    fitted = fitter.fit("dae", how())
+    assert not fitted.is_new
+    events = EventAccumulator(str(tmp_path / "dae-4.training")).Reload()
+    assert [e.step for e in events.Scalars("train_loss")] == [1, 2, 3]  # once
+
+
+def test_rows_that_do_not_fit_in_memory_give_the_same_file(data, tmp_path, monkeypatch):
+    one = Fitter(data, tmp_path / "memory").fit("dae", how()).path
+    monkeypatch.setattr(fit, "training_rows", partial(training_rows, memory=1000))
+    other = Fitter(data, tmp_path / "disk").fit("dae", how()).path
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_an_encoder_is_compared_with_pca(data, tmp_path):
+    fitter = Fitter(data, tmp_path)
+    short, full = fitter.fit("dae", how()).encoder, fitter.fit("identity", how()).encoder
+    theirs = fitter.fit("pca", how()).encoder
+    assert ratio_to_pca(theirs, data) == pytest.approx(1)
+    errors = [encoder.header["metrics"]["held_out_mse"] for encoder in (short, theirs)]
+    assert ratio_to_pca(short, data) == pytest.approx(errors[0] / errors[1])
+    assert ratio_to_pca(full, data) is None
+
+
+def test_the_header_has_the_batch_size_that_was_chosen(data, tmp_path):
+    training = Fitter(data, tmp_path).fit("dae", how(batch_size=None)).encoder.header["training"]
+    assert training["batch_size"] == 128
 
 
 def test_other_settings_or_data_are_refused_and_nothing_is_lost(data, collected, tmp_path):
     fitter = Fitter(data, tmp_path)
     path = fitter.fit("dae", how()).path
     before = path.read_bytes()
-    with pytest.raises(InputError, match=r"made otherwise: noise 0\.1 \(now: 0\.2\); take anoth"):
+    with pytest.raises(
+        InputError, match=r"trained with other settings: noise 0\.1 \(now: 0\.2\); choose anoth"
+    ):
         fitter.fit("dae", how(noise=0.2))
     other = changed(collected, tmp_path / "other", lambda rows: rows + 1)
-    with pytest.raises(InputError, match=r"made otherwise: data [0-9a-f]{64} \(now"):
+    with pytest.raises(InputError, match=r"trained with other settings: data [0-9a-f.]+ \(now"):
         Fitter(ScaledDataset(other), tmp_path).fit("dae", how())
     assert path.read_bytes() == before
     shutil.copy(path, tmp_path / "ae-4.safetensors")
-    with pytest.raises(InputError, match=r"made otherwise: kind dae \(now: ae\)"):
+    with pytest.raises(InputError, match=r"trained with other settings: kind dae \(now: ae\)"):
         fitter.fit("ae", how())
 
 
 def test_mistakes_are_named(data, tmp_path):
     fitter = Fitter(data, tmp_path)
+    with pytest.raises(InputError, match="pca needs a latent size, from 1 to 15"):
+        fitter.fit("pca", how(None))
     for latent in (0, -1, 16, 17):
         for kind in ("pca", "dae", "untrained"):
-            with pytest.raises(InputError, match=f"latent size is {latent}: .* from 1 to 15"):
+            with pytest.raises(
+                InputError, match=f"latent size is {latent}: .* it must be from 1 to 15"
+            ):
                 fitter.fit(kind, how(latent))
     with pytest.raises(InputError, match="unknown kind 'vae': choose one of identity, pca, random"):
         fitter.fit("vae", how())
-    with pytest.raises(InputError, match="without noise is a plain autoencoder: take the kind ae"):
+    with pytest.raises(InputError, match="without noise is a plain autoencoder: use the kind ae"):
         fitter.fit("dae", how(noise=0))
     (tmp_path / "file").write_text("")
     for kind in ("pca", "dae"):

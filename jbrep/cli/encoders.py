@@ -1,17 +1,30 @@
 """Making, judging and looking at encoders."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, GOES_ON, example, printable, stoppable
+from jbrep.cli.base import (
+    COUNT,
+    GOES_ON,
+    as_json,
+    echo_json,
+    echo_paths,
+    example,
+    printable,
+    stoppable,
+)
 from jbrep.errors import InputError
+from jbrep.text import terminal_width
+
+_POOR = 1.5  # times PCA's error, from which a trained encoder deserves a warning
 
 
 class _Variadic(click.Command):
-    """An option that may come several times takes several values, too: --latent 12 8 4."""
+    """An option that may be repeated also takes several values at once: --latent 12 8 4."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         repeatable = {
@@ -28,28 +41,51 @@ class _Variadic(click.Command):
         return super().parse_args(ctx, spread)
 
 
+class _Sizes(click.ParamType[tuple[int, ...]]):
+    """One or more sizes: 8, or 12,8,4."""
+
+    name = "sizes"
+
+    def convert(
+        self, value: str, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, ...]:
+        if not re.fullmatch(r"[0-9]{1,9}(,[0-9]{1,9})*,?", value):
+            self.fail(f"{value!r} is not a list of sizes: write 12 8 4 or 12,8,4")
+        return tuple(int(size) for size in value.split(",") if size)
+
+
 _data = click.option(
-    "--data", required=True, type=click.Path(path_type=Path), help="A folder of jbrep collect."
+    "--data", required=True, type=click.Path(path_type=Path), help="A folder from jbrep collect."
 )
 _out = click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="A folder for the encoder files."
 )
 _latent = click.option(
-    "--latent", type=int, multiple=True, help="Latent sizes l; one, or several: 12 8 4."
+    "--latent", type=_Sizes(), multiple=True, help="Latent sizes l, one or several: 12 8 4."
 )
 _noise = click.option(
-    "--noise", type=float, help="Standard deviation of the corruption; 0.1 if not given."
+    "--noise", type=float, help="Standard deviation of the corruption; 0.1 by default."
 )
 
 
 def _how(command: Callable[..., None]) -> Callable[..., None]:
-    """The options of everything that has a network."""
+    """The options of every kind that has a network."""
     options = (
-        click.option("--architecture", help="paper, which is the default, or deep."),
-        click.option("--epochs", type=COUNT, help="Passes over the data; paper 200, deep 12."),
-        click.option("--batch-size", type=COUNT, help="Rows in a batch; 8192 if not given."),
-        click.option("--learning-rate", type=float, help="Of Adam; paper 5e-4, deep 2e-3."),
-        click.option("--seed", type=COUNT, help="Of weights, order and noise; 0 if not given."),
+        click.option("--architecture", help="paper, the default, or deep."),
+        click.option(
+            "--epochs",
+            type=COUNT,
+            help="Passes over the data; by default 200 or, if deep, 12.",
+        ),
+        click.option(
+            "--batch-size",
+            type=COUNT,
+            help="Rows in a batch; by default from the rows, 128 to 8192.",
+        ),
+        click.option(
+            "--learning-rate", type=float, help="Of Adam; by default 5e-4 or, if deep, 2e-3."
+        ),
+        click.option("--seed", type=COUNT, help="Of weights, order and noise; 0 by default."),
         click.option("--device", default="auto", show_default=True, help="cpu, cuda, or auto."),
     )
     for option in reversed(options):
@@ -69,8 +105,8 @@ def _how(command: Callable[..., None]) -> Callable[..., None]:
 def train_dae(**options: Any) -> None:
     """Train denoising autoencoders.
 
-    On 80 % of the episodes, with the paper's settings unless told otherwise; the error on the rest
-    is printed. Ctrl-C keeps the best so far, and the same command goes on.
+    They learn from 80 % of the episodes, with the paper's settings by default; their error on the
+    others is compared with PCA's. Ctrl-C keeps the best so far, and the same command resumes.
     """
     _fit("dae", **options)
 
@@ -81,54 +117,69 @@ def train_dae(**options: Any) -> None:
         "jbrep train-encoder --kind pca --data data/face --latent 8 --out encoders/face"
     ),
 )
-@click.option(
-    "--kind", required=True, help="identity, pca, random, untrained, ae (no noise) or dae."
-)
+@click.option("--kind", required=True, help="full, pca, random, untrained, ae (no noise) or dae.")
 @_data
 @_latent
 @_how
 @_noise
 @_out
 def train_encoder(kind: str, **options: Any) -> None:
-    """Make encoders to compare with, of any kind.
+    """Make encoders of any kind, to compare with.
 
-    The scaled observation itself, principal components, a random projection, an untrained network,
-    a plain autoencoder, or a denoising one.
+    The full observation, scaled; principal components; a random projection; an untrained network; a
+    plain autoencoder; or a denoising one.
     """
-    _fit(kind, **options)
+    from jbrep.encoders.encoder import FULL, IDENTITY
+
+    _fit(IDENTITY if kind == FULL else kind, **options)
 
 
 def _fit(
-    kind: str, data: Path, latent: tuple[int, ...], out: Path, device: str, **how: Any
+    kind: str, data: Path, latent: tuple[tuple[int, ...], ...], out: Path, device: str, **how: Any
 ) -> None:
     from jbrep.dae.training import Training
     from jbrep.dataset import Dataset, ScaledDataset
-    from jbrep.encoders.file import HELD_OUT_MSE
     from jbrep.methods.fit import Fitter, get_kind
 
+    sizes = dict.fromkeys(size for each in latent for size in each)
     given = {name: value for name, value in how.items() if value is not None}
     settings = get_kind(kind).settings
-    for name in (*given, *(["latent"] if latent else [])):
+    for name in (*given, *(["latent"] if sizes else [])):
         if name not in settings:
             raise InputError(f"{kind} takes no --{name.replace('_', '-')}: leave it out")
-    if "latent" in settings and not latent:
-        raise InputError(f"{kind} needs latent sizes: --latent 12 8 4, say")
-    trainings = [Training.of(size, **given) for size in latent or (0,)]
+    if "latent" in settings and not sizes:
+        raise InputError(f"{kind} needs latent sizes, such as --latent 12 8 4")
+    trainings = [Training.of(size, **given) for size in sizes or (None,)]
     scaled = ScaledDataset(Dataset(data))
     for name in scaled.constant_features:
-        click.echo(f"{name} never varies in the training part: it is scaled to 0", err=True)
+        click.echo(f"{name} is constant in the training part: it is scaled to 0", err=True)
     fitter = Fitter(scaled, out, device)
-    for training in trainings:  # all that is wrong before the first hour
+    for training in trainings:  # every mistake is reported before the first training
         fitter.check(kind, training)
-    with stoppable(f"{GOES_ON}; what is best so far is in {out}"):
+    with stoppable(f"{GOES_ON}; the best so far is in {out}"):
         for training in trainings:
-            found = fitter.fit(kind, training)
-            error = found.encoder.header["metrics"][HELD_OUT_MSE]
-            there = "" if found.anew else ", complete already"
-            click.echo(
-                f"{found.encoder.name}: held-out mean squared error {error:.5f}, features scaled "
-                f"to [-1, 1]; {found.path}{there}"
-            )
+            _report(fitter.fit(kind, training), scaled)
+
+
+def _report(fitted: Any, data: Any) -> None:
+    """Say how an encoder that was fitted to that data compares with PCA."""
+    from jbrep.encoders.file import HELD_OUT_MSE
+    from jbrep.methods.fit import KINDS
+    from jbrep.methods.held_out import ratio_to_pca
+
+    encoder, path, is_new = fitted
+    ratio = ratio_to_pca(encoder, data)
+    comparison = "" if ratio is None else f", {ratio:.2f} times PCA's"
+    click.echo(
+        f"{encoder.name}: held-out mean squared error {encoder.header['metrics'][HELD_OUT_MSE]:.5f}"
+        f"{comparison} (features scaled to [-1, 1]); {path}{'' if is_new else ', already complete'}"
+    )
+    if ratio is not None and ratio > _POOR and KINDS[encoder.header["kind"]].make is None:
+        click.echo(
+            f"warning: {encoder.name} reconstructs worse than PCA with as many components: train "
+            "for more --epochs, on more data, or with another --learning-rate or --batch-size",
+            err=True,
+        )
 
 
 @click.command(
@@ -148,38 +199,53 @@ def _fit(
     type=click.Path(path_type=Path),
     help="A folder for evaluation.json and figures.",
 )
-def evaluate(encoder: tuple[str, ...], data: Path, out: Path) -> None:
+@as_json
+def evaluate(encoder: tuple[str, ...], data: Path, out: Path, as_json: bool) -> None:
     """Show what encoders lose and keep, side by side.
 
-    On the episodes that training holds out: reconstruction, corruption, the latent's units and
-    dimensions, linear probes, nearest neighbours, and the next latent.
+    Judged on the held-out episodes: reconstruction, corruption, the latent's units and dimensions,
+    linear probes, nearest neighbours, and the prediction of the next latent.
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders import find
-    from jbrep.encoders.file import SUFFIX
+    from jbrep.encoders.shipped import source_of
     from jbrep.evaluate.files import EVALUATION, write
     from jbrep.evaluate.summary import evaluation_text
     from jbrep.figures import encoder_plots
     from jbrep.figures import write as write_plots
 
     scaled = ScaledDataset(Dataset(data))
-    found = [find(name, scaled.task.name) for name in encoder]
-    names = [each.name for each in found]
-    labels = [  # by the path, if more than one has the name
-        name if names.count(name) == 1 else given.removesuffix(SUFFIX)
-        for name, given in zip(names, encoder, strict=True)
-    ]
-    with stoppable("the same command starts anew"):
-        evaluation = write(dict(zip(labels, found, strict=True)), scaled, out)
+    encoders = [find(name, scaled.task.name) for name in encoder]
+    sources = [source_of(name, scaled.task.name) for name in encoder]
+    labelled = dict(zip(_labels([each.name for each in encoders], sources), encoders, strict=True))
+    with stoppable("the same command starts over"):
+        evaluation = write(labelled, scaled, out)
         pictures = write_plots(encoder_plots(evaluation), out)
+    for label, source in zip(labelled, sources, strict=True):
+        click.echo(printable(f"{label}: {source}"), err=as_json)
     for label, seen in evaluation["seen"].items():
         if seen == "maybe":
             click.echo(
-                f"note: {label} was trained on other data of the same seed, so these episodes may "
-                "not be new to it"
+                printable(
+                    f"note: {label} was trained on other data with the same seed, so it may have "
+                    "seen these episodes"
+                ),
+                err=as_json,
             )
-    click.echo(evaluation_text(evaluation))
-    click.echo("\n" + "\n".join(map(str, (out / EVALUATION, *pictures))))
+    if as_json:
+        return echo_json(evaluation)
+    click.echo(f"\n{evaluation_text(evaluation, terminal_width())}")
+    return echo_paths((out / EVALUATION, *pictures))
+
+
+def _labels(names: list[str], sources: list[str]) -> list[str]:
+    """What tables call encoders: by name, or by source where several have the same name."""
+    from jbrep.encoders.file import SUFFIX
+
+    return [
+        name if names.count(name) == 1 else source.removesuffix(SUFFIX)
+        for name, source in zip(names, sources, strict=True)
+    ]
 
 
 @click.group()
@@ -194,13 +260,18 @@ _task = click.option("--task", help="Its task, for an encoder that ships.")
 @encoder.command(epilog=example("jbrep encoder info dae-8 --task face_direction"))
 @_which
 @_task
-def info(encoder: str, task: str | None) -> None:
+@as_json
+def info(encoder: str, task: str | None, as_json: bool) -> None:
     """Show what an encoder is and where it comes from."""
-    from jbrep.encoders.card import card
-    from jbrep.encoders.shipped import find_alone
+    from jbrep.encoders.card import card, describe
+    from jbrep.encoders.shipped import find_alone, source_of
 
-    for line in card(find_alone(encoder, task)).splitlines():
+    shown, source = find_alone(encoder, task), source_of(encoder, task)
+    if as_json:
+        return echo_json(describe(shown, source))
+    for line in card(shown, source, terminal_width()).splitlines():
         click.echo(printable(line))
+    return None
 
 
 @encoder.command(
@@ -215,7 +286,8 @@ def export(encoder: str, task: str | None, out: Path) -> None:
     The input is `observation`, in physical units; the outputs are `latent` and `reconstruction`.
     """
     from jbrep.encoders.onnx import export as run
-    from jbrep.encoders.shipped import find_alone
+    from jbrep.encoders.shipped import find_alone, source_of
 
     run(find_alone(encoder, task), out)
+    click.echo(f"exported {printable(source_of(encoder, task))}")
     click.echo(f"open it with onnxruntime.InferenceSession({str(out)!r})")

@@ -1,4 +1,4 @@
-"""Where training has got to, in a file that runs nothing when it is read."""
+"""Checkpoints of training, in a file that runs nothing when it is read."""
 
 import math
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from jbrep.dae.training import Epoch, Trainer
-from jbrep.errors import InputError, differences
+from jbrep.errors import DamageError, InputError, differences
 from jbrep.files import container
 
 
@@ -18,7 +18,7 @@ def save(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
 
     Args:
         trainer: after at least one epoch.
-        identity: what must be equal for training to go on: plain JSON.
+        identity: what must be equal for training to resume; plain JSON.
         path: the file.
     """
     tensors = {name: tensor.cpu().numpy() for name, tensor in _state(trainer).items()}
@@ -26,10 +26,10 @@ def save(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
 
 
 def restore(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
-    """Bring a trainer to where the file's was; nothing of the trainer's own progress stays.
+    """Put a trainer into the state that the file holds, in place of its own.
 
     Raises:
-        InputError: the file is damaged, or of other settings, data or versions.
+        InputError: the file is damaged, or from other settings, data or versions.
     """
     tensors, header = container.read(path, "checkpoint")
     try:
@@ -39,8 +39,8 @@ def restore(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
         raise _damaged(path) from None
     if differing:
         raise InputError(
-            f"{path} was begun otherwise: {differing}; take another folder, or delete it to begin "
-            "anew"
+            f"{path} belongs to another configuration: {differing}; choose another folder, or "
+            "delete it to start over"
         )
     if not history or not all(math.isfinite(loss) for epoch in history for loss in epoch):
         raise _damaged(path)
@@ -54,7 +54,7 @@ def restore(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
 
 
 def _state(trainer: Trainer) -> dict[str, Tensor]:
-    """All that an epoch changes, by name; the tensors are the trainer's own."""
+    """Everything that an epoch changes, by name; the tensors are the trainer's own."""
     named = {f"network.{name}": p for name, p in trainer.network.state_dict().items()}
     named |= {f"best.{name}": p for name, p in trainer.best.items()}
     for name, parameter in trainer.network.named_parameters():
@@ -68,5 +68,5 @@ def _shapes(tensors: dict[str, Tensor]) -> dict[str, Any]:
     return {name: (tensor.shape, tensor.dtype) for name, tensor in tensors.items()}
 
 
-def _damaged(path: Path) -> InputError:
-    return InputError(f"{path} is damaged: delete it to begin anew")
+def _damaged(path: Path) -> DamageError:
+    return DamageError(f"{path} is damaged: delete it to start over")

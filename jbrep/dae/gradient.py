@@ -1,7 +1,8 @@
 """Backpropagation through dense layers, written out.
 
-With so few features a step is bound by memory and by the number of operations: working feature by
-feature, in buffers made once, takes about half of autograd's time (benchmarks/encoders.py).
+With so few features a step is limited by memory access and by the number of operations: with
+features first, in preallocated buffers, it takes about half of autograd's time
+(benchmarks/encoders.py).
 """
 
 from collections.abc import Iterable
@@ -12,11 +13,11 @@ from torch import Tensor, nn
 
 
 class Gradient:
-    """Sets the gradients of the mean squared error of a stack of layers.
+    """Computes the gradients of the mean squared error of a stack of layers.
 
     Args:
         modules: nn.Linear, each followed by an activation, nn.ReLU or nn.Tanh, or by none.
-        rows: the most rows in a batch.
+        rows: the largest batch.
     """
 
     def __init__(self, modules: Iterable[nn.Module], rows: int):
@@ -32,11 +33,11 @@ class Gradient:
 
     @torch.no_grad()
     def __call__(self, values: Tensor, target: Tensor) -> Tensor:
-        """Set every parameter's gradient; the mean squared error.
+        """Set every parameter's gradient, and return the mean squared error.
 
         Args:
-            values: what goes in, (features, rows).
-            target: what should come out, (features, rows).
+            values: the input, (features, rows).
+            target: the output to come close to, (features, rows).
         """
         inputs = [values, *self._cut(self._outputs, values.shape[1])]
         for (linear, activation), before, after in zip(
@@ -57,13 +58,13 @@ class Gradient:
         return loss
 
     def _cut(self, buffers: list[Tensor], rows: int) -> list[Tensor]:
-        """The part of each buffer that so many rows take, (features, rows)."""
+        """The part of each buffer that this many rows occupy, (features, rows)."""
         sizes = [len(linear.bias) for linear, _ in self._layers]
         return [b[: n * rows].view(n, rows) for n, b in zip(sizes, buffers, strict=True)]
 
 
 def _activate(activation: nn.Module, values: Tensor) -> None:
-    """In place."""
+    """Apply an activation in place."""
     if isinstance(activation, nn.Tanh):  # as 2 sigmoid(2x) - 1: a third of torch.tanh's time
         values.mul_(2).sigmoid_().mul_(2).sub_(1)
     elif isinstance(activation, nn.ReLU):
@@ -71,7 +72,7 @@ def _activate(activation: nn.Module, values: Tensor) -> None:
 
 
 def _differentiate(activation: nn.Module, output: Tensor, error: Tensor) -> None:
-    """Turn the error at an activation's output, which is used up, into that at its input."""
+    """Turn the error at an activation's output into that at its input, overwriting both."""
     if isinstance(activation, nn.Tanh):
         torch.addcmul(error, error, output.square_(), value=-1, out=error)
     elif isinstance(activation, nn.ReLU):

@@ -15,7 +15,7 @@ _NAMES = {module: name for name, module in _MODULES.items()}
 
 @dataclass(frozen=True)
 class Architecture:
-    """What lies between observation and latent, and how it is trained unless asked otherwise."""
+    """The layers between observation and latent, and the default settings of training."""
 
     hidden: tuple[int, ...]  # widths from observation to latent, mirrored in the decoder; ReLU
     output: str  # activation of the reconstruction; the latent's is tanh
@@ -40,7 +40,7 @@ def get_architecture(name: str) -> Architecture:
 
 
 class Autoencoder(nn.Module):
-    """Encoder and decoder, untrained: d features to l to d."""
+    """Encoder and decoder, from d features to l and back; untrained."""
 
     def __init__(self, architecture: Architecture, size: int, latent: int, seed: int):
         super().__init__()
@@ -51,7 +51,7 @@ class Autoencoder(nn.Module):
             self.decoder = _stack(tuple(reversed(sizes)), architecture.output)
 
     def forward(self, values: Tensor) -> Tensor:
-        """Scaled observations (n, d) to their reconstructions."""
+        """Reconstructions of scaled observations (n, d)."""
         return self.decoder(self.encoder(values))
 
 
@@ -63,7 +63,7 @@ def _stack(sizes: tuple[int, ...], last: str) -> nn.Sequential:
 
 
 def layers(stack: nn.Sequential) -> tuple[Layer, ...]:
-    """A stack's numbers, as an encoder file holds them."""
+    """A stack's layers, as an encoder file holds them."""
     made = []
     modules = [*stack, None]
     for module, after in pairwise(modules):

@@ -1,11 +1,11 @@
 """Training the autoencoder: corruption, batches, epochs."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -17,48 +17,55 @@ from jbrep.dae.gradient import Gradient
 from jbrep.dae.network import Autoencoder, get_architecture
 from jbrep.errors import InputError
 
-_MOST = 1 << 63  # numbers that torch takes are smaller
 NOISE = 0.1  # standard deviation, of features scaled to [-1, 1]
-_TOGETHER = 4  # batches drawn at once
+_MAX_NUMBER = (1 << 63) - 1  # that torch accepts
+_MAX_LEARNING_RATE = 1  # beyond which Adam's steps are larger than any useful weight
+_MIN_BATCH, _MAX_BATCH = 128, 8192
+_BATCHES = 400  # that an epoch should have
+_DRAWN_AT_ONCE = 4  # batches
 _Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
-    """How to train; together with the data it decides the weights on a given device."""
+    """How to train; together with the data it determines the weights on a given device.
 
-    latent: int
+    Kinds of encoders that aren't trained take some of these settings, too: KINDS of
+    jbrep.methods.fit says which.
+    """
+
+    latent: int | None  # latent units; None for a kind that has no choice of them
     architecture: str
     epochs: int
-    batch_size: int
+    batch_size: int | None  # None: `default_batch_size` of the training rows
     learning_rate: float
-    noise: float
+    noise: float  # standard deviation, of features scaled to [-1, 1]
     seed: int
 
     @classmethod
     def of(
         cls,
-        latent: int,
+        latent: int | None = None,
         architecture: str = "paper",
         *,
         epochs: int | None = None,
-        batch_size: int = 8192,
+        batch_size: int | None = None,
         learning_rate: float | None = None,
         noise: float = NOISE,
         seed: int = 0,
     ) -> "Training":
-        """The architecture's own epochs and learning rate where none are given.
+        """Use the architecture's own epochs and learning rate unless they are given.
 
         Raises:
             InputError: unknown architecture, or a number out of range.
         """
-        usual = get_architecture(architecture)
+        defaults = get_architecture(architecture)
         training = cls(
             latent=latent,
             architecture=architecture,
-            epochs=usual.epochs if epochs is None else epochs,
+            epochs=defaults.epochs if epochs is None else epochs,
             batch_size=batch_size,
-            learning_rate=usual.learning_rate if learning_rate is None else learning_rate,
+            learning_rate=defaults.learning_rate if learning_rate is None else learning_rate,
             noise=noise,
             seed=seed,
         )
@@ -66,75 +73,106 @@ class Training:
         return training
 
     def check(self) -> None:
-        """Make sure that it can be done.
+        """Make sure that all numbers are in range.
 
         Raises:
-            InputError: it can't.
+            InputError: one isn't.
         """
         for name, least in (("epochs", 1), ("batch_size", 1), ("seed", 0)):
-            if not least <= getattr(self, name) < _MOST:
+            value = getattr(self, name)
+            if value is not None and not least <= value <= _MAX_NUMBER:
                 said = name.replace("_", " ")
-                raise InputError(
-                    f"{said} is {getattr(self, name)}: from {least} to {_MOST - 1} is needed"
-                )
-        if not 0 < self.learning_rate < np.inf or not 0 <= self.noise < np.inf:
+                raise InputError(f"{said} is {value}: it must be from {least} to {_MAX_NUMBER}")
+        if not 0 < self.learning_rate <= _MAX_LEARNING_RATE:
             raise InputError(
-                f"learning rate {self.learning_rate} and noise {self.noise}: a positive number and "
-                "one from 0 are needed"
+                f"learning rate is {self.learning_rate}: it must be above 0 and at most "
+                f"{_MAX_LEARNING_RATE}"
             )
+        if not 0 <= self.noise < math.inf:
+            raise InputError(f"noise is {self.noise}: it must be at least 0, and finite")
+
+
+def default_batch_size(rows: int) -> int:
+    """Rows in a batch where the settings leave it open, for that many training rows.
+
+    The largest power of two that leaves at least 400 batches in an epoch, but at least 128 and at
+    most 8192: the paper's size, and what its 4 million training rows get.
+    """
+    largest = 1 << max(1, rows // _BATCHES).bit_length() - 1
+    return min(max(largest, _MIN_BATCH), _MAX_BATCH)
+
+
+class Rows(Protocol):
+    """Scaled rows (n, d): a tensor, or what gives chosen rows as one."""
+
+    @property
+    def shape(self) -> Sequence[int]:
+        """(n, d)."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the chosen rows will be."""
+
+    def index_select(self, dim: int, index: Tensor, /) -> Tensor:
+        """The rows with those numbers, in that order; `dim` is 0."""
 
 
 class Epoch(NamedTuple):
-    """What an epoch came to."""
+    """The losses of an epoch: mean squared errors, of features scaled to [-1, 1]."""
 
     train_loss: float  # mean over the epoch, from corrupted rows
-    test_loss: float  # from clean held-out rows
+    test_loss: float  # after the epoch, from clean held-out rows
 
 
 def get_device(name: str) -> torch.device:
-    """The device cpu or cuda; auto takes a GPU where there is one.
+    """The device cpu or cuda; auto is a GPU if there is one.
 
     Raises:
-        InputError: another name, or no GPU here.
+        InputError: another name, or there is no GPU.
     """
     gpu = torch.cuda.is_available()
     if name == "auto":
         return torch.device("cuda" if gpu else "cpu")
     if name not in ("cpu", "cuda") or (name == "cuda" and not gpu):
-        here = "auto, cpu or cuda" if gpu else "auto or cpu"
-        raise InputError(f"no device {name!r} here: take {here}")
+        choices = "auto, cpu or cuda" if gpu else "auto or cpu"
+        raise InputError(f"no device {name!r} on this machine: choose {choices}")
     return torch.device(name)
 
 
 class Trainer:
-    """An autoencoder in training, an epoch at a time.
+    """Trains an autoencoder, an epoch at a time.
 
-    An epoch's order and noise are drawn from the seed and its number, so that training goes on
-    from any epoch as it would have.
+    An epoch's order and noise depend on the seed and the epoch's number alone, so that a resumed
+    training gives the same weights as one that was never stopped.
 
     Args:
-        training: how.
+        training: its settings.
         train: scaled rows to train on, (n, d), on the device to train on.
-        test: scaled rows to watch, (m, d), there.
+        test: scaled rows to report the loss on, (m, d), on the same device.
 
     Attributes:
-        network: as the last epoch left it.
-        optimiser: likewise.
-        best: parameters after the epoch with the lowest training loss; held-out rows choose
-            nothing.
+        network: after the last epoch.
+        optimiser: after the last epoch.
+        best: parameters after the epoch with the lowest training loss; held-out rows have no
+            influence on the choice.
         history: the epochs so far.
+
+    Raises:
+        InputError: there is no latent size.
     """
 
-    def __init__(self, training: Training, train: Tensor, test: Tensor):
+    def __init__(self, training: Training, train: Rows, test: Tensor):
+        if training.latent is None:
+            raise InputError("an autoencoder needs a latent size")
         self.training = training
         self._train, self._test = train, test
         architecture = get_architecture(training.architecture)
-        size = train.shape[1]
-        network = Autoencoder(architecture, size, training.latent, training.seed)
+        count, features = train.shape
+        network = Autoencoder(architecture, features, training.latent, training.seed)
         self.network = network.to(train.device)
         self.best = _copy(self.network)
         modules = (*self.network.encoder, *self.network.decoder)
-        self._batch_size = min(training.batch_size, len(train))
+        self._batch_size = min(training.batch_size or default_batch_size(count), count)
         self._gradient = Gradient(modules, self._batch_size)
         self.optimiser = Adam(self.network.parameters(), training.learning_rate, fused=True)
         self._decay = architecture.decay
@@ -148,7 +186,7 @@ class Trainer:
         return losses.index(min(losses)) + 1 if losses else 0
 
     def epochs(self) -> Iterator[Epoch]:
-        """Train to the end, an epoch for each that is asked for."""
+        """Train to the end, yielding each epoch."""
         with single_torch_thread():
             while len(self.history) < self.training.epochs:
                 self._epoch()
@@ -161,21 +199,21 @@ class Trainer:
             self.optimiser.param_groups[0]["lr"] = self._learning_rate(number, i)
             total += self._gradient(corrupted, clean) * clean.shape[1]
             self.optimiser.step()
-        train_loss = float(total) / len(self._train)
+        train_loss = float(total) / self._train.shape[0]
         with torch.no_grad():
             test_loss = float(mse_loss(self.network(self._test), self._test))
         if not math.isfinite(train_loss) or not math.isfinite(test_loss):
             raise InputError(
-                f"the losses are {train_loss} and {test_loss} in epoch {number}: less noise than "
-                f"{self.training.noise}, or a learning rate below {self.training.learning_rate}, "
-                "is needed"
+                f"training diverged in epoch {number}, with losses {train_loss} and {test_loss}: "
+                f"use less noise than {self.training.noise}, or a learning rate below "
+                f"{self.training.learning_rate}"
             )
         if all(train_loss < epoch.train_loss for epoch in self.history):
             self.best = _copy(self.network)
         self.history.append(Epoch(train_loss, test_loss))
 
     def _begin_optimiser(self) -> None:
-        """Make the state that Adam would make at its first step, for a checkpoint to fill."""
+        """Create the state that Adam creates at its first step, for a checkpoint to fill."""
         for p in self.network.parameters():
             self.optimiser.state[p] = {
                 "step": torch.zeros((), device=p.device),
@@ -186,23 +224,23 @@ class Trainer:
     def _learning_rate(self, number: int, batch: int) -> float:
         if not self._decay:
             return self.training.learning_rate
-        batches = -(-len(self._train) // self._batch_size)
+        batches = -(-self._train.shape[0] // self._batch_size)
         done = (number - 1 + batch / batches) / self.training.epochs
         return self.training.learning_rate * (1 + math.cos(math.pi * done)) / 2
 
     def _batches(self, number: int) -> Iterator[tuple[Tensor, Tensor]]:
-        """Every row once, (d, rows): clean, and with noise of its own on each feature."""
+        """Every row once, clean and with independent noise on each feature, (d, rows) each."""
         size = self._batch_size
         for clean, corrupted in prefetch(self._draws(number)):
             yield from zip(clean.split(size, 1), corrupted.split(size, 1), strict=True)
 
     def _draws(self, number: int) -> Iterator[tuple[Tensor, Tensor]]:
-        """The same, some batches at a time."""
+        """The same, several batches at a time."""
         rows, noise = self._train, self.training.noise
         words = np.random.SeedSequence((self.training.seed, number)).generate_state(1, np.uint64)
         generator = torch.Generator(rows.device).manual_seed(int(words[0]))
-        order = torch.randperm(len(rows), generator=generator, device=rows.device)
-        for batches in order.split(_TOGETHER * self._batch_size):
+        order = torch.randperm(rows.shape[0], generator=generator, device=rows.device)
+        for batches in order.split(_DRAWN_AT_ONCE * self._batch_size):
             clean = rows.index_select(0, batches).T.contiguous()
             if noise:
                 drawn = torch.empty_like(clean).normal_(0, noise, generator=generator)
@@ -216,7 +254,7 @@ def _copy(network: Autoencoder) -> dict[str, Tensor]:
 
 
 def prefetch(items: Iterable[_Item]) -> Iterator[_Item]:
-    """The items in order, each made in another thread while the one before it is used."""
+    """The items in order, each produced in another thread while the one before it is used."""
     iterator = iter(items)
     with ThreadPoolExecutor(1) as executor:
         upcoming = executor.submit(next, iterator, None)
@@ -227,7 +265,7 @@ def prefetch(items: Iterable[_Item]) -> Iterator[_Item]:
 
 @contextmanager
 def single_torch_thread() -> Iterator[None]:
-    """Torch on one: networks so small gain little from more, which move the last bits and wait."""
+    """Limit torch to one thread: more gain little with small networks and change the last bits."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,4 +1,4 @@
-"""Encoders: from observations to latents and back, their file, and the ones that ship."""
+"""Encoders: from observations to latents and back, their file format, and those that ship."""
 
 from jbrep.encoders.encoder import ACTIVATIONS, FULL, Encoder, Layer
 from jbrep.encoders.file import load, save

@@ -1,36 +1,78 @@
-"""An encoder as its card: what it is, where it comes from, what it reads."""
+"""An encoder's card: what it is, where it comes from, what it reads."""
+
+from collections.abc import Mapping
+from typing import Any
 
 from jbrep.encoders.encoder import Encoder, Layer
 from jbrep.encoders.file import fingerprint
+from jbrep.text import facts, table
+
+_RECORDS = ("training", "data", "metrics", "versions")
 
 
-def card(encoder: Encoder) -> str:
-    """A few lines on an encoder, then its features with the range that is scaled to [-1, 1]."""
-    header = encoder.header
-    facts = {
-        "task": f"{header['task']}, {encoder.size} features to {encoder.latent_size}",
+def describe(encoder: Encoder, source: str) -> dict[str, Any]:
+    """An encoder's card as plain JSON.
+
+    Args:
+        encoder: the encoder.
+        source: where it was taken from, as `shipped.source_of` says it.
+    """
+    header, scaler = encoder.header, encoder.scaler
+    ranges = zip(encoder.feature_names, scaler.low, scaler.high, strict=True)
+    return {
+        "name": encoder.name,
+        "source": source,
+        "task": header["task"],
         "kind": header["kind"],
-        "encoder": _shape(encoder.size, encoder.encoder),
-        "decoder": _shape(encoder.latent_size, encoder.decoder),
-        "training": _listed(header["training"]),
-        "data": _listed(header["data"]),
-        "metrics": _listed(header["metrics"]),
-        "made with": _listed(header["versions"]),
+        "size": encoder.size,
+        "latent_size": encoder.latent_size,
+        "encoder": _layers(encoder.encoder),
+        "decoder": _layers(encoder.decoder),
+        **{name: header[name] for name in _RECORDS},
         "sha256": fingerprint(encoder),
+        "features": [
+            {"name": name, "low": float(low), "high": float(high)} for name, low, high in ranges
+        ],
     }
-    lines = [encoder.name, *(f"  {name:<10} {value}" for name, value in facts.items()), ""]
-    lines.append(f"  {'feature':<28} {'low':>11} {'high':>11}")
-    for name, low, high in zip(
-        encoder.feature_names, encoder.scaler.low, encoder.scaler.high, strict=True
-    ):
-        lines.append(f"  {name:<28} {low:11.4g} {high:11.4g}")
-    return "\n".join(lines)
 
 
-def _shape(size: int, layers: tuple[Layer, ...]) -> str:
+def card(encoder: Encoder, source: str, width: int) -> str:
+    """A few lines on an encoder, then its features with the range that is scaled to [-1, 1].
+
+    Args:
+        encoder: the encoder.
+        source: where it was taken from, as `shipped.source_of` says it.
+        width: columns to fit.
+    """
+    told = describe(encoder, source)
+    lines = {
+        "source": source,
+        "task": f"{told['task']}, {told['size']} features to {told['latent_size']}",
+        "kind": told["kind"],
+        "encoder": _shape(encoder.size, told["encoder"]),
+        "decoder": _shape(encoder.latent_size, told["decoder"]),
+        **{name: _listed(told[name]) for name in _RECORDS},
+        "sha256": told["sha256"],
+    }
+    rows = [(f["name"], f"{f['low']:.4g}", f"{f['high']:.4g}") for f in told["features"]]
+    return f"{encoder.name}\n{facts(lines, width)}\n\n{table(('feature', 'low', 'high'), rows)}"
+
+
+def _layers(layers: tuple[Layer, ...]) -> list[dict[str, Any]]:
+    return [{"units": len(layer.bias), "activation": layer.activation} for layer in layers]
+
+
+def _shape(size: int, layers: list[dict[str, Any]]) -> str:
     """As 16 -> 128 relu -> 8 tanh."""
-    return " -> ".join([str(size), *(f"{len(layer.bias)} {layer.activation}" for layer in layers)])
+    return " -> ".join(
+        [str(size), *(f"{layer['units']} {layer['activation']}" for layer in layers)]
+    )
 
 
-def _listed(record: dict[str, object]) -> str:
-    return ", ".join(f"{name} {value}" for name, value in record.items()) or "none"
+def _listed(record: Mapping[str, Any]) -> str:
+    """As latent 8, policy (kind uniform)."""
+    return ", ".join(f"{name} {_said(value)}" for name, value in record.items()) or "none"
+
+
+def _said(value: Any) -> str:
+    return f"({_listed(value)})" if isinstance(value, Mapping) else str(value)

@@ -1,7 +1,8 @@
-"""What an encoder is: observations to latents and back, through dense layers."""
+"""The encoder: from observations to latents and back, through dense layers."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -14,9 +15,10 @@ from jbrep.jitterbug.tasks import Task
 Float32 = NDArray[np.float32]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 
-FULL = "full"  # what the identity is called beside encoders to fewer numbers
-_WIDEST = 4096
-_MOST = 1e12  # what float32 arithmetic stays clear of
+FULL = "full"  # the representation that is the whole observation
+IDENTITY = "identity"  # the kind of encoder that leaves the scaled observation as it is
+_MAX_UNITS = 4096  # in a layer
+_MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
 
 
 class Layer(NamedTuple):
@@ -27,7 +29,7 @@ class Layer(NamedTuple):
     activation: str
 
 
-ACTIVATIONS: dict[str, Callable[[Any], Any]] = {  # of NumPy arrays and of torch tensors alike
+ACTIVATIONS: dict[str, Callable[[Any], Any]] = {  # for NumPy arrays and torch tensors
     "linear": lambda values: values,
     "relu": lambda values: values.clip(min=0),
     "tanh": lambda values: values.tanh() if hasattr(values, "tanh") else np.tanh(values),
@@ -35,14 +37,14 @@ ACTIVATIONS: dict[str, Callable[[Any], Any]] = {  # of NumPy arrays and of torch
 
 
 def run(layers: tuple[Layer, ...], values: Any) -> Any:
-    """Values (..., in) through the layers, (..., out)."""
+    """Pass values (..., in) through the layers, giving (..., out)."""
     for weight, bias, activation in layers:
         values = ACTIVATIONS[activation](values @ weight.T + bias)
     return values
 
 
 class _Parts(NamedTuple):
-    """The numbers of an encoder, all in one library and on one device."""
+    """An encoder's arrays, all NumPy's, or torch tensors on one device."""
 
     centre: Any
     half_width: Any
@@ -52,20 +54,20 @@ class _Parts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Encoder:
-    """An encoder with its decoder, and the scaling that they were made for.
+    """An encoder with its decoder and the scaling that both expect.
 
-    It takes observations in physical units, as data sets and environments give them, and scales
-    them to [-1, 1] over its training data itself. All arithmetic is float32.
+    It takes observations in physical units, as data sets and environments give them, and applies
+    its own scaling: the extrema of its training data become -1 and 1. All arithmetic is float32.
 
     Attributes:
-        header: what it is and where it comes from, see docs/encoders.md; plain JSON.
+        header: its kind, name and origin as plain JSON, see docs/encoders.md.
         scaler: fitted on the training part of its data.
-        encoder: layers from d scaled features to l; none leaves them as they are.
-        decoder: layers from l to d.
+        encoder: layers from d scaled features to l latent units; empty for the identity.
+        decoder: layers from l latent units to d scaled features.
 
     Raises:
-        InputError: tensors whose shapes don't fit together, of another type than float32, or not
-            finite; an unknown activation. The message names the tensor.
+        InputError: tensors whose shapes are inconsistent, whose type is not float32, or that hold
+            numbers that are not finite; an unknown activation. The message names the tensor.
     """
 
     header: Mapping[str, Any]
@@ -79,21 +81,25 @@ class Encoder:
         for name, tensor in self.tensors().items():
             self._check(name, tensor, sizes)
         if sizes[-1] != self.size:
-            raise InputError(f"the last layer gives {sizes[-1]} features: {self.size} are needed")
-        if max(sizes) > _WIDEST or self.latent_size > self.size:
+            raise InputError(f"the last layer has {sizes[-1]} units, expected {self.size}")
+        if max(sizes) > _MAX_UNITS:
+            raise InputError(f"a layer has {max(sizes)} units: the limit is {_MAX_UNITS}")
+        if self.latent_size > self.size:
             raise InputError(
-                f"layers of {sizes[1:]} units: at most {_WIDEST}, and no more in the latent than "
-                f"there are features, {self.size}"
+                f"the latent has {self.latent_size} units: there must not be more than the "
+                f"{self.size} features"
             )
         for layer in (*self.encoder, *self.decoder):
             if layer.activation not in ACTIVATIONS:
                 choices = ", ".join(ACTIVATIONS)
-                raise InputError(f"unknown activation {layer.activation!r}: one of {choices}")
+                raise InputError(
+                    f"unknown activation {layer.activation!r}: choose one of {choices}"
+                )
         scaling = self.scaler.centre, self.scaler.half_width
         self._on[None] = _Parts(*scaling, self.encoder, self.decoder)
 
     def _check(self, name: str, tensor: Any, sizes: list[int]) -> None:
-        """One tensor; `sizes` has those of the layers up to it."""
+        """Check one tensor; `sizes` holds the widths of the layers so far, and grows."""
         if name.endswith("weight"):
             rows = max(1, tensor.shape[0]) if np.ndim(tensor) == 2 else 1
             expected: tuple[int, ...] = (rows, sizes[-1])
@@ -101,14 +107,19 @@ class Encoder:
         else:
             expected = (sizes[-1],)
         if tensor.shape != expected:
-            raise InputError(f"tensor {name} has shape {tensor.shape}: {expected} is needed")
+            raise InputError(f"tensor {name} has shape {tensor.shape}, expected {expected}")
         if tensor.dtype != np.float32:
-            raise InputError(f"tensor {name} holds {tensor.dtype}: float32 is needed")
-        if not (np.abs(tensor) < _MOST).all():
-            raise InputError(f"tensor {name} holds a number that is not finite, or beyond {_MOST}")
+            raise InputError(f"tensor {name} has type {tensor.dtype}, expected float32")
+        if not (np.abs(tensor) < _MAX_MAGNITUDE).all():
+            raise InputError(
+                f"tensor {name} holds a number that is not finite or not below {_MAX_MAGNITUDE:g}"
+            )
+
+    def __repr__(self) -> str:
+        return f"Encoder({self.name}, {self.header.get('task')}, {self.size} to {self.latent_size})"
 
     def tensors(self) -> dict[str, Float32]:
-        """All its numbers by name, as they stand in its file."""
+        """All its numbers, by their names in its file."""
         named = {"low": self.scaler.low, "high": self.scaler.high}
         for part in ("encoder", "decoder"):
             for i, layer in enumerate(getattr(self, part)):
@@ -117,8 +128,13 @@ class Encoder:
 
     @property
     def name(self) -> str:
-        """What tables call it: `dae-8`, `dae-deep-8`, `pca-8`, `identity`."""
+        """Its name in tables and files, such as `dae-8`, `dae-deep-8`, `pca-8`, `identity`."""
         return self.header["name"]
+
+    @property
+    def representation(self) -> str:
+        """What an agent that sees its latent sees: `full` for the identity, else its name."""
+        return FULL if self.header["kind"] == IDENTITY else self.name
 
     @property
     def size(self) -> int:
@@ -132,14 +148,14 @@ class Encoder:
 
     @property
     def feature_names(self) -> tuple[str, ...]:
-        """The features of an observation, in order."""
+        """Names of the features of an observation, in order."""
         return tuple(self.header["features"])
 
     def encode(self, observation: Values) -> Values:
-        """Observations (..., d) in physical units to latents (..., l).
+        """Encode observations (..., d) in physical units as latents (..., l).
 
-        A torch tensor gives one on the same device, and gradients flow through; anything else is
-        taken as a NumPy array.
+        A torch tensor gives a tensor on the same device, and gradients flow through; anything else
+        is converted to a NumPy array.
 
         Raises:
             InputError: observations of another length.
@@ -150,7 +166,7 @@ class Encoder:
     __call__ = encode
 
     def decode(self, latent: Values) -> Values:
-        """Latents (..., l) to reconstructed observations (..., d) in physical units.
+        """Decode latents (..., l) to reconstructed observations (..., d) in physical units.
 
         Raises:
             InputError: latents of another length.
@@ -159,19 +175,19 @@ class Encoder:
         return run(parts.decoder, values) * parts.half_width + parts.centre
 
     def _prepare(self, values: Any, size: int, what: str) -> tuple[Any, _Parts]:
-        """Values as float32, and this encoder's numbers where the values are."""
+        """Values as float32, and this encoder's arrays on the device that they are on."""
         if type(values).__module__ == "torch":
             values, parts = values.float(), self._on_device(values.device)
         else:
             values, parts = np.asarray(values, np.float32), self._on[None]
         if not values.ndim or values.shape[-1] != size:
             raise InputError(
-                f"{self.name} takes {what} of {size} numbers: shape {tuple(values.shape)}"
+                f"{self.name} takes {what} of {size} numbers, but got shape {tuple(values.shape)}"
             )
         return values, parts
 
     def _on_device(self, device: Any) -> _Parts:
-        """The numbers as torch tensors there, made once."""
+        """This encoder's arrays as torch tensors on a device, made once."""
         if device not in self._on:
             import torch
 
@@ -191,10 +207,10 @@ class Encoder:
         return self._on[device]
 
     def check_task(self, task: Task) -> None:
-        """Make sure that it reads this task's observations.
+        """Make sure that it can read this task's observations.
 
         Raises:
-            InputError: it was made for other features, or for the same in another order.
+            InputError: it was made for other features, or for these in another order.
         """
         ours, theirs = self.feature_names, task.feature_names
         if ours == theirs:
@@ -202,12 +218,8 @@ class Encoder:
         if self.header["task"] != task.name:
             raise InputError(
                 f"{self.name} was made for {self.header['task']}, whose features differ from those "
-                f"of {task.name}: take one made for {task.name}"
+                f"of {task.name}: use an encoder made for {task.name}"
             )
-        place = next(
-            i for i in range(max(len(ours), len(theirs))) if ours[i : i + 1] != theirs[i : i + 1]
-        )
-        named = [names[place] if place < len(names) else "nothing" for names in (ours, theirs)]
-        raise InputError(
-            f"{self.name} has {named[0]} as feature {place}, where {task.name} has {named[1]}"
-        )
+        pairs = enumerate(zip_longest(ours, theirs, fillvalue="nothing"))
+        place, (one, other) = next((i, pair) for i, pair in pairs if pair[0] != pair[1])
+        raise InputError(f"{self.name} has {one} as feature {place}, where {task.name} has {other}")

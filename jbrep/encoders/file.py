@@ -1,9 +1,9 @@
-"""The encoder file: safetensors, with a header of JSON; reading one runs nothing in it."""
+"""The encoder file: safetensors with a JSON header; reading one runs nothing in it."""
 
-import hashlib
 import json
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,36 +11,52 @@ import numpy as np
 
 from jbrep.dataset import Scaler
 from jbrep.encoders.encoder import Encoder, Layer
-from jbrep.errors import DamageError, InputError, check_version
+from jbrep.errors import InputError, check_version
 from jbrep.files import container
 from jbrep.files.container import Tensors
+from jbrep.files.storage import write_whole
 
 FORMAT = "jbrep encoder"
 FORMAT_VERSION = 1
 SUFFIX = ".safetensors"
 HELD_OUT_MSE = "held_out_mse"  # the metric that every encoder has
-_HASH = "sha256"  # of the rest of the header and all tensors
 _TEXTS = ("kind", "name", "task")
 _RECORDS = ("training", "data", "metrics", "versions")
+_RESERVED = ("format", "format_version", "encoder", "decoder", "sha256")
 
 
 def save(encoder: Encoder, path: Path) -> None:
     """Write an encoder's file, whole or not at all.
 
     Raises:
-        InputError: it can't be written.
+        InputError: it can't be written, or `load` would refuse it.
     """
-    header = {**_whole_header(encoder), _HASH: fingerprint(encoder)}
-    container.write(path, encoder.tensors(), header)
+    try:
+        content = _pack(encoder)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"can't save an encoder in {path}: {error}") from None
+    write_whole(path, content)
+
+
+def _pack(encoder: Encoder) -> bytes:
+    """The bytes of an encoder's file, checked as `load` checks them."""
+    header = _whole_header(encoder)
+    if reserved := [name for name in _RESERVED if name in encoder.header]:
+        raise InputError(f"the header must not have {reserved[0]}, which saving adds")
+    _encoder(json.loads(json.dumps(header)), encoder.tensors())
+    content = container.pack(encoder.tensors(), header)
+    if len(content) > container.MAX_BYTES:
+        raise InputError(f"{len(content):,} bytes are more than {container.MAX_BYTES:,}")
+    return content
 
 
 def fingerprint(encoder: Encoder) -> str:
-    """SHA-256 of an encoder's header and numbers: it names the encoder."""
-    return _digest(_whole_header(encoder), encoder.tensors())
+    """SHA-256 of an encoder's header and numbers: it identifies the encoder."""
+    return container.checksum(encoder.tensors(), _whole_header(encoder))
 
 
 def _whole_header(encoder: Encoder) -> dict[str, Any]:
-    """The header with what only the file needs."""
+    """The header with the fields that only the file needs."""
     activations = {
         part: [layer.activation for layer in getattr(encoder, part)]
         for part in ("encoder", "decoder")
@@ -53,32 +69,25 @@ def load(path: Path) -> Encoder:
 
     Raises:
         InputError: no such file, another kind of file, one of a newer jbrep, or one whose header
-            and tensors don't fit together; the message names the tensor.
+            and tensors are inconsistent; the message names the tensor.
         DamageError: it isn't what was written.
     """
     tensors, header = container.read(path, "encoder")
-    if header.get("format") != FORMAT or not isinstance(header.get("format_version"), int):
+    if header.get("format") != FORMAT:
         raise InputError(f"{path} is not a jbrep encoder")
-    check_version(path, header["format_version"], FORMAT_VERSION)
-    if header.pop(_HASH, None) != _digest(header, tensors):
-        raise DamageError(f"{path} is damaged: its numbers or header aren't those written")
+    check_version(path, header.get("format_version"), FORMAT_VERSION)
     try:
         return _encoder(header, tensors)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def _digest(header: Mapping[str, Any], tensors: Tensors) -> str:
-    """SHA-256 of a header in its one spelling, and of all tensors."""
-    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
-    for name, tensor in sorted(tensors.items()):
-        digest.update(f"{name} {tensor.dtype} {tensor.shape} ".encode())
-        digest.update(np.ascontiguousarray(tensor).tobytes())
-    return digest.hexdigest()
-
-
 def _encoder(header: dict[str, Any], tensors: Tensors) -> Encoder:
-    """Both put together; what is left to go wrong is what a forger wrote."""
+    """The encoder with that header and those tensors, both of which are used up.
+
+    Raises:
+        InputError: they are invalid or inconsistent.
+    """
     _check(header)
     parts = {}
     for part in ("encoder", "decoder"):
@@ -89,27 +98,40 @@ def _encoder(header: dict[str, Any], tensors: Tensors) -> Encoder:
         ]
     scaler = Scaler(_take(tensors, "low"), _take(tensors, "high"))
     if tensors:
-        raise InputError(f"tensor {min(tensors)} is none of an encoder's")
+        raise InputError(f"unexpected tensor {min(tensors)}")
     expected = (len(header["features"]),)
     if scaler.low.shape != expected:
-        raise InputError(f"tensor low has shape {scaler.low.shape}: {expected} is needed")
+        raise InputError(f"tensor low has shape {scaler.low.shape}, expected {expected}")
     del header["format"], header["format_version"]
     return Encoder(header, scaler, tuple(parts["encoder"]), tuple(parts["decoder"]))
 
 
 def _check(header: dict[str, Any]) -> None:
-    """Every field is there and of its type."""
+    """Make sure that every field is there and of its type."""
     fields = [(name, str) for name in _TEXTS] + [(name, dict) for name in _RECORDS]
     for name, kind in [*fields, ("features", list), ("encoder", list), ("decoder", list)]:
         if not isinstance(header.get(name), kind):
-            raise InputError(f"its header has no {name}")
+            raise InputError(f"the header has no {name}, or not as a {kind.__name__}")
     if not re.fullmatch("[a-z0-9-]+", header["name"]):
-        raise InputError(f"its name {header['name']!r} is none")
+        raise InputError(
+            f"invalid encoder name {header['name']!r}: use lower-case letters, digits and hyphens"
+        )
     if not isinstance(header["metrics"].get(HELD_OUT_MSE), float):
-        raise InputError(f"its header has no {HELD_OUT_MSE} among its metrics")
+        raise InputError(f"the header's metrics have no {HELD_OUT_MSE}, or not as a float")
     for name in ("features", "encoder", "decoder"):
         if not all(isinstance(word, str) for word in header[name]):
-            raise InputError(f"its header's {name} are no words")
+            raise InputError(f"the header's {name} must be strings")
+    if not all(map(math.isfinite, _floats(header))):
+        raise InputError("the header holds a number that is not finite")
+
+
+def _floats(value: Any) -> Iterator[float]:
+    """All floats in plain JSON."""
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, Mapping | list):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from _floats(item)
 
 
 def _take(tensors: Tensors, name: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Encoders as ONNX, for whatever runs that."""
+"""Encoders as ONNX models, for other programs."""
 
 import json
 from pathlib import Path
@@ -19,18 +19,18 @@ def export(encoder: Encoder, path: Path) -> None:
     """Write encoder and decoder, with the scaling, as one model.
 
     Its input is `observation`, (n, d) float32 in physical units; its outputs are `latent`, (n, l),
-    and `reconstruction`, (n, d) in physical units. The header stands in its metadata.
+    and `reconstruction`, (n, d) in physical units. Its metadata has the header.
 
     Raises:
-        InputError: the file is there already, or can't be written.
+        InputError: the file exists already, or can't be written.
     """
     if exists(path):
-        raise InputError(f"{path} is there already: choose another file")
+        raise InputError(f"{path} exists already: choose another file")
     write_whole(path, model(encoder).SerializeToString(deterministic=True))
 
 
 def model(encoder: Encoder) -> onnx.ModelProto:
-    """The model, checked."""
+    """The ONNX model, checked."""
     graph = _Graph()
     graph.constant("centre", encoder.scaler.centre)
     graph.constant("half_width", encoder.scaler.half_width)
@@ -63,7 +63,7 @@ def _rows(name: str, size: int) -> onnx.ValueInfoProto:
 
 
 class _Graph:
-    """Nodes and constants, as they come."""
+    """The nodes and constants of a graph, in order."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -78,7 +78,7 @@ class _Graph:
         return output
 
     def layers(self, part: str, layers: tuple[Layer, ...], value: str, output: str) -> None:
-        """Through all layers; the last gives the output."""
+        """Add a part's layers, from a value to the output."""
         for i, layer in enumerate(layers):
             names = f"{part}.{i}.weight", f"{part}.{i}.bias"
             weight, bias = map(self.constant, names, (layer.weight.T, layer.bias))

@@ -8,6 +8,7 @@ import numpy as np
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import FULL, Encoder
+from jbrep.encoders.encoder import IDENTITY
 from jbrep.errors import InputError
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import latent
@@ -29,16 +30,17 @@ _DIAGNOSTICS: dict[str, Callable[[Encoder, HeldOut], Any]] = {
 }
 
 
-def evaluate(encoders: Mapping[str, Encoder], data: ScaledDataset) -> dict[str, Any]:
-    """Every diagnostic of every encoder, as plain JSON; docs/encoders.md says what each is.
+def diagnose(encoders: Mapping[str, Encoder], data: ScaledDataset) -> dict[str, Any]:
+    """Every diagnostic of every encoder, as plain JSON; docs/encoders.md describes each.
 
-    The full observation, scaled, comes first, as what there is to keep. A value with an interval
-    is [value, low, high], a 95 % bootstrap interval over episodes.
+    The full observation comes first, as the upper limit of what can be kept. A value with an
+    interval is [value, low, high], a 95 % bootstrap interval over episodes. Errors are those of
+    features scaled by this data set's extrema, whatever the encoder's own scaling.
 
     Args:
         encoders: by the label to show.
-        data: to judge them on; its test part is what they haven't seen if they were trained on
-            this data set.
+        data: to judge them on; encoders that were trained on this data set haven't seen its test
+            part.
 
     Raises:
         InputError: an encoder made for other features, or whose numbers overflow.
@@ -46,15 +48,15 @@ def evaluate(encoders: Mapping[str, Encoder], data: ScaledDataset) -> dict[str, 
     held_out = HeldOut(data)
     for label, encoder in encoders.items():
         _check(label, encoder, data)
-    full = Encoder({"kind": "identity", "name": FULL}, data.scaler, (), ())
-    found = {}
+    full = Encoder({"kind": IDENTITY, "name": FULL}, data.scaler, (), ())
     everything = {FULL: full, **encoders}
+    results: dict[str, Any] = {}
     with Progress(total=len(everything) * len(_DIAGNOSTICS), unit="diagnostic") as progress:
         for label, encoder in everything.items():
-            found[label] = {"kind": encoder.header["kind"], "latent": encoder.latent_size}
-            for name, diagnose in _DIAGNOSTICS.items():
+            results[label] = {"kind": encoder.header["kind"], "latent": encoder.latent_size}
+            for name, diagnostic in _DIAGNOSTICS.items():
                 progress.set_description(f"{label} {name}")
-                found[label][name] = diagnose(encoder, held_out)
+                results[label][name] = diagnostic(encoder, held_out)
                 progress.update()
     return {
         "format": FORMAT,
@@ -62,28 +64,28 @@ def evaluate(encoders: Mapping[str, Encoder], data: ScaledDataset) -> dict[str, 
         "data": _describe(held_out),
         "resamples": RESAMPLES,
         "seen": {label: seen(encoder, data) for label, encoder in encoders.items()},
-        "encoders": found,
+        "encoders": results,
     }
 
 
 def _check(label: str, encoder: Encoder, data: ScaledDataset) -> None:
     if label == FULL:
-        raise InputError(f"the label {FULL} is that of the observation itself: take another")
+        raise InputError(f"the label {FULL} is reserved for the observation itself: choose another")
     encoder.check_task(data.task)
     rows = data.dataset["observation"][sample(data.test, 1000)]
     with np.errstate(over="ignore", invalid="ignore"):
         back = encoder.decode(encoder.encode(rows))
     if not np.isfinite(back).all():
-        raise InputError(f"{label} gives numbers that aren't finite: train it anew")
+        raise InputError(f"{label} gives numbers that are not finite: train it again")
 
 
 def seen(encoder: Encoder, data: ScaledDataset) -> str:
-    """Whether the encoder was trained on this data set: "no test row", "none" or "maybe"."""
+    """Which of these rows an encoder saw in training: "no test row", "none" or "maybe"."""
     source, manifest = encoder.header["data"], data.dataset.manifest
     if source.get("fingerprint") == manifest.fingerprint:
         return "no test row"
-    apart = "seed" in source and source["seed"] != manifest.settings.seed
-    return "none" if apart else "maybe"
+    differs = "seed" in source and source["seed"] != manifest.settings.seed
+    return "none" if differs else "maybe"
 
 
 def _describe(held_out: HeldOut) -> dict[str, Any]:

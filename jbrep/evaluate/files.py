@@ -1,4 +1,4 @@
-"""The file that an evaluation is kept in."""
+"""The file of an evaluation."""
 
 import json
 import re
@@ -10,7 +10,7 @@ from jbrep.dataset import ScaledDataset
 from jbrep.encoders import Encoder
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError
-from jbrep.evaluate.evaluation import evaluate
+from jbrep.evaluate.evaluation import diagnose
 from jbrep.files.storage import exists, make_folder, write_whole
 
 EVALUATION = "evaluation.json"
@@ -23,50 +23,49 @@ def write(encoders: Mapping[str, Encoder], data: ScaledDataset, folder: Path) ->
     Args:
         encoders: by the label to show.
         data: to judge them on.
-        folder: made if it isn't there.
+        folder: created if it doesn't exist.
 
     Returns:
-        The evaluation, as `jbrep.evaluate.evaluate` gives it.
+        The evaluation, as `jbrep.evaluate.diagnose` returns it.
 
     Raises:
-        InputError: an encoder made for other features, or a folder that holds the evaluation of
+        InputError: an encoder was made for other features, or the folder holds the evaluation of
             other encoders or data.
     """
     path = folder / EVALUATION
-    marks = {label: fingerprint(encoder) for label, encoder in encoders.items()}
+    hashes = {label: fingerprint(encoder) for label, encoder in encoders.items()}
     if exists(path):
-        _check_same(path, {"data": data.dataset.manifest.fingerprint, "encoders": marks})
+        _check_same(path, {"data": data.dataset.manifest.fingerprint, "encoders": hashes})
     make_folder(folder)
-    evaluation = evaluate(encoders, data)
-    for label, mark in marks.items():
-        evaluation["encoders"][label]["sha256"] = mark
+    evaluation = diagnose(encoders, data)
+    for label, digest in hashes.items():
+        evaluation["encoders"][label]["sha256"] = digest
     write_whole(path, _text(evaluation).encode())
     return evaluation
 
 
 def _check_same(path: Path, wanted: dict[str, Any]) -> None:
-    """An evaluation is replaced by its own repetition only."""
+    """Make sure that a repeated evaluation replaces no other one."""
     try:
         there = json.loads(path.read_bytes())
-        marks = {label: e["sha256"] for label, e in there["encoders"].items() if "sha256" in e}
-        same = {"data": there["data"]["fingerprint"], "encoders": marks} == wanted
+        hashes = {label: e["sha256"] for label, e in there["encoders"].items() if "sha256" in e}
+        same = {"data": there["data"]["fingerprint"], "encoders": hashes} == wanted
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         same = False
     if not same:
         raise InputError(
-            f"{path} holds something else than the evaluation of these encoders on this data: "
-            "choose another --out"
+            f"{path} is not an evaluation of these encoders on this data: choose another --out"
         )
 
 
 def _text(value: Any) -> str:
     """JSON with each list of numbers on one line."""
     text = json.dumps(_rounded(value), indent=1, allow_nan=False)
-    return re.sub(r"\[[-+.,\deEnul\s]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
+    return re.sub(r"\[[-+.,\deEnul\s]*\]", lambda match: " ".join(match[0].split()), text) + "\n"
 
 
 def _rounded(value: Any) -> Any:
-    """All numbers in so many digits."""
+    """The same with all floats in six digits."""
     if isinstance(value, float):
         return float(f"{value:.{_DIGITS}g}")
     if isinstance(value, dict):

@@ -17,7 +17,7 @@ class HeldOut:
 
     Attributes:
         data: the data set, split and scaled.
-        numbers: of the held-out episodes in the data set, (episodes,).
+        numbers: of the held-out episodes within the data set, (episodes,).
     """
 
     def __init__(self, data: ScaledDataset):
@@ -32,15 +32,15 @@ class HeldOut:
         return np.searchsorted(self._ends, rows, side="right")
 
     def place(self, rows: Rows) -> Rows:
-        """Which of the held-out episodes each held-out row is of, from 0, (n,)."""
+        """The position of each held-out row's episode among the held-out ones, (n,)."""
         return np.searchsorted(self.numbers, self._episode(rows))
 
     def followed(self, rows: Rows) -> Rows:
-        """Those of the rows whose next row is of the same episode."""
+        """Those rows whose next row belongs to the same episode."""
         return rows[self._ends[self._episode(rows)] > rows + 1]
 
     def sums(self, rows: Rows, *values: NDArray[Any]) -> list[Array]:
-        """Of each array (n, k), the sums over the rows of each held-out episode, (episodes, k)."""
+        """Sums of each array (n, k) over the rows of each held-out episode, (episodes, k)."""
         place = self.place(rows)
         return [by_episode(v, place, len(self)) for v in values]
 

@@ -12,20 +12,20 @@ from jbrep.stats.bootstrap import without_nan
 
 _ROWS = 200_000
 _POINTS = 5_000  # for intrinsic dimensions
-_SATURATED = 0.95  # of a tanh unit's magnitude
-_DEAD = 0.01  # standard deviation, of the liveliest unit's
-_STILL = 1e-6  # standard deviation that is rounding
+_SATURATED = 0.95  # magnitude of a tanh unit
+_DEAD = 0.01  # standard deviation, as a share of the most variable unit's
+_ROUNDING = 1e-6  # standard deviation that rounding alone can cause
 _NEIGHBOURS = 20  # of the maximum-likelihood estimator
 
 
 def latent(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
-    """Units, correlations and dimensions of the latent over held-out rows.
+    """Units, their correlations, and dimensions of the latent, over held-out rows.
 
     The participation ratio is (sum of the covariance's eigenvalues)^2 / sum of their squares.
     """
     values = encode(encoder, held_out, sample(held_out.data.test, _ROWS)).astype(np.float64)
     deviation = values.std(axis=0)
-    live = deviation > max(_DEAD * deviation.max(), _STILL)
+    live = deviation > max(_DEAD * deviation.max(), _ROUNDING)
     spectrum = np.linalg.eigvalsh(np.atleast_2d(np.cov(values.T)))
     return {
         "mean": values.mean(axis=0).tolist(),
@@ -46,24 +46,24 @@ def encode(encoder: Encoder, held_out: HeldOut, rows: NDArray[np.int64]) -> NDAr
 
 
 def _saturation(encoder: Encoder, values: NDArray[np.float64]) -> list[float] | None:
-    """The share of rows in which each tanh unit is near its end; None of a linear latent."""
+    """The share of rows in which each tanh unit is saturated; None for a linear latent."""
     if not encoder.encoder or encoder.encoder[-1].activation != "tanh":
         return None
     return (np.abs(values) > _SATURATED).mean(axis=0).tolist()
 
 
 def _correlation(values: NDArray[np.float64], live: NDArray[np.bool_]) -> list[list[float | None]]:
-    """Pearson's, (l, l); None with a dead unit."""
-    found = np.full((len(live), len(live)), np.nan)
-    found[np.ix_(live, live)] = np.corrcoef(values[:, live].T)
-    return without_nan(found.tolist())
+    """Pearson's correlation of the units, (l, l); None for dead ones."""
+    matrix = np.full((len(live), len(live)), np.nan)
+    matrix[np.ix_(live, live)] = np.corrcoef(values[:, live].T)
+    return without_nan(matrix.tolist())
 
 
 def intrinsic_dimension(values: NDArray[Any]) -> dict[str, float | None]:
-    """Estimates of how many dimensions points (n, k) fill locally, by scikit-dimension.
+    """Estimates of how many dimensions points (n, k) fill locally, from scikit-dimension.
 
     TwoNN (Facco et al. 2017) and the maximum likelihood of Levina and Bickel (2005). None where
-    there are too few different points.
+    there are too few distinct points.
     """
     from skdim.id import MLE, TwoNN  # not at the top: it takes seconds
 

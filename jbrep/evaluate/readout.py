@@ -1,4 +1,4 @@
-"""What can be read from a latent: the robot's state, and what comes next."""
+"""What can be read from a latent: the robot's state, and the next latent."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,13 +12,13 @@ from jbrep.evaluate.held_out import HeldOut, Rows
 from jbrep.evaluate.truth import quantities, state
 from jbrep.stats.bootstrap import Array, Interval, bootstrap, r_squared, variation
 
-_ROWS = 100_000  # to fit on, and to judge on
-_CORRELATED = 50_000
-_QUERIES = 5_000
-_REFERENCES = 20_000
+_ROWS = 100_000  # at most, to fit on and to judge on
+_CORRELATED = 50_000  # held-out rows
+_QUERIES = 5_000  # held-out rows whose neighbours are looked up
+_REFERENCES = 20_000  # training rows among which they are
 _NEIGHBOURS = 5
-_ROUNDING = 1e-6  # of the largest variance
-_STILL = 1e-12  # variance that is rounding
+_NEGLIGIBLE = 1e-6  # variance, as a share of the largest
+_ROUNDING = 1e-12  # variance that rounding alone can cause
 _PENALTY = 1.0  # of the ridge, on standardised latents
 
 
@@ -29,21 +29,21 @@ def probes(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
     """
     data = held_out.data
     train, test = sample(data.train, _ROWS), sample(data.test, _ROWS)
-    before, after = data.dataset["observation"][train], data.dataset["observation"][test]
-    wanted, true = (quantities(data.task, rows) for rows in (before, after))
-    latents, unseen = encoder.encode(before), encoder.encode(after)
-    found = {}
-    for name, values in wanted.items():
-        predicted = _ridge().fit(latents, values).predict(unseen)
-        found[name] = _explained(predicted, true[name], test, held_out).tolist()
-    return found
+    seen, unseen = data.dataset["observation"][train], data.dataset["observation"][test]
+    known, true = (quantities(data.task, rows) for rows in (seen, unseen))
+    latents, unseen_latents = encoder.encode(seen), encoder.encode(unseen)
+    scores = {}
+    for name, values in known.items():
+        predicted = _ridge().fit(latents, values).predict(unseen_latents)
+        scores[name] = _explained(predicted, true[name], test, held_out).tolist()
+    return scores
 
 
 def dynamics(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
-    """R^2 of the next latent: linear in latent and action, and taken to stay as it is.
+    """R^2 of the next latent: predicted linearly from latent and action, and as unchanged.
 
-    The latent is whitened first, so that how units are scaled and mixed doesn't matter: every
-    direction in which it varies counts alike.
+    The latent is whitened first, so that every direction in which it varies counts alike, however
+    its units are scaled and mixed.
     """
     data = held_out.data
     steps = []
@@ -62,10 +62,13 @@ def dynamics(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
 
 
 def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
-    """To uncorrelated directions of unit variance, without those of none; if all are, to one 0."""
+    """A map to uncorrelated directions of unit variance, leaving out constant ones.
+
+    If all are constant, one direction is left, and it is 0.
+    """
     mean = latents.mean(axis=0, dtype=np.float64)
     variances, directions = np.linalg.eigh(np.cov(latents.T).reshape(len(mean), -1))
-    kept = variances > max(_ROUNDING * variances[-1], _STILL)
+    kept = variances > max(_NEGLIGIBLE * variances[-1], _ROUNDING)
     scales = np.where(kept, 1 / np.sqrt(np.where(kept, variances, 1)), 0)
     matrix = (directions * scales)[:, kept | (np.arange(len(kept)) == len(kept) - 1)]
     return lambda values: (values - mean) @ matrix
@@ -80,27 +83,31 @@ def _ridge() -> Any:
 
 
 def neighbours(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
-    """How alike the states of nearest neighbours in the latent are (KNN-MSE).
+    """How similar the states of nearest neighbours in the latent are (KNN-MSE).
 
     The mean squared difference between a held-out row's state and those of its 5 nearest
-    neighbours, as in the S-RL Toolbox (Raffin et al. 2018), but of thousands of rows rather than
+    neighbours, as in the S-RL Toolbox (Raffin et al. 2018), but for thousands of rows rather than
     five, over the whole state with every dimension standardised, and with neighbours from training
-    episodes alone, never from the moments before and after. Unrelated rows have 2.
+    episodes only, never from the same episode. Unrelated rows give 2.
     """
     from sklearn.neighbors import NearestNeighbors
 
     data = held_out.data
     test, train = sample(data.test, _QUERIES), sample(data.train, _REFERENCES)
-    asked, known = (data.dataset["observation"][rows] for rows in (test, train))
-    wanted, true = (np.stack(list(state(data.task, o).values()), 1) for o in (asked, known))
-    scale = true.std(axis=0)
-    varying = np.ptp(true, axis=0) > 0
-    index = NearestNeighbors(n_neighbors=min(_NEIGHBOURS, len(train))).fit(encoder.encode(known))
-    nearest = index.kneighbors(encoder.encode(asked), return_distance=False)
-    apart = (true[nearest] - wanted[:, None])[..., varying] / scale[varying]
-    sums, counts = held_out.sums(test, np.square(apart).mean(axis=1), np.ones((len(test), 1)))
+    queries, references = (data.dataset["observation"][rows] for rows in (test, train))
+    query_states, reference_states = (
+        np.stack(list(state(data.task, rows).values()), 1) for rows in (queries, references)
+    )
+    scale = reference_states.std(axis=0)
+    varying = np.ptp(reference_states, axis=0) > 0
+    index = NearestNeighbors(n_neighbors=min(_NEIGHBOURS, len(train)))
+    index.fit(encoder.encode(references))
+    nearest = index.kneighbors(encoder.encode(queries), return_distance=False)
+    differences = (reference_states[nearest] - query_states[:, None])[..., varying] / scale[varying]
+    squares = np.square(differences).mean(axis=1)
+    sums, counts = held_out.sums(test, squares, np.ones((len(test), 1)))
     by_name = bootstrap(lambda s, n: s / n, sums, counts).tolist()
-    names = [n for n, varies in zip(state(data.task, known[:1]), varying, strict=True) if varies]
+    names = np.array(list(state(data.task, references[:1])))[varying].tolist()
     return {
         "mse": bootstrap(lambda s, n: s.mean(axis=-1) / n[..., 0], sums, counts).tolist(),
         "dimensions": dict(zip(names, by_name, strict=True)),
@@ -108,10 +115,10 @@ def neighbours(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
 
 
 def correlation(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
-    """How directly units show the state: the ground-truth correlation (GTC).
+    """How directly single units show the state: the ground-truth correlation (GTC).
 
     For each dimension of the state, the largest absolute correlation with a unit of the latent; as
-    in the S-RL Toolbox, but the other dimensions of the state are no candidates.
+    in the S-RL Toolbox, but other dimensions of the state are not counted as units.
     """
     data = held_out.data
     test = sample(data.test, _CORRELATED)
@@ -138,7 +145,7 @@ def correlation(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
 def _explained(
     predicted: NDArray[Any], true: NDArray[Any], rows: Rows, held_out: HeldOut
 ) -> Interval:
-    """R^2 of all columns (n, k) together."""
+    """R^2 of predicted columns (n, k), all together."""
     true = np.asarray(true, np.float64)
     predicted = predicted.reshape(true.shape)  # scikit-learn gives one column as (n,)
     shifted = true - true.mean(axis=0)  # keeps the digits of a small variation

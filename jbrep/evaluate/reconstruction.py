@@ -1,4 +1,4 @@
-"""What an encoder and its decoder lose, clean and corrupted."""
+"""What an encoder and its decoder lose, from clean and from corrupted observations."""
 
 from functools import lru_cache
 from typing import Any
@@ -22,14 +22,14 @@ _WORST = 5
 def reconstruction(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
     """Errors over all held-out rows, of features scaled to [-1, 1] and in physical units.
 
-    Beside them stands the error of PCA with as many components, fitted on the training part.
+    They come with the error of PCA with as many components, fitted on the training part.
     """
     data = held_out.data
     errors = _errors(encoder, data, data.test)
     (sums,) = held_out.sums(data.test, errors)
     return {
         "mse": bootstrap(_mean, sums, held_out.row_counts).tolist(),
-        **_beside_pca(encoder.latent_size, sums, held_out),
+        **_compared_with_pca(encoder.latent_size, sums, held_out),
         "features": _by_feature(sums, held_out),
         "quantiles": dict(
             zip(
@@ -43,19 +43,19 @@ def reconstruction(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
 
 
 def corruption(encoder: Encoder, held_out: HeldOut) -> list[dict[str, Any]]:
-    """Errors of reconstructions of corrupted rows from clean ones, at each strength.
+    """Errors of reconstructing clean rows from corrupted ones, at each noise level.
 
-    Beside them stand the corrupted rows' own error, and that of the linear denoiser of the same
-    latent size that is best at that strength.
+    They come with the error of the corrupted rows themselves, and with that of the best linear
+    denoiser of the same latent size at that level.
     """
     data = held_out.data
     rows = sample(data.test, _CORRUPTED_ROWS)
     (counts,) = held_out.sums(rows, np.ones((len(rows), 1)))
-    found = []
+    levels = []
     for noise in NOISES:
         (ours,) = held_out.sums(rows, _errors(encoder, data, rows, noise))
         best = _best_linear(held_out, encoder.latent_size, noise)
-        found.append(
+        levels.append(
             {
                 "noise": noise,
                 "mse": bootstrap(_mean, ours, counts).tolist(),
@@ -63,29 +63,29 @@ def corruption(encoder: Encoder, held_out: HeldOut) -> list[dict[str, Any]]:
                 "linear_mse": bootstrap(_mean, best, counts).tolist(),
             }
         )
-    return found
+    return levels
 
 
 def _mean(squares: Array, rows: Array) -> Array:
-    """Over rows and features, of sums of squares (..., d)."""
+    """Mean over rows and features, from sums of squares (..., d)."""
     return squares.mean(axis=-1) / rows[..., 0]
 
 
 def _errors(
     encoder: Encoder, data: ScaledDataset, rows: Rows, noise: float = 0
 ) -> NDArray[np.float32]:
-    """Squared errors of each feature, scaled, (n, d); the noise is the same for every encoder."""
+    """Squared errors of each scaled feature, (n, d), with the same noise for every encoder."""
     width = data.scaler.half_width
     random = np.random.default_rng(0)
-    found = []
+    errors = []
     for observation in data.observations(rows):
         drawn = random.standard_normal(observation.shape, np.float32) if noise else 0
         back = encoder.decode(encoder.encode(observation + noise * drawn * width))
-        found.append(np.square((back - observation) / width))
-    return np.concatenate(found)
+        errors.append(np.square((back - observation) / width))
+    return np.concatenate(errors)
 
 
-@lru_cache(1024)  # as many encoders of one size share it
+@lru_cache(1024)  # since encoders of one size share it
 def _best_linear(held_out: HeldOut, latent: int, noise: float) -> Array:
     """Sums of squared errors of the best linear denoiser, by episode."""
     data = held_out.data
@@ -106,7 +106,7 @@ def _linear(data: ScaledDataset, layers: tuple[Layers, Layers]) -> Encoder:
     return Encoder({"name": "linear"}, data.scaler, *layers)
 
 
-def _beside_pca(latent: int, sums: Array, held_out: HeldOut) -> dict[str, Any]:
+def _compared_with_pca(latent: int, sums: Array, held_out: HeldOut) -> dict[str, Any]:
     linear = _pca(held_out, latent)
     ratio = bootstrap(lambda ours, pca: ours.sum(axis=-1) / pca.sum(axis=-1), sums, linear)
     return {
@@ -131,7 +131,7 @@ def _by_feature(sums: Array, held_out: HeldOut) -> list[dict[str, Any]]:
 
 
 def _worst(sums: Array, held_out: HeldOut) -> list[dict[str, Any]]:
-    """The episodes with the largest mean error."""
+    """The episodes with the largest mean errors."""
     errors = _mean(sums, np.maximum(held_out.row_counts, 1))
     order = np.argsort(-errors, kind="stable")[:_WORST]
     seeds = held_out.data.dataset.episodes["seed"]

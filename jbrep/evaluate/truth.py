@@ -1,4 +1,4 @@
-"""The robot's state as a researcher would name it, read from observations."""
+"""The robot's state in terms of heading, speed and angles, computed from observations."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,18 +12,18 @@ _ANGLES = ("motor_angle", "angle_to_target")
 
 
 def quantities(task: Task, observation: ArrayLike) -> dict[str, Array]:
-    """What a controller would want to know of each observation (n, d), in physical units.
+    """What a controller needs to know from observations (n, d) in physical units.
 
-    An angle is its cosine and sine, (n, 2); anything else is (n, 1): the heading of the robot's
-    face in the world, its uprightness (cosine of the tilt), its speed toward where it faces [m/s],
-    the motor's phase, and where the task has them the angle to the target's yaw and the bearing of
-    the target's position from the face, counter-clockwise.
+    Angles are cosine and sine, (n, 2); the rest is (n, 1): the heading of the robot's face in the
+    world, its uprightness (cosine of the tilt), its forward speed [m/s], the motor's phase, and, if
+    the task has them, the angle to the target's yaw and the bearing of the target's position from
+    the face, counter-clockwise.
     """
     return _quantities(_features(task, observation))
 
 
 def state(task: Task, observation: ArrayLike) -> dict[str, Array]:
-    """The whole state, a column (n,) by name: the quantities above and all other features."""
+    """The whole state as columns (n,) by name: the quantities above and all other features."""
     features = _features(task, observation)
     columns: dict[str, Array] = {}
     for name, values in _quantities(features).items():
@@ -42,7 +42,7 @@ def _quantities(f: dict[str, Array]) -> dict[str, Array]:
     w, x, y, z = (f[name] for name in _REPLACED)
     face = _direction(2 * (w * z - x * y), 2 * (x * x + z * z) - 1)  # the robot's -Y axis
     speed = face[:, 0] * f["velocity_x"] + face[:, 1] * f["velocity_y"]
-    found = {
+    columns = {
         "heading": face,
         "uprightness": (1 - 2 * (x * x + y * y))[:, None],
         "forward_speed": speed[:, None],
@@ -50,13 +50,13 @@ def _quantities(f: dict[str, Array]) -> dict[str, Array]:
     }
     if "angle_to_target" in f:
         angle = f["angle_to_target"]
-        found["angle_to_target"] = _direction(np.cos(angle), np.sin(angle))
+        columns["angle_to_target"] = _direction(np.cos(angle), np.sin(angle))
     if "target_x" in f:
-        found["bearing_of_target"] = _direction(-f["target_y"], f["target_x"])
-    return found
+        columns["bearing_of_target"] = _direction(-f["target_y"], f["target_x"])
+    return columns
 
 
 def _direction(x: Array, y: Array) -> Array:
-    """Unit vectors, (n, 2); where both are 0, they stay."""
+    """Unit vectors along (x, y), (n, 2); zero vectors stay zero."""
     length = np.maximum(np.hypot(x, y), 1e-12)
     return np.stack((x / length, y / length), axis=1)

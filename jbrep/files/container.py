@@ -1,42 +1,63 @@
-"""Tensors with a header of JSON in one safetensors file; reading one runs nothing in it."""
+"""Tensors with a JSON header in one safetensors file, with a checksum; reading runs no code."""
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import safetensors.numpy
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
-from jbrep.errors import InputError
+from jbrep.errors import DamageError, InputError
 from jbrep.files.storage import read_regular, write_whole
 
 Tensors = dict[str, NDArray[Any]]
 
-_KEY = "jbrep"  # of the header among the file's metadata
-_MAX_BYTES = 1 << 24
+MAX_BYTES = 1 << 24  # that `read` accepts unless told otherwise
+_KEY = "jbrep"  # of the header in the file's metadata
+_CHECKSUM = "sha256"  # of the rest of the header and all tensors, in the header
 
 
 def write(path: Path, tensors: Tensors, header: Mapping[str, Any]) -> None:
-    """Write tensors and header, whole or not at all.
+    """Write tensors and header with their checksum, whole or not at all.
 
     Raises:
         InputError: they can't be written.
     """
-    write_whole(path, safetensors.numpy.save(tensors, {_KEY: json.dumps(header)}))
+    write_whole(path, pack(tensors, header))
 
 
-def read(path: Path, what: str, most: int = _MAX_BYTES) -> tuple[Tensors, dict[str, Any]]:
-    """Tensors and header of such a file.
+def pack(tensors: Tensors, header: Mapping[str, Any]) -> bytes:
+    """The bytes of such a file."""
+    checked = {**header, _CHECKSUM: checksum(tensors, header)}
+    in_order = {name: np.asarray(t, order="C") for name, t in tensors.items()}
+    return safetensors.numpy.save(in_order, {_KEY: json.dumps(checked)})
+
+
+def checksum(tensors: Tensors, header: Mapping[str, Any]) -> str:
+    """SHA-256 of a header, as JSON with sorted keys, and of all tensors."""
+    plain = json.loads(json.dumps(header))
+    digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tensor.shape} ".encode())
+        digest.update(np.ascontiguousarray(tensor).data)
+    return digest.hexdigest()
+
+
+def read(path: Path, what: str, most: int = MAX_BYTES) -> tuple[Tensors, dict[str, Any]]:
+    """Tensors and header of such a file, once its checksum has been verified.
 
     Args:
         path: the file.
-        what: it should be, for messages: an encoder.
+        what: it should be, for messages, such as "encoder".
         most: bytes that it may have.
 
     Raises:
         InputError: no such file, or another kind of file.
+        DamageError: it isn't what was written, or has no checksum.
     """
     try:
         raw = read_regular(path, most)
@@ -46,19 +67,28 @@ def read(path: Path, what: str, most: int = _MAX_BYTES) -> tuple[Tensors, dict[s
         raise InputError(f"can't read {path}: {error.strerror or error}") from error
     if not raw:
         raise InputError(
-            f"{path} is not a jbrep {what}: a regular file of 1 to {most:,} bytes is needed"
+            f"{path} is not a jbrep {what}: it must be a regular file of 1 to {most:,} bytes"
         )
     try:
-        return safetensors.numpy.load(raw), _header(raw)
+        tensors, header = safetensors.numpy.load(raw), _header(raw)
     except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{path} is not a jbrep {what}, or cut short: {error}") from None
+        raise InputError(f"{path} is not a jbrep {what}, or is truncated: {error}") from None
+    if _CHECKSUM not in header:
+        raise DamageError(
+            f"{path} has no checksum, so an older jbrep wrote it: delete it to start over"
+        )
+    if header.pop(_CHECKSUM) != checksum(tensors, header):
+        raise DamageError(
+            f"{path} is damaged (its checksum doesn't match): delete it to start over"
+        )
+    return tensors, header
 
 
 def _header(raw: bytes) -> dict[str, Any]:
-    """The header, of bytes that safetensors found well-formed."""
+    """The header, from bytes that safetensors has found well-formed."""
     length = int.from_bytes(raw[:8], "little")
     text = json.loads(raw[8 : 8 + length])["__metadata__"][_KEY]
     header = json.loads(text)
     if not isinstance(header, dict) or json.dumps(header) != text:
-        raise TypeError("its header isn't as jbrep writes it")
+        raise TypeError("its header is not in the form that jbrep writes")
     return header

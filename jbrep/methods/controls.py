@@ -1,4 +1,4 @@
-"""Encoders that need no training: what a learned one is compared with."""
+"""Encoders in closed form, to compare learned ones with."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,9 @@ Layers = tuple[Layer, ...]
 
 
 def pca(data: ScaledDataset, latent: int) -> tuple[Layers, Layers]:
-    """The principal components: of all linear codes, the least squared error on the training part.
+    """Principal components, the linear code of least squared error on the training part.
 
-    Each component points where its largest weight is positive.
+    The sign of each component makes its largest weight positive.
     """
     _, vectors = np.linalg.eigh(data.moments.covariance)
     components = vectors[:, ::-1][:, :latent].T
@@ -23,14 +23,14 @@ def pca(data: ScaledDataset, latent: int) -> tuple[Layers, Layers]:
 
 
 def random_projection(data: ScaledDataset, latent: int, seed: int) -> tuple[Layers, Layers]:
-    """Orthonormal directions drawn uniformly, with the best linear decoder for them."""
+    """Uniformly random orthonormal directions, with the best linear decoder for them."""
     drawn = np.random.default_rng(seed).normal(size=(data.task.size, latent))
     directions, triangle = np.linalg.qr(drawn)
     return linear_code((directions * np.sign(np.diag(triangle))).T, data.moments)
 
 
 def linear_code(weight: NDArray[np.float64], moments: Moments) -> tuple[Layers, Layers]:
-    """Encoder z = W (x - mean), and the linear decoder of least squared error.
+    """The encoder z = W (x - mean), with the linear decoder of least squared error.
 
     The decoder is C W' (W C W')^-1 z + mean, with the covariance C.
     """
@@ -40,7 +40,7 @@ def linear_code(weight: NDArray[np.float64], moments: Moments) -> tuple[Layers, 
 
 
 def linear_denoiser(latent: int, noise: float, moments: Moments) -> tuple[Layers, Layers]:
-    """The linear code of that size with the least error from corrupted rows to clean ones.
+    """The linear code of that size with the least error in restoring clean rows from corrupted.
 
     Corruption adds noise of standard deviation `noise` to each feature. The best denoiser of full
     rank is ridge regression, B = C (C + noise^2 I)^-1; of rank l, it is B projected on the first l

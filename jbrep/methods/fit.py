@@ -1,4 +1,4 @@
-"""Encoders of every kind from a data set, each in its file."""
+"""Making encoders of every kind from a data set, each in its file."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -7,59 +7,72 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-import torch
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.dae import checkpoint
 from jbrep.dae.network import Autoencoder, get_architecture, layers
-from jbrep.dae.training import Epoch, Trainer, Training, get_device
+from jbrep.dae.training import (
+    Epoch,
+    Rows,
+    Trainer,
+    Training,
+    default_batch_size,
+    get_device,
+)
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder, load, save
+from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import HELD_OUT_MSE, SUFFIX
+from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose, differences
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder
 from jbrep.methods.controls import Layers, pca, random_projection
+from jbrep.methods.held_out import held_out_error
+from jbrep.methods.rows import load_rows, training_rows
 from jbrep.progress import Progress
 
-_WATCHED = 100_000  # held-out rows whose error is shown after each epoch
-_EVERY = ("latent", "architecture", "epochs", "batch_size", "learning_rate", "seed")
+_WATCHED = 100_000  # held-out rows whose loss is reported after each epoch
+_TRAINED = ("latent", "architecture", "epochs", "batch_size", "learning_rate", "seed")
 
 
-def _untrained(data: ScaledDataset, training: Training) -> tuple[Layers, Layers]:
-    architecture = get_architecture(training.architecture)
-    network = Autoencoder(architecture, data.task.size, training.latent, training.seed)
+def _identity(data: ScaledDataset) -> tuple[Layers, Layers]:
+    return (), ()
+
+
+def _untrained(
+    data: ScaledDataset, latent: int, architecture: str, seed: int
+) -> tuple[Layers, Layers]:
+    network = Autoencoder(get_architecture(architecture), data.task.size, latent, seed)
     return layers(network.encoder), layers(network.decoder)
 
 
-class _Kind(NamedTuple):
-    settings: tuple[str, ...]  # of a Training that matter to it
-    make: Callable[[ScaledDataset, Training], tuple[Layers, Layers]] | None  # None: trained
+class Kind(NamedTuple):
+    """A kind of encoder: the settings of a Training that it takes, and how it is made."""
+
+    settings: tuple[str, ...]
+    make: Callable[..., tuple[Layers, Layers]] | None  # from data and settings; None: by training
 
 
 KINDS = {
-    "identity": _Kind((), lambda data, training: ((), ())),
-    "pca": _Kind(("latent",), lambda data, training: pca(data, training.latent)),
-    "random": _Kind(
-        ("latent", "seed"),
-        lambda data, training: random_projection(data, training.latent, training.seed),
-    ),
-    "untrained": _Kind(("latent", "architecture", "seed"), _untrained),
-    "ae": _Kind(_EVERY, None),
-    "dae": _Kind((*_EVERY, "noise"), None),
+    IDENTITY: Kind((), _identity),
+    "pca": Kind(("latent",), pca),
+    "random": Kind(("latent", "seed"), random_projection),
+    "untrained": Kind(("latent", "architecture", "seed"), _untrained),
+    "ae": Kind(_TRAINED, None),
+    "dae": Kind((*_TRAINED, "noise"), None),
 }
 
 
-def get_kind(kind: str) -> _Kind:
-    """What a kind of encoder needs.
+def get_kind(name: str) -> Kind:
+    """The kind of encoder of that name.
 
     Raises:
-        InputError: there is none of that name; the message lists them.
+        InputError: there is none; the message lists them.
     """
-    return choose(kind, KINDS, "kind")
+    return choose(name, KINDS, "kind")
 
 
 class Fitted(NamedTuple):
@@ -67,18 +80,18 @@ class Fitted(NamedTuple):
 
     encoder: Encoder
     path: Path
-    anew: bool  # False where the file held it already
+    is_new: bool  # False if the file was complete already
 
 
 class Fitter:
-    """Makes encoders from one data set, into one folder.
+    """Makes encoders from one data set, in one folder.
 
-    The encoder `dae-8` is the file `dae-8.safetensors` there; `dae-8.training` beside it has
-    TensorBoard's scalars and, until it is done, the checkpoint to go on from.
+    The encoder `dae-8` is the file `dae-8.safetensors` there; the folder `dae-8.training` beside it
+    has TensorBoard's scalars and, until training is finished, the checkpoint to resume from.
 
     Args:
         data: to learn from.
-        folder: made if it isn't there.
+        folder: created if it doesn't exist.
         device: to train on: cpu, cuda, or auto.
     """
 
@@ -88,55 +101,52 @@ class Fitter:
         self._device = get_device(device)
 
     def fit(self, kind: str, training: Training) -> Fitted:
-        """Make an encoder, unless its file is there already.
+        """Make an encoder, unless its file is complete already.
 
-        Interrupted, an autoencoder in training leaves the best so far in the file, and its
-        checkpoint, from which the same call goes on.
+        An interrupted training leaves its best parameters so far in the file, and its checkpoint,
+        from which the same call resumes.
 
         Raises:
-            InputError: as `check` does, or the files can't be written.
+            InputError: as `check`, or the files can't be written.
         """
         header, path = self._plan(kind, training)
-        if exists(path) and _is_done(path, header):
-            return Fitted(load(path), path, False)
-        make_folder(self._folder)
-        if make := KINDS[kind].make:
-            self._save(header, make(self._data, training), path, {})
-        else:
-            work = path.with_suffix(".training")
-            make_folder(work)
-            with exclusive(work):
-                noise = header["training"].get("noise", 0)
-                self._train(header, replace(training, noise=noise), path, work)
-        return Fitted(load(path), path, True)
+        complete = _is_complete(path, header)
+        if not complete:
+            make_folder(self._folder)
+            if make := KINDS[kind].make:
+                self._save(header, make(self._data, **header["training"]), path, {})
+            else:
+                complete = self._train_alone(header, training, path)
+        return Fitted(load(path), path, not complete)
 
     def check(self, kind: str, training: Training) -> bool:
-        """Make sure that it can be made; whether it is there already.
+        """Make sure that an encoder can be made, and say whether its file is complete already.
 
         Raises:
-            InputError: an unknown kind, a latent size out of range, or a file of other settings or
-                data.
+            InputError: an unknown kind, a latent size out of range, or a file that was made with
+                other settings or from other data.
         """
         header, path = self._plan(kind, training)
-        return exists(path) and _is_done(path, header)
+        return _is_complete(path, header)
 
     def _plan(self, kind: str, training: Training) -> tuple[dict[str, Any], Path]:
-        """The header of what is asked for, and its file, once it is found to be possible."""
-        get_kind(kind)
-        header = self._header(kind, training)
-        _check(kind, header["training"], self._data.task.size)
+        """The header and the file of an encoder, once its settings have been checked."""
+        settings = {name: getattr(training, name) for name in get_kind(kind).settings}
+        if "batch_size" in settings:
+            settings["batch_size"] = training.batch_size or default_batch_size(
+                len(self._data.train)
+            )
+        _check(kind, settings, self._data.task.size)
+        header = self._header(kind, settings)
         return header, self._folder / f"{header['name']}{SUFFIX}"
 
-    def _header(self, kind: str, training: Training) -> dict[str, Any]:
-        """What an encoder is and where it comes from."""
-        settings = {name: getattr(training, name) for name in KINDS[kind].settings}
+    def _header(self, kind: str, settings: dict[str, Any]) -> dict[str, Any]:
+        """The header of an encoder, without its metrics."""
         manifest = self._data.dataset.manifest
-        architecture = settings.get("architecture", "paper")
-        words = [kind, *([architecture] if architecture != "paper" else [])]
-        words += [str(settings["latent"])] if "latent" in settings else []
+        parts = {name: settings[name] for name in ("architecture", "latent") if name in settings}
         return {
             "kind": kind,
-            "name": "-".join(words),
+            "name": str(EncoderName(kind, **parts)),
             "task": self._data.task.name,
             "features": list(self._data.task.feature_names),
             "training": settings,
@@ -150,24 +160,35 @@ class Fitter:
             "versions": {name: version(name) for name in ("jbrep", "numpy", "torch")},
         }
 
+    def _train_alone(self, header: dict[str, Any], training: Training, path: Path) -> bool:
+        """Train while no other process does, unless one has finished it; whether one has."""
+        work = path.with_suffix(".training")
+        make_folder(work)
+        with exclusive(work):
+            complete = _is_complete(path, header)
+            if not complete:
+                settings = {"noise": 0, **header["training"]}
+                self._train(header, replace(training, **settings), path, work)
+        return complete
+
     def _train(self, header: dict[str, Any], training: Training, path: Path, work: Path) -> None:
-        """Train from the checkpoint there is, or from the start."""
+        """Train from the checkpoint, if there is one, or from the start."""
         trainer = Trainer(training, *self._rows)
         versions = {"device": self._device.type, "torch": header["versions"]["torch"]}
-        identity = {**_identity(header), **versions}
-        at = work / "checkpoint.safetensors"
-        if at.exists():
-            checkpoint.restore(trainer, identity, at)
+        identity = {**_origin(header), **versions}
+        saved = work / "checkpoint.safetensors"
+        if exists(saved):
+            checkpoint.restore(trainer, identity, saved)
         try:
             with SummaryWriter(str(work), purge_step=len(trainer.history) + 1) as scalars:
-                for _ in _shown(trainer, header["name"]):
-                    checkpoint.save(trainer, identity, at)
+                for _ in _with_progress(trainer, header["name"]):
+                    checkpoint.save(trainer, identity, saved)
                     for name, value in trainer.history[-1]._asdict().items():
                         scalars.add_scalar(name, value, len(trainer.history))
         finally:
             if trainer.history:
                 self._save_best(header, trainer, path)
-        at.unlink()
+        saved.unlink()
 
     def _save_best(self, header: dict[str, Any], trainer: Trainer, path: Path) -> None:
         trainer.network.load_state_dict(trainer.best)
@@ -183,67 +204,62 @@ class Fitter:
     def _save(
         self, header: dict[str, Any], parts: tuple[Layers, Layers], path: Path, metrics: Any
     ) -> None:
-        """Write the file, with the error on all held-out rows."""
+        """Write the file, with the error on all held-out rows among its metrics."""
         encoder = Encoder(header, self._data.scaler, *parts)
         error = held_out_error(encoder, self._data)
         save(replace(encoder, header={**header, "metrics": {**metrics, HELD_OUT_MSE: error}}), path)
 
     @cached_property
-    def _rows(self) -> tuple[Tensor, Tensor]:
-        """Training rows, and some held-out ones from all over, on the device."""
-        test = sample(self._data.test, _WATCHED)
-        train, watched = (
-            torch.from_numpy(self._data.load(rows)).to(self._device)
-            for rows in (self._data.train, test)
-        )
-        return train, watched
+    def _rows(self) -> tuple[Rows, Tensor]:
+        """Training rows, and a sample of the held-out ones, on the device."""
+        watched = sample(self._data.test, _WATCHED)
+        train = training_rows(self._data, self._device)
+        return train, load_rows(self._data, watched, self._device)
 
 
-def held_out_error(encoder: Encoder, data: ScaledDataset) -> float:
-    """Mean squared error of the reconstruction over all held-out rows, scaled to [-1, 1].
-
-    In six digits: those after them differ with the number of threads.
-    """
-    total = 0.0
-    for rows in data.observations(data.test):
-        error = (encoder.decode(encoder.encode(rows)) - rows) / data.scaler.half_width
-        total += float(np.square(error, dtype=np.float64).sum())
-    return float(f"{total / (len(data.test) * data.task.size):.6g}")
-
-
-def _check(kind: str, settings: dict[str, Any], size: int) -> None:
-    if not 1 <= settings.get("latent", 1) < size:
-        raise InputError(
-            f"the latent size is {settings['latent']}: there are {size} features, so it must be "
-            f"from 1 to {size - 1}"
-        )
-    if settings.get("noise") == 0:
-        raise InputError(f"{kind} without noise is a plain autoencoder: take the kind ae")
-
-
-def _is_done(path: Path, header: dict[str, Any]) -> bool:
-    """Whether the file has what is asked for; one that is half trained is to be gone on with.
+def _check(kind: str, settings: Mapping[str, Any], size: int) -> None:
+    """Make sure that a kind's settings fit observations of that size.
 
     Raises:
-        InputError: the file is of other settings or other data.
+        InputError: they don't.
     """
-    there = load(path).header
-    asked = _identity(header)
-    if differing := differences(_identity(there), asked):
+    if "latent" in settings:
+        latent = settings["latent"]
+        if latent is None:
+            raise InputError(f"{kind} needs a latent size, from 1 to {size - 1}")
+        if not 1 <= latent < size:
+            raise InputError(
+                f"latent size is {latent}: with {size} features it must be from 1 to {size - 1}"
+            )
+    if settings.get("noise") == 0:
+        raise InputError(f"{kind} without noise is a plain autoencoder: use the kind ae")
+
+
+def _is_complete(path: Path, header: Mapping[str, Any]) -> bool:
+    """Whether the file holds that encoder, trained to the end; False if there is no file.
+
+    Raises:
+        InputError: the file was made with other settings or from other data.
+    """
+    if not exists(path):
+        return False
+    there, wanted = load(path).header, _origin(header)
+    if differing := differences(_origin(there), wanted):
         raise InputError(
-            f"{path} is made otherwise: {differing}; take another folder, or delete it"
+            f"{path} was trained with other settings: {differing}; choose another folder, or "
+            "delete it"
         )
-    return there["metrics"].get("epochs") == asked.get("epochs")
+    return there["metrics"].get("epochs") == wanted.get("epochs")
 
 
-def _identity(header: Mapping[str, Any]) -> dict[str, Any]:
-    """What makes two encoders of one name the same."""
+def _origin(header: Mapping[str, Any]) -> dict[str, Any]:
+    """What must be equal for two encoders of one name to be the same."""
     data = header["data"].get("fingerprint")
     return {**header["training"], "kind": header["kind"], "task": header["task"], "data": data}
 
 
-def _shown(trainer: Trainer, name: str) -> Iterator[Epoch]:
-    """The epochs, with progress."""
+def _with_progress(trainer: Trainer, name: str) -> Iterator[Epoch]:
+    """The epochs still to train, with a progress bar."""
     total, done = trainer.training.epochs, len(trainer.history)
     with Progress(total=total, initial=done, desc=name, unit="epoch") as progress:
         for epoch in trainer.epochs():

@@ -8,6 +8,7 @@ from typing import Any
 
 from jbrep.dae.training import Training
 from jbrep.encoders import FULL
+from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.names import USUAL_ARCHITECTURE, EncoderName
 from jbrep.errors import InputError
 from jbrep.files.storage import read_regular
@@ -58,7 +59,7 @@ class Representation:
             InputError: no such representation, or invalid training settings.
         """
         if name == FULL:
-            return cls(name, "identity", _training(0, USUAL_ARCHITECTURE, training))
+            return cls(name, IDENTITY, _training(None, USUAL_ARCHITECTURE, training))
         kind, architecture, latent = parts = EncoderName.parse(name)
         settings = get_kind(kind).settings
         taken = architecture == USUAL_ARCHITECTURE or "architecture" in settings
@@ -70,7 +71,7 @@ class Representation:
         return cls(name, kind, _training(latent, architecture, training))
 
 
-def _training(latent: int, architecture: str, settings: Mapping[str, Any]) -> Training:
+def _training(latent: int | None, architecture: str, settings: Mapping[str, Any]) -> Training:
     if unknown := [name for name in settings if name not in _TRAINING]:
         raise InputError(f"unknown training.{unknown[0]}: must be one of {', '.join(_TRAINING)}")
     for name, value in settings.items():

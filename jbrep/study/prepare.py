@@ -28,7 +28,7 @@ def check(plan: Plan) -> None:
         for representation in plan.representations:
             if study.data is None:
                 find(representation.encoder, task)
-            elif representation.training.latent >= get_task(task).size:
+            elif (representation.training.latent or 0) >= get_task(task).size:
                 raise InputError(
                     f"{representation.name} doesn't reduce the {get_task(task).size} features of "
                     f"{task}: choose a smaller latent size"

@@ -1,0 +1,44 @@
+"""How well encoders reconstruct held-out rows, and how they compare with PCA."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from jbrep.dataset import ScaledDataset
+from jbrep.encoders import Encoder
+from jbrep.encoders.file import HELD_OUT_MSE
+from jbrep.methods.controls import pca
+
+
+def held_out_error(encoder: Encoder, data: ScaledDataset) -> float:
+    """Mean squared error of the reconstruction over all held-out rows, scaled to [-1, 1].
+
+    Rounded to six digits: the others depend on the number of threads.
+    """
+    total = 0.0
+    for rows in data.observations(data.test):
+        error = (encoder.decode(encoder.encode(rows)) - rows) / data.scaler.half_width
+        total += float(np.square(error, dtype=np.float64).sum())
+    return float(f"{total / (len(data.test) * data.task.size):.6g}")
+
+
+def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
+    """An encoder's held-out error as a multiple of PCA's, with as many components.
+
+    Args:
+        encoder: made from this data.
+        data: what PCA is fitted on.
+
+    Returns:
+        The ratio; None where PCA loses nothing.
+    """
+    error = _pca_error(data, encoder.latent_size)
+    return encoder.header["metrics"][HELD_OUT_MSE] / error if error else None
+
+
+@lru_cache(64)
+def _pca_error(data: ScaledDataset, latent: int) -> float:
+    """PCA's held-out error with that many components; 0 with as many as there are features."""
+    if latent == data.task.size:
+        return 0.0
+    return held_out_error(Encoder({"name": "pca"}, data.scaler, *pca(data, latent)), data)

@@ -1,0 +1,98 @@
+"""The container of encoders and checkpoints: whatever changes in one is noticed."""
+
+import json
+
+import numpy as np
+import pytest
+import safetensors.numpy
+import torch
+
+from jbrep.dae import checkpoint
+from jbrep.dae.training import Trainer, Training
+from jbrep.errors import DamageError, InputError
+from jbrep.files import container
+from jbrep.rl import Run, train
+from jbrep.rl.files import CHECKPOINT
+
+RANDOM = np.random.default_rng(0)
+
+
+def flip(path, bit):
+    content = bytearray(path.read_bytes())
+    content[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(content)
+
+
+def bits_of_tensors(path, count):
+    content = path.read_bytes()
+    start = 8 * (8 + int.from_bytes(content[:8], "little"))
+    return RANDOM.integers(start, 8 * len(content), count)
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    tensors = {
+        "transposed": np.arange(6, dtype=np.float32).reshape(2, 3).T,
+        "scalar": np.zeros(()),
+        "empty": np.zeros((0, 3), np.int64),
+        "flags": np.array([True, False]),
+    }
+    header = {"pair": (1, 2), "nested": {"b": None, "a": 1e-300}}
+    container.write(tmp_path / "it", tensors, header)
+    given, plain = container.read(tmp_path / "it", "thing")
+    assert plain == {"pair": [1, 2], "nested": {"b": None, "a": 1e-300}}
+    for name, tensor in tensors.items():
+        np.testing.assert_array_equal(given[name], tensor)
+        assert given[name].dtype == tensor.dtype
+    container.write(tmp_path / "again", given, plain)
+    assert (tmp_path / "again").read_bytes() == (tmp_path / "it").read_bytes()
+
+
+def test_a_changed_bit_in_a_checkpoint_of_an_encoder_is_noticed(tmp_path):
+    rows = torch.from_numpy(RANDOM.normal(size=(60, 16)).astype(np.float32))
+    trainer = Trainer(Training.of(4, epochs=2, batch_size=30), rows, rows)
+    next(trainer.epochs())
+    path = tmp_path / "at"
+    checkpoint.save(trainer, {}, path)
+    whole = path.read_bytes()
+    for bit in bits_of_tensors(path, 32):
+        flip(path, bit)
+        with pytest.raises(DamageError, match=r"at is damaged .*: delete it to start over"):
+            checkpoint.restore(trainer, {}, path)
+        path.write_bytes(whole)
+    checkpoint.restore(trainer, {}, path)
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """A run that has written a checkpoint, and the folder that has it."""
+    folder = tmp_path_factory.mktemp("stopped") / "run"
+    run = Run(task="face_direction", algorithm="a2c", steps=40, evaluation_episodes=1)
+
+    def watch(step, mean):
+        if (folder / CHECKPOINT).exists():
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(run, folder, watch, save_every=0)
+    return run, folder
+
+
+def test_a_changed_bit_in_a_checkpoint_of_a_run_is_noticed(stopped):
+    run, folder = stopped
+    path = folder / CHECKPOINT
+    whole = path.read_bytes()
+    for bit in bits_of_tensors(path, 32):
+        flip(path, bit)
+        with pytest.raises(DamageError, match="is damaged"):
+            container.read(path, "checkpoint")
+        path.write_bytes(whole)
+    flip(path, 8 * len(whole) - 1)
+    with pytest.raises(DamageError, match=r"is damaged .*: delete it to start over"):
+        train(run, folder)
+
+
+def test_a_checkpoint_without_a_checksum_is_refused(tmp_path):
+    header = {"jbrep": json.dumps({"identity": {}, "history": [[1.0, 1.0]]})}
+    (tmp_path / "at").write_bytes(safetensors.numpy.save({"low": np.zeros(3)}, header))
+    with pytest.raises(InputError, match="has no checksum, so an older jbrep wrote it: delete it"):
+        container.read(tmp_path / "at", "checkpoint")
