@@ -2,9 +2,7 @@
 
 import os
 import shutil
-from contextlib import contextmanager
 from ctypes.util import find_library
-from functools import partial
 
 import pytest
 import torch
@@ -35,22 +33,6 @@ def collected(tmp_path_factory):
 def copied(collected, tmp_path):
     """A copy of it to spoil."""
     return shutil.copytree(collected, tmp_path / "copied")
-
-
-@contextmanager
-def short_episodes(steps=100):
-    """Of agents in this process: theirs are what takes time, and little depends on their length."""
-    from jbrep.envs import sb3
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sb3, "Episodes", partial(sb3.Episodes, max_episode_steps=steps))
-        yield steps
-
-
-@pytest.fixture
-def episode_steps():
-    with short_episodes() as steps:
-        yield steps
 
 
 LONGEST = ("test_whole", "test_study", "test_rl", "test_cli", "test_report")

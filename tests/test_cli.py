@@ -19,7 +19,6 @@ COMMANDS = sorted({*main.commands} - {*GROUPS}) + [
 ]
 
 
-@pytest.mark.usefixtures("episode_steps")
 def test_a_run_from_training_to_its_returns(tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
     run = tmp_path / "runs" / "dae-8"
@@ -51,7 +50,6 @@ def test_a_run_from_training_to_its_returns(tmp_path, monkeypatch):
     assert "holds another run: algorithm a2c (now: sac)" in again.output
 
 
-@pytest.mark.usefixtures("episode_steps")
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
 def test_a_run_that_fails_says_why_and_ends_with_1(tmp_path, monkeypatch):
     from jbrep.rl.presets import PRESETS, get_preset
@@ -62,7 +60,7 @@ def test_a_run_that_fails_says_why_and_ends_with_1(tmp_path, monkeypatch):
     run = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 200)
     failed = jbrep("rl", *run, "--evaluation-episodes", 1, "--out", tmp_path / "run")
     assert failed.exit_code == 1
-    assert re.search(r"the run failed: .* after [\d,]+ steps; .*run\.json keeps it", failed.stderr)
+    assert re.search(r"the run failed: .* after [\d,]+ steps; see .*run\.json", failed.stderr)
 
 
 def test_a_studys_dry_run_and_its_mistakes(tmp_path):

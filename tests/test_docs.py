@@ -25,7 +25,6 @@ def found(pattern):
     ]
 
 
-@pytest.mark.usefixtures("episode_steps")
 @pytest.mark.parametrize("block", found(r"^```python\n(.*?)^```"))
 def test_the_python_runs(block, monkeypatch, tmp_path):
     for name in ("data", "jbrep"):  # what the blocks read; what they write stays out of here

@@ -1,36 +1,39 @@
-"""One run: settings, files, evaluation, kills, failures, and files from unlisted_files."""
+"""One run: settings, files, evaluation, kills and stops, failures, and files from elsewhere."""
 
 import dataclasses
-import io
 import json
 import pickle
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 import zipfile
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from conftest import short_episodes
 from stable_baselines3 import SAC
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
+from jbrep.cli.rl import _Bar
 from jbrep.encoders import find
 from jbrep.envs.episodes import Episodes
 from jbrep.errors import InputError
-from jbrep.rl import Run, train
+from jbrep.files import container
+from jbrep.rl import Run, StoppedError, checkpoint, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, read_evaluations, read_run
 from jbrep.rl.policy import load_run, load_zip
 from jbrep.rl.presets import ALGORITHMS, PRESETS, get_preset
 
 TASK = "face_direction"
-SHORT = Run(task=TASK, algorithm="a2c", encoder="dae-8", steps=80, evaluation_episodes=1)
-
-pytestmark = pytest.mark.usefixtures("episode_steps")
+STEPS = 100  # of an episode: little depends on its length
+QUICK = {"task": TASK, "evaluation_episodes": 1, "episode_steps": STEPS}
+SHORT = Run(algorithm="a2c", encoder="dae-8", steps=80, **QUICK)
 
 
 def agent_of(algorithm, preset="paper", encoder="dae-8"):
@@ -43,27 +46,13 @@ def widths(network):
     return [m.out_features for m in network.modules() if isinstance(m, torch.nn.Linear)]
 
 
-def weights(folder):
-    """All that torch saved in a policy's zip file."""
-    with zipfile.ZipFile(folder / "policy.zip") as file:
-        names = [name for name in file.namelist() if name.endswith(".pth")]
-        return {n: torch.load(io.BytesIO(file.read(n)), weights_only=True) for n in names}
-
-
 def assert_same_run(one, other):
-    for name in ("episodes.csv", "evaluations.csv"):
-        assert (one / name).read_bytes() == (other / name).read_bytes()
-    torch.testing.assert_close(weights(one), weights(other), rtol=0, atol=0)
+    for name in ("episodes.csv", "evaluations.csv", "policy.zip"):
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
 
 
 @pytest.fixture(scope="module")
-def episode_steps():
-    with short_episodes() as steps:
-        yield steps
-
-
-@pytest.fixture(scope="module")
-def short(tmp_path_factory, episode_steps):
+def short(tmp_path_factory):
     folder = tmp_path_factory.mktemp("short")
     train(SHORT, folder)
     return folder
@@ -148,37 +137,37 @@ def test_plain_sb3_loads_the_policy_that_was_evaluated(short):
     rows = encoder(np.random.default_rng(0).normal(size=(50, 16)).astype(np.float32))
     expected = plain.predict(rows, deterministic=True)[0]
     np.testing.assert_array_equal(trained.policy.predict(rows, deterministic=True)[0], expected)
-    returns = Evaluator(TASK, trained.encoder, 1).returns(trained.policy)
+    returns = Evaluator(TASK, trained.encoder, 1, episode_steps=STEPS).returns(trained.policy)
     at_end = [e.episode_return for e in read_evaluations(short) if e.step == 80]
     np.testing.assert_allclose(returns, at_end, atol=5e-4)
 
 
-def test_evaluation_is_the_deterministic_policys_return(episode_steps):
+def test_evaluation_is_the_deterministic_policys_return():
     agent = agent_of("ppo")
     encoder = find("dae-8", TASK)
-    lanes = Episodes(TASK, 2)
+    lanes = Episodes(TASK, 2, max_episode_steps=STEPS)
     observation, total = lanes.reset([EVALUATION_SEED, EVALUATION_SEED + 1]), np.zeros(2)
-    for _ in range(episode_steps):
+    for _ in range(STEPS):
         latent = encoder(observation.astype(np.float32))
         outcome = lanes.step(agent.predict(latent, deterministic=True)[0])
         observation, total = outcome.observation, total + outcome.reward
-    evaluator = Evaluator(TASK, encoder, 2)
+    evaluator = Evaluator(TASK, encoder, 2, episode_steps=STEPS)
     for _ in range(2):  # the same episodes each time
         np.testing.assert_allclose(evaluator.returns(agent), total, rtol=1e-5)
 
 
-def test_training_episodes_are_recorded_and_evaluation_leaves_no_trace(tmp_path, episode_steps):
+def test_training_episodes_are_recorded_and_evaluation_leaves_no_trace(tmp_path):
     run = dataclasses.replace(SHORT, steps=880)
     for name, every in (("often", 400), ("never", 10_000)):
         train(dataclasses.replace(run, evaluate_every=every), tmp_path / name)
     often, never = tmp_path / "often", tmp_path / "never"
-    assert (often / "episodes.csv").read_bytes() == (never / "episodes.csv").read_bytes()
-    torch.testing.assert_close(weights(often), weights(never), rtol=0, atol=0)
+    for name in ("episodes.csv", "policy.zip"):
+        assert (often / name).read_bytes() == (never / name).read_bytes()
     steps = [0, 400, 800, 880]
     assert sorted({e.step for e in read_evaluations(often)}) == steps
     rows = [line.split(",") for line in (often / "episodes.csv").read_text().splitlines()[1:]]
     assert [(row[0], row[1], row[3], row[4]) for row in rows] == [
-        ("800", str(lane), f"{episode_steps}", "0") for lane in range(8)
+        ("800", str(lane), f"{STEPS}", "0") for lane in range(8)
     ]
     assert len({row[2] for row in rows}) > 4
 
@@ -196,14 +185,17 @@ def test_the_full_observation_is_scaled_as_encoders_scale_it():
     np.testing.assert_allclose(env.reset(), dae.scaler.scale(plain), rtol=1e-5, atol=1e-6)
 
 
-def test_neither_threads_nor_a_second_time_change_a_bit(short, tmp_path):
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        train(SHORT, tmp_path / "again")
-    finally:
-        torch.set_num_threads(threads)
-    assert_same_run(short, tmp_path / "again")
+def test_neither_threads_nor_clock_nor_process_change_a_bit(short, tmp_path):
+    text = (
+        "import time, torch; from pathlib import Path; from jbrep.rl import Run, train\n"
+        "torch.set_num_threads(2)\n"
+        "for seconds in (0, 1 << 33):\n"  # zip files can't be dated before 1980 or after 2107
+        "    time.time = lambda: seconds\n"
+        f"    train({SHORT!r}, Path({str(tmp_path)!r}, str(seconds)))"
+    )
+    subprocess.run([sys.executable, "-c", text], check=True)
+    for seconds in (0, 1 << 33):
+        assert_same_run(short, tmp_path / str(seconds))
 
 
 def test_another_seed_is_another_run(short, tmp_path):
@@ -212,7 +204,7 @@ def test_another_seed_is_another_run(short, tmp_path):
         assert_same_run(short, tmp_path / "other")
 
 
-def test_a_run_that_is_over_is_left_alone(short):
+def test_a_finished_run_is_left_alone(short):
     before = {p: p.stat().st_mtime_ns for p in short.iterdir()}
     assert train(SHORT, short)["status"] == FINISHED
     with pytest.raises(InputError, match=r"holds another run: seed 0 \(now: 5\)"):
@@ -220,41 +212,61 @@ def test_a_run_that_is_over_is_left_alone(short):
     assert {p: p.stat().st_mtime_ns for p in short.iterdir()} == before
 
 
-def test_mid_episode_the_environment_goes_on_bit_for_bit():
-    drive = np.random.default_rng(0).uniform(-1, 1, (1200, 3, 1))
-    one, other = Episodes(TASK, 3), Episodes(TASK, 3)
+def test_a_run_that_another_process_has_just_finished_is_left_alone(short, tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+
+    @contextmanager
+    def wait_for_another_process(_):
+        shutil.copytree(short, folder, dirs_exist_ok=True)
+        yield
+
+    monkeypatch.setattr("jbrep.rl.run.exclusive", wait_for_another_process)
+    monkeypatch.setattr("jbrep.rl.run._train", lambda *_: pytest.fail("it was trained again"))
+    assert train(SHORT, folder) == read_run(short)
+
+
+def test_the_episodes_of_earlier_versions_had_1000_steps(short, tmp_path):
+    run = json.loads((short / "run.json").read_text())
+    del run["settings"]["episode_steps"]
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    assert train(dataclasses.replace(SHORT, episode_steps=1000), tmp_path)["status"] == FINISHED
+    with pytest.raises(InputError, match=r"another run: episode_steps 1000 \(now: 100\)"):
+        train(SHORT, tmp_path)
+
+
+def test_mid_episode_the_environment_continues_bit_for_bit():
+    drive = np.random.default_rng(0).uniform(-1, 1, (120, 3, 1))
+    one, other = (Episodes(TASK, 3, max_episode_steps=STEPS) for _ in range(2))
     one.reset([1, 2, 3])
     other.reset([7, 8, 9])
-    for action in drive[:700]:
+    for action in drive[:70]:
         one.step(action)
-    arrays, generators = one.state
-    other.restore(arrays, json.loads(json.dumps(generators)))
-    for action in drive[700:]:  # past the episode's end
-        expected, found = one.step(action), other.step(action)
+    state = one.state
+    other.restore(state._replace(generators=json.loads(json.dumps(state.generators))))
+    for action in drive[70:]:  # past the episode's end
+        expected, continued = one.step(action), other.step(action)
         for name in ("observation", "reward", "done", "final_observation"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+            np.testing.assert_array_equal(getattr(continued, name), getattr(expected, name))
 
 
 KILLED = {
-    "ddpg": Run(task=TASK, algorithm="ddpg", encoder="dae-8", steps=300, evaluation_episodes=1),
-    "sac": Run(task=TASK, algorithm="sac", preset="modern", steps=1100, evaluation_episodes=1),
-    "ppo": Run(task=TASK, algorithm="ppo", encoder="dae-4", steps=4096, evaluation_episodes=1),
+    "ddpg": Run(algorithm="ddpg", encoder="dae-8", steps=300, **QUICK),
+    "sac": Run(algorithm="sac", preset="modern", steps=1100, **QUICK),
+    "ppo": Run(algorithm="ppo", encoder="dae-4", steps=4096, **QUICK),
 }
 
 
-def kill(run, folder, episode_steps, checkpoints=2):
-    """Train in another process; kill it when so many have been written."""
+def kill(run, folder, checkpoints=2):
+    """Train in another process; kill it when so many checkpoints have been written."""
     text = (
-        "from functools import partial; from pathlib import Path; from jbrep.envs import sb3;"
-        f"sb3.Episodes = partial(sb3.Episodes, max_episode_steps={episode_steps});"
-        "from jbrep.rl import Run, train;"
+        "from pathlib import Path; from jbrep.rl import Run, train;"
         f"train({run!r}, Path({str(folder)!r}), save_every=0.05)"
     )
     process = subprocess.Popen([sys.executable, "-c", text], stderr=subprocess.PIPE, text=True)
-    seen, checkpoint = set(), folder / "checkpoint.safetensors"
+    seen, path = set(), folder / "checkpoint.safetensors"
     while process.poll() is None and len(seen) < checkpoints:
-        if checkpoint.exists():
-            seen.add(checkpoint.stat().st_mtime_ns)
+        if path.exists():
+            seen.add(path.stat().st_mtime_ns)
         time.sleep(0.005)
     process.kill()
     error = process.communicate()[1]
@@ -262,29 +274,85 @@ def kill(run, folder, episode_steps, checkpoints=2):
 
 
 @pytest.mark.parametrize("algorithm", KILLED)
-def test_a_killed_run_goes_on_to_the_same_bits(algorithm, tmp_path, episode_steps):
+def test_a_killed_run_resumes_to_the_same_bits(algorithm, tmp_path):
     run, folder = KILLED[algorithm], tmp_path / "killed"
-    killed, error = kill(run, folder, episode_steps)
+    killed, error = kill(run, folder)
     assert killed == -signal.SIGKILL, error
-    checkpoint = (folder / "checkpoint.safetensors").read_bytes()
+    written = (folder / "checkpoint.safetensors").read_bytes()
     train(run, folder, save_every=0.05)
-    train(run, tmp_path / "peace")
-    assert_same_run(tmp_path / "peace", folder)
+    train(run, tmp_path / "undisturbed")
+    assert_same_run(tmp_path / "undisturbed", folder)
     (tmp_path / "spoilt").mkdir()
     spoilt = tmp_path / "spoilt" / "checkpoint.safetensors"
-    for content in (checkpoint[:-100], b"", pickle.dumps(run), checkpoint):
+    for content in (written[:-100], b"", pickle.dumps(run), written):
         spoilt.write_bytes(content)
-        with pytest.raises(InputError, match=r"checkpoint\.safetensors (is|was)"):
+        with pytest.raises(InputError, match=r"checkpoint\.safetensors (is|belongs)"):
             train(dataclasses.replace(run, seed=9), tmp_path / "spoilt")
+    assert [p.name for p in spoilt.parent.iterdir() if p.suffix] == [spoilt.name]
+
+
+def test_a_run_that_is_asked_to_stop_writes_a_checkpoint_and_resumes_from_there(short, tmp_path):
+    steps = []
+    with pytest.raises(StoppedError, match="stopped after 40 steps"):
+        train(SHORT, tmp_path, lambda step, _: steps.append(step), stop=lambda: steps[-1] == 40)
+    assert not (tmp_path / "run.json").exists()
+    assert steps[0] == 0
+    train(SHORT, tmp_path, lambda step, _: steps.append(step))
+    assert steps == sorted(steps)
+    assert steps.count(40) == 2  # where it stopped, and where it resumed
+    assert_same_run(short, tmp_path)
+
+
+def test_ctrl_c_stops_the_command_with_a_checkpoint(tmp_path):
+    settings = ("--task", TASK, "--steps", "1M", "--evaluation-episodes", 1, "--out", tmp_path)
+    command = [sys.executable, "-c", "from jbrep.cli import main; main()", "rl"]
+    process = subprocess.Popen(
+        [*command, *map(str, settings)],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+    )
+    while process.poll() is None and not (tmp_path / "tensorboard").exists():
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    lines = process.communicate(timeout=120)[1].splitlines()
+    assert process.returncode == 128 + signal.SIGINT, lines
+    assert any(line.startswith("stopping: writing a checkpoint") for line in lines)
+    told = re.fullmatch(r"stopped after ([\d,]+) steps; the same command resumes it", lines[-1])
+    header = container.read(tmp_path / "checkpoint.safetensors", "checkpoint")[1]
+    assert header["counters"]["num_timesteps"] == int(told[1].replace(",", ""))
+
+
+def test_a_second_signal_ends_the_command_at_once():
+    text = (
+        "import os, signal, time; from jbrep.cli.rl import _stop_signals\n"
+        "with _stop_signals() as received:\n"
+        "    os.kill(os.getpid(), signal.SIGTERM); print(len(received), flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGINT); time.sleep(60)"
+    )
+    process = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
+    assert process.returncode == -signal.SIGINT
+    assert process.stdout == "1\n"
+    assert "Ctrl-C again ends at once" in process.stderr
+
+
+def test_the_rate_after_resuming_counts_the_steps_since():
+    with closing(_Bar(1000, "sac")) as bar:
+        bar.show(500, None)
+        bar.show(600, 1.0)
+        assert (bar._progress.n, bar._progress.initial) == (600, 500)
+    trained, resumed = agent_of("a2c").learn(80), agent_of("a2c").learn(40)
+    checkpoint.restore(resumed, checkpoint.take(trained))
+    assert resumed.num_timesteps == resumed._num_timesteps_at_start == 80
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
-@pytest.mark.parametrize("algorithm", ["ddpg", "sac", "ppo"])
+@pytest.mark.parametrize("algorithm", ["ddpg", "sac", "ppo", "a2c", "trpo"])
 def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
     preset = get_preset("paper", algorithm)
     wild = dataclasses.replace(preset, settings={**preset.settings, "learning_rate": 1e30})
     monkeypatch.setitem(PRESETS["paper"], algorithm, wild)
-    run = Run(task=TASK, algorithm=algorithm, steps=4096, evaluation_episodes=1)
+    run = Run(algorithm=algorithm, steps=4096, **QUICK)
     result = train(run, tmp_path / "wild")
     assert result["status"] == FAILED
     assert "loss is" in result["reason"] or "not finite" in result["reason"]
@@ -293,6 +361,15 @@ def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
     assert train(run, tmp_path / "wild") == result
     with pytest.raises(InputError, match="failed: it has no policy"):
         load_run(tmp_path / "wild")
+
+
+def test_an_error_whose_words_sound_like_divergence_is_not_taken_for_it(tmp_path):
+    def watch(step, mean):
+        raise ValueError("found invalid values: actions are not finite")
+
+    with pytest.raises(ValueError, match="found invalid values"):
+        train(SHORT, tmp_path, watch)
+    assert not (tmp_path / "run.json").exists()
 
 
 class Trap:
@@ -371,9 +448,14 @@ def test_a_zip_file_from_elsewhere_needs_trust(tmp_path):
         ({"preset": "best"}, "unknown preset 'best': choose one of paper, modern"),
         ({"encoder": "dae-9"}, "no encoder 'dae-9'"),
         ({"seed": 2**31}, "the seed is"),
-        ({"steps": 0}, "steps is 0"),
+        ({"steps": 0}, "steps is 0: it must be between 1 and 1,000,000,000,000"),
+        ({"steps": 10**23}, f"steps is {10**23}: it must be between 1 and"),
         ({"evaluate_every": 0}, "evaluate every is 0"),
+        ({"evaluate_every": 10**23}, "evaluate every is 1000"),
         ({"evaluation_episodes": 0}, "evaluation episodes is 0"),
+        ({"evaluation_episodes": 10_001}, "evaluation episodes is 10001: .* 1 and 10,000"),
+        ({"episode_steps": 0}, "episode steps is 0"),
+        ({"episode_steps": 1_000_001}, "episode steps is 1000001"),
     ],
 )
 def test_what_cannot_be_run_is_refused(change, message, tmp_path):

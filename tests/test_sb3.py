@@ -174,7 +174,7 @@ def test_mistakes_are_named():
     class Liar(Halves):
         latent_size = 7
 
-    with pytest.raises(InputError, match=r"gave \(2, 8\) .* latent_size says \(2, 7\)"):
+    with pytest.raises(InputError, match=r"shape \(2, 8\) .* latent_size asks for \(2, 7\)"):
         JitterbugVecEnv("face_direction", 2, encoder=Liar())
     environment = JitterbugVecEnv("face_direction", 2)
     environment.reset()

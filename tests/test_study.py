@@ -83,40 +83,44 @@ def test_a_study_from_toml(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("tasks", "task", "unknown task: must be one of tasks, algorithms"),
+        ("tasks", "task", "unknown task: it must be one of tasks, algorithms"),
         ("face_direction", "fly", "unknown task 'fly'"),
         ('"a2c"', '"dqn"', "unknown algorithm 'dqn'"),
         ('"a2c"', '"a2c-best"', "unknown preset 'best'"),
         ('"pca-8"', '"fit-8"', "unknown kind 'fit'"),
         ('"pca-8"', '"dae-wide-8"', "unknown architecture 'wide'"),
         *(
-            ('"pca-8"', f'"{name}"', f"unknown representation '{name}': must be full, or a kind")
+            ('"pca-8"', f'"{name}"', f"unknown representation '{name}': it must be full, or a kind")
             for name in ("pca", "pca-08", "pca-0", "pca-deep-8", "dae-paper-8", "identity-8")
         ),
         ('"pca-8"', '"full"', "representations is .*each once"),
         ("seeds = 2", "seeds = []", "seeds is .*one or more"),
-        ("seeds = 2", "seeds = 0", r"seeds is 0: must be a list of int, or how many \(1 to 65535"),
-        ("seeds = 2", "seeds = [0.5]", r"seeds is \[0.5\]: must be a list of int"),
-        ("seeds = 2", "seeds = true", "seeds is True: must be a list of int"),
+        (
+            "seeds = 2",
+            "seeds = 0",
+            r"seeds is 0: it must be a list of int, or how many \(1 to 65535",
+        ),
+        ("seeds = 2", "seeds = [0.5]", r"seeds is \[0.5\]: it must be a list of int"),
+        ("seeds = 2", "seeds = true", "seeds is True: it must be a list of int"),
         ("seeds = 2", "seeds = [-1]", "seed"),
         ("steps = 80", "steps = 0", "steps"),
         ("steps = 80", f"steps = {10**23}", "steps"),
         ("evaluate_every = 80", "evaluate_every = 0", "evaluate every"),
         ("steps = 80", "steps = 80\nepisode_steps = 0", "episode steps"),
-        ("steps = 80", "steps = '80'", "steps is '80': must be of type int"),
+        ("steps = 80", "steps = '80'", "steps is '80': it must be of type int"),
         ("steps = 80", "", "steps is missing"),
-        ("steps = 80", "steps = 80\ndata = 7", "data is 7: must be a table"),
+        ("steps = 80", "steps = 80\ndata = 7", "data is 7: it must be a table"),
         ("steps = 80", "steps = 80\ndata = {rows = 7}", "unknown data.rows"),
         ("steps = 80", "steps = 80\ndata = {}", "data must have either steps"),
         ("steps = 80", "steps = 80\ntraining = {epochs = 3}", r"\[data\] is missing"),
         *(
             ("steps = 80", f"steps = 80\ndata = {{steps = 9}}\ntraining = {training}", message)
             for training, message in [
-                ("{depth = 3}", "unknown training.depth: must be one of epochs, "),
+                ("{depth = 3}", "unknown training.depth: it must be one of epochs, "),
                 ("{latent = 3}", "unknown training.latent"),
-                ("{epochs = 'many'}", "training.epochs is 'many': must be of type int"),
+                ("{epochs = 'many'}", "training.epochs is 'many': it must be of type int"),
                 ("{epochs = 0}", "epochs"),
-                ("7", "training is 7: must be a table"),
+                ("7", "training is 7: it must be a table"),
             ]
         ),
         ("steps = 80", "steps 80", "is not valid TOML"),

@@ -1,11 +1,20 @@
 """Training one agent."""
 
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, GOES_ON, example, stoppable
+from jbrep.cli.base import COUNT, example
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 
 
 @click.command(
@@ -16,12 +25,15 @@ from jbrep.cli.base import COUNT, GOES_ON, example, stoppable
     "--algorithm", default="sac", show_default=True, help="ddpg, td3, sac, ppo, a2c or trpo."
 )
 @click.option(
-    "--preset", default="paper", show_default=True, help="Whose settings: paper or modern."
+    "--preset",
+    default="paper",
+    show_default=True,
+    help="Its settings: paper or modern.",
 )
 @click.option(
     "--encoder",
     default="identity",
-    help="A file, or a name that ships; the full observation if not given, scaled the same way.",
+    help="A file, or a shipped encoder's name. Default: the full observation, scaled alike.",
 )
 @click.option("--steps", default=100_000, show_default=True, type=COUNT, help="Control steps.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
@@ -33,7 +45,7 @@ from jbrep.cli.base import COUNT, GOES_ON, example, stoppable
     default=10,
     show_default=True,
     type=COUNT,
-    help="Of the deterministic policy, each time, with starts that training doesn't have.",
+    help="Of the deterministic policy, each time, from starts that training doesn't use.",
 )
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="A folder for this run."
@@ -42,31 +54,72 @@ from jbrep.cli.base import COUNT, GOES_ON, example, stoppable
 def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
     """Train and evaluate one agent.
 
-    It sees the full observation, scaled, or an encoder's latent. Killed or stopped by Ctrl-C, the
-    same command goes on from the last minute's checkpoint, to the same result.
+    It sees the full observation, scaled, or an encoder's latent. A checkpoint is written every
+    minute, and on Ctrl-C before the command ends (td3 takes seconds to get there). The same command
+    resumes from it, to the same result.
     """
-    from jbrep.progress import Progress
-    from jbrep.rl import Run, train
-    from jbrep.rl.files import EVALUATIONS, read_evaluations
+    with _stop_signals() as received:
+        from jbrep.rl import Run, StoppedError, train
+        from jbrep.rl.files import EVALUATIONS, read_evaluations
 
-    run = Run(**settings)
-    run.check()
-    with (
-        stoppable(GOES_ON),
-        Progress(
-            total=run.steps, desc=f"{run.algorithm} on {run.encoder}", unit="step", delay=0.5
-        ) as progress,
-    ):
-
-        def watch(step: int, mean: float | None) -> None:
-            progress.update(step - progress.n)
-            progress.set_postfix(evaluation="-" if mean is None else f"{mean:.0f}", refresh=False)
-
-        result = train(run, out, watch)
+        run = Run(**settings)
+        run.check()
+        try:
+            with closing(_Bar(run.steps, f"{run.algorithm} on {run.encoder}")) as bar:
+                result = train(run, out, bar.show, stop=lambda: bool(received))
+        except StoppedError as error:
+            click.echo(f"{error}; the same command resumes it", err=True)
+            context.exit(128 + received[0])  # as a shell reports a command that a signal ended
     if "reason" in result:
-        click.echo(f"the run failed: {result['reason']}; {out / 'run.json'} keeps it", err=True)
+        click.echo(f"the run failed: {result['reason']}; see {out / 'run.json'}", err=True)
         context.exit(1)
     rows = read_evaluations(out)
     returns = ", ".join(f"{e.episode_return:.0f}" for e in rows if e.step == rows[-1].step)
     name = result["settings"]["representation"]
-    click.echo(f"returns on {name} at the end: {returns}; {out / EVALUATIONS} has those before")
+    click.echo(f"returns on {name} at the end: {returns}; all evaluations: {out / EVALUATIONS}")
+
+
+class _Bar:
+    """A progress bar that starts at the step from which the run starts or resumes."""
+
+    def __init__(self, steps: int, name: str):
+        self._steps, self._name = steps, name
+        self._progress: Any = None
+
+    def show(self, step: int, mean: float | None) -> None:
+        """Show the steps so far and the mean return of the last evaluation."""
+        from jbrep.progress import Progress
+
+        if self._progress is None:
+            self._progress = Progress(
+                total=self._steps, initial=step, desc=self._name, unit="step", delay=0.5
+            )
+        self._progress.update(step - self._progress.n)
+        evaluation = "-" if mean is None else f"{mean:.0f}"
+        self._progress.set_postfix(evaluation=evaluation, refresh=False)
+
+    def close(self) -> None:
+        """End the bar's line."""
+        if self._progress is not None:
+            self._progress.close()
+
+
+@contextmanager
+def _stop_signals() -> Iterator[list[int]]:
+    """The signals received so far, Ctrl-C or SIGTERM; the second ends the process at once."""
+    received: list[int] = []
+
+    def receive(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        for each in _SIGNALS:
+            signal.signal(each, signal.SIG_DFL)
+        if sys.stderr is not None:  # written directly: Python's streams may be in use right now
+            with suppress(OSError, ValueError):
+                os.write(sys.stderr.fileno(), _STOPPING)
+
+    before = [signal.signal(number, receive) for number in _SIGNALS]
+    try:
+        yield received
+    finally:
+        for number, handler in zip(_SIGNALS, before, strict=True):
+            signal.signal(number, handler)

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import mse_loss
 from torch.optim import Adam
 
+from jbrep.dae.adam import allocate_adam_state
 from jbrep.dae.gradient import Gradient
 from jbrep.dae.network import Autoencoder, get_architecture
 from jbrep.errors import InputError
@@ -176,7 +177,7 @@ class Trainer:
         self._gradient = Gradient(modules, self._batch_size)
         self.optimiser = Adam(self.network.parameters(), training.learning_rate, fused=True)
         self._decay = architecture.decay
-        self._begin_optimiser()
+        allocate_adam_state(self.optimiser)
         self.history: list[Epoch] = []
 
     @property
@@ -211,15 +212,6 @@ class Trainer:
         if all(train_loss < epoch.train_loss for epoch in self.history):
             self.best = _copy(self.network)
         self.history.append(Epoch(train_loss, test_loss))
-
-    def _begin_optimiser(self) -> None:
-        """Create the state that Adam creates at its first step, for a checkpoint to fill."""
-        for p in self.network.parameters():
-            self.optimiser.state[p] = {
-                "step": torch.zeros((), device=p.device),
-                "exp_avg": torch.zeros_like(p),
-                "exp_avg_sq": torch.zeros_like(p),
-            }
 
     def _learning_rate(self, number: int, batch: int) -> float:
         if not self._decay:

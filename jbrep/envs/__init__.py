@@ -1,6 +1,6 @@
-"""The Jitterbug's tasks as environments: Gymnasium's, and stable-baselines3's.
+"""The Jitterbug's tasks as environments for Gymnasium and for stable-baselines3.
 
-Each is loaded when it is first asked for, so that Gymnasium's need no torch.
+Each class is imported on first use, so that Gymnasium's need no torch.
 """
 
 from importlib import import_module

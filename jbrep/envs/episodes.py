@@ -1,6 +1,6 @@
-"""Episodes on many lanes: seeds, time limit, and reset in the step that ends an episode."""
+"""Episodes in many lanes: seeds, time limit, and reset in the step that ends an episode."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +12,9 @@ from jbrep.jitterbug.tasks import EPISODE_STEPS, Array, get_task
 
 
 class Outcome(NamedTuple):
-    """What a step gave in each of n lanes; the arrays are to be read, not written."""
+    """The result of one step in each of n lanes; treat the arrays as read-only."""
 
-    observation: Array  # (n, d) the next episode's first where one ended
+    observation: Array  # (n, d) the first of the next episode where one ended
     reward: Array  # (n,) 0 where the physics diverged
     done: NDArray[np.bool_]  # (n,)
     ended: list[int]  # the lanes where done
@@ -22,11 +22,24 @@ class Outcome(NamedTuple):
     final_observation: Array  # (n, d) before any reset; the last finite one where it diverged
 
 
-class Episodes:
-    """Endless episodes of a task in n lanes, each lane with a generator of its own.
+class LaneState(NamedTuple):
+    """Everything that decides how n lanes continue."""
 
-    An episode ends at the time limit or when its physics diverges. Neither is the robot's doing,
-    so both truncate and none terminates.
+    arrays: dict[str, Array]  # (n, ...) each
+    generators: list[Any]  # the state of each lane's random generator, as plain JSON
+
+
+class Episodes:
+    """Endless episodes of a task in n lanes, each lane with a random generator of its own.
+
+    An episode ends at the time limit or when its physics diverges. Both truncate it; no state of
+    the robot terminates an episode.
+
+    Args:
+        task: a key of `jbrep.jitterbug.tasks.TASKS`.
+        num_envs: n.
+        num_threads: threads to step the lanes on; None takes one for each core.
+        max_episode_steps: the time limit [control steps].
 
     Raises:
         InputError: unknown task, or a number below 1.
@@ -47,22 +60,27 @@ class Episodes:
         self.simulation = Simulation(self.task, num_envs, num_threads)
         self._max_steps = max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._randoms = [np.random.default_rng() for _ in range(num_envs)]
+        self._generators = [np.random.default_rng() for _ in range(num_envs)]
         self._observation = np.zeros((num_envs, self.task.size))
 
     def reset(self, seeds: Sequence[int | None]) -> Array:
-        """Start anew in every lane; a seed of None goes on with the lane's generator."""
+        """Start an episode in every lane; a lane whose seed is None keeps its generator.
+
+        Returns:
+            The first observations in physical units, (n, d).
+        """
         for lane, seed in enumerate(seeds):
             if seed is not None:
-                self._randoms[lane] = np.random.default_rng(seed)
+                self._generators[lane] = np.random.default_rng(seed)
         self._restart(range(self.simulation.num_lanes))
         return self._observation
 
     def step(self, actions: ArrayLike) -> Outcome:
-        """One control step in every lane.
+        """Take one control step in every lane.
 
         Raises:
-            InputError: actions of another shape than (n, 1), or not finite.
+            InputError: actions of another shape than (n, 1).
+            NonFiniteActionError: actions that are not finite.
         """
         diverged = self.simulation.step(check_actions(actions, self.simulation.num_lanes))
         reward, observation = self.simulation.reward(), self.simulation.observe()
@@ -78,24 +96,23 @@ class Episodes:
         return Outcome(self._observation, reward, done, ended, diverged, observation)
 
     @property
-    def state(self) -> tuple[dict[str, Array], list[Any]]:
-        """What `restore` takes: arrays by name, (n, ...) each, and the generators' states."""
+    def state(self) -> LaneState:
+        """A copy of what `restore` takes."""
         arrays = {**self.simulation.state, "observation": self._observation.copy()}
         arrays["steps"] = self._steps.astype(np.float64)
-        generators = [random.bit_generator.state for random in self._randoms]
-        return arrays, generators
+        return LaneState(arrays, [each.bit_generator.state for each in self._generators])
 
-    def restore(self, arrays: Mapping[str, Array], generators: Sequence[Any]) -> None:
-        """Go on from where `state` was taken, bit for bit."""
-        physics = dict(arrays)
+    def restore(self, state: LaneState) -> None:
+        """Continue from where the state was taken, to the same bits."""
+        physics = dict(state.arrays)
         self._steps[:] = physics.pop("steps")
         self._observation = physics.pop("observation").copy()
-        for random, state in zip(self._randoms, generators, strict=True):
-            random.bit_generator.state = state
+        for generator, words in zip(self._generators, state.generators, strict=True):
+            generator.bit_generator.state = words
         self.simulation.restore(**physics)
 
     def _restart(self, lanes: Sequence[int]) -> None:
-        self.simulation.reset(lanes, [self._randoms[lane] for lane in lanes])
+        self.simulation.reset(lanes, [self._generators[lane] for lane in lanes])
         self._steps[lanes] = 0
         self._observation = self._observation.copy()
         self._observation[lanes] = self.simulation.observe()[lanes]

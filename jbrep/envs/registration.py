@@ -4,7 +4,7 @@ from jbrep.jitterbug.tasks import EPISODE_STEPS, SOLVED_RETURN, TASKS, environme
 
 
 def register() -> None:
-    """Register the five tasks; importing jbrep sees to it as soon as there is a Gymnasium."""
+    """Register the five tasks; with jbrep imported, Gymnasium's own import calls this."""
     import gymnasium
 
     for task in TASKS:

@@ -18,6 +18,10 @@ _NOT_FINITE = slice(
 )
 
 
+class NonFiniteActionError(InputError):
+    """An action is NaN or infinite."""
+
+
 class Simulation:
     """n Jitterbugs in n lanes; what a lane does depends on its own start and actions alone.
 
@@ -151,7 +155,8 @@ def check_actions(actions: ArrayLike, num_lanes: int) -> Array:
     """The actions as (num_lanes, 1) float64.
 
     Raises:
-        InputError: another shape, or a value that is not finite.
+        InputError: another shape.
+        NonFiniteActionError: a value that is not finite.
     """
     checked: Array = np.asarray(actions, dtype=np.float64)
     if checked.shape != (num_lanes, 1):
@@ -160,5 +165,7 @@ def check_actions(actions: ArrayLike, num_lanes: int) -> Array:
             "in [-1, 1] for each robot"
         )
     if not np.isfinite(checked).all():
-        raise InputError(f"actions are not finite: {checked.ravel()}; they must be in [-1, 1]")
+        raise NonFiniteActionError(
+            f"actions are not finite: {checked.ravel()}; they must be in [-1, 1]"
+        )
     return checked

@@ -1,16 +1,18 @@
 """Reinforcement learning on a representation: one run, its files, its checkpoint."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jbrep.rl.checkpoint import StoppedError
     from jbrep.rl.run import Run, train
 
-__all__ = ["Run", "train"]
+__all__ = ["Run", "StoppedError", "train"]
+
+_MODULES = {"Run": "run", "StoppedError": "checkpoint", "train": "run"}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from jbrep.rl import run  # brings torch
-
-    return getattr(run, name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)  # imports torch

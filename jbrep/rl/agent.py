@@ -1,5 +1,7 @@
-"""A stable-baselines3 agent from a preset, and how well its policy does."""
+"""A stable-baselines3 agent from a preset, and the evaluation of its policy."""
 
+from collections.abc import Iterator
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -10,28 +12,35 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecMonitor
 
+from jbrep.dae.adam import allocate_adam_state
 from jbrep.encoders import Encoder
 from jbrep.envs.sb3 import JitterbugVecEnv
+from jbrep.jitterbug.tasks import EPISODE_STEPS
 from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rl.presets import ALGORITHMS, Preset
 
 
-def make_env(task: str, num_envs: int, seed: int, encoder: Encoder) -> VecMonitor:
-    """Jitterbugs seen through an encoder, on one thread."""
-    return VecMonitor(JitterbugVecEnv(task, num_envs, seed, encoder, num_threads=1))
+def make_env(
+    task: str, num_envs: int, seed: int, encoder: Encoder, episode_steps: int = EPISODE_STEPS
+) -> VecMonitor:
+    """Jitterbugs seen through an encoder, stepped on one thread."""
+    env = JitterbugVecEnv(
+        task, num_envs, seed, encoder, num_threads=1, max_episode_steps=episode_steps
+    )
+    return VecMonitor(env)
 
 
 def training_seed(seed: int) -> int:
-    """The environment's seed in the run of that seed: lanes of different runs share none."""
+    """The environment's seed in the run with this seed: no two runs share a lane's seed."""
     return int(np.random.SeedSequence(seed).generate_state(1)[0]) >> 1
 
 
 def make_agent(algorithm: str, preset: Preset, env: VecMonitor, seed: int) -> BaseAlgorithm:
-    """An agent that hasn't learned yet, on the CPU."""
+    """An untrained agent on the CPU, with its optimisers' state allocated."""
     settings: dict[str, Any] = {**preset.settings}
     if preset.noise:
         settings["action_noise"] = preset.noise.make()
-    return ALGORITHMS[algorithm](
+    agent = ALGORITHMS[algorithm](
         "MlpPolicy",
         env,
         seed=seed,
@@ -43,20 +52,38 @@ def make_agent(algorithm: str, preset: Preset, env: VecMonitor, seed: int) -> Ba
         },
         **settings,
     )
+    for _, part in trained_parts(agent):
+        if isinstance(part, torch.optim.Optimizer):
+            allocate_adam_state(part)
+    return agent
+
+
+def trained_parts(agent: BaseAlgorithm) -> Iterator[tuple[str, Any]]:
+    """The modules and optimisers that training changes, by stable-baselines3's names for them."""
+    names, _ = agent._get_torch_save_params()
+    return ((name, attrgetter(name)(agent)) for name in names)
 
 
 class Evaluator:
-    """Runs deterministic policies on the same episodes each time.
+    """Plays deterministic policies, in the same episodes each time.
 
     Args:
         task: a key of TASKS.
-        encoder: what the policy sees through.
-        episodes: how many.
-        seed: of the first; the others follow.
+        encoder: the policy's view of the observation.
+        episodes: the number of episodes.
+        seed: of the first episode; the others take the numbers that follow.
+        episode_steps: the length of an episode [control steps].
     """
 
-    def __init__(self, task: str, encoder: Encoder, episodes: int, seed: int = EVALUATION_SEED):
-        self._env = make_env(task, episodes, seed, encoder)
+    def __init__(
+        self,
+        task: str,
+        encoder: Encoder,
+        episodes: int,
+        seed: int = EVALUATION_SEED,
+        episode_steps: int = EPISODE_STEPS,
+    ):
+        self._env = make_env(task, episodes, seed, encoder, episode_steps)
         self._seed = seed
 
     def returns(self, policy: BasePolicy | BaseAlgorithm) -> NDArray[np.float64]:

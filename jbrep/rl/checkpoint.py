@@ -1,92 +1,162 @@
-"""Where a run has got to, in a file that runs nothing when it is read."""
+"""The checkpoint of a run, in a file that can't run code when it is read."""
 
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
 
-from jbrep.errors import InputError, differences
+from jbrep.envs.episodes import LaneState
+from jbrep.envs.sb3 import JitterbugVecEnv
+from jbrep.errors import DamageError, InputError, differences
 from jbrep.files import container
 from jbrep.files.container import Tensors
+from jbrep.files.storage import exists
+from jbrep.rl.agent import trained_parts
+from jbrep.rl.recorder import History
 
 _MAX_BYTES = 1 << 34
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 _ROLLOUT = ("_last_obs", "_last_episode_starts")
 _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_MALFORMED = (KeyError, TypeError, ValueError, RuntimeError, IndexError, AttributeError)
 
 
-def save(
-    agent: BaseAlgorithm, record: Mapping[str, Any], identity: Mapping[str, Any], path: Path
-) -> None:
-    """Write all that decides how the run goes on, whole or not at all.
+class StoppedError(Exception):
+    """A run stopped on request, its checkpoint written; `train` resumes it.
+
+    Attributes:
+        step: the training step at which it stopped.
+    """
+
+    def __init__(self, step: int):
+        super().__init__(f"stopped after {step:,} steps")
+        self.step = step
+
+
+class Snapshot(NamedTuple):
+    """Everything that decides how an agent's training continues."""
+
+    tensors: Tensors
+    counters: dict[str, Any]  # plain JSON
+
+
+class Checkpointer(BaseCallback):
+    """Resumes an agent from the run's checkpoint, if there is one, and saves it from time to time.
+
+    It acts between rollouts, where an agent's state is complete, and comes after the callbacks
+    that add to the history.
 
     Args:
-        agent: between two rollouts.
-        record: what else to keep: plain JSON.
-        identity: what must be equal for the run to go on: plain JSON.
-        path: the file.
-    """
-    tensors, counters = _state(agent)
-    header = {"identity": identity, "record": record, "counters": counters}
-    container.write(path, {k: np.asarray(v, order="C") for k, v in tensors.items()}, header)
-
-
-def restore(agent: BaseAlgorithm, identity: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Bring an agent that begins to learn to where the file's was.
-
-    Returns:
-        The record that was kept.
+        path: the checkpoint.
+        identity: settings and versions as plain JSON, which must be equal for a run to resume.
+        history: saved with the agent, and continued from the checkpoint.
+        save_every: seconds between checkpoints.
+        stop: whether to save and stop now.
 
     Raises:
-        InputError: the file is damaged, or of other settings or versions.
+        InputError: the checkpoint is damaged, or of other settings or versions.
+        StoppedError: (in training) `stop` said so.
     """
-    tensors, header = container.read(path, "checkpoint", _MAX_BYTES)
-    try:
-        differing = differences(dict(header["identity"]), identity)
-        if not differing:
-            _restore(agent, tensors, header["counters"])
-            return dict(header["record"])
-    except (KeyError, TypeError, ValueError, RuntimeError, IndexError):
-        raise InputError(f"{path} is damaged: delete it to begin anew") from None
-    raise InputError(
-        f"{path} was begun otherwise: {differing}; take another folder, or delete it to begin anew"
-    )
+
+    def __init__(
+        self,
+        path: Path,
+        identity: Mapping[str, Any],
+        history: History,
+        save_every: float,
+        stop: Callable[[], bool],
+    ):
+        super().__init__()
+        self._path, self._identity, self._history = path, identity, history
+        self._save_every, self._stop = save_every, stop
+        self._snapshot = self._read() if exists(path) else None
+        self._saved = time.monotonic()
+
+    def _on_training_start(self) -> None:
+        if self._snapshot:
+            try:
+                restore(self.model, self._snapshot)
+            except _MALFORMED:
+                raise self._damaged() from None
+            self._snapshot = None  # a replay buffer can be large
+
+    def _on_rollout_start(self) -> None:
+        stopping = self._stop()
+        if stopping or time.monotonic() - self._saved >= self._save_every:
+            self._write()
+            self._saved = time.monotonic()
+        if stopping:
+            raise StoppedError(self.model.num_timesteps)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _read(self) -> Snapshot:
+        tensors, header = container.read(self._path, "checkpoint", _MAX_BYTES)
+        try:
+            differing = differences(dict(header["identity"]), self._identity)
+            if not differing:
+                counters = dict(header["counters"])
+                self._history.resume(header["record"], int(counters["num_timesteps"]))
+                return Snapshot(tensors, counters)
+        except _MALFORMED:
+            raise self._damaged() from None
+        raise InputError(
+            f"{self._path} belongs to another configuration: {differing}; choose another folder, "
+            "or delete the file to start over"
+        )
+
+    def _write(self) -> None:
+        tensors, counters = take(self.model)
+        header = {
+            "identity": self._identity,
+            "record": self._history.as_json(),
+            "counters": counters,
+        }
+        contiguous = {name: np.asarray(values, order="C") for name, values in tensors.items()}
+        container.write(self._path, contiguous, header)
+
+    def _damaged(self) -> DamageError:
+        return DamageError(f"{self._path} is damaged: delete it to start over")
 
 
-def _state(agent: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
-    """Arrays by name, and what JSON holds."""
-    env = _env(agent)
-    physics, generators = env.venv.get_attr("episodes")[0].state
+def take(agent: BaseAlgorithm) -> Snapshot:
+    """Take a snapshot of an agent between two rollouts; its tensors share the agent's memory."""
+    monitor, env = _envs(agent)
+    lanes = env.state
     kind, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 draws there
     tensors = {f"parameters.{name}": tensor.numpy() for name, tensor in _parameters(agent)}
-    tensors |= {f"physics.{name}": values for name, values in physics.items()}
-    tensors |= {f"noise.{i}": n.noise_prev for i, n in enumerate(_drifting(agent))}
+    tensors |= {f"physics.{name}": values for name, values in lanes.arrays.items()}
+    tensors |= {f"noise.{i}": n.noise_prev for i, n in enumerate(_drifting_noises(agent))}
     tensors |= {f"rollout.{name}": getattr(agent, name) for name in _ROLLOUT}
-    tensors |= {"returns": env.episode_returns, "lengths": env.episode_lengths}
+    tensors |= {"returns": monitor.episode_returns, "lengths": monitor.episode_lengths}
     tensors |= {"torch": torch.get_rng_state().numpy(), "numpy": np.asarray(keys)}
     counters = {name: getattr(agent, name) for name in _COUNTERS}
     counters |= {
         "numpy": (kind, position, has_gauss, gauss),
-        "generators": generators,
+        "generators": lanes.generators,
         "action_space": agent.action_space.np_random.bit_generator.state,
         "episodes": [{k: float(v) for k, v in e.items()} for e in agent.ep_info_buffer or ()],
     }
     if buffer := _buffer(agent):
         counters["buffer"] = (buffer.pos, buffer.full)
         tensors |= {f"buffer.{name}": values for name, values in _transitions(buffer).items()}
-    return tensors, counters
+    return Snapshot(tensors, counters)
 
 
-def _restore(agent: BaseAlgorithm, tensors: Tensors, counters: Mapping[str, Any]) -> None:
-    """Put back what `_state` took."""
-    env = _env(agent)
+def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
+    """Bring an agent that is set up to learn to where the snapshot was taken."""
+    tensors, counters = snapshot
+    monitor, env = _envs(agent)
     if buffer := _buffer(agent):
         buffer.pos, buffer.full = counters["buffer"]
         for name, values in _transitions(buffer).items():
@@ -94,15 +164,20 @@ def _restore(agent: BaseAlgorithm, tensors: Tensors, counters: Mapping[str, Any]
     with torch.no_grad():
         for name, tensor in _parameters(agent):
             tensor.copy_(torch.from_numpy(tensors[f"parameters.{name}"]))
-    for i, noise in enumerate(_drifting(agent)):
+    for i, noise in enumerate(_drifting_noises(agent)):
         noise.noise_prev = tensors[f"noise.{i}"]
     for name in _ROLLOUT:
         setattr(agent, name, tensors[f"rollout.{name}"])
     for name in _COUNTERS:
         setattr(agent, name, counters[name])
-    env.episode_returns, env.episode_lengths = tensors["returns"], tensors["lengths"]
-    physics = {n.removeprefix("physics."): v for n, v in tensors.items() if "physics." in n}
-    env.venv.get_attr("episodes")[0].restore(physics, counters["generators"])
+    agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that TensorBoard shows
+    monitor.episode_returns, monitor.episode_lengths = tensors["returns"], tensors["lengths"]
+    physics = {
+        name.removeprefix("physics."): values
+        for name, values in tensors.items()
+        if name.startswith("physics.")
+    }
+    env.restore(LaneState(physics, counters["generators"]))
     assert agent.ep_info_buffer is not None
     agent.ep_info_buffer.extend(counters["episodes"])
     agent.action_space.np_random.bit_generator.state = counters["action_space"]
@@ -111,9 +186,12 @@ def _restore(agent: BaseAlgorithm, tensors: Tensors, counters: Mapping[str, Any]
     np.random.set_state((kind, tensors["numpy"], *rest))  # noqa: NPY002
 
 
-def _env(agent: BaseAlgorithm) -> VecMonitor:
-    assert isinstance(agent.env, VecMonitor)
-    return agent.env
+def _envs(agent: BaseAlgorithm) -> tuple[VecMonitor, JitterbugVecEnv]:
+    monitor = agent.env
+    assert isinstance(monitor, VecMonitor)
+    env = monitor.unwrapped
+    assert isinstance(env, JitterbugVecEnv)
+    return monitor, env
 
 
 def _buffer(agent: BaseAlgorithm) -> ReplayBuffer | None:
@@ -121,28 +199,24 @@ def _buffer(agent: BaseAlgorithm) -> ReplayBuffer | None:
 
 
 def _transitions(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
-    """Views of what is in the buffer."""
+    """Views of the filled part of the buffer."""
     size = buffer.buffer_size if buffer.full else buffer.pos
     return {name: getattr(buffer, name)[:size] for name in _TRANSITIONS}
 
 
-def _drifting(agent: BaseAlgorithm) -> list[OrnsteinUhlenbeckActionNoise]:
-    """The action noise of each lane, if it has a memory."""
+def _drifting_noises(agent: BaseAlgorithm) -> list[OrnsteinUhlenbeckActionNoise]:
+    """The action noise of each lane, where it depends on its last value."""
     noise = getattr(agent, "action_noise", None)
     noises = noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]
     return [n for n in noises if isinstance(n, OrnsteinUhlenbeckActionNoise)]
 
 
 def _parameters(agent: BaseAlgorithm) -> Iterator[tuple[str, torch.Tensor]]:
-    """What gradient steps change: weights, targets, moments; the agent's own tensors."""
-    names, variables = agent._get_torch_save_params()
+    """Everything that gradient steps change: weights, targets, Adam's moments, entropy's weight."""
+    _, variables = agent._get_torch_save_params()
     yield from ((name, getattr(agent, name).data) for name in variables)
-    for name in names:
-        part: Any = agent
-        for word in name.split("."):
-            part = getattr(part, word)
+    for name, part in trained_parts(agent):
         if isinstance(part, torch.optim.Optimizer):
-            begin(part)
             yield from _moments(name, part)
         else:
             yield from ((f"{name}.{key}", t) for key, t in part.state_dict().items())
@@ -153,13 +227,3 @@ def _moments(name: str, optimizer: torch.optim.Optimizer) -> Iterator[tuple[str,
     for i, parameter in enumerate(parameters):
         for key, tensor in optimizer.state[parameter].items():
             yield f"{name}.{i}.{key}", tensor
-
-
-def begin(optimizer: torch.optim.Optimizer) -> None:
-    """Make the state that Adam would make at its first step, where it has none yet."""
-    for group in optimizer.param_groups:
-        for parameter in group["params"]:
-            state = optimizer.state[parameter]
-            state.setdefault("step", torch.zeros(()))
-            state.setdefault("exp_avg", torch.zeros_like(parameter))
-            state.setdefault("exp_avg_sq", torch.zeros_like(parameter))

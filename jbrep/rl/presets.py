@@ -18,24 +18,24 @@ from jbrep.errors import choose
 
 
 class NormalNoise(NamedTuple):
-    """Independent noise on each action, of mean 0."""
+    """Independent Gaussian noise on each action, with mean 0."""
 
     sigma: float
 
     def make(self) -> ActionNoise:
-        """As stable-baselines3 has it."""
+        """The noise as a stable-baselines3 object."""
         return NormalActionNoise(np.zeros(1), np.full(1, self.sigma))
 
 
 class OrnsteinUhlenbeckNoise(NamedTuple):
-    """Noise that drifts back to its mean, from 0 at each episode's start."""
+    """Noise that drifts back to its mean, starting from 0 in each episode."""
 
     mean: float
     sigma: float
     theta: float
 
     def make(self) -> ActionNoise:
-        """As stable-baselines3 has it, a control step being its time unit's hundredth."""
+        """The noise as a stable-baselines3 object, which takes a step for 0.01 units of time."""
         return OrnsteinUhlenbeckActionNoise(
             np.full(1, self.mean), np.full(1, self.sigma), self.theta
         )
@@ -43,13 +43,13 @@ class OrnsteinUhlenbeckNoise(NamedTuple):
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings of an algorithm; stable-baselines3's own hold for what isn't named."""
+    """Settings of an algorithm; those not named keep stable-baselines3's defaults."""
 
-    hidden: tuple[int, ...]  # units of each hidden layer, of actor and of critic, with ReLU
-    settings: Mapping[str, Any]  # what the algorithm's class is given
-    num_envs: int = 1  # robots that learn together
+    hidden: tuple[int, ...]  # units of the hidden layers of actor and critic, with ReLU
+    settings: Mapping[str, Any]  # arguments of the algorithm's class
+    num_envs: int = 1  # robots stepped together
     noise: NormalNoise | OrnsteinUhlenbeckNoise | None = None  # on the actions, in [-1, 1]
-    optimizer: Mapping[str, Any] = field(default_factory=dict)  # of Adam
+    optimizer: Mapping[str, Any] = field(default_factory=dict)  # arguments of Adam
 
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -63,7 +63,7 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
 
 _SHARED = {"learning_rate": 1e-4, "gamma": 0.99}
 _HIDDEN = (350, 250)
-_ON_POLICY = {"eps": 1e-5}  # Adam's, as stable-baselines3 has it for PPO and A2C
+_ON_POLICY = {"eps": 1e-5}  # of Adam, as stable-baselines3 sets it for PPO and A2C
 _PAPER = {
     "ddpg": Preset(
         _HIDDEN,
@@ -134,10 +134,10 @@ PRESETS = {"paper": _PAPER, "modern": _MODERN}
 
 
 def get_preset(preset: str, algorithm: str) -> Preset:
-    """The settings of that name for an algorithm.
+    """The settings of an algorithm in the preset of that name.
 
     Raises:
-        InputError: there is no preset or algorithm of that name; the message lists them.
+        InputError: no preset or algorithm of that name; the message lists them.
     """
     choose(algorithm, ALGORITHMS, "algorithm")
     return choose(preset, PRESETS, "preset")[algorithm]

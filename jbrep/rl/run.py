@@ -1,17 +1,18 @@
 """One training run: task, representation, algorithm, seed."""
 
 import hashlib
-import io
 import platform
-import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
+from torch.distributions import Distribution
 
 from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import FULL, Encoder, find, save
@@ -19,9 +20,10 @@ from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError, differences
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder, write_whole
-from jbrep.jitterbug.tasks import get_task
-from jbrep.rl import checkpoint
+from jbrep.jitterbug.simulation import NonFiniteActionError
+from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
+from jbrep.rl.checkpoint import Checkpointer
 from jbrep.rl.files import (
     CHECKPOINT,
     ENCODER,
@@ -37,12 +39,18 @@ from jbrep.rl.files import (
     write_rows,
     write_run,
 )
+from jbrep.rl.policy_file import policy_zip
 from jbrep.rl.presets import get_preset
-from jbrep.rl.recorder import NotFiniteError, Recorder, Scalars, Watch
+from jbrep.rl.recorder import DivergedError, History, Recorder, Scalars, Watch
 
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
-_MOST_SEED = 1 << 31
-_NOT_FINITE = ("found invalid values", "actions are not finite")
+_MAX_SEED = (1 << 31) - 1
+_LIMITS = {
+    "steps": 10**12,
+    "evaluate_every": 10**12,
+    "evaluation_episodes": 10_000,
+    "episode_steps": 1_000_000,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,31 +64,33 @@ class Run:
     task: str
     algorithm: str = "sac"
     preset: str = "paper"
-    encoder: str = "identity"  # a file, or a name that ships; identity is the full observation
+    encoder: str = "identity"  # a file, or a shipped encoder's name; identity: full observation
     seed: int = 0
     steps: int = 100_000
     evaluate_every: int = 10_000  # steps
     evaluation_episodes: int = 10
-    episode_steps: int = 1000
+    episode_steps: int = EPISODE_STEPS  # control steps in an episode
 
     def __post_init__(self) -> None:
-        for name in ("steps", "evaluate_every", "evaluation_episodes"):
-            if getattr(self, name) < 1:
-                said = name.replace("_", " ")
-                raise InputError(f"{said} is {getattr(self, name)}: a number from 1 is needed")
-        if not 0 <= self.seed < _MOST_SEED:
-            raise InputError(f"the seed is {self.seed}: from 0 to {_MOST_SEED - 1} is needed")
+        for name, limit in _LIMITS.items():
+            if not 1 <= getattr(self, name) <= limit:
+                words = name.replace("_", " ")
+                raise InputError(
+                    f"{words} is {getattr(self, name)}: it must be between 1 and {limit:,}"
+                )
+        if not 0 <= self.seed <= _MAX_SEED:
+            raise InputError(f"the seed is {self.seed}: it must be between 0 and {_MAX_SEED:,}")
 
     def check(self) -> None:
-        """Make sure that it can be run.
+        """Check that the run can start.
 
         Raises:
-            InputError: an unknown task, algorithm or preset, or an encoder that can't be used.
+            InputError: an unknown task, algorithm or preset, or an unusable encoder.
         """
         self.describe(find(self.encoder, get_task(self.task).name))
 
     def describe(self, encoder: Encoder) -> dict[str, Any]:
-        """All that makes two runs the same, as plain JSON.
+        """All settings that two equal runs share, as plain JSON.
 
         Raises:
             InputError: as `check`.
@@ -96,139 +106,141 @@ class Run:
             "steps": self.steps,
             "evaluate_every": self.evaluate_every,
             "evaluation_episodes": self.evaluation_episodes,
+            "episode_steps": self.episode_steps,
         }
 
 
 def train(
-    run: Run, folder: Path, watch: Watch = lambda step, mean: None, save_every: float = 60
+    run: Run,
+    folder: Path,
+    watch: Watch = lambda step, mean: None,
+    save_every: float = 60,
+    stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
-    """Train an agent and write its folder, unless the run is over already.
+    """Train an agent and write its folder, unless the run has ended already.
 
-    A run that was killed goes on from its checkpoint, to the same bits.
+    A run that was killed or stopped resumes from its checkpoint, to the same bits.
 
     Args:
         run: what to train.
         folder: for this run alone.
-        watch: is told the steps so far, and the mean return of the last evaluation.
-        save_every: seconds from one checkpoint to the next.
+        watch: called with the steps so far and the mean return of the last evaluation.
+        save_every: seconds between checkpoints.
+        stop: asked before each rollout; once it is true, the run writes a checkpoint and stops.
 
     Returns:
-        What run.json holds.
+        The contents of run.json.
 
     Raises:
-        InputError: as `Run.check`, or the folder holds another run, or another process writes it.
+        InputError: as `Run.check`; or the folder holds another run, or is in use.
+        StoppedError: `stop` was true.
     """
     encoder = find(run.encoder, get_task(run.task).name)
     settings = plain(run.describe(encoder))
-    if exists(folder / RUN):
-        return _check_same(folder, settings)
+    if ended := _read_ended(folder, settings):
+        return ended
     make_folder(folder)
     with exclusive(folder), single_torch_thread():
-        save(encoder, folder / ENCODER)
-        return _Training(run, encoder, settings, folder, watch, save_every).finish()
+        return _read_ended(folder, settings) or _train(
+            run, encoder, settings, folder, watch, save_every, stop
+        )
 
 
 def plain(value: Any) -> Any:
-    """As JSON gives it back: lists for tuples."""
+    """The value as JSON gives it back: lists for tuples."""
     if isinstance(value, Mapping):
         return {name: plain(v) for name, v in value.items()}
     return [plain(v) for v in value] if isinstance(value, (list, tuple)) else value
 
 
-def _check_same(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
-    there = read_run(folder)
-    if differing := differences(there["settings"], settings):
+def _read_ended(folder: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
+    """The contents of run.json, if the run has ended."""
+    if not exists(folder / RUN):
+        return None
+    result = read_run(folder)
+    before = {"episode_steps": EPISODE_STEPS, **result["settings"]}  # earlier versions had no other
+    if differing := differences(before, settings):
         raise InputError(f"{folder} holds another run: {differing}; choose another folder")
-    return there
+    return result
 
 
-class _Training:
-    """A run under way."""
+def _train(
+    run: Run,
+    encoder: Encoder,
+    settings: dict[str, Any],
+    folder: Path,
+    watch: Watch,
+    save_every: float,
+    stop: Callable[[], bool],
+) -> dict[str, Any]:
+    """The run, from its start or its checkpoint to its end."""
+    versions = {name: version(name) for name in _PACKAGES}
+    history = History()
+    checkpointer = Checkpointer(
+        folder / CHECKPOINT, {**settings, **versions}, history, save_every, stop
+    )
+    save(encoder, folder / ENCODER)  # now that no checkpoint of another run is there
 
-    def __init__(
-        self,
-        run: Run,
-        encoder: Encoder,
-        settings: dict[str, Any],
-        folder: Path,
-        watch: Watch,
-        save_every: float,
-    ):
-        self._settings, self._folder, self._steps = settings, folder, run.steps
-        self._versions = {name: version(name) for name in _PACKAGES}
-        self._before, self._began = 0.0, time.monotonic()  # seconds of earlier processes
-        preset = get_preset(run.preset, run.algorithm)
-        env = make_env(run.task, preset.num_envs, training_seed(run.seed), encoder)
-        self._agent = make_agent(run.algorithm, preset, env, run.seed)
-        evaluator = Evaluator(run.task, encoder, run.evaluation_episodes)
-        self._recorder = Recorder(
-            evaluator, run.evaluate_every, self._begin, watch, self._save, save_every
-        )
+    preset = get_preset(run.preset, run.algorithm)
+    seed = training_seed(run.seed)
+    env = make_env(run.task, preset.num_envs, seed, encoder, run.episode_steps)
+    agent = make_agent(run.algorithm, preset, env, run.seed)
+    agent.set_logger(Logger(None, [Scalars(folder / "tensorboard", history.first_step)]))
 
-    @property
-    def _checkpoint(self) -> Path:
-        return self._folder / CHECKPOINT
+    evaluator = Evaluator(
+        run.task, encoder, run.evaluation_episodes, episode_steps=run.episode_steps
+    )
+    recorder = Recorder(history, evaluator, run.evaluate_every, watch)
+    failure = _learn(agent, run.steps, [recorder, checkpointer])
 
-    @property
-    def _identity(self) -> dict[str, Any]:
-        return {**self._settings, **self._versions}
+    result = {
+        "status": FAILED if failure else FINISHED,
+        **({"reason": failure} if failure else {}),
+        "settings": settings,
+        "steps": agent.num_timesteps,
+        "seconds": history.seconds,
+        "versions": versions,
+        "cpu": _cpu(),
+    }
+    write_rows(folder / EPISODES, history.episodes, Episode)
+    write_rows(folder / EVALUATIONS, history.evaluations, Evaluation)
+    if not failure:
+        policy = policy_zip(agent)
+        write_whole(folder / POLICY, policy)
+        result["policy_sha256"] = hashlib.sha256(policy).hexdigest()
+    write_run(folder, result)  # last: the run has ended where it exists
+    (folder / CHECKPOINT).unlink(missing_ok=True)
+    return result
 
-    @property
-    def _seconds(self) -> float:
-        return round(self._before + time.monotonic() - self._began, 1)
 
-    def finish(self) -> dict[str, Any]:
-        """Learn to the end, and write what came of it."""
-        problem = self._learn()
-        write_rows(self._folder / EPISODES, self._recorder.episodes, Episode)
-        write_rows(self._folder / EVALUATIONS, self._recorder.evaluations, Evaluation)
-        result = {
-            "status": FAILED if problem else FINISHED,
-            **({"reason": problem} if problem else {}),
-            "settings": self._settings,
-            "steps": self._agent.num_timesteps,
-            "seconds": self._seconds,
-            "versions": self._versions,
-            "cpu": _cpu(),
-        }
-        if not problem:
-            content = io.BytesIO()
-            self._agent.save(content)
-            write_whole(self._folder / POLICY, content.getvalue())
-            result["policy_sha256"] = hashlib.sha256(content.getvalue()).hexdigest()
-        write_run(self._folder, result)
-        self._checkpoint.unlink(missing_ok=True)
-        return result
+def _learn(agent: BaseAlgorithm, steps: int, callbacks: Sequence[BaseCallback]) -> str:
+    """Train up to that step; why training failed, or nothing."""
+    try:
+        with _unchecked_distributions():
+            agent.learn(steps, callback=[*callbacks])
+    except DivergedError as error:
+        failure = str(error)
+    except NonFiniteActionError:
+        failure = "the policy's actions are not finite"
+    else:
+        return ""
+    finally:
+        agent.logger.close()
+    return f"{failure} after {agent.num_timesteps:,} steps"
 
-    def _learn(self) -> str:
-        """Learn to the end; what stopped it, if something did."""
-        agent = self._agent
-        try:
-            agent.learn(self._steps, callback=self._recorder)
-        except NotFiniteError as error:
-            problem = str(error)
-        except ValueError as error:  # torch's distributions refuse NaN, as the environment does
-            if not any(words in str(error) for words in _NOT_FINITE):
-                raise
-            problem = "the policy's actions are not finite"
-        else:
-            return ""
-        finally:
-            agent.logger.close()
-        return f"{problem} after {agent.num_timesteps:,} steps"
 
-    def _begin(self) -> None:
-        """Go on from the checkpoint, if there is one."""
-        if exists(self._checkpoint):
-            record = checkpoint.restore(self._agent, self._identity, self._checkpoint)
-            self._before = record.pop("seconds")
-            self._recorder.resume(record)
-        scalars = Scalars(self._folder / "tensorboard", self._agent.num_timesteps)
-        self._agent.set_logger(Logger(None, [scalars]))
+@contextmanager
+def _unchecked_distributions() -> Iterator[None]:
+    """Let NaN through torch's distributions, which would raise a bare ValueError.
 
-    def _save(self) -> None:
-        record = {**self._recorder.record, "seconds": self._seconds}
-        checkpoint.save(self._agent, record, self._identity, self._checkpoint)
+    It then shows in an action, a loss or a weight, each of which is checked.
+    """
+    before = Distribution._validate_args
+    Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        Distribution.set_default_validate_args(before)
 
 
 def _cpu() -> str:

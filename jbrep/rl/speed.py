@@ -1,4 +1,4 @@
-"""How long a run takes, from a short try."""
+"""How long a run takes, estimated from a short trial."""
 
 import time
 from dataclasses import replace
@@ -12,29 +12,28 @@ from jbrep.rl.agent import Evaluator, make_agent, make_env
 from jbrep.rl.presets import ALGORITHMS, get_preset
 from jbrep.rl.run import Run
 
-_LEAST_STEPS = 300
+_MIN_STEPS = 300
 
 
 def estimate(run: Run) -> float:
-    """Seconds that a run takes on one core of this machine, if nothing else is on it."""
+    """Seconds that a run takes on one core of this machine with nothing else running."""
     encoder = find(run.encoder, run.task)
     preset = get_preset(run.preset, run.algorithm)
     settings: dict[str, Any] = {**preset.settings}
     rollout = settings.get("train_freq", settings.get("n_steps", 1) * preset.num_envs)
     if issubclass(ALGORITHMS[run.algorithm], OffPolicyAlgorithm):
-        settings["learning_starts"] = 0  # with gradient steps from the first rollout on
-    agent = make_agent(
-        run.algorithm,
-        replace(preset, settings=settings),
-        make_env(run.task, preset.num_envs, 0, encoder),
-        0,
+        settings["learning_starts"] = 0  # gradient steps from the first rollout on
+    env = make_env(run.task, preset.num_envs, 0, encoder, run.episode_steps)
+    agent = make_agent(run.algorithm, replace(preset, settings=settings), env, 0)
+    evaluator = Evaluator(
+        run.task, encoder, run.evaluation_episodes, episode_steps=run.episode_steps
     )
     with single_torch_thread():
-        began = time.perf_counter()
-        agent.learn(max(rollout, _LEAST_STEPS))
+        started = time.perf_counter()
+        agent.learn(max(rollout, _MIN_STEPS))
         learned = time.perf_counter()
-        Evaluator(run.task, encoder, run.evaluation_episodes).returns(agent)
+        evaluator.returns(agent)
         evaluated = time.perf_counter()
     evaluations = run.steps // run.evaluate_every + 1
-    per_step = (learned - began) / agent.num_timesteps
+    per_step = (learned - started) / agent.num_timesteps
     return run.steps * per_step + evaluations * (evaluated - learned)

@@ -65,7 +65,7 @@ class Representation:
         taken = architecture == USUAL_ARCHITECTURE or "architecture" in settings
         if latent is None or "latent" not in settings or not taken or str(parts) != name:
             raise InputError(
-                f"unknown representation {name!r}: must be {FULL}, or a kind and a latent size, "
+                f"unknown representation {name!r}: it must be {FULL}, or a kind and a latent size, "
                 "such as dae-8, dae-deep-8, pca-8 or random-8"
             )
         return cls(name, kind, _training(latent, architecture, training))
@@ -73,11 +73,11 @@ class Representation:
 
 def _training(latent: int | None, architecture: str, settings: Mapping[str, Any]) -> Training:
     if unknown := [name for name in settings if name not in _TRAINING]:
-        raise InputError(f"unknown training.{unknown[0]}: must be one of {', '.join(_TRAINING)}")
+        raise InputError(f"unknown training.{unknown[0]}: it must be one of {', '.join(_TRAINING)}")
     for name, value in settings.items():
         if type(value) not in _TRAINING[name]:
             kind = _TRAINING[name][0].__name__
-            raise InputError(f"training.{name} is {value!r}: must be of type {kind}")
+            raise InputError(f"training.{name} is {value!r}: it must be of type {kind}")
     return Training.of(latent, architecture, **settings)
 
 
@@ -120,7 +120,7 @@ class Study:
         for name in ("tasks", "algorithms", "representations", "seeds"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
-                raise InputError(f"{name} is {list(values)}: must have one or more, each once")
+                raise InputError(f"{name} is {list(values)}: it must have one or more, each once")
         for task in self.tasks:
             get_task(task)
         for algorithm in self.algorithms:
@@ -166,7 +166,7 @@ def read_study(path: Path) -> Study:
     try:
         given = tomllib.loads(read_regular(path, _MAX_BYTES).decode())
     except FileNotFoundError:
-        raise InputError(f"no study at {path}: must be a TOML file") from None
+        raise InputError(f"no study at {path}: it must be a TOML file") from None
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
@@ -195,9 +195,9 @@ def _checked(kind: Any, given: Any, where: str) -> dict[str, Any]:
     """The given values, if each is known and of its field's type, and none is missing."""
     known = {f.name: f for f in fields(kind)}
     if not isinstance(given, dict):
-        raise InputError(f"{where.rstrip('.')} is {given!r}: must be a table")
+        raise InputError(f"{where.rstrip('.')} is {given!r}: it must be a table")
     if unknown := [name for name in given if name not in known]:
-        raise InputError(f"unknown {where}{unknown[0]}: must be one of {', '.join(known)}")
+        raise InputError(f"unknown {where}{unknown[0]}: it must be one of {', '.join(known)}")
     needed = [n for n, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
     if missing := [name for name in needed if name not in given]:
         raise InputError(f"{where}{missing[0]} is missing")
@@ -211,10 +211,10 @@ def _typed(kind: Any, value: Any, name: str) -> Any:
         items = value if isinstance(value, list) else [None]
         if not all(type(item) is inner for item in items):
             number = f", or how many (1 to {_MOST_SEEDS})" if name == "seeds" else ""
-            raise InputError(f"{name} is {value!r}: must be a list of {inner.__name__}{number}")
+            raise InputError(f"{name} is {value!r}: it must be a list of {inner.__name__}{number}")
         return tuple(items)
     if kind in (int, str) and type(value) is not kind:
-        raise InputError(f"{name} is {value!r}: must be of type {kind.__name__}")
+        raise InputError(f"{name} is {value!r}: it must be of type {kind.__name__}")
     if name == "training" and not isinstance(value, dict):
-        raise InputError(f"training is {value!r}: must be a table")
+        raise InputError(f"training is {value!r}: it must be a table")
     return value

@@ -1,0 +1,58 @@
+"""Writing policy.zip: stable-baselines3's format, with equal bytes for equal runs."""
+
+import io
+import json
+import zipfile
+from typing import Any
+
+import stable_baselines3
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import data_to_json
+
+_OF_THIS_PROCESS = {  # wall times, and where the environment was: `load` starts with defaults
+    "_last_episode_starts",
+    "_last_obs",
+    "_num_timesteps_at_start",
+    "ep_info_buffer",
+    "ep_success_buffer",
+    "start_time",
+}
+
+
+def policy_zip(agent: BaseAlgorithm) -> bytes:
+    """A zip file that the algorithm's `load` takes, as its `save` writes it.
+
+    Unlike there, members carry a fixed date, whatever the clock says, and nothing in them depends
+    on the process or the machine.
+    """
+    names, variables = agent._get_torch_save_params()
+    left_out = {*agent._excluded_save_params(), *_OF_THIS_PROCESS}
+    left_out |= {name.partition(".")[0] for name in (*names, *variables)}
+    data = {name: value for name, value in vars(agent).items() if name not in left_out}
+    members: dict[str, str | bytes] = {
+        "data": _to_json(data),
+        "pytorch_variables.pth": _to_bytes({name: getattr(agent, name) for name in variables}),
+        **{f"{name}.pth": _to_bytes(state) for name, state in agent.get_parameters().items()},
+        "_stable_baselines3_version": stable_baselines3.__version__,
+    }
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as file:
+        for name, member in members.items():
+            file.writestr(zipfile.ZipInfo(name), member)  # dated 1980, the format's first year
+    return content.getvalue()
+
+
+def _to_json(data: dict[str, Any]) -> str:
+    """stable-baselines3's JSON without its notes for human readers, which hold addresses."""
+    stated = json.loads(data_to_json(data))
+    for name, value in stated.items():
+        if isinstance(value, dict) and ":serialized:" in value:
+            stated[name] = {key: value[key] for key in (":type:", ":serialized:")}
+    return json.dumps(stated, indent=4)
+
+
+def _to_bytes(tensors: dict[str, Any]) -> bytes:
+    content = io.BytesIO()
+    torch.save(tensors, content)
+    return content.getvalue()
