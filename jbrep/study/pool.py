@@ -78,7 +78,7 @@ class Pool(Generic[_Job, _Result]):
             worker.connection.send((self._function, arguments))
 
     def result(self) -> tuple[_Job, _Result | None]:
-        """Wait for a job: what it returned, or None if its worker died."""
+        """Wait for a job to end: what it returned, or None if its worker died or was stopped."""
         connection = wait(list(self._busy))[0]
         assert isinstance(connection, Connection)
         worker, job = self._busy.pop(connection)
@@ -115,9 +115,12 @@ def _serve(connection: Connection) -> None:
     signal.signal(signal.SIGTERM, lambda number, frame: _stop.set())
     os.environ.update(_SINGLE_THREADED)
     with suppress(EOFError, OSError):
-        while not _stop.is_set():
+        while True:
             function, arguments = connection.recv()
-            connection.send(function(*arguments))
+            result = function(*arguments)
+            if stop_requested():
+                return
+            connection.send(result)
 
 
 def _end_with_parent() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from jbrep.errors import choose
 from jbrep.study.plan import Cell, Plan
-from jbrep.study.pool import Pool
+from jbrep.study.pool import Pool, stop_requested
 from jbrep.study.progress import say
 from jbrep.study.work import CRASHED, Outcome, work
 
@@ -24,7 +24,7 @@ def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generato
     checkpoints.
     """
     waiting, deaths = deque(cells), Counter[str]()
-    with Pool[Cell, Outcome](work, workers, _announce_stop) as pool:
+    with Pool[Cell, Outcome | None](work, workers, _announce_stop) as pool:
         while waiting or not pool.is_idle:
             while waiting and not pool.is_full:
                 cell = waiting.popleft()
@@ -99,4 +99,4 @@ def get_backend(name: str) -> Backend:
 
 def _job(plan: Plan, cell: Cell) -> tuple[Any, ...]:
     """The arguments of `work`."""
-    return cell.name, plan.run(cell), plan.folder_of(cell)
+    return cell.name, plan.run(cell), plan.folder_of(cell), stop_requested

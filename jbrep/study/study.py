@@ -5,7 +5,7 @@ from contextlib import closing
 from dataclasses import replace
 
 from jbrep.files.lock import exclusive
-from jbrep.rl import train
+from jbrep.rl.run import read_result
 from jbrep.rl.speed import estimate
 from jbrep.study.plan import Cell, Plan
 from jbrep.study.prepare import check, prepare
@@ -30,11 +30,8 @@ def run_study(plan: Plan, backend: Backend, workers: int) -> int:
     with exclusive(plan.folder):
         prepare(plan)
         unfinished = plan.unfinished
-        for cell in plan.cells:  # all errors before the first hour of training
-            if plan.has_ended(cell):
-                train(plan.run(cell), plan.folder_of(cell))
-            else:
-                plan.run(cell).check()
+        for cell in plan.cells:  # so that any mistake shows before the first run
+            read_result(plan.run(cell), plan.folder_of(cell))
         if not unfinished:
             return 0
         statuses = Counter[str]()

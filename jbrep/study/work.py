@@ -2,12 +2,13 @@
 
 import time
 import traceback
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from jbrep.files.storage import make_folder
-from jbrep.rl import Run, train
+from jbrep.rl import Run, StoppedError, train
 
 PROGRESS = "progress"
 ERROR = "error.txt"  # the traceback of a run that crashed
@@ -23,21 +24,30 @@ class Outcome(NamedTuple):
     message: str  # the reason, or how long it took
 
 
-def work(name: str, run: Run, folder: Path) -> Outcome:
+def work(
+    name: str, run: Run, folder: Path, stop: Callable[[], bool] = lambda: False
+) -> Outcome | None:
     """Train; an error is reported in the outcome and stops no other run.
 
     Args:
         name: of the run.
         run: what to train.
         folder: of this run alone.
+        stop: whether to write a checkpoint and stop now.
+
+    Returns:
+        How the run ended; None if it was stopped.
     """
     try:
         make_folder(folder)
-        result = train(run, folder, _ProgressFile(folder))
+        result = train(run, folder, _ProgressFile(folder), stop=stop)
+    except StoppedError:
+        return None
     except Exception as error:
         with suppress(OSError):
             (folder / ERROR).write_text(traceback.format_exc())
-        return Outcome(name, CRASHED, f"{error}; see {folder / ERROR}")
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        return Outcome(name, CRASHED, f"{reason}; see {folder / ERROR}")
     for leftover in (PROGRESS, ERROR):
         (folder / leftover).unlink(missing_ok=True)
     message = result.get("reason", f"{result['seconds'] / 60:.1f} min")
