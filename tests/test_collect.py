@@ -356,7 +356,7 @@ def test_a_signal_ends_it_within_seconds_and_it_says_how_to_go_on(number, tmp_pa
     process.send_signal(number)
     _, told = process.communicate(timeout=5)
     assert process.returncode == 128 + number
-    assert told.endswith("stopped; the same command goes on where it stopped\n")
+    assert told.endswith("stopped; the same command resumes it\n")
     assert not list((tmp_path / "data").glob("*.partial"))
     assert len(Dataset(tmp_path / "data")) > 0
 

@@ -105,7 +105,7 @@ def test_a_stopped_training_goes_on_to_the_same_file(whole, collected, number, t
     told = process.communicate()[1]
     path = out / "dae-4.safetensors"
     assert process.returncode == 128 + number
-    assert f"the same command goes on where it stopped; what is best so far is in {out}" in told
+    assert f"the same command resumes it; what is best so far is in {out}" in told
     kept = load(path).header["metrics"]
     assert 1 <= kept["best_epoch"] <= kept["epochs"] < 30
     assert "dae-4: held-out mean squared error" in jbrep(*command).output

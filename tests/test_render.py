@@ -186,8 +186,8 @@ def test_an_mp4_keeps_what_it_is_given(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--out", "a.avi"), "a.avi has no suffix of a video: .mp4 or .gif is needed"),
-        (("--out", "there.mp4"), "there.mp4 is there already: choose another name"),
+        (("--out", "a.avi"), "a.avi isn't named as a video: the suffix must be .mp4 or .gif"),
+        (("--out", "there.mp4"), "there.mp4 exists already: choose another name"),
         (("--camera", "side"), "unknown camera 'side': choose one of overhead, tracking, ego"),
         (("--size", "640"), "'640' is no size: write it as 640x480"),
         (("--size", "641x480"), "the size is 641x480: both must be even and from 64 to 3840"),
@@ -195,13 +195,13 @@ def test_an_mp4_keeps_what_it_is_given(tmp_path):
         (("--fps", 0), "frames a second: 0, it must be from 1 to 50"),
         (("--speed", "nan"), "speed: nan, it must be from 0.01 to 100"),
         (("--seconds", 11), "simulated seconds: 11, it must be from 0.01 to 10"),
-        (("--episode", 1, "uniform"), "differ in their task or start: side by side go"),
+        (("--episode", 1, "uniform"), "differ in their task or start: only episodes"),
         (("--episode", 4), "has no episode 4: it has 4, from 0"),
         (("nowhere",), "nowhere is no data set, no folder of a run that is over, and no policy"),
         (("--size", "3840x64", *["uniform"] * 2), "are 11,520 pixels wide: at most 7,680"),
         (
             ("--out", "a.gif", "--size", "1920x1080", "--seconds", "10"),
-            "a.gif would have 259,200,000 pixels, at most 200,000,000 go into a .gif",
+            "a.gif would have 259,200,000 pixels: at most 200,000,000 fit into a .gif",
         ),
     ],
 )

@@ -1,4 +1,4 @@
-"""What the commands share: mistakes, Ctrl-C, numbers as people write them."""
+"""What the commands share: how mistakes are shown, Ctrl-C, numbers as people write them."""
 
 import json
 import math
@@ -14,7 +14,7 @@ import click
 from jbrep.cli.output import lasting_output
 from jbrep.errors import InputError
 
-_EXTRAS = {  # what a missing package is installed with
+_EXTRAS = {  # the extra that installs a missing package
     **dict.fromkeys(
         ("jinja2", "joblib", "matplotlib", "rich", "safetensors", "sb3_contrib"), "learn"
     ),
@@ -40,7 +40,7 @@ class _Count(click.ParamType[int]):
     ) -> int:
         number = self._number(value)
         if self._least is not None and number < self._least:
-            self.fail(f"{value!r} is too small: at least {self._least} is needed")
+            self.fail(f"{value!r} is too small: it must be at least {self._least}")
         return number
 
     def _number(self, value: str | int) -> int:
@@ -54,12 +54,12 @@ class _Count(click.ParamType[int]):
         except ValueError:
             number = math.nan
         if not number.is_integer():
-            self.fail(f"{value!r} is no whole number: write it as 5000000, 5_000_000, 5e6 or 5M")
+            self.fail(f"{value!r} isn't a whole number: write it as 5000000, 5_000_000, 5e6 or 5M")
         return int(number)
 
 
 COUNT, POSITIVE = _Count(), _Count(least=1)
-GOES_ON = "the same command goes on where it stopped"
+GOES_ON = "the same command resumes it"
 
 
 class _Mistake(click.ClickException):
@@ -70,13 +70,13 @@ class _Mistake(click.ClickException):
 
 
 def printable(line: str) -> str:
-    """One line that can't steer a terminal, whatever a file's name holds."""
+    """The line without characters that could control a terminal, as names of files may hold."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 @contextmanager
-def stoppable(how_to_go_on: str) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the command between two steps, with a line on how to go on."""
+def stoppable(afterwards: str) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the command, with a line on what follows from that."""
     numbers = (signal.SIGINT, signal.SIGTERM)
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
@@ -86,7 +86,7 @@ def stoppable(how_to_go_on: str) -> Iterator[None]:
     try:
         yield
     except SystemExit:
-        click.echo(f"stopped; {how_to_go_on}", err=True)
+        click.echo(f"stopped; {afterwards}", err=True)
         raise
     finally:
         for number, handler in zip(numbers, before, strict=True):

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Reading and writing files safely: whole or not at all, regular, of bounded size."""
 
 import os
 import shutil
@@ -12,7 +12,7 @@ _PARTIAL = ".partial"
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that it is there with all its bytes, also after a power cut, or not at all.
+    """Write a file atomically: even after a power cut it has all its bytes or doesn't exist.
 
     Raises:
         InputError: it can't be written; the message names it and the bytes that are needed.
@@ -20,7 +20,7 @@ def write_whole(path: Path, content: bytes) -> None:
     partial = path.with_name(path.name + _PARTIAL)
     try:
         partial.unlink(missing_ok=True)
-        with partial.open("xb") as file:  # never through a link that stands there
+        with partial.open("xb") as file:  # never through a link of that name
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -30,7 +30,7 @@ def write_whole(path: Path, content: bytes) -> None:
         _sync_folder(path.parent)
     except OSError as error:
         raise InputError(
-            f"can't write {path}: {error.strerror or error}; {len(content):,} bytes are needed"
+            f"can't write {path}: {error.strerror or error} ({len(content):,} bytes are needed)"
         ) from error
     finally:
         with suppress(OSError):
@@ -38,7 +38,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring a rename to the disk."""
+    """Make a rename in the folder durable."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -47,12 +47,12 @@ def _sync_folder(folder: Path) -> None:
 
 
 def exists(path: str | Path) -> bool:
-    """Whether something is there; False, too, where that can't be told, as of a name too long."""
+    """Whether the path exists; False where the system can't tell, as for a name too long."""
     return os.path.exists(path)  # noqa: PTH110, Path.exists raises there
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, if they aren't there.
+    """Make a folder and its parents unless they exist.
 
     Raises:
         InputError: it can't be made.
@@ -64,26 +64,26 @@ def make_folder(folder: Path) -> None:
 
 
 def check_space(folder: Path, needed: int) -> None:
-    """Make sure that so many bytes are free.
+    """Make sure that enough bytes are free.
 
     Raises:
-        InputError: they aren't.
+        InputError: too few are.
     """
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise InputError(
-            f"no space in {folder}: about {needed:,} bytes are needed, {free:,} are free"
+            f"not enough space in {folder}: about {needed:,} bytes are needed, {free:,} are free"
         )
 
 
 def regular_size(path: Path) -> int:
-    """Bytes of a file; 0 of a link, a pipe or anything else that isn't one."""
+    """The size of a regular file in bytes; 0 of a link, a pipe or anything else."""
     status = path.lstat()
     return status.st_size if stat.S_ISREG(status.st_mode) else 0
 
 
 def read_regular(path: Path, most: int) -> bytes:
-    """A file's bytes; none of something else than a file, or of one that is larger than `most`.
+    """The bytes of a regular file of at most `most` bytes; of anything else, none.
 
     Raises:
         OSError: it can't be read.

@@ -1,4 +1,4 @@
-"""Episodes as a sequence of pictures in time, and its files."""
+"""Films: episodes as a sequence of frames, and their files."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -24,15 +24,15 @@ _WIDEST = 7680  # [pixels]
 
 @dataclass(frozen=True)
 class Pace:
-    """How time goes by in a film.
+    """How fast a film shows simulated time.
 
     Args:
-        fps: frames a second of the film.
-        speed: of the film over that of the simulation.
-        seconds: simulated ones to show, from the start.
+        fps: frames per second of the film.
+        speed: simulated seconds per second of the film.
+        seconds: simulated seconds to show, from the start.
 
     Raises:
-        InputError: one out of range.
+        InputError: a value out of range.
     """
 
     fps: float = 25
@@ -41,25 +41,25 @@ class Pace:
 
     def __post_init__(self) -> None:
         for what, value, (low, high) in (
-            ("frames a second", self.fps, (1, 50)),
+            ("frames per second", self.fps, (1, 50)),
             ("speed", self.speed, _SPEEDS),
             ("simulated seconds", self.seconds, (CONTROL_TIMESTEP, _LONGEST)),
         ):
             if not low <= value <= high:
-                raise InputError(f"{what}: {value:g}, it must be from {low:g} to {high:g}")
+                raise InputError(f"{what} is {value:g}: it must be from {low:g} to {high:g}")
 
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """Episodes side by side; one that ends before the others stands still from there on.
+    """Episodes side by side; one that ends before the others stands still afterwards.
 
     Args:
-        rollouts: the episodes, of one task and with one start.
-        camera: that sees each.
-        pace: how time goes by.
+        rollouts: the episodes, of the same task and from the same start.
+        camera: shows each episode.
+        pace: how fast to show them.
 
     Raises:
-        InputError: episodes that differ in that, or too many for the width.
+        InputError: the tasks or starts differ, or the frames would be too wide.
     """
 
     rollouts: Sequence[Rollout]
@@ -69,25 +69,25 @@ class Film:
     def __post_init__(self) -> None:
         if self.width > _WIDEST:
             raise InputError(
-                f"{len(self.rollouts)} pictures are {self.width:,} pixels wide: at most "
-                f"{_WIDEST:,} go side by side; choose a smaller --size"
+                f"{len(self.rollouts)} pictures side by side are {self.width:,} pixels wide: at "
+                f"most {_WIDEST:,} are possible; choose a smaller --size"
             )
         first = self.rollouts[0]
         for other in self.rollouts[1:]:
             if not _start_alike(first, other):
                 raise InputError(
-                    f"{first.name} and {other.name} differ in their task or start: side by side "
-                    "go episodes that share both, as those of runs and policies of one task do"
+                    f"{first.name} and {other.name} differ in their task or start: only episodes "
+                    "that share both can be shown side by side, as those of policies of one task"
                 )
 
     @property
     def width(self) -> int:
-        """Of a frame [pixels]."""
+        """Width of a frame [pixels]."""
         return len(self.rollouts) * self.camera.width
 
     @property
     def seconds(self) -> float:
-        """That it lasts."""
+        """Length of the film [s]."""
         return len(self) / self.pace.fps
 
     def __len__(self) -> int:
@@ -102,7 +102,7 @@ class Film:
         return np.rint(times / CONTROL_TIMESTEP).astype(int)
 
     def frames(self) -> Iterator[Image.Image]:
-        """The frames, one after the other."""
+        """The frames in order."""
         for state in self.states:
             yield join([self._picture(rollout, state) for rollout in self.rollouts])
 
@@ -118,18 +118,18 @@ class Film:
 
         Args:
             path: the file, .mp4 or .gif.
-            show: a bar, too.
+            show: whether to show progress.
 
         Raises:
-            InputError: another suffix, a file that is there or can't be written, or too much of
-                it for a GIF.
+            InputError: another suffix, the file exists or can't be written, or the film is too
+                long or too large for a GIF.
         """
         form = get_format(path)
         pixels = len(self) * self.width * self.camera.height
         if pixels > form.most_pixels:
             raise InputError(
-                f"{path} would have {pixels:,} pixels, at most {form.most_pixels:,.0f} go into "
-                f"a {path.suffix}: choose a smaller --size or --fps, fewer --seconds, or .mp4"
+                f"{path} would have {pixels:,} pixels: at most {form.most_pixels:,.0f} fit into "
+                f"a {path.suffix} file; choose a smaller --size or --fps, fewer --seconds, or .mp4"
             )
         make_folder(path.parent)
         with (

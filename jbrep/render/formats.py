@@ -13,15 +13,15 @@ from PIL import Image
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
 
-_X264 = {"crf": "18", "preset": "medium"}  # to the eye as good as the frames
-_TICK = 0.01  # in which GIF counts [s]
-_SAMPLES = 8  # frames that a palette is made of
-_COLOURS = 128  # a fifth smaller than with twice as many, and looks the same
+_X264 = {"crf": "18", "preset": "medium"}  # no loss that the eye can see
+_TICK = 0.01  # GIF's unit of time [s]
+_SAMPLES = 8  # frames that the palette is computed from
+_COLOURS = 128  # files are a fifth smaller than with 256, and look the same
 _IN_MEMORY = 2e8  # [pixels], of three bytes
 
 
 class Format(NamedTuple):
-    """A kind of file, and what suits it."""
+    """A file format, with the settings that suit it."""
 
     encode: Callable[[Iterable[Image.Image], Path, float], None]  # frames of one size; fps
     fps: float
@@ -30,7 +30,7 @@ class Format(NamedTuple):
 
 
 def encode_mp4(frames: Iterable[Image.Image], path: Path, fps: float) -> None:
-    """H.264 as browsers play it, from the first byte on."""
+    """H.264 as browsers play it, streamable."""
     import av
     from av.video.reformatter import ColorRange, Colorspace
 
@@ -41,7 +41,7 @@ def encode_mp4(frames: Iterable[Image.Image], path: Path, fps: float) -> None:
         stream = container.add_stream("libx264", rate, options=_X264)
         stream.width, stream.height = first.size
         stream.pix_fmt = "yuv420p"
-        # what the frames are turned into; players guess another where it isn't said
+        # without these two, players guess the colour space, and guess wrong
         stream.codec_context.colorspace = Colorspace.ITU601
         stream.codec_context.color_range = ColorRange.MPEG
         for frame in chain((first,), frames):
@@ -50,10 +50,10 @@ def encode_mp4(frames: Iterable[Image.Image], path: Path, fps: float) -> None:
 
 
 def encode_gif(frames: Iterable[Image.Image], path: Path, fps: float) -> None:
-    """A loop without end, in one palette and undithered: what stands still costs nothing."""
+    """An endless loop with one palette and no dithering, so that still areas compress well."""
     pictures = list(frames)
     samples = [np.asarray(p) for p in pictures[:: -(-len(pictures) // _SAMPLES)]]
-    # by coverage: the robot is small, and counting pixels would leave its colours out
+    # by coverage of the colour space: by counts, the small robot would lose its colours
     together = Image.fromarray(np.concatenate(samples))
     palette = together.quantize(_COLOURS, method=Image.Quantize.MAXCOVERAGE, kmeans=2)
     first, *others = (p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
@@ -69,13 +69,15 @@ FORMATS = {
 
 
 def get_format(path: Path) -> Format:
-    """That of a new video, by its suffix.
+    """The format of a new video, by its suffix.
 
     Raises:
-        InputError: another suffix, or a file that is there.
+        InputError: an unknown suffix, or the file exists.
     """
     if path.suffix.lower() not in FORMATS:
-        raise InputError(f"{path} has no suffix of a video: {' or '.join(FORMATS)} is needed")
+        raise InputError(
+            f"{path} isn't named as a video: the suffix must be {' or '.join(FORMATS)}"
+        )
     if exists(path):
-        raise InputError(f"{path} is there already: choose another name")
+        raise InputError(f"{path} exists already: choose another name")
     return FORMATS[path.suffix.lower()]

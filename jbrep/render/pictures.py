@@ -1,4 +1,4 @@
-"""Pictures: a state as a camera of the model sees it, and a line on it that says what it is."""
+"""Pictures: a state as a camera of the model sees it, with a caption."""
 
 from collections.abc import Sequence
 from typing import Self
@@ -17,29 +17,29 @@ Pixels = NDArray[np.uint8]
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 _SIZES = (64, 3840)  # of a side [pixels]
-# a third less work than the model's own: shadows nearly as fine, over the floor and no further
+# a third less work than the model's own settings, with shadows nearly as fine
 _SHADOW_PIXELS = 4096
-_SHADOW_CONE = 0.4  # of the light's
-_SAMPLES = 4  # of a pixel
+_SHADOW_CONE = 0.4  # share of the light's cone that casts shadows
+_SAMPLES = 4  # per pixel
 
 _BAND = (22, 27, 36, 190)
 _NAME = (255, 255, 255)
 _FACTS = (205, 214, 226)
 _SMALLEST_LETTERS = 12  # [pixels]
 _LETTERS_IN_HEIGHT = 22
-_LINE = 2  # between pictures [pixels]
-_GAP = 0.6  # about the text, in letters
+_LINE = 2  # width of the line between pictures [pixels]
+_GAP = 0.6  # around the text, in heights of a letter
 
 
 class Camera:
-    """A camera of the model; close it when done.
+    """A camera of the model; close it after use.
 
     Args:
         name: overhead, tracking or egocentric.
-        width, height: of its pictures [pixels], even.
+        width, height: of its pictures [pixels], even numbers.
 
     Raises:
-        InputError: no such camera, a size that can't be, or no OpenGL.
+        InputError: no such camera, an invalid size, or no OpenGL.
     """
 
     def __init__(self, name: str = "tracking", width: int = 640, height: int = 480):
@@ -82,7 +82,7 @@ class Camera:
 
 
 def join(pictures: Sequence[Image.Image]) -> Image.Image:
-    """Pictures of one size side by side, a line between them."""
+    """Pictures of the same size side by side, separated by lines."""
     width, height = pictures[0].size
     joined = Image.new("RGB", (width * len(pictures), height))
     draw = ImageDraw.Draw(joined)
@@ -94,12 +94,12 @@ def join(pictures: Sequence[Image.Image]) -> Image.Image:
 
 
 def band_height(height: int) -> int:
-    """Of the caption on a picture of that height [pixels]."""
+    """Height of the caption on a picture of that height [pixels]."""
     return round(_letters(height) * (1 + 2 * _GAP))
 
 
 def add_caption(picture: Image.Image, name: str, facts: str) -> None:
-    """Draw a band with a name on the left, cut from its front to fit, and facts on the right."""
+    """Draw a caption: the name on the left, shortened at its front to fit, facts on the right."""
     letters, height = _letters(picture.height), band_height(picture.height)
     font, gap = ImageFont.load_default(letters), _GAP * letters
     draw = ImageDraw.Draw(picture, "RGBA")
@@ -115,7 +115,7 @@ def _letters(height: int) -> int:
 
 
 def _cut(name: str, font: _Font, room: float) -> str:
-    """The end of a name that fits, of a path in whole parts if it can be."""
+    """As much of the end of a name as fits; of a path, whole parts if possible."""
     parts = [start for start, letter in enumerate(name) if letter == "/"]
     ends = (f"…{name[start:]}" for start in (*parts, *range(1, len(name))))
     return next((end for end in (name, *ends) if font.getlength(end) <= room), "")
