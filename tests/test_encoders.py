@@ -4,6 +4,7 @@ import io
 import json
 import os
 import pickle
+import re
 import struct
 import time
 from dataclasses import replace
@@ -17,7 +18,7 @@ import torch
 
 from jbrep.dataset import DamageError, Scaler
 from jbrep.encoders import Encoder, Layer, find, load, save, shipped
-from jbrep.encoders.card import card
+from jbrep.encoders.card import card, describe
 from jbrep.encoders.file import fingerprint
 from jbrep.encoders.onnx import export
 from jbrep.encoders.shipped import names, source_of
@@ -345,11 +346,25 @@ def test_onnx_gives_what_torch_gives(encoder, rows, tmp_path):
         export(encoder, tmp_path / "it.onnx")
 
 
-def test_the_card_tells_layers_and_ranges(encoder):
-    text = card(encoder)
+def test_the_card_tells_layers_and_ranges_and_fits_the_terminal(encoder):
+    text = card(encoder, "encoders/dae-3.safetensors", 80)
     assert "16 -> 5 relu -> 3 tanh" in text
-    assert "sha256     " + fingerprint(encoder) in text
-    assert text.count("\n") > 16
+    assert "encoders/dae-3.safetensors" in text
+    assert fingerprint(encoder) in text
+    assert re.search(r"motor_velocity +-15 +17", text)
+    for name in ("dae-8", "full"):
+        lines = card(find(name, TASK.name), f"{name}, shipped", 80).splitlines()
+        assert max(map(len, lines)) <= 80
+
+
+def test_the_card_as_json_has_the_same(encoder):
+    told = json.loads(json.dumps(describe(encoder, "here")))
+    assert told["encoder"] == [
+        {"units": 5, "activation": "relu"},
+        {"units": 3, "activation": "tanh"},
+    ]
+    assert told["features"][13] == {"name": TASK.feature_names[13], "low": -14, "high": 16}
+    assert (told["source"], told["sha256"]) == ("here", fingerprint(encoder))
 
 
 @pytest.mark.parametrize("task", TASKS)

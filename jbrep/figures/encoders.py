@@ -1,6 +1,6 @@
 """Figures of encoders, from their evaluation."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from jbrep.encoders import FULL
+from jbrep.encoders.encoder import IDENTITY
 from jbrep.figures.curves import below
 from jbrep.figures.plot import Plot
 from jbrep.figures.style import COLUMN, PAGE, ink, plain, reference, styles
@@ -19,13 +20,13 @@ _ERROR = ("mse", "low", "high")
 
 
 def encoder_plots(evaluation: Mapping[str, Any]) -> list[Plot]:
-    """What encoders lose, how they stand noise, and how their units hang together.
+    """What encoders lose, how they cope with noise, and how their latent units correlate.
 
-    Error against size and against noise need an encoder whose latent is smaller than the
+    Errors against latent size and against noise are drawn if a latent is smaller than the
     observation.
 
     Args:
-        evaluation: what jbrep.evaluate.evaluate returned, or its JSON.
+        evaluation: what jbrep.evaluate.diagnose returned, or its JSON.
     """
     task = evaluation["data"]["task"]
     encoders = {label: e for label, e in evaluation["encoders"].items() if label != FULL}
@@ -42,10 +43,10 @@ def _sizes(encoders: Encoders) -> list[int]:
 
 
 def _error_by_feature(task: str, encoders: Encoders) -> Plot:
-    """R^2 of each feature (rows) by encoder (columns)."""
+    """R^2 of each feature (rows) for each encoder (columns)."""
     return Plot(
         "error_by_feature",
-        f"{task}: what comes back of each feature",
+        f"{task}: reconstruction of each feature",
         "R² of each feature's reconstruction on held-out episodes.",
         ("encoder", "feature", "r2", "low", "high"),
         [
@@ -73,13 +74,13 @@ def _draw_features(task: str, encoders: Encoders) -> Figure:
     axes.set_yticks(range(len(features)), [f["name"] for f in features])
     axes.set_xticks(range(len(encoders)), [plain(n) for n in encoders], rotation=60, ha="right")
     _bare(axes)
-    axes.set_title(f"{task}: what comes back of each feature")
+    axes.set_title(f"{task}: reconstruction of each feature")
     figure.colorbar(picture, label="R² on held-out episodes")
     return figure
 
 
 def _bare(axes: Axes) -> None:
-    """As a matrix stands best."""
+    """Remove what a matrix doesn't need."""
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
@@ -105,13 +106,10 @@ def _draw_sizes(task: str, encoders: Encoders) -> Figure:
     figure = Figure(figsize=(COLUMN, 2.9))
     axes: Axes = figure.subplots()
     sizes = _sizes(encoders)
-    for family, style in _families(encoders).items():
-        points = {
-            size: encoders[f"{family}-{size}"]["reconstruction"]["mse"]
-            for size in sizes
-            if f"{family}-{size}" in encoders
-        }
-        _draw_errors(axes, points, label=plain(family), **style)
+    families = _families(encoders)
+    for name, style in _styles(families).items():
+        points = {size: e["reconstruction"]["mse"] for size, e in sorted(families[name].items())}
+        _draw_errors(axes, points, label=plain(name), **style)
     pca = {e["latent"]: e["reconstruction"]["pca_mse"][0] for e in encoders.values()}
     axes.plot(sizes, [pca[size] for size in sizes], label="PCA", **reference())
     axes.set(xlabel="latent size l", ylabel="mean squared error", yscale="log", xticks=sizes)
@@ -122,13 +120,13 @@ def _draw_sizes(task: str, encoders: Encoders) -> Figure:
 
 
 def _error_by_corruption(task: str, encoders: Encoders) -> Plot:
-    """Error from corrupted rows to clean ones, a panel for each latent size."""
+    """Error in restoring clean rows from corrupted ones, a panel for each latent size."""
     return Plot(
         "error_by_corruption",
         f"{task}: does denoising denoise?",
-        "Mean squared error from corrupted observations to the clean ones, against the standard "
-        "deviation of the noise. Dashed: the best linear denoiser of that size; dotted: the "
-        "corrupted input itself.",
+        "Mean squared error of clean observations reconstructed from corrupted ones, against the "
+        "standard deviation of the noise. Dashed: the best linear denoiser of that size; dotted: "
+        "the corrupted input itself.",
         ("encoder", "latent", "noise", *_ERROR, "linear_mse", "input_mse"),
         [
             (label, e["latent"], c["noise"], *c["mse"], c["linear_mse"][0], c["input_mse"])
@@ -143,18 +141,19 @@ def _draw_corruption(task: str, encoders: Encoders) -> Figure:
     sizes = _sizes(encoders)
     figure = Figure(figsize=(COLUMN if len(sizes) == 1 else PAGE, 2.6))
     panels = figure.subplots(1, len(sizes), sharey=True, squeeze=False)[0]
+    families = _families(encoders)
     for axes, size in zip(panels, sizes, strict=True):
-        for family, style in _families(encoders).items():
-            if f"{family}-{size}" in encoders:
-                levels = encoders[f"{family}-{size}"]["corruption"]
+        for name, style in _styles(families).items():
+            if size in families[name]:
+                levels = families[name][size]["corruption"]
                 points = {level["noise"]: level["mse"] for level in levels}
-                _draw_errors(axes, points, label=plain(family), **style)
+                _draw_errors(axes, points, label=plain(name), **style)
         levels = next(e["corruption"] for e in encoders.values() if e["latent"] == size)
         noise = np.array([level["noise"] for level in levels])
         best = [level["linear_mse"][0] for level in levels]
         axes.plot(noise, best, label="best linear denoiser", **reference())
         axes.plot(noise[1:], noise[1:] ** 2, ":", color=ink(), alpha=0.65, label="corrupted input")
-        axes.set(title=f"l = {size}", xlabel="noise", yscale="log")
+        axes.set(title=f"latent size {size}", xlabel="noise (standard deviation)", yscale="log")
     panels[0].set_ylabel("mean squared error")
     below(figure, panels)
     figure.suptitle(f"{task}: does denoising denoise?", size=8)
@@ -162,16 +161,17 @@ def _draw_corruption(task: str, encoders: Encoders) -> Figure:
 
 
 def _latent_correlation(task: str, encoders: Encoders) -> Plot:
-    """Pearson's correlation of the latent's units, a panel for each encoder."""
+    """Pearson's correlation between the latent units of each encoder, a panel each."""
     return Plot(
         "latent_correlation",
-        f"{task}: do units repeat each other?",
-        "Pearson's correlation between the units of each latent on held-out episodes; empty: a "
-        "unit that is dead.",
+        f"{task}: correlation between latent units",
+        "Pearson's correlation between the latent units of each encoder, numbered from 0, on "
+        "held-out episodes. The units of the identity are the features. Empty: a dead unit.",
         ("encoder", "unit", "other_unit", "correlation"),
         [
-            (label, i, j, value)
+            (label, names[i], names[j], value)
             for label, e in encoders.items()
+            for names in (_unit_names(e),)
             for i, row in enumerate(e["latent_units"]["correlation"])
             for j, value in enumerate(row)
         ],
@@ -179,30 +179,47 @@ def _latent_correlation(task: str, encoders: Encoders) -> Plot:
     )
 
 
+def _unit_names(encoder: Mapping[str, Any]) -> list[str]:
+    """Numbers of the latent units from 0; for the identity, names of the features."""
+    if encoder["kind"] == IDENTITY:
+        return [feature["name"] for feature in encoder["reconstruction"]["features"]]
+    return [str(i) for i in range(encoder["latent"])]
+
+
 def _draw_correlation(task: str, encoders: Encoders) -> Figure:
-    across = min(6, len(encoders))
+    across = min(3, len(encoders))
     rows = -(-len(encoders) // across)
-    width = COLUMN if across < 3 else PAGE
-    figure = Figure(figsize=(width, 0.4 + (width - 0.5) / across * rows))
+    figure = Figure(figsize=(PAGE, 0.4 + (PAGE - 0.8) / max(across, 2) * rows))
     panels = figure.subplots(rows, across, squeeze=False).ravel()
     for axes in panels[len(encoders) :]:
         axes.set_axis_off()
     for axes, (label, e) in zip(panels, encoders.items(), strict=False):
         values = np.array(e["latent_units"]["correlation"], float)
         picture = axes.imshow(values, cmap="RdBu_r", vmin=-1, vmax=1)
-        axes.set_title(plain(label))
-        axes.set_xticks([])
-        axes.set_yticks([])
-        axes.grid(visible=False)
+        names = _unit_names(e)
+        axes.set_xticks(range(len(names)), names, rotation=0 if names[0] == "0" else 90)
+        axes.set_yticks(range(len(names)), names)
+        unit = "feature" if e["kind"] == IDENTITY else "latent unit"
+        axes.set(title=plain(label), xlabel=unit, ylabel=unit)
+        _bare(axes)
     figure.colorbar(picture, ax=panels.tolist(), label="correlation", shrink=0.8, aspect=30)
-    figure.suptitle(f"{task}: do units repeat each other?", size=8)
+    figure.suptitle(f"{task}: correlation between latent units", size=8)
     return figure
 
 
-def _families(encoders: Encoders) -> dict[str, dict[str, Any]]:
-    """Colour and marker of each family; PCA is the reference, drawn apart."""
-    families = {label.rpartition("-")[0] for label in encoders if label[-1].isdigit()} - {"pca"}
-    return styles(sorted(families, key=lambda f: (not f.startswith("dae"), f)))
+def _families(encoders: Encoders) -> dict[str, dict[int, Mapping[str, Any]]]:
+    """Encoders that differ in latent size only, by that size; PCA is the reference, drawn apart."""
+    families: dict[str, dict[int, Mapping[str, Any]]] = {}
+    for label, e in encoders.items():
+        name = label.removesuffix(f"-{e['latent']}")
+        if name not in ("pca", label):
+            families.setdefault(name, {})[e["latent"]] = e
+    return families
+
+
+def _styles(families: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Colour and marker of each family, denoising autoencoders first."""
+    return styles(sorted(families, key=lambda name: (not name.startswith("dae"), name)))
 
 
 def _draw_errors(axes: Axes, points: dict[Any, list[float]], **style: Any) -> None:
