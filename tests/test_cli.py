@@ -168,7 +168,7 @@ def test_every_command_has_help_with_an_example(command):
         (("encoder", "info", "none"), "no encoder at none"),
         (("encoder", "info", "dae-9", "--task", "face_direction"), "no encoder 'dae-9'"),
         (("rl", "--task", "face_direction", "--encoder", "x", "--out", "y"), "no encoder 'x'"),
-        (("report", "none"), "none is not of a study"),
+        (("report", "none"), "none is not the folder of a study"),
         (("report",), "Missing argument 'FOLDER'. See jbrep report --help."),
         (("fly",), "No such command 'fly'. See jbrep --help."),
     ],

@@ -2,8 +2,10 @@
 
 import csv
 import json
+import random
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,9 @@ from jbrep.errors import InputError
 from jbrep.figures import write
 from jbrep.files.tables import write_csv
 from jbrep.report import report, write_report
+from jbrep.report.columns import are_numbers
 from jbrep.report.facts import reproduce
+from jbrep.report.markdown import escape, markdown
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, SUMMARY
 from jbrep.report.tables import read_tables
 from jbrep.report.words import answers
@@ -37,6 +41,7 @@ STUDY = Study(
     evaluate_every=1000,
     evaluation_episodes=2,
 )
+TABLES = ("runs.json", "returns.csv", "statistics.json", "heuristics.csv")
 TRAP = "<script>document.title = 'run'</script>"
 
 
@@ -135,7 +140,7 @@ def test_it_loads_alone_and_without_errors(page):
 
 def test_every_figure_shows_in_light_and_dark(page):
     shown = page.locator("figure img.light")
-    assert shown.count() == 9
+    assert shown.count() == 8
     for theme in ("light", "dark"):
         for image in page.locator(f"figure img.{theme}").all():
             assert image.is_visible()
@@ -175,6 +180,42 @@ def test_tables_sort_by_number_and_by_name(page):
     assert column(1) == ["dae-8", "full", "pca-8"]
 
 
+def test_text_stands_left_and_numbers_right(page):
+    def alignments(table):
+        cells = page.locator(f"{table} tbody tr").first.locator("td").all()
+        return [cell.evaluate("cell => getComputedStyle(cell).textAlign") for cell in cells]
+
+    right = ["right"]
+    assert alignments("#tables .wide >> nth=0 >> table") == ["left"] + 8 * right
+    assert alignments("#tables .wide >> nth=3 >> table")[:3] == ["left", "left", "right"]
+
+
+def test_a_column_of_numbers_may_have_intervals_and_dashes():
+    rows = [("1,190", "-3 [-4, 2]", "> 320", "- (0/5)", "1e-05", "dae-8", "7dd50d17"), ("-",) * 7]
+    assert are_numbers(rows) == [True] * 5 + [False] * 2
+
+
+def test_verdicts_come_as_a_matrix_before_the_sentences(page):
+    text = page.locator("#verdicts").inner_text()
+    assert text.index("face_direction, sac\n") < text.index("The reduced state ends at")
+    matrix = page.locator(".matrix")
+    heads = matrix.locator("thead th").all_inner_texts()
+    assert heads == ["representation", "similar reward", "less variance", "faster learning"]
+    assert matrix.locator("tbody th").all_inner_texts() == ["dae-8", "pca-8"]
+    assert matrix.locator("tbody tr").first.locator(".pill").first.inner_text() == "contradicted"
+
+
+def test_it_can_be_read_on_a_telephone(page):
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    for figure in page.locator(".zoom").all():
+        image = figure.locator("img.light")
+        width = image.bounding_box()["width"]
+        assert width >= 330  # as on paper, where text has 7 points
+        assert width < 360 or figure.evaluate("button => button.scrollWidth") >= width
+    assert page.locator(".matrix").bounding_box()["width"] <= 362
+
+
 def test_it_prints(page):
     page.locator("#theme").click()  # prints light all the same
     assert page.pdf(format="A4").startswith(b"%PDF")
@@ -189,14 +230,14 @@ def test_each_claim_has_its_verdicts_with_the_numbers_of_the_statistics(whole):
     text = (whole / PAGE).read_text()
     for comparison in statistics["groups"][0]["comparisons"]:
         for verdict in comparison["verdicts"]:
-            (found,) = [
+            (finding,) = [
                 each
                 for each in summary["claims"][verdict["claim"]]["verdicts"]
                 if each["representation"] == comparison["representation"]
             ]
-            assert found["verdict"] == verdict["verdict"]
-            assert number(verdict["nominal"][0], SIGNIFICANT) in found["sentence"]
-            assert found["sentence"].replace("'", "&#39;") in text.replace("&gt;", ">")
+            assert finding["verdict"] == verdict["verdict"]
+            assert number(verdict["nominal"][0], SIGNIFICANT) in finding["sentence"]
+            assert finding["sentence"].replace("'", "&#39;") in text.replace("&gt;", ">")
     similar = summary["claims"]["similar reward"]["counts"]
     assert sum(similar.values()) == 2
     assert summary["numbers"]["face_direction/sac/full"]["final_return_mean"][0] > 600
@@ -211,13 +252,68 @@ def test_the_markdown_shows_verdicts_numbers_and_a_figure_that_is_there(whole):
     assert (whole / figure).exists()
     assert "| full | 4 | 0 |" in text
     assert "> 1 run is counted as return 0" in text
+    matrix = "| representation | similar reward | less variance | faster learning |"
+    assert text.index(matrix) < text.index("**The reduced state")
+    assert re.search(r"\n\| dae-8 \| contradicted \| undecided; .* \| .* \|\n", text)
+
+
+@pytest.mark.parametrize(
+    ("text", "escaped"),
+    [
+        ("face_direction: 812 [780, 844], 5 %", "face_direction: 812 [780, 844], 5 %"),
+        ("a|b `c` *d* _e_ <f> ~g~ h\\", r"a\|b \`c\` \*d\* \_e\_ \<f> \~g\~ h\\"),
+        ("two\nlines\r\n# head", r"two lines \# head"),
+        ("![x](y) [x][y] [x]: y", r"\![x\](y) [x\][y\] [x\]: y".replace(r"y\]", "y]")),
+        ("&lt; R&D", r"\&lt; R\&D"),
+        ("- item", r"\- item"),
+        ("12. item", r"12\. item"),
+    ],
+)
+def test_nothing_in_a_name_is_markup(text, escaped):
+    assert escape(text) == escaped
+
+
+def named_otherwise(folder, out, name):
+    """A copy of a study's tables in which dae-8 has another name."""
+    out.mkdir()
+    for each in TABLES:
+        text = (folder / each).read_text()
+        quoted = json.dumps(name)[1:-1] if each.endswith("json") else name
+        (out / each).write_text(text.replace("dae-8", quoted))
+
+
+def test_markdown_keeps_its_tables_whatever_the_names(whole, tmp_path):
+    named_otherwise(whole, tmp_path / "a|b*", "d|a*<b>`e")
+    tables = read_tables(tmp_path / "a|b*")
+    text = markdown(tables, answers(tables.analysis), "figure.png")
+    assert text.startswith("# a\\|b\\*\n")
+    assert r"| d\|a\*\<b>\`e | 4 | 1 |" in text
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {5, 10}
+    assert not re.search(r"(?<!\\)[<`]", text)
+
+
+def test_names_that_are_not_utf_8_are_written_all_the_same(whole, tmp_path):
+    folder = Path(f"{tmp_path}/studi\udce9")  # as Linux gives a folder named in Latin-1
+    folder.mkdir()
+    for name in TABLES:
+        shutil.copy(whole / name, folder / name)
+    (folder / "statistics.json").unlink()
+    record = json.loads((folder / "runs.json").read_text())
+    for run in record["runs"]:
+        run["reason"] = "no \udcff"
+    (folder / "runs.json").write_text(json.dumps(record))
+    page, summary, text, _ = write_report(folder)
+    assert "<h1>studi?</h1>" in page.read_text()
+    assert '<td class="text">no ?</td>' in page.read_text()
+    assert json.loads(summary.read_text())["study"] == "studi?"
+    assert text.read_text().startswith("# studi?\n")
 
 
 def test_it_can_be_made_from_the_tables_alone(whole, tmp_path):
-    tables = ("runs.json", "returns.csv", "statistics.json", "heuristics.csv")
     alone = tmp_path / "a-study"
     alone.mkdir()
-    for name in tables:
+    for name in TABLES:
         shutil.copy(whole / name, alone / name)
     write_report(alone)
     for name in (PAGE, SUMMARY, MARKDOWN):
@@ -248,8 +344,11 @@ def test_runs_without_a_study_are_made_again_each_in_a_folder_of_its_own(whole):
     assert sorted(folders) == sorted(f"a-study/{label}/seed-0" for label in labels)
 
 
-def test_where_nothing_was_compared_no_verdict_is_missing():
-    (similar, *_) = answers({"groups": [{"comparisons": []}]})
+def test_where_nothing_was_compared_the_claims_say_so(whole):
+    analysis = read_tables(whole).analysis
+    (group,) = analysis.groups
+    alone = replace(group, labels=group.labels[:1], comparisons=())
+    (similar, *_) = answers(replace(analysis, groups=(alone,)))
     assert similar.headline.endswith("at a similar reward: no reduced state was compared")
 
 
@@ -262,7 +361,7 @@ def test_an_unfinished_study_says_what_is_missing(tmp_path):
     assert summary["missing"] == [cell.name for cell in plan.cells[-5:]]
     assert summary["runs"] == 7
     text = (plan.folder / PAGE).read_text()
-    assert "This study is not finished: 5 runs are missing" in text
+    assert "This study is unfinished: 5 runs are missing" in text
     assert "700</td>" in text
     assert "supported" in text  # of what two runs are there
 
@@ -292,33 +391,83 @@ def test_heuristics_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("runs.json", lambda text: text[:100], "runs.json is damaged, or no jbrep runs"),
-        ("runs.json", lambda text: "[]", "runs.json is damaged, or no jbrep runs"),
+        ("runs.json", lambda text: text[:100], "runs.json is damaged, or not a jbrep runs file"),
+        ("runs.json", lambda text: "[]", "runs.json is damaged, or not a jbrep runs file"),
+        ("runs.json", lambda text: text.replace("60.0", "NaN"), "runs.json is damaged"),
+        ("runs.json", lambda text: text.replace("60.0", "1e999"), "seconds must be a number"),
+        ("runs.json", lambda text: text.replace('"seed"', '"sead"'), "seed is missing"),
+        ("runs.json", lambda text: text.replace('"failed"', '"lost"'), "one of finished, failed"),
+        ("runs.json", lambda text: text.replace('"size": 16', '"size": -1'), "are not positive"),
+        (
+            "runs.json",
+            lambda text: text.replace('"label": "face_direction', '"label": "turn'),
+            "settings of turn/sac/full are missing",
+        ),
         ("runs.json", lambda text: text.replace('version": 1', 'version": 2'), "newer one is need"),
         (
             "statistics.json",
             lambda text: text.replace('version": 1', 'version": 2'),
             "statistics.json has format version 2: this jbrep reads up to 1",
         ),
-        ("statistics.json", lambda text: text.replace('"grid"', '"gird"'), "don't fit together"),
-        ("returns.csv", lambda text: text[:-1] + ",", "returns.csv is damaged, or cut short"),
-        ("heuristics.csv", lambda text: text + "x", "heuristics.csv is damaged, or cut short"),
-        ("returns.csv", None, "returns.csv"),
-        ("runs.json", None, "is not of a study: runs below it are expected, or a runs.json"),
+        ("statistics.json", lambda text: text.replace('"grid"', '"gird"'), "grid is missing"),
+        ("returns.csv", lambda text: text[:-1] + ",", "returns.csv is damaged or cut short"),
+        ("returns.csv", lambda text: text + f"a,b,c,0,{10**30},0,1\n", "returns.csv is damaged or"),
+        ("returns.csv", lambda text: text + "a,b,c,0,0,0,nan\n", "returns.csv is damaged or"),
+        ("returns.csv", lambda text: text + "a,b,c,0,0,0,1e9\n", "returns.csv is damaged or"),
+        ("returns.csv", lambda text: text + '"' + "a" * 200_000, "returns.csv is damaged or"),
+        ("heuristics.csv", lambda text: text + "x", "heuristics.csv is damaged or cut short"),
+        ("heuristics.csv", lambda text: b"\xff", "heuristics.csv is damaged: it is not UTF-8"),
+        ("returns.csv", None, r"can't read .*returns\.csv"),
+        ("runs.json", None, "is not the folder of a study: it has neither runs nor a runs.json"),
     ],
 )
-def test_tables_that_are_none(name, change, message, whole, tmp_path):
-    for each in ("runs.json", "returns.csv", "statistics.json", "heuristics.csv"):
+def test_damaged_tables_are_refused(name, change, message, whole, tmp_path):
+    for each in TABLES:
         shutil.copy(whole / each, tmp_path / each)
     path = tmp_path / name
     if change is None:
         path.unlink()
     else:
-        path.write_text(change(path.read_text()))
+        changed = change(path.read_text())
+        path.write_bytes(changed if isinstance(changed, bytes) else changed.encode())
     before = sorted(tmp_path.iterdir())
     with pytest.raises(InputError, match=message):
         write_report(tmp_path)
     assert sorted(tmp_path.iterdir()) == before
+
+
+ODD = (None, True, -1, 0.5, 10**30, "", "x", [], {}, [None], {"x": None})
+
+
+def change_one(value, choose):
+    """A copy of a JSON value with one part, anywhere, replaced or removed."""
+    if isinstance(value, dict | list) and value and choose.random() < 0.85:
+        key = choose.choice(list(value) if isinstance(value, dict) else range(len(value)))
+        changed = value.copy()
+        if choose.random() < 0.1:
+            del changed[key]
+        else:
+            changed[key] = change_one(value[key], choose)
+        return changed
+    return choose.choice(ODD)
+
+
+@pytest.mark.parametrize("name", ["runs.json", "statistics.json"])
+def test_changed_tables_are_refused_or_shown(name, whole, tmp_path, monkeypatch):
+    """Whatever is read can be put into words; figures are left out here, as they take long."""
+    for each in TABLES:
+        shutil.copy(whole / each, tmp_path / each)
+    monkeypatch.setattr(report, "study_plots", lambda *tables: [])
+    record = json.loads((whole / name).read_text())
+    choose, refused = random.Random(0), []
+    for _ in range(150):
+        (tmp_path / name).write_text(json.dumps(change_one(record, choose)))
+        try:
+            write_report(tmp_path)
+        except InputError as error:
+            refused.append(str(error))
+    assert 50 < len(refused) < 150
+    assert not any("\n" in message for message in refused)
 
 
 def test_a_run_of_a_newer_jbrep_is_named(tmp_path):

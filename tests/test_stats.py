@@ -4,15 +4,24 @@ import json
 import warnings
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from jbrep.errors import InputError
-from jbrep.stats import RunCurve, analyse, statistics_text
+from jbrep.errors import DamageError, InputError
+from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.claims import CLAIMS, decide, in_words, mean_p, variance_p
+from jbrep.stats.claims import (
+    CLAIMS,
+    FASTER_LEARNING,
+    LESS_VARIANCE,
+    VERDICTS,
+    decide,
+    mean_p,
+    variance_p,
+)
 from jbrep.stats.comparison import holm, probability_of_improvement
 from jbrep.stats.curves import (
     bands,
@@ -28,7 +37,6 @@ from jbrep.stats.power import POWER, SEEDS, seeds_needed
 from jbrep.stats.reliability import drawdown, expected_shortfall, fixed_policy, within_runs
 from jbrep.text import SIGNIFICANT, interval
 
-SIMILAR, STEADIER, FASTER = CLAIMS
 GRID = np.arange(0, 10_001, 1000)
 
 
@@ -76,21 +84,27 @@ def shapes(n, random, studies=3000):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"seed": None}, "its seed is None; a run has a whole number"),
+        ({"seed": None}, "its seed is None; it must be a whole number"),
         ({"seed": True}, "its seed is True"),
-        ({"steps": GRID.astype(float)}, "its steps are float64; give whole numbers"),
+        ({"steps": GRID.astype(float)}, "its steps are float64; they must be whole numbers"),
         ({"steps": GRID[::-1], "returns": np.ones((11, 3))}, "its steps don't ascend"),
-        ({"returns": np.ones(11)}, r"shape \(11,\); give \(evaluations, episodes\), with 11"),
+        ({"returns": np.ones(11)}, r"shape \(11,\); expected \(evaluations, episodes\), with 11"),
         ({"returns": np.ones((1, 11))}, r"shape \(1, 11\)"),
-        ({"returns": np.full((11, 3), np.nan)}, "returns aren't finite; a run that diverged"),
-        ({"returns": np.full((11, 3), 1001.0)}, r"returns are in \[1001, 1001\]; they lie in"),
+        (
+            {"returns": np.full((11, 3), np.nan)},
+            "returns aren't finite; set failed_at",
+        ),
+        ({"returns": np.full((11, 3), 1001.0)}, r"returns are in \[1001, 1001\]; they must be in"),
         ({"returns": np.full((11, 3), -1.0)}, r"returns are in \[-1, -1\]"),
-        ({"steps": [10_000], "returns": np.ones((1, 9))}, "evaluated 1 times; a curve takes two"),
-        ({"total_steps": 9000}, "at steps 0 to 10000; they lie within its total_steps, 9000"),
-        ({"failed_at": 20_000}, "failed at step 20000; that is within 0 to 10000"),
+        (
+            {"steps": [10_000], "returns": np.ones((1, 9))},
+            "evaluations is 1; a curve needs",
+        ),
+        ({"total_steps": 9000}, "at steps 0 to 10000; they must be within its total_steps, 9000"),
+        ({"failed_at": 20_000}, "failed at step 20000; that must be within 0 to 10000"),
     ],
 )
-def test_runs_that_are_none(changes, message):
+def test_invalid_runs_are_refused(changes, message):
     with pytest.raises(InputError, match=message) as raised:
         make(**changes)
     assert str(raised.value).startswith("run face_direction/sac/full, seed ")
@@ -113,11 +127,17 @@ TWO = [make(seed=0), make(seed=1)]
     ("runs", "message"),
     [
         ([], "there are no runs"),
-        (np.ones((10, 30)), "runs hold a ndarray: give a RunCurve for each run; episodes are no"),
+        (
+            np.ones((10, 30)),
+            "runs contain a ndarray: give one RunCurve for each",
+        ),
         ([*TWO, make("dae-8")], "face_direction/sac/dae-8 has one seed: train at least two"),
         ([*TWO, make(seed=1, level=9)], "face_direction/sac/full has seed 1 twice"),
         ([*TWO, make(seed=2, settings="b2")], "mixes the settings a1, b2"),
-        ([make("dae-8", 0), make("dae-8", 1)], "no runs of the baseline 'full': choose one of da"),
+        (
+            [make("dae-8", 0), make("dae-8", 1)],
+            "the baseline 'full': train some, or choose .*: da",
+        ),
         ([*TWO, make("dae-8", 0, task="x"), make("dae-8", 1, task="x")], "x/sac has no runs of"),
         (
             [*TWO, make(seed=2, steps=[10_000, 12_000], total_steps=12_000)],
@@ -206,10 +226,10 @@ def test_bands_are_those_of_whole_runs():
     random = np.random.default_rng(0)
     curves = random.normal(500, 20, (8, 1)) + random.normal(0, 5, (8, 150))
     found = bands(curves, seed=0)
-    np.testing.assert_allclose(found["p25"], np.percentile(curves, 25, axis=0))
-    np.testing.assert_allclose(found["iqm"].value, stats.trim_mean(curves, 0.25, axis=0))
+    np.testing.assert_allclose(found.p25, np.percentile(curves, 25, axis=0))
+    np.testing.assert_allclose(found.iqm.value, stats.trim_mean(curves, 0.25, axis=0))
     for i in (0, 70, 149):  # the same resamples at each step
-        np.testing.assert_allclose([p[i] for p in found["iqm"]], percentile(iqm, curves[:, i]))
+        np.testing.assert_allclose([p[i] for p in found.iqm], percentile(iqm, curves[:, i]))
 
 
 # reliability
@@ -378,9 +398,9 @@ def test_groups_without_variance_have_no_interval():
 
 def test_verdicts_at_their_borders():
     def verdict(claim, low, high, boundary):
-        return in_words(int(decide(claim, Interval((low + high) / 2, low, high), boundary)))
+        return VERDICTS[int(decide(claim, Interval((low + high) / 2, low, high), boundary))]
 
-    for claim, above in ((SIMILAR, "supported"), (STEADIER, "contradicted"), (FASTER, "supported")):
+    for claim, above in zip(CLAIMS, ("supported", "contradicted", "supported"), strict=True):
         below = {"supported": "contradicted", "contradicted": "supported"}[above]
         assert verdict(claim, 1.001, 2, 1) == above
         assert verdict(claim, 1, 2, 1) == "undecided"
@@ -415,15 +435,17 @@ def with_moments(mean, sd, n, random):
 def test_seeds_needed_are_those_of_the_t_test(effect):
     random = np.random.default_rng(1)
     x, y = with_moments(effect, 1, 10, random), with_moments(0, 1, 10, random)
-    assert near(seeds_needed(FASTER, x, y, 0.95), lambda n: power_of_t(n, effect))
-    assert near(seeds_needed(FASTER, -x, -y, 0.996), lambda n: power_of_t(n, effect, 0.004))
+    assert near(seeds_needed(FASTER_LEARNING, x, y, 0.95), lambda n: power_of_t(n, effect))
+    assert near(
+        seeds_needed(FASTER_LEARNING, -x, -y, 0.996), lambda n: power_of_t(n, effect, 0.004)
+    )
 
 
 def test_few_runs_are_not_taken_to_vary_less_than_they_do():
     """With a variance that is by a third too small, 20 seeds would do."""
     y = np.array([-1.0, 0, 1])
     assert power_of_t(20, 0.8) < POWER < power_of_t(30, 0.8)
-    assert seeds_needed(FASTER, y + 0.8, y, 0.95) == 40
+    assert seeds_needed(FASTER_LEARNING, y + 0.8, y, 0.95) == 40
 
 
 def power_of_t(n, effect, alpha=0.05):
@@ -435,8 +457,8 @@ def power_of_t(n, effect, alpha=0.05):
 def test_no_verdict_is_promised_that_the_permutation_test_can_not_give():
     random = np.random.default_rng(0)
     steady, wild = random.normal(size=5), 1e6 * random.normal(size=5)
-    assert seeds_needed(STEADIER, steady, wild, 0.95) == 5  # p can be 2 / 252
-    assert seeds_needed(STEADIER, steady, wild, 0.999) == 10
+    assert seeds_needed(LESS_VARIANCE, steady, wild, 0.95) == 5  # p can be 2 / 252
+    assert seeds_needed(LESS_VARIANCE, steady, wild, 0.999) == 10
 
 
 def test_a_part_of_a_study_is_judged_as_strictly_as_the_whole():
@@ -453,7 +475,7 @@ def test_seeds_needed_are_those_of_the_f_test(ratio):
 
     normal = stats.norm.ppf((np.arange(20) + 0.5) / 20)
     normal /= normal.std(ddof=1)
-    found = seeds_needed(STEADIER, np.sqrt(ratio) * normal, normal, 0.95)
+    found = seeds_needed(LESS_VARIANCE, np.sqrt(ratio) * normal, normal, 0.95)
     assert near(found, power_of_f)
 
 
@@ -467,7 +489,7 @@ def near(found, power):
 def test_the_larger_the_effect_the_fewer_seeds():
     random = np.random.default_rng(0)
     y = with_moments(500, 30, 10, random)
-    found = [seeds_needed(FASTER, y + shift, y, 0.99) for shift in (2, 10, 20, 40, 100)]
+    found = [seeds_needed(FASTER_LEARNING, y + shift, y, 0.99) for shift in (2, 10, 20, 40, 100)]
     assert found[0] == "> 320"
     assert found[1:] == sorted(found[1:], reverse=True)
     assert found[-1] == 5
@@ -602,7 +624,7 @@ def test_runs_that_failed_to_learn_by_chance_decide_no_variance():
     runs = study({"full": [50, 60, *most[2:]], "dae-8": most})
     steadier = analyse(runs).groups[0].comparisons[0].verdicts[1]
     assert steadier.simultaneous.high < 1
-    assert (steadier.verdict, steadier.reason) == ("undecided", "its p-value doesn't agree")
+    assert (steadier.verdict, steadier.reason) == ("undecided", "its p-value disagrees")
     assert steadier.seeds_needed is None
 
 
@@ -613,17 +635,80 @@ def test_two_runs_are_too_few_for_a_variance():
 
 
 def test_tables_have_a_line_for_each_label_comparison_and_verdict(analysis):
-    text = statistics_text(analysis.tolist())
+    text = statistics_text(analysis)
     assert text.startswith("face_direction, sac: 18 runs over 10,000 steps")
     assert "nan" not in text
     assert "inf" not in text
     lines = [line.split() for line in text.splitlines()]
-    for name, times in (("full", 2), ("dae-8", 6), ("dae-4", 6)):
+    for name, times in (("full", 2), ("dae-8", 3), ("dae-4", 3)):
         assert sum(line[:1] == [name] for line in lines) == times
+        assert sum(line[:1] == [f"{name}:"] for line in lines) == 3 * (name != "full")
     first = next(line for line in lines if line[:1] == ["dae-8"])
     assert first[1:3] == ["6", "0"]
     assert first[-2:] == ["-", "(0/6)"]
-    assert "dae-4 similar reward contradicted" in " ".join(text.split())
+    assert "dae-4: similar reward contradicted" in " ".join(text.split())
+
+
+def test_tables_fit_a_terminal(analysis):
+    text = statistics_text(analysis, width=60)
+    assert max(map(len, text.splitlines())) <= 60
+    for cell in statistics_text(analysis).split():
+        assert cell in text
+    assert text.count("dae-4: similar reward") > 1  # each part of a table says what it is about
+
+
+def test_an_analysis_is_read_back_from_its_json(analysis):
+    text = analysis.to_json()
+    again = Analysis.from_json(text, Path("statistics.json"))
+    assert again.to_json() == text
+    assert statistics_text(again) == statistics_text(analysis)
+    (group,), (expected,) = again.groups, analysis.groups
+    np.testing.assert_array_equal(group.labels[1].curve.iqm.low, expected.labels[1].curve.iqm.low)
+    assert group.comparisons[0].verdict(LESS_VARIANCE) == expected.comparisons[0].verdicts[1]
+    assert np.isnan(group.labels[2].numbers["steps_to_90_percent"].value)  # it was infinite
+
+
+DAMAGES = [
+    (lambda whole, group: whole.pop("baseline"), "the file must be complete: baseline is missing"),
+    (lambda whole, group: whole.update(baseline="pca"), "each group must begin with the baseline"),
+    (lambda whole, group: whole.update(groups={}), "groups must be a list"),
+    (lambda whole, group: whole.update(groups=[]), "each group must begin with the baseline"),
+    (lambda whole, group: whole.update(seed=True), "seed must be a whole number"),
+    (lambda whole, group: whole["profile_returns"].pop(), "each profile must have as many values"),
+    (lambda whole, group: group["grid"].pop(), "the curve of full doesn't fit the grid"),
+    (lambda whole, group: group["grid"].reverse(), "two ascending steps"),
+    (lambda whole, group: group.update(grid="x"), r"groups\[0\].grid"),
+    (lambda whole, group: group.update(task=3), r"groups\[0\].task must be text"),
+    (lambda whole, group: group["labels"].pop(), "each representation but the first must have"),
+    (lambda whole, group: group["labels"][0]["seeds"].pop(), "5 seeds, but numbers of"),
+    (lambda whole, group: group["labels"][0]["curve"]["p10"].pop(), "must have the same length"),
+    (lambda whole, group: group["labels"][0]["numbers"].pop("gain"), "numbers: .*expected"),
+    (
+        lambda whole, group: group["labels"][0]["numbers"].update(gain=[[1, 2, 3]]),
+        "each number must be one interval",
+    ),
+    (lambda whole, group: group["labels"][0].update(profile=[10**400]), "profile"),
+    (
+        lambda whole, group: group["comparisons"][0]["verdicts"][1].update(verdict="<b>"),
+        "unknown verdict '<b>'",
+    ),
+    (lambda whole, group: group["comparisons"][0]["verdicts"].pop(), "claims: .*expected"),
+    (lambda whole, group: group["comparisons"][0]["verdicts"][0].update(p="0"), "number or null"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), DAMAGES)
+def test_a_damaged_analysis_is_refused(change, message, analysis):
+    record = json.loads(analysis.to_json())
+    change(record, record["groups"][0])
+    with pytest.raises(DamageError, match=rf"^a\.json is damaged: .*{message}"):
+        Analysis.from_json(json.dumps(record), Path("a.json"))
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": "other"}', "[" * 10**6, "NaN"])
+def test_what_is_no_analysis_is_refused(text):
+    with pytest.raises(DamageError, match=r"a\.json is damaged, or not a jbrep statistics file"):
+        Analysis.from_json(text, Path("a.json"))
 
 
 def test_groups_stay_apart():

@@ -11,16 +11,27 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from jbrep.figures.plot import Plot
-from jbrep.figures.style import COLUMN, PAGE, plain, reference, solved_line_style, styles
+from jbrep.figures.style import (
+    COLUMN,
+    PAGE,
+    Looks,
+    plain,
+    reference,
+    solved_line_style,
+    with_runs,
+)
 from jbrep.jitterbug.tasks import SOLVED_RETURN
-from jbrep.stats.runs import in_order
+from jbrep.stats.analysis import GroupAnalysis
 
-Group = dict[str, Any]  # of statistics.json: what was found for a task and an algorithm
+Groups = Sequence[GroupAnalysis]
 Evaluated = tuple[str, str, str, int, int]  # task, algorithm, representation, seed, step
 Heuristics = Mapping[str, Sequence[float]]  # returns of the hand-written policy, by task
 
-_BAND = ("p10", "p50", "p90")
-_COLUMNS = ("task", "algorithm", "representation", "step", *_BAND, "iqm", "iqm_low", "iqm_high")
+_HANDLE, _CHARACTER = 0.5, 0.05  # widths in a legend [inches]
+_COLUMNS = (
+    *("task", "algorithm", "representation", "step"),
+    *("p10", "p50", "p90", "iqm", "iqm_low", "iqm_high"),
+)
 
 
 class Return(NamedTuple):
@@ -35,41 +46,27 @@ class Return(NamedTuple):
     episode_return: float
 
 
-def baseline_curves(groups: Sequence[Group], heuristics: Heuristics) -> Plot:
-    """The baseline alone, tasks by algorithms, as the paper's Fig. 7."""
-    first = [{**group, "labels": group["labels"][:1]} for group in groups]
-    name = groups[0]["labels"][0]["representation"]
-    return Plot(
-        "training_curves",
-        f"Training on the {name} observation",
-        _CAPTION,
-        _COLUMNS,
-        list(_rows(first)),
-        lambda: _grid_of_curves(first, heuristics),
-    )
-
-
-def curves(groups: Sequence[Group], heuristics: Heuristics) -> Plot:
+def curves(groups: Groups, heuristics: Heuristics, looks: Looks) -> Plot:
     """Every representation on one axis, tasks by algorithms."""
     return Plot(
         "representations",
-        "Training on the full and on reduced observations",
-        _CAPTION,
+        "Return over training by representation",
+        "Return of the deterministic policy over training: median and 10 to 90 % over n runs. "
+        "Dashed: the hand-written policy's median on the same starts; dotted: "
+        f"{SOLVED_RETURN:.0f}, from which on the paper calls a task solved.",
         _COLUMNS,
         list(_rows(groups)),
-        lambda: _grid_of_curves(groups, heuristics),
+        lambda: _grid_of_curves(groups, heuristics, looks),
     )
 
 
-_CAPTION = (
-    "Return of the deterministic policy over training: median and 10 to 90 % over runs. Dashed: "
-    "the hand-written policy's median on the same starts; dotted: "
-    f"{SOLVED_RETURN:.0f}, where the paper calls a task solved."
-)
+def every_run(returns: Sequence[Return], looks: Looks) -> Plot:
+    """Each run by itself: a row for each task and algorithm, a panel for each representation.
 
-
-def every_run(returns: Sequence[Return], baseline: str) -> Plot:
-    """Each run by itself: a row for each task and algorithm, a panel for each representation."""
+    Args:
+        returns: at least one.
+        looks: of the representations, in the order of their panels.
+    """
     episodes = defaultdict(list)
     for row in returns:
         key = (row.task, row.algorithm, row.representation, row.seed, row.step)
@@ -78,55 +75,67 @@ def every_run(returns: Sequence[Return], baseline: str) -> Plot:
     return Plot(
         "every_run",
         "Every run",
-        "Mean return of each evaluation, a line for each run; thick: the median of all.",
+        "Mean return of each evaluation, a line for each of n runs; thick: their median.",
         ("task", "algorithm", "representation", "seed", "step", "mean_return"),
         [(*key, f"{mean:.3f}") for key, mean in means.items()],
-        lambda: _draw_runs(means, baseline),
+        lambda: _draw_runs(means, looks),
     )
 
 
-def _rows(groups: Sequence[Group]) -> Iterator[tuple[Any, ...]]:
+def _rows(groups: Groups) -> Iterator[tuple[Any, ...]]:
     for group in groups:
-        for label in group["labels"]:
-            curve = label["curve"]
-            columns = [group["grid"], *(curve[name] for name in _BAND), *np.array(curve["iqm"]).T]
+        for label in group.labels:
+            curve = label.curve
+            columns = (group.grid, curve.p10, curve.p50, curve.p90, *curve.iqm)
             for step, *values in zip(*columns, strict=True):
-                key = (group["task"], group["algorithm"], label["representation"], int(step))
-                yield *key, *("" if v is None else f"{v:.3f}" for v in values)
+                key = (group.task, group.algorithm, label.representation, int(step))
+                yield *key, *(cell(value) for value in values)
 
 
-def _grid_of_curves(groups: Sequence[Group], heuristics: Heuristics) -> Figure:
-    look = looks(groups)
+def cell(value: float) -> str:
+    """A number in a figure's table; nothing for what isn't finite."""
+    return f"{value:.3f}" if np.isfinite(value) else ""
 
-    def draw(axes: Axes, group: Group) -> None:
-        if returns := heuristics.get(group["task"]):
+
+def _grid_of_curves(groups: Groups, heuristics: Heuristics, looks: Looks) -> Figure:
+    look, names = looks(), names_with_runs(groups)
+
+    def draw(axes: Axes, group: GroupAnalysis) -> None:
+        if returns := heuristics.get(group.task):
             axes.axhline(float(np.median(returns)), label="hand-written", **reference())
         axes.axhline(SOLVED_RETURN, **solved_line_style())
-        for label in group["labels"]:
-            name, curve = label["representation"], label["curve"]
-            low, median, high = (np.array(curve[key], float) for key in _BAND)
-            colour, marker = look[name]["color"], look[name]["marker"]
-            axes.fill_between(group["grid"], low, high, color=colour, alpha=0.15, linewidth=0)
+        for label in group.labels:
+            style, curve = look[label.representation], label.curve
+            axes.fill_between(
+                group.grid, curve.p10, curve.p90, color=style["color"], alpha=0.15, linewidth=0
+            )
             axes.plot(
-                *(group["grid"], median),
-                **{"color": colour, "marker": marker, "ms": 2.5, "label": plain(name)},
-                markevery=max(1, len(median) // 8),
+                group.grid,
+                curve.p50,
+                label=names[label.representation],
+                ms=2.5,
+                markevery=max(1, len(group.grid) // 8),
+                clip_on=False,  # whole markers at the edges
+                **style,
             )
 
     return _grid(groups, draw)
 
 
-def looks(groups: Sequence[Group]) -> dict[str, dict[str, Any]]:
-    """Colour and marker of each representation, the baseline in the colour of text."""
-    names = [label["representation"] for group in groups for label in group["labels"]]
-    return styles(names, first=names[0])
+def names_with_runs(groups: Groups) -> dict[str, str]:
+    """Each representation for a legend, with the number of its runs."""
+    counts = defaultdict(list)
+    for group in groups:
+        for label in group.labels:
+            counts[label.representation].append(len(label.seeds))
+    return {name: with_runs(name, each) for name, each in counts.items()}
 
 
-def _grid(groups: Sequence[Group], draw: Callable[[Axes, Group], None]) -> Figure:
+def _grid(groups: Groups, draw: Callable[[Axes, GroupAnalysis], None]) -> Figure:
     """A panel for each task (rows) and algorithm (columns), over steps of training."""
-    tasks = list(dict.fromkeys(group["task"] for group in groups))
-    algorithms = list(dict.fromkeys(group["algorithm"] for group in groups))
-    by_place = {(group["task"], group["algorithm"]): group for group in groups}
+    tasks = list(dict.fromkeys(group.task for group in groups))
+    algorithms = list(dict.fromkeys(group.algorithm for group in groups))
+    by_place = {(group.task, group.algorithm): group for group in groups}
     width = COLUMN if len(algorithms) == 1 else PAGE
     figure = Figure(figsize=(width, 0.5 + (2.0 if len(algorithms) < 3 else 1.6) * len(tasks)))
     panels = figure.subplots(len(tasks), len(algorithms), squeeze=False, sharey=True)
@@ -137,7 +146,7 @@ def _grid(groups: Sequence[Group], draw: Callable[[Axes, Group], None]) -> Figur
             continue
         draw(axes, group)
         axes.set_title(plain(f"{tasks[i]}, {algorithms[j]}"))
-        _training_axes(axes, group["grid"][-1])
+        _training_axes(axes, group.grid[-1])
         axes.set_xlabel("training step" if i == len(tasks) - 1 else "")
         axes.set_ylabel("" if j else "return")
     below(figure, panels.ravel())
@@ -146,31 +155,33 @@ def _grid(groups: Sequence[Group], draw: Callable[[Axes, Group], None]) -> Figur
 
 def _training_axes(axes: Axes, last: float, ticks: int = 5) -> None:
     """Steps from 0 on, returns from 0 to 1,000."""
-    axes.set(xlim=(0, last), ylim=(-15, 1015), yticks=range(0, 1001, 250))
+    axes.set(xlim=(0, max(last, 1)), ylim=(-15, 1015), yticks=range(0, 1001, 250))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(ticks))
 
 
 def below(figure: Figure, panels: Iterable[Axes]) -> None:
-    """One legend under all panels, lines to compare with last; as many columns as usual fit."""
+    """One legend below all panels, reference lines last, in as many columns as fit."""
     entries = {
         name: handle
         for axes in panels
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     names = sorted(entries, key=lambda name: _is_broken(entries[name]))
-    columns = 4 if figure.get_figwidth() < PAGE else 6
-    figure.legend([entries[n] for n in names], names, loc="outside lower center", ncols=columns)
+    longest = max(map(len, names), default=0)
+    columns = max(1, int(figure.get_figwidth() / (_HANDLE + longest * _CHARACTER)))
+    handles = [entries[name] for name in names]
+    figure.legend(handles, names, loc="outside lower center", ncols=columns)
 
 
 def _is_broken(handle: Any) -> bool:
     return isinstance(handle, Line2D) and handle.get_linestyle() not in ("-", "None")
 
 
-def _draw_runs(means: Mapping[Evaluated, float], baseline: str) -> Figure:
-    names = in_order((key[2] for key in means), baseline)
+def _draw_runs(means: Mapping[Evaluated, float], looks: Looks) -> Figure:
+    look = looks()
+    names = [name for name in look if any(key[2] == name for key in means)]
     groups = list(dict.fromkeys(key[:2] for key in means))
-    look = styles(names, first=baseline)
     figure = Figure(figsize=(PAGE, 0.35 + 1.35 * len(groups)))
     panels = figure.subplots(len(groups), len(names), squeeze=False, sharey=True, sharex="row")
     for (i, j), axes in np.ndenumerate(panels):
@@ -182,8 +193,8 @@ def _draw_runs(means: Mapping[Evaluated, float], baseline: str) -> Figure:
             axes.set_axis_off()
             continue
         _draw_label(axes, runs, look[names[j]]["color"])
-        title = f"{', '.join(groups[i])}\n{names[j]}" if j == 0 else names[j]
-        axes.set_title(plain(title))
+        group = f"{', '.join(groups[i])}\n" if j == 0 else ""
+        axes.set_title(plain(group) + with_runs(names[j], [len(runs)]))
         last = max(key[4] for key in means if key[:2] == groups[i])
         _training_axes(axes, last, ticks=5 if len(names) < 5 else 3)
         axes.set_xlabel("training step" if i == len(groups) - 1 else "")

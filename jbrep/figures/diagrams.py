@@ -1,8 +1,8 @@
-"""Drawings of the autoencoder and of the system around it, from the sizes that they really have."""
+"""Drawings of the autoencoder and of the system around it, to their actual sizes."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,65 +11,115 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from jbrep.figures.plot import Plot
-from jbrep.figures.style import COLUMN, PAGE, ink, plain, styles
-
-Labels = Mapping[str, Any]  # of runs.json: what the runs of each label share
+from jbrep.figures.style import COLUMN, PAGE, Looks, ink, plain
+from jbrep.jitterbug.tasks import CONTROL_TIMESTEP
 
 _MOST = 20  # units of a layer that are drawn
 
 
-def diagrams(labels: Labels) -> list[Plot]:
+class Settings(TypedDict):
+    """What runs that differ by seed alone share; settings that nothing here reads come beside."""
+
+    task: str
+    algorithm: str
+    preset: str
+    representation: str
+    encoder: str  # SHA-256 of its file
+    hidden: list[int]  # units of the agent's layers
+    steps: int
+    evaluate_every: int
+    evaluation_episodes: int
+
+
+class Training(TypedDict, total=False):
+    """How an encoder was trained."""
+
+    noise: float  # standard deviation of the corruption
+
+
+class Data(TypedDict, total=False):
+    """What an encoder was trained on."""
+
+    train_rows: int
+
+
+class Metrics(TypedDict, total=False):
+    """What training measured."""
+
+    held_out_mse: float | None
+
+
+class EncoderRecord(TypedDict):
+    """An encoder, layer by layer: units and activation."""
+
+    name: str
+    kind: str
+    size: int  # of the observation
+    encoder: list[tuple[int, str]]
+    decoder: list[tuple[int, str]]
+    training: Training
+    data: Data
+    metrics: Metrics
+
+
+class LabelRecord(TypedDict):
+    """A label in runs.json."""
+
+    settings: Settings
+    encoder: EncoderRecord
+
+
+def diagrams(labels: Mapping[str, LabelRecord], looks: Looks) -> list[Plot]:
     """The paper's Fig. 6 and Fig. 2; nothing of a study without reduced states."""
-    reduced = {name: shared for name, shared in labels.items() if shared["encoder"]["encoder"]}
-    denoising = {n: s for n, s in reduced.items() if s["encoder"]["kind"] == "dae"} or reduced
-    if not denoising:
+    reduced = [shared for shared in labels.values() if shared["encoder"]["encoder"]]
+    drawn = [shared for shared in reduced if shared["encoder"]["kind"] == "dae"] or reduced
+    if not drawn:
         return []
-    first = next(iter(denoising.values()))
-    task = first["settings"]["task"]
-    alike = [each for each in denoising.values() if each["settings"]["task"] == task]
-    encoders = {each["encoder"]["name"]: each["encoder"] for each in alike}
-    return [system(first["settings"], first["encoder"]), autoencoders(task, encoders)]
+    task = drawn[0]["settings"]["task"]
+    of_task = [shared for shared in drawn if shared["settings"]["task"] == task]
+    by_representation = {each["settings"]["representation"]: each["encoder"] for each in of_task}
+    return [system(drawn[0], looks), autoencoders(task, by_representation, looks)]
 
 
-def autoencoders(task: str, encoders: Mapping[str, Any]) -> Plot:
-    """The encoders of a task with their decoders, unit by unit."""
+def autoencoders(task: str, encoders: Mapping[str, EncoderRecord], looks: Looks) -> Plot:
+    """The encoders of a task with their decoders, unit by unit; by representation."""
     rows = [
-        (name, part, i, *layer)
-        for name, encoder in encoders.items()
-        for part in ("encoder", "decoder")
-        for i, layer in enumerate(encoder[part])
+        (encoder["name"], part, i, *layer)
+        for encoder in encoders.values()
+        for part, layers in (("encoder", encoder["encoder"]), ("decoder", encoder["decoder"]))
+        for i, layer in enumerate(layers)
     ]
     return Plot(
         "autoencoders",
         f"The encoders of {task}",
         "Layers with their units; agents see the latent, and the decoder only serves training and "
-        f"diagnosis. Of more than {_MOST} units some are left out.",
+        f"diagnosis. Of larger layers {_MOST} units are drawn.",
         ("encoder", "part", "layer", "units", "activation"),
         rows,
-        lambda: _draw_autoencoders(encoders),
+        lambda: _draw_autoencoders(encoders, looks),
     )
 
 
-def _draw_autoencoders(encoders: Mapping[str, Any]) -> Figure:
+def _draw_autoencoders(encoders: Mapping[str, EncoderRecord], looks: Looks) -> Figure:
     count = min(3, len(encoders))
     rows = -(-len(encoders) // count)
     figure = Figure(figsize=(COLUMN if count == 1 else PAGE, 2.5 * rows))
     panels = figure.subplots(rows, count, squeeze=False).ravel()
+    look = looks()
     for axes in panels:
         axes.set_axis_off()
-    for axes, (name, encoder) in zip(panels, encoders.items(), strict=False):
-        _draw_layers(axes, encoder)
+    for axes, (representation, encoder) in zip(panels, encoders.items(), strict=False):
+        _draw_layers(axes, encoder, look[representation]["color"])
         noise = encoder["training"].get("noise")
-        corrupted = f", trained with noise N(0, {noise})" if noise else ""
-        axes.set_title(plain(f"{name}{corrupted}"), loc="center")
+        corrupted = f", trained with noise N(0, {noise:g}²)" if noise else ""
+        axes.set_title(plain(f"{encoder['name']}{corrupted}"), loc="center")
     return figure
 
 
-def _draw_layers(axes: Axes, encoder: Mapping[str, Any]) -> None:
+def _draw_layers(axes: Axes, encoder: EncoderRecord, colour: str) -> None:
     """A column of units for each layer, joined to the next one's."""
-    sizes = [(encoder["size"], "scaled")] + encoder["encoder"] + encoder["decoder"]
+    sizes = [(encoder["size"], "scaled"), *encoder["encoder"], *encoder["decoder"]]
     latent = len(encoder["encoder"])
-    colour = styles(["encoder"])["encoder"]["color"]
     columns = [_heights(units) for units, _ in sizes]
     for x, (left, right) in enumerate(pairwise(columns)):
         lines = [((x, a), (x + 1, b)) for a in left for b in right]
@@ -77,10 +127,11 @@ def _draw_layers(axes: Axes, encoder: Mapping[str, Any]) -> None:
     for x, (heights, (units, words)) in enumerate(zip(columns, sizes, strict=True)):
         shade = colour if x == latent else ink()
         axes.plot(np.full(len(heights), x), heights, "o", ms=3.6, color=shade, zorder=3)
-        axes.text(x, -0.08, f"{units} {words}", ha="center", va="top", size=6.5)
+        axes.text(x, -0.08, plain(f"{units} {words}"), ha="center", va="top", size=6.5)
     names = {0: "observation", latent: "latent", len(sizes) - 1: "reconstruction"}
     for x, name in names.items():
-        axes.text(x, -0.17, name, ha="center", va="top", size=6.5, color=colour, weight="bold")
+        shade = colour if x == latent else ink()
+        axes.text(x, -0.17, name, ha="center", va="top", size=6, color=shade, weight="bold")
     axes.set(xlim=(-0.45, len(sizes) - 0.55), ylim=(-0.26, 1.04))
 
 
@@ -90,8 +141,9 @@ def _heights(units: int) -> Any:
     return 0.5 + (np.arange(shown) - (shown - 1) / 2) / _MOST
 
 
-def system(settings: Mapping[str, Any], encoder: Mapping[str, Any]) -> Plot:
+def system(shared: LabelRecord, looks: Looks) -> Plot:
     """Robot, observation, encoder, agent, action."""
+    settings, encoder = shared["settings"], shared["encoder"]
     latent = encoder["encoder"][-1][0]
     hidden = "-".join(map(str, settings["hidden"]))
     boxes = [
@@ -104,21 +156,21 @@ def system(settings: Mapping[str, Any], encoder: Mapping[str, Any]) -> Plot:
     return Plot(
         "system",
         "The system",
-        "What an agent sees and does in each control step of 0.01 s.",
+        f"What an agent sees and does in each control step of {CONTROL_TIMESTEP:g} s.",
         ("part", "what"),
         [(name, what.replace("\n", ", ")) for name, what in [*boxes, ("action", "1 drive")]],
-        lambda: _draw_system(boxes),
+        lambda: _draw_system(boxes, looks()[settings["representation"]]["color"]),
     )
 
 
-def _draw_system(boxes: Sequence[tuple[str, str]]) -> Figure:
+def _draw_system(boxes: Sequence[tuple[str, str]], reduced: str) -> Figure:
+    """Boxes in a row, the encoder and its latent in the colour of the representation."""
     figure = Figure(figsize=(PAGE, 1.45))
     axes: Axes = figure.subplots()
     axes.set_axis_off()
     axes.set(xlim=(-0.05, len(boxes) * 1.25 - 0.2), ylim=(-0.55, 1.05))
-    look = styles(name for name, _ in boxes)
     for i, (name, what) in enumerate(boxes):
-        x, colour = 1.25 * i, look[name]["color"]
+        x, colour = 1.25 * i, reduced if name in ("encoder", "latent") else ink()
         box = FancyBboxPatch(
             (x, 0.1), 1, 0.8, "round,pad=0,rounding_size=.08", fc="none", ec=colour
         )

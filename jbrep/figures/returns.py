@@ -1,4 +1,4 @@
-"""What runs end at, how they spread, how fast they learn: a point for each run, an interval."""
+"""Final returns, their spread, and learning speed: a point for each run, and intervals."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -8,108 +8,116 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from jbrep.figures.curves import Group, below, looks
+from jbrep.figures.curves import Groups, below, cell, names_with_runs
 from jbrep.figures.plot import Plot
-from jbrep.figures.style import COLUMN, PAGE, plain, reference, solved_line_style
+from jbrep.figures.style import (
+    COLUMN,
+    PAGE,
+    Looks,
+    Styles,
+    mark_cut,
+    plain,
+    reference,
+    solved_line_style,
+)
 from jbrep.jitterbug.tasks import SOLVED_RETURN
+from jbrep.stats.analysis import Analysis, GroupAnalysis
+from jbrep.stats.bootstrap import Interval
+from jbrep.stats.claims import LESS_VARIANCE
+from jbrep.stats.comparison import Comparison
+from jbrep.stats.runs import MAX_RETURN
 
 _ENDS = ("low", "high")
 _LABEL = ("task", "algorithm", "representation")
-_JITTER = 0.16  # between the outermost runs and the middle of their label
+_JITTER = 0.16  # between the outermost runs and the middle of their representation
+_MAX_SD = MAX_RETURN / 2  # of many returns in [0, 1000]
+_MAX_DECADES = 4  # of a variance ratio, on each side of 1
+_CUT = " A triangle at an edge: the interval goes beyond it."
 
 
-def final_return(groups: Sequence[Group]) -> Plot:
+def final_return(groups: Groups, looks: Looks) -> Plot:
     """Final return and its spread by representation."""
     return Plot(
         "final_return",
         "Final return and its spread",
-        "Left: mean over the last tenth of training, a point for each run, and the mean over runs "
-        "with its 95 % interval. Right: the standard deviation over runs with its 95 % interval.",
+        "Left: mean over the last tenth of training, a point for each of n runs, and the mean over "
+        "runs with its 95 % interval. Right: the standard deviation over runs with its 95 % "
+        "interval." + _CUT,
         (
-            *_LABEL,
-            "seed",
-            "final_return",
-            "mean",
-            "mean_low",
-            "mean_high",
-            "sd",
-            "sd_low",
-            "sd_high",
+            *(*_LABEL, "seed", "final_return", "mean", "mean_low", "mean_high"),
+            *("sd", "sd_low", "sd_high"),
         ),
         list(_by_run(groups, "final_return", ("final_return_mean", "final_return_sd"))),
-        lambda: _draw_final(groups),
+        lambda: _draw_final(groups, looks),
     )
 
 
-def learning_rate(groups: Sequence[Group]) -> Plot:
+def learning_rate(groups: Groups, looks: Looks) -> Plot:
     """How fast each representation learns: the mean return over training."""
     return Plot(
         "learning_rate",
         "How fast agents learn",
-        "Mean return over all of training (the area under the learning curve), a point for each "
-        "run, and the mean over runs with its 95 % interval.",
+        "Mean return over all of training (the area under the learning curve), a point for each of "
+        "n runs, and the mean over runs with its 95 % interval." + _CUT,
         (*_LABEL, "seed", "mean_return", "mean", "mean_low", "mean_high"),
         list(_by_run(groups, "mean_return", ("mean_return_mean",))),
-        lambda: _draw_learning(groups),
+        lambda: _draw_learning(groups, looks),
     )
 
 
-def variance_ratio(groups: Sequence[Group], baseline: str, level: float) -> Plot:
+def variance_ratio(analysis: Analysis, looks: Looks) -> Plot:
     """Variances of final returns against the baseline's."""
+    level = f"{100 * analysis.simultaneous_level:.2f} %"
     return Plot(
         "variance_ratio",
-        "Variance against the full observation's",
-        f"Ratio of the variance of final returns to that on {baseline}. Thick: 95 % interval; "
-        f"thin: {100 * level:.2f} %, at which all verdicts hold together. Below 1 varies less.",
+        f"Variance relative to {analysis.baseline}",
+        f"Ratio of the variance of final returns to that on {analysis.baseline}. Thick: 95 % "
+        f"interval; thin: {level}, at which all verdicts hold together. Below 1 varies less."
+        + _CUT,
         (*_LABEL, "ratio", *_ENDS, "low_together", "high_together", "verdict"),
         [
-            (*key, *values, *verdict["simultaneous"][1:], verdict["verdict"])
-            for key, values, verdict in _ratios(groups)
+            (group.task, group.algorithm, comparison.representation, *_ratio_cells(comparison))
+            for group in analysis.groups
+            for comparison in group.comparisons
         ],
-        lambda: _draw_ratios(groups),
+        lambda: _draw_ratios(analysis.groups, looks),
     )
 
 
-def profiles(groups: Sequence[Group], returns: Sequence[float]) -> Plot:
+def profiles(analysis: Analysis, looks: Looks) -> Plot:
     """The share of runs above each return."""
     return Plot(
         "profiles",
         "Performance profiles",
-        "The share of runs whose final return is above that on the axis, with its 95 % bootstrap "
+        "The share of n runs whose final return is above that on the axis, with its 95 % bootstrap "
         "interval (Agarwal et al. 2021). Higher is better; steep is steady.",
         (*_LABEL, "final_return", "share", *_ENDS),
         [
-            (group["task"], group["algorithm"], label["representation"], at, *share)
-            for group in groups
-            for label in group["labels"]
-            for at, share in zip(returns, label["profile"], strict=True)
+            (group.task, group.algorithm, label.representation, *row)
+            for group in analysis.groups
+            for label in group.labels
+            for row in zip(analysis.profile_returns, *label.profile, strict=True)
         ],
-        lambda: _draw_profiles(groups, returns),
+        lambda: _draw_profiles(analysis, looks),
     )
 
 
-def _by_run(groups: Sequence[Group], value: str, numbers: Sequence[str]) -> Iterator[Any]:
+def _by_run(groups: Groups, value: str, numbers: Sequence[str]) -> Iterator[tuple[Any, ...]]:
     for group in groups:
-        for label in group["labels"]:
-            key = (group["task"], group["algorithm"], label["representation"])
-            shared = [_cell(v) for name in numbers for v in label["numbers"][name]]
-            for seed, each in zip(label["seeds"], label["by_run"][value], strict=True):
-                yield (*key, seed, _cell(each), *shared)
+        for label in group.labels:
+            key = (group.task, group.algorithm, label.representation)
+            shared = [cell(part) for name in numbers for part in label.numbers[name]]
+            for seed, each in zip(label.seeds, label.by_run[value], strict=True):
+                yield (*key, seed, cell(each), *shared)
 
 
-def _cell(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
+def _ratio_cells(comparison: Comparison) -> list[Any]:
+    verdict = comparison.verdict(LESS_VARIANCE)
+    numbers = (*comparison.numbers["variance_ratio"], *verdict.simultaneous[1:])
+    return [*(number if np.isfinite(number) else "" for number in numbers), verdict.verdict]
 
 
-def _ratios(groups: Sequence[Group]) -> Iterator[tuple[tuple[str, str, str], list[Any], Any]]:
-    for group in groups:
-        for comparison in group["comparisons"]:
-            key = (group["task"], group["algorithm"], comparison["representation"])
-            verdict = next(v for v in comparison["verdicts"] if v["claim"] == "less variance")
-            yield key, comparison["numbers"]["variance_ratio"], verdict
-
-
-def _panels(groups: Sequence[Group], columns: int, height: float = 1.7) -> tuple[Figure, Any]:
+def _panels(groups: Groups, columns: int, height: float = 1.7) -> tuple[Figure, Any]:
     """A row of panels for each group; two groups side by side where a row has one panel."""
     across = 1 if columns > 1 or len(groups) == 1 else 2
     rows = -(-len(groups) // across)
@@ -122,97 +130,104 @@ def _panels(groups: Sequence[Group], columns: int, height: float = 1.7) -> tuple
     return figure, flat[: len(groups)]
 
 
-def _draw_final(groups: Sequence[Group]) -> Figure:
+def _draw_final(groups: Groups, looks: Looks) -> Figure:
     figure, panels = _panels(groups, 2)
-    look = looks(groups)
+    look = looks()
     for (left, right), group in zip(panels, groups, strict=True):
-        _draw_runs(left, group, look, "final_return")
         left.axhline(SOLVED_RETURN, **solved_line_style())
         left.set(ylabel="final return", ylim=(-40, 1040))
-        _by_label(right, group)
-        for i, label in enumerate(group["labels"]):
-            style = look[label["representation"]]
-            _interval(right, i, label["numbers"]["final_return_sd"], style)
+        _draw_runs(left, group, look, "final_return")
+        deviations = [label.numbers["final_return_sd"] for label in group.labels]
+        _from_zero(right, deviations, _MAX_SD)
         right.set_ylabel("SD over runs")
-        _from_zero(right)
+        _name_columns(right, group)
+        for i, (label, deviation) in enumerate(zip(group.labels, deviations, strict=True)):
+            _draw_interval(right, i, deviation, look[label.representation])
     return figure
 
 
-def _draw_learning(groups: Sequence[Group]) -> Figure:
+def _draw_learning(groups: Groups, looks: Looks) -> Figure:
     figure, panels = _panels(groups, 1)
-    look = looks(groups)
+    look = looks()
     for (axes,), group in zip(panels, groups, strict=True):
+        means = [label.numbers["mean_return_mean"] for label in group.labels]
+        values = np.concatenate([label.by_run["mean_return"] for label in group.labels])
+        _from_zero(axes, [*means, Interval(values.max(), np.nan, np.nan)], MAX_RETURN)
+        axes.set_ylabel("mean return")
         _draw_runs(axes, group, look, "mean_return")
-        axes.set_ylabel("mean return over training")
-        _from_zero(axes)
     return figure
 
 
-def _from_zero(axes: Axes) -> None:
-    """From zero up, with room for whole markers."""
-    _, top = axes.get_ylim()
-    axes.set_ylim(-0.04 * top, 1.04 * top)
+def _from_zero(axes: Axes, intervals: Sequence[Interval], limit: float) -> None:
+    """From zero to all values, and to the ends of their intervals as far as a limit."""
+    ends = [end for each in intervals for end in each if end <= limit]
+    cut = any(each.high > limit for each in intervals)
+    top = max([*ends, *(each.value for each in intervals), limit if cut else 0]) or 1
+    axes.set_ylim(-0.04 * top, 1.04 * top)  # with room for whole markers
 
 
-def _draw_runs(axes: Axes, group: Group, look: dict[str, Any], value: str) -> None:
-    """A point for each run of each label, and the mean with its interval."""
-    _by_label(axes, group)
-    for i, label in enumerate(group["labels"]):
-        style, runs = look[label["representation"]], np.array(label["by_run"][value], float)
+def _draw_runs(axes: Axes, group: GroupAnalysis, look: Styles, value: str) -> None:
+    """A point for each run of each representation, and the mean with its interval."""
+    _name_columns(axes, group)
+    for i, label in enumerate(group.labels):
+        style, runs = look[label.representation], label.by_run[value]
         beside = i - 0.22 + np.linspace(-_JITTER, _JITTER, len(runs)) * (len(runs) > 1)
         axes.plot(beside, runs, ".", color=style["color"], ms=4, alpha=0.6, mew=0)
-        _interval(axes, i + 0.16, label["numbers"][f"{value}_mean"], style)
+        _draw_interval(axes, i + 0.16, label.numbers[f"{value}_mean"], style)
 
 
-def _by_label(axes: Axes, group: Group) -> None:
-    names = [plain(label["representation"]) for label in group["labels"]]
-    axes.set_title(plain(f"{group['task']}, {group['algorithm']}"))
-    tilt: dict[str, Any] = {"rotation": 30, "ha": "right"} if len(names) > 4 else {}
+def _name_columns(axes: Axes, group: GroupAnalysis) -> None:
+    names = list(names_with_runs([group]).values())
+    axes.set_title(plain(group.name))
+    tilt: dict[str, Any] = {"rotation": 30, "ha": "right"} if len(names) > 3 else {}
     axes.set_xticks(range(len(names)), names, **tilt)
     axes.set_xlim(-0.6, len(names) - 0.4)
     axes.grid(visible=False, axis="x")
 
 
-def _interval(axes: Axes, at: float, values: Sequence[float | None], style: dict[str, Any]) -> None:
-    """A value with its interval, upright; no bar where there is none."""
-    value, low, high = np.array(values, float)
+def _draw_interval(axes: Axes, at: float, values: Interval, style: dict[str, Any]) -> None:
+    """A value with its interval, upright; no bar where there is no interval."""
+    value, low, high = values
     spread = None if np.isnan(low) else np.clip([[value - low], [high - value]], 0, None)
     axes.errorbar([at], [value], spread, ms=4, lw=1.4, capsize=2.5, **style)
+    mark_cut(axes, "y", at, values, style["color"])
 
 
-def _draw_ratios(groups: Sequence[Group]) -> Figure:
+def _draw_ratios(groups: Groups, looks: Looks) -> Figure:
     """A panel for each group, a row for each representation, all to one scale."""
-    compared = [group for group in groups if group["comparisons"]]
-    most = max(len(group["comparisons"]) for group in compared)
+    compared = [group for group in groups if group.comparisons]
+    most = max(len(group.comparisons) for group in compared)
     figure, panels = _panels(compared, 1, 0.45 + 0.19 * most)
-    look = looks(groups)
-    limit = max(_reach(values, verdict) for _, values, verdict in _ratios(groups))
+    look = looks()
+    decades = max(_decades(c) for group in compared for c in group.comparisons)
     for (axes,), group in zip(panels, compared, strict=True):
-        rows = list(_ratios([group]))
-        for i, (key, values, verdict) in enumerate(rows):
-            _draw_ratio(axes, i, values, verdict, look[key[2]])
+        baseline, *names = names_with_runs([group]).values()
+        axes.set(xscale="log", xlim=(10 ** -(decades + 0.1), 10 ** (decades + 0.1)))
+        for i, comparison in enumerate(group.comparisons):
+            _draw_ratio(axes, i, comparison, look[comparison.representation])
         axes.axvline(1, **reference())
-        axes.set_yticks(range(len(rows)), [plain(key[2]) for key, _, _ in rows])
-        axes.set(ylim=(len(rows) - 0.4, -0.6), xscale="log", xlabel="variance ratio")
-        axes.set_xlim(10 ** -(limit + 0.1), 10 ** (limit + 0.1))
-        _few_decades(axes, limit)
+        axes.set_yticks(range(len(names)), names)
+        axes.set(ylim=(len(names) - 0.4, -0.6), xlabel=f"variance relative to {baseline}")
+        _few_decades(axes, decades)
         axes.grid(visible=False, axis="y")
-        axes.set_title(plain(f"{group['task']}, {group['algorithm']}"))
+        axes.set_title(plain(group.name))
     return figure
 
 
-def _reach(values: Sequence[float | None], verdict: Group) -> float:
-    """How many powers of ten the intervals go from 1, where they are above 0."""
-    ends = np.array((*values, *verdict["simultaneous"], 1), float)
-    return float(np.abs(np.log10(ends[ends > 0])).max())
+def _decades(comparison: Comparison) -> float:
+    """How many powers of ten the intervals extend from 1, where they are above 0; not too many."""
+    simultaneous = comparison.verdict(LESS_VARIANCE).simultaneous
+    ends = np.array([*comparison.numbers["variance_ratio"], *simultaneous, 1])
+    return min(float(np.abs(np.log10(ends[ends > 0])).max()), _MAX_DECADES)
 
 
-def _draw_ratio(
-    axes: Axes, row: int, values: Sequence[float | None], verdict: Group, style: dict[str, Any]
-) -> None:
-    for (_, low, high), width in ((verdict["simultaneous"], 0.8), (values, 2)):
-        axes.plot(np.array([low, high], float), [row, row], color=style["color"], linewidth=width)
-    axes.plot(np.array(values[:1], float), [row], style["marker"], color=style["color"], ms=4)
+def _draw_ratio(axes: Axes, row: int, comparison: Comparison, style: dict[str, Any]) -> None:
+    simultaneous = comparison.verdict(LESS_VARIANCE).simultaneous
+    nominal, colour = comparison.numbers["variance_ratio"], style["color"]
+    for (_, *ends), width in ((simultaneous, 0.8), (nominal, 2)):
+        axes.plot(ends, [row, row], color=colour, linewidth=width)
+    axes.plot([nominal.value], [row], style["marker"], color=colour, ms=4)
+    mark_cut(axes, "x", row, [*nominal, *simultaneous], colour)
 
 
 def _few_decades(axes: Axes, limit: float) -> None:
@@ -223,21 +238,20 @@ def _few_decades(axes: Axes, limit: float) -> None:
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.2g}" if x < 1 else f"{x:,.0f}"))
 
 
-def _draw_profiles(groups: Sequence[Group], returns: Sequence[float]) -> Figure:
+def _draw_profiles(analysis: Analysis, looks: Looks) -> Figure:
+    groups = analysis.groups
     figure, panels = _panels(groups, 1, 2.0)
-    look = looks(groups)
+    look, names = looks(), names_with_runs(groups)
     for (axes,), group in zip(panels, groups, strict=True):
-        for label in group["labels"]:
-            colour = look[label["representation"]]["color"]
-            share, low, high = np.array(label["profile"], float).T
+        for label in group.labels:
+            colour, returns = look[label.representation]["color"], analysis.profile_returns
+            share, low, high = label.profile
             axes.fill_between(returns, low, high, step="post", color=colour, alpha=0.12, lw=0)
-            axes.step(
-                returns, share, where="post", color=colour, label=plain(label["representation"])
-            )
+            name = names[label.representation]
+            axes.step(returns, share, where="post", color=colour, label=name)
         axes.axvline(SOLVED_RETURN, **solved_line_style())
-        axes.set_title(plain(f"{group['task']}, {group['algorithm']}"))
-        axes.set(
-            xlim=(0, 1000), ylim=(-0.02, 1.02), xlabel="final return", ylabel="share of runs above"
-        )
+        axes.set_title(plain(group.name))
+        axes.set(xlim=(0, 1000), ylim=(-0.02, 1.02))
+        axes.set(xlabel="final return", ylabel="share of runs above")
     below(figure, panels.ravel())
     return figure

@@ -1,38 +1,46 @@
 """All figures of a study."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import partial
 
 from jbrep.encoders import FULL
-from jbrep.figures.curves import Heuristics, Return, baseline_curves, curves, every_run
-from jbrep.figures.diagrams import Labels, diagrams
+from jbrep.figures.curves import Heuristics, Return, curves, every_run
+from jbrep.figures.diagrams import LabelRecord, diagrams
 from jbrep.figures.plot import Plot
 from jbrep.figures.returns import final_return, learning_rate, profiles, variance_ratio
+from jbrep.figures.style import styles
+from jbrep.stats import Analysis
+from jbrep.stats.runs import in_order
 
 
 def study_plots(
-    statistics: Mapping[str, Any] | None,
+    analysis: Analysis | None,
     returns: Sequence[Return],
     heuristics: Heuristics,
-    labels: Labels,
+    labels: Mapping[str, LabelRecord],
 ) -> list[Plot]:
-    """The figures that the tables of a study allow.
+    """The figures that the tables of a study allow; a representation has one colour in all.
 
     Args:
-        statistics: statistics.json; None where there are none.
+        analysis: statistics.json; None if there is none.
         returns: returns.csv.
         heuristics: returns of the hand-written policy, by task.
         labels: of runs.json.
     """
+    baseline = analysis.baseline if analysis else FULL
+    groups = analysis.groups if analysis else ()
+    names = {
+        *(row.representation for row in returns),
+        *(label.representation for group in groups for label in group.labels),
+        *(shared["settings"]["representation"] for shared in labels.values()),
+    }
+    looks = partial(styles, in_order(names, baseline), baseline if baseline in names else None)
     plots = []
-    baseline = statistics["baseline"] if statistics else FULL
-    if statistics:
-        groups = statistics["groups"]
-        plots += [curves(groups, heuristics), final_return(groups)]
-        if any(group["comparisons"] for group in groups):
-            level = statistics["simultaneous_level"]
-            plots.append(variance_ratio(groups, baseline, level))
-        plots += [learning_rate(groups), profiles(groups, statistics["profile_returns"])]
-        if any(len(group["labels"]) > 1 for group in groups):
-            plots.append(baseline_curves(groups, heuristics))
-    return [*plots, every_run(returns, baseline), *diagrams(labels)]
+    if analysis:
+        plots += [curves(groups, heuristics, looks), final_return(groups, looks)]
+        if any(group.comparisons for group in groups):
+            plots.append(variance_ratio(analysis, looks))
+        plots += [learning_rate(groups, looks), profiles(analysis, looks)]
+    if returns:
+        plots.append(every_run(returns, looks))
+    return [*plots, *diagrams(labels, looks)]

@@ -1,10 +1,14 @@
 """One style for all figures: sized for a paper's column, safe for the colour-blind."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any
 
 import matplotlib as mpl
 from cycler import cycler
+from matplotlib.axes import Axes
+
+Styles = dict[str, dict[str, Any]]  # colour and marker, by name
+Looks = Callable[[], Styles]  # of a study's representations, in the style in use
 
 COLUMN, PAGE = 3.45, 7.1  # widths in a paper of two columns [inches]
 MARKERS = "osD^vPX*"
@@ -51,7 +55,7 @@ DARK: Any = {
 
 
 def ink() -> str:
-    """The colour of text in the style that holds."""
+    """The colour of text in the style in use."""
     return str(mpl.rcParams["text.color"])
 
 
@@ -61,26 +65,51 @@ def reference() -> dict[str, Any]:
 
 
 def solved_line_style() -> dict[str, Any]:
-    """The line at which the paper calls a task solved."""
-    return {"color": ink(), "linestyle": ":", "linewidth": 0.8, "alpha": 0.65}
+    """The line from which on the paper calls a task solved."""
+    return {"color": ink(), "linestyle": ":", "linewidth": 0.8, "alpha": 0.65, "label": "solved"}
 
 
-def styles(names: Iterable[str], first: str | None = None) -> dict[str, dict[str, Any]]:
-    """Colour and marker of each name, in the style that holds.
+def styles(names: Iterable[str], first: str | None = None) -> Styles:
+    """Colour and marker of each name, in the style in use.
 
     Args:
         names: in order.
-        first: the one in the colour of text, if it is among them.
+        first: a name that gets the colour of text.
     """
     colours = mpl.rcParams["axes.prop_cycle"].by_key()["color"]
     others = [name for name in dict.fromkeys(names) if name != first]
-    found = {
+    coloured = {
         name: {"color": colours[i % len(colours)], "marker": MARKERS[(i + 1) % len(MARKERS)]}
         for i, name in enumerate(others)
     }
-    return {**({first: {"color": ink(), "marker": MARKERS[0]}} if first else {}), **found}
+    return {**({first: {"color": ink(), "marker": MARKERS[0]}} if first else {}), **coloured}
 
 
 def plain(text: str) -> str:
     """Text in which a dollar sign begins no formula."""
     return text.replace("$", r"\$")
+
+
+def with_runs(name: str, counts: Collection[int]) -> str:
+    """A representation with the number of its runs, or their range over several groups."""
+    numbers = "\N{EN DASH}".join(map(str, dict.fromkeys((min(counts), max(counts)))))
+    return plain(f"{name} (n = {numbers})")
+
+
+def mark_cut(axes: Axes, axis: str, at: float, values: Sequence[float], colour: str) -> None:
+    """Mark each edge of a panel beyond which values lie with a triangle that points outwards.
+
+    Args:
+        axes: the panel, with its final limits.
+        axis: that the values are on: x or y.
+        at: place on the other axis.
+        values: such as the ends of an interval; NaN is none.
+        colour: of the triangle.
+    """
+    low, high = axes.get_xlim() if axis == "x" else axes.get_ylim()
+    cut = {low: any(value < low for value in values), high: any(value > high for value in values)}
+    markers = "<>" if axis == "x" else "v^"
+    for (edge, is_cut), marker in zip(cut.items(), markers, strict=True):
+        if is_cut:
+            place = ([edge], [at]) if axis == "x" else ([at], [edge])
+            axes.plot(*place, marker, color=colour, ms=3.5, mew=0, clip_on=False, zorder=5)

@@ -1,11 +1,12 @@
-"""What a report says of a study besides its statistics: what ran, how, and how to run it again."""
+"""Everything in a report but its statistics: what ran, how, and how to run it again."""
 
 import json
-from collections import Counter
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from jbrep.encoders import FULL
+from jbrep.figures.diagrams import EncoderRecord, LabelRecord
 from jbrep.report.tables import Tables
 from jbrep.rl.files import FAILED
 from jbrep.stats.runs import in_order
@@ -20,61 +21,61 @@ def outline(tables: Tables) -> str:
     settings = [shared["settings"] for shared in tables.record["labels"].values()]
     tasks = dict.fromkeys(each["task"] for each in settings)
     algorithms = dict.fromkeys(map(learner, settings))
-    seen = in_order((each["representation"] for each in settings), FULL)
+    representations = in_order((each["representation"] for each in settings), FULL)
     runs = tables.record["runs"]
-    counts = Counter(run["status"] for run in runs)
-    steps = max(run["steps"] for run in runs)
     total = len(runs) + len(tables.record["missing"])
+    failed = sum(run["status"] == FAILED for run in runs)
+    steps = max(run["steps"] for run in runs)
     return (
-        f"{', '.join(algorithms)} on {', '.join(tasks)}, seen as {', '.join(seen)}: "
-        f"{len(runs)} of {total} runs are over, {counts[FAILED]} of them failed; up to {steps:,} "
-        "steps each."
+        f"{', '.join(algorithms)} on {', '.join(tasks)} with the representations "
+        f"{', '.join(representations)}: {len(runs) - failed} of {total} runs finished, {failed} "
+        f"failed; up to {steps:,} steps each."
     )
 
 
 def notices(tables: Tables) -> list[str]:
-    """What keeps the report from being whole."""
-    found = []
+    """What the report lacks."""
+    lines = []
     if missing := list(tables.record["missing"]):
         names = ", ".join(missing[:3]) + (" and others" if len(missing) > 3 else "")
-        found.append(
-            f"This study is not finished: {len(missing)} {_runs(missing)} missing ({names}). The "
-            "same jbrep study goes on."
+        lines.append(
+            f"This study is unfinished: {_runs(missing)} missing ({names}). The same jbrep study "
+            "command resumes it."
         )
     if failed := failed_rows(tables):
-        found.append(
-            f"{len(failed)} {_runs(failed)} counted as return 0 from the step on at which they "
-            "failed; why stands below."
+        lines.append(
+            f"{_runs(failed)} counted as return 0 from the step of failure on; the reasons are "
+            "given under Runs."
         )
-    return [*found, *(f"No statistics: {line}." for line in tables.record["left_out"])]
+    return [*lines, *(f"No statistics: {line}." for line in tables.record["left_out"])]
 
 
 def _runs(which: Sequence[object]) -> str:
-    return "run is" if len(which) == 1 else "runs are"
+    return "1 run is" if len(which) == 1 else f"{len(which)} runs are"
 
 
 def run_rows(tables: Tables) -> Rows:
-    """A line for each run that is over."""
-    last: dict[tuple[str, int], dict[int, list[float]]] = {}
+    """A row for each finished or failed run."""
+    returns: dict[tuple[str, int], dict[int, list[float]]] = {}
     for row in tables.returns:
         label = f"{row.task}/{row.algorithm}/{row.representation}"
-        steps = last.setdefault((label, row.seed), {})
-        steps.setdefault(row.step, []).append(row.episode_return)
+        of_run = returns.setdefault((label, row.seed), {})
+        of_run.setdefault(row.step, []).append(row.episode_return)
     return [
         (
             run["label"],
             str(run["seed"]),
             run["status"],
             f"{run['steps']:,}",
-            _end(last.get((run["label"], run["seed"]), {})),
+            _last(returns.get((run["label"], run["seed"]), {})),
             f"{run['seconds'] / 60:.1f}",
         )
         for run in tables.record["runs"]
     ]
 
 
-def _end(returns: Mapping[int, list[float]]) -> str:
-    """The mean of the last evaluation."""
+def _last(returns: Mapping[int, list[float]]) -> str:
+    """The mean return of the last evaluation, from the returns at each step."""
     if not returns:
         return "-"
     final = returns[max(returns)]
@@ -82,7 +83,7 @@ def _end(returns: Mapping[int, list[float]]) -> str:
 
 
 def failed_rows(tables: Tables) -> Rows:
-    """A line for each run that failed."""
+    """A row for each failed run."""
     return [
         (run["label"], str(run["seed"]), f"{run['steps']:,}", run["reason"] or "-")
         for run in tables.record["runs"]
@@ -91,57 +92,52 @@ def failed_rows(tables: Tables) -> Rows:
 
 
 def missing_rows(tables: Tables) -> Rows:
-    """A line for each run that isn't over."""
+    """A row for each unfinished run."""
     return [(name, f"{steps:,}") for name, steps in tables.record["missing"].items()]
 
 
 def version_rows(tables: Tables) -> Rows:
-    """A line for each package."""
-    found: dict[str, list[str]] = {}
+    """A row for each package."""
+    numbers: dict[str, dict[str, None]] = {}
     for versions in tables.record["versions"]:
         for package, number in versions.items():
-            found.setdefault(package, [])
-            if number not in found[package]:
-                found[package].append(number)
-    return [(package, ", ".join(numbers)) for package, numbers in found.items()]
+            numbers.setdefault(package, {})[number] = None
+    return [(package, ", ".join(each)) for package, each in numbers.items()]
 
 
 def encoder_rows(tables: Tables) -> Rows:
-    """A line for each label."""
-    found: Rows = []
-    for label, shared in tables.record["labels"].items():
-        encoder = shared["encoder"]
-        error, data = encoder["metrics"].get("held_out_mse"), encoder["data"]
-        found.append(
-            (
-                label,
-                encoder["name"],
-                layers(encoder),
-                "-" if error is None else f"{error:.2g}",
-                f"{data['train_rows']:,} states" if "train_rows" in data else "-",
-                shared["settings"]["encoder"][:12],
-            )
-        )
-    return found
+    """A row for each label."""
+    return [_encoder_row(label, shared) for label, shared in tables.record["labels"].items()]
 
 
-def layers(encoder: Mapping[str, Any]) -> str:
-    """As 16 - 8 tanh - 16 tanh."""
-    sizes = [
-        f"{units} {activation}" for units, activation in encoder["encoder"] + encoder["decoder"]
-    ]
-    return " - ".join([str(encoder["size"]), *sizes])
+def _encoder_row(label: str, shared: LabelRecord) -> Row:
+    encoder = shared["encoder"]
+    error, rows = encoder["metrics"].get("held_out_mse"), encoder["data"].get("train_rows")
+    return (
+        label,
+        encoder["name"],
+        _layers(encoder),
+        "-" if error is None else f"{error:.2g}",
+        "-" if rows is None else f"{rows:,}",
+        shared["settings"]["encoder"][:12],
+    )
+
+
+def _layers(encoder: EncoderRecord) -> str:
+    """Such as 16 - 8 tanh - 16 tanh."""
+    layers = [*encoder["encoder"], *encoder["decoder"]]
+    return " - ".join([str(encoder["size"]), *(f"{units} {kind}" for units, kind in layers)])
 
 
 def setting_rows(tables: Tables) -> tuple[Row, Rows]:
-    """What agents share besides their seeds, a column for each task and algorithm."""
+    """The settings that agents share, a column for each task and algorithm."""
     columns: dict[str, Mapping[str, Any]] = {}
     for label, shared in tables.record["labels"].items():
         columns.setdefault(label.rpartition("/")[0], dict(_flat(shared["settings"])))
     names = dict.fromkeys(name for settings in columns.values() for name in settings)
     skipped = ("task", "representation", "encoder")
     rows = [
-        (name, *(_said(settings.get(name)) for settings in columns.values()))
+        (name, *(_shown(settings.get(name)) for settings in columns.values()))
         for name in names
         if name not in skipped
     ]
@@ -156,38 +152,39 @@ def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
-def _said(value: Any) -> str:
+def _shown(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(map(str, value))
     return "-" if value is None else str(value)
 
 
 def reproduce(tables: Tables) -> list[tuple[str, str]]:
-    """What to type, each with a line on what it does."""
+    """Commands and files, each with a line on what it does."""
     versions = " ".join(
         f"{package}=={number.partition('+')[0]}"
         for package, number in tables.record["versions"][0].items()
         if package != "jbrep"
     )
     first = (
-        f"In a checkout of jbrep {tables.record['versions'][0]['jbrep']}, with these versions (the "
-        "same bits need the same kind of processor, too):",
+        f"In a checkout of jbrep {tables.record['versions'][0]['jbrep']}, with these versions "
+        "(equal results also need the same kind of processor):",
         f"pip install '.[learn]' {versions}",
     )
-    report = ("The tables, figures and this page from the runs:", f"jbrep report {tables.name}")
+    folder = shlex.quote(tables.name)
+    report = ("The tables, the figures and this page, from the runs:", f"jbrep report {folder}")
     study = tables.record["study"]
     if study:
         toml = ("This file, as study.toml:", _toml(study))
-        return [first, toml, ("All runs:", f"jbrep study study.toml --out {tables.name}"), report]
+        return [first, toml, ("All runs:", f"jbrep study study.toml --out {folder}"), report]
     commands = "\n".join(
         _command(shared, f"{tables.name}/{label}/seed-0")
         for label, shared in tables.record["labels"].items()
     )
-    return [first, ("Each run; these are of one seed:", commands), report]
+    return [first, ("Each run, here with one seed:", commands), report]
 
 
 def _toml(study: Mapping[str, Any]) -> str:
-    """A study as the file that it came from says it."""
+    """A study as the file that describes it."""
     lines, below = [], []
     for name, value in study.items():
         if isinstance(value, Mapping):
@@ -200,8 +197,11 @@ def _toml(study: Mapping[str, Any]) -> str:
     return "\n".join(lines + below)
 
 
-def _command(shared: Mapping[str, Any], out: str) -> str:
-    settings = shared["settings"]
+def _command(shared: LabelRecord, out: str) -> str:
+    settings: Mapping[str, Any] = shared["settings"]
     options = ("task", "algorithm", "preset", "steps", "evaluate_every", "evaluation_episodes")
-    given = " ".join(f"--{name.replace('_', '-')} {settings[name]}" for name in options)
-    return f"jbrep rl {given} --encoder {shared['encoder']['name']} --seed 0 --out {out}"
+    parts = ["jbrep", "rl"]
+    for name in options:
+        parts += [f"--{name.replace('_', '-')}", str(settings[name])]
+    parts += ["--encoder", shared["encoder"]["name"], "--seed", "0", "--out", out]
+    return shlex.join(parts)

@@ -2,7 +2,7 @@
 
 import base64
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
@@ -14,24 +14,33 @@ from jbrep.figures.style import DARK, PAGE
 from jbrep.files.tables import csv_text
 from jbrep.progress import Progress
 from jbrep.report import facts
+from jbrep.report.columns import are_numbers
 from jbrep.report.tables import Tables
-from jbrep.report.words import Answer
+from jbrep.report.words import Answer, remark
+from jbrep.stats import Analysis
+from jbrep.stats.claims import CLAIMS
 from jbrep.stats.summary import Rows, group_tables
 
 _WIDEST = 1000  # of a figure [CSS pixels]
+_PER_INCH = 96  # CSS pixels: on a narrow screen a figure is shown at its size on paper
 
 
 def page(tables: Tables, answers: Sequence[Answer], plots: Sequence[Plot]) -> str:
-    """The page; whatever the tables hold is shown as text and never runs."""
+    """The page; the content of the tables is shown as text and never runs."""
     script = _own("page.js")
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     return template.from_string(_own("page.html.j2")).render(
         name=tables.name,
         outline=facts.outline(tables),
         notices=facts.notices(tables),
+        groups=[g for g in (tables.analysis.groups if tables.analysis else ()) if g.comparisons],
+        baseline=tables.analysis.baseline if tables.analysis else "",
+        claims=CLAIMS,
+        remark=remark,
         answers=answers,
+        are_numbers=are_numbers,
         figures=[_figure(plot) for plot in Progress(plots, unit="figure", delay=1, leave=False)],
-        tables=_tables(tables.statistics) if tables.statistics else [],
+        tables=_tables(tables.analysis) if tables.analysis else [],
         runs=facts.run_rows(tables),
         failed=facts.failed_rows(tables),
         missing=facts.missing_rows(tables),
@@ -46,12 +55,12 @@ def page(tables: Tables, answers: Sequence[Answer], plots: Sequence[Plot]) -> st
     )
 
 
-def _tables(statistics: Mapping[str, Any]) -> list[tuple[str, Rows]]:
-    """Every table of every group, under a title that says which."""
+def _tables(analysis: Analysis) -> list[tuple[str, Rows]]:
+    """Every table of every group, each with a title that names the group."""
     return [
-        (f"{group['task']}, {group['algorithm']}. {title}" if i else title, rows)
-        for group in statistics["groups"]
-        for i, (title, rows) in enumerate(group_tables(group, statistics))
+        (f"{group.name}. {title}" if i else title, rows)
+        for group in analysis.groups
+        for i, (title, rows) in enumerate(group_tables(group, analysis))
     ]
 
 
@@ -61,6 +70,7 @@ def _figure(plot: Plot) -> dict[str, Any]:
         "title": plot.title,
         "caption": plot.caption,
         "width": round(min(_WIDEST, _WIDEST * max(plot.on_paper.width, 0.62 * PAGE) / PAGE)),
+        "narrowest": round(_PER_INCH * plot.on_paper.width),
         "light": _base64(plot.on_paper.picture("svg")),
         "dark": _base64(Drawing(plot, DARK).picture("svg")),
         "table": _base64(csv_text(plot.columns, plot.rows).encode()),

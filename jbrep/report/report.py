@@ -5,14 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jbrep.errors import InputError
 from jbrep.figures import study_plots, write
 from jbrep.files.storage import make_folder, write_whole
 from jbrep.report import facts
+from jbrep.report.markdown import markdown
 from jbrep.report.page import page
 from jbrep.report.tables import Tables, read_tables
 from jbrep.report.words import Answer, answers
-from jbrep.stats.summary import label_rows
+from jbrep.stats.plain import to_plain
 
 PAGE, SUMMARY, MARKDOWN, FIGURES = "report.html", "summary.json", "summary.md", "figures"
 FORMAT = "jbrep summary"
@@ -31,30 +31,26 @@ def write_report(folder: Path, out: Path | None = None) -> list[Path]:
         The page, the summaries, the folder of the figures.
 
     Raises:
-        InputError: the folder is not of a study, its tables are damaged, or it can't be written.
+        InputError: the folder is not that of a study, a table is damaged, or the report can't be
+            written.
     """
     tables = read_tables(folder)
     out = out or folder
     make_folder(out)
-    try:
-        found = answers(tables.statistics) if tables.statistics else []
-        plots = study_plots(
-            tables.statistics, tables.returns, tables.heuristics, tables.record["labels"]
-        )
-        texts = {
-            PAGE: page(tables, found, plots),
-            SUMMARY: json.dumps(_summary(tables, found), indent=1, allow_nan=False) + "\n",
-            MARKDOWN: markdown(tables, found),
-        }
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"the tables in {folder} don't fit together: {error!r}") from error
+    verdicts = answers(tables.analysis) if tables.analysis else []
+    plots = study_plots(tables.analysis, tables.returns, tables.heuristics, tables.record["labels"])
+    texts = {
+        PAGE: page(tables, verdicts, plots),
+        SUMMARY: json.dumps(_summary(tables, verdicts), indent=1, allow_nan=False) + "\n",
+        MARKDOWN: markdown(tables, verdicts, f"{FIGURES}/{_MAIN_FIGURE}.png"),
+    }
     write(plots, out / FIGURES)
     for name, text in texts.items():
         write_whole(out / name, text.encode())
     return [out / name for name in (*texts, FIGURES)]
 
 
-def _summary(tables: Tables, found: Sequence[Answer]) -> dict[str, Any]:
+def _summary(tables: Tables, verdicts: Sequence[Answer]) -> dict[str, Any]:
     """For programs."""
     record = tables.record
     return {
@@ -70,31 +66,12 @@ def _summary(tables: Tables, found: Sequence[Answer]) -> dict[str, Any]:
                 "counts": answer.counts,
                 "verdicts": [finding._asdict() for finding in answer.findings],
             }
-            for answer in found
+            for answer in verdicts
         },
         "numbers": {
-            f"{group['task']}/{group['algorithm']}/{label['representation']}": label["numbers"]
-            for group in (tables.statistics["groups"] if tables.statistics else [])
-            for label in group["labels"]
+            f"{group.task}/{group.algorithm}/{label.representation}": to_plain(label.numbers)
+            for group in (tables.analysis.groups if tables.analysis else ())
+            for label in group.labels
         },
         "versions": record["versions"],
     }
-
-
-def markdown(tables: Tables, found: Sequence[Answer]) -> str:
-    """For a README."""
-    lines = [f"# {tables.name}", "", facts.outline(tables), ""]
-    lines += [f"> {notice}\n" for notice in facts.notices(tables)]
-    for answer in found:
-        lines += [f"**{answer.headline}.**", ""]
-        lines += [f"- {f.where}: *{f.verdict}*. {f.sentence}" for f in answer.findings] + [""]
-    if tables.statistics:
-        lines += [f"![Returns over training]({FIGURES}/{_MAIN_FIGURE}.png)", ""]
-        for group in tables.statistics["groups"]:
-            header, rows = label_rows(group)
-            lines += [f"{group['task']}, {group['algorithm']}, with 95 % intervals over runs:", ""]
-            lines += [
-                "| " + " | ".join(row) + " |" for row in (header, ["---"] * len(header), *rows)
-            ]
-            lines.append("")
-    return "\n".join(lines)

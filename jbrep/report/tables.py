@@ -1,27 +1,56 @@
-"""The tables that a report is made from, read back from a study's folder."""
+"""The tables that a report is made from, read back from a study's folder and checked."""
 
 import csv
-import json
+import io
+import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, TypedDict
 
-from jbrep.errors import InputError, check_version
+from jbrep.errors import DamageError, InputError
 from jbrep.figures.curves import Return
+from jbrep.figures.diagrams import LabelRecord
 from jbrep.files.storage import exists
+from jbrep.files.typed import read_json, typed
 from jbrep.rl.files import read_text
-from jbrep.stats import analysis
+from jbrep.stats import Analysis
+from jbrep.stats.runs import MAX_RETURN
 from jbrep.study import record
 from jbrep.study.heuristics import HEURISTIC_RETURNS
 from jbrep.study.results import RETURNS, STATISTICS
 
+_MOST = 1 << 53  # of a whole number: a float holds it exactly
+
+
+class RunRecord(TypedDict):
+    """A finished or failed run in runs.json."""
+
+    label: str
+    seed: int
+    status: Literal["finished", "failed"]
+    reason: str | None
+    steps: int
+    seconds: float
+
+
+class Record(TypedDict):
+    """runs.json."""
+
+    study: dict[str, Any] | None  # its settings; None for runs without a study
+    missing: dict[str, int]  # unfinished runs: training steps done
+    left_out: list[str]  # what has no statistics, and why
+    versions: list[dict[str, str]]  # by package
+    processors: list[str]
+    labels: dict[str, LabelRecord]
+    runs: list[RunRecord]
+
 
 class Tables(NamedTuple):
-    """What a study left."""
+    """The tables of a study."""
 
     name: str
-    record: dict[str, Any]  # runs.json
-    statistics: dict[str, Any] | None  # statistics.json
+    record: Record
+    analysis: Analysis | None  # statistics.json
     returns: list[Return]  # returns.csv
     heuristics: dict[str, list[float]]  # heuristics.csv: returns by task
 
@@ -30,43 +59,83 @@ def read_tables(folder: Path) -> Tables:
     """The tables in a folder.
 
     Raises:
-        InputError: it is not of a study, or a file is damaged, missing, or of a newer jbrep.
+        InputError: there is no study in it, or a file is damaged, missing, or of a newer jbrep.
     """
     if not exists(folder / record.RECORD):
         raise InputError(
-            f"{folder} is not of a study: runs below it are expected, or a {record.RECORD}"
+            f"{folder} is not the folder of a study: it has neither runs nor a {record.RECORD}"
         )
-    found = _read_json(folder / record.RECORD, record.FORMAT, record.FORMAT_VERSION)
-    statistics = None
+    analysis = None
     if exists(folder / STATISTICS):
-        statistics = _read_json(folder / STATISTICS, analysis.FORMAT, analysis.FORMAT_VERSION)
+        analysis = Analysis.from_json(_text(folder / STATISTICS), folder / STATISTICS)
     heuristics: dict[str, list[float]] = {}
     if exists(folder / HEURISTIC_RETURNS):
-        for task, _, each in _read_csv(folder / HEURISTIC_RETURNS, (str, int, float)):
+        columns = (str, _count, _episode_return)
+        for task, _, each in _read_csv(folder / HEURISTIC_RETURNS, columns):
             heuristics.setdefault(task, []).append(each)
-    rows = _read_csv(folder / RETURNS, (str, str, str, int, int, int, float))
-    returns = [Return(*row) for row in rows]
-    return Tables(folder.resolve().name, found, statistics, returns, heuristics)
+    columns_of_returns = (str, str, str, _count, _count, _count, _episode_return)
+    returns = [Return(*row) for row in _read_csv(folder / RETURNS, columns_of_returns)]
+    name = folder.resolve().name.encode(errors="replace").decode()
+    return Tables(name, _read_record(folder / record.RECORD), analysis, returns, heuristics)
 
 
-def _read_json(path: Path, kind: str, known: int) -> dict[str, Any]:
+def _read_record(path: Path) -> Record:
+    value = read_json(_text(path), path, record.FORMAT, record.FORMAT_VERSION)
     try:
-        found = json.loads(read_text(path))
-        if found["format"] != kind:
-            raise ValueError
-        version = found["format_version"]
-    except (ValueError, KeyError, TypeError, RecursionError):
-        raise InputError(f"{path} is damaged, or no {kind}") from None
-    check_version(path, version, known)
-    return dict(found)
+        checked: Record = typed(value, Record)
+        _check(checked)
+    except ValueError as error:
+        raise DamageError(f"{path} is damaged: {error}") from None
+    return checked
+
+
+def _check(checked: Record) -> None:
+    """Make sure that the parts of a record fit together.
+
+    Raises:
+        ValueError: they don't.
+    """
+    if not checked["runs"]:
+        raise ValueError("it has no finished run")
+    if "jbrep" not in (*checked["versions"], {})[0]:
+        raise ValueError("the version of jbrep is missing")
+    for run in checked["runs"]:
+        if run["label"] not in checked["labels"]:
+            raise ValueError(f"settings of {run['label']} are missing")
+    for label, shared in checked["labels"].items():
+        layers = [*shared["encoder"]["encoder"], *shared["encoder"]["decoder"]]
+        if any(not 0 < size < _MOST for size, _ in [(shared["encoder"]["size"], ""), *layers]):
+            raise ValueError(f"the encoder of {label} has sizes that are not positive")
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_text(path)
+    except UnicodeDecodeError:
+        raise DamageError(f"{path} is damaged: it is not UTF-8") from None
 
 
 def _read_csv(path: Path, kinds: tuple[Callable[[str], Any], ...]) -> list[tuple[Any, ...]]:
     """The rows below the header, each cell of its column's kind."""
+    text = _text(path)
     try:
         return [
             tuple(kind(cell) for kind, cell in zip(kinds, row, strict=True))
-            for row in csv.reader(read_text(path).splitlines()[1:])
+            for row in list(csv.reader(io.StringIO(text, newline=""), strict=True))[1:]
         ]
-    except ValueError:
-        raise InputError(f"{path} is damaged, or cut short") from None
+    except (ValueError, csv.Error):
+        raise DamageError(f"{path} is damaged or cut short") from None
+
+
+def _count(cell: str) -> int:
+    number = int(cell)
+    if not 0 <= number < _MOST:
+        raise ValueError
+    return number
+
+
+def _episode_return(cell: str) -> float:
+    number = float(cell)
+    if not -1 <= number <= MAX_RETURN + 1 or math.isnan(number):  # rounding is within 1
+        raise ValueError
+    return number

@@ -1,30 +1,14 @@
-"""What the statistics say, in sentences."""
+"""Verdicts in sentences."""
 
+import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
-from jbrep.stats.claims import MARGIN
-from jbrep.text import SIGNIFICANT, interval, number
-
-Plain = Mapping[str, Any]  # statistics.json, or a part of it
-
-_CLAIMS = {
-    "similar reward": "The reduced state ends at a similar reward",
-    "less variance": "It has less variance over training runs",
-    "faster learning": "It learns faster",
-}
-_MEASURES = {
-    "similar reward": "difference of mean final returns",
-    "less variance": "ratio of variances of final returns",
-    "faster learning": "difference of mean returns over training",
-}
-
-_BOUNDARIES = {
-    "similar reward": f"the margin of {100 * MARGIN:.0f} %, ",
-    "less variance": "",
-    "faster learning": "",
-}
+from jbrep.stats import Analysis
+from jbrep.stats.claims import CLAIMS, Claim
+from jbrep.stats.comparison import Comparison, Verdict
+from jbrep.stats.summary import shown, shown_number
 
 
 class Finding(NamedTuple):
@@ -37,7 +21,7 @@ class Finding(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What a study says of a claim."""
+    """All verdicts of a study on one claim."""
 
     claim: str
     headline: str
@@ -45,19 +29,20 @@ class Answer(NamedTuple):
     findings: list[Finding]
 
 
-def answers(statistics: Plain) -> list[Answer]:
+def answers(analysis: Analysis) -> list[Answer]:
     """Each claim of the paper, with every verdict on it."""
-    found = []
-    for claim, words in _CLAIMS.items():
-        findings = list(_findings(claim, statistics))
-        counts = Counter(finding.verdict for finding in findings)
-        headline = f"{words}: {_overall(counts)}"
-        found.append(Answer(claim, headline, dict(counts), findings))
-    return found
+    return [_answer(claim, analysis) for claim in CLAIMS]
+
+
+def _answer(claim: Claim, analysis: Analysis) -> Answer:
+    findings = list(_findings(claim, analysis))
+    counts = Counter(finding.verdict for finding in findings)
+    headline = f"{claim.statement}: {_overall(counts)}"
+    return Answer(claim.name, headline, dict(counts), findings)
 
 
 def _overall(counts: Counter[str]) -> str:
-    """The verdict, if all agree; else how many say what."""
+    """The verdict if all agree, otherwise how many there are of each."""
     if not counts:
         return "no reduced state was compared"
     if len(counts) == 1:
@@ -66,40 +51,46 @@ def _overall(counts: Counter[str]) -> str:
     return ", ".join(f"{verdict} in {count}" for verdict, count in counts.most_common())
 
 
-def _findings(claim: str, statistics: Plain) -> Iterator[Finding]:
-    for group in statistics["groups"]:
-        for comparison in group["comparisons"]:
-            verdict = next(v for v in comparison["verdicts"] if v["claim"] == claim)
-            yield Finding(
-                f"{group['task']}, {group['algorithm']}",
-                comparison["representation"],
-                verdict["verdict"],
-                _sentence(verdict, comparison["representation"], statistics),
-            )
+def _findings(claim: Claim, analysis: Analysis) -> Iterator[Finding]:
+    for group in analysis.groups:
+        for comparison in group.comparisons:
+            verdict = comparison.verdict(claim).verdict
+            sentence = _sentence(claim, comparison, analysis)
+            yield Finding(group.name, comparison.representation, verdict, sentence)
 
 
-def _sentence(verdict: Plain, representation: str, statistics: Plain) -> str:
-    """The numbers behind a verdict, and what would decide where nothing does."""
-    nominal = interval(verdict["nominal"], SIGNIFICANT)
-    _, *ends = verdict["simultaneous"]
-    level = f"{100 * statistics['simultaneous_level']:.2f} %"
-    pair = f"{representation} against {statistics['baseline']}"
-    said = f"{pair}: {_MEASURES[verdict['claim']]} {nominal}"
-    if None not in ends:
-        low, high = (number(end, SIGNIFICANT) for end in ends)
-        bound = _BOUNDARIES[verdict["claim"]] + number(verdict["boundary"], SIGNIFICANT)
-        said += f"; at {level}, [{low}, {high}] {_place(verdict)} {bound}"
-    if verdict["reason"]:
-        return f"{said}; not decided: {verdict['reason']}."
-    needed = verdict["seeds_needed"]
-    if needed is None:
-        return f"{said}."
-    count = f"more than {needed[2:]}" if isinstance(needed, str) else f"about {needed}"
-    return f"{said}; {count} seeds would decide."
+def _sentence(claim: Claim, comparison: Comparison, analysis: Analysis) -> str:
+    """The numbers behind a verdict; of an undecided one, why or what would decide it."""
+    verdict = comparison.verdict(claim)
+    pair = f"{comparison.representation} against {analysis.baseline}"
+    sentence = f"{pair}: {claim.quantity} {shown(verdict.nominal)}"
+    _, low, high = verdict.simultaneous
+    if math.isfinite(low) and math.isfinite(high):
+        level = f"{100 * analysis.simultaneous_level:.2f} %"
+        bound = f"{claim.boundary_name} {shown_number(verdict.boundary)}".lstrip()
+        ends = f"[{shown_number(low)}, {shown_number(high)}]"
+        sentence += f"; at {level}, {ends} {_place(verdict)} {bound}"
+    return f"{sentence}{_outlook(verdict)}."
 
 
-def _place(verdict: Plain) -> str:
-    _, low, high = verdict["simultaneous"]
-    if low > verdict["boundary"]:
+def _place(verdict: Verdict) -> str:
+    if verdict.simultaneous.low > verdict.boundary:
         return "lies above"
-    return "lies below" if high < verdict["boundary"] else "contains"
+    return "lies below" if verdict.simultaneous.high < verdict.boundary else "contains"
+
+
+def _outlook(verdict: Verdict) -> str:
+    if verdict.reason:
+        return f"; undecided: {verdict.reason}"
+    if verdict.seeds_needed is None:
+        return ""
+    most = str(verdict.seeds_needed).removeprefix("> ")
+    count = f"about {most}" if isinstance(verdict.seeds_needed, int) else f"more than {most}"
+    return f"; {count} seeds would decide"
+
+
+def remark(verdict: Verdict) -> str:
+    """Why a verdict is undecided, or how many seeds would decide it, for a narrow column."""
+    if verdict.seeds_needed is not None:
+        return f"{verdict.seeds_needed} seeds"
+    return verdict.reason or ""

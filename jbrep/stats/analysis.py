@@ -1,18 +1,22 @@
-"""A whole study: every label, every comparison with the baseline, every verdict."""
+"""A whole study: results of every representation, comparisons with the baseline, verdicts."""
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jbrep.encoders import FULL
-from jbrep.stats.bootstrap import Array, Interval, without_nan
+from jbrep.errors import DamageError
+from jbrep.files.typed import read_json, typed
+from jbrep.stats.bootstrap import Array
 from jbrep.stats.claims import CLAIMS
 from jbrep.stats.comparison import Comparison, adjusted, compare, simultaneous_level
 from jbrep.stats.curves import common_grid
 from jbrep.stats.labels import PROFILE_RETURNS, RepresentationResult, describe, thresholds
+from jbrep.stats.plain import READERS, to_plain
 from jbrep.stats.runs import Group, RunCurve, groups
 
 FORMAT = "jbrep statistics"
@@ -21,16 +25,19 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class GroupAnalysis:
-    """What was found for one task and algorithm.
+    """The results for one task and algorithm.
 
     Args:
         task: the task's name.
         algorithm: the algorithm's name.
         grid: training steps at which runs are compared, (g,).
-        cut: what of the runs the grid leaves out; None for nothing.
-        thresholds: the return to reach under each name of a number of steps.
-        labels: the baseline's first, then by name.
-        comparisons: of each other label with the baseline.
+        cut: which evaluations the grid leaves out, in words; None if it leaves out none.
+        thresholds: the return to reach for each of STEPS_TO.
+        labels: results of each representation, the baseline first.
+        comparisons: of the other representations with the baseline, in the same order.
+
+    Raises:
+        ValueError: parts that don't fit together.
     """
 
     task: str
@@ -41,22 +48,51 @@ class GroupAnalysis:
     labels: tuple[RepresentationResult, ...]
     comparisons: tuple[Comparison, ...]
 
+    def __post_init__(self) -> None:
+        if len(self.grid) < 2 or not np.all(np.diff(self.grid) > 0) or self.grid[0] < 0:
+            raise ValueError("the grid must have at least two ascending steps")
+        names = [label.representation for label in self.labels]
+        if not names or len(set(names)) < len(names):
+            raise ValueError("each representation must have one result")
+        if [comparison.representation for comparison in self.comparisons] != names[1:]:
+            raise ValueError("each representation but the first must have one comparison")
+        for label in self.labels:
+            if len(label.curve.mean) != len(self.grid):
+                raise ValueError(f"the curve of {label.representation} doesn't fit the grid")
+
+    @property
+    def name(self) -> str:
+        """Task and algorithm, for titles."""
+        return f"{self.task}, {self.algorithm}"
+
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """What was found in a study.
+    """The results of a study.
 
     Args:
-        baseline: the representation that the others were compared with.
-        seed: of all that was drawn.
+        baseline: the representation that the others are compared with.
+        seed: of all resampling.
         simultaneous_level: of each verdict's interval, so that all hold together at 95 %.
         groups: by task and algorithm.
+        profile_returns: where performance profiles are evaluated, (k,).
+
+    Raises:
+        ValueError: parts that don't fit together.
     """
 
     baseline: str
     seed: int
     simultaneous_level: float
     groups: tuple[GroupAnalysis, ...]
+    profile_returns: Array = field(default_factory=PROFILE_RETURNS.copy)
+
+    def __post_init__(self) -> None:
+        results = [label for group in self.groups for label in group.labels]
+        if not results or any(g.labels[0].representation != self.baseline for g in self.groups):
+            raise ValueError(f"each group must begin with the baseline {self.baseline}")
+        if any(np.shape(each.profile.value) != self.profile_returns.shape for each in results):
+            raise ValueError("each profile must have as many values as profile_returns")
 
     def to_json(self) -> str:
         """All of it as JSON; an interval is [value, low, high], null stands for not finite."""
@@ -65,7 +101,26 @@ class Analysis:
 
     def tolist(self) -> dict[str, Any]:
         """The same as plain dicts, lists, numbers and text."""
-        return {**_plain(self), "profile_returns": PROFILE_RETURNS.tolist()}
+        return dict(to_plain(self))
+
+    @classmethod
+    def from_json(cls, text: str, path: Path) -> "Analysis":
+        """What to_json wrote, with NaN for all that wasn't finite.
+
+        Args:
+            text: the JSON.
+            path: where it comes from, for messages.
+
+        Raises:
+            DamageError: it is damaged, or something else.
+            InputError: it is of a newer jbrep.
+        """
+        record = read_json(text, path, FORMAT, FORMAT_VERSION)
+        try:
+            analysis: Analysis = typed(record, cls, READERS)
+        except ValueError as error:
+            raise DamageError(f"{path} is damaged: {error}") from None
+        return analysis
 
 
 def analyse(
@@ -76,16 +131,16 @@ def analyse(
     Args:
         runs: every run of the study.
         baseline: the representation that the others are compared with.
-        seed: of all that is drawn.
-        planned: comparisons with the baseline that the whole study has, for when only a part of
-            its runs is there: the verdicts of that part are as strict as those of the whole.
+        seed: of all resampling.
+        planned: comparisons with the baseline in the whole study. If only a part of its runs is
+            given, the verdicts are still as strict as those of the whole.
 
     Raises:
         InputError: runs that can't be compared, or would mislead; see jbrep.stats.runs.groups.
     """
-    found = groups(runs, baseline)
-    family = len(CLAIMS) * max(planned, sum(len(group) - 1 for group in found.values()))
-    analysed = [_analyse_group(group, family, seed) for group in found.values()]
+    runs_by_group = groups(runs, baseline)
+    family = len(CLAIMS) * max(planned, sum(len(group) - 1 for group in runs_by_group.values()))
+    analysed = [_analyse_group(group, family, seed) for group in runs_by_group.values()]
     comparisons = iter(adjusted([c for group in analysed for c in group.comparisons]))
     return Analysis(
         baseline=baseline,
@@ -99,30 +154,17 @@ def analyse(
 
 
 def _analyse_group(group: Group, family: int, seed: int) -> GroupAnalysis:
-    baseline = next(iter(group.values()))
+    """The results of a group; the p-values of its verdicts aren't adjusted yet."""
+    runs_of_baseline = next(iter(group.values()))
     grid, cut = common_grid(group)
-    reach = thresholds(baseline, grid)
-    described, *labels = (describe(of_label, grid, reach, seed) for of_label in group.values())
+    reach = thresholds(runs_of_baseline, grid)
+    baseline, *others = (describe(runs, grid, reach, seed) for runs in group.values())
     return GroupAnalysis(
-        task=baseline[0].task,
-        algorithm=baseline[0].algorithm,
+        task=runs_of_baseline[0].task,
+        algorithm=runs_of_baseline[0].algorithm,
         grid=grid,
         cut=cut,
         thresholds=reach,
-        labels=(described, *labels),
-        comparisons=tuple(compare(label, described, family, seed) for label in labels),
+        labels=(baseline, *others),
+        comparisons=tuple(compare(each, baseline, family, seed) for each in others),
     )
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Interval):
-        return value.tolist()
-    if is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, Mapping):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, tuple):
-        return [_plain(part) for part in value]
-    if isinstance(value, np.ndarray | float):
-        return without_nan(np.asarray(value).tolist())
-    return value

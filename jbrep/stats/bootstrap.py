@@ -1,4 +1,4 @@
-"""Intervals from resampling whole episodes: rows of one episode are no independent samples."""
+"""Intervals from resampling whole episodes, as the rows of one episode are not independent."""
 
 import math
 from collections.abc import Callable
@@ -16,20 +16,20 @@ _BOUNDS = (2.5, 97.5)  # [%]
 
 
 class Interval(NamedTuple):
-    """A value with its interval: of 95 %, from a percentile bootstrap, unless said otherwise."""
+    """A value with its interval: the 95 % percentile bootstrap interval unless stated otherwise."""
 
     value: Any
     low: Any
     high: Any
 
     def tolist(self) -> list[Any]:
-        """For JSON, [value, low, high] last; None where it isn't finite."""
+        """Lists (..., 3) for JSON: value, low, high; None for what isn't finite."""
         stacked = np.stack([np.asarray(part, float) for part in self], axis=-1)
         return without_nan(stacked.tolist())
 
 
 def without_nan(values: Any) -> Any:
-    """Numbers in lists of lists, None in place of those that aren't finite."""
+    """Numbers in nested lists, with None in place of those that aren't finite."""
     if isinstance(values, list):
         return [without_nan(value) for value in values]
     return values if math.isfinite(values) else None
@@ -38,15 +38,15 @@ def without_nan(values: Any) -> Any:
 def bootstrap(
     statistic: Callable[..., ArrayLike], *sums: Array, resamples: int = RESAMPLES
 ) -> Interval:
-    """A statistic of sums over all episodes, with its interval; NaN for that of one episode.
+    """A statistic of sums over all episodes with its interval, which is NaN for one episode.
 
-    The same resamples come for every call on as many episodes, so what is compared is compared on
-    the same episodes.
+    The resamples depend on the number of episodes alone, so statistics of the same episodes are
+    compared on the same resamples.
 
     Args:
-        statistic: what the sums over the episodes, (..., k) each, give, (...).
-        sums: per episode, (episodes, ...) each.
-        resamples: how many draws of as many episodes as there are, with replacement.
+        statistic: maps sums over episodes, (..., k) each, to values, (...).
+        sums: for each episode, (episodes, ...) each.
+        resamples: number of resamples; each draws as many episodes as there are, with replacement.
     """
     count = len(sums[0])
     weights = _weights(count, resamples)
@@ -59,7 +59,7 @@ def bootstrap(
 
 @lru_cache(4)
 def _weights(count: int, resamples: int) -> Array:
-    """How often each episode counts: once each, then as each resample drew them."""
+    """How often each episode counts: once in the first row, then as often as it was drawn."""
     draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), resamples)
     return np.concatenate((np.ones((1, count)), draws))
 
@@ -69,8 +69,8 @@ def by_episode(values: NDArray[Any], episode: NDArray[np.int64], count: int) -> 
 
     Args:
         values: a row for each row of data.
-        episode: the number of its episode, (n,), in ascending order.
-        count: how many episodes there are; one without rows has zeros.
+        episode: the number of each row's episode, (n,), in ascending order.
+        count: the number of episodes; the sums of one without rows are zero.
     """
     sums = np.zeros((count, *values.shape[1:]))
     if len(values):
@@ -80,12 +80,12 @@ def by_episode(values: NDArray[Any], episode: NDArray[np.int64], count: int) -> 
 
 
 def variation(total: Array, squares: Array, rows: Array) -> Array:
-    """Squared deviations from the mean, of the sum of values and of their squares.
+    """The sum of squared deviations from the mean, from the sums of values and of their squares.
 
-    0 where there is nothing but rounding.
+    0 where it is no more than rounding.
     """
-    found = squares - total**2 / rows
-    return np.where(found > 1e-9 * squares, found, 0)
+    deviations = squares - total**2 / rows
+    return np.where(deviations > 1e-9 * squares, deviations, 0)
 
 
 def r_squared(residual: Array, about_mean: Array) -> Array:

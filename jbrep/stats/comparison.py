@@ -7,37 +7,48 @@ import numpy as np
 from scipy.stats import levene
 
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.claims import CLAIMS, Claim, decide, in_words
+from jbrep.stats.claims import CLAIMS, VERDICTS, Claim, decide
 from jbrep.stats.intervals import FEWEST, LEVEL, constant, difference, percentile, variance_ratio
-from jbrep.stats.labels import STEPS_TO, RepresentationResult, median
+from jbrep.stats.labels import STEPS_TO, RepresentationResult, check_names, check_numbers, median
 from jbrep.stats.power import seeds_needed
 
-_ERROR = 0.05  # how often any of a study's verdicts may be wrong
+COMPARISON_NUMBERS = (
+    "final_return_difference",
+    "mean_return_difference",
+    "variance_ratio",
+    "variance_ratio_bootstrap",
+    "probability_of_improvement",
+    *(f"{name}_ratio" for name in STEPS_TO),
+)
+_ERROR = 0.05  # the probability that any of a study's verdicts is wrong
 
 
 def simultaneous_level(family: int) -> float:
-    """Of as many intervals, so that all hold together at 95 % (Bonferroni)."""
+    """The level of each of `family` intervals that hold together at 95 % (Bonferroni)."""
     return 1 - _ERROR / max(family, 1)
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the runs say about a claim.
+    """The verdict of the runs on a claim.
 
     Args:
-        claim: in words.
-        verdict: supported, contradicted or undecided, by the simultaneous interval, with which the
-            p-value must agree: where a run in ten failed to learn, Bonett's interval decides on
+        claim: its name.
+        verdict: supported, contradicted or undecided, by the simultaneous interval, and only where
+            the p-value agrees: if one run in ten fails to learn, Bonett's interval decides between
             equal variances in 19 % of comparisons of 10 runs at a level of 0.56 %, the permutation
             test in 0.3 %.
         boundary: the value that the interval must exclude.
-        nominal: the number that the claim is about, with its 95 % interval.
-        simultaneous: the same with the interval of the level that all of a study's verdicts share.
-        p: two-sided, of lying on the boundary.
+        nominal: the quantity that the claim is about, with its 95 % interval.
+        simultaneous: the same with an interval of the level that all verdicts of the study share.
+        p: two-sided, of lying on the boundary; NaN where it is undefined.
         p_holm: adjusted for all verdicts of the study.
-        seeds_needed: a label, to decide what is undecided, or "> 320"; None for what is decided
-            or has a reason.
-        reason: why it is undecided, other than too wide an interval.
+        seeds_needed: runs per representation that would decide an undecided claim, or "> 320";
+            None if it is decided or has a reason.
+        reason: why it is undecided, if not because the interval is too wide.
+
+    Raises:
+        ValueError: an unknown verdict, or several intervals in place of one.
     """
 
     claim: str
@@ -50,16 +61,26 @@ class Verdict:
     seeds_needed: int | str | None
     reason: str | None
 
+    def __post_init__(self) -> None:
+        if self.verdict not in VERDICTS.values():
+            raise ValueError(f"unknown verdict {self.verdict!r}")
+        if np.ndim(self.nominal.value) or np.ndim(self.simultaneous.value):
+            raise ValueError("nominal and simultaneous must be one interval each")
+
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """A representation against the baseline.
 
     Args:
-        representation: its label.
-        numbers: each with its 95 % interval.
-        brown_forsythe_p: of equal variances of final returns, as a check of the permutation test.
-        verdicts: one for each claim.
+        representation: its name.
+        numbers: COMPARISON_NUMBERS, each with its 95 % interval.
+        brown_forsythe_p: of equal variances of final returns, as a check of the permutation test;
+            NaN where it is undefined.
+        verdicts: one for each of CLAIMS, in that order.
+
+    Raises:
+        ValueError: numbers or verdicts that are missing or unknown.
     """
 
     representation: str
@@ -67,17 +88,25 @@ class Comparison:
     brown_forsythe_p: float
     verdicts: tuple[Verdict, ...]
 
+    def __post_init__(self) -> None:
+        check_numbers(self.numbers, COMPARISON_NUMBERS)
+        check_names("claims", [v.claim for v in self.verdicts], [claim.name for claim in CLAIMS])
+
+    def verdict(self, claim: Claim) -> Verdict:
+        """The verdict on a claim."""
+        return next(verdict for verdict in self.verdicts if verdict.claim == claim.name)
+
 
 def compare(
     label: RepresentationResult, baseline: RepresentationResult, family: int, seed: int
 ) -> Comparison:
-    """A label against the baseline; the p-values of its verdicts are yet to be adjusted.
+    """A representation against the baseline; the p-values of its verdicts aren't adjusted yet.
 
     Args:
         label: of the representation.
         baseline: of the same task and algorithm.
-        family: how many verdicts the study has.
-        seed: of all that is drawn.
+        family: the number of verdicts in the study.
+        seed: of all resampling.
     """
     final, final_of_baseline = label.by_run["final_return"], baseline.by_run["final_return"]
     numbers = {
@@ -106,7 +135,7 @@ def compare(
 
 
 def probability_of_improvement(x: Array, y: Array) -> Array:
-    """How often a run of x (..., n) is above one of y (..., m), a tie counting half, (...).
+    """The share of pairs in which a run of x (..., n) beats one of y (..., m); ties count half.
 
     Mann and Whitney's statistic, as in Agarwal et al. 2021, "Deep Reinforcement Learning at the
     Edge of the Statistical Precipice".
@@ -142,18 +171,18 @@ def _judge(
     decided = int(decide(claim, simultaneous, claim.boundary(y)))
     p = claim.p_value(x, y, boundary, seed)
     reason = _reason(claim, x, y)
-    if not baseline.learned:  # then all do nothing alike
+    if not baseline.learned:  # then there is nothing to compare with
         decided, reason = 0, f"{baseline.representation} didn't learn"
-    elif decided > 0 and label.failed and not claim.despite_failures:
+    elif decided > 0 and label.failed and not claim.allow_failures:
         decided, reason = 0, "failed runs"
     elif decided > 0 and not label.learned and not claim.allow_no_learning:
         decided, reason = 0, f"{label.representation} didn't learn"
     elif decided and p > 1 - level:
-        decided, reason = 0, "its p-value doesn't agree"
+        decided, reason = 0, "its p-value disagrees"
     needed = None if decided or reason else seeds_needed(claim, x, y, level, seed)
     return Verdict(
         claim=claim.name,
-        verdict=in_words(decided),
+        verdict=VERDICTS[decided],
         boundary=boundary,
         nominal=claim.interval(x, y, LEVEL),
         simultaneous=simultaneous,
@@ -171,11 +200,11 @@ def _reason(claim: Claim, x: Array, y: Array) -> str | None:
 
 
 def adjusted(comparisons: Sequence[Comparison]) -> list[Comparison]:
-    """The same with the p-values of all verdicts adjusted together."""
+    """The comparisons with the p-values of all their verdicts adjusted together."""
     p = np.array([verdict.p for c in comparisons for verdict in c.verdicts])
-    of_holm = iter(holm(p).tolist())
+    p_holm = iter(holm(p).tolist())
     return [
-        replace(c, verdicts=tuple(replace(v, p_holm=next(of_holm)) for v in c.verdicts))
+        replace(c, verdicts=tuple(replace(v, p_holm=next(p_holm)) for v in c.verdicts))
         for c in comparisons
     ]
 
@@ -185,6 +214,6 @@ def holm(p: Array) -> Array:
     counted = np.where(np.isnan(p), 1, p)
     order = np.argsort(counted, kind="stable")
     factors = np.arange(len(p), 0, -1)
-    found = np.empty(len(p))
-    found[order] = np.minimum(np.maximum.accumulate(factors * counted[order]), 1)
-    return np.where(np.isnan(p), np.nan, found)
+    p_holm = np.empty(len(p))
+    p_holm[order] = np.minimum(np.maximum.accumulate(factors * counted[order]), 1)
+    return np.where(np.isnan(p), np.nan, p_holm)

@@ -1,5 +1,6 @@
-"""Learning curves on a grid of steps that all runs compared share."""
+"""Learning curves on a grid of training steps that all compared runs share."""
 
+from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
@@ -12,23 +13,50 @@ from jbrep.stats.runs import Group, RunCurve
 
 PERCENTILES = (10, 25, 50, 75, 90)
 _LAST = 0.1  # of the grid's range, for the final return
-_POINTS = 64  # at a time, to keep the resamples in memory
+_POINTS = 64  # of the grid at a time, to keep the resamples in memory
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Mean returns of a representation's runs at each step of the grid, (g,) each.
+
+    Args:
+        p10: 10th percentile over runs; the others likewise.
+        mean: over runs.
+        iqm: interquartile mean over runs with its 95 % interval.
+
+    Raises:
+        ValueError: they differ in length.
+    """
+
+    p10: Array
+    p25: Array
+    p50: Array
+    p75: Array
+    p90: Array
+    mean: Array
+    iqm: Interval
+
+    def __post_init__(self) -> None:
+        parts = (self.p10, self.p25, self.p50, self.p75, self.p90, self.iqm.value)
+        if any(np.shape(part) != self.mean.shape for part in parts):
+            raise ValueError("the parts of a curve must have the same length")
 
 
 def iqm(values: Array) -> Array:
-    """The interquartile mean of (..., n): that of the middle half (Agarwal et al. 2021)."""
+    """The interquartile mean of (..., n): the mean of the middle half (Agarwal et al. 2021)."""
     return trim_mean(values, 0.25, axis=-1)
 
 
 def common_grid(group: Group) -> tuple[Array, str | None]:
-    """The steps at which all runs of a group are compared, (g,), and what was cut off.
+    """The training steps at which all runs of a group are compared, (g,), and what is cut off.
 
-    The grid ends where the first run that didn't fail ends, and begins where the last one begins:
-    nothing is extrapolated. Between, it has the evaluations of the run that has fewest, as more
+    The grid begins where the last run begins and ends where the first run that didn't fail ends:
+    nothing is extrapolated. In between it has the evaluations of the run with the fewest, as more
     would only be interpolated.
 
     Raises:
-        InputError: runs without steps in common.
+        InputError: the runs have no range of steps in common.
     """
     runs = list(chain.from_iterable(group.values()))
     whole = [run for run in runs if run.failed_at is None]
@@ -37,7 +65,7 @@ def common_grid(group: Group) -> tuple[Array, str | None]:
     if start >= end:
         raise InputError(
             f"{runs[0].task}/{runs[0].algorithm}: the evaluations of one run end at step {end}, "
-            f"those of another begin at {start}; train runs that overlap"
+            f"those of another begin at {start}: compare runs whose steps overlap"
         )
     inside = [run.steps[(start < run.steps) & (run.steps < end)] for run in whole or runs]
     fewest = min(inside, key=lambda steps: (len(steps), *steps))
@@ -45,7 +73,7 @@ def common_grid(group: Group) -> tuple[Array, str | None]:
 
 
 def _first(run: RunCurve) -> int:
-    """Where its curve begins: at 0 if it failed before it was evaluated."""
+    """The first step of its curve: 0 if it failed before it was evaluated."""
     steps, _ = run.curve()
     return 0 if steps[0] == run.failed_at else int(steps[0])
 
@@ -70,11 +98,8 @@ def on_grid(run: RunCurve, grid: Array) -> Array:
     return np.interp(grid, *run.curve())
 
 
-def bands(curves: Array, seed: int) -> dict[str, Array | Interval]:
-    """Of the runs of a label at each step, (g,) each.
-
-    Percentiles over runs, the mean, and the interquartile mean with its interval, from resampling
-    whole curves.
+def bands(curves: Array, seed: int) -> Curve:
+    """Percentiles and means over runs at each step, from resampling whole curves.
 
     Args:
         curves: on the grid, (runs, g).
@@ -84,11 +109,9 @@ def bands(curves: Array, seed: int) -> dict[str, Array | Interval]:
         percentile(iqm, curves.T[first : first + _POINTS], seed=seed)
         for first in range(0, curves.shape[1], _POINTS)
     ]
-    return {
-        **{f"p{q}": np.percentile(curves, q, axis=0) for q in PERCENTILES},
-        "mean": curves.mean(axis=0),
-        "iqm": Interval(*(np.concatenate(part) for part in zip(*parts, strict=True))),
-    }
+    iqm_of_all = Interval(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    p10, p25, p50, p75, p90 = np.percentile(curves, PERCENTILES, axis=0)
+    return Curve(p10, p25, p50, p75, p90, curves.mean(axis=0), iqm_of_all)
 
 
 def final_return(curves: Array, grid: Array) -> Array:
@@ -103,14 +126,14 @@ def mean_return(curves: Array, grid: Array) -> Array:
 
 
 def steps_to(curves: Array, grid: Array, threshold: float) -> Array:
-    """The first step at which each curve, (runs, g), reaches a return; inf where it never does.
+    """The first step at which each curve, (runs, g), reaches a return; inf if it never does.
 
     NaN for a threshold that isn't above 0: there is nothing to reach.
     """
     if not threshold > 0:
         return np.full(len(curves), np.nan)
     above = curves >= threshold
-    after = above.argmax(axis=1)  # 0, too, where it's never reached
+    after = above.argmax(axis=1)  # also 0 where it is never reached
     before = np.maximum(after - 1, 0)
     rows = np.arange(len(curves))
     low, high = curves[rows, before], curves[rows, after]

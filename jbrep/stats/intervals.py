@@ -1,8 +1,8 @@
 """Intervals over runs, each by the method that covered best in simulations.
 
-Coverage [%] of 95 % intervals for 5, 10 and 20 runs a group, drawn from a normal distribution, from
-a skewed one (1000 minus a gamma variable of shape 2), and from Student's with 5 degrees of freedom
-(600 to 40,000 samples each):
+Coverage [%] of 95 % intervals for 5, 10 and 20 runs per group, drawn from a normal distribution,
+from a skewed one (1000 minus a gamma variable of shape 2), and from Student's t distribution with 5
+degrees of freedom (600 to 40,000 samples each):
 
                                          normal              skewed              heavy tails
     mean: Student's t                    94.9  93.8  95.1    91.3  93.4  93.1    96.4  95.3  95.7
@@ -24,14 +24,15 @@ a skewed one (1000 minus a gamma variable of shape 2), and from Student's with 5
     IQR: percentile bootstrap            86.8  94.6  97.3    82.5  93.4  94.5    87.1  97.3  97.0
     MAD: percentile bootstrap            66.9  94.1  97.3    67.1  92.5  94.8    72.1  95.9  96.9
 
-With five runs, then, a percentile interval is too short. It stays where the literature uses it, so
-that numbers compare (Agarwal et al. 2021); a verdict never depends on one. With five runs an
-interval of the ratio of variances is wide, times and divided by ten. The level that a study's
-verdicts share is held, too: at 99.44 % and 99.89 %, for 5, 10 and 20 runs, a difference of means
-misses about as often as it may or less, a ratio of variances at most 1.5 times as often.
+So with five runs a percentile interval is too short. It is kept where the literature uses it, so
+that numbers can be compared (Agarwal et al. 2021); no verdict depends on one. With five runs the
+interval of a ratio of variances is wide: it extends by a factor of ten to both sides. Intervals of
+the level that a study's verdicts share hold as well: at 99.44 % and 99.89 %, for 5, 10 and 20 runs,
+those of a difference of means miss about as often as they may or less, those of a ratio of
+variances at most 1.5 times as often.
 
-One kind of returns nothing covers: those of runs of which some learn, near 900 with an SD of 20,
-and others don't, near 50 (40,000 samples each):
+No interval covers returns of which some are near 900 with an SD of 20, from runs that learn, and
+the others near 50, from runs that don't (40,000 samples each):
 
                                          a tenth don't       a fifth don't
     difference of means: Welch's t       98.5  98.5  96.4    99.1  96.8  95.3
@@ -39,8 +40,8 @@ and others don't, near 50 (40,000 samples each):
     ratio of variances: Bonett's         55.9  54.7  78.0    58.8  80.8  94.4
       of 99.44 %                         94.6  80.7  85.3    93.4  86.5  97.1
 
-as a group that all learned by luck seems to vary little. That is why a verdict on variances takes
-the permutation test, too (jbrep.stats.comparison).
+because a group in which all runs happen to learn seems to vary little. That is why a verdict on
+variances also takes the permutation test (jbrep.stats.comparison).
 """
 
 import math
@@ -57,17 +58,17 @@ LEVEL = 0.95
 RESAMPLES = 2000
 UNDEFINED = Interval(np.nan, np.nan, np.nan)
 _TINY = np.finfo(float).tiny  # against 0 / 0
-FEWEST = 3  # runs that a variance's interval takes: with two, Bonett's covers 86 %
+FEWEST = 3  # runs for an interval of a variance: with two, Bonett's covers 86 %
 
 
 def percentile(statistic: Callable[..., Array], *samples: Array, seed: int = 0) -> Interval:
     """A statistic with its 95 % percentile interval, from a stratified bootstrap over whole runs.
 
-    Resamples where it is undefined widen the interval at both ends.
+    Resamples in which the statistic is undefined widen the interval at both ends.
 
     Args:
-        statistic: of samples with runs on the last axis, (..., n) each, (...).
-        samples: one for each group, which is resampled on its own, (..., n) each.
+        statistic: maps samples with runs on the last axis, (..., n) each, to values, (...).
+        samples: one for each group, (..., n) each; each group is resampled on its own.
         seed: of the resamples.
     """
     random = np.random.default_rng(seed)
@@ -86,22 +87,22 @@ def percentile(statistic: Callable[..., Array], *samples: Array, seed: int = 0) 
 
 
 def constant(values: Array) -> NDArray[np.bool_]:
-    """Whether values (..., n) differ by rounding at most, (...)."""
+    """Whether values (..., n) differ by no more than rounding, (...)."""
     return np.ptp(values, axis=-1) <= 1e-9 * np.abs(values).max(axis=-1)
 
 
 def mean(values: Array) -> Interval:
-    """The mean of (n,) with Student's 95 % interval; NaN for its ends where nothing varies."""
+    """The mean of (n,) with Student's 95 % interval, which is NaN where nothing varies."""
     if constant(values):
         return Interval(values.mean(), np.nan, np.nan)
-    found = ttest_1samp(values, 0).confidence_interval(LEVEL)
-    return Interval(values.mean(), found.low, found.high)
+    ends = ttest_1samp(values, 0).confidence_interval(LEVEL)
+    return Interval(values.mean(), ends.low, ends.high)
 
 
 def difference(x: Array, y: Array, level: float = LEVEL) -> Interval:
     """The mean of x (..., n) minus that of y (..., m), with Welch's interval, (...).
 
-    NaN for its ends where neither varies.
+    The interval is NaN where neither varies.
     """
     value, error, freedom = welch(x, y)
     half = stdtrit(freedom, (1 + level) / 2) * error
@@ -112,7 +113,7 @@ def welch(x: Array, y: Array) -> tuple[Array, Array, Array]:
     """The difference of means, its error and its degrees of freedom, (...) each.
 
     Welch 1947, "The generalization of 'Student's' problem when several different population
-    variances are involved". NaN for the last two where neither x (..., n) nor y (..., m) varies;
+    variances are involved". The last two are NaN where neither x (..., n) nor y (..., m) varies;
     scipy's ttest_ind warns there.
     """
     n, m = x.shape[-1], y.shape[-1]
@@ -126,8 +127,8 @@ def deviation(values: Array) -> Interval:
     """The standard deviation of (n,) with Bonett's 95 % interval.
 
     Bonett 2006, "Approximate confidence interval for standard deviation of nonnormal
-    distributions", Computational Statistics & Data Analysis 50: of the log variance, with a
-    kurtosis about a trimmed mean. NaN for its ends with two runs, or where nothing varies.
+    distributions", Computational Statistics & Data Analysis 50: an interval of the log variance,
+    with a kurtosis about a trimmed mean. It is NaN for two runs, and where nothing varies.
     """
     runs, value = len(values), values.std(ddof=1)
     if runs < FEWEST or constant(values):
@@ -146,7 +147,7 @@ def variance_ratio(x: Array, y: Array, level: float = LEVEL) -> Interval:
     Bonett 2006, "Robust confidence interval for a ratio of standard deviations", Applied
     Psychological Measurement 30: a normal interval of the log ratio, whose error has the kurtosis
     pooled over both groups. His correction for groups of unequal size is left out, as it breaks
-    down for levels near 1. NaN for its ends where a group doesn't vary, or has two runs only.
+    down for levels near 1. The interval is NaN where a group has only two runs or doesn't vary.
     """
     n, m = x.shape[-1], y.shape[-1]
     (quartic_x, squares_x), (quartic_y, squares_y) = _moments(x), _moments(y)
@@ -160,9 +161,9 @@ def variance_ratio(x: Array, y: Array, level: float = LEVEL) -> Interval:
 
 
 def _moments(values: Array) -> tuple[Array, Array]:
-    """Of (..., n): the sums of fourth powers about a trimmed mean, of squares about the mean."""
+    """Sums over (..., n) of fourth powers about a trimmed mean, and of squares about the mean."""
     n = values.shape[-1]
-    # the part that Bonett trims off each end is half, that is, all but the median, for five runs
+    # for five runs Bonett trims half of them off each end, that is, all but the median
     centre = np.median(values, axis=-1) if n < 6 else trim_mean(values, _trimmed(n), axis=-1)
     return ((values - centre[..., None]) ** 4).sum(axis=-1), n * values.var(axis=-1)
 

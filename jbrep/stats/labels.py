@@ -1,21 +1,22 @@
-"""What the runs of one label returned, each by itself and together."""
+"""The results of one representation: of each run, and of all runs together."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import binomtest, iqr, median_abs_deviation
 
+from jbrep.jitterbug.tasks import SOLVED_RETURN
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.curves import bands, final_return, iqm, mean_return, on_grid, steps_to
+from jbrep.stats.curves import Curve, bands, final_return, iqm, mean_return, on_grid, steps_to
 from jbrep.stats.intervals import LEVEL, UNDEFINED, deviation, mean, percentile
 from jbrep.stats.reliability import TAIL_OF_RUNS, expected_shortfall, fixed_policy, within_runs
 from jbrep.stats.runs import RunCurve
 
-SOLVED = 900.0  # a final return that counts as a task solved
 PROFILE_RETURNS = np.linspace(0, 1000, 51)  # at which a performance profile is drawn
 SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the baseline's median final return
-STEPS_TO = tuple(f"steps_to_{name}" for name in (*SHARES, "900"))
+STEPS_TO = tuple(f"steps_to_{name}" for name in (*SHARES, f"{SOLVED_RETURN:.0f}"))
+REACHED = {name: name.replace("steps_to", "reached") for name in STEPS_TO}
 WITHIN = (  # of one run
     "dispersion_across_time",
     "short_term_risk",
@@ -23,6 +24,19 @@ WITHIN = (  # of one run
     "largest_drawdown",
     "policy_dispersion",
     "policy_risk",
+)
+RUN_NUMBERS = ("final_return", "mean_return", "gain", *STEPS_TO, *WITHIN)
+NUMBERS = (  # of all runs
+    *(
+        f"{name}_{by}"
+        for name in ("final_return", "mean_return")
+        for by in ("mean", "median", "iqm")
+    ),
+    "gain",
+    *(f"final_return_{spread}" for spread in ("sd", "iqr", "mad")),
+    "risk_across_runs",
+    *(name for pair in REACHED.items() for name in pair),
+    *WITHIN,
 )
 
 
@@ -35,44 +49,75 @@ class RepresentationResult:
         settings: that all runs share.
         seeds: of the runs, in ascending order.
         failed: seeds of the runs that failed.
-        curve: over the grid, (g,) each: percentiles over runs, mean, interquartile mean.
-        by_run: numbers of each run, (runs,) each, in the order of seeds.
-        numbers: numbers of the label, each with its 95 % interval.
+        curve: over the grid of the group.
+        by_run: RUN_NUMBERS, (runs,) each, in the order of seeds.
+        numbers: NUMBERS, each with its 95 % interval.
         profile: the share of runs whose final return is above each of PROFILE_RETURNS, (51,).
+
+    Raises:
+        ValueError: names or lengths that don't fit.
     """
 
     representation: str
     settings: str
     seeds: tuple[int, ...]
     failed: tuple[int, ...]
-    curve: Mapping[str, Array | Interval]
+    curve: Curve
     by_run: Mapping[str, Array]
     numbers: Mapping[str, Interval]
     profile: Interval
+
+    def __post_init__(self) -> None:
+        check_names("numbers of runs", self.by_run, RUN_NUMBERS)
+        check_numbers(self.numbers, NUMBERS)
+        lengths = {len(self.seeds), *(len(values) for values in self.by_run.values())}
+        if len(lengths) > 1:
+            raise ValueError(f"{len(self.seeds)} seeds, but numbers of {sorted(lengths)} runs")
 
     @property
     def learned(self) -> bool:
         """Whether the final return lies above the untrained policy's, beyond chance."""
         gain = self.numbers["gain"]
-        return bool(gain.value > 0 and not gain.low <= 0)  # without an end where nothing varies
+        return bool(gain.value > 0 and not gain.low <= 0)  # low is NaN where nothing varies
+
+
+def check_names(what: str, there: Collection[str], expected: Collection[str]) -> None:
+    """Make sure that all names are there and no others, in whatever order.
+
+    Raises:
+        ValueError: they aren't.
+    """
+    if set(there) != set(expected) or len(there) != len(expected):
+        raise ValueError(f"{what}: {', '.join(there)}; expected {', '.join(expected)}")
+
+
+def check_numbers(numbers: Mapping[str, Interval], expected: Collection[str]) -> None:
+    """Make sure that there is one interval for each name.
+
+    Raises:
+        ValueError: there isn't.
+    """
+    check_names("numbers", numbers, expected)
+    if any(np.ndim(number.value) for number in numbers.values()):
+        raise ValueError("each number must be one interval")
 
 
 def thresholds(baseline: list[RunCurve], grid: Array) -> dict[str, float]:
-    """The returns to reach, by the baseline's median final return; their names are STEPS_TO."""
+    """The return to reach for each of STEPS_TO: shares of the baseline's median, and solved."""
     median = float(np.median(final_return(_curves(baseline, grid), grid)))
-    returns = (*(share * median for share in SHARES.values()), SOLVED)
+    returns = (*(share * median for share in SHARES.values()), SOLVED_RETURN)
     return dict(zip(STEPS_TO, returns, strict=True))
 
 
 def describe(
     runs: list[RunCurve], grid: Array, reach: Mapping[str, float], seed: int
 ) -> RepresentationResult:
-    """A label's numbers.
+    """The results of a representation.
 
     Args:
-        runs: all of the label, in the order of seeds.
-        grid: steps at which runs are compared, (g,).
-        reach: the return to reach under each name of a number of steps.
+        runs: all of the representation, in the order of seeds.
+        grid: training steps at which runs are compared, (g,).
+        reach: the return to reach for each of STEPS_TO.
         seed: of the resamples.
     """
     curves = _curves(runs, grid)
@@ -108,33 +153,33 @@ def _curves(runs: list[RunCurve], grid: Array) -> Array:
 
 
 def _numbers(by_run: Mapping[str, Array], seed: int) -> dict[str, Interval]:
-    found = {}
+    numbers = {}
     for name in ("final_return", "mean_return"):
         values = by_run[name]
-        found[f"{name}_mean"] = mean(values)
-        found[f"{name}_median"] = percentile(median, values, seed=seed)
-        found[f"{name}_iqm"] = percentile(iqm, values, seed=seed)
-    found["gain"] = mean(by_run["gain"])
+        numbers[f"{name}_mean"] = mean(values)
+        numbers[f"{name}_median"] = percentile(median, values, seed=seed)
+        numbers[f"{name}_iqm"] = percentile(iqm, values, seed=seed)
+    numbers["gain"] = mean(by_run["gain"])
     final = by_run["final_return"]
-    found["final_return_sd"] = deviation(final)
-    found["final_return_iqr"] = percentile(lambda v: iqr(v, axis=-1), final, seed=seed)
-    found["final_return_mad"] = percentile(
+    numbers["final_return_sd"] = deviation(final)
+    numbers["final_return_iqr"] = percentile(lambda v: iqr(v, axis=-1), final, seed=seed)
+    numbers["final_return_mad"] = percentile(
         lambda v: median_abs_deviation(v, axis=-1), final, seed=seed
     )
-    found["risk_across_runs"] = percentile(
+    numbers["risk_across_runs"] = percentile(
         lambda v: expected_shortfall(v, TAIL_OF_RUNS), final, seed=seed
     )
     for name in STEPS_TO:
-        found[name] = percentile(median, by_run[name], seed=seed)
-        found[name.replace("steps_to", "reached")] = _share_reached(by_run[name])
+        numbers[name] = percentile(median, by_run[name], seed=seed)
+        numbers[REACHED[name]] = _share_reached(by_run[name])
     for name in WITHIN:
         finished = by_run[name][~np.isnan(by_run[name])]
-        found[name] = percentile(median, finished, seed=seed) if len(finished) else UNDEFINED
-    return found
+        numbers[name] = percentile(median, finished, seed=seed) if len(finished) else UNDEFINED
+    return numbers
 
 
 def median(values: Array) -> Array:
-    """Over runs, (..., n), of which some may be infinite."""
+    """The median over runs, (..., n), some of which may be infinite."""
     return np.median(values, axis=-1)
 
 
@@ -143,5 +188,5 @@ def _share_reached(steps: Array) -> Interval:
     if np.isnan(steps).any():
         return UNDEFINED
     reached = int(np.isfinite(steps).sum())
-    found = binomtest(reached, len(steps)).proportion_ci(LEVEL, method="wilson")
-    return Interval(reached / len(steps), found.low, found.high)
+    ends = binomtest(reached, len(steps)).proportion_ci(LEVEL, method="wilson")
+    return Interval(reached / len(steps), ends.low, ends.high)

@@ -1,4 +1,4 @@
-"""How many seeds would decide what is undecided, if the effect observed is the true one."""
+"""How many seeds would decide an undecided claim, if the observed effect is the true one."""
 
 import numpy as np
 
@@ -11,18 +11,18 @@ _STUDIES = 1000
 
 
 def seeds_needed(claim: Claim, x: Array, y: Array, level: float, seed: int = 0) -> int | str:
-    """The fewest seeds a label with which four of five simulated studies are decided.
+    """The fewest seeds per representation with which four of five simulated studies are decided.
 
-    The rule and its interval are those of the verdict; of its p-value only the least possible is
-    heeded, so that variances may take rather more. A study draws runs of both groups from those
-    there are.
+    The rule and the interval are those of the verdict; of the p-value only its smallest possible
+    value is taken into account, so variances may need somewhat more. A simulated study draws the
+    runs of both groups from the runs given.
 
     Args:
-        claim: what is to be decided.
+        claim: to be decided.
         x: a value for each run of the representation, (n,).
-        y: for each run of the baseline, (m,).
+        y: a value for each run of the baseline, (m,).
         level: of the interval.
-        seed: of the studies.
+        seed: of the simulated studies.
     """
     for count in SEEDS:
         if claim.least_p(count) > 1 - level:
@@ -36,11 +36,12 @@ def seeds_needed(claim: Claim, x: Array, y: Array, level: float, seed: int = 0) 
 
 
 def _draw(values: Array, count: int, random: np.random.Generator) -> Array:
-    """Studies of that many runs, (studies, count), drawn with replacement.
+    """Studies with `count` runs each, (studies, count), drawn with replacement.
 
-    Draws vary less than the runs' variance says, by (n - 1) / n, so they are stretched about the
-    mean by its root. Of a few runs they never have the tails, which makes numbers for variances
-    rough: mostly within a step of SEEDS for normal returns, and blind to outliers none of them was.
+    The variance of the draws is (n - 1) / n of the runs' variance, so the draws are stretched about
+    the mean to make up for it. A few runs don't show the tails of their distribution, which makes
+    the result for variances rough: mostly within one step of SEEDS for normal returns, and blind to
+    outliers that haven't occurred.
     """
     runs, mean = len(values), values.mean()
     stretched = mean + (values - mean) * np.sqrt(runs / (runs - 1))

@@ -1,9 +1,9 @@
 """How steadily runs learn, after Chan et al. 2020.
 
 "Measuring the Reliability of Reinforcement Learning Algorithms", ICLR 2020: dispersion is an
-interquartile range, risk an expected shortfall. Over time it is that of a curve's differences from
-one evaluation to the next, which takes the trend away, and for the long term that of its drawdown.
-Both depend on how far evaluations are apart, so compare within one grid only.
+interquartile range, risk an expected shortfall. Both are taken over a curve's differences from one
+evaluation to the next, which removes the trend; long-term risk is taken over its drawdown. They
+depend on the distance between evaluations, so compare them only within one grid.
 """
 
 import numpy as np
@@ -14,13 +14,13 @@ from jbrep.stats.bootstrap import Array
 from jbrep.stats.runs import RunCurve
 
 TAIL = 0.05  # of a run's evaluations, or episodes
-TAIL_OF_RUNS = 0.25  # with so few runs, a smaller part would be the worst one
+TAIL_OF_RUNS = 0.25  # a smaller part of so few runs would be the worst run alone
 
 
 def expected_shortfall(values: Array, tail: float) -> Array:
     """The mean of the lowest part of (..., n), also called CVaR.
 
-    The value at the edge counts by the share that is in the tail (Rockafellar and Uryasev 2002,
+    A value on the edge of the tail counts in part (Rockafellar and Uryasev 2002,
     "Conditional value-at-risk for general loss distributions"); a tail of less than one value is
     the lowest.
     """
@@ -33,14 +33,14 @@ def expected_shortfall(values: Array, tail: float) -> Array:
 
 
 def drawdown(curves: Array) -> Array:
-    """How far curves (..., g) lie below their maximum until then, at most 0."""
+    """Curves (..., g) minus their running maximum, at most 0."""
     return curves - np.maximum.accumulate(curves, axis=-1)
 
 
 def within_runs(curves: Array, failed: NDArray[np.bool_]) -> dict[str, Array]:
     """Dispersion and risk over the training of each run, (runs,) each.
 
-    NaN for a failed run, as its zeros would pass for steadiness.
+    NaN for a failed run, whose zeros would look like steadiness.
 
     Args:
         curves: on the grid, (runs, g).
@@ -48,13 +48,13 @@ def within_runs(curves: Array, failed: NDArray[np.bool_]) -> dict[str, Array]:
     """
     steps = np.diff(curves, axis=1)
     fallen = drawdown(curves)
-    found = {
+    numbers = {
         "dispersion_across_time": iqr(steps, axis=1),
         "short_term_risk": expected_shortfall(steps, TAIL),
         "long_term_risk": expected_shortfall(fallen, TAIL),
         "largest_drawdown": fallen.min(axis=1),
     }
-    return {name: np.where(failed, np.nan, values) for name, values in found.items()}
+    return {name: np.where(failed, np.nan, values) for name, values in numbers.items()}
 
 
 def fixed_policy(runs: list[RunCurve], end: float) -> dict[str, Array]:
@@ -63,16 +63,16 @@ def fixed_policy(runs: list[RunCurve], end: float) -> dict[str, Array]:
     NaN for a failed run.
 
     Args:
-        runs: of one label.
-        end: the last step that counts.
+        runs: of one representation.
+        end: the last step of the grid.
     """
-    found = {
+    numbers = {
         "policy_dispersion": np.full(len(runs), np.nan),
         "policy_risk": np.full(len(runs), np.nan),
     }
     for i, run in enumerate(runs):
         if run.failed_at is None:
             last = run.returns[run.steps <= end][-1]
-            found["policy_dispersion"][i] = iqr(last)
-            found["policy_risk"][i] = expected_shortfall(last, TAIL)
-    return found
+            numbers["policy_dispersion"][i] = iqr(last)
+            numbers["policy_risk"][i] = expected_shortfall(last, TAIL)
+    return numbers

@@ -1,144 +1,151 @@
-"""An analysis as tables to read on a screen."""
+"""An analysis as tables to read in a terminal."""
 
-from collections.abc import Mapping
-from typing import Any
+import math
+import textwrap
 
-from jbrep.stats.labels import STEPS_TO
+from jbrep.stats.analysis import Analysis, GroupAnalysis
+from jbrep.stats.bootstrap import Interval
+from jbrep.stats.claims import LESS_VARIANCE
+from jbrep.stats.labels import REACHED, STEPS_TO, RepresentationResult
 from jbrep.text import SIGNIFICANT, interval, number, table
 
-Plain = Mapping[str, Any]  # statistics.json, or a part of it
-Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]  # a header, and the lines under it
+Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]  # a header, and the rows below it
 _KEY = "representation"
 
 
-def statistics_text(statistics: Plain) -> str:
+def statistics_text(analysis: Analysis, width: int | None = None) -> str:
     """All tables of an analysis, by task and algorithm.
 
     Args:
-        statistics: as statistics.json has it.
+        analysis: of a study.
+        width: that tables must fit, in columns; None for tables of any width.
     """
     parts = (
         part
-        for group in statistics["groups"]
-        for title, rows in group_tables(group, statistics)
-        for part in (title, table(*rows))
+        for group in analysis.groups
+        for title, (header, rows) in group_tables(group, analysis)
+        for part in (_wrapped(title, width), table(header, rows, width))
     )
     return "\n\n".join(parts)
 
 
-def group_tables(group: Plain, statistics: Plain) -> list[tuple[str, Rows]]:
-    """Up to four tables, each with a line that says what it is."""
-    runs = sum(len(label["seeds"]) for label in group["labels"])
-    end, cut = group["grid"][-1], group["cut"]
-    found = [
+def _wrapped(title: str, width: int | None) -> str:
+    return title if width is None else textwrap.fill(title, width, break_on_hyphens=False)
+
+
+def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[tuple[str, Rows]]:
+    """Up to four tables, each with a title."""
+    runs = sum(len(label.seeds) for label in group.labels)
+    cut = f"; the comparison {group.cut}" if group.cut else ""
+    tables = [
         (
-            f"{group['task']}, {group['algorithm']}: {runs} runs over {end:,.0f} steps; 95 % "
-            f"intervals over runs{f'; the comparison {cut}' if cut else ''}",
+            f"{group.name}: {runs} runs over {group.grid[-1]:,.0f} steps; 95 % intervals over runs"
+            f"{cut}",
             label_rows(group),
         ),
         (
-            "Spread of final returns over runs; CVaR: the mean of the worst quarter",
+            "Spread of final returns over runs; CVaR is the mean of the worst quarter",
             spread_rows(group),
         ),
     ]
-    if group["comparisons"]:
-        level = f"{100 * statistics['simultaneous_level']:.2f} %"
-        found += [
-            (f"Against {statistics['baseline']}", comparison_rows(group)),
+    if group.comparisons:
+        level = f"{100 * analysis.simultaneous_level:.2f} %"
+        tables += [
+            (f"Compared with {analysis.baseline}", comparison_rows(group)),
             (
-                f"Verdicts, by the intervals at {level}, which hold together at 95 %; seeds: how "
-                "many would decide",
+                f"Verdicts, by intervals at {level}, which hold together at 95 %; seeds: the "
+                "number per representation that would decide",
                 verdict_rows(group),
             ),
         ]
-    return found
+    return tables
 
 
-def label_rows(group: Plain) -> Rows:
-    """A line for each label; the number of runs that reached a return stands behind the steps."""
+def label_rows(group: GroupAnalysis) -> Rows:
+    """A row for each representation; after the steps, how many of its runs reached the return."""
     header = (
         *(_KEY, "runs", "failed", "final return", "mean return", "IQM of final"),
         *("steps to 50 %", "to 90 %", "to 900"),
     )
     return header, [
         (
-            label["representation"],
-            str(len(label["seeds"])),
-            str(len(label["failed"])),
-            _of(label, "final_return_mean"),
-            _of(label, "mean_return_mean"),
-            _of(label, "final_return_iqm"),
+            label.representation,
+            str(len(label.seeds)),
+            str(len(label.failed)),
+            shown(label.numbers["final_return_mean"], ",.0f"),
+            shown(label.numbers["mean_return_mean"], ",.0f"),
+            shown(label.numbers["final_return_iqm"], ",.0f"),
             *(_steps(label, name) for name in STEPS_TO),
         )
-        for label in group["labels"]
+        for label in group.labels
     ]
 
 
-def spread_rows(group: Plain) -> Rows:
-    """A line for each label."""
+def spread_rows(group: GroupAnalysis) -> Rows:
+    """A row for each representation."""
     names = ("final_return_sd", "final_return_iqr", "final_return_mad", "risk_across_runs")
     return (_KEY, "SD", "IQR", "MAD", "CVaR"), [
-        (label["representation"], *(_of(label, name, ",.1f") for name in names))
-        for label in group["labels"]
+        (label.representation, *(shown(label.numbers[name], ",.1f") for name in names))
+        for label in group.labels
     ]
 
 
-def _of(label: Plain, name: str, form: str = ",.0f") -> str:
-    return interval(label["numbers"][name], form)
+def _steps(label: RepresentationResult, name: str) -> str:
+    steps = shown_number(label.numbers[name].value, ",.0f")
+    reached, runs = label.numbers[REACHED[name]].value, len(label.seeds)
+    return steps if math.isnan(reached) else f"{steps} ({round(reached * runs)}/{runs})"
 
 
-def _steps(label: Plain, name: str) -> str:
-    steps = number(label["numbers"][name][0], ",.0f")
-    reached = label["numbers"][name.replace("steps_to", "reached")][0]
-    runs = len(label["seeds"])
-    return steps if reached is None else f"{steps} ({round(reached * runs)}/{runs})"
-
-
-def comparison_rows(group: Plain) -> Rows:
-    """A line for each comparison with the baseline."""
+def comparison_rows(group: GroupAnalysis) -> Rows:
+    """A row for each comparison with the baseline."""
     header = (
         *(_KEY, "final return", "mean return", "P(improvement)", "variance ratio"),
         *("by bootstrap", "permutation p", "Brown-Forsythe p"),
     )
     return header, [
         (
-            comparison["representation"],
-            interval(comparison["numbers"]["final_return_difference"], ",.0f"),
-            interval(comparison["numbers"]["mean_return_difference"], ",.0f"),
-            interval(comparison["numbers"]["probability_of_improvement"], ".2f"),
-            interval(comparison["numbers"]["variance_ratio"], SIGNIFICANT),
-            interval(comparison["numbers"]["variance_ratio_bootstrap"], SIGNIFICANT),
-            next(
-                _probability(v["p"])
-                for v in comparison["verdicts"]
-                if v["claim"] == "less variance"
-            ),
-            _probability(comparison["brown_forsythe_p"]),
+            comparison.representation,
+            shown(comparison.numbers["final_return_difference"], ",.0f"),
+            shown(comparison.numbers["mean_return_difference"], ",.0f"),
+            shown(comparison.numbers["probability_of_improvement"], ".2f"),
+            shown(comparison.numbers["variance_ratio"]),
+            shown(comparison.numbers["variance_ratio_bootstrap"]),
+            _probability(comparison.verdict(LESS_VARIANCE).p),
+            _probability(comparison.brown_forsythe_p),
         )
-        for comparison in group["comparisons"]
+        for comparison in group.comparisons
     ]
 
 
-def verdict_rows(group: Plain) -> Rows:
-    """A line for each verdict, with the interval that decides and the bound it must exclude."""
-    header = (_KEY, "claim", "verdict", "interval", "bound", "p", "Holm's p", "seeds")
+def verdict_rows(group: GroupAnalysis) -> Rows:
+    """A row for each verdict, with the interval that decides and the bound it must exclude."""
+    header = ("representation: claim", "verdict", "interval", "bound", "p", "Holm's p", "seeds")
     return header, [
         (
-            comparison["representation"],
-            verdict["claim"],
-            verdict["verdict"] + (f" ({verdict['reason']})" if verdict["reason"] else ""),
-            interval(verdict["simultaneous"], SIGNIFICANT),
-            number(verdict["boundary"], SIGNIFICANT),
-            _probability(verdict["p"]),
-            _probability(verdict["p_holm"]),
-            "-" if verdict["seeds_needed"] is None else str(verdict["seeds_needed"]),
+            f"{comparison.representation}: {verdict.claim}",
+            verdict.verdict + (f" ({verdict.reason})" if verdict.reason else ""),
+            shown(verdict.simultaneous),
+            shown_number(verdict.boundary),
+            _probability(verdict.p),
+            _probability(verdict.p_holm),
+            "-" if verdict.seeds_needed is None else str(verdict.seeds_needed),
         )
-        for comparison in group["comparisons"]
-        for verdict in comparison["verdicts"]
+        for comparison in group.comparisons
+        for verdict in comparison.verdicts
     ]
 
 
-def _probability(p: float | None) -> str:
-    if p is None:
+def shown(values: Interval, form: str = SIGNIFICANT) -> str:
+    """A value with its interval, if it has one; a dash for what isn't finite."""
+    return interval(values.tolist(), form)
+
+
+def shown_number(value: float, form: str = SIGNIFICANT) -> str:
+    """A number; a dash if it isn't finite."""
+    return number(value if math.isfinite(value) else None, form)
+
+
+def _probability(p: float) -> str:
+    if math.isnan(p):
         return "-"
     return "<0.001" if p < 0.001 else f"{p:.3f}"

@@ -160,7 +160,7 @@ def as_text(results: Results, width: int | None = None) -> str:
         width: to fit [columns]; None for no limit.
     """
     shown = (
-        statistics_text(results.analysis.tolist())
+        statistics_text(results.analysis, width)
         if results.analysis
         else table(*_last_evaluations(results.runs), width)
     )
