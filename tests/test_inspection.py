@@ -1,17 +1,21 @@
 """Recordings hold what they were made from, as Rerun's own reader finds it."""
 
+import json
 import re
+import signal
+import sys
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
-from command import jbrep
+from command import jbrep, start, wait_for, wait_for_the_end_of
 from rerun.chunk import RrdReader
 
 from jbrep.encoders import find, save
 from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError
+from jbrep.files import container
 from jbrep.inspection import inspect
 from jbrep.inspection.ghost import shades
 from jbrep.inspection.latent import principal_components
@@ -19,7 +23,19 @@ from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import contacts
 from jbrep.inspection.traversal import POINTS, SPACING, sweep
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.rl.files import ENCODER, FAILED, Evaluation, read_evaluations, write_rows, write_run
+from jbrep.rl import Run
+from jbrep.rl.agent import make_agent, make_env
+from jbrep.rl.files import (
+    CHECKPOINT,
+    ENCODER,
+    FAILED,
+    FINISHED,
+    Evaluation,
+    read_evaluations,
+    write_rows,
+    write_run,
+)
+from jbrep.rl.presets import Preset
 from jbrep.rollouts.sources import find_episode
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
@@ -317,6 +333,21 @@ def test_a_traversal_shows_what_each_unit_decodes_to(traversed, rollout):
         assert len(quaternion) == POINTS
 
 
+def write_end(folder, representation, seed=0, status=FINISHED):
+    """What a run of 300 steps says at its end; a failed one ended half-way."""
+    encoder = "identity" if representation == "full" else representation
+    run = Run(task="face_direction", encoder=encoder, steps=300, seed=seed)
+    record = {
+        "status": status,
+        "settings": run.describe(find(encoder, run.task)),
+        "steps": 150 if status == FAILED else 300,
+        "seconds": 1.0,
+        "versions": {},
+        "cpu": "",
+    }
+    write_run(folder, record)
+
+
 def write_study(folder):
     """Two representations with two runs each, of which one failed."""
     random = np.random.default_rng(0)
@@ -325,16 +356,7 @@ def write_study(folder):
             failed = (representation, seed) == ("dae-8", 1)
             run = folder / "runs" / representation / f"seed-{seed}"
             run.mkdir(parents=True)
-            settings = {
-                "task": "face_direction",
-                "algorithm": "sac",
-                "preset": "paper",
-                "representation": representation,
-                "steps": 300,
-                "seed": seed,
-            }
-            end = {"status": FAILED, "steps": 150} if failed else {"status": "ok", "steps": 300}
-            write_run(run, {"settings": settings, **end, "seconds": 1.0})
+            write_end(run, representation, seed, FAILED if failed else FINISHED)
             rows = [
                 Evaluation(step, episode, float(random.uniform(0, 1000)))
                 for step in ((0, 100) if failed else (0, 100, 200, 300))
@@ -380,12 +402,30 @@ def test_training_curves_are_the_evaluations(tmp_path):
 def test_a_run_shows_its_own_encoder(tmp_path, rollout, monkeypatch):
     monkeypatch.setattr("jbrep.inspection.subject.find_episode", lambda *given: rollout)
     for name in ("dae-4", "identity"):
-        write_run(tmp_path, {"settings": {}, "status": "finished", "seconds": 1.0})
+        write_end(tmp_path, name)
         save(find(name, "face_direction"), tmp_path / ENCODER)
         found = read(inspect(str(tmp_path), out=tmp_path / f"{name}.rrd"))
         assert ("/world/ghost/jitterbug" in found) == (name == "dae-4")
         other = read(inspect(str(tmp_path), encoder="dae-8", out=tmp_path / "other.rrd"))
         assert "- encoder: dae-8 (dae)" in text(other["/provenance"])
+
+
+def test_a_run_under_way_shows_its_checkpoint(tmp_path):
+    encoder = find("dae-4", "face_direction")
+    settings = Run(task="face_direction", algorithm="a2c", encoder="dae-4").describe(encoder)
+    settings |= {"evaluation_episodes": 1, "episode_steps": 50}
+    preset = Preset(settings["hidden"], {})
+    agent = make_agent("a2c", preset, make_env("face_direction", 1, 0, encoder), seed=0)
+    weights = {
+        f"parameters.policy.{name}": np.ascontiguousarray(value.numpy())
+        for name, value in agent.policy.state_dict().items()
+    }
+    header = {"identity": settings, "counters": {"num_timesteps": 12_000}, "record": {}}
+    container.write(tmp_path / CHECKPOINT, weights, header)
+    save(encoder, tmp_path / ENCODER)
+    shown = read(inspect(str(tmp_path), out=tmp_path / "it.rrd"))
+    assert f"# {tmp_path} at step 12,000" in text(shown["/provenance"])
+    assert "/world/ghost/jitterbug" in shown
 
 
 def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
@@ -401,8 +441,14 @@ def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
     ("given", "message"),
     [
         ({}, "give a SOURCE to inspect, or one encoder with its --task"),
-        ({"source": "tests"}, "tests is no data set and no run, and none is over below it"),
-        ({"source": "nowhere"}, "nowhere is no data set, no folder of a run that is over, and no"),
+        (
+            {"source": "tests"},
+            "tests is no data set, no run with a policy or checkpoint, and holds no",
+        ),
+        (
+            {"source": "nowhere"},
+            "nowhere is no data set, no run with a policy or checkpoint, and no",
+        ),
         ({"source": FACE, "episode": 9}, "has no episode 9: it has 4, from 0"),
         ({"source": FACE, "task": "move_to_pose"}, "is of face_direction, not of move_to_pose"),
         ({"source": FACE, "encoder": "dae-9"}, "no encoder 'dae-9'"),
@@ -431,7 +477,7 @@ def test_mistakes(given, message):
 def test_a_study_has_no_episodes(tmp_path):
     study = str(write_study(tmp_path / "study"))
     for given in ({"episode": 0}, {"encoder": "dae-8"}, {"traverse": True}, {"task": TASKS}):
-        with pytest.raises(InputError, match="holds several runs: of these training curves"):
+        with pytest.raises(InputError, match="holds several runs, whose training curves"):
             inspect(study, **given)
 
 
@@ -452,7 +498,7 @@ def test_the_command_names_the_file_after_its_content(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     told = jbrep("inspect", FACE, "--episode", 1, "--encoder", "dae-8").output
     path = "inspect/face_direction-data-sample-episode-1-dae-8.rrd"
-    assert told == f"{path}; open it with: rerun {path}\n"
+    assert told == f"encoder: dae-8, shipped\n{path}; open it with: rerun {path}\n"
     assert len(read(tmp_path / path)["/observation/position"]["step"]) == ROWS
     told = jbrep("inspect", "--encoder", "dae-4", "--task", "move_to_pose", "--traverse").output
     assert "inspect/move_to_pose-uniform-episode-0-dae-4-traverse.rrd;" in told
@@ -461,29 +507,45 @@ def test_the_command_names_the_file_after_its_content(tmp_path, monkeypatch):
     assert "Example: jbrep inspect " in jbrep("inspect", "--help").output
 
 
+@pytest.fixture
+def viewer(tmp_path, monkeypatch):
+    """A program in the place of Rerun's, which tells its arguments and its process."""
+
+    def make(then):
+        path = tmp_path / "viewer.py"
+        told = tmp_path / "told.json"
+        path.write_text(
+            f"#!{sys.executable}\n"
+            "import json, os, pathlib, sys, time\n"
+            f"told = pathlib.Path({str(told)!r})\n"
+            "told.with_suffix('.new').write_text(json.dumps([os.getpid(), *sys.argv[1:]]))\n"
+            "told.with_suffix('.new').rename(told)\n"
+            f"{then}\n"
+        )
+        path.chmod(0o755)
+        monkeypatch.setenv("RERUN_CLI_PATH", str(path))
+        return told
+
+    return make
+
+
 @pytest.mark.parametrize("code", [0, 3])
-def test_the_viewer_is_rerun_itself_and_serves_this_machine_alone(code, tmp_path, monkeypatch):
-    class Viewer:
-        pid = 1 << 30  # nobody's
-
-        def __init__(self, command, process_group):
-            commands.append(command)
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *error):
-            return None
-
-        def wait(self):
-            return code
-
-    commands = []
-    monkeypatch.setattr("subprocess.Popen", Viewer)
-    out = tmp_path / "it.rrd"
+def test_the_viewer_is_rerun_itself_and_serves_this_machine_alone(code, viewer, tmp_path):
+    told, out = viewer(f"sys.exit({code})"), tmp_path / "it.rrd"
     shown = jbrep("inspect", FACE, "--out", out, "--view")
+    assert json.loads(told.read_text())[1:] == ["--bind", "127.0.0.1", str(out)]
     served = jbrep("inspect", FACE, "--out", out, "--serve")
-    assert commands[0][1:] == ["-m", "rerun", "--bind", "127.0.0.1", str(out)]
-    assert commands[1][3:6] == ["--bind", "127.0.0.1", "--serve-web"]
-    assert f"http://127.0.0.1:{commands[1][7]}/" in served.output
+    arguments = json.loads(told.read_text())[1:]
+    assert arguments[:3] == ["--bind", "127.0.0.1", "--serve-web"]
+    assert f"http://127.0.0.1:{arguments[4]}/" in served.output
     assert (shown.exit_code, served.exit_code) == ((2, 2) if code else (0, 0))
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_the_viewer_ends_with_jbrep(number, viewer, tmp_path):
+    """Also the program that Rerun's script starts, and also where jbrep can't say good-bye."""
+    told = viewer("time.sleep(600)")
+    with start("inspect", FACE, "--out", tmp_path / "it.rrd", "--serve") as process:
+        assert wait_for(told.exists, process)
+        process.send_signal(number)
+    wait_for_the_end_of([json.loads(told.read_text())[0]], seconds=30)

@@ -1,6 +1,7 @@
 """One run: settings, files, evaluation, kills and stops, failures, and files from elsewhere."""
 
 import dataclasses
+import hashlib
 import json
 import pickle
 import re
@@ -392,8 +393,13 @@ def test_nothing_in_a_runs_folder_runs_as_code(member, short, tmp_path):
         for name in old.namelist():
             content = pickle.dumps(Trap(sprung), protocol=2) if name == member else old.read(name)
             new.writestr(name, content)
+    run = json.loads((tmp_path / "run.json").read_text())
+    run["policy_sha256"] = hashlib.sha256((tmp_path / "policy.zip").read_bytes()).hexdigest()
+    (tmp_path / "run.json").write_text(json.dumps(run))
     if member == "policy.pth":
-        with pytest.raises(InputError, match=r"policy\.zip is damaged"):
+        with pytest.raises(
+            InputError, match=r"policy\.zip is damaged, it holds no policy's weights"
+        ):
             load_run(tmp_path)
     else:
         load_run(tmp_path)
@@ -404,11 +410,11 @@ def test_nothing_in_a_runs_folder_runs_as_code(member, short, tmp_path):
     ("name", "content", "message"),
     [
         ("policy.zip", b"PK", "damaged"),
-        ("policy.zip", None, "missing or damaged"),
+        ("policy.zip", None, r"can't read .*policy\.zip: No such file"),
         ("encoder.safetensors", None, "no encoder"),
-        ("run.json", b"{", "damaged, or not of a run"),
-        ("run.json", None, "no run that is over"),
-        ("run.json", "hidden", "don't fit together"),
+        ("run.json", b"{", "damaged or not from a jbrep run"),
+        ("run.json", None, "no run in"),
+        ("run.json", "hidden", "doesn't fit the run's settings"),
         ("run.json", "algorithm", "unknown algorithm 'x'"),
         ("run.json", "encoder", "not the encoder"),
     ],
@@ -422,7 +428,7 @@ def test_a_damaged_folder_is_named(name, content, message, short, tmp_path):
         (tmp_path / name).write_bytes(content)
     else:
         run = json.loads((short / name).read_text())
-        run["settings"][content] = [3] if content == "hidden" else "x"
+        run["settings"][content] = {"hidden": [3], "algorithm": "x", "encoder": "0" * 64}[content]
         (tmp_path / name).write_text(json.dumps(run))
     with pytest.raises(InputError, match=message) as error:
         load_run(tmp_path)
@@ -432,7 +438,7 @@ def test_a_damaged_folder_is_named(name, content, message, short, tmp_path):
 def test_a_zip_file_from_elsewhere_needs_trust(tmp_path):
     path = tmp_path / "agent.zip"
     SAC("MlpPolicy", make_env(TASK, 1, 0, find("dae-8", TASK)), buffer_size=10).save(path)
-    with pytest.raises(InputError, match="runs as code when it is read; --trust"):
+    with pytest.raises(InputError, match="runs as code when it is read; add --trust"):
         load_zip(path, TASK, "sac", "dae-8", trust=False)
     assert load_zip(path, TASK, "sac", "dae-8", trust=True).task == TASK
     for algorithm, encoder in (("sac", "dae-4"), ("ppo", "dae-8"), ("fly", "dae-8")):

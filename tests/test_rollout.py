@@ -132,7 +132,7 @@ def test_an_episode_that_diverged_ends_before_it_did(tmp_path):
 @pytest.mark.parametrize(
     ("source", "episode", "task", "message"),
     [
-        ("nowhere", 0, None, "nowhere is no data set, no folder of a run that is over, and no"),
+        ("nowhere", 0, None, "nowhere is no data set, no run with a policy or checkpoint, and no"),
         ("heuristic", 0, None, "policy heuristic needs a --task"),
         ("heuristic", 0, "fly", "unknown task 'fly'"),
         ("heuristic", -1, "face_direction", "there is no episode -1"),

@@ -393,8 +393,8 @@ def test_a_single_seed_gives_its_returns_and_says_why_no_more(done, tmp_path):
     [
         ("evaluations.csv", "step,episode,return\n0,0", "not a table of evaluations"),
         ("evaluations.csv", "step,episode,return\n0,0,nan\n80,0,1\n", "finite"),
-        (RUN, "[]", "damaged, or not of a run"),
-        (RUN, "settings", "damaged, or not of a run"),
+        (RUN, "[]", "damaged or not from a jbrep run"),
+        (RUN, "settings", "damaged or not from a jbrep run"),
     ],
 )
 def test_a_damaged_run_is_named(name, content, message, done, tmp_path):

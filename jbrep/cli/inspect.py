@@ -1,24 +1,25 @@
 """Looking at episodes, encoders and studies in the Rerun viewer."""
 
-import os
-import signal
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 
 import click
 
 from jbrep.cli.base import COUNT, example, printable, stoppable
+from jbrep.cli.policies import origin
 from jbrep.errors import InputError
 
 _ADDRESS = "127.0.0.1"
+# Waits for the end of its input, which comes when jbrep ends, even killed; then ends its own group.
+_KEEPER = ("sh", "-c", "read -r _; kill 0")
 
 
 @click.command(epilog=example("jbrep inspect data/face --episode 3 --encoder dae-8 --view"))
 @click.argument("source", required=False)
-@click.option("--episode", type=COUNT, help="Which one, from 0; 0 if not given.")
+@click.option("--episode", type=COUNT, help="Its number, from 0; 0 if not given.")
 @click.option("--task", help="Of a policy, or of an encoder without a SOURCE.")
 @click.option("--encoder", help="A file, or a name that ships; a run's own if not given.")
 @click.option("--traverse", is_flag=True, help="Show what each unit of the latent moves.")
@@ -26,7 +27,12 @@ _ADDRESS = "127.0.0.1"
     "--out", type=click.Path(path_type=Path), help="An .rrd file; one in inspect/ if not given."
 )
 @click.option("--view", is_flag=True, help="Open it in the Rerun viewer.")
-@click.option("--serve", is_flag=True, help="Show it to a browser on this machine until Ctrl-C.")
+@click.option(
+    "--serve",
+    is_flag=True,
+    help="Show it to a browser on this machine until Ctrl-C. Meanwhile every user and program of "
+    "the machine can read the recording, too; Rerun asks for no password and checks no host name.",
+)
 def inspect(
     source: str | None,
     episode: int | None,
@@ -40,13 +46,16 @@ def inspect(
     """Record an episode, encoder or study to see in Rerun.
 
     SOURCE is a data set, a run, a folder with several runs, an encoder's file, or a policy such as
-    heuristic. With an encoder the robot that comes back stands beside the true one.
+    heuristic. A run that is not over plays its last checkpoint. With an encoder, the decoded robot
+    stands beside the true one.
     """
     if view and serve:
         raise InputError("--view and --serve exclude each other: choose one")
     from jbrep.inspection import inspect as record
 
     path = record(source, episode, task, encoder, traverse, out)
+    if encoder:
+        click.echo(printable(f"encoder: {origin(encoder)}"))
     click.echo(printable(f"{path}" if view or serve else f"{path}; open it with: rerun {path}"))
     if view:
         _run_viewer(path)
@@ -59,21 +68,25 @@ def inspect(
 
 
 def _free_ports(count: int) -> list[int]:
-    """Ports that nobody listens on: on one in use Rerun would talk to whoever does."""
+    """Unused ports: on one in use, Rerun would connect to the program that listens there."""
     with ExitStack() as stack:
         sockets = [stack.enter_context(socket.create_server((_ADDRESS, 0))) for _ in range(count)]
         return [each.getsockname()[1] for each in sockets]
 
 
 def _run_viewer(path: Path, *options: str) -> None:
-    """Run Rerun's own program until it ends, or this one is told to."""
+    """Run Rerun's viewer until it ends, or this process does in whatever way."""
     command = [sys.executable, "-m", "rerun", "--bind", _ADDRESS, *options, str(path)]
-    # a group of its own, as the program is a child of the script that starts it
-    with stoppable(f"{path} stays"), subprocess.Popen(command, process_group=0) as viewer:
+    with (
+        stoppable(f"{path} stays"),
+        subprocess.Popen(_KEEPER, stdin=subprocess.PIPE, process_group=0) as keeper,
+        # in the keeper's group, as is the program that this script starts
+        subprocess.Popen(command, process_group=keeper.pid) as viewer,
+    ):
         try:
             code = viewer.wait()
         finally:
-            with suppress(ProcessLookupError):
-                os.killpg(viewer.pid, signal.SIGTERM)
+            assert keeper.stdin is not None
+            keeper.stdin.close()
     if code:
         raise InputError(f"the Rerun viewer ended with code {code}; {path} stays")

@@ -1,11 +1,25 @@
 """What policies do."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
-from jbrep.cli.base import POSITIVE, echo_paths, example, printable, stoppable
+from jbrep.cli.base import (
+    POSITIVE,
+    as_json,
+    echo_json,
+    echo_paths,
+    example,
+    printable,
+    stoppable,
+)
+from jbrep.errors import InputError
+
+if TYPE_CHECKING:
+    from jbrep.rollouts.sources import Player
+
+_TASK = "face_direction"
 
 
 @click.command(epilog=example("jbrep evaluate-policy runs/a --episodes 100"))
@@ -14,60 +28,107 @@ from jbrep.cli.base import POSITIVE, echo_paths, example, printable, stoppable
     "--episodes", default=20, show_default=True, type=POSITIVE, help="How many, the same each time."
 )
 @click.option("--trust", is_flag=True, help="Read a zip file from elsewhere, which can run code.")
-@click.option(
-    "--task",
-    default="face_direction",
-    show_default=True,
-    help="Of a zip file, or of a policy by name.",
-)
+@click.option("--task", help=f"Of a zip file or of a policy by name; {_TASK} if not given.")
 @click.option("--algorithm", default="sac", show_default=True, help="Of a zip file.")
-@click.option("--encoder", help="That a zip file was trained on; or between robot and policy.")
+@click.option(
+    "--encoder",
+    help="What a zip file was trained on, or what a policy by name observes through: a file, or "
+    "the name of one that ships.",
+)
+@as_json
 def evaluate_policy(
-    policy: str, episodes: int, trust: bool, task: str, algorithm: str, encoder: str | None
+    policy: str,
+    episodes: int,
+    trust: bool,
+    task: str | None,
+    algorithm: str,
+    encoder: str | None,
+    as_json: bool,
 ) -> None:
     """Show the returns of a policy.
 
     POLICY is a folder of jbrep rl, a zip file that stable-baselines3 wrote, or a policy by its
-    name, such as heuristic. Of a folder only numbers are read. A zip file runs as code when it is
-    opened, so it needs --trust. A policy by name may act on what an encoder's latent is decoded
-    to: what it loses by that is what the latent lacks for it.
+    name, such as heuristic. A run that is under way or was stopped plays its last checkpoint. Of a
+    folder only numbers are read. A zip file from elsewhere runs as code when it is opened, so it
+    needs --trust. A policy by name may act on what an encoder's latent is decoded to: the return
+    that it loses measures what the latent lacks.
     """
     import numpy as np
 
-    name, returns = _play(policy, episodes, trust, task, algorithm, encoder)
+    player = _find(policy, task, algorithm, encoder, trust)
+    returns = np.array([rollout.reward.sum() for rollout in player.play_first(episodes)])
     low, median, high = np.percentile(returns, (10, 50, 90))
+    if as_json:
+        echo_json(
+            {
+                "policy": policy,
+                "task": player.task.name,
+                "representation": player.representation,
+                **({} if encoder is None else {"encoder": origin(encoder)}),
+                **({} if player.step is None else {"step": player.step}),
+                "episodes": episodes,
+                "returns": returns.tolist(),
+                "median": median,
+                "percentile_10": low,
+                "percentile_90": high,
+            }
+        )
+        return
+    if encoder is not None:
+        click.echo(printable(f"encoder: {origin(encoder)}"))
     click.echo(
         printable(
-            f"{name}: median return {median:.0f} [{low:.0f}, {high:.0f}] "
-            f"(10th and 90th percentile of {episodes} episodes)"
+            f"{_title(policy, player)}: median return {median:.0f} [{low:.0f}, {high:.0f}] "
+            f"(10-90 % of {episodes} episodes)"
         )
     )
 
 
-def _play(
-    policy: str, episodes: int, trust: bool, task: str, algorithm: str, encoder: str | None
-) -> tuple[str, Any]:
-    """What was played, and the returns."""
+def _title(policy: str, player: "Player") -> str:
+    """The task, and what is not in the command: what a trained policy observes, its step."""
     from jbrep.collect.policies import POLICIES
-    from jbrep.encoders import find
-    from jbrep.rollouts.sources import find_player
 
     if policy.partition(":")[0] in POLICIES:
-        player = find_player(policy, task)
+        return f"{player.task.name}, {player.name}"
+    step = "" if player.step is None else f" at step {player.step:,}"
+    return f"{player.task.name} on {player.representation}{step}"
+
+
+def _find(
+    policy: str, task: str | None, algorithm: str, encoder: str | None, trust: bool
+) -> "Player":
+    """The policy of a run, by name, or in a zip file."""
+    from jbrep.collect.policies import POLICIES
+    from jbrep.encoders import find
+    from jbrep.files.storage import exists
+    from jbrep.rollouts.sources import as_player, find_player, run_folder
+
+    path = Path(policy)
+    if run_folder(policy) or (exists(path) and path.is_dir()):
         if encoder:
-            player = player.with_reconstruction(find(encoder, player.task.name))
-        played = player.play(range(episodes))
-        return f"{task}, {player.name}", [rollout.reward.sum() for rollout in played]
+            raise InputError(f"{policy} is a run, which has its own encoder: leave out --encoder")
+        return find_player(policy, task)
+    task = task or _TASK
+    if policy.partition(":")[0] in POLICIES:
+        player = find_player(policy, task)
+        return player.with_reconstruction(find(encoder, task)) if encoder else player
+    if not exists(path):
+        raise InputError(
+            f"no policy at {policy}: a folder of jbrep rl is needed, a zip file of "
+            f"stable-baselines3, or a name: {', '.join(POLICIES)}"
+        )
+    from jbrep.rl.policy import load_zip  # imports torch
 
-    from jbrep.rl.agent import Evaluator  # brings torch, which no policy by name needs
-    from jbrep.rl.policy import load_run, load_zip
+    return as_player(policy, load_zip(path, task, algorithm, encoder or "identity", trust))
 
-    if Path(policy).is_dir():
-        trained = load_run(Path(policy))
-    else:
-        trained = load_zip(Path(policy), task, algorithm, encoder or "identity", trust)
-    returns = Evaluator(trained.task, trained.encoder, episodes).returns(trained.policy)
-    return f"{trained.task} on {trained.encoder.name}", returns
+
+def origin(encoder: str) -> str:
+    """An encoder as a user gave it, and whether it ships or is a file."""
+    from jbrep.encoders.shipped import names
+    from jbrep.jitterbug.tasks import TASKS
+
+    ships = any(encoder in names(task) for task in TASKS)
+    return f"{encoder}, shipped" if ships else f"the file {encoder}"
 
 
 @click.command(epilog=example("jbrep behaviour runs/full runs/dae-4 --out behaviour"))
@@ -83,8 +144,8 @@ def behaviour(
 ) -> None:
     """Draw how policies turn the motor and where they go.
 
-    A policy is the folder of a run, shown before and after training, or goes by its name, such as
-    heuristic. All play the same episodes.
+    A policy is the folder of a run, shown before and after training, or a name, such as heuristic.
+    All play the same episodes.
     """
     import numpy as np
 
@@ -92,9 +153,11 @@ def behaviour(
     from jbrep.rollouts.behaviour import SPEEDS, observe
 
     yaw = np.deg2rad(target_yaw)
-    with stoppable("the same command starts anew"):
-        found, behaviours = observe(policies, task, episodes, yaw)
+    with stoppable("the same command starts again"):
+        shared_task, behaviours = observe(policies, task, episodes, yaw)
     for each in behaviours:
         low, median, high = np.percentile(each.returns, (10, 50, 90))
-        click.echo(printable(f"{each.name}: median return {median:.0f} [{low:.0f}, {high:.0f}]"))
-    echo_paths(write(behaviour_plots(found.name, behaviours, SPEEDS, yaw), out))
+        click.echo(
+            printable(f"{each.name}: median return {median:.0f} [{low:.0f}, {high:.0f}] (10-90 %)")
+        )
+    echo_paths(write(behaviour_plots(shared_task.name, behaviours, SPEEDS, yaw), out))

@@ -14,13 +14,13 @@ from jbrep.inspection.episode import record_episode
 from jbrep.inspection.recording import SUFFIX, check_out
 from jbrep.inspection.traversal import record_traversal
 from jbrep.jitterbug.tasks import get_task
-from jbrep.rl.files import ENCODER, RUN
+from jbrep.rl.files import ENCODER, is_run
 from jbrep.rollouts.rollout import Rollout
-from jbrep.rollouts.sources import find_episode
+from jbrep.rollouts.sources import find_episode, run_folder
 from jbrep.study.results import has_runs, read_runs
 
-FOLDER = Path("inspect")  # of recordings whose file isn't named
-_POLICY = "uniform"  # of an encoder's episode
+FOLDER = Path("inspect")  # of recordings without an --out
+_POLICY = "uniform"  # plays the episode that an encoder alone is shown on
 
 
 def inspect(
@@ -36,26 +36,27 @@ def inspect(
     Args:
         source: a data set's folder, a run's, or one with several runs below; an encoder's file, or
             a policy's name; an encoder alone is shown on an episode under uniformly random drives.
-        episode: which one, from 0; the first if not given.
+            A run that is not over plays its last checkpoint.
+        episode: its number, from 0; the first if not given.
         task: of a policy or encoder by its name.
         encoder: a file, or the name of one that ships; a run's own if not given.
-        traverse: what each unit of the latent moves, in the place of the episode.
+        traverse: whether to show what each unit of the latent moves, instead of the episode.
         out: the .rrd file; one in inspect/, named after its content, if not given.
 
     Returns:
         The file.
 
     Raises:
-        InputError: any of these can't be found, or don't fit together, or something other than a
-            recording stands where it is to be written.
+        InputError: any of these can't be found, or they are inconsistent, or the file to be written
+            exists and is no recording.
     """
     if out:
         check_out(out)
     if source and _is_study(Path(source)):
         if encoder or traverse or task or episode is not None:
             raise InputError(
-                f"{source} holds several runs: of these training curves are shown, without "
-                "--episode, --task, --encoder and --traverse; name one run for an episode"
+                f"{source} holds several runs, whose training curves are shown without --episode, "
+                "--task, --encoder and --traverse: give one run's folder to see an episode"
             )
         out = out or _default("curves", *_words(source))
         record_curves(read_runs(Path(source)), source, out)
@@ -76,14 +77,15 @@ def inspect(
 
 
 def _is_study(folder: Path) -> bool:
-    """Whether runs stand below it, and it is none itself."""
-    if not _is_folder(folder) or exists(folder / MANIFEST) or exists(folder / RUN):
+    """Whether a folder holds runs and is neither a run nor a data set itself."""
+    return _is_other_folder(folder) and has_runs(folder)
+
+
+def _is_other_folder(path: Path) -> bool:
+    """Whether this is a folder, but no data set and no run."""
+    if not exists(path) or not path.is_dir():
         return False
-    return has_runs(folder)
-
-
-def _is_folder(path: Path) -> bool:
-    return exists(path) and path.is_dir()
+    return not exists(path / MANIFEST) and not is_run(path)
 
 
 def _find(
@@ -95,37 +97,35 @@ def _find(
             raise InputError("give a SOURCE to inspect, or one encoder with its --task")
         shown = _load(source or encoder or "", task)
         return find_episode(_POLICY, episode, shown.header["task"]), shown
-    folder = Path(source)
-    if _is_folder(folder) and not exists(folder / MANIFEST) and not exists(folder / RUN):
+    if _is_other_folder(Path(source)):
         raise InputError(
-            f"{source} is no data set and no run, and none is over below it: jbrep collect makes a "
-            "data set, jbrep rl a run"
+            f"{source} is no data set, no run with a policy or checkpoint, and holds no finished "
+            "run: jbrep collect makes a data set, jbrep rl a run"
         )
     rollout = find_episode(source, episode, task)
     if task not in (None, rollout.task.name):
         raise InputError(f"{source} is of {rollout.task.name}, not of {task}")
     if encoder:
         return rollout, find(encoder, rollout.task.name)
-    return rollout, _own(folder)
+    folder = run_folder(source)
+    return rollout, _own(folder) if folder else None
 
 
 def _load(encoder: str, task: str | None) -> Encoder:
     """An encoder whose features are those of its own task."""
-    found = find_alone(encoder, task)
-    found.check_task(get_task(found.header["task"]))
-    return found
+    loaded = find_alone(encoder, task)
+    loaded.check_task(get_task(loaded.header["task"]))
+    return loaded
 
 
 def _own(folder: Path) -> Encoder | None:
-    """What a trained run sees through, unless it sees all."""
-    if not exists(folder / RUN):
-        return None
+    """A run's encoder; None if the run observes the full state."""
     encoder = load(folder / ENCODER)
     return None if encoder.header["kind"] == "identity" else encoder
 
 
 def _words(source: str | None) -> tuple[str, ...]:
-    """The end of a path, enough to tell runs apart."""
+    """The last three parts of a path, which tell runs apart."""
     path = Path((source or _POLICY).removesuffix(ENCODER_SUFFIX))
     return tuple(part for part in path.parts if part not in ("/", ".", ".."))[-3:]
 

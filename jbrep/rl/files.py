@@ -2,25 +2,31 @@
 
 import csv
 import json
+import math
 from collections.abc import Iterable, Mapping
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jbrep.errors import InputError, check_version
+from jbrep.errors import DamageError, InputError, check_version
 from jbrep.files.storage import exists, read_regular, write_whole
 from jbrep.files.tables import write_csv
+from jbrep.jitterbug.tasks import EPISODE_STEPS
+from jbrep.rl.fields import FAILED as FAILED
+from jbrep.rl.fields import FINISHED as FINISHED
+from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_STEPS, check_run
 
 FORMAT = "jbrep run"
 FORMAT_VERSION = 1
-RUN = "run.json"  # written last: the run is over where it is
+RUN = "run.json"  # written last: its presence means that the run has ended
 POLICY = "policy.zip"
-CHECKPOINT = "checkpoint.safetensors"  # while the run is under way
+CHECKPOINT = "checkpoint.safetensors"  # until the run ends
 ENCODER = "encoder.safetensors"
 EPISODES = "episodes.csv"
 EVALUATIONS = "evaluations.csv"
-EVALUATION_SEED = 1 << 31  # of the first episode of an evaluation; training's are smaller
-FINISHED, FAILED = "finished", "failed"
-_MAX_BYTES = 1 << 28
+EVALUATION_SEED = 1 << 31  # of an evaluation's first episode; seeds in training are smaller
+_MAX_TABLE_BYTES = 1 << 28
+_MAX_RUN_BYTES = 1 << 20
 
 
 class Episode(NamedTuple):
@@ -30,41 +36,72 @@ class Episode(NamedTuple):
     lane: int
     episode_return: float
     length: int  # control steps
-    diverged: bool  # its physics, which ended it
+    diverged: bool  # whether its physics did, which ended it
 
 
 class Evaluation(NamedTuple):
     """An episode of the deterministic policy."""
 
     step: int  # of training before it
-    episode: int  # the same number is the same start
+    episode: int  # the same number has the same start
     episode_return: float
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder is of a run that has ended or has written a checkpoint."""
+    return exists(folder / RUN) or exists(folder / CHECKPOINT)
 
 
 def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -> None:
     """Write a long table as CSV."""
     columns = [name.removeprefix("episode_") for name in kind._fields]
-    write_csv(path, columns, ([_shown(value) for value in row] for row in rows))
+    write_csv(path, columns, ([_cell(value) for value in row] for row in rows))
 
 
-def _shown(value: float) -> str | int:
+def _cell(value: float) -> str | int:
     return f"{value:.3f}" if isinstance(value, float) else int(value)
 
 
 def read_evaluations(folder: Path) -> list[Evaluation]:
-    """The evaluations of a run.
+    """The evaluations of a run: ascending steps, each with the same episodes from 0.
 
     Raises:
-        InputError: the file is missing or no such table.
+        InputError: the file is missing.
+        DamageError: it is not such a table.
     """
     path = folder / EVALUATIONS
     try:
-        rows = list(csv.reader(read_text(path).splitlines()))
-        if rows[0] != ["step", "episode", "return"]:
+        header, *rows = csv.reader(read_text(path).splitlines(), strict=True)
+        if header != ["step", "episode", "return"]:
             raise ValueError
-        return [Evaluation(int(step), int(e), float(r)) for step, e, r in rows[1:]]
-    except (ValueError, IndexError):
-        raise InputError(f"{path} is not a table of evaluations, or cut short") from None
+        evaluations = [_evaluation(*row) for row in rows]
+        _check_grid(evaluations)
+    except (ValueError, TypeError, csv.Error):
+        raise DamageError(
+            f"{path} is damaged or not a table of evaluations: its columns must be step, episode "
+            "and a finite return, with the same episodes at every step"
+        ) from None
+    return evaluations
+
+
+def _evaluation(step: str, episode: str, episode_return: str) -> Evaluation:
+    row = Evaluation(int(step), int(episode), float(episode_return))
+    in_range = 0 <= row.step <= MAX_STEPS and 0 <= row.episode < MAX_EVALUATION_EPISODES
+    if not in_range or not math.isfinite(row.episode_return):
+        raise ValueError
+    return row
+
+
+def _check_grid(evaluations: list[Evaluation]) -> None:
+    steps, counts = [], set()
+    for step, rows in groupby(evaluations, lambda row: row.step):
+        episodes = [row.episode for row in rows]
+        if episodes != [*range(len(episodes))]:
+            raise ValueError
+        steps.append(step)
+        counts.add(len(episodes))
+    if steps != sorted(set(steps)) or len(counts) > 1:
+        raise ValueError
 
 
 def write_run(folder: Path, run: Mapping[str, Any]) -> None:
@@ -74,34 +111,61 @@ def write_run(folder: Path, run: Mapping[str, Any]) -> None:
 
 
 def read_run(folder: Path) -> dict[str, Any]:
-    """What run.json says of a run that is over.
+    """What run.json says of a run that has ended, every field checked.
+
+    Runs of earlier versions lack `episode_steps` among their settings: theirs was 1,000.
 
     Raises:
-        InputError: there is none, or it is something else.
+        InputError: there is none, or it is from a newer jbrep.
+        DamageError: it is damaged or something else.
     """
     path = folder / RUN
     if not exists(path):
-        raise InputError(f"no run that is over in {folder}: a {RUN} is expected")
-    try:
-        run = json.loads(read_text(path))
-        version = run.get("format_version", 1)  # the first ones didn't say
-        fields = (run["settings"], run["status"], run["seconds"])
-        kinds = (dict, str, float)
-        if not all(isinstance(f, kind) for f, kind in zip(fields, kinds, strict=True)):
-            raise TypeError
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise InputError(f"{path} is damaged, or not of a run") from None
+        raise InputError(f"no finished run in {folder}: {RUN} is missing")
+    run = _read_json(path)
+    version = run.pop("format_version", 1)
+    if run.pop("format", FORMAT) != FORMAT or type(version) is not int:
+        raise DamageError(f"{path} is damaged or not from a jbrep run: its format is another")
     check_version(path, version, FORMAT_VERSION)
-    return {name: run[name] for name in run if name not in ("format", "format_version")}
+    if isinstance(run.get("settings"), dict):
+        run["settings"].setdefault("episode_steps", EPISODE_STEPS)
+    check_run(path, run)
+    return run
 
 
-def read_text(path: Path) -> str:
-    """A table's text.
+def _read_json(path: Path) -> dict[str, Any]:
+    """A JSON object of finite numbers and of text that can be written."""
+    try:
+        value = json.loads(
+            read_text(path, _MAX_RUN_BYTES), parse_constant=_refuse, parse_float=_finite
+        )
+        json.dumps(value, ensure_ascii=False).encode()  # a lone surrogate can't be
+        if not isinstance(value, dict):
+            raise TypeError
+        return value
+    except (ValueError, TypeError, RecursionError):
+        raise DamageError(
+            f"{path} is damaged or not from a jbrep run: it must be a JSON object of finite numbers"
+        ) from None
+
+
+def _refuse(constant: str) -> float:
+    raise ValueError(f"{constant} is not JSON")
+
+
+def _finite(number: str) -> float:
+    value = float(number)
+    return value if math.isfinite(value) else _refuse(number)
+
+
+def read_text(path: Path, most: int = _MAX_TABLE_BYTES) -> str:
+    """A file's text; empty for one of more than `most` bytes, or that isn't a regular file.
 
     Raises:
         InputError: it can't be read.
+        UnicodeDecodeError: it isn't UTF-8.
     """
     try:
-        return read_regular(path, _MAX_BYTES).decode()
+        return read_regular(path, most).decode()
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error

@@ -1,1 +1,1 @@
-"""Episodes to look at: where they come from, and what policies do in them."""
+"""Single episodes: where they come from, and what policies do in them."""

@@ -1,25 +1,22 @@
 """What policies do, as tables: how the motor turns, and where the robot goes."""
 
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.figures.behaviour import Behaviour
-from jbrep.files.storage import exists
 from jbrep.jitterbug.tasks import Array, Task
-from jbrep.rl.files import RUN
-from jbrep.rollouts.sources import Player, find_player
+from jbrep.rollouts.sources import Player, find_player, find_untrained, run_folder
 
-SPEEDS = np.linspace(-180, 180, 73)  # edges of bins of the motor's velocity [rad/s]
+SPEEDS = np.linspace(-180, 180, 73)  # edges of the bins of the motor's velocity [rad/s]
 _CELL = 0.02  # edge of a cell of the floor [m]
 
 
 def observe(
     sources: Sequence[str], task: str | None, episodes: int, target_yaw: float
 ) -> tuple[Task, list[Behaviour]]:
-    """What policies do in the same episodes; of a run, also the policy that it began with.
+    """What policies do in the same episodes; for a run, also the policy that it began with.
 
     Args:
         sources: as `find_player` takes them.
@@ -34,7 +31,9 @@ def observe(
     for source in sources:
         player = find_player(source, task)
         task = player.task.name
-        players += [*_before(source, player), player]
+        if folder := run_folder(source):
+            players.append(find_untrained(folder))
+        players.append(player)
     played = [_Visits(player, episodes, target_yaw) for player in players]
     reach = max(np.abs(visits.position).max() for visits in played)
     cells = int(np.ceil((reach + _CELL) / _CELL))
@@ -42,26 +41,21 @@ def observe(
     return players[0].task, [visits.counted(edges) for visits in played]
 
 
-def _before(source: str, player: Player) -> Iterable[Player]:
-    """The policy that a run began with; nothing for a policy that didn't learn."""
-    if exists(Path(source) / RUN):
-        from jbrep.rl.policy import load_untrained  # brings torch
-
-        began = load_untrained(Path(source)).begin
-        yield player._replace(name=f"{player.name}, before training", begin=began)
-
-
 class _Visits:
     """Where a policy went, and how the motor turned."""
 
     def __init__(self, player: Player, episodes: int, target_yaw: float):
-        rollouts = player.play(range(episodes), target_yaw)
         self._name = player.name
-        self._returns = np.array([rollout.reward.sum() for rollout in rollouts])
-        self._motor = np.concatenate([rollout.qvel[:, -1] for rollout in rollouts])
-        self.position = np.concatenate([rollout.qpos[:, :2] for rollout in rollouts])
+        returns, motor, position = [], [], []
+        for rollout in player.play_first(episodes, target_yaw):
+            returns.append(rollout.reward.sum())
+            motor.append(rollout.qvel[:, -1].copy())  # a view would keep the whole rollout
+            position.append(rollout.qpos[:, :2].copy())
+        self._returns, self._motor = np.array(returns), np.concatenate(motor)
+        self.position = np.concatenate(position)
 
     def counted(self, edges: Array) -> Behaviour:
+        """The shares of states by motor velocity, and by cells between these edges [m]."""
         x, y = self.position.T
         return Behaviour(
             name=self._name,

@@ -122,6 +122,7 @@ def play(
     name: str,
     seeds: Sequence[int],
     target_yaw: float | None = None,
+    steps: int = EPISODE_STEPS,
 ) -> list[Rollout]:
     """Episodes under a policy, an episode for each seed; one that diverges ends before it does.
 
@@ -131,6 +132,7 @@ def play(
         name: what the policy is called.
         seeds: an episode starts as a Gymnasium environment reset with its seed.
         target_yaw: turns the target of every episode there [rad].
+        steps: control steps in an episode.
     """
     simulation = Simulation(task, len(seeds))
     randoms = [np.random.default_rng(seed) for seed in seeds]
@@ -141,7 +143,7 @@ def play(
             **simulation.state | {"target_quaternion": np.tile(turned, (len(seeds), 1))}
         )
     act = begin(task, randoms)
-    tape = _play(simulation, lambda: act(simulation.observe()), EPISODE_STEPS, show=True)
+    tape = _play(simulation, lambda: act(simulation.observe()), steps, show=True)
     return [tape.rollout(lane, name, seed) for lane, seed in enumerate(seeds)]
 
 

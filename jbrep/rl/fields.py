@@ -1,0 +1,124 @@
+"""What each field of run.json may hold: a folder may come from a stranger."""
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jbrep.errors import DamageError
+
+FINISHED, FAILED = "finished", "failed"
+MAX_STEPS = 10**12  # of training
+MAX_EPISODE_STEPS = 1_000_000
+MAX_EVALUATION_EPISODES = 10_000
+_MAX_SEED = (1 << 31) - 1
+_MAX_LAYERS, _MAX_UNITS = 8, 1024  # of a policy's network
+_MAX_ENVS = 4096
+_MAX_SECONDS = 1e12
+_MAX_LINE = 1000  # characters
+
+
+class Kind(NamedTuple):
+    """The values that a field may have."""
+
+    allows: Callable[[Any], object]  # true for those
+    words: str
+
+
+def whole_number(least: int, most: int) -> Kind:
+    """A whole number in a range, both ends included."""
+    return Kind(
+        lambda value: type(value) is int and least <= value <= most,
+        f"a whole number from {least} to {most:,}",
+    )
+
+
+def text(pattern: str, words: str) -> Kind:
+    """A string that a regular expression matches as a whole."""
+    return Kind(lambda value: isinstance(value, str) and re.fullmatch(pattern, value), words)
+
+
+def _is_line(value: Any) -> bool:
+    return isinstance(value, str) and len(value) <= _MAX_LINE and value.isprintable()
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float)
+
+
+_NAME = text(r"[\w.-]{1,100}", "a name of letters, digits, dots, hyphens and underscores")
+_SHA256 = text("[0-9a-f]{64}", "64 hexadecimal digits")
+_LINE = Kind(_is_line, f"a line of at most {_MAX_LINE:,} characters")
+_OBJECT = Kind(lambda value: isinstance(value, dict), "an object")
+
+_RUN = {
+    "status": text(f"{FINISHED}|{FAILED}", f"{FINISHED} or {FAILED}"),
+    "settings": _OBJECT,
+    "steps": whole_number(0, MAX_STEPS),
+    "seconds": Kind(lambda v: _is_number(v) and 0 <= v <= _MAX_SECONDS, "a number from 0"),
+    "versions": Kind(
+        lambda v: isinstance(v, dict) and all(map(_is_line, [*v, *v.values()])),
+        "an object of strings",
+    ),
+    "cpu": _LINE,
+}
+_OPTIONAL = {"reason": _LINE, "policy_sha256": _SHA256}
+_SETTINGS = {
+    "task": _NAME,
+    "algorithm": _NAME,
+    "preset": _NAME,
+    "hidden": Kind(
+        lambda v: (
+            isinstance(v, list)
+            and len(v) <= _MAX_LAYERS
+            and all(type(units) is int and 1 <= units <= _MAX_UNITS for units in v)
+        ),
+        f"at most {_MAX_LAYERS} whole numbers from 1 to {_MAX_UNITS:,}",
+    ),
+    "settings": _OBJECT,
+    "num_envs": whole_number(1, _MAX_ENVS),
+    "noise": Kind(
+        lambda v: v is None or (isinstance(v, list) and all(map(_is_number, v))),
+        "null or a list of numbers",
+    ),
+    "optimizer": _OBJECT,
+    "representation": _NAME,
+    "encoder": _SHA256,
+    "seed": whole_number(0, _MAX_SEED),
+    "steps": whole_number(1, MAX_STEPS),
+    "evaluate_every": whole_number(1, MAX_STEPS),
+    "evaluation_episodes": whole_number(1, MAX_EVALUATION_EPISODES),
+    "episode_steps": whole_number(1, MAX_EPISODE_STEPS),
+}
+
+
+def check_run(path: Path, run: Mapping[str, Any]) -> None:
+    """Make sure that all fields of a run.json are there, of their types and in range.
+
+    Raises:
+        DamageError: one isn't; the message names it.
+    """
+    _check(path, run, _RUN)
+    _check(path, run, {name: kind for name, kind in _OPTIONAL.items() if name in run})
+    check_settings(path, run["settings"])
+
+
+def check_settings(path: Path, settings: Mapping[str, Any]) -> None:
+    """The same for the settings of a run alone.
+
+    Raises:
+        DamageError: as `check_run`.
+    """
+    _check(path, settings, _SETTINGS, "settings.")
+
+
+def _check(
+    path: Path, values: Mapping[str, Any], kinds: Mapping[str, Kind], prefix: str = ""
+) -> None:
+    for name, kind in kinds.items():
+        if name not in values or not kind.allows(values[name]):
+            state = "invalid" if name in values else "missing"
+            raise DamageError(
+                f"{path} is damaged or not from a jbrep run: {prefix}{name} is {state}, it must be "
+                f"{kind.words}"
+            )

@@ -1,0 +1,83 @@
+"""The weights in a stable-baselines3 zip file, read without running anything in it."""
+
+import hashlib
+import io
+import pickletools
+import textwrap
+import zipfile
+from pathlib import Path
+
+import torch
+
+from jbrep.errors import DamageError, InputError
+from jbrep.files.storage import read_regular
+
+MAX_BYTES = 1 << 28  # of the file
+_MEMBER = "policy.pth"
+_GLOBALS = {"collections OrderedDict", "torch._utils _rebuild_tensor_v2", "torch FloatStorage"}
+
+
+def read_weights(path: Path, sha256: str) -> dict[str, torch.Tensor]:
+    """The state dictionary of a policy, by the names of its parameters.
+
+    Args:
+        path: a zip file that stable-baselines3 wrote.
+        sha256: of the file.
+
+    Raises:
+        InputError: it can't be read.
+        DamageError: it isn't the file with this hash, or holds no weights.
+    """
+    raw = read_file(path)
+    if hashlib.sha256(raw).hexdigest() != sha256:
+        raise DamageError(f"{path} is damaged or another run's: its SHA-256 isn't in run.json")
+    try:
+        content = _stored(raw).read(_MEMBER)
+        archive = _stored(content)
+        for name in archive.namelist():
+            if name.endswith(".pkl"):
+                _check_globals(archive.read(name))
+        return dict(torch.load(io.BytesIO(content), map_location="cpu", weights_only=True))
+    except Exception as error:  # zipfile and torch raise many types for a forged file
+        raise DamageError(
+            f"{path} is damaged, it holds no policy's weights: {one_line(error)}"
+        ) from None
+
+
+def read_file(path: Path) -> bytes:
+    """All bytes of a policy's file.
+
+    Raises:
+        InputError: it is missing, not a regular file, or larger than a policy.
+    """
+    try:
+        raw = read_regular(path, MAX_BYTES)
+    except OSError as error:
+        raise InputError(f"can't read {path}: {error.strerror or error}") from None
+    if not raw:
+        raise InputError(f"{path} must be a regular file of 1 to {MAX_BYTES:,} bytes")
+    return raw
+
+
+def _stored(raw: bytes) -> zipfile.ZipFile:
+    """A zip archive without compression, so that it can't grow when it is read."""
+    archive = zipfile.ZipFile(io.BytesIO(raw))
+    for member in archive.infolist():
+        if member.compress_type != zipfile.ZIP_STORED:
+            raise ValueError(f"{member.filename!r} is compressed")
+    return archive
+
+
+def _check_globals(content: bytes) -> None:
+    """Make sure that a pickle names nothing but tensors and their dictionary.
+
+    torch's own unpickler for weights allows more, such as a bytearray of any size.
+    """
+    for opcode, argument, _ in pickletools.genops(content):
+        if opcode.name in ("GLOBAL", "STACK_GLOBAL", "INST") and argument not in _GLOBALS:
+            raise ValueError(f"it names {argument!r}")
+
+
+def one_line(error: Exception) -> str:
+    """An error's text for a message."""
+    return textwrap.shorten(str(error), 200)
