@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +24,18 @@ from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.study.config import Data, Study, read_study
 from jbrep.study.plan import Plan
 from jbrep.study.prepare import prepare
-from jbrep.study.progress import duration
-from jbrep.study.results import RETURNS, STATISTICS, read_results, read_runs, write_results
+from jbrep.study.progress import Progress, duration
+from jbrep.study.results import (
+    RETURNS,
+    STATISTICS,
+    as_text,
+    read_results,
+    read_runs,
+    write_results,
+)
 from jbrep.study.runner import get_backend, on_this_machine
 from jbrep.study.study import run_study
-from jbrep.study.work import PROGRESS, work
+from jbrep.study.work import PROGRESS, Outcome, work
 
 TINY = Study(
     tasks=("face_direction",),
@@ -37,6 +45,7 @@ TINY = Study(
     steps=80,
     evaluate_every=80,
     evaluation_episodes=1,
+    episode_steps=100,
 )
 TOML = """
 tasks = ["face_direction"]
@@ -46,6 +55,7 @@ seeds = 2
 steps = 80
 evaluate_every = 80
 evaluation_episodes = 1
+episode_steps = 100
 """
 
 
@@ -106,7 +116,7 @@ def test_a_study_from_toml(tmp_path):
         ("steps = 80", "steps = 0", "steps"),
         ("steps = 80", f"steps = {10**23}", "steps"),
         ("evaluate_every = 80", "evaluate_every = 0", "evaluate every"),
-        ("steps = 80", "steps = 80\nepisode_steps = 0", "episode steps"),
+        ("episode_steps = 100", "episode_steps = 0", "episode steps"),
         ("steps = 80", "steps = '80'", "steps is '80': it must be of type int"),
         ("steps = 80", "", "steps is missing"),
         ("steps = 80", "steps = 80\ndata = 7", "data is 7: it must be a table"),
@@ -264,7 +274,7 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     preset = get_preset("paper", "a2c")
     wild = dataclasses.replace(preset, settings={**preset.settings, "learning_rate": 1e30})
     monkeypatch.setitem(PRESETS["modern"], "a2c", wild)
-    study = dataclasses.replace(TINY, algorithms=("a2c", "a2c-modern"), episode_steps=100)
+    study = dataclasses.replace(TINY, algorithms=("a2c", "a2c-modern"))
     plan = Plan(study, tmp_path / "mixed")
     blocked = plan.folder_of(plan.cells[0])
     blocked.mkdir(parents=True)
@@ -290,9 +300,11 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     stop(process)
     assert len(list(out.rglob(RUN))) < 4
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
-    reported = jbrep("report", out)
+    reported = jbrep("report", out, "--json")
     assert reported.exit_code == 0, reported.output
-    assert "This study is not finished" in (out / "report.html").read_text()
+    summary = json.loads(reported.stdout)
+    assert summary == json.loads((out / "summary.json").read_text())
+    assert len(summary["missing"]) == 4 - summary["runs"]
     assert run_study(Plan(TINY, out), on_this_machine, 1) == 0
     assert tables(out) == tables(done.folder)
 
@@ -320,14 +332,13 @@ def test_a_stopped_study_leaves_checkpoints_and_a_killed_one_no_workers(tmp_path
     told = jbrep("report", out)
     assert told.exit_code == 2
     assert told.stderr == f"Error: no finished run below {out}: jbrep study resumes it\n"
-    for delay in (0.1, 0.5):  # of which workers need more to start
-        process = start("study", path, "--out", out, "--workers", 2)
-        assert wait_for(lambda p=process: workers_of(p.pid), process), process.communicate()[1]
-        time.sleep(delay)
-        workers = workers_of(process.pid)
-        process.kill()
-        process.communicate()
-        wait_for_the_end_of(workers, seconds=10)
+    process = start("study", path, "--out", out, "--workers", 2)
+    assert wait_for(lambda: workers_of(process.pid), process), process.communicate()[1]
+    time.sleep(0.2)  # workers need more to start
+    workers = workers_of(process.pid)
+    process.kill()
+    process.communicate()
+    wait_for_the_end_of(workers, seconds=10)
 
 
 def test_on_a_cluster_that_loses_a_node(done, tmp_path):
@@ -347,6 +358,30 @@ def test_on_a_cluster_that_loses_a_node(done, tmp_path):
     for ours, theirs in zip(runs, expected, strict=True):
         assert (ours.label, ours.settings) == (theirs.label, theirs.settings)
         np.testing.assert_array_equal(ours.returns, theirs.returns)
+
+
+def test_progress_is_a_line_for_each_run_where_there_is_no_terminal(done, capsys, monkeypatch):
+    outcomes = [Outcome(cell.name, "finished", "1.0 min") for cell in done.cells[:3]]
+    with Progress(done, done.cells) as progress:
+        progress.report(outcomes[0])
+        progress.report(outcomes[1])
+        monkeypatch.setattr(sys, "stderr", None)  # closed
+        progress.report(outcomes[2])
+        with Path("/dev/full").open("w") as full:
+            monkeypatch.setattr(sys, "stderr", full)
+            progress.report(Outcome(done.cells[3].name, "failed", "loss is nan"))
+            monkeypatch.undo()
+            with suppress(OSError):
+                full.close()
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.splitlines() == [
+        f"{i}/4 {outcome.name} finished: 1.0 min" for i, outcome in enumerate(outcomes[:2], 1)
+    ]
+
+
+def test_tables_fit_the_terminal(done):
+    assert max(map(len, as_text(read_results(done.folder), 80).splitlines())) <= 80
 
 
 def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):

@@ -108,15 +108,6 @@ def _comparable(runs: list[RunCurve]) -> tuple[list[RunCurve], list[str]]:
 
 def _curve(folder: Path) -> RunCurve:
     run = read_run(folder)
-    try:
-        return _as_curve(run, folder)
-    except InputError:
-        raise
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"{folder / RUN} is damaged, or not of a run") from None
-
-
-def _as_curve(run: dict[str, Any], folder: Path) -> RunCurve:
     settings = {name: value for name, value in run["settings"].items() if name != "seed"}
     evaluations = read_evaluations(folder)
     steps = sorted({each.step for each in evaluations})
