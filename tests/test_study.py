@@ -45,7 +45,6 @@ TINY = Study(
     steps=80,
     evaluate_every=80,
     evaluation_episodes=1,
-    episode_steps=100,
 )
 TOML = """
 tasks = ["face_direction"]
@@ -55,7 +54,6 @@ seeds = 2
 steps = 80
 evaluate_every = 80
 evaluation_episodes = 1
-episode_steps = 100
 """
 
 
@@ -116,7 +114,7 @@ def test_a_study_from_toml(tmp_path):
         ("steps = 80", "steps = 0", "steps"),
         ("steps = 80", f"steps = {10**23}", "steps"),
         ("evaluate_every = 80", "evaluate_every = 0", "evaluate every"),
-        ("episode_steps = 100", "episode_steps = 0", "episode steps"),
+        ("steps = 80", "steps = 80\nepisode_steps = 0", "episode steps"),
         ("steps = 80", "steps = '80'", "steps is '80': it must be of type int"),
         ("steps = 80", "", "steps is missing"),
         ("steps = 80", "steps = 80\ndata = 7", "data is 7: it must be a table"),
@@ -274,7 +272,7 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     preset = get_preset("paper", "a2c")
     wild = dataclasses.replace(preset, settings={**preset.settings, "learning_rate": 1e30})
     monkeypatch.setitem(PRESETS["modern"], "a2c", wild)
-    study = dataclasses.replace(TINY, algorithms=("a2c", "a2c-modern"))
+    study = dataclasses.replace(TINY, algorithms=("a2c", "a2c-modern"), episode_steps=100)
     plan = Plan(study, tmp_path / "mixed")
     blocked = plan.folder_of(plan.cells[0])
     blocked.mkdir(parents=True)
