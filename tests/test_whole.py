@@ -1,4 +1,4 @@
-"""The whole system at toy size: from states to a report and a recording, in peace and killed."""
+"""The whole system at toy size: from states to a report and a recording, undisturbed and killed."""
 
 import csv
 import json
@@ -32,7 +32,7 @@ def test_states_become_encoders_and_diagnostics(peace):
     pca = ("--kind", "pca", "--data", data, "--latent", 8, 4, "--out", encoders)
     assert "pca-8: held-out mean squared error" in jbrep("train-encoder", *pca).output
     paths = [encoders / f"{name}.safetensors" for name in ("dae-4", "pca-4")]
-    assert "dae-4.safetensors, complete already" in jbrep(*stages(folder)["train-dae"]).output
+    assert "dae-4.safetensors, already complete" in jbrep(*stages(folder)["train-dae"]).output
     assert "16 -> 4 tanh" in jbrep("encoder", "info", paths[0]).output
     told = jbrep("encoder", "export", paths[0], "--out", folder / "it.onnx").output
     assert f"onnxruntime.InferenceSession('{folder / 'it.onnx'}')" in told
