@@ -37,7 +37,7 @@ class Episodes:
 
     Args:
         task: a key of `jbrep.jitterbug.tasks.TASKS`.
-        num_envs: n.
+        num_lanes: n.
         num_threads: threads to step the lanes on; None takes one for each core.
         max_episode_steps: the time limit [control steps].
 
@@ -48,7 +48,7 @@ class Episodes:
     def __init__(
         self,
         task: str,
-        num_envs: int,
+        num_lanes: int,
         num_threads: int | None = None,
         max_episode_steps: int = EPISODE_STEPS,
     ):
@@ -57,11 +57,11 @@ class Episodes:
                 f"the number of steps in an episode is {max_episode_steps}: it must be at least 1"
             )
         self.task = get_task(task)
-        self.simulation = Simulation(self.task, num_envs, num_threads)
+        self.simulation = Simulation(self.task, num_lanes, num_threads)
         self._max_steps = max_episode_steps
-        self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._generators = [np.random.default_rng() for _ in range(num_envs)]
-        self._observation = np.zeros((num_envs, self.task.size))
+        self._steps = np.zeros(num_lanes, dtype=np.int64)
+        self._generators = [np.random.default_rng() for _ in range(num_lanes)]
+        self._observation = np.zeros((num_lanes, self.task.size))
 
     def reset(self, seeds: Sequence[int | None]) -> Array:
         """Start an episode in every lane; a lane whose seed is None keeps its generator.
