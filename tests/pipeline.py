@@ -1,4 +1,4 @@
-"""From states to a study at toy size, in peace or killed: python tests/pipeline.py 20."""
+"""From states to a study at toy size, undisturbed or killed: python tests/pipeline.py 20."""
 
 import shutil
 import signal
@@ -53,7 +53,7 @@ def in_peace(folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jbrep.study.heuristics._EPISODES", 2)  # they would take as long as the rest
         with pytest.MonkeyPatch.context() as once:
-            once.setattr("jbrep.report.write_report", lambda folder: [])
+            once.setattr("jbrep.report.write_report", lambda folder, out: [])
             said = {stage: jbrep(*given).output for stage, given in stages(folder).items()}
         return said | {"report": jbrep("report", folder / "study").output}
 

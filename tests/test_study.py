@@ -1,4 +1,4 @@
-"""Studies: their files, their preparation, kills, workers, clusters, results."""
+"""Studies: their files, preparation, workers, kills, clusters and results."""
 
 import dataclasses
 import json
@@ -9,27 +9,33 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
-from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from jbrep.encoders import load
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.rl.files import RUN, read_run, write_run
+from jbrep.rl.files import CHECKPOINT, RUN, read_run, write_run
 from jbrep.rl.presets import PRESETS, get_preset
-from jbrep.study import runner
 from jbrep.study.config import Data, Study, read_study
 from jbrep.study.plan import Plan
 from jbrep.study.prepare import prepare
-from jbrep.study.progress import in_words
-from jbrep.study.results import RETURNS, STATISTICS, read_results, read_runs, write_results
+from jbrep.study.progress import Progress, duration
+from jbrep.study.results import (
+    RETURNS,
+    STATISTICS,
+    as_text,
+    read_results,
+    read_runs,
+    write_results,
+)
 from jbrep.study.runner import get_backend, on_this_machine
 from jbrep.study.study import run_study
-from jbrep.study.work import PROGRESS
+from jbrep.study.work import PROGRESS, Outcome, work
 
 TINY = Study(
     tasks=("face_direction",),
@@ -52,26 +58,26 @@ evaluation_episodes = 1
 
 
 def tables(folder):
-    """All that a study concludes, as bytes."""
+    """The tables of a study, as bytes."""
     write_results(read_results(folder), folder)
     return [(folder / name).read_bytes() for name in (RETURNS, STATISTICS)]
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
-    """The tiny study on one worker, at its end."""
+    """The tiny study, finished by one worker."""
     plan = Plan(TINY, tmp_path_factory.mktemp("study") / "done")
     assert run_study(plan, on_this_machine, 1) == 0
     return plan
 
 
 def test_the_presets_are_studies():
-    found = {p.stem: read_study(p) for p in Path("studies").glob("*.toml")}
-    assert set(found) == {"smoke", "ddpg", "desk", "paper", "yaw"}
-    paper = found["paper"]
+    studies = {p.stem: read_study(p) for p in Path("studies").glob("*.toml")}
+    assert set(studies) == {"smoke", "ddpg", "desk", "paper", "yaw"}
+    paper = studies["paper"]
     assert (paper.steps, len(paper.seeds), paper.data) == (5_000_000, 10, Data(steps=5_000_000))
     assert {"dae-12", "dae-8", "dae-4", "full"} <= set(paper.representations)
-    desk = found["desk"]
+    desk = studies["desk"]
     assert (desk.steps, len(desk.seeds), desk.data) == (50_000, 10, None)
     assert {"dae-12", "dae-8", "dae-4", "full", "pca-8", "random-8"} == set(desk.representations)
 
@@ -85,32 +91,47 @@ def test_a_study_from_toml(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("tasks", "task", "unknown task: known are tasks, algorithms"),
+        ("tasks", "task", "unknown task: it must be one of tasks, algorithms"),
         ("face_direction", "fly", "unknown task 'fly'"),
         ('"a2c"', '"dqn"', "unknown algorithm 'dqn'"),
         ('"a2c"', '"a2c-best"', "unknown preset 'best'"),
-        ('"pca-8"', '"pca"', "unknown representation 'pca': full, or a kind and a latent size"),
         ('"pca-8"', '"fit-8"', "unknown kind 'fit'"),
         ('"pca-8"', '"dae-wide-8"', "unknown architecture 'wide'"),
+        *(
+            ('"pca-8"', f'"{name}"', f"unknown representation '{name}': it must be full, or a kind")
+            for name in ("pca", "pca-08", "pca-0", "pca-deep-8", "dae-paper-8", "identity-8")
+        ),
         ('"pca-8"', '"full"', "representations is .*each once"),
         ("seeds = 2", "seeds = []", "seeds is .*one or more"),
-        ("seeds = 2", "seeds = 0", "seeds is 0: a list of int"),
-        ("seeds = 2", "seeds = [0.5]", r"seeds is \[0.5\]: a list of int"),
+        (
+            "seeds = 2",
+            "seeds = 0",
+            r"seeds is 0: it must be a list of int, or how many \(1 to 65535",
+        ),
+        ("seeds = 2", "seeds = [0.5]", r"seeds is \[0.5\]: it must be a list of int"),
+        ("seeds = 2", "seeds = true", "seeds is True: it must be a list of int"),
         ("seeds = 2", "seeds = [-1]", "the seed is -1: it must be"),
         ("steps = 80", "steps = 0", "steps is 0: it must be"),
+        ("steps = 80", f"steps = {10**23}", "steps"),
         ("evaluate_every = 80", "evaluate_every = 0", "evaluate every is 0: it must be"),
-        ("steps = 80", "steps = '80'", "steps is '80': int is needed"),
+        ("steps = 80", "steps = 80\nepisode_steps = 0", "episode steps"),
+        ("steps = 80", "steps = '80'", "steps is '80': it must be of type int"),
         ("steps = 80", "", "steps is missing"),
-        ("steps = 80", "steps = 80\ndata = 7", "data is 7: a table is needed"),
+        ("steps = 80", "steps = 80\ndata = 7", "data is 7: it must be a table"),
         ("steps = 80", "steps = 80\ndata = {rows = 7}", "unknown data.rows"),
-        ("steps = 80", "steps = 80\ndata = {}", "data needs either steps"),
-        ("steps = 80", "steps = 80\ntraining = {epochs = 3}", "so data is needed, too"),
-        (
-            "steps = 80",
-            "steps = 80\ndata = {steps = 9}\ntraining = {depth = 3}",
-            "training: .*depth",
+        ("steps = 80", "steps = 80\ndata = {}", "data must have either steps"),
+        ("steps = 80", "steps = 80\ntraining = {epochs = 3}", r"\[data\] is missing"),
+        *(
+            ("steps = 80", f"steps = 80\ndata = {{steps = 9}}\ntraining = {training}", message)
+            for training, message in [
+                ("{depth = 3}", "unknown training.depth: it must be one of epochs, "),
+                ("{latent = 3}", "unknown training.latent"),
+                ("{epochs = 'many'}", "training.epochs is 'many': it must be of type int"),
+                ("{epochs = 0}", "epochs"),
+                ("7", "training is 7: it must be a table"),
+            ]
         ),
-        ("steps = 80", "steps 80", "is no TOML"),
+        ("steps = 80", "steps 80", "is not valid TOML"),
     ],
 )
 def test_a_mistaken_study_is_refused(old, new, message, tmp_path):
@@ -120,6 +141,27 @@ def test_a_mistaken_study_is_refused(old, new, message, tmp_path):
         read_study(path)
     assert "\n" not in str(error.value)
     assert str(path) in str(error.value)
+
+
+def test_training_is_checked_even_if_no_encoder_is_trained():
+    study = dataclasses.replace(TINY, representations=("full",), data=Data(steps=9))
+    with pytest.raises(InputError, match=r"unknown training\.depth"):
+        dataclasses.replace(study, training={"depth": 3})
+
+
+@pytest.mark.parametrize("representations", [("pca-8", "pca-4"), ("full",)])
+def test_a_study_without_comparisons_says_so_first(representations, tmp_path, monkeypatch):
+    study = dataclasses.replace(TINY, representations=representations)
+    assert study.comparisons == 0
+    assert "compares nothing" in study.notices[0]
+    assert TINY.comparisons == 1
+    assert not TINY.notices
+    path = tmp_path / "tiny.toml"
+    path.write_text(TOML.replace('["full", "pca-8"]', json.dumps(representations)))
+    monkeypatch.setattr("jbrep.study.study.estimate", lambda run: 60)
+    told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
+    assert "This study compares nothing: representations must have full" in told.stderr
+    assert "1.0 h" not in told.stdout
 
 
 def test_a_study_that_is_not_there(tmp_path):
@@ -141,7 +183,7 @@ def test_every_cell_has_its_run(done):
 
 
 def test_two_workers_of_which_one_is_killed_give_the_same_tables(done, tmp_path):
-    """What it was at is gone on with."""
+    """Its run is resumed."""
     plan = Plan(TINY, tmp_path / "two")
     killed = []
 
@@ -161,7 +203,7 @@ def test_two_workers_of_which_one_is_killed_give_the_same_tables(done, tmp_path)
 
 def test_what_is_finished_is_not_run_again_and_seeds_may_come(done, tmp_path, monkeypatch):
     grown = Plan(dataclasses.replace(TINY, seeds=(0, 1, 2)), done.folder)
-    assert [cell.name for cell in grown.cells if not grown.is_over(cell)] == [
+    assert [cell.name for cell in grown.unfinished] == [
         "face_direction/a2c/full/seed-2",
         "face_direction/a2c/pca-8/seed-2",
     ]
@@ -182,7 +224,7 @@ def test_it_makes_data_and_encoders(tmp_path):
         training={"epochs": 2, "batch_size": 256},
     )
     plan = Plan(study, tmp_path / "made")
-    plan.begin()
+    plan.write()
     prepare(plan)
     prints = set()
     for cell in plan.cells:
@@ -204,7 +246,10 @@ def test_a_data_set_from_elsewhere(collected, tmp_path):
         plan = Plan(study, tmp_path / folder.name)
         prepare(plan)
         assert (plan.encoders("face_direction") / "pca-8.safetensors").exists()
-    for name, message in (("pca-16", "no reduction of face_direction"), ("pca-99", "no reduction")):
+    for name, message in (
+        ("pca-16", "reduce the 16 features of face_direction"),
+        ("pca-99", "reduce"),
+    ):
         wrong = dataclasses.replace(study, representations=("full", name))
         with pytest.raises(InputError, match=message):
             run_study(Plan(wrong, tmp_path / "wrong"), None, 1)
@@ -216,45 +261,82 @@ def test_a_data_set_from_elsewhere(collected, tmp_path):
     assert not (tmp_path / "w").exists()
 
 
+def in_this_process(plan, cells, workers):
+    """A backend that sees what a test has patched."""
+    for cell in cells:
+        yield work(cell.name, plan.run(cell), plan.folder_of(cell))
+
+
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
 def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     preset = get_preset("paper", "a2c")
     wild = dataclasses.replace(preset, settings={**preset.settings, "learning_rate": 1e30})
     monkeypatch.setitem(PRESETS["modern"], "a2c", wild)
-    study = dataclasses.replace(TINY, algorithms=("a2c", "a2c-modern"), seeds=(0, 1))
+    study = dataclasses.replace(TINY, algorithms=("a2c", "a2c-modern"), episode_steps=100)
     plan = Plan(study, tmp_path / "mixed")
     blocked = plan.folder_of(plan.cells[0])
     blocked.mkdir(parents=True)
-    (blocked / "encoder.safetensors").mkdir()  # where a file is to be
-    assert run_study(plan, on_this_machine, 1) == 1
+    (blocked / "encoder.safetensors").mkdir()  # in the place of a file
+    assert run_study(plan, in_this_process, 1) == 1
     assert "can't write" in (blocked / "error.txt").read_text()
-    over = {cell.name: read_run(plan.folder_of(cell))["status"] for cell in plan.cells[1:]}
-    for name, status in over.items():
+    statuses = {cell.name: read_run(plan.folder_of(cell))["status"] for cell in plan.cells[1:]}
+    for name, status in statuses.items():
         assert status == ("failed" if "a2c-modern" in name else "finished")
     (blocked / "encoder.safetensors").rmdir()
-    assert run_study(plan, on_this_machine, 1) == 0
+    assert run_study(plan, in_this_process, 1) == 0
     analysis = read_results(plan.folder).analysis
     failed = {group.algorithm: [len(x.failed) for x in group.labels] for group in analysis.groups}
     assert failed == {"a2c": [0, 0], "a2c-modern": [2, 2]}
 
 
-def test_a_stopped_study_goes_on(done, tmp_path):
-    """Of one that is killed, test_whole says so."""
+def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
+    """And reported before: test_whole resumes killed ones."""
     path, out = tmp_path / "tiny.toml", tmp_path / "stopped"
     path.write_text(TOML)
     process = start("study", path, "--out", out, "--workers", 2)
     assert wait_for(lambda: list(out.rglob(RUN)), process), process.communicate()[1]
+    stop(process)
+    assert len(list(out.rglob(RUN))) < 4
+    monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
+    reported = jbrep("report", out, "--json")
+    assert reported.exit_code == 0, reported.output
+    summary = json.loads(reported.stdout)
+    assert summary == json.loads((out / "summary.json").read_text())
+    assert len(summary["missing"]) == 4 - summary["runs"]
+    assert run_study(Plan(TINY, out), on_this_machine, 1) == 0
+    assert tables(out) == tables(done.folder)
+
+
+def stop(process):
+    """Stop a study as Ctrl-C does; what it says."""
     workers = workers_of(process.pid)
     process.send_signal(signal.SIGINT)
     _, told = process.communicate(timeout=120)
     assert process.returncode == 128 + signal.SIGINT, told
     assert workers
-    wait_for_the_end_of(workers)
-    assert "the same command goes on" in told
+    wait_for_the_end_of(workers, seconds=1)
     assert "Traceback" not in told
-    assert len(list(out.rglob(RUN))) < 4
-    assert run_study(Plan(TINY, out), on_this_machine, 1) == 0
-    assert tables(out) == tables(done.folder)
+    return told
+
+
+def test_a_stopped_study_leaves_checkpoints_and_a_killed_one_no_workers(tmp_path):
+    path, out = tmp_path / "long.toml", tmp_path / "stopped"
+    path.write_text(TOML.replace("steps = 80", "steps = 1_000_000", 1))
+    process = start("study", path, "--out", out, "--workers", 2)
+    assert wait_for(lambda: len(list(out.rglob(PROGRESS))) == 2, process), process.communicate()[1]
+    told = stop(process)
+    assert "stopping: the runs under way write their checkpoints" in told
+    assert len(list(out.rglob(CHECKPOINT))) == 2
+    told = jbrep("report", out)
+    assert told.exit_code == 2
+    assert told.stderr == f"Error: no finished run below {out}: jbrep study resumes it\n"
+    process = start("study", path, "--out", out, "--workers", 2)
+    assert wait_for(lambda: workers_of(process.pid), process), process.communicate()[1]
+    time.sleep(0.2)  # workers need more to start
+    workers = workers_of(process.pid)
+    process.kill()
+    process.communicate()
+    wait_for_the_end_of(workers, seconds=10)
 
 
 def test_on_a_cluster_that_loses_a_node(done, tmp_path):
@@ -269,30 +351,42 @@ def test_on_a_cluster_that_loses_a_node(done, tmp_path):
     )
     assert told.returncode == 0, told.stderr[-3000:]
     assert "a node died at work" in told.stdout
-    found = read_runs(tmp_path / "ray")
+    runs = read_runs(tmp_path / "ray")
     expected = [run for run in read_runs(done.folder) if run.seed == 0]
-    for ours, theirs in zip(found, expected, strict=True):
+    for ours, theirs in zip(runs, expected, strict=True):
         assert (ours.label, ours.settings) == (theirs.label, theirs.settings)
         np.testing.assert_array_equal(ours.returns, theirs.returns)
 
 
-def test_workers_that_are_killed_again_and_again(done, monkeypatch):
-    def killed(*arguments, **settings):
-        tries.append(settings)
-        raise TerminatedWorkerError
+def test_progress_is_a_line_for_each_run_where_there_is_no_terminal(done, capsys, monkeypatch):
+    outcomes = [Outcome(cell.name, "finished", "1.0 min") for cell in done.cells[:3]]
+    with Progress(done, done.cells) as progress:
+        progress.report(outcomes[0])
+        progress.report(outcomes[1])
+        monkeypatch.setattr(sys, "stderr", None)  # closed
+        progress.report(outcomes[2])
+        with Path("/dev/full").open("w") as full:
+            monkeypatch.setattr(sys, "stderr", full)
+            progress.report(Outcome(done.cells[3].name, "failed", "loss is nan"))
+            monkeypatch.undo()
+            with suppress(OSError):
+                full.close()
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.splitlines() == [
+        f"{i}/4 {outcome.name} finished: 1.0 min" for i, outcome in enumerate(outcomes[:2], 1)
+    ]
 
-    tries = []
-    monkeypatch.setattr(runner, "Parallel", killed)
-    with pytest.raises(InputError, match=r"workers were killed 5 times, .* take fewer --workers"):
-        list(on_this_machine(done, done.cells, 1))
-    assert len(tries) == 5
+
+def test_tables_fit_the_terminal(done):
+    assert max(map(len, as_text(read_results(done.folder), 80).splitlines())) <= 80
 
 
 def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     (tmp_path / "tiny.toml").write_text(TOML)
     out = shutil.copytree(done.folder, tmp_path / "out")
     monkeypatch.setattr("jbrep.study.study.run_study", lambda *given: 2)
-    monkeypatch.setattr("jbrep.report.write_report", lambda folder: [])
+    monkeypatch.setattr("jbrep.report.write_report", lambda folder, out: [])
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
     told = jbrep("study", tmp_path / "tiny.toml", "--out", out)
     assert told.exit_code == 1
@@ -324,7 +418,7 @@ def test_a_single_seed_gives_its_returns_and_says_why_no_more(done, tmp_path):
         (tmp_path / name).write_bytes((source / name).read_bytes())
     results = read_results(tmp_path)
     assert results.analysis is None
-    assert "one run is over, two are needed" in results.left_out[0]
+    assert "one run has ended, at least two are needed" in results.left_out[0]
 
 
 @pytest.mark.parametrize(
@@ -349,17 +443,17 @@ def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
 
 
 def test_no_run_and_no_backend(tmp_path):
-    with pytest.raises(InputError, match="no run that is over below"):
+    with pytest.raises(InputError, match=r"no finished run below .* train one with jbrep rl"):
         read_runs(tmp_path)
-    with pytest.raises(InputError, match="unknown backend 'slurm': choose one of joblib, ray"):
+    with pytest.raises(InputError, match="unknown backend 'slurm': choose one of local, ray"):
         get_backend("slurm")
 
 
 @pytest.mark.parametrize(
-    ("seconds", "words"), [(12.4, "12 s"), (300, "5.0 min"), (90 * 60, "1.5 h"), (1e6, "277.8 h")]
+    ("seconds", "text"), [(12.4, "12 s"), (300, "5.0 min"), (90 * 60, "1.5 h"), (1e6, "277.8 h")]
 )
-def test_durations_in_words(seconds, words):
-    assert in_words(seconds) == words
+def test_durations_as_text(seconds, text):
+    assert duration(seconds) == text
 
 
 def test_interpolation_leaves_evaluations_as_they_are(done):

@@ -1,4 +1,4 @@
-"""The whole system at toy size: from states to a report and a recording, in peace and killed."""
+"""The whole system at toy size: from states to a report and a recording, undisturbed and killed."""
 
 import csv
 import json

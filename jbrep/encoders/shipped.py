@@ -4,6 +4,7 @@ from pathlib import Path
 
 from jbrep.encoders.encoder import FULL, IDENTITY, Encoder
 from jbrep.encoders.file import SUFFIX, load
+from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
 from jbrep.jitterbug.tasks import get_task
@@ -16,13 +17,9 @@ def names(task: str) -> tuple[str, ...]:
 
     `full` is the identity, whose file is called after its kind.
     """
-
-    def order(name: str) -> tuple[str, int]:
-        kind, _, latent = name.partition("-")
-        return kind, -int(latent or 0)
-
     stems = (path.name.removesuffix(SUFFIX) for path in (_FOLDER / task).glob(f"*{SUFFIX}"))
-    return tuple(sorted((FULL if stem == IDENTITY else stem for stem in stems), key=order))
+    shown = (FULL if stem == IDENTITY else stem for stem in stems)
+    return tuple(sorted(shown, key=lambda name: EncoderName.parse(name).order))
 
 
 def find(name: str | Path, task: str) -> Encoder:

@@ -25,6 +25,7 @@ from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder, load, save
 from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import HELD_OUT_MSE, SUFFIX
+from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose, differences
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder
@@ -142,12 +143,10 @@ class Fitter:
     def _header(self, kind: str, settings: dict[str, Any]) -> dict[str, Any]:
         """The header of an encoder, without its metrics."""
         manifest = self._data.dataset.manifest
-        architecture = settings.get("architecture", "paper")
-        words = [kind, *([architecture] if architecture != "paper" else [])]
-        words += [str(settings["latent"])] if "latent" in settings else []
+        parts = {name: settings[name] for name in ("architecture", "latent") if name in settings}
         return {
             "kind": kind,
-            "name": "-".join(words),
+            "name": str(EncoderName(kind, **parts)),
             "task": self._data.task.name,
             "features": list(self._data.task.feature_names),
             "training": settings,

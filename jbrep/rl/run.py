@@ -146,6 +146,16 @@ def train(
         )
 
 
+def read_result(run: Run, folder: Path) -> dict[str, Any] | None:
+    """The contents of run.json; None if the run hasn't ended.
+
+    Raises:
+        InputError: as `Run.check`, or the folder holds another run.
+    """
+    encoder = find(run.encoder, get_task(run.task).name)
+    return _read_ended(folder, plain(run.describe(encoder)))
+
+
 def plain(value: Any) -> Any:
     """The value as JSON gives it back: lists for tuples."""
     if isinstance(value, Mapping):

@@ -8,6 +8,7 @@ from numbers import Integral
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError
 from jbrep.stats.bootstrap import Array
 
@@ -157,13 +158,11 @@ def _ordered(group: Group, key: tuple[str, str], baseline: str) -> Group:
 
 def in_order(names: Iterable[str], baseline: str) -> list[str]:
     """Representations as tables and figures order them: the baseline first, dae-12 before dae-8."""
-    return sorted(set(names), key=lambda name: (name != baseline, *_by_latent(name)))
 
+    def key(name: str) -> tuple[bool, tuple[str, str, int], str]:
+        return name != baseline, EncoderName.parse(name).order, name
 
-def _by_latent(name: str) -> tuple[str, int, str]:
-    """Sorts dae-12 before dae-8."""
-    kind, _, latent = name.rpartition("-")
-    return (kind, -int(latent), name) if latent.isdecimal() else (name, 0, name)
+    return sorted(set(names), key=key)
 
 
 def _check_label(runs: list[RunCurve]) -> None:

@@ -1,6 +1,5 @@
 """What a study is: a TOML file, checked."""
 
-import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
@@ -9,74 +8,93 @@ from typing import Any
 
 from jbrep.dae.training import Training
 from jbrep.encoders import FULL
+from jbrep.encoders.encoder import IDENTITY
+from jbrep.encoders.names import USUAL_ARCHITECTURE, EncoderName
 from jbrep.errors import InputError
 from jbrep.files.storage import read_regular
-from jbrep.jitterbug.tasks import get_task
+from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
 from jbrep.methods.fit import get_kind
 from jbrep.rl.presets import get_preset
 from jbrep.rl.run import Run
 
 _MAX_BYTES = 1 << 20
+_MOST_SEEDS = (1 << 16) - 1
+_RUN_SETTINGS = ("steps", "evaluate_every", "evaluation_episodes", "episode_steps")
+_TRAINING: dict[str, tuple[type, ...]] = {  # settings of encoders, with their types
+    "epochs": (int,),
+    "batch_size": (int,),
+    "learning_rate": (float, int),
+    "noise": (float, int),
+    "seed": (int,),
+}
 
 
 @dataclass(frozen=True)
 class Data:
-    """The data set that encoders are made from: collected for the study, or there already."""
+    """The data set that encoders are trained on: collected for the study, or an existing one."""
 
     steps: int = 0
     seed: int = 0
-    folder: str = ""  # of data sets by task, or of the one
+    folder: str = ""  # a data set, or a folder with one for each task
 
 
 @dataclass(frozen=True)
 class Representation:
-    """How an agent sees the state."""
+    """What an agent observes."""
 
-    name: str  # full, or as its encoder is called: dae-8, dae-deep-8, pca-8
+    name: str  # full, or the name of an encoder: dae-8, dae-deep-8, pca-8
     kind: str
-    training: Training  # how its encoder is made, as far as that matters to the kind
+    training: Training  # of its encoder; only some settings matter to each kind
 
     @property
     def encoder(self) -> str:
-        """What its encoder is called."""
+        """The name of its encoder."""
         return self.kind if self.name == FULL else self.name
 
     @classmethod
     def of(cls, name: str, training: Mapping[str, Any]) -> "Representation":
-        """From its name.
+        """The representation of that name.
 
         Raises:
-            InputError: it is none, or can't be trained so.
+            InputError: no such representation, or invalid training settings.
         """
         if name == FULL:
-            return cls(name, "identity", Training.of(0))
-        parts = re.fullmatch(r"([a-z]+)(?:-([a-z]+))?-(\d{1,3})", name)
-        if not parts or "latent" not in get_kind(parts[1]).settings:
+            return cls(name, IDENTITY, _training(None, USUAL_ARCHITECTURE, training))
+        kind, architecture, latent = parts = EncoderName.parse(name)
+        settings = get_kind(kind).settings
+        taken = architecture == USUAL_ARCHITECTURE or "architecture" in settings
+        if latent is None or "latent" not in settings or not taken or str(parts) != name:
             raise InputError(
-                f"unknown representation {name!r}: {FULL}, or a kind and a latent size, such as "
-                "dae-8, dae-deep-8, pca-8 or random-8, is needed"
+                f"unknown representation {name!r}: it must be {FULL}, or a kind and a latent size, "
+                "such as dae-8, dae-deep-8, pca-8 or random-8"
             )
-        try:
-            how = Training.of(int(parts[3]), parts[2] or "paper", **training)
-        except TypeError as error:
-            raise InputError(f"training: {error}") from None
-        return cls(name, parts[1], how)
+        return cls(name, kind, _training(latent, architecture, training))
+
+
+def _training(latent: int | None, architecture: str, settings: Mapping[str, Any]) -> Training:
+    if unknown := [name for name in settings if name not in _TRAINING]:
+        raise InputError(f"unknown training.{unknown[0]}: it must be one of {', '.join(_TRAINING)}")
+    for name, value in settings.items():
+        if type(value) not in _TRAINING[name]:
+            kind = _TRAINING[name][0].__name__
+            raise InputError(f"training.{name} is {value!r}: it must be of type {kind}")
+    return Training.of(latent, architecture, **settings)
 
 
 @dataclass(frozen=True)
 class Learner:
-    """An algorithm with its settings."""
+    """An algorithm with a preset."""
 
-    name: str  # ddpg, with the paper's settings; sac-modern, with others
+    name: str  # ddpg, with the preset paper; sac-modern, with another
     algorithm: str
     preset: str
 
     @classmethod
     def of(cls, name: str) -> "Learner":
-        """From its name.
+        """The learner of that name.
 
         Raises:
-            InputError: it is none.
+            InputError: unknown algorithm or preset.
         """
         algorithm, _, preset = name.partition("-")
         get_preset(preset or "paper", algorithm)
@@ -85,7 +103,7 @@ class Learner:
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """Tasks x algorithms x representations x seeds, and what they share."""
+    """Tasks x algorithms x representations x seeds, and the settings that all runs share."""
 
     tasks: tuple[str, ...]
     algorithms: tuple[str, ...]
@@ -94,14 +112,15 @@ class Study:
     steps: int
     evaluate_every: int = 10_000
     evaluation_episodes: int = 10
-    data: Data | None = None  # None: encoders that ship
-    training: Mapping[str, Any] = field(default_factory=dict)  # of encoders, where not usual
+    episode_steps: int = EPISODE_STEPS  # control steps in an episode
+    data: Data | None = None  # None: the shipped encoders
+    training: Mapping[str, Any] = field(default_factory=dict)  # of encoders, other than the usual
 
     def __post_init__(self) -> None:
         for name in ("tasks", "algorithms", "representations", "seeds"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
-                raise InputError(f"{name} is {list(values)}: one or more is needed, each once")
+                raise InputError(f"{name} is {list(values)}: it must have one or more, each once")
         for task in self.tasks:
             get_task(task)
         for algorithm in self.algorithms:
@@ -109,65 +128,76 @@ class Study:
         for name in self.representations:
             Representation.of(name, self.training)
         for seed in self.seeds:
-            Run(  # whose numbers are in range
-                task=self.tasks[0],
-                seed=seed,
-                steps=self.steps,
-                evaluate_every=self.evaluate_every,
-                evaluation_episodes=self.evaluation_episodes,
-            )
+            Run(task=self.tasks[0], seed=seed, **self.run_settings)  # checks the numbers
         if self.data and bool(self.data.steps) == bool(self.data.folder):
-            raise InputError("data needs either steps, to collect, or the folder of a data set")
+            raise InputError("data must have either steps, to collect, or the folder of a data set")
         if self.training and not self.data:
-            raise InputError("training is of encoders made for the study, so data is needed, too")
+            raise InputError("training is for encoders made by the study: [data] is missing")
+
+    @property
+    def run_settings(self) -> dict[str, Any]:
+        """The settings of a Run that all runs share."""
+        return {name: getattr(self, name) for name in _RUN_SETTINGS}
 
     @property
     def comparisons(self) -> int:
         """How many times a representation is compared with the full observation."""
-        smaller = set(self.representations) - {FULL}
-        return len(self.tasks) * len(self.algorithms) * len(smaller)
+        if FULL not in self.representations:
+            return 0
+        return len(self.tasks) * len(self.algorithms) * (len(self.representations) - 1)
+
+    @property
+    def notices(self) -> list[str]:
+        """What to know before the first run."""
+        if self.comparisons:
+            return []
+        return [
+            f"This study compares nothing: representations must have {FULL} and at least one other."
+        ]
 
 
 def read_study(path: Path) -> Study:
     """A study from its TOML file.
 
     Raises:
-        InputError: no such file, no TOML, or something in it is unknown, missing or out of range.
+        InputError: no such file, invalid TOML, or a name or value that is unknown, missing or out
+            of range.
     """
     try:
         given = tomllib.loads(read_regular(path, _MAX_BYTES).decode())
     except FileNotFoundError:
-        raise InputError(f"no study at {path}: a TOML file is needed") from None
+        raise InputError(f"no study at {path}: it must be a TOML file") from None
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no TOML: {error}") from None
+        raise InputError(f"{path} is not valid TOML: {error}") from None
     try:
         return as_study(given)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def as_study(given: dict[str, Any]) -> Study:
-    """A study from what TOML or JSON gave; a count of seeds stands for the first so many.
+def as_study(given: Mapping[str, Any]) -> Study:
+    """A study from parsed TOML or JSON; a number of seeds n stands for the seeds 0 to n - 1.
 
     Raises:
-        InputError: something in it is unknown, missing or out of range.
+        InputError: a name or value is unknown, missing or out of range.
     """
+    given = dict(given)
     if "data" in given:
         given["data"] = Data(**_checked(Data, given["data"], "data."))
-    if isinstance(given.get("seeds"), int) and 0 < given["seeds"] < 1 << 16:
+    if type(given.get("seeds")) is int and 0 < given["seeds"] <= _MOST_SEEDS:
         given["seeds"] = list(range(given["seeds"]))
     return Study(**_checked(Study, given, ""))
 
 
 def _checked(kind: Any, given: Any, where: str) -> dict[str, Any]:
-    """Every value known, and of its field's type."""
+    """The given values, if each is known and of its field's type, and none is missing."""
     known = {f.name: f for f in fields(kind)}
     if not isinstance(given, dict):
-        raise InputError(f"{where.rstrip('.')} is {given!r}: a table is needed")
+        raise InputError(f"{where.rstrip('.')} is {given!r}: it must be a table")
     if unknown := [name for name in given if name not in known]:
-        raise InputError(f"unknown {where}{unknown[0]}: known are {', '.join(known)}")
+        raise InputError(f"unknown {where}{unknown[0]}: it must be one of {', '.join(known)}")
     needed = [n for n, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
     if missing := [name for name in needed if name not in given]:
         raise InputError(f"{where}{missing[0]} is missing")
@@ -180,8 +210,11 @@ def _typed(kind: Any, value: Any, name: str) -> Any:
     if inner:
         items = value if isinstance(value, list) else [None]
         if not all(type(item) is inner for item in items):
-            raise InputError(f"{name} is {value!r}: a list of {inner.__name__} is needed")
+            number = f", or how many (1 to {_MOST_SEEDS})" if name == "seeds" else ""
+            raise InputError(f"{name} is {value!r}: it must be a list of {inner.__name__}{number}")
         return tuple(items)
     if kind in (int, str) and type(value) is not kind:
-        raise InputError(f"{name} is {value!r}: {kind.__name__} is needed")
+        raise InputError(f"{name} is {value!r}: it must be of type {kind.__name__}")
+    if name == "training" and not isinstance(value, dict):
+        raise InputError(f"training is {value!r}: it must be a table")
     return value

@@ -1,4 +1,4 @@
-"""What the hand-written policies return, for curves to be compared with."""
+"""Returns of the hand-written policies, to compare curves with."""
 
 import csv
 from collections.abc import Iterable
@@ -10,12 +10,12 @@ from jbrep.jitterbug.heuristics import HEURISTICS, episode_returns
 from jbrep.rl.files import EVALUATION_SEED
 
 HEURISTIC_RETURNS = "heuristics.csv"
-_EPISODES = 20  # from the start on that every run's evaluation begins with
+_EPISODES = 20  # with the starts of every run's evaluations
 _COLUMNS = ("task", "episode", "return")
 
 
 def write_heuristics(tasks: Iterable[str], folder: Path) -> Path:
-    """Play the hand-written policy of each task, unless the file has them all."""
+    """Play the hand-written policy of each task, unless the file has exactly these tasks."""
     path = folder / HEURISTIC_RETURNS
     wanted = sorted(set(tasks))
     there: list[str] = []

@@ -1,4 +1,4 @@
-"""A study's folder: what is where, and which runs there are."""
+"""A study's folder: where its files are, and which runs it has."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -15,7 +15,7 @@ from jbrep.rl.run import plain
 from jbrep.study.config import Learner, Representation, Study, as_study
 
 STUDY = "study.json"
-_GRID = ("tasks", "algorithms", "representations", "seeds")  # may grow
+_GRID = ("tasks", "algorithms", "representations", "seeds")  # may be added to
 _MAX_BYTES = 1 << 24
 
 
@@ -30,30 +30,32 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Where it is below the study's folder of runs."""
-        words = (self.task, self.learner.name, self.representation.name)
-        return "/".join((*words, f"seed-{self.seed}"))
+        """Its folder below the study's folder of runs."""
+        parts = (self.task, self.learner.name, self.representation.name, f"seed-{self.seed}")
+        return "/".join(parts)
 
 
 class Plan:
-    """A study in its folder.
+    """A study in its folder, which holds `runs`, and `data` and `encoders` if the study makes them.
 
-    Below it are `runs`, and `data` and `encoders` where the study makes its own.
+    Args:
+        study: what to run.
+        folder: of this study alone.
     """
 
     def __init__(self, study: Study, folder: Path):
         self.study = study
-        self.folder = folder.absolute()  # workers may stand elsewhere
+        self.folder = folder.absolute()  # workers may have another working directory
 
     @cached_property
     def representations(self) -> tuple[Representation, ...]:
-        """How agents see the state."""
+        """What agents observe."""
         study = self.study
         return tuple(Representation.of(name, study.training) for name in study.representations)
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """All runs, whole seeds first."""
+        """All runs; those of the first seed come first."""
         study = self.study
         return tuple(
             Cell(task, Learner.of(algorithm), representation, seed)
@@ -67,26 +69,28 @@ class Plan:
         """A run's folder."""
         return self.folder / "runs" / cell.name
 
-    def is_over(self, cell: Cell) -> bool:
-        """Whether a run has come to its end, be it a failure."""
+    def has_ended(self, cell: Cell) -> bool:
+        """Whether a run has finished or failed."""
         return exists(self.folder_of(cell) / RUN)
 
+    @property
+    def unfinished(self) -> list[Cell]:
+        """The runs that have neither finished nor failed."""
+        return [cell for cell in self.cells if not self.has_ended(cell)]
+
     def run(self, cell: Cell) -> Run:
-        """What is to be trained."""
-        study = self.study
+        """What to train."""
         return Run(
             task=cell.task,
             algorithm=cell.learner.algorithm,
             preset=cell.learner.preset,
             encoder=self._encoder(cell),
             seed=cell.seed,
-            steps=study.steps,
-            evaluate_every=study.evaluate_every,
-            evaluation_episodes=study.evaluation_episodes,
+            **self.study.run_settings,
         )
 
     def encoders(self, task: str) -> Path:
-        """The folder of the encoders that the study makes for a task."""
+        """The folder of the encoders that the study trains for a task."""
         return self.folder / "encoders" / task
 
     def _encoder(self, cell: Cell) -> str:
@@ -95,43 +99,41 @@ class Plan:
             return name
         return str(self.encoders(cell.task) / f"{name}{SUFFIX}")
 
-    def begin(self) -> None:
-        """Make the folder, and write down there what the study is.
+    def write(self) -> None:
+        """Make the folder, and write what the study is.
 
         Raises:
-            InputError: the folder is of another study: other tasks, algorithms, representations
-                and seeds may come to one, all else stays.
+            InputError: the folder holds another study; only tasks, algorithms, representations and
+                seeds may change.
         """
         make_folder(self.folder)
-        path = self.folder / STUDY
-        wanted = plain(asdict(self.study))
-        if exists(path):
-            shared = {name: value for name, value in wanted.items() if name not in _GRID}
-            if differing := differences(_read(path), shared):
+        settings = self.as_json()
+        if there := read_plan(self.folder):
+            fixed = {name: value for name, value in settings.items() if name not in _GRID}
+            if differing := differences(there.as_json(), fixed):
                 raise InputError(
                     f"{self.folder} holds another study: {differing}; choose another --out"
                 )
-        write_whole(path, (json.dumps(wanted, indent=2) + "\n").encode())
+        write_whole(self.folder / STUDY, (json.dumps(settings, indent=2) + "\n").encode())
+
+    def as_json(self) -> dict[str, Any]:
+        """The study as plain JSON."""
+        return dict(plain(asdict(self.study)))
 
 
 def read_plan(folder: Path) -> Plan | None:
-    """The study that a folder is of; None if it holds runs alone.
+    """The study in a folder; None if there is none, but at most runs.
 
     Raises:
-        InputError: what says so is damaged.
+        InputError: its file is damaged or of a newer jbrep.
     """
     path = folder / STUDY
     if not exists(path):
         return None
-    given = {name: value for name, value in _read(path).items() if value is not None}
     try:
-        return Plan(as_study(given), folder)
-    except InputError as error:
-        raise InputError(f"{path} is damaged, or of a newer jbrep: {error}") from None
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(read_regular(path, _MAX_BYTES)))
-    except (OSError, ValueError, TypeError, RecursionError):
-        raise InputError(f"{path} is damaged, or not of a study: choose another --out") from None
+        given = json.loads(read_regular(path, _MAX_BYTES))
+        return Plan(as_study({n: v for n, v in given.items() if v is not None}), folder)
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(
+            f"{path} is damaged, or of a newer jbrep ({error}): choose another folder"
+        ) from None

@@ -16,30 +16,30 @@ from jbrep.study.plan import Plan
 
 
 def check(plan: Plan) -> None:
-    """Make sure, before anything is made, that the runs will have their encoders.
+    """Check, before anything is collected or trained, that the runs will have their encoders.
 
     Raises:
-        InputError: an encoder that doesn't ship, a latent size out of range, or no data set.
+        InputError: no such shipped encoder, a latent size out of range, or no data set.
     """
     study = plan.study
     for task in study.tasks:
         if study.data and study.data.folder:
-            Dataset(_folder(study.data, task))
+            Dataset(_existing(study.data, task))
         for representation in plan.representations:
             if study.data is None:
                 find(representation.encoder, task)
             elif (representation.training.latent or 0) >= get_task(task).size:
                 raise InputError(
-                    f"{representation.name} is no reduction of {task}, which has "
-                    f"{get_task(task).size} features"
+                    f"{representation.name} doesn't reduce the {get_task(task).size} features of "
+                    f"{task}: choose a smaller latent size"
                 )
 
 
 def prepare(plan: Plan) -> None:
-    """Make what isn't there yet, data sets first; what is there is left as it is.
+    """Collect the data sets and train the encoders that don't exist yet.
 
     Raises:
-        InputError: as `collect`, `derive` and `Fitter.fit`, or an encoder that doesn't ship.
+        InputError: as `collect`, `derive` and `Fitter.fit`.
     """
     data = plan.study.data
     if data is None:
@@ -52,9 +52,9 @@ def prepare(plan: Plan) -> None:
 
 
 def _data(plan: Plan, data: Data, task: str) -> Path:
-    """The folder of a task's data set; simulated for the first task, derived for the others."""
+    """The folder of a task's data set: collected for the first task, derived for the others."""
     if data.folder:
-        return _folder(data, task)
+        return _existing(data, task)
     first = plan.study.tasks[0]
     source = plan.folder / "data" / first
     if task == first:
@@ -64,7 +64,7 @@ def _data(plan: Plan, data: Data, task: str) -> Path:
     return plan.folder / "data" / task
 
 
-def _folder(data: Data, task: str) -> Path:
-    """Where a data set is that the study was given: the folder itself, or the task's in it."""
+def _existing(data: Data, task: str) -> Path:
+    """The folder of an existing data set: the given one, or the task's within it."""
     folder = Path(data.folder)
     return folder if exists(folder / MANIFEST) else folder / task

@@ -1,12 +1,13 @@
-"""What a study looks like while it runs."""
+"""What a study shows while it runs."""
 
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext, suppress
 
 from rich.console import Console
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
 
 from jbrep.rl.files import FAILED, FINISHED, read_run
@@ -15,50 +16,53 @@ from jbrep.study.work import CRASHED, Outcome, read_progress
 
 
 class Progress:
-    """A live table: runs done, running, failed, and the time left.
+    """A line for each run that ends; on a terminal also a live table of the runs under way.
 
     Args:
         plan: the study.
-        left: the runs that aren't over.
+        unfinished: the runs to go.
     """
 
-    def __init__(self, plan: Plan, left: Iterable[Cell]):
+    def __init__(self, plan: Plan, unfinished: Iterable[Cell]):
         self._plan = plan
-        self._left = {cell.name: cell for cell in left}
+        self._unfinished = {cell.name: cell for cell in unfinished}
         self._counts = Counter(
             read_run(plan.folder_of(cell))["status"]
             for cell in plan.cells
-            if cell.name not in self._left
+            if cell.name not in self._unfinished
         )
-        self._began, self._over = time.monotonic(), 0  # runs since then
-        self._before = self._in_work()  # steps of earlier processes
-        self._console = Console(stderr=True)
-        self._live = Live(
-            console=self._console, get_renderable=self._table, refresh_per_second=1, transient=True
-        )
+        self._start, self._ended = time.monotonic(), 0  # runs that ended since then
+        self._steps_before = self._steps_under_way()
+        self._live: AbstractContextManager[object] = nullcontext()
+        if sys.stderr is not None and sys.stderr.isatty():
+            self._live = Live(
+                console=Console(stderr=True),
+                get_renderable=self._table,
+                refresh_per_second=1,
+                transient=True,
+            )
 
     def __enter__(self) -> "Progress":
         self._live.__enter__()
         return self
 
-    def __exit__(self, *what: object) -> None:
+    def __exit__(self, *error: object) -> None:
         self._live.__exit__(None, None, None)
 
-    def tell(self, outcome: Outcome) -> None:
-        """A run is over."""
+    def report(self, outcome: Outcome) -> None:
+        """Count a run that has ended, and print a line."""
         self._counts[outcome.status] += 1
-        self._over += 1
+        self._ended += 1
         total = len(self._plan.cells)
-        del self._left[outcome.name]
-        number = total - len(self._left)
-        line = f"{number}/{total} {outcome.name} {outcome.status}: {outcome.words}"
-        self._console.print(escape(line), highlight=False, soft_wrap=True)
+        del self._unfinished[outcome.name]
+        number = total - len(self._unfinished)
+        say(f"{number}/{total} {outcome.name} {outcome.status}: {outcome.message}")
 
     def _table(self) -> Table:
         table = Table(box=None, pad_edge=False)
         for name in ("running", "steps", "last evaluation"):
             table.add_column(name, justify="left" if name == "running" else "right")
-        for cell in list(self._left.values()):
+        for cell in list(self._unfinished.values()):
             step, mean = read_progress(self._plan.folder_of(cell))
             if step:
                 table.add_row(cell.name, f"{step:,} of {self._plan.study.steps:,}", mean)
@@ -66,25 +70,33 @@ class Progress:
         return table
 
     def _summary(self) -> str:
-        words = [f"{self._counts[status]} {status}" for status in (FINISHED, FAILED, CRASHED)]
-        return ", ".join([*words, f"{len(self._left)} to go, {self._time_left()} left"])
+        counts = [f"{self._counts[status]} {status}" for status in (FINISHED, FAILED, CRASHED)]
+        return ", ".join([*counts, f"{len(self._unfinished)} to go, {self._time_left()} left"])
 
-    def _in_work(self) -> int:
-        """Steps of the runs that are begun and not over."""
-        return sum(read_progress(self._plan.folder_of(c))[0] for c in list(self._left.values()))
+    def _steps_under_way(self) -> int:
+        """Steps that the unfinished runs have done."""
+        cells = list(self._unfinished.values())
+        return sum(read_progress(self._plan.folder_of(cell))[0] for cell in cells)
 
     def _time_left(self) -> str:
-        """From the steps made since this began."""
-        steps, in_work = self._plan.study.steps, self._in_work()
-        done = self._over * steps + in_work - self._before
+        """From the steps done since the start."""
+        steps, under_way = self._plan.study.steps, self._steps_under_way()
+        done = self._ended * steps + under_way - self._steps_before
         if done <= 0:
             return "-"
-        seconds = (time.monotonic() - self._began) / done * (len(self._left) * steps - in_work)
-        return in_words(seconds)
+        seconds_per_step = (time.monotonic() - self._start) / done
+        return duration(seconds_per_step * (len(self._unfinished) * steps - under_way))
 
 
-def in_words(seconds: float) -> str:
-    """A duration: 40 s, 7 min, 12.5 h."""
+def say(line: str) -> None:
+    """Print a line on standard error, above a live table; a study goes on where that fails."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(line, file=sys.stderr, flush=True)
+
+
+def duration(seconds: float) -> str:
+    """A duration as text: 40 s, 7 min, 12.5 h."""
     for unit, size in (("h", 3600), ("min", 60)):
         if seconds >= 1.5 * size:
             return f"{seconds / size:.1f} {unit}"

@@ -1,14 +1,12 @@
-"""What was run, as one file: every run, what its label shares, what is missing of the study."""
+"""What was run, in one file: every run, the settings under each label, the unfinished runs."""
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from jbrep.encoders import FULL, Encoder, load
 from jbrep.rl.files import ENCODER, read_run
-from jbrep.rl.run import plain
 from jbrep.stats.runs import in_order
 from jbrep.study.plan import read_plan
 from jbrep.study.work import read_progress
@@ -22,18 +20,18 @@ def record(folder: Path, folders: Sequence[Path], left_out: Sequence[str]) -> di
     """What was run, as plain JSON.
 
     Args:
-        folder: of a study, or any above runs.
-        folders: of the runs that are over.
-        left_out: what the statistics leave out, in words.
+        folder: of a study, or any folder with runs below it.
+        folders: of the runs that have finished or failed.
+        left_out: what the statistics leave out, in sentences.
 
     Raises:
         InputError: a file is damaged.
     """
-    read = {each: read_run(each) for each in folders}
-    order = in_order((run["settings"]["representation"] for run in read.values()), FULL)
-    read = dict(sorted(read.items(), key=lambda item: _place(item[1]["settings"], order)))
+    runs = {each: read_run(each) for each in folders}
+    order = in_order((run["settings"]["representation"] for run in runs.values()), FULL)
+    runs = dict(sorted(runs.items(), key=lambda item: _sort_key(item[1]["settings"], order)))
     labels: dict[str, Any] = {}
-    for each, run in read.items():
+    for each, run in runs.items():
         label = run_label(run["settings"])
         if label not in labels:
             labels[label] = _shared(run["settings"], load(each / ENCODER))
@@ -42,8 +40,8 @@ def record(folder: Path, folders: Sequence[Path], left_out: Sequence[str]) -> di
         "format_version": FORMAT_VERSION,
         **_study(folder),
         "left_out": list(left_out),
-        "versions": _different(run["versions"] for run in read.values()),
-        "processors": _different(run["cpu"] for run in read.values()),
+        "versions": _distinct(run["versions"] for run in runs.values()),
+        "processors": _distinct(run["cpu"] for run in runs.values()),
         "labels": labels,
         "runs": [
             {
@@ -51,13 +49,13 @@ def record(folder: Path, folders: Sequence[Path], left_out: Sequence[str]) -> di
                 "seed": run["settings"]["seed"],
                 **{name: run.get(name) for name in ("status", "reason", "steps", "seconds")},
             }
-            for run in read.values()
+            for run in runs.values()
         ],
     }
 
 
-def _place(settings: Mapping[str, Any], order: list[str]) -> tuple[Any, ...]:
-    """By task and algorithm, then as tables have representations, then seeds."""
+def _sort_key(settings: Mapping[str, Any], order: list[str]) -> tuple[Any, ...]:
+    """By task, algorithm, representation (in the order of tables) and seed."""
     representation = order.index(settings["representation"])
     return settings["task"], learner(settings), representation, settings["seed"]
 
@@ -68,18 +66,18 @@ def run_label(settings: Mapping[str, Any]) -> str:
 
 
 def learner(settings: Mapping[str, Any]) -> str:
-    """The algorithm; a preset other than the paper's follows."""
+    """The algorithm with its preset, unless that is the paper's: ddpg, sac-modern."""
     suffix = "" if settings["preset"] == "paper" else f"-{settings['preset']}"
     return settings["algorithm"] + suffix
 
 
-def as_json(found: Mapping[str, Any]) -> bytes:
-    """A record as it is kept."""
-    return (json.dumps(found, indent=1, allow_nan=False) + "\n").encode()
+def as_json(contents: Mapping[str, Any]) -> bytes:
+    """The contents of the file."""
+    return (json.dumps(contents, indent=1, allow_nan=False) + "\n").encode()
 
 
 def _shared(settings: Mapping[str, Any], encoder: Encoder) -> dict[str, Any]:
-    """What all runs of a label share: all but the seed."""
+    """What the runs of a label share: everything but the seed."""
     return {
         "settings": {name: value for name, value in settings.items() if name != "seed"},
         "encoder": {
@@ -95,20 +93,19 @@ def _shared(settings: Mapping[str, Any], encoder: Encoder) -> dict[str, Any]:
 
 
 def _study(folder: Path) -> dict[str, Any]:
-    """What was asked for, and what of it isn't over: steps done by run."""
+    """The study, and the steps done by each of its unfinished runs."""
     plan = read_plan(folder)
     if plan is None:
         return {"study": None, "missing": {}}
-    left = [cell for cell in plan.cells if not plan.is_over(cell)]
     return {
-        "study": plain(asdict(plan.study)),
-        "missing": {cell.name: read_progress(plan.folder_of(cell))[0] for cell in left},
+        "study": plan.as_json(),
+        "missing": {c.name: read_progress(plan.folder_of(c))[0] for c in plan.unfinished},
     }
 
 
-def _different(values: Any) -> list[Any]:
-    found: list[Any] = []
+def _distinct(values: Any) -> list[Any]:
+    distinct: list[Any] = []
     for value in values:
-        if value not in found:
-            found.append(value)
-    return found
+        if value not in distinct:
+            distinct.append(value)
+    return distinct

@@ -1,4 +1,4 @@
-"""A study's runs as one table, and what the statistics say of them."""
+"""The runs of a study as tables, and what the statistics say of them."""
 
 import hashlib
 import json
@@ -11,11 +11,12 @@ import numpy as np
 
 from jbrep.encoders import FULL
 from jbrep.errors import InputError
-from jbrep.files.storage import write_whole
+from jbrep.files.storage import exists, write_whole
 from jbrep.files.tables import write_csv
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
-from jbrep.study.plan import read_plan
+from jbrep.study.heuristics import write_heuristics
+from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.record import RECORD, as_json, learner, record
 from jbrep.text import table
 
@@ -25,7 +26,7 @@ _COLUMNS = ("task", "algorithm", "representation", "seed", "step", "episode", "r
 
 
 class Results(NamedTuple):
-    """What a folder of runs says."""
+    """The runs in a folder, and what the statistics say of them."""
 
     folders: list[Path]  # of the runs
     runs: list[RunCurve]
@@ -33,16 +34,32 @@ class Results(NamedTuple):
     left_out: list[str]  # what there are no statistics of, and why
 
 
-def read_results(folder: Path) -> Results:
-    """The runs below a folder that are over, and their statistics where they allow any.
+def conclude(folder: Path) -> tuple[Results, list[Path]]:
+    """Write the tables of the runs below a folder, of a study or not, as far as they have ended.
+
+    Returns:
+        The results and the files: every return, what was run, the statistics if there are any, and
+        the returns of the hand-written policies.
 
     Raises:
-        InputError: no run is over there, or a file is damaged.
+        InputError: as `read_results` and `write_results`.
     """
-    folders = _folders(folder)
+    results = read_results(folder)
+    tasks = {run.task for run in results.runs}
+    return results, [*write_results(results, folder), write_heuristics(tasks, folder)]
+
+
+def read_results(folder: Path) -> Results:
+    """The runs below a folder that have finished or failed, with statistics if they allow any.
+
+    Raises:
+        InputError: there is no such run, or a file is damaged.
+    """
+    plan = read_plan(folder)
+    folders = _folders(folder, plan)
     runs = [_curve(each) for each in folders]
     compared, left_out = _comparable(runs)
-    planned = plan.study.comparisons if (plan := read_plan(folder)) else 0
+    planned = plan.study.comparisons if plan else 0
     try:
         analysis = analyse(compared, planned=planned) if compared else None
         return Results(folders, runs, analysis, left_out)
@@ -51,36 +68,37 @@ def read_results(folder: Path) -> Results:
 
 
 def read_runs(folder: Path) -> list[RunCurve]:
-    """The runs below a folder that are over.
+    """The runs below a folder that have finished or failed.
 
     Raises:
         InputError: there is none, or a file of one is damaged.
     """
-    return [_curve(each) for each in _folders(folder)]
+    return [_curve(each) for each in _folders(folder, read_plan(folder))]
 
 
 def has_runs(folder: Path) -> bool:
-    """Whether a run below a folder is over."""
-    return any(folder.rglob(RUN))
+    """Whether a folder is of a study, or there is a run below it that has finished or failed."""
+    return exists(folder / STUDY) or any(folder.rglob(RUN))
 
 
-def _folders(folder: Path) -> list[Path]:
-    found = sorted(file.parent for file in folder.rglob(RUN))
-    if not found:
-        raise InputError(f"no run that is over below {folder}: jbrep study or jbrep rl makes one")
-    return found
+def _folders(folder: Path, plan: Plan | None) -> list[Path]:
+    folders = sorted(file.parent for file in folder.rglob(RUN))
+    if not folders:
+        what_to_do = "jbrep study resumes it" if plan else "train one with jbrep rl or jbrep study"
+        raise InputError(f"no finished run below {folder}: {what_to_do}")
+    return folders
 
 
 def _comparable(runs: list[RunCurve]) -> tuple[list[RunCurve], list[str]]:
-    """The runs that statistics can be made of while others are missing, and what is left out."""
+    """The runs that there can be statistics of, though others are missing; what is left out."""
     counts = Counter((run.task, run.algorithm, run.representation) for run in runs)
     alone = {
-        key: f"{'/'.join(key)}: one run is over, two are needed"
+        key: f"{'/'.join(key)}: one run has ended, at least two are needed"
         for key, count in counts.items()
         if count == 1
     }
     alone |= {
-        key: f"{'/'.join(key)}: two runs of {FULL} are needed to compare it with"
+        key: f"{'/'.join(key)}: at least two runs of {FULL} are needed to compare it with"
         for key in counts
         if counts[*key[:2], FULL] < 2 and key not in alone
     }
@@ -90,15 +108,6 @@ def _comparable(runs: list[RunCurve]) -> tuple[list[RunCurve], list[str]]:
 
 def _curve(folder: Path) -> RunCurve:
     run = read_run(folder)
-    try:
-        return _as_curve(run, folder)
-    except InputError:
-        raise
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"{folder / RUN} is damaged, or not of a run") from None
-
-
-def _as_curve(run: dict[str, Any], folder: Path) -> RunCurve:
     settings = {name: value for name, value in run["settings"].items() if name != "seed"}
     evaluations = read_evaluations(folder)
     steps = sorted({each.step for each in evaluations})
@@ -120,23 +129,32 @@ def write_results(results: Results, folder: Path) -> list[Path]:
     """Write all returns as one long table, what was run, and the statistics if there are any.
 
     Raises:
-        InputError: a file of a run is damaged, or they can't be written.
+        InputError: a file of a run is damaged, or a table can't be written.
     """
-    found = record(folder, results.folders, results.left_out)
+    contents = record(folder, results.folders, results.left_out)
     paths = [folder / RETURNS, folder / RECORD]
     write_csv(paths[0], _COLUMNS, _rows(results.runs))
-    write_whole(paths[1], as_json(found))
+    write_whole(paths[1], as_json(contents))
     if results.analysis:
         paths.append(folder / STATISTICS)
         write_whole(paths[2], results.analysis.to_json().encode())
     else:
-        (folder / STATISTICS).unlink(missing_ok=True)  # it would be of other runs
+        (folder / STATISTICS).unlink(missing_ok=True)  # of fewer runs
     return paths
 
 
-def as_text(results: Results) -> str:
-    """Tables to read: the statistics, or each run's end where there are none."""
-    shown = statistics_text(results.analysis) if results.analysis else table(*_ends(results.runs))
+def as_text(results: Results, width: int | None = None) -> str:
+    """Tables to read: the statistics, or each run's last evaluation where there are none.
+
+    Args:
+        results: of the runs below a folder.
+        width: to fit [columns]; None for no limit.
+    """
+    shown = (
+        statistics_text(results.analysis, width)
+        if results.analysis
+        else table(*_last_evaluations(results.runs), width)
+    )
     return "\n".join((shown, *(f"\nno statistics: {line}" for line in results.left_out)))
 
 
@@ -148,8 +166,8 @@ def _rows(runs: list[RunCurve]) -> Iterator[tuple[Any, ...]]:
                 yield (*key, step, episode, f"{each:.3f}")
 
 
-def _ends(runs: list[RunCurve]) -> tuple[tuple[str, ...], Iterator[tuple[str, ...]]]:
-    """A line for each run: the returns of its last evaluation."""
+def _last_evaluations(runs: list[RunCurve]) -> tuple[tuple[str, ...], Iterator[tuple[str, ...]]]:
+    """A row for each run."""
     header = ("run", "seed", "steps", "median return", "10-90 %")
 
     def row(run: RunCurve) -> tuple[str, ...]:

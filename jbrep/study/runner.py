@@ -1,67 +1,78 @@
 """The runs of a study, side by side: on this machine, or on a Ray cluster."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterable
 from typing import Any
 
-from joblib import Parallel, delayed, parallel_config
-from joblib.externals.loky import get_reusable_executor
-from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-from jbrep.errors import InputError, choose
+from jbrep.errors import choose
 from jbrep.study.plan import Cell, Plan
-from jbrep.study.work import Outcome, work
+from jbrep.study.pool import Pool, stop_requested
+from jbrep.study.progress import say
+from jbrep.study.work import CRASHED, Outcome, work
 
-_TRIES = 5  # of a run whose worker is killed
+_ATTEMPTS = 5  # at a run whose worker is killed
 
-Backend = Callable[[Plan, Iterable[Cell], int], Iterator[Outcome]]
+Backend = Callable[[Plan, Iterable[Cell], int], Generator[Outcome]]
 
 
-def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Iterator[Outcome]:
-    """Bring runs to their end in processes of one thread each; each one's outcome as it comes.
+def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:
+    """Bring runs to their end in processes of one thread each; yield each outcome as it comes.
 
-    Runs whose worker is killed are gone on with, from their checkpoints.
-
-    Raises:
-        InputError: workers are killed again and again.
+    A run whose worker is killed is resumed from its checkpoint by another. One that has lost five
+    workers has crashed. Closed early, this waits until the runs under way have written their
+    checkpoints.
     """
-    left = {cell.name: cell for cell in cells}
-    for _ in range(_TRIES):
-        try:
-            with parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
-                jobs = (delayed(work)(*_job(plan, cell)) for cell in list(left.values()))
-                for outcome in Parallel(return_as="generator_unordered", batch_size=1)(jobs):
-                    del left[outcome.name]
-                    yield outcome
-            return
-        except TerminatedWorkerError:
-            continue
-        finally:
-            if workers > 1:
-                get_reusable_executor().shutdown(wait=True, kill_workers=True)
-    raise InputError(
-        f"workers were killed {_TRIES} times, perhaps for want of memory: take fewer --workers"
-    )
+    waiting, deaths = deque(cells), Counter[str]()
+    with Pool[Cell, Outcome | None](work, workers, _announce_stop) as pool:
+        while waiting or not pool.is_idle:
+            while waiting and not pool.is_full:
+                cell = waiting.popleft()
+                pool.submit(cell, *_job(plan, cell))
+            cell, outcome = pool.result()
+            if outcome is not None:
+                yield outcome
+                continue
+            deaths[cell.name] += 1
+            if deaths[cell.name] == _ATTEMPTS:
+                yield _killed(cell.name)
+            else:
+                waiting.append(cell)
 
 
-def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Iterator[Outcome]:
-    """The same on the Ray cluster that RAY_ADDRESS names, or on one of this machine's.
+def _announce_stop() -> None:
+    say("stopping: the runs under way write their checkpoints; Ctrl-C again ends them at once")
 
-    All nodes need the study's folder at the same path. What a node was at when it died is gone on
-    with on another.
+
+def _killed(name: str) -> Outcome:
+    reason = f"its worker was killed {_ATTEMPTS} times, perhaps because memory ran out"
+    return Outcome(name, CRASHED, f"{reason}: try fewer --workers")
+
+
+def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:
+    """The same on the Ray cluster that RAY_ADDRESS names, or else on a local one.
+
+    All nodes need the study's folder at the same path. The runs of a node that dies are resumed on
+    another. Closed early, this cancels the runs under way; their checkpoints are up to a minute
+    old.
     """
     import ray
 
     if not ray.is_initialized():
         ray.init(num_cpus=None if "RAY_ADDRESS" in os.environ else workers, **_QUIET)
-    task = ray.remote(num_cpus=1, max_retries=_TRIES)(work)
-    left = [task.remote(*_job(plan, cell)) for cell in cells]
+    task = ray.remote(num_cpus=1, max_retries=_ATTEMPTS - 1)(work)
+    names = {task.remote(*_job(plan, cell)): cell.name for cell in cells}
     try:
-        while left:
-            (done,), left = ray.wait(left)
-            yield ray.get(done)
+        while names:
+            (done,), _ = ray.wait(list(names))
+            name = names.pop(done)
+            try:
+                outcome = ray.get(done)
+            except ray.exceptions.RayError:
+                outcome = _killed(name)
+            yield outcome
     finally:
-        for job in left:
+        for job in names:
             ray.cancel(job, force=True)
 
 
@@ -70,7 +81,11 @@ _QUIET: dict[str, Any] = {
     "logging_level": "ERROR",
     "include_dashboard": False,
 }
-BACKENDS: dict[str, Backend] = {"joblib": on_this_machine, "ray": on_ray}
+BACKENDS: dict[str, Backend] = {
+    "local": on_this_machine,
+    "ray": on_ray,
+    "joblib": on_this_machine,  # what 0.1.0 called it
+}
 
 
 def get_backend(name: str) -> Backend:
@@ -83,5 +98,5 @@ def get_backend(name: str) -> Backend:
 
 
 def _job(plan: Plan, cell: Cell) -> tuple[Any, ...]:
-    """What `work` takes."""
-    return cell.name, plan.run(cell), plan.folder_of(cell), os.getpid()
+    """The arguments of `work`."""
+    return cell.name, plan.run(cell), plan.folder_of(cell), stop_requested

@@ -1,65 +1,73 @@
-"""A study from beginning to end, and what it would be."""
+"""A study from start to end, and an estimate of how long it takes."""
 
 from collections import Counter
+from contextlib import closing
 from dataclasses import replace
 
 from jbrep.files.lock import exclusive
-from jbrep.rl import train
+from jbrep.rl.run import read_result
 from jbrep.rl.speed import estimate
 from jbrep.study.plan import Cell, Plan
 from jbrep.study.prepare import check, prepare
-from jbrep.study.progress import Progress, in_words
+from jbrep.study.progress import Progress, duration
 from jbrep.study.runner import Backend
 from jbrep.study.work import CRASHED
 
 
 def run_study(plan: Plan, backend: Backend, workers: int) -> int:
-    """Prepare a study and bring all its runs to their end; how many crashed.
+    """Collect data, train encoders, and train every agent that hasn't been trained yet.
+
+    `jbrep.study.results.conclude` then writes what came of it.
+
+    Returns:
+        How many runs crashed.
 
     Raises:
-        InputError: the folder is of another study, or what it needs can't be made.
+        InputError: the folder holds another study, or the study's settings can't be used.
     """
     check(plan)
-    plan.begin()
+    plan.write()
     with exclusive(plan.folder):
         prepare(plan)
-        left = [cell for cell in plan.cells if not plan.is_over(cell)]
-        for cell in plan.cells:  # all that is wrong before the first hour
-            if plan.is_over(cell):
-                train(plan.run(cell), plan.folder_of(cell))  # makes sure that it is this very run
-            else:
-                plan.run(cell).check()
-        if not left:
+        unfinished = plan.unfinished
+        for cell in plan.cells:  # so that any mistake shows before the first run
+            read_result(plan.run(cell), plan.folder_of(cell))
+        if not unfinished:
             return 0
-        outcomes = Counter[str]()
-        with Progress(plan, left) as progress:
-            for outcome in backend(plan, left, workers):
-                progress.tell(outcome)
-                outcomes[outcome.status] += 1
-    return outcomes[CRASHED]
+        statuses = Counter[str]()
+        with (
+            Progress(plan, unfinished) as progress,
+            closing(backend(plan, unfinished, workers)) as outcomes,
+        ):
+            for outcome in outcomes:
+                progress.report(outcome)
+                statuses[outcome.status] += 1
+    return statuses[CRASHED]
 
 
 def dry_run(plan: Plan, workers: int) -> str:
-    """The runs that are left, and the time that they would take, from a short try of each kind.
+    """The runs to go, and how long they would take, estimated from a few steps of each learner.
 
     Raises:
-        InputError: an encoder that is neither made by the study nor ships.
+        InputError: as `run_study`, as far as that is known beforehand.
     """
     check(plan)
-    left = [cell for cell in plan.cells if not plan.is_over(cell)]
-    kinds = {(cell.task, cell.learner.name): cell for cell in left}
-    seconds = {  # whatever the encoder, which may not be there yet
-        kind: estimate(replace(plan.run(cell), encoder="identity")) for kind, cell in kinds.items()
+    unfinished = plan.unfinished
+    examples = {_kind(cell): cell for cell in unfinished}
+    seconds = {  # the encoder, which need not exist yet, makes little difference
+        kind: estimate(replace(plan.run(cell), encoder="identity"))
+        for kind, cell in examples.items()
     }
-    lines = [f"{cell.name}  {in_words(seconds[_kind(cell)])}" for cell in left]
-    total = sum(seconds[_kind(cell)] for cell in left)
-    over = len(plan.cells) - len(left)
+    lines = [f"{cell.name}  {duration(seconds[_kind(cell)])}" for cell in unfinished]
+    total = sum(seconds[_kind(cell)] for cell in unfinished)
+    done = len(plan.cells) - len(unfinished)
     lines.append(
-        f"{len(left)} runs to go, {over} over; {in_words(total)} of one core, "
-        f"{in_words(total / workers)} with {workers} workers, data and encoders aside"
+        f"{len(unfinished)} runs to go, {done} done; {duration(total)} on one core, "
+        f"{duration(total / workers)} with {workers} workers, besides data and encoders"
     )
     return "\n".join(lines)
 
 
 def _kind(cell: Cell) -> tuple[str, str]:
+    """What the duration of a run depends on."""
     return cell.task, cell.learner.name

@@ -1,0 +1,131 @@
+"""Worker processes that take one job at a time and never outlive the process that started them.
+
+This module imports the standard library alone, so that a new worker watches its parent before the
+seconds that it takes to import torch.
+"""
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection, wait
+from typing import Any, Generic, TypeVar
+
+_STOPPING_SECONDS = 60.0  # that jobs under way have to stop before they are killed
+_SINGLE_THREADED = dict.fromkeys(
+    ("MKL_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
+)
+_stop = threading.Event()  # set in a worker that is asked to stop
+_Job = TypeVar("_Job")
+_Result = TypeVar("_Result")
+
+
+class Pool(Generic[_Job, _Result]):
+    """Workers, started as they are needed; those that die are replaced.
+
+    On leaving its context, jobs under way are asked to stop (see `stop_requested`) and waited for.
+
+    Args:
+        function: what a worker calls with a job's arguments; importable by its name.
+        size: the most workers at a time.
+        stopping: called on leaving with jobs under way.
+    """
+
+    def __init__(self, function: Callable[..., _Result], size: int, stopping: Callable[[], None]):
+        self._function, self._size, self._stopping = function, size, stopping
+        self._idle: list[_Worker] = []
+        self._busy: dict[Connection, tuple[_Worker, _Job]] = {}
+
+    def __enter__(self) -> "Pool[_Job, _Result]":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        busy = [worker for worker, _ in self._busy.values()]
+        workers = [*busy, *self._idle]
+        try:
+            for worker in busy:
+                worker.process.terminate()
+            for worker in workers:
+                worker.connection.close()
+            if busy:
+                self._stopping()
+            deadline = time.monotonic() + _STOPPING_SECONDS
+            for worker in workers:
+                worker.process.join(max(deadline - time.monotonic(), 0))
+        finally:  # at once if this is interrupted, too
+            for worker in workers:
+                worker.process.kill()
+                worker.process.join()
+
+    @property
+    def is_full(self) -> bool:
+        """Whether every worker has a job."""
+        return len(self._busy) >= self._size
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no worker has a job."""
+        return not self._busy
+
+    def submit(self, job: _Job, *arguments: Any) -> None:
+        """Give a job to a worker."""
+        worker = self._idle.pop() if self._idle else _Worker()
+        self._busy[worker.connection] = worker, job
+        with suppress(OSError):  # it died: `result` notices
+            worker.connection.send((self._function, arguments))
+
+    def result(self) -> tuple[_Job, _Result | None]:
+        """Wait for a job to end: what it returned, or None if its worker died or was stopped."""
+        connection = wait(list(self._busy))[0]
+        assert isinstance(connection, Connection)
+        worker, job = self._busy.pop(connection)
+        try:
+            result: _Result = connection.recv()
+        except (EOFError, OSError):
+            connection.close()
+            worker.process.join()
+            return job, None
+        self._idle.append(worker)
+        return job, result
+
+
+class _Worker:
+    """A process, and the parent's end of the connection to it."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        self.process.start()
+        theirs.close()
+
+
+def stop_requested() -> bool:
+    """Whether this process is a worker that has been asked to stop."""
+    return _stop.is_set()
+
+
+def _serve(connection: Connection) -> None:
+    """Work on one job after the other, until the parent closes the connection."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which then asks
+    signal.signal(signal.SIGTERM, lambda number, frame: _stop.set())
+    os.environ.update(_SINGLE_THREADED)
+    with suppress(EOFError, OSError):
+        while True:
+            function, arguments = connection.recv()
+            result = function(*arguments)
+            if stop_requested():
+                return
+            connection.send(result)
+
+
+def _end_with_parent() -> None:
+    """End this process at once when its parent has ended; a run can be cut off anywhere."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
