@@ -44,7 +44,10 @@ def test_a_run_from_training_to_its_returns(tmp_path, monkeypatch):
     assert jbrep("evaluate-policy", policy, "--episodes", 2, *zip_file).output.endswith(told)
     table = jbrep("report", tmp_path / "runs").output.splitlines()
     assert table[1].split()[:3] == ["face_direction/a2c/dae-8", "0", "40"]
-    assert "no statistics: face_direction/a2c/dae-8: one run is over, two are needed" in table
+    assert (
+        "no statistics: face_direction/a2c/dae-8: one run has ended, at least two are needed"
+        in table
+    )
     assert (tmp_path / "runs" / "returns.csv").exists()
     again = jbrep("rl", "--task", "face_direction", "--seed", 1, "--out", run)
     assert (again.exit_code, again.output.count("\n")) == (2, 1)
@@ -69,11 +72,11 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
     dry = ("study", tmp_path / "tiny.toml", "--dry-run", "--workers", 2, "--out", tmp_path / "dry")
     told = jbrep(*dry).output
     assert told.count("face_direction/a2c/pca-8/seed-") == 2
-    assert re.search(r"4 runs to go, 0 over; [\d.]+ \w+ of one core, [\d.]+ \w+ with 2 ", told)
+    assert re.search(r"4 runs to go, 0 done; [\d.]+ \w+ on one core, [\d.]+ \w+ with 2 ", told)
     for arguments, message in (
         (("studies/none.toml",), "no study at studies/none.toml"),
         (("studies/desk.toml", "--backend", "slurm"), "unknown backend 'slurm'"),
-        (("README.md",), "README.md is no TOML"),
+        (("README.md",), "README.md is not valid TOML"),
     ):
         refused = jbrep("study", *arguments, "--out", tmp_path / "dry")
         assert (refused.exit_code, refused.output.count("\n")) == (2, 1), refused.output
@@ -92,7 +95,7 @@ def test_what_policies_do_is_drawn(tmp_path):
     policies = ("heuristic", "constant:drive=0.5", "--task", "move_in_direction")
     told = jbrep("behaviour", *policies, "--episodes", 2, "--out", tmp_path / "drawn").stdout
     for name in ("heuristic", "constant"):
-        assert re.search(rf"^{name}.*: median return \d+ \[\d+, \d+\]$", told, re.M)
+        assert re.search(rf"^{name}.*: median return \d+ \[\d+, \d+\] \(10-90 %\)$", told, re.M)
     for path in (tmp_path / "drawn").glob("*.png"):
         assert str(path) in told
         assert path.with_suffix(".csv").exists()
@@ -129,7 +132,7 @@ def test_every_command_has_help_with_an_example(command):
         (("evaluate-policy", "none"), "no policy at none: a folder of jbrep rl is needed"),
         (
             ("behaviour", "uniform", "--task", "fly", "--episodes", "0", "--out", "x"),
-            "'0' is too small: at least 1 is needed. See",
+            "'0' is too small: it must be at least 1. See",
         ),
         (
             ("collect", "--task", "fly", "--steps", "1", "--policy", "sprint", "--out", "x"),

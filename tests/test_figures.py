@@ -342,7 +342,7 @@ def test_behaviour_is_drawn_from_its_tables(behaviours, tmp_path):
 
 
 def test_the_task_of_a_policy_is_needed_and_no_data_set():
-    with pytest.raises(InputError, match="sample/face_direction is a data set: the folder of a"):
+    with pytest.raises(InputError, match="face_direction is a data set: give the folder of a"):
         observe(("data/sample/face_direction",), None, 1, 0)
     with pytest.raises(InputError, match="policy heuristic needs a --task"):
         observe(("heuristic",), None, 1, 0)

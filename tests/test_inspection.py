@@ -453,7 +453,7 @@ def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
         ({"source": FACE, "task": "move_to_pose"}, "is of face_direction, not of move_to_pose"),
         ({"source": FACE, "encoder": "dae-9"}, "no encoder 'dae-9'"),
         ({"source": FACE, "traverse": True}, "--traverse moves the units of a latent: give an"),
-        ({"encoder": "dae-8"}, "no encoder at dae-8: of one that ships, the --task is needed"),
+        ({"encoder": "dae-8"}, "no encoder at dae-8: for one that ships, give its --task, too"),
         ({"source": "none.safetensors"}, "no encoder at none.safetensors"),
         (
             {

@@ -73,7 +73,7 @@ def write_a_run(plan, cell, failed=False, reason=TRAP):
 
 def make_study(folder, left=0, failed=()):
     plan = Plan(STUDY, folder)
-    plan.begin()
+    plan.write()
     for i, cell in enumerate(plan.cells[: len(plan.cells) - left]):
         write_a_run(plan, cell, failed=i in failed)
     return plan
@@ -371,7 +371,7 @@ def test_of_single_runs_it_shows_what_there_is(tmp_path):
     conclude(plan.folder)
     assert not (plan.folder / "statistics.json").exists()
     text = (plan.folder / PAGE).read_text()
-    assert "dae-8: one run is over, two are needed" in text
+    assert "dae-8: one run has ended, at least two are needed" in text
     assert "There are no statistics yet" in text
     assert text.count("<figure") == 3
     assert (plan.folder / FIGURES / "every_run.png").exists()
@@ -403,7 +403,11 @@ def test_heuristics_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
             lambda text: text.replace('"label": "face_direction', '"label": "turn'),
             "settings of turn/sac/full are missing",
         ),
-        ("runs.json", lambda text: text.replace('version": 1', 'version": 2'), "newer one is need"),
+        (
+            "runs.json",
+            lambda text: text.replace('version": 1', 'version": 2'),
+            "this jbrep reads up to 1",
+        ),
         (
             "statistics.json",
             lambda text: text.replace('version": 1', 'version": 2'),

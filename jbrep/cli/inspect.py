@@ -46,7 +46,7 @@ def inspect(
     """Record an episode, encoder or study to see in Rerun.
 
     SOURCE is a data set, a run, a folder with several runs, an encoder's file, or a policy such as
-    heuristic. A run that is not over plays its last checkpoint. With an encoder, the decoded robot
+    heuristic. An unfinished run plays its last checkpoint. With an encoder, the decoded robot
     stands beside the true one.
     """
     if view and serve:

@@ -66,9 +66,9 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
 
         run = Run(**settings)
         run.check()
-        click.echo(printable(f"encoder: {source_of(run.encoder, run.task)}"))
+        source = source_of(run.encoder, run.task)
         try:
-            with closing(_Bar(run.steps, f"{run.algorithm} on {run.encoder}")) as bar:
+            with closing(_Bar(run.steps, f"{run.algorithm} on {source}")) as bar:
                 result = train(run, out, bar.show, stop=lambda: bool(received))
         except StoppedError as error:
             click.echo(f"{error}; the same command resumes it", err=True)
@@ -76,6 +76,7 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
     if "reason" in result:
         click.echo(f"the run failed: {result['reason']}; see {out / 'run.json'}", err=True)
         context.exit(1)
+    click.echo(printable(f"encoder: {source}"))
     rows = read_evaluations(out)
     returns = ", ".join(f"{e.episode_return:.0f}" for e in rows if e.step == rows[-1].step)
     name = result["settings"]["representation"]
