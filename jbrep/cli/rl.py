@@ -62,7 +62,7 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
     with _stop_signals() as received:
         from jbrep.encoders.shipped import source_of
         from jbrep.rl import Run, StoppedError, train
-        from jbrep.rl.files import EVALUATIONS, read_evaluations
+        from jbrep.rl.files import EVALUATIONS, RUN, read_evaluations
 
         run = Run(**settings)
         run.check()
@@ -74,7 +74,7 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
             click.echo(f"{error}; the same command resumes it", err=True)
             context.exit(128 + received[0])  # as a shell reports a command that a signal ended
     if "reason" in result:
-        click.echo(f"the run failed: {result['reason']}; see {out / 'run.json'}", err=True)
+        click.echo(f"the run failed: {result['reason']}; see {out / RUN}", err=True)
         context.exit(1)
     click.echo(printable(f"encoder: {source}"))
     rows = read_evaluations(out)

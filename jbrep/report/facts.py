@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from jbrep.encoders import FULL
+from jbrep.encoders.file import HELD_OUT_MSE
 from jbrep.figures.diagrams import EncoderRecord, LabelRecord
 from jbrep.report.tables import Tables
 from jbrep.rl.files import FAILED
@@ -112,7 +113,7 @@ def encoder_rows(tables: Tables) -> Rows:
 
 def _encoder_row(label: str, shared: LabelRecord) -> Row:
     encoder = shared["encoder"]
-    error, rows = encoder["metrics"].get("held_out_mse"), encoder["data"].get("train_rows")
+    error, rows = encoder["metrics"].get(HELD_OUT_MSE), encoder["data"].get("train_rows")
     return (
         label,
         encoder["name"],
