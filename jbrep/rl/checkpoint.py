@@ -122,8 +122,7 @@ class Checkpointer(BaseCallback):
             "record": self._history.as_json(),
             "counters": counters,
         }
-        contiguous = {name: np.asarray(values, order="C") for name, values in tensors.items()}
-        container.write(self._path, contiguous, header)
+        container.write(self._path, tensors, header)
 
     def _damaged(self) -> DamageError:
         return DamageError(f"{self._path} is damaged: delete it to start over")
