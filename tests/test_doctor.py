@@ -49,6 +49,14 @@ def test_it_draws_something_to_see_whether_it_can(monkeypatch):
 
 
 @pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("width", [60, 80])
+def test_it_fits_the_terminal(width, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(width))
+    lines = CliRunner().invoke(main, ["doctor"]).output.splitlines()
+    assert max(map(len, lines)) <= width
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_every_extra_is_examined():
     project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
     assert set(doctor.EXTRAS) == {"", *project["optional-dependencies"]}

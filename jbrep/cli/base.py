@@ -3,7 +3,7 @@
 import json
 import math
 import signal
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -59,6 +59,7 @@ class _Count(click.ParamType[int]):
 
 
 COUNT, POSITIVE = _Count(), _Count(least=1)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 RESUMES = "the same command resumes it"
 
 
@@ -75,22 +76,29 @@ def printable(line: str) -> str:
 
 
 @contextmanager
+def on_stop(handle: Callable[[int, FrameType | None], object]) -> Iterator[None]:
+    """Install a handler of Ctrl-C and SIGTERM, and put back those before at the end."""
+    before = [signal.signal(number, handle) for number in STOP_SIGNALS]
+    try:
+        yield
+    finally:
+        for number, handler in zip(STOP_SIGNALS, before, strict=True):
+            signal.signal(number, handler)
+
+
+@contextmanager
 def stoppable(afterwards: str) -> Iterator[None]:
     """Ctrl-C and SIGTERM end the command, with a line on what follows from that."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         raise SystemExit(128 + number)
 
-    before = [signal.signal(number, stop) for number in numbers]
-    try:
-        yield
-    except SystemExit:
-        click.echo(f"stopped; {afterwards}", err=True)
-        raise
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
+    with on_stop(stop):
+        try:
+            yield
+        except SystemExit:
+            click.echo(f"stopped; {afterwards}", err=True)
+            raise
 
 
 class Cli(click.Group):

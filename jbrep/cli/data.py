@@ -8,7 +8,16 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, RESUMES, as_json, echo_json, example, printable, stoppable
+from jbrep.cli.base import (
+    COUNT,
+    RESUMES,
+    as_json,
+    echo_json,
+    example,
+    on_stop,
+    printable,
+    stoppable,
+)
 from jbrep.text import terminal_width
 
 _threads = click.option(
@@ -211,12 +220,9 @@ def export(data: Path, to: str, out: Path) -> None:
 def _deferred_stop() -> Iterator[None]:
     """Deliver Ctrl-C and SIGTERM at the end: an extension module turns them into ImportError."""
     pending: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda got, frame: pending.append(got)) for number in numbers]
     try:
-        yield
+        with on_stop(lambda number, frame: pending.append(number)):
+            yield
     finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
         if pending:
             signal.raise_signal(pending[0])

@@ -1,12 +1,9 @@
 """This machine."""
 
-import textwrap
-
 import click
 
 from jbrep.cli.base import example, printable
-
-_INDENT, _WIDTH = 9, 100
+from jbrep.text import facts, terminal_width
 
 
 @click.command(epilog=example("jbrep doctor"))
@@ -20,8 +17,6 @@ def doctor(context: click.Context) -> None:
     from jbrep.doctor import examine
 
     findings = list(examine())
-    for finding in findings:
-        line = f"{finding.what:{_INDENT}}{printable(finding.said)}"
-        indent = " " * _INDENT
-        click.echo(textwrap.fill(line, _WIDTH, subsequent_indent=indent, break_on_hyphens=False))
+    said = {finding.what: printable(finding.said) for finding in findings}
+    click.echo(facts(said, terminal_width(), indent=0))
     context.exit(any(finding.is_wrong for finding in findings))

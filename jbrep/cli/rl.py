@@ -11,9 +11,8 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, example, printable
+from jbrep.cli.base import COUNT, STOP_SIGNALS, example, on_stop, printable
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 
 
@@ -115,15 +114,11 @@ def _stop_signals() -> Iterator[list[int]]:
 
     def receive(number: int, frame: FrameType | None) -> None:
         received.append(number)
-        for each in _SIGNALS:
+        for each in STOP_SIGNALS:
             signal.signal(each, signal.SIG_DFL)
         if sys.stderr is not None:  # written directly: Python's streams may be in use right now
             with suppress(OSError, ValueError):
                 os.write(sys.stderr.fileno(), _STOPPING)
 
-    before = [signal.signal(number, receive) for number in _SIGNALS]
-    try:
+    with on_stop(receive):
         yield received
-    finally:
-        for number, handler in zip(_SIGNALS, before, strict=True):
-            signal.signal(number, handler)

@@ -1,7 +1,5 @@
 """How well encoders reconstruct held-out rows, and how they compare with PCA."""
 
-from functools import lru_cache
-
 import numpy as np
 
 from jbrep.dataset import ScaledDataset
@@ -36,7 +34,6 @@ def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
     return encoder.header["metrics"][HELD_OUT_MSE] / error if error else None
 
 
-@lru_cache(64)
 def _pca_error(data: ScaledDataset, latent: int) -> float:
     """PCA's held-out error with that many components; 0 with as many as there are features."""
     if latent == data.task.size:

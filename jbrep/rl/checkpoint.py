@@ -23,7 +23,8 @@ from jbrep.files.storage import exists
 from jbrep.rl.agent import trained_parts
 from jbrep.rl.recorder import History
 
-_MAX_BYTES = 1 << 34
+MAX_BYTES = 1 << 34
+PARAMETERS = "parameters."  # begins the names of what gradient steps change
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 _ROLLOUT = ("_last_obs", "_last_episode_starts")
 _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -101,7 +102,7 @@ class Checkpointer(BaseCallback):
         return True
 
     def _read(self) -> Snapshot:
-        tensors, header = container.read(self._path, "checkpoint", _MAX_BYTES)
+        tensors, header = container.read(self._path, "checkpoint", MAX_BYTES)
         try:
             differing = differences(dict(header["identity"]), self._identity)
             if not differing:
@@ -133,7 +134,7 @@ def take(agent: BaseAlgorithm) -> Snapshot:
     monitor, env = _envs(agent)
     lanes = env.state
     kind, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 draws there
-    tensors = {f"parameters.{name}": tensor.numpy() for name, tensor in _parameters(agent)}
+    tensors = {f"{PARAMETERS}{name}": tensor.numpy() for name, tensor in _parameters(agent)}
     tensors |= {f"physics.{name}": values for name, values in lanes.arrays.items()}
     tensors |= {f"noise.{i}": n.noise_prev for i, n in enumerate(_drifting_noises(agent))}
     tensors |= {f"rollout.{name}": getattr(agent, name) for name in _ROLLOUT}
@@ -162,7 +163,7 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
             values[:] = tensors[f"buffer.{name}"]
     with torch.no_grad():
         for name, tensor in _parameters(agent):
-            tensor.copy_(torch.from_numpy(tensors[f"parameters.{name}"]))
+            tensor.copy_(torch.from_numpy(tensors[f"{PARAMETERS}{name}"]))
     for i, noise in enumerate(_drifting_noises(agent)):
         noise.noise_prev = tensors[f"noise.{i}"]
     for name in _ROLLOUT:

@@ -17,13 +17,13 @@ from jbrep.files import container
 from jbrep.files.storage import exists
 from jbrep.jitterbug.tasks import EPISODE_STEPS, Array, Task, get_task
 from jbrep.rl.agent import make_agent, make_env
+from jbrep.rl.checkpoint import MAX_BYTES, PARAMETERS
 from jbrep.rl.fields import MAX_STEPS, check_settings, whole_number
 from jbrep.rl.files import CHECKPOINT, ENCODER, FINISHED, POLICY, RUN, is_run, read_run
 from jbrep.rl.presets import ALGORITHMS, Preset
 from jbrep.rl.weights import one_line, read_file, read_weights
 
-_PARAMETERS = "parameters.policy."  # what the checkpoint's names of the policy's weights begin with
-_MAX_CHECKPOINT_BYTES = 1 << 34
+_WEIGHTS = f"{PARAMETERS}policy."
 
 
 class Trained(NamedTuple):
@@ -133,7 +133,7 @@ class _Checkpoint(NamedTuple):
 
 def _read_checkpoint(folder: Path) -> _Checkpoint:
     path = folder / CHECKPOINT
-    tensors, header = container.read(path, "checkpoint", _MAX_CHECKPOINT_BYTES)
+    tensors, header = container.read(path, "checkpoint", MAX_BYTES)
     settings, counters = header.get("identity"), header.get("counters")
     if not isinstance(settings, dict) or not isinstance(counters, dict):
         raise DamageError(f"{path} is not a run's checkpoint")
@@ -143,9 +143,9 @@ def _read_checkpoint(folder: Path) -> _Checkpoint:
     if not whole_number(0, MAX_STEPS).allows(step):
         raise DamageError(f"{path} is damaged: its number of steps is {step!r}")
     weights = {
-        name.removeprefix(_PARAMETERS): torch.tensor(values)
+        name.removeprefix(_WEIGHTS): torch.tensor(values)
         for name, values in tensors.items()
-        if name.startswith(_PARAMETERS) and not name.startswith(f"{_PARAMETERS}optimizer.")
+        if name.startswith(_WEIGHTS) and not name.startswith(f"{_WEIGHTS}optimizer.")
     }
     return _Checkpoint(settings, step, weights)
 

@@ -4,6 +4,7 @@ from collections import Counter
 from contextlib import closing
 from dataclasses import replace
 
+from jbrep.encoders import FULL
 from jbrep.files.lock import exclusive
 from jbrep.rl.run import read_result
 from jbrep.rl.speed import estimate
@@ -55,8 +56,7 @@ def dry_run(plan: Plan, workers: int) -> str:
     unfinished = plan.unfinished
     examples = {_kind(cell): cell for cell in unfinished}
     seconds = {  # the encoder, which need not exist yet, makes little difference
-        kind: estimate(replace(plan.run(cell), encoder="identity"))
-        for kind, cell in examples.items()
+        kind: estimate(replace(plan.run(cell), encoder=FULL)) for kind, cell in examples.items()
     }
     lines = [f"{cell.name}  {duration(seconds[_kind(cell)])}" for cell in unfinished]
     total = sum(seconds[_kind(cell)] for cell in unfinished)
