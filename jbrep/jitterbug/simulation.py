@@ -7,19 +7,15 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import ArrayLike, NDArray
 
-from jbrep.errors import InputError
+from jbrep.envs.checks import check_counts
 from jbrep.jitterbug import model
-from jbrep.jitterbug.tasks import QUATERNION, Array, Readings, Task, yaw_direction
+from jbrep.jitterbug.tasks import QUATERNION, Array, JitterbugTask, Readings, yaw_direction
 
 _UP_TO_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
 # on a position, velocity or acceleration that isn't finite, MuJoCo warns and resets the lane
 _NOT_FINITE = slice(
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1
 )
-
-
-class NonFiniteActionError(InputError):
-    """An action is NaN or infinite."""
 
 
 class Simulation:
@@ -41,7 +37,7 @@ class Simulation:
         InputError: a number below 1.
     """
 
-    def __init__(self, task: Task, num_lanes: int, num_threads: int | None = None):
+    def __init__(self, task: JitterbugTask, num_lanes: int, num_threads: int | None = None):
         check_counts(num_lanes, num_threads)
         model.stop_profiling()
         self.task = task
@@ -141,34 +137,3 @@ class Simulation:
         data = self._batch.get_data(lane, data)
         mujoco.mj_fwdPosition(self.model, data)
         return data
-
-
-def check_counts(num_lanes: int, num_threads: int | None) -> None:
-    """Check the numbers of lanes and threads.
-
-    Raises:
-        InputError: a number below 1.
-    """
-    for count, what in ((num_lanes, "lanes"), (num_threads, "threads")):
-        if count is not None and count < 1:
-            raise InputError(f"the number of {what} is {count}: it must be at least 1")
-
-
-def check_actions(actions: ArrayLike, num_lanes: int) -> Array:
-    """The actions as (num_lanes, 1) float64.
-
-    Raises:
-        InputError: another shape.
-        NonFiniteActionError: a value that is not finite.
-    """
-    checked: Array = np.asarray(actions, dtype=np.float64)
-    if checked.shape != (num_lanes, 1):
-        raise InputError(
-            f"actions have shape {checked.shape}: it must be ({num_lanes}, 1), one motor drive "
-            "in [-1, 1] per lane"
-        )
-    if not np.isfinite(checked).all():
-        raise NonFiniteActionError(
-            f"actions are not finite: {checked.ravel()}; they must be in [-1, 1]"
-        )
-    return checked
