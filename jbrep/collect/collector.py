@@ -188,7 +188,7 @@ def _begin(settings: Settings, folder: Path) -> Manifest:
 
 def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
     """Check that resuming gives what an uninterrupted run gives."""
-    differing = differences(there.settings.as_json(), wanted.settings.as_json())
+    differing = differences(_flat(there.settings), _flat(wanted.settings))
     if differing:
         raise InputError(
             f"{folder} holds a data set with other settings: {differing}; "
@@ -203,6 +203,12 @@ def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
             f"{folder} was started with other versions: {differing}; "
             "install those to resume, or choose another folder"
         )
+
+
+def _flat(settings: Settings) -> dict[str, Any]:
+    """The settings with those of the environment beside them; equal names mean equal features."""
+    task = {n: v for n, v in settings.task.as_json().items() if n not in ("id", "name")}
+    return {n: v for n, v in settings.as_json().items() if n != "environment"} | task
 
 
 def usual_shard_episodes(settings: Settings) -> int:

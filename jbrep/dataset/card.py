@@ -69,7 +69,8 @@ def card(dataset: Dataset, width: int = 80) -> str:
 
 
 def _task_line(task: Task) -> str:
-    parts = [task.name, f"{task.size} features", f"{task.action_size} actions"]
+    actions = f"{task.action_size} action{'s' if task.action_size > 1 else ''}"
+    parts = [task.name, f"{task.size} features", actions]
     arguments = [f"{name}={value}" for name, value in task.arguments.items()]
     return ", ".join([*parts, *arguments])
 
@@ -77,8 +78,10 @@ def _task_line(task: Task) -> str:
 def _episodes_line(about: Mapping[str, Any]) -> str:
     line = f"{about['episodes']:,}"
     if lengths := about["steps_per_episode"]:
-        line += f" of {lengths['min']:,.0f} to {lengths['max']:,.0f} steps"
-    return f"{line}, {about['terminated']:,} terminated before the time limit"
+        low, high = lengths["min"], lengths["max"]
+        line += f" of {low:,.0f}" + (f" to {high:,.0f} steps" if low != high else " steps")
+    ended = about["terminated"]
+    return f"{line}, {ended:,} terminated by a state" if ended else line
 
 
 def _cells(feature: Mapping[str, Any]) -> list[str]:
