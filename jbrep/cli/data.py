@@ -39,7 +39,7 @@ _data = click.argument("data", type=click.Path(path_type=Path))
 
 
 @click.command(epilog=example("jbrep collect --task face_direction --steps 5M --out data/face"))
-@task_options
+@task_options()
 @click.option("--steps", required=True, type=COUNT, help="How many; the last episode is completed.")
 @click.option("--seed", default=0, show_default=True, help="Root of every episode's seed.")
 @click.option(

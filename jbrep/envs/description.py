@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -78,6 +78,7 @@ def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | N
         action = _checked_action(env_id, env.action_space)
         spec = env.spec or find_spec(env_id)
         limit = max_episode_steps or spec.max_episode_steps or _find_limit(env, env_id)
+        episodes = [_play(env, seed=1), _play(env, seed=0), _play(fresh, seed=0)]
         timestep: Any = getattr(env.unwrapped, "dt", None)
         return Task(
             id=find_spec(env_id).id,
@@ -89,7 +90,8 @@ def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | N
             arguments=dict(arguments),
             timestep=float(timestep) if _is_positive(timestep) else None,
             solved_return=spec.reward_threshold,
-            reproducible=_is_reproducible(env, fresh),
+            terminates=True if any(each.terminated for each in episodes) else None,
+            reproducible=episodes[1].content == episodes[2].content,
             seed_bits=_seed_bits(env),
         )
     finally:
@@ -184,25 +186,26 @@ def _seed_bits(env: gymnasium.Env[Any, Any]) -> int:
     return wide
 
 
-def _is_reproducible(env: gymnasium.Env[Any, Any], fresh: gymnasium.Env[Any, Any]) -> bool:
-    """Whether an instance that has been used and a fresh one give the same bits."""
-    _episode(env, seed=1)
-    return _episode(env, seed=0) == _episode(fresh, seed=0)
+class _Played(NamedTuple):
+    """The first steps of an episode."""
+
+    content: list[bytes]  # of what each step gave
+    terminated: bool
 
 
-def _episode(env: gymnasium.Env[Any, Any], seed: int) -> list[bytes]:
-    """The bytes of what an episode's first steps give under random actions."""
+def _play(env: gymnasium.Env[Any, Any], seed: int) -> _Played:
+    """Play an episode's first steps with random actions."""
     random = np.random.default_rng(seed)
     space: Any = env.action_space
     observation, _ = env.reset(seed=seed)
-    given = [_bytes(env, observation)]
+    content = [_bytes(env, observation)]
     for _ in range(_PROBE_STEPS):
         action = random.uniform(space.low, space.high).astype(space.dtype)
         observation, reward, terminated, truncated, _ = env.step(action)
-        given.append(_bytes(env, observation, reward, terminated, truncated))
+        content.append(_bytes(env, observation, reward, terminated, truncated))
         if terminated or truncated:
-            break
-    return given
+            return _Played(content, bool(terminated))
+    return _Played(content, False)
 
 
 def _bytes(env: gymnasium.Env[Any, Any], observation: Any, *others: Any) -> bytes:
