@@ -4,7 +4,6 @@ import re
 import shutil
 import signal
 from contextlib import contextmanager
-from functools import partial
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from jbrep.files.lock import exclusive
 from jbrep.methods import fit
 from jbrep.methods.fit import KINDS, Fitter
 from jbrep.methods.held_out import ratio_to_pca
-from jbrep.methods.rows import training_rows
 
 
 @pytest.fixture(scope="module")
@@ -141,10 +139,9 @@ def test_what_another_process_finished_before_the_lock_is_left_as_it_is(
     assert [e.step for e in events.Scalars("train_loss")] == [1, 2, 3]  # once
 
 
-def test_rows_that_do_not_fit_in_memory_give_the_same_file(data, tmp_path, monkeypatch):
+def test_rows_that_do_not_fit_in_memory_give_the_same_file(data, tmp_path):
     one = Fitter(data, tmp_path / "memory").fit("dae", how()).path
-    monkeypatch.setattr(fit, "training_rows", partial(training_rows, memory=1000))
-    other = Fitter(data, tmp_path / "disk").fit("dae", how()).path
+    other = Fitter(data, tmp_path / "disk", memory=1000).fit("dae", how()).path
     assert one.read_bytes() == other.read_bytes()
 
 
