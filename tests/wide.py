@@ -1,78 +1,66 @@
 """A made-up data set of a wide robot, as far as encoders look at one."""
 
-from itertools import accumulate
 from types import SimpleNamespace
 
 import numpy as np
 
 from jbrep.dataset import Column, Dataset, ScaledDataset
 
+SPREADS = {0: 0, 1: 1e8, 2: 1e-8}  # of the first features; about 1 of the others
+PLANE = 5  # dimensions in which nearly all variation lies
+
+
+def make_feature(name, unit="", low=None, high=None, bounded=False):
+    """A feature as a task has it."""
+    return SimpleNamespace(name=name, unit=unit, low=low, high=high, bounded=bounded)
+
+
+def make_task(features, name="Humanoid-v5"):
+    """What encoders and diagnostics look at of a task."""
+    names = tuple(f.name for f in features)
+    return SimpleNamespace(name=name, features=features, size=len(features), feature_names=names)
+
 
 class WideDataset:
-    """Features near a plane of few dimensions, in episodes of these lengths.
-
-    Feature 0 is constant, feature 1 spreads over 1e8 and feature 2 over 1e-8.
+    """A Dataset of features near a plane, with actions of 17 numbers.
 
     Args:
         lengths: rows of each episode.
-        features: of an observation, at least 3.
-        actions: numbers of an action.
-        name: of the task.
-        folder: for a file of the observations, to be mapped; None keeps them in memory.
-        unit, bounded, half_range: of every feature.
+        features: in an observation.
+        folder: for a file of the observations, which is mapped; None keeps them in memory.
     """
 
     split, fit_scaler = Dataset.split, Dataset.fit_scaler
 
-    def __init__(
-        self,
-        lengths,
-        features=348,
-        actions=17,
-        name="Humanoid-v5",
-        folder=None,
-        unit="",
-        bounded=False,
-        half_range=None,
-    ):
-        low, high = (None, None) if half_range is None else (-half_range, half_range)
-        described = [
-            SimpleNamespace(name=f"obs_{i}", unit=unit, low=low, high=high, bounded=bounded)
-            for i in range(features)
-        ]
-        names = tuple(f.name for f in described)
-        self.task = SimpleNamespace(
-            name=name, features=described, size=features, feature_names=names
-        )
+    def __init__(self, lengths, features=348, folder=None):
+        self.task = make_task([make_feature(f"obs_{i}") for i in range(features)])
         self.episodes = {"length": np.array(lengths), "seed": np.arange(len(lengths))}
         self.folder = folder
         settings = SimpleNamespace(policy={"kind": "uniform"}, seed=0)
         self.manifest = SimpleNamespace(fingerprint="wide", settings=settings)
-        count = sum(lengths)
-        action = np.random.default_rng(1).uniform(-1, 1, (count, actions)).astype(np.float32)
-        self._columns = {"observation": self._observations(count, features), "action": action}
+        random = np.random.default_rng(0)
+        self.arrays = {
+            "observation": self._observations(sum(lengths), features, random),
+            "action": random.uniform(-1, 1, (sum(lengths), 17)).astype(np.float32),
+        }
 
-    def _observations(self, count, features):
+    def _observations(self, count, features, random):
         if self.folder is None:
             rows = np.empty((count, features), np.float32)
         else:
-            path = self.folder / "observations"
-            rows = np.memmap(path, np.float32, "w+", shape=(count, features))
-        random = np.random.default_rng(0)
-        plane = random.normal(size=(5, features)).astype(np.float32)
+            rows = np.memmap(self.folder / "rows", np.float32, "w+", shape=(count, features))
+        plane = random.normal(size=(PLANE, features))
         for start in range(0, count, 1000):
             part = rows[start : start + 1000]
-            part[:] = random.normal(size=(len(part), 5)).astype(np.float32) @ plane
-            part[:, 0] = 3
-            part[:, 1:3] *= np.float32([1e8, 1e-8])
+            noise = 0.1 * random.normal(size=part.shape)
+            part[:] = random.normal(size=(len(part), PLANE)) @ plane + noise
+            for place, spread in SPREADS.items():
+                part[:, place : place + 1] *= np.float32(spread)
         return rows
 
     def __getitem__(self, name):
-        values = self._columns[name]
+        values = self.arrays[name]
         return Column(lambda shard: values, [len(values)], values.dtype, values.shape[1:])
-
-    def __len__(self):
-        return list(accumulate(self.episodes["length"]))[-1]
 
 
 def wide(lengths, **options):

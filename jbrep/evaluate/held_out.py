@@ -87,5 +87,5 @@ class HeldOut:
     @cached_property
     def variation(self) -> list[Array]:
         """Sums of scaled features and of their squares over each group, (groups, d)."""
-        scaled = self.data.chunks(self.data.test)
+        scaled = (chunk.astype(np.float64) for chunk in self.data.chunks(self.data.test))
         return self.sums_of_parts(self.data.test, ((chunk, chunk**2) for chunk in scaled))

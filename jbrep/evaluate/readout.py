@@ -95,8 +95,8 @@ def _steps(encoder: Encoder, held_out: HeldOut, rows: Rows) -> _Steps:
     dataset = held_out.data.dataset
     chosen = held_out.followed(sample_rows(rows, _ROWS, held_out.data.task.size))
     now, then = (dataset["observation"][r] for r in (chosen, chosen + 1))
-    action = dataset["action"][chosen].reshape(len(chosen), -1)
-    return _Steps(chosen, encoder.encode(now), action, encoder.encode(then), then - now)
+    latent, next_latent = encoder.encode(now), encoder.encode(then)
+    return _Steps(chosen, latent, dataset["action"][chosen], next_latent, then - now)
 
 
 def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
@@ -185,11 +185,12 @@ def correlation(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
         spread_z, spread_s = variation(z, zz, n), variation(s, ss, n)
         shared = zs - z[..., :, None] * s[..., None, :] / n[..., None]
         spread = np.sqrt(spread_z[..., :, None] * spread_s[..., None, :])
-        return np.where(spread > 0, np.abs(shared) / spread, 0).max(axis=-2)
+        by_name = np.where(spread > 0, np.abs(shared) / spread, 0).max(axis=-2)
+        return np.append(by_name, by_name.mean(axis=-1, keepdims=True), axis=-1)
 
-    by_name = bootstrap(largest, *sums, products).tolist()
+    *by_name, mean = bootstrap(largest, *sums, products).tolist()
     return {
-        "mean": bootstrap(lambda *sums: largest(*sums).mean(axis=-1), *sums, products).tolist(),
+        "mean": mean,
         "dimensions": dict(zip(names, by_name, strict=True)),
         "state_dimensions": len(truth),
     }
