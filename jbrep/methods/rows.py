@@ -13,7 +13,7 @@ from jbrep.dataset.scaled import sample
 
 _LEAST_MEMORY = 1 << 30  # bytes that rows may take on any machine
 _WATCHED = 100_000  # held-out rows whose loss is reported after each epoch
-_WATCHED_NUMBERS = 1 << 24  # at most in those rows: 64 MiB
+_WATCHED_NUMBERS = 1 << 22  # at most in those rows: 16 MiB
 
 
 def available_memory(device: torch.device) -> int:
@@ -46,9 +46,8 @@ def training_rows(data: ScaledDataset, device: torch.device, memory: int | None 
 
 def watched_rows(data: ScaledDataset, device: torch.device) -> Tensor:
     """A sample of the scaled held-out rows, (m, d): at most 100,000, fewer of wide robots."""
-    return load_rows(
-        data, sample(data.test, min(_WATCHED, _WATCHED_NUMBERS // data.task.size)), device
-    )
+    most = min(_WATCHED, _WATCHED_NUMBERS // data.task.size)
+    return load_rows(data, sample(data.test, most), device)
 
 
 def load_rows(data: ScaledDataset, rows: NDArray[np.int64], device: torch.device) -> Tensor:
