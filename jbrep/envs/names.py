@@ -3,6 +3,7 @@
 import difflib
 from collections.abc import Iterable
 from importlib import import_module, metadata
+from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -88,8 +89,9 @@ def environment_versions(env_id: str) -> dict[str, str]:
     Raises:
         InputError: as `find_spec`.
     """
-    entry_point = find_spec(env_id).entry_point
-    module = entry_point if isinstance(entry_point, str) else getattr(entry_point, "__module__", "")
+    entry_point: Any = find_spec(env_id).entry_point
+    maker = getattr(entry_point, "func", entry_point)  # shimmy's are partial functions
+    module = maker if isinstance(maker, str) else getattr(maker, "__module__", "")
     package = module.partition(":")[0].partition(".")[0]
     if package == "jbrep":
         return {}
