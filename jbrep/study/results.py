@@ -13,6 +13,7 @@ from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.files.storage import exists, write_whole
 from jbrep.files.tables import write_csv
+from jbrep.jitterbug.tasks import SOLVED_RETURN
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.study.heuristics import write_heuristics
@@ -122,6 +123,8 @@ def _curve(folder: Path) -> RunCurve:
         returns=np.array(returns, dtype=np.float64),
         total_steps=max(run["steps"], settings["steps"]),
         failed_at=run["steps"] if run["status"] == FAILED else None,
+        return_floor=0.0,  # of the Jitterbug, whose rewards are never negative
+        solved=SOLVED_RETURN,
     )
 
 
