@@ -10,7 +10,7 @@ import wrapt
 
 
 def _register(_gymnasium: ModuleType) -> None:
-    from jbrep.envs.registration import register
+    from jbrep.jitterbug.registration import register
 
     register()
 

@@ -24,6 +24,7 @@ _EXTRAS = {  # the extra that installs a missing package
     **dict.fromkeys(("PIL", "av"), "render"),
     "ray": "cluster",
     "rerun": "view",
+    "shimmy": "suite",
 }
 
 

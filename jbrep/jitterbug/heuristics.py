@@ -11,9 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jbrep.jitterbug.episodes import Actor, run
-from jbrep.jitterbug.simulation import Simulation
-from jbrep.jitterbug.tasks import EPISODE_STEPS, Array, get_task, wrap
+from jbrep.jitterbug.tasks import Array, get_task, wrap
 
 
 @dataclass(frozen=True)
@@ -143,22 +141,3 @@ HEURISTICS: dict[str, Callable[..., Array]] = {
         move_to_pose,
     )
 }
-
-
-def episode_returns(task: str, policy: Actor, episodes: int = 50, seed: int = 0) -> Array:
-    """Returns of whole episodes under a policy, (episodes,).
-
-    An episode ends when its physics diverges, as in the environments.
-
-    Args:
-        task: a key of `tasks.TASKS`.
-        policy: observations in physical units, (n, d), to actions, (n, 1).
-        episodes: how many.
-        seed: episode i starts like a Gymnasium environment reset with seed + i.
-    """
-    simulation = Simulation(get_task(task), episodes)
-    simulation.reset(range(episodes), [np.random.default_rng(seed + i) for i in range(episodes)])
-    total = np.zeros(episodes)
-    for step in run(simulation, policy, EPISODE_STEPS):
-        total += np.where(step.diverged, 0, simulation.reward())
-    return total

@@ -7,9 +7,9 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import ArrayLike, NDArray
 
-from jbrep.errors import InputError
+from jbrep.envs.checks import check_counts
 from jbrep.jitterbug import bodies, model
-from jbrep.jitterbug.tasks import QUATERNION, Array, Readings, Task, yaw_direction
+from jbrep.jitterbug.tasks import QUATERNION, Array, JitterbugTask, Readings, yaw_direction
 
 _UP_TO_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -17,10 +17,6 @@ _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _NOT_FINITE = slice(
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1
 )
-
-
-class NonFiniteActionError(InputError):
-    """An action is NaN or infinite."""
 
 
 class Simulation:
@@ -46,7 +42,7 @@ class Simulation:
 
     def __init__(
         self,
-        task: Task,
+        task: JitterbugTask,
         num_lanes: int,
         num_threads: int | None = None,
         body: int | str | None = None,
@@ -185,11 +181,6 @@ class Simulation:
             self._shown[number] = model.plain_model(self._drawn(number))
         return self._shown[number]
 
-    @property
-    def model(self) -> mujoco.MjModel:
-        """The model of the first lane's robot."""
-        return self.model_of(0)
-
     def copy_data(self, lane: int, data: mujoco.MjData | None = None) -> mujoco.MjData:
         """A lane as a MuJoCo data object of `model_of(lane)`, to render or inspect."""
         shown = self.model_of(lane)
@@ -197,34 +188,3 @@ class Simulation:
         mujoco.mj_setState(shown, data, self._batch.state[lane], _STATE)
         mujoco.mj_forward(shown, data)
         return data
-
-
-def check_counts(num_lanes: int, num_threads: int | None) -> None:
-    """Check the numbers of lanes and threads.
-
-    Raises:
-        InputError: a number below 1.
-    """
-    for count, what in ((num_lanes, "lanes"), (num_threads, "threads")):
-        if count is not None and count < 1:
-            raise InputError(f"the number of {what} is {count}: it must be at least 1")
-
-
-def check_actions(actions: ArrayLike, num_lanes: int) -> Array:
-    """The actions as (num_lanes, 1) float64.
-
-    Raises:
-        InputError: another shape.
-        NonFiniteActionError: a value that is not finite.
-    """
-    checked: Array = np.asarray(actions, dtype=np.float64)
-    if checked.shape != (num_lanes, 1):
-        raise InputError(
-            f"actions have shape {checked.shape}: it must be ({num_lanes}, 1), one motor drive "
-            "in [-1, 1] per lane"
-        )
-    if not np.isfinite(checked).all():
-        raise NonFiniteActionError(
-            f"actions are not finite: {checked.ravel()}; they must be in [-1, 1]"
-        )
-    return checked

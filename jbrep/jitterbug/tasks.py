@@ -4,7 +4,7 @@ Nothing here steps a simulation: the dm_control domain calls these functions wit
 the batched simulation with n. Lengths in m, angles in rad, times in s; n is the batch size.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.envs.task import Feature, Task
 from jbrep.errors import choose
 
 Array = NDArray[np.float64]
@@ -19,7 +20,8 @@ _Float = TypeVar("_Float", bound=np.floating[Any])
 
 CONTROL_TIMESTEP = 0.01  # [s]
 EPISODE_STEPS = 1000  # control steps
-SOLVED_RETURN = 900.0  # of an episode: the paper calls a task solved from there
+SOLVED_REWARD = 0.9  # mean of an episode: the paper calls a task solved from there
+START_DRAWS = 6  # random numbers that an episode's start takes
 
 # MuJoCo's qpos: root position and quaternion, 8 leg joints, motor; qvel likewise
 QPOS_SIZE, QVEL_SIZE = 16, 15
@@ -115,16 +117,6 @@ class Start(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Feature:
-    """One number of an observation."""
-
-    name: str
-    unit: str
-    low: float  # nominal range: where the robot usually is, not a bound
-    high: float
-
-
-@dataclass(frozen=True)
 class Observable:
     """A named group of features; `read` maps n readings to (n, len(features))."""
 
@@ -137,16 +129,20 @@ def _observable(
     name: str, axes: str, unit: str, highs: tuple[float, ...], read: Callable[[Readings], Array]
 ) -> Observable:
     names = [f"{name}_{axis}" for axis in axes.split()] or [name]
-    features = (Feature(n, unit, -high, high) for n, high in zip(names, highs, strict=True))
+    bounded = unit in ("rad", "1")  # wrapped angles and unit quaternions
+    features = (
+        Feature(each, unit, -float(high), float(high), bounded, name)
+        for each, high in zip(names, highs, strict=True)
+    )
     return Observable(name, tuple(features), read)
 
 
 _POSITION = Observable(
     "position",
     (
-        Feature("position_x", "m", -2, 2),
-        Feature("position_y", "m", -2, 2),
-        Feature("position_z", "m", 0, 0.1),
+        Feature("position_x", "m", -2.0, 2.0, group="position"),
+        Feature("position_y", "m", -2.0, 2.0, group="position"),
+        Feature("position_z", "m", 0.0, 0.1, group="position"),
     ),
     lambda r: r.qpos[:, POSITION],
 )
@@ -209,7 +205,7 @@ def velocity_term(r: Readings) -> Array:
 
 
 @dataclass(frozen=True)
-class Task:
+class JitterbugTask:
     """What is observed, how an episode starts and what is rewarded.
 
     The reward is the product of the terms, each in [0, 1].
@@ -238,17 +234,44 @@ class Task:
         return tuple(f.name for f in self.features)
 
     @cached_property
-    def _centre(self) -> Array:
-        return np.array([(f.high + f.low) / 2 for f in self.features])
-
-    @cached_property
-    def _half_width(self) -> Array:
-        return np.array([(f.high - f.low) / 2 for f in self.features])
+    def plain(self) -> Task:
+        """The task as plain data, with the usual time limit."""
+        return self.describe()
 
     @cached_property
     def _start_ranges(self) -> Array:
         tilt = (-_MAX_TILT, _MAX_TILT)
         return np.array([_TURN, tilt, tilt, self.target_radius, _TURN, self.target_yaw]).T
+
+    def describe(
+        self,
+        arguments: Mapping[str, Any] | None = None,
+        max_episode_steps: int | None = None,
+    ) -> Task:
+        """The task as plain data.
+
+        Args:
+            arguments: of the environment.
+            max_episode_steps: the time limit; 1,000 if not given.
+        """
+        steps = max_episode_steps or EPISODE_STEPS
+        return Task(
+            id=environment_id(self.name),
+            name=self.name,
+            features=self.features,
+            action_low=(-1.0,),
+            action_high=(1.0,),
+            max_episode_steps=steps,
+            arguments=dict(arguments or {}),
+            timestep=CONTROL_TIMESTEP,
+            reward_low=0.0,
+            reward_high=1.0,
+            solved_return=SOLVED_REWARD * steps,
+            terminates=False,
+            draws=START_DRAWS,
+            state={"qpos": QPOS_SIZE, "qvel": QVEL_SIZE},
+            constants={"target_position": 3, "target_quaternion": 4},
+        )
 
     def observe(self, readings: Readings) -> Array:
         """The flat observation in physical units, (n, d)."""
@@ -263,17 +286,15 @@ class Task:
 
     def scale(self, observation: Array) -> Array:
         """Scale by the nominal ranges: physical units (n, d) to about [-1, 1]."""
-        return (observation - self._centre) / self._half_width
+        return self.plain.scale(observation)
 
     def unscale(self, scaled: Array) -> Array:
         """The inverse of `scale`."""
-        return scaled * self._half_width + self._centre
+        return self.plain.unscale(scaled)
 
     def split(self, observation: NDArray[_Float]) -> dict[str, NDArray[_Float]]:
         """Split flat observations (..., d) by observable; the parts are views."""
-        ends = np.cumsum([len(o.features) for o in self.observables])[:-1]
-        parts = np.split(observation, ends, axis=-1)
-        return {o.name: part for o, part in zip(self.observables, parts, strict=True)}
+        return self.plain.split(observation)
 
     def start(self, random: np.random.Generator | np.random.RandomState) -> Start:
         """Draw how an episode begins.
@@ -293,29 +314,29 @@ class Task:
 TASKS = {
     task.name: task
     for task in (
-        Task("move_from_origin", "easy", _SHARED, (away_term,)),
-        Task(
+        JitterbugTask("move_from_origin", "easy", _SHARED, (away_term,)),
+        JitterbugTask(
             "face_direction",
             "easy",
             (*_SHARED, _ANGLE_TO_TARGET),
             (heading_term,),
             target_yaw=_TURN,
         ),
-        Task(
+        JitterbugTask(
             "move_in_direction",
             "easy",
             (*_SHARED, _ANGLE_TO_TARGET, _TARGET_VELOCITY),
             (velocity_term,),
             target_yaw=_TURN,
         ),
-        Task(
+        JitterbugTask(
             "move_to_position",
             "hard",
             (*_SHARED, _TARGET_POSITION),
             (position_term,),
             target_radius=_TARGET_RADIUS,
         ),
-        Task(
+        JitterbugTask(
             "move_to_pose",
             "hard",
             (*_SHARED, _TARGET_POSITION, _ANGLE_TO_TARGET),
@@ -327,7 +348,7 @@ TASKS = {
 }
 
 
-def get_task(name: str) -> Task:
+def get_task(name: str) -> JitterbugTask:
     """Look up a task by its name.
 
     Raises:

@@ -1,6 +1,6 @@
 """Gymnasium environments: one robot, or many stepped together."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,42 +12,48 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from jbrep.envs.episodes import Episodes
-from jbrep.errors import InputError
-from jbrep.jitterbug.simulation import Simulation, check_actions
-from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, Array, Task, get_task
+from jbrep.envs.checks import check_actions
+from jbrep.envs.task import Task
+from jbrep.errors import InputError, choose
+from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, Array, JitterbugTask, get_task
 from jbrep.opengl import has_display, no_opengl, prepare_opengl
 
-Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
+Observation = NDArray[Any] | dict[str, NDArray[Any]]
 
-_FORMS = ("flat", "dict")
+_FORMS = {form: form for form in ("flat", "dict")}
+_TYPES = {name: np.dtype(name) for name in ("float32", "float64")}
 _ACTIONS = spaces.Box(-1, 1, (1,), np.float32)
 
 
 @dataclass(frozen=True)
 class _View:
-    """How observations are given: scaled or not, and in which form."""
+    """How observations are given: scaled or not, in which form and precision."""
 
-    task: Task
+    task: JitterbugTask
     scaled: bool
     form: str
+    dtype: str = "float32"
 
     def __post_init__(self) -> None:
-        if self.form not in _FORMS:
-            raise InputError(f"unknown form {self.form!r}: choose one of {', '.join(_FORMS)}")
+        choose(self.form, _FORMS, "form")
+        choose(self.dtype, _TYPES, "dtype")
 
     @property
     def space(self) -> spaces.Space[Any]:
         if self.form == "flat":
-            return _box(self.task.size)
-        return spaces.Dict([(o.name, _box(len(o.features))) for o in self.task.observables])
+            return self._box(self.task.size)
+        return spaces.Dict([(o.name, self._box(len(o.features))) for o in self.task.observables])
+
+    def _box(self, size: int) -> spaces.Box:
+        return spaces.Box(-np.inf, np.inf, (size,), _TYPES[self.dtype].type)
 
     def __call__(self, observation: Array) -> Observation:
         """Convert observations in physical units, (..., d), to the form of the space."""
         if self.scaled:
             observation = self.task.scale(observation)
-        single = observation.astype(np.float32)
-        return single if self.form == "flat" else self.task.split(single)
+        given = observation.astype(_TYPES[self.dtype])
+        return given if self.form == "flat" else self.task.split(given)
 
 
 def _render_modes() -> list[str]:
@@ -56,8 +62,18 @@ def _render_modes() -> list[str]:
     return [mode for mode in modes if mode != "human" or has_display()]
 
 
-def _box(size: int) -> spaces.Box:
-    return spaces.Box(-np.inf, np.inf, (size,), np.float32)
+def describe(arguments: Mapping[str, Any], max_episode_steps: int | None) -> Task:
+    """A task as plain data, see `jbrep.envs.description`.
+
+    Raises:
+        InputError: the observations are scaled or in a dictionary, or an argument doesn't exist.
+    """
+    others = {name: value for name, value in arguments.items() if name != "task"}
+    if others:
+        raise InputError(
+            f"the Jitterbug has no argument {min(others)} that changes the robot: leave it out"
+        )
+    return get_task(arguments["task"]).describe(others, max_episode_steps)
 
 
 class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -80,6 +96,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             another shape than (1,), or not finite.
     """
 
+    describe = staticmethod(describe)
     metadata = {  # noqa: RUF012 (Gymnasium's own convention)
         "render_modes": ["human", "rgb_array", "depth_array"],
         "render_fps": round(1 / CONTROL_TIMESTEP),
@@ -104,7 +121,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
                 f"{', '.join(self.metadata['render_modes'])}; human needs a display"
             )
         self._simulation = Simulation(self.task, 1, 1)
-        self.model = self._simulation.model
+        self.model = self._simulation.model_of(0)
         self.observation_space = self._view.space
         self.action_space = _ACTIONS
         self.render_mode = render_mode
@@ -131,7 +148,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self, action: NDArray[np.floating]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Hold the drive, (1,), for one control step of 0.01 s."""
-        diverged = bool(self._simulation.step(check_actions(np.asarray(action)[None], 1))[0])
+        diverged = bool(self._simulation.step(check_actions(np.asarray(action)[None], 1, 1))[0])
         if diverged:
             reward = 0.0
         else:
@@ -173,20 +190,22 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
     """Many Jitterbugs stepped together; what `gymnasium.make_vec` gives.
 
     Lane i of an environment that is reset with seed s has the episodes of a single environment
-    reset with seed s + i. A lane whose episode ends is reset in the same step.
+    reset with seed s + i. Infos hold `qpos`, `qvel`, `target_position` and `target_quaternion` of
+    each lane's state.
 
     Args:
         task, scaled, form: as for `JitterbugEnv`.
         num_envs: how many robots.
         max_episode_steps: the time limit, in control steps.
         num_threads: threads to step them on; None takes one for each core.
+        autoreset_mode: SAME_STEP, which resets a lane in the step that ends its episode, or
+            DISABLED, which leaves it to `reset` with `options={"reset_mask": ...}`.
+        dtype: of observations, float32 or float64.
 
     Raises:
-        InputError: unknown task or form, a number below 1; actions of another shape than
-            (num_envs, 1), or not finite.
+        InputError: unknown task, form, dtype or mode, a number below 1; actions of another shape
+            than (num_envs, 1), or not finite.
     """
-
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(
         self,
@@ -196,9 +215,24 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         form: str = "flat",
         max_episode_steps: int = EPISODE_STEPS,
         num_threads: int | None = None,
+        autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
+        dtype: str = "float32",
     ):
-        self._episodes = Episodes(task, num_envs, num_threads, max_episode_steps)
-        self._view = _View(self._episodes.task, scaled, form)
+        if max_episode_steps < 1:
+            raise InputError(
+                f"the number of steps in an episode is {max_episode_steps}: it must be at least 1"
+            )
+        if autoreset_mode not in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
+            raise InputError(f"{autoreset_mode} is not possible: choose SAME_STEP or DISABLED")
+        self.task = get_task(task)
+        self.simulation = Simulation(self.task, num_envs, num_threads)
+        self.metadata = {"autoreset_mode": autoreset_mode}
+        self._resets = autoreset_mode == AutoresetMode.SAME_STEP
+        self._view = _View(self.task, scaled, form, dtype)
+        self._max_steps = max_episode_steps
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._generators = [np.random.default_rng() for _ in range(num_envs)]
+        self._observation = np.zeros((num_envs, self.task.size))  # the last finite ones
         self.num_envs = num_envs
         self.single_observation_space = self._view.space
         self.single_action_space = _ACTIONS
@@ -211,24 +245,85 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode in every lane; `options` are ignored."""
+        """Start an episode in every lane, or where the option `reset_mask`, (n,), is true.
+
+        A lane without a seed draws from its generator as it is.
+        """
         if seed is None or isinstance(seed, int):
             seed = [None if seed is None else seed + lane for lane in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise InputError(f"{len(seed)} seeds for {self.num_envs} lanes: give one for each lane")
-        return self._view(self._episodes.reset(seed)), {}
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
+        lanes = np.flatnonzero(mask).tolist()
+        for lane in lanes:
+            if (number := seed[lane]) is not None:
+                self._generators[lane] = np.random.default_rng(number)
+        self._restart(lanes)
+        return self._view(self._observation), self._state_info()
 
     def step(
         self, actions: NDArray[np.floating]
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """One control step in every lane."""
-        outcome = self._episodes.step(actions)
+        """One control step in every lane.
+
+        A lane whose physics diverges is truncated with its last finite observation, reward 0 and
+        `non_finite` true in its info.
+        """
+        diverged = self.simulation.step(check_actions(actions, self.num_envs, 1))
+        reward, observation = self.simulation.reward(), self.simulation.observe()
+        self._steps += 1
+        truncated = diverged | (self._steps >= self._max_steps)
+        if diverged.any():
+            reward[diverged] = 0
+            observation[diverged] = self._observation[diverged]
+        self._observation = observation
         info: dict[str, Any] = {}
-        for lane in outcome.ended:
-            final = {
-                "final_obs": self._view(outcome.final_observation[lane]),
-                "final_info": {"non_finite": bool(outcome.diverged[lane])},
-            }
-            info = self._add_info(info, final, lane)
+        if self._resets and truncated.any():
+            for lane in np.flatnonzero(truncated).tolist():
+                final = {
+                    "final_obs": self._view(observation[lane]),
+                    "final_info": {"non_finite": bool(diverged[lane])},
+                }
+                info = self._add_info(info, final, lane)
+            self._restart(np.flatnonzero(truncated).tolist())
         terminated = np.zeros(self.num_envs, dtype=np.bool_)
-        return self._view(outcome.observation), outcome.reward, terminated, outcome.done, info
+        info |= self._state_info() | {"non_finite": diverged, "_non_finite": self._every_lane}
+        return self._view(self._observation), reward, terminated, truncated, info
+
+    @property
+    def state(self) -> dict[str, NDArray[Any]]:
+        """A copy of what `restore` takes; generators are left out, as `reset` can take seeds."""
+        return {
+            **self.simulation.state,
+            "last_observation": self._observation.copy(),
+            "episode_steps": self._steps.copy(),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> tuple[Observation, dict[str, Any]]:
+        """Continue from where the state was taken, to the same bits; as `reset` else."""
+        physics = dict(state)
+        self._steps[:] = physics.pop("episode_steps")
+        self._observation = physics.pop("last_observation").copy()
+        self.simulation.restore(**physics)
+        return self._view(self._observation), self._state_info()
+
+    def _restart(self, lanes: Sequence[int]) -> None:
+        self.simulation.reset(lanes, [self._generators[lane] for lane in lanes])
+        self._steps[lanes] = 0
+        self._observation = self._observation.copy()
+        self._observation[lanes] = self.simulation.observe()[lanes]
+
+    @property
+    def _every_lane(self) -> NDArray[np.bool_]:
+        return np.ones(self.num_envs, np.bool_)
+
+    def _state_info(self) -> dict[str, Any]:
+        """The state of each lane, as Gymnasium's vector environments give infos."""
+        now = self.simulation.readings
+        arrays = {
+            "qpos": now.qpos.copy(),
+            "qvel": now.qvel.copy(),
+            "target_position": now.target_position.copy(),
+            "target_quaternion": self.simulation.target_quaternion.copy(),
+        }
+        return arrays | dict.fromkeys((f"_{name}" for name in arrays), self._every_lane)

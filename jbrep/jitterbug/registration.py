@@ -1,6 +1,6 @@
 """The Jitterbug's ids in Gymnasium's registry."""
 
-from jbrep.jitterbug.tasks import EPISODE_STEPS, SOLVED_RETURN, TASKS, environment_id
+from jbrep.jitterbug.tasks import EPISODE_STEPS, SOLVED_REWARD, TASKS, environment_id
 
 
 def register() -> None:
@@ -10,9 +10,9 @@ def register() -> None:
     for task in TASKS:
         gymnasium.register(
             environment_id(task),
-            entry_point="jbrep.envs.gym:JitterbugEnv",
-            vector_entry_point="jbrep.envs.gym:JitterbugVectorEnv",
+            entry_point="jbrep.jitterbug.gym:JitterbugEnv",
+            vector_entry_point="jbrep.jitterbug.gym:JitterbugVectorEnv",
             max_episode_steps=EPISODE_STEPS,
-            reward_threshold=SOLVED_RETURN,
+            reward_threshold=SOLVED_REWARD * EPISODE_STEPS,
             kwargs={"task": task},
         )

@@ -1,0 +1,108 @@
+"""The options that say which environment a command is about."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from jbrep.cli.base import POSITIVE
+from jbrep.errors import InputError
+
+if TYPE_CHECKING:
+    from jbrep.envs.task import Task
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+_TASK = click.option(
+    "--task", help="One of the Jitterbug's, such as face_direction, or a Gymnasium id: Hopper-v5."
+)
+_ARGUMENTS = ("env", "episode_steps", "features")
+
+
+def import_option(command: _Command) -> _Command:
+    """The option --import, which takes effect before the command begins."""
+
+    def imported(context: click.Context, option: click.Parameter, modules: tuple[str, ...]) -> None:
+        if modules:
+            from jbrep.envs.names import import_modules
+
+            import_modules(modules)
+
+    return click.option(
+        "--import",
+        multiple=True,
+        metavar="MODULE",
+        expose_value=False,
+        is_eager=True,
+        callback=imported,
+        help="Import a module that registers environments; this runs its code.",
+    )(command)
+
+
+def task_options(named: bool = True) -> Callable[[_Command], _Command]:
+    """The options from which `given_task` makes a task; --task is left out unless `named`."""
+    options = (
+        *([_TASK] if named else []),
+        click.option(
+            "--env",
+            multiple=True,
+            metavar="NAME=VALUE",
+            help="An argument of the environment, such as g=1.6; may be repeated.",
+        ),
+        click.option(
+            "--episode-steps",
+            type=POSITIVE,
+            help="The time limit of an episode; the environment's own by default.",
+        ),
+        click.option(
+            "--features",
+            type=click.Path(path_type=Path),
+            help="A TOML file with names, units and ranges of the features.",
+        ),
+        import_option,
+    )
+
+    def decorate(command: _Command) -> _Command:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+def given_task(options: dict[str, Any], required: bool = True) -> "Task | None":
+    """The task that a command's options name; they are taken out of the options.
+
+    Raises:
+        InputError: there is none though it is required, or options without a task; or as
+            `jbrep.envs.describe`.
+    """
+    name = options.pop("task")
+    env, steps, features = (options.pop(option) for option in _ARGUMENTS)
+    if name is None:
+        if required or env or steps or features:
+            raise InputError("give the --task: one of the Jitterbug's, or a Gymnasium id")
+        return None
+    from jbrep.envs.description import describe
+    from jbrep.envs.names import name_given
+
+    return describe(name_given(name), parse_arguments(env), steps, features)
+
+
+def parse_arguments(given: tuple[str, ...]) -> dict[str, Any]:
+    """Arguments of an environment from NAME=VALUE; a value is JSON, or else text.
+
+    Raises:
+        InputError: something else.
+    """
+    arguments: dict[str, Any] = {}
+    for pair in given:
+        name, equals, value = pair.partition("=")
+        if not equals or not name.isidentifier() or name in arguments:
+            raise InputError(f"--env {pair} is no argument, or a second one: write NAME=VALUE")
+        try:
+            arguments[name] = json.loads(value)
+        except ValueError:
+            arguments[name] = value
+    return arguments

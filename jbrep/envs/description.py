@@ -1,0 +1,249 @@
+"""What an environment is, found out by making it once."""
+
+import json
+import math
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.spaces.utils import flatten, flatten_space
+from numpy.typing import NDArray
+
+from jbrep.envs.make import creator, make_env, one_line
+from jbrep.envs.names import find_spec
+from jbrep.envs.task import MAX_EPISODE_STEPS, SEED_BITS, Feature, Task
+from jbrep.errors import InputError
+from jbrep.files.storage import read_regular
+
+_PROBE_STEPS = 200  # of each instance whose episodes are compared
+_LONGEST_PROBE = 10_000  # steps in search of a time limit
+_MAX_BYTES = 1 << 20  # of a file of features
+_FEATURE_FIELDS = ("name", "unit", "low", "high", "group")
+_TASK_FIELDS = ("timestep", "reward_low", "reward_high", "solved_return")
+
+
+def describe(
+    name: str,
+    arguments: Mapping[str, Any] | None = None,
+    max_episode_steps: int | None = None,
+    features: Path | None = None,
+) -> Task:
+    """Describe a task: its environment is made and played for some steps.
+
+    An environment class may describe itself: its static method `describe`, given the arguments
+    and the time limit or None, returns the `Task`; nothing is played then.
+
+    Args:
+        name: one of the Jitterbug's tasks, or an id in Gymnasium's registry.
+        arguments: of the environment, plain JSON.
+        max_episode_steps: the time limit [steps]; the registered one if not given.
+        features: a TOML file with names, units and ranges, see docs/environments.md.
+
+    Raises:
+        InputError: an unknown task, an environment that can't be made, actions or observations
+            of a kind that isn't possible, no time limit, or an unusable file of features.
+    """
+    task = _describe(name, json.dumps(dict(arguments or {}), sort_keys=True), max_episode_steps)
+    return _with_features(task, features) if features else task
+
+
+@lru_cache(maxsize=64)
+def _describe(name: str, arguments: str, max_episode_steps: int | None) -> Task:
+    spec, given = find_spec(name), json.loads(arguments)
+    if max_episode_steps is not None and not 1 <= max_episode_steps <= MAX_EPISODE_STEPS:
+        raise InputError(
+            f"the number of steps in an episode is {max_episode_steps}: it must be at least 1 and "
+            f"at most {MAX_EPISODE_STEPS:,}"
+        )
+    try:
+        if own := getattr(creator(spec), "describe", None):
+            described: Task = own({**spec.kwargs, **given}, max_episode_steps)
+            return described
+        return _probe(spec.id, given, max_episode_steps)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{spec.id} can't be used: {error}") from error
+
+
+def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None) -> Task:
+    env, fresh = (make_env(env_id, arguments, max_episode_steps) for _ in range(2))
+    try:
+        action = _checked_action(env_id, env.action_space)
+        spec = env.spec or find_spec(env_id)
+        limit = max_episode_steps or spec.max_episode_steps or _find_limit(env, env_id)
+        episodes = [_play(env, seed=1), _play(env, seed=0), _play(fresh, seed=0)]
+        timestep: Any = getattr(env.unwrapped, "dt", None)
+        return Task(
+            id=find_spec(env_id).id,
+            name=find_spec(env_id).id,
+            features=tuple(_features(env_id, env.observation_space)),
+            action_low=tuple(np.ravel(action.low).astype(float).tolist()),
+            action_high=tuple(np.ravel(action.high).astype(float).tolist()),
+            max_episode_steps=limit,
+            arguments=dict(arguments),
+            timestep=float(timestep) if _is_positive(timestep) else None,
+            solved_return=spec.reward_threshold,
+            terminates=True if any(each.terminated for each in episodes) else None,
+            reproducible=episodes[1].content == episodes[2].content,
+            seed_bits=_seed_bits(env),
+        )
+    finally:
+        env.close()
+        fresh.close()
+
+
+def _checked_action(env_id: str, space: spaces.Space[Any]) -> spaces.Box:
+    if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
+        raise InputError(
+            f"{env_id} has actions in {space}: only continuous ones are possible, a Box of floats"
+        )
+    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        raise InputError(
+            f"{env_id} has actions without bounds, {space}: wrap it, such as in "
+            "gymnasium.wrappers.RescaleAction, so that they have finite ones"
+        )
+    return space
+
+
+def _features(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
+    """The features of a flat observation, named by the keys of dictionaries, else numbered."""
+    flat = flatten_space(space) if space.is_np_flattenable else None
+    if not isinstance(flat, spaces.Box):
+        raise InputError(f"{env_id} has observations in {space}, which don't make one flat array")
+    if any(_is_image(part) for _, part in _parts("", space)):
+        raise InputError(
+            f"{env_id} has images as observations, {space}: only features are possible"
+        )
+    place = 0
+    for name, part in _parts("", space):
+        size = spaces.utils.flatdim(part)
+        for i in range(size):
+            low, high = float(flat.low[place]), float(flat.high[place])
+            bounded = math.isfinite(low) and math.isfinite(high) and max(-low, high) < 1e30
+            yield Feature(
+                name=name if size == 1 and name != "obs" else f"{name}_{i}",
+                low=low if bounded else None,
+                high=high if bounded else None,
+                group=name,
+            )
+            place += 1
+
+
+def _parts(name: str, space: spaces.Space[Any]) -> Iterator[tuple[str, spaces.Space[Any]]]:
+    """The spaces that dictionaries and tuples consist of, in the order of flattening."""
+    if isinstance(space, spaces.Dict):
+        items = list(space.spaces.items())
+    elif isinstance(space, spaces.Tuple):
+        items = [(f"part{i}", part) for i, part in enumerate(space.spaces)]
+    else:
+        yield name or "obs", space
+        return
+    for key, part in items:
+        word = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "_" for c in str(key))
+        yield from _parts(f"{name}.{word}" if name else word, part)
+
+
+def _is_image(space: spaces.Space[Any]) -> bool:
+    return (
+        isinstance(space, spaces.Box)
+        and len(space.shape) >= 2
+        and (space.dtype == np.uint8 or (len(space.shape) == 3 and min(space.shape[:2]) >= 16))
+    )
+
+
+def _find_limit(env: gymnasium.Env[Any, Any], env_id: str) -> int:
+    """The time limit that an environment keeps by itself."""
+    for episode in range(3):
+        env.action_space.seed(episode)
+        env.reset(seed=episode)
+        for step in range(1, _LONGEST_PROBE + 1):
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            if truncated:
+                return step
+            if terminated:
+                break
+    raise InputError(f"{env_id} has no time limit: give one with --episode-steps")
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, (int, float)) and math.isfinite(value) and value > 0
+
+
+def _seed_bits(env: gymnasium.Env[Any, Any]) -> int:
+    """The size of the seeds that an environment takes."""
+    wide, narrow = SEED_BITS
+    try:
+        env.reset(seed=(1 << wide) - 1)
+    except Exception:
+        return narrow
+    return wide
+
+
+class _Played(NamedTuple):
+    """The first steps of an episode."""
+
+    content: list[bytes]  # of what each step gave
+    terminated: bool
+
+
+def _play(env: gymnasium.Env[Any, Any], seed: int) -> _Played:
+    """Play an episode's first steps with random actions."""
+    random = np.random.default_rng(seed)
+    space: Any = env.action_space
+    observation, _ = env.reset(seed=seed)
+    content = [_bytes(env, observation)]
+    for _ in range(_PROBE_STEPS):
+        action = random.uniform(space.low, space.high).astype(space.dtype)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        content.append(_bytes(env, observation, reward, terminated, truncated))
+        if terminated or truncated:
+            return _Played(content, bool(terminated))
+    return _Played(content, False)
+
+
+def _bytes(env: gymnasium.Env[Any, Any], observation: Any, *others: Any) -> bytes:
+    flat: NDArray[Any] = np.asarray(flatten(env.observation_space, observation))
+    return flat.tobytes() + np.array(others, dtype=np.float64).tobytes()
+
+
+def _with_features(task: Task, path: Path) -> Task:
+    """The task with what a TOML file says of its features and rewards.
+
+    Raises:
+        InputError: no such file, or one with unknown or unfitting entries.
+    """
+    try:
+        given = tomllib.loads(read_regular(path, _MAX_BYTES).decode())
+        rows = given.pop("features", None)
+        if rows is not None and (not isinstance(rows, list) or len(rows) != task.size):
+            raise ValueError(f"it must have a [[features]] for each of the {task.size} features")
+        features = [
+            replace(old, **_known(row, _FEATURE_FIELDS))
+            for old, row in zip(task.features, rows or [{}] * task.size, strict=True)
+        ]
+        changed = replace(task, features=tuple(features), **_known(given, _TASK_FIELDS))
+        return type(task)(**{f: getattr(changed, f) for f in Task.__dataclass_fields__})
+    except OSError as error:
+        raise InputError(f"can't read {path}: {error.strerror or error}") from error
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path} can't be used for {task.name}: {one_line(error)}") from None
+
+
+def _known(row: Any, names: tuple[str, ...]) -> dict[str, Any]:
+    """The entries of a table, all of which must be known."""
+    if not isinstance(row, dict) or (unknown := set(row) - set(names)):
+        raise ValueError(f"unknown {min(unknown)!r}: it must be one of {', '.join(names)}")
+    kinds = {name: (str,) if name in ("name", "unit", "group") else (int, float) for name in names}
+    for name, value in row.items():
+        if type(value) not in kinds[name]:
+            raise ValueError(
+                f"{name} is {value!r}: it must be {'text' if str in kinds[name] else 'a number'}"
+            )
+    return {name: value if isinstance(value, str) else float(value) for name, value in row.items()}

@@ -1,0 +1,329 @@
+"""Lanes: many environments of one task, each reset with a seed of its own and stepped together."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jbrep.envs.checks import check_actions, check_counts
+from jbrep.envs.flat import flattener
+from jbrep.envs.make import is_batched, make_batch, make_env, one_line
+from jbrep.envs.task import Task
+from jbrep.errors import InputError
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+State = dict[str, NDArray[Any]]  # everything that decides how lanes continue; (n, ...) each
+
+
+class EnvironmentFailedError(InputError):
+    """An environment raised an error, or gave something else than its task's description says."""
+
+
+class Step(NamedTuple):
+    """What a step of n lanes led to; treat the arrays as read-only."""
+
+    observation: Array  # (n, d) of the new states; the last one of its episode where that ended
+    reward: Array  # (n,) 0 in a lane whose episode had ended before
+    terminated: Flags  # (n,) true from the step on that ended the episode
+    truncated: Flags  # (n,) likewise; also where the physics diverged
+    arrays: Mapping[str, Array]  # those of the task's `state` and `constants`, (n, width) each
+
+
+class _Engine(Protocol):
+    """What steps the lanes."""
+
+    envs: Any
+
+    def reset(self, lanes: Sequence[int], seeds: Sequence[int]) -> tuple[Array, dict[str, Any]]:
+        """Start episodes; observations (n, d) of all lanes, and infos."""
+
+    def step(self, actions: Array, active: Flags) -> tuple[Array, Array, Flags, Flags, Any]:
+        """Step the active lanes at least."""
+
+    @property
+    def state(self) -> State:
+        """See `Lanes.state`."""
+
+    def restore(self, state: State) -> tuple[Array, dict[str, Any]]:
+        """See `Lanes.restore`."""
+
+    def close(self) -> None:
+        """Free what it holds."""
+
+
+class Lanes:
+    """n lanes of a task, each going through an episode at a time.
+
+    A lane whose episode has ended stands still until it is reset. What a lane does depends on its
+    own seed and actions alone, not on the number of lanes or threads.
+
+    Args:
+        task: whose environment is made.
+        num_lanes: n.
+        num_threads: threads to step a batch on; None takes one for each core.
+
+    Attributes:
+        task: the task.
+        num_lanes: n.
+        observation: the current one of each lane, (n, d) in physical units.
+        arrays: the current ones of the task's `state` and `constants`, (n, width) each.
+        terminated, truncated: how each lane's episode has ended, (n,).
+        active: whether it goes on, (n,).
+        num_active: in how many lanes it does.
+        envs: the environments themselves: a batch, or one for each lane.
+
+    Raises:
+        InputError: a number below 1, or the environment can't be made.
+    """
+
+    def __init__(self, task: Task, num_lanes: int, num_threads: int | None = None):
+        check_counts(num_lanes, num_threads)
+        self.task, self.num_lanes = task, num_lanes
+        engine = _Batch if is_batched(task) else _Separate
+        self._engine: _Engine = engine(task, num_lanes, num_threads)
+        self.envs = self._engine.envs
+        self.observation = np.zeros((num_lanes, task.size))
+        self.arrays: Mapping[str, Array] = {}
+        self._names = tuple(task.arrays)
+        self.terminated = self.truncated = np.ones(num_lanes, dtype=np.bool_)
+        self._count()
+        self._seeds = np.zeros(num_lanes, np.int64)
+        self._steps = np.zeros(num_lanes, np.int64)
+
+    def __repr__(self) -> str:
+        return f"Lanes({self.task.name}, {self.num_lanes:,})"
+
+    @property
+    def ended(self) -> Flags:
+        """Whether each lane's episode has ended, (n,)."""
+        return ~self.active
+
+    def reset(self, lanes: Sequence[int], seeds: Sequence[int]) -> Array:
+        """Start an episode in each of the lanes, with its seed.
+
+        Returns:
+            The current observations of all lanes, (n, d).
+        """
+        at = np.asarray(lanes)
+        self._seeds[at], self._steps[at] = seeds, 0
+        self.terminated, self.truncated = self.terminated.copy(), self.truncated.copy()
+        self.terminated[at] = self.truncated[at] = False
+        self._count()
+        observation, info = self._engine.reset(lanes, seeds)
+        self._check(observation, np.zeros(self.num_lanes), "reset gave")
+        self.observation, self.arrays = observation, {n: info[n] for n in self._names}
+        return observation
+
+    def step(self, actions: ArrayLike) -> Step:
+        """Take one step in every lane whose episode goes on.
+
+        Raises:
+            InputError: actions of another shape than (n, k).
+            NonFiniteActionError: actions that are not finite.
+            EnvironmentFailedError: the environment raises an error, or gives a number that isn't
+                finite; the message has the lane's seed and step.
+        """
+        checked = check_actions(actions, self.num_lanes, self.task.action_size)
+        active = self.active
+        self._steps += active
+        observation, reward, terminated, truncated, info = self._engine.step(checked, active)
+        arrays = {name: info[name] for name in self._names}
+        if self.num_active < self.num_lanes:
+            here = active[:, None]
+            observation = np.where(here, observation, self.observation)
+            arrays = {n: np.where(here, values, self.arrays[n]) for n, values in arrays.items()}
+            reward = np.where(active, reward, 0.0)
+            terminated = np.where(active, terminated, self.terminated)
+            truncated = np.where(active, truncated, self.truncated)
+        self._check(observation, reward, "gave")
+        self.observation, self.arrays = observation, arrays
+        self.terminated, self.truncated = terminated, truncated
+        self._count()
+        return Step(observation, reward, terminated, truncated, arrays)
+
+    @property
+    def state(self) -> State:
+        """A copy of what `restore` takes."""
+        own = {
+            "seeds": self._seeds.copy(),
+            "steps": self._steps.copy(),
+            "terminated": self.terminated.copy(),
+            "truncated": self.truncated.copy(),
+            "observation": self.observation.copy(),
+        }
+        return own | self._engine.state
+
+    def restore(self, state: State) -> None:
+        """Continue from where the state was taken, to the same bits.
+
+        Raises:
+            InputError: the environment isn't reproducible.
+        """
+        engine = dict(state)
+        self._seeds, self._steps = engine.pop("seeds").copy(), engine.pop("steps").copy()
+        self.terminated, self.truncated = engine.pop("terminated"), engine.pop("truncated")
+        self._count()
+        expected = engine.pop("observation")
+        observation, info = self._engine.restore(engine)
+        observation = np.where(self.active[:, None], observation, expected)
+        if observation.tobytes() != expected.astype(np.float64).tobytes():
+            raise InputError(
+                f"{self.task.name} is not reproducible here: the same seed and actions lead to "
+                "another state, so this can't continue where it stopped"
+            )
+        self.observation, self.arrays = observation, {n: info[n] for n in self._names}
+
+    def close(self) -> None:
+        """Free what the environments hold."""
+        self._engine.close()
+
+    def _count(self) -> None:
+        self.active = ~(self.terminated | self.truncated)
+        self.num_active = int(np.count_nonzero(self.active))
+
+    def _check(self, observation: Array, reward: Array, did: str) -> None:
+        """Make sure that all numbers are finite."""
+        if math.isfinite(observation.sum() + reward.sum()):
+            return
+        good = np.isfinite(observation).all(axis=1) & np.isfinite(reward)
+        if good.all():
+            return  # their sum overflows
+        lane = int(np.flatnonzero(~good)[0])
+        raise EnvironmentFailedError(
+            f"{self.task.name} {did} an observation or reward that is not finite, at step "
+            f"{self._steps[lane]} of the episode with seed {self._seeds[lane]}"
+        )
+
+
+class _Batch:
+    """All lanes in one environment, whose state can be taken."""
+
+    def __init__(self, task: Task, num_lanes: int, num_threads: int | None):
+        self.envs: Any = make_batch(task, num_lanes, num_threads)
+        self._num_lanes = num_lanes
+
+    def reset(self, lanes: Sequence[int], seeds: Sequence[int]) -> tuple[Array, dict[str, Any]]:
+        mask = np.zeros(self._num_lanes, np.bool_)
+        mask[np.asarray(lanes)] = True
+        every: list[int | None] = [None] * self._num_lanes
+        for lane, seed in zip(lanes, seeds, strict=True):
+            every[lane] = int(seed)
+        observation, info = self.envs.reset(seed=every, options={"reset_mask": mask})
+        return observation, info
+
+    def step(self, actions: Array, active: Flags) -> tuple[Array, Array, Flags, Flags, Any]:
+        return self.envs.step(actions)
+
+    @property
+    def state(self) -> State:
+        return self.envs.state
+
+    def restore(self, state: State) -> tuple[Array, dict[str, Any]]:
+        observation, info = self.envs.restore(state)
+        return observation, info
+
+    def close(self) -> None:
+        self.envs.close()
+
+
+class _Separate:
+    """An environment for each lane; a lane's state is its seed and the actions since."""
+
+    def __init__(self, task: Task, num_lanes: int, num_threads: int | None):
+        self._task = task
+        self.envs: Any = [
+            make_env(task.id, task.arguments, task.max_episode_steps) for _ in range(num_lanes)
+        ]
+        self._flat = flattener(self.envs[0].observation_space)
+        space: Any = self.envs[0].action_space
+        self._action_type, self._action_shape = space.dtype, space.shape
+        self._observation = np.zeros((num_lanes, task.size))
+        self._arrays = {name: np.zeros((num_lanes, w)) for name, w in task.arrays.items()}
+        self._seeds = [0] * num_lanes
+        self._actions: list[list[NDArray[np.float32]]] = [[] for _ in range(num_lanes)]
+
+    def reset(self, lanes: Sequence[int], seeds: Sequence[int]) -> tuple[Array, dict[str, Any]]:
+        self._make_new_arrays()
+        for lane, seed in zip(lanes, seeds, strict=True):
+            self._seeds[lane], self._actions[lane] = int(seed), []
+            try:
+                observation, info = self.envs[lane].reset(seed=int(seed))
+                self._put(lane, observation, info)
+            except Exception as error:
+                raise self._failure(lane, error) from error
+        return self._observation, self._arrays
+
+    def step(self, actions: Array, active: Flags) -> tuple[Array, Array, Flags, Flags, Any]:
+        self._make_new_arrays()
+        single = actions.astype(np.float32)
+        rewards: list[float] = []
+        terminated: list[bool] = []
+        truncated: list[bool] = []
+        for lane, goes_on in enumerate(active.tolist()):
+            if not goes_on:
+                result: Sequence[Any] = (0.0, False, False)
+            else:
+                self._actions[lane].append(single[lane])
+                try:
+                    observation, *result, info = self._step(lane)
+                    self._put(lane, observation, info)
+                except Exception as error:
+                    raise self._failure(lane, error) from error
+            rewards.append(result[0])
+            terminated.append(result[1])
+            truncated.append(result[2])
+        flags = np.array(terminated, np.bool_), np.array(truncated, np.bool_)
+        return self._observation, np.array(rewards, np.float64), *flags, self._arrays
+
+    def _make_new_arrays(self) -> None:
+        """So that those given before don't change."""
+        self._observation = self._observation.copy()
+        if self._arrays:
+            self._arrays = {name: values.copy() for name, values in self._arrays.items()}
+
+    def _step(self, lane: int) -> Any:
+        """Step with the last action."""
+        action = self._actions[lane][-1].astype(self._action_type, copy=False)
+        return self.envs[lane].step(action.reshape(self._action_shape))
+
+    def _put(self, lane: int, observation: Any, info: Mapping[str, Any]) -> None:
+        flat = self._flat(observation)
+        if flat.shape != (self._task.size,):
+            raise ValueError(
+                f"it gave an observation of {flat.size} numbers instead of {self._task.size}"
+            )
+        self._observation[lane] = flat
+        for name, values in self._arrays.items():
+            values[lane] = info[name]
+
+    def _failure(self, lane: int, error: Exception) -> EnvironmentFailedError:
+        return EnvironmentFailedError(
+            f"{self._task.name} failed at step {len(self._actions[lane])} of the episode with seed "
+            f"{self._seeds[lane]}: {one_line(error)}"
+        )
+
+    @property
+    def state(self) -> State:
+        lengths = [len(actions) for actions in self._actions]
+        taken = np.zeros((len(self.envs), max(lengths), self._task.action_size), np.float32)
+        for lane, actions in enumerate(self._actions):
+            taken[lane, : len(actions)] = actions or 0
+        return {
+            "episode_seeds": np.array(self._seeds),
+            "lengths": np.array(lengths),
+            "actions": taken,
+        }
+
+    def restore(self, state: State) -> tuple[Array, dict[str, Any]]:
+        seeds, lengths, actions = state["episode_seeds"], state["lengths"], state["actions"]
+        observation, arrays = self.reset(range(len(self.envs)), seeds.tolist())
+        for step in range(max(lengths.tolist())):
+            observation, _, _, _, arrays = self.step(actions[:, step], step < lengths)
+        return observation, arrays
+
+    def close(self) -> None:
+        for env in self.envs:
+            env.close()

@@ -1,0 +1,96 @@
+"""Making a task's environment: one instance with a flat observation, or a batch of many."""
+
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec, load_env_creator
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from jbrep.envs.names import find_spec
+from jbrep.envs.task import Task
+from jbrep.errors import InputError
+
+
+def make_env(
+    env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None = None, **options: Any
+) -> gymnasium.Env[Any, Any]:
+    """One instance, as Gymnasium makes it.
+
+    Args:
+        env_id: in the registry, or a short name.
+        arguments: of the environment.
+        max_episode_steps: the time limit; None takes the registered one.
+        options: more arguments, such as render_mode.
+
+    Raises:
+        InputError: it can't be made; the message says why.
+    """
+    spec = find_spec(env_id)
+    if max_episode_steps is not None:
+        options["max_episode_steps"] = max_episode_steps  # None would lift the registered limit
+    try:
+        with _quiet():
+            return gymnasium.make(spec, disable_env_checker=True, **{**arguments, **options})
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"can't make {env_id}{_with(arguments)}: {one_line(error)}") from error
+
+
+def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:
+    """All lanes as one environment that steps them together, see `is_batched`."""
+    spec = find_spec(task.id)
+    return gymnasium.make_vec(
+        spec,
+        num_envs=num_lanes,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode=AutoresetMode.DISABLED,
+        max_episode_steps=task.max_episode_steps,
+        num_threads=num_threads,
+        dtype="float64",
+        **task.arguments,
+    )
+
+
+def is_batched(task: Task) -> bool:
+    """Whether the environment steps many lanes faster together than one by one.
+
+    That is so if the registered vector entry point is a class that can take and restore its state:
+    one with the attributes `state` and `restore`, and with the arguments num_threads, dtype and
+    autoreset_mode.
+    """
+    return hasattr(creator(find_spec(task.id), vector=True), "restore")
+
+
+def creator(spec: EnvSpec, vector: bool = False) -> Any:
+    """The class or function that makes the environment; None if there is none."""
+    entry_point = spec.vector_entry_point if vector else spec.entry_point
+    return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+
+
+def one_line(error: BaseException) -> str:
+    """An error's kind and the first line of its message."""
+    text = str(error).strip().partition("\n")[0]
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without warnings of newer versions, of spaces without bounds, of deprecated models."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def _with(arguments: Mapping[str, Any]) -> str:
+    return f" with {dict(arguments)}" if arguments else ""

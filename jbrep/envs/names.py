@@ -1,0 +1,93 @@
+"""Names of tasks: the Jitterbug's five, and every id in Gymnasium's registry."""
+
+import difflib
+from collections.abc import Iterable
+from importlib import import_module
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec
+
+import jbrep  # noqa: F401  registers the Jitterbug's
+from jbrep.errors import InputError
+
+_NAMESPACE = "Jitterbug"
+_REGISTERED_BY = {"dm_control": "shimmy"}  # the package whose import registers a namespace's ids
+_imported: list[str] = []
+
+
+def short_names() -> dict[str, str]:
+    """The Jitterbug's tasks by their short names: face_direction is Jitterbug/FaceDirection-v0."""
+    specs = gymnasium.registry.values()
+    return {spec.kwargs["task"]: spec.id for spec in specs if spec.namespace == _NAMESPACE}
+
+
+def find_spec(name: str) -> EnvSpec:
+    """What is registered under a short name or an id.
+
+    Raises:
+        InputError: nothing; or the name has a module to import, which only a command line may have.
+        ModuleNotFoundError: the package that registers the id isn't installed.
+    """
+    if ":" in name:
+        raise InputError(
+            f"the task {name!r} names a module: importing it runs its code, so this is possible on "
+            "a command line only; elsewhere give the id alone, and --import MODULE to the command"
+        )
+    short = short_names()
+    namespace = name.partition("/")[0]
+    if namespace in _REGISTERED_BY:
+        _import_quietly(_REGISTERED_BY[namespace])
+    try:
+        return gymnasium.spec(short.get(name, name))
+    except gymnasium.error.Error:
+        near = difflib.get_close_matches(name, [*short, *gymnasium.registry], n=3)
+        hint = f"did you mean {' or '.join(near)}? " if near else ""
+        raise InputError(
+            f"unknown task {name!r}: {hint}choose one of {', '.join(short)}, or an id that "
+            "Gymnasium knows; for one of another package add --import PACKAGE"
+        ) from None
+
+
+def import_modules(modules: Iterable[str]) -> None:
+    """Import modules that register environments; this runs their code.
+
+    Raises:
+        InputError: there is no such module, or its import fails.
+    """
+    for module in modules:
+        try:
+            import_module(module)
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+            raise InputError(f"can't import {module}: {reason}") from None
+        if module not in _imported:
+            _imported.append(module)
+
+
+def imported_modules() -> tuple[str, ...]:
+    """The modules imported so far, for other processes to import, too."""
+    return tuple(_imported)
+
+
+def name_given(text: str) -> str:
+    """The task that a command line names, once the module before its colon has been imported.
+
+    Raises:
+        InputError: as `import_modules`.
+    """
+    module, colon, name = text.rpartition(":")
+    if colon:
+        import_modules([module])
+    return name
+
+
+def _import_quietly(module: str) -> None:
+    """Import a package that opens OpenGL and complains of a missing display."""
+    import warnings
+
+    from jbrep.opengl import prepare_opengl
+
+    prepare_opengl()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import_module(module)

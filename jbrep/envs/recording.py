@@ -1,0 +1,126 @@
+"""Episodes: lanes stepped under a policy until every episode has ended, and recorded."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.envs.lanes import Lanes, Step
+from jbrep.envs.task import Array
+
+Actor = Callable[[Array], NDArray[Any]]  # observations (n, d) to actions (n, k), once for each step
+Tick = Callable[[int], object]  # called with the number of steps just made, over all lanes
+Read = Callable[[Lanes], Mapping[str, Array]]  # of the lanes as they are, (n, ...) each
+
+
+class Played(NamedTuple):
+    """A step of n lanes, and what came before it."""
+
+    observation: Array  # before it, (n, d)
+    action: NDArray[Any]  # (n, k)
+    active: NDArray[np.bool_]  # the lanes whose episode went on, (n,)
+    step: Step
+
+
+def play(lanes: Lanes, act: Actor) -> Iterator[Played]:
+    """Step lanes until every episode has ended; while a step is yielded, they are where it led."""
+    while lanes.num_active:
+        observation, active = lanes.observation, lanes.active
+        action = act(observation)
+        yield Played(observation, action, active, lanes.step(action))
+
+
+def open_loop(actions: NDArray[Any]) -> Actor:
+    """The actor that plays given actions (T, n, k), one after the other."""
+    remaining = iter(actions)
+    return lambda observation: next(remaining)
+
+
+def read_nothing(lanes: Lanes) -> Mapping[str, Array]:
+    """Record observations and rewards alone."""
+    return {}
+
+
+def read_states(lanes: Lanes) -> Mapping[str, Array]:
+    """Record what moves of the task's arrays, too."""
+    return {name: lanes.arrays[name] for name in lanes.task.state}
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What n lanes went through in T steps; the first axis is time.
+
+    A lane whose episode ended early stands still: its rows from `length` on mean nothing.
+
+    Attributes:
+        start: the task's arrays before the first step, (n, width) each.
+        observation: before, between and after the steps, (T + 1, n, d) float32.
+        arrays: what was read at the same times, (T + 1, n, ...) each.
+        action: (T, n, k).
+        reward: (T, n) float32.
+        terminated: whether a state ended the episode, (n,).
+        truncated: whether the time limit did, or physics that diverged, (n,).
+        length: of each episode, (n,).
+    """
+
+    start: Mapping[str, Array]
+    observation: NDArray[np.float32]
+    arrays: Mapping[str, Array]
+    action: NDArray[Any]
+    reward: NDArray[np.float32]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    length: NDArray[np.int32]
+
+    def __repr__(self) -> str:
+        steps, lanes = self.reward.shape
+        return f"Recording({lanes} lanes, {steps} steps)"
+
+
+def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = read_nothing) -> Recording:
+    """Play the episodes that the lanes are at the start of, and record them.
+
+    Args:
+        lanes: at the start of their episodes.
+        act: the policy.
+        tick: called after each step.
+        read: what else to record.
+    """
+    start, reads = _copied(lanes.arrays), [_copied(read(lanes))]
+    observations = [lanes.observation]
+    actives, actions, rewards = [], [], []
+    for played in play(lanes, act):
+        observations.append(played.step.observation)
+        actives.append(played.active)
+        actions.append(played.action)
+        rewards.append(played.step.reward)
+        reads.append(_copied(read(lanes)))
+        tick(int(np.count_nonzero(played.active)))
+    return Recording(
+        start=start,
+        observation=np.stack(observations).astype(np.float32),
+        arrays={name: np.stack([each[name] for each in reads]) for name in reads[0]},
+        action=np.stack(actions),
+        reward=np.stack(rewards).astype(np.float32),
+        terminated=lanes.terminated,
+        truncated=lanes.truncated,
+        length=np.stack(actives).sum(axis=0, dtype=np.int32),
+    )
+
+
+def _copied(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    return {name: values.copy() for name, values in arrays.items()}
+
+
+def episode_returns(lanes: Lanes, act: Actor, first_seed: int = 0) -> Array:
+    """Returns of one whole episode in each lane under a policy, (n,).
+
+    Lane i starts like a Gymnasium environment reset with `first_seed` + i.
+    """
+    lanes.reset(range(lanes.num_lanes), range(first_seed, first_seed + lanes.num_lanes))
+    total = np.zeros(lanes.num_lanes)
+    for played in play(lanes, act):
+        total += played.step.reward
+    return total
