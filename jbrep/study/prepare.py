@@ -75,7 +75,10 @@ def _collect(plan: Plan, data: Data, task: str) -> Path:
     else:
         described = plan.task(task)
         with_state = bool(described.state)
-        collect(Settings(described, data.steps, seed=data.seed, store_state=with_state), folder)
+        collect(
+            Settings(task=described, steps=data.steps, seed=data.seed, store_state=with_state),
+            folder,
+        )
     return folder
 
 
