@@ -13,7 +13,6 @@ from jbrep.inspection.recording import PROVENANCE
 from jbrep.inspection.scene import ROBOT, TRAIL, WORLD
 from jbrep.inspection.signals import STEP, TIME
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, Array, Task
-from jbrep.stats.runs import MAX_RETURN
 
 TRAVERSE = "traverse"  # a timeline, and the parent entity of its series
 TRAINING_STEP = "training_step"
@@ -79,7 +78,6 @@ def curves_layout(groups: Sequence[str], last_step: int) -> rrb.Blueprint:
             f"{group}: mean return",
             [f"{group}/**"],
             axis_x=training,
-            axis_y=rrb.ScalarAxis(range=(0, MAX_RETURN)),
         )
         for group in groups
     ]

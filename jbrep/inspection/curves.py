@@ -14,7 +14,7 @@ from jbrep.inspection.blueprint import TRAINING_STEP, curves_layout
 from jbrep.inspection.recording import Colour, Recording, palette
 from jbrep.jitterbug.tasks import Array
 from jbrep.stats import RunCurve
-from jbrep.stats.runs import in_order
+from jbrep.stats.runs import in_order, with_failure_returns
 
 _RUN_WIDTH = 1.0  # [points]
 _MEDIAN_WIDTH = 4.0  # [points]
@@ -23,7 +23,7 @@ _MEDIAN_WIDTH = 4.0  # [points]
 def median_curve(runs: Sequence[RunCurve]) -> tuple[NDArray[np.int64], Array]:
     """Median over runs at the steps at which all were evaluated.
 
-    A failed run counts as return 0 from the step at which it failed.
+    A failed run counts as its failure_return from the step at which it failed.
     """
     whole = [run.steps for run in runs if run.failed_at is None] or [runs[0].curve()[0]]
     steps: NDArray[np.int64] = reduce(np.intersect1d, whole)
@@ -43,7 +43,7 @@ def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
         InputError: the file can't be written.
     """
     labels = defaultdict(list)
-    for run in sorted(runs, key=lambda run: (run.label, run.seed)):
+    for run in sorted(with_failure_returns(runs), key=lambda run: (run.label, run.seed)):
         labels[run.label].append(run)
     representations = in_order((run.representation for run in runs), FULL)
     colours = dict(zip(representations, palette(len(representations)), strict=True))
