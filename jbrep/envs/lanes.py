@@ -18,7 +18,7 @@ Flags = NDArray[np.bool_]
 State = dict[str, NDArray[Any]]  # everything that decides how lanes continue; (n, ...) each
 
 
-class EnvironmentFailure(InputError):
+class EnvironmentFailedError(InputError):
     """An environment raised an error, or gave something else than its task's description says."""
 
 
@@ -117,7 +117,7 @@ class Lanes:
         Raises:
             InputError: actions of another shape than (n, k).
             NonFiniteActionError: actions that are not finite.
-            EnvironmentFailure: the environment raises an error, or gives a number that isn't
+            EnvironmentFailedError: the environment raises an error, or gives a number that isn't
                 finite; the message has the lane's seed and step.
         """
         checked = check_actions(actions, self.num_lanes, self.task.action_size)
@@ -187,7 +187,7 @@ class Lanes:
         if good.all():
             return  # their sum overflows
         lane = int(np.flatnonzero(~good)[0])
-        raise EnvironmentFailure(
+        raise EnvironmentFailedError(
             f"{self.task.name} {did} an observation or reward that is not finite, at step "
             f"{self._steps[lane]} of the episode with seed {self._seeds[lane]}"
         )
@@ -253,10 +253,12 @@ class _Separate:
     def step(self, actions: Array, active: Flags) -> tuple[Array, Array, Flags, Flags, Any]:
         self._make_new_arrays()
         single = actions.astype(np.float32)
-        rewards, terminated, truncated = [], [], []
+        rewards: list[float] = []
+        terminated: list[bool] = []
+        truncated: list[bool] = []
         for lane, goes_on in enumerate(active.tolist()):
             if not goes_on:
-                result: tuple[Any, ...] = (0.0, False, False)
+                result: Sequence[Any] = (0.0, False, False)
             else:
                 self._actions[lane].append(single[lane])
                 try:
@@ -264,8 +266,9 @@ class _Separate:
                     self._put(lane, observation, info)
                 except Exception as error:
                     raise self._failure(lane, error) from error
-            for values, value in zip((rewards, terminated, truncated), result, strict=True):
-                values.append(value)
+            rewards.append(result[0])
+            terminated.append(result[1])
+            truncated.append(result[2])
         flags = np.array(terminated, np.bool_), np.array(truncated, np.bool_)
         return self._observation, np.array(rewards, np.float64), *flags, self._arrays
 
@@ -290,8 +293,8 @@ class _Separate:
         for name, values in self._arrays.items():
             values[lane] = info[name]
 
-    def _failure(self, lane: int, error: Exception) -> EnvironmentFailure:
-        return EnvironmentFailure(
+    def _failure(self, lane: int, error: Exception) -> EnvironmentFailedError:
+        return EnvironmentFailedError(
             f"{self._task.name} failed at step {len(self._actions[lane])} of the episode with seed "
             f"{self._seeds[lane]}: {one_line(error)}"
         )

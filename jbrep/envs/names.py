@@ -17,8 +17,8 @@ _imported: list[str] = []
 
 def short_names() -> dict[str, str]:
     """The Jitterbug's tasks by their short names: face_direction is Jitterbug/FaceDirection-v0."""
-    specs = gymnasium.registry.items()
-    return {spec.kwargs["task"]: id for id, spec in specs if spec.namespace == _NAMESPACE}
+    specs = gymnasium.registry.values()
+    return {spec.kwargs["task"]: spec.id for spec in specs if spec.namespace == _NAMESPACE}
 
 
 def find_spec(name: str) -> EnvSpec:

@@ -38,6 +38,16 @@ def open_loop(actions: NDArray[Any]) -> Actor:
     return lambda observation: next(remaining)
 
 
+def read_nothing(lanes: Lanes) -> Mapping[str, Array]:
+    """Record observations and rewards alone."""
+    return {}
+
+
+def read_states(lanes: Lanes) -> Mapping[str, Array]:
+    """Record what moves of the task's arrays, too."""
+    return {name: lanes.arrays[name] for name in lanes.task.state}
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """What n lanes went through in T steps; the first axis is time.
@@ -45,6 +55,7 @@ class Recording:
     A lane whose episode ended early stands still: its rows from `length` on mean nothing.
 
     Attributes:
+        start: the task's arrays before the first step, (n, width) each.
         observation: before, between and after the steps, (T + 1, n, d) float32.
         arrays: what was read at the same times, (T + 1, n, ...) each.
         action: (T, n, k).
@@ -54,6 +65,7 @@ class Recording:
         length: of each episode, (n,).
     """
 
+    start: Mapping[str, Array]
     observation: NDArray[np.float32]
     arrays: Mapping[str, Array]
     action: NDArray[Any]
@@ -67,7 +79,7 @@ class Recording:
         return f"Recording({lanes} lanes, {steps} steps)"
 
 
-def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = lambda lanes: {}) -> Recording:
+def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = read_nothing) -> Recording:
     """Play the episodes that the lanes are at the start of, and record them.
 
     Args:
@@ -76,7 +88,7 @@ def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = lambda lanes: {}) 
         tick: called after each step.
         read: what else to record.
     """
-    first = _copied(read(lanes))
+    start, first = _copied(lanes.arrays), _copied(read(lanes))
     observations = [lanes.observation.astype(np.float32)]
     actions: list[NDArray[Any]] = []
     rewards: list[NDArray[np.float32]] = []
@@ -91,6 +103,7 @@ def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = lambda lanes: {}) 
         length += played.active
         tick(int(played.active.sum()))
     return Recording(
+        start=start,
         observation=np.stack(observations),
         arrays={name: np.stack(values) for name, values in arrays.items()},
         action=np.stack(actions),
