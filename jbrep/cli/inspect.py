@@ -21,7 +21,7 @@ _KEEPER = ("sh", "-c", "read -r _; kill 0")
 @click.command(epilog=example("jbrep inspect data/face --episode 3 --encoder dae-8 --view"))
 @click.argument("source", required=False)
 @click.option("--episode", type=COUNT, help="Its number, from 0; 0 if not given.")
-@task_options
+@task_options()
 @click.option("--encoder", help="A file, or a name that ships; a run's own if not given.")
 @click.option("--traverse", is_flag=True, help="Show what each unit of the latent moves.")
 @click.option(

@@ -30,7 +30,7 @@ _TASK = "face_direction"
     "--episodes", default=20, show_default=True, type=POSITIVE, help="How many, the same each time."
 )
 @click.option("--trust", is_flag=True, help="Read a zip file from elsewhere, which can run code.")
-@task_options
+@task_options()
 @click.option("--algorithm", default="sac", show_default=True, help="Of a zip file.")
 @click.option(
     "--encoder",
@@ -132,7 +132,7 @@ def _find(
 
 @click.command(epilog=example("jbrep behaviour runs/full runs/dae-4 --out behaviour"))
 @click.argument("policies", nargs=-1, required=True)
-@task_options
+@task_options()
 @click.option("--episodes", default=100, show_default=True, type=POSITIVE, help="Of each policy.")
 @click.option(
     "--target-yaw", default=45.0, show_default=True, help="Where every target points [degrees]."

@@ -33,7 +33,7 @@ class _Size(click.ParamType[tuple[int, int]]):
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="A new file, .mp4 or .gif."
 )
-@task_options
+@task_options()
 @click.option("--episode", default=0, show_default=True, type=COUNT, help="Its number, from 0.")
 @click.option(
     "--camera",

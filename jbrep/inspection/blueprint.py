@@ -91,9 +91,7 @@ def curves_layout(groups: Sequence[str], last_step: int) -> rrb.Blueprint:
             end=rrb.TimeRangeBoundary.absolute(seq=last_step),
         )
     )
-    plots = [
-        _series(f"{group}: mean return", [f"{group}/**"], axis_x=training) for group in groups
-    ]
+    plots = [_series(f"{group}: mean return", [f"{group}/**"], axis_x=training) for group in groups]
     text = rrb.TextDocumentView(origin=PROVENANCE, name="runs")
     layout = rrb.Horizontal(rrb.Grid(*plots), text, column_shares=[2, 1])
     return _blueprint(layout, TRAINING_STEP)

@@ -109,7 +109,9 @@ class Robot:
             columns = []
             place, turned = poses.position[:, body], poses.quaternion[:, body][:, XYZW]
             if (place == place[0]).all() and (turned == turned[0]).all():
-                still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turned[0]))
+                still = rr.Transform3D(
+                    translation=place[0], quaternion=rr.Quaternion(xyzw=turned[0])
+                )
                 recording.send(path, still)
             else:
                 columns.append(rr.Transform3D.columns(translation=place, quaternion=turned))
