@@ -55,6 +55,8 @@ def runs():
                 yield RunCurve(
                     *(task, algorithm, label, seed, "s", STEPS, returns.clip(0, 1000)),
                     total_steps=50_000,
+                    return_floor=0,
+                    solved=900,
                     failed_at=30_000 if (label, seed) == ("pca-4", 3) else None,
                 )
 
@@ -207,16 +209,21 @@ def cut_marks(axes, markers):
 
 def test_no_interval_stretches_an_axis_and_cuts_are_marked(analysis):
     wide = with_interval(analysis, "final_return_sd", (40, 2, 5000))
-    _, right = drawn(study_plots(wide, [], {}, {})[1]).axes
+    left, right = drawn(study_plots(wide, [], {}, {})[1]).axes
     _, high = right.get_ylim()
-    assert high == pytest.approx(520)  # returns in [0, 1000] have an SD of some 500 at most
+    low, top = left.get_ylim()
+    assert high == pytest.approx(1.04 * (top - low) / 1.08 / 2)  # the SD of two far apart
     assert (0, high, "^") in cut_marks(right, "^v")
+    largest = max(max(label.by_run["final_return"]) for label in wide.groups[0].labels)
     wide = with_interval(analysis, "final_return_mean", (500, -900, 1900))
     left, _ = drawn(study_plots(wide, [], {}, {})[1]).axes
-    assert cut_marks(left, "^v") == [(0.16, -40, "v"), (0.16, 1040, "^")]
+    low, high = left.get_ylim()
+    assert (low, high) == pytest.approx((-0.05 * largest, 1.3 * largest))  # not below the floor
+    assert cut_marks(left, "^v") == [(0.16, low, "v"), (0.16, high, "^")]
     wide = with_interval(analysis, "mean_return_mean", (500, 400, 1900))
     (axes,) = drawn(study_plots(wide, [], {}, {})[3]).axes
-    assert axes.get_ylim()[1] == pytest.approx(1040)
+    largest = max(max(label.by_run["mean_return"]) for label in wide.groups[0].labels)
+    assert axes.get_ylim()[1] == pytest.approx(1.3 * largest)
     assert cut_marks(axes, "^v") == [(0.16, axes.get_ylim()[1], "^")]
 
 
@@ -249,11 +256,12 @@ def test_a_ratio_of_zero_is_marked_at_the_edge():
 
 
 def test_a_profile_falls_from_all_runs_to_none(analysis):
-    label = analysis.groups[0].labels[0]
+    group = analysis.groups[0]
+    label = group.labels[0]
     share = label.profile.value
     assert share[0] == 1
     assert share[-1] == 0
-    at = analysis.profile_returns.tolist().index(900)
+    at = group.profile_returns.tolist().index(900)
     assert share[at] == (label.by_run["final_return"] > 900).mean()
     assert np.all(np.diff(share) <= 0)
 

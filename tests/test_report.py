@@ -17,7 +17,7 @@ from jbrep.figures import write
 from jbrep.files.tables import write_csv
 from jbrep.report import report, write_report
 from jbrep.report.columns import are_numbers
-from jbrep.report.facts import reproduce
+from jbrep.report.facts import reproduce, setting_rows
 from jbrep.report.markdown import escape, markdown
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, SUMMARY
 from jbrep.report.tables import read_tables
@@ -337,11 +337,16 @@ def test_the_page_says_how_to_reproduce_it(whole):
 def test_runs_without_a_study_are_made_again_each_in_a_folder_of_its_own(whole):
     tables = read_tables(whole)
     labels = tables.record["labels"]
-    labels["move_to_pose/sac/full"] = labels["face_direction/sac/full"]
+    other = labels["face_direction/sac/full"]
+    settings = {**other["settings"], "task": "dm_control/cheetah-run-v0"}
+    labels["dm_control/cheetah-run-v0/sac/full"] = {**other, "settings": settings}
+    assert setting_rows(tables)[0][1:] == ("face_direction/sac", "dm_control/cheetah-run-v0/sac")
     tables.record["study"] = None
     typed = [line for _, code in reproduce(tables) for line in code.splitlines()]
     folders = [line.split()[-1] for line in typed if line.startswith("jbrep rl")]
-    assert sorted(folders) == sorted(f"a-study/{label}/seed-0" for label in labels)
+    assert sorted(folders) == sorted(
+        f"a-study/{label.replace('dm_control/', 'dm_control-')}/seed-0" for label in labels
+    )
 
 
 def test_where_nothing_was_compared_the_claims_say_so(whole):
@@ -410,14 +415,14 @@ def test_heuristics_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
         ),
         (
             "statistics.json",
-            lambda text: text.replace('version": 1', 'version": 2'),
-            "statistics.json has format version 2: this jbrep reads up to 1",
+            lambda text: text.replace('version": 2', 'version": 3'),
+            "statistics.json has format version 3: this jbrep reads up to 2",
         ),
         ("statistics.json", lambda text: text.replace('"grid"', '"gird"'), "grid is missing"),
         ("returns.csv", lambda text: text[:-1] + ",", "returns.csv is damaged or cut short"),
         ("returns.csv", lambda text: text + f"a,b,c,0,{10**30},0,1\n", "returns.csv is damaged or"),
         ("returns.csv", lambda text: text + "a,b,c,0,0,0,nan\n", "returns.csv is damaged or"),
-        ("returns.csv", lambda text: text + "a,b,c,0,0,0,1e9\n", "returns.csv is damaged or"),
+        ("returns.csv", lambda text: text + "a,b,c,0,0,0,1e16\n", "returns.csv is damaged or"),
         ("returns.csv", lambda text: text + '"' + "a" * 200_000, "returns.csv is damaged or"),
         ("heuristics.csv", lambda text: text + "x", "heuristics.csv is damaged or cut short"),
         ("heuristics.csv", lambda text: b"\xff", "heuristics.csv is damaged: it is not UTF-8"),

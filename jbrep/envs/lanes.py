@@ -70,6 +70,7 @@ class Lanes:
         num_lanes: n.
         observation: the current one of each lane, (n, d) in physical units.
         arrays: the current ones of the task's `state` and `constants`, (n, width) each.
+        info: all that a batch tells of its lanes, by name, (n, ...) each.
         terminated, truncated: how each lane's episode has ended, (n,).
         ended: whether it has, (n,).
         envs: the environments themselves: a batch, or one for each lane.
@@ -86,6 +87,7 @@ class Lanes:
         self.envs = self._engine.envs
         self.observation = np.zeros((num_lanes, task.size))
         self.arrays: Mapping[str, Array] = {}
+        self.info: Mapping[str, Any] = {}
         self.ended = np.ones(num_lanes, dtype=np.bool_)
         self.terminated, self.truncated = self.ended.copy(), self.ended.copy()
         self._some_ended = True  # so that steps need not look at each lane
@@ -176,7 +178,7 @@ class Lanes:
         self._some_ended = bool(self.ended.any())
 
     def _see(self, observation: Array, info: Mapping[str, Any]) -> None:
-        self.observation = observation
+        self.observation, self.info = observation, info
         self.arrays = {name: info[name] for name in self.task.arrays}
 
     def _check(self, observation: Array, reward: Array, did: str) -> None:

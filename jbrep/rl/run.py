@@ -17,14 +17,17 @@ from torch.distributions import Distribution
 from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import FULL, Encoder, find, save
 from jbrep.encoders.file import fingerprint
-from jbrep.errors import InputError, differences
+from jbrep.envs.checks import NonFiniteActionError
+from jbrep.envs.description import describe
+from jbrep.envs.lanes import EnvironmentFailure
+from jbrep.envs.task import Task
+from jbrep.errors import InputError
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder, write_whole
-from jbrep.jitterbug.simulation import NonFiniteActionError
-from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
+from jbrep.rl.beginning import begin, policy_to_begin_with
 from jbrep.rl.checkpoint import Checkpointer
-from jbrep.rl.fields import MAX_EPISODE_STEPS, MAX_EVALUATION_EPISODES, MAX_SEED, MAX_STEPS
+from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_LINE, MAX_SEED, MAX_STEPS
 from jbrep.rl.files import (
     CHECKPOINT,
     ENCODER,
@@ -36,6 +39,7 @@ from jbrep.rl.files import (
     RUN,
     Episode,
     Evaluation,
+    differing,
     read_run,
     write_rows,
     write_run,
@@ -44,12 +48,11 @@ from jbrep.rl.policy_file import policy_zip
 from jbrep.rl.presets import get_preset
 from jbrep.rl.recorder import DivergedError, History, Recorder, Scalars, Watch
 
-_PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
+_PACKAGES = ("gymnasium", "jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 _LIMITS = {
     "steps": MAX_STEPS,
     "evaluate_every": MAX_STEPS,
     "evaluation_episodes": MAX_EVALUATION_EPISODES,
-    "episode_steps": MAX_EPISODE_STEPS,
 }
 
 
@@ -58,10 +61,10 @@ class Run:
     """What to train; together with the versions it decides every number, on one kind of CPU.
 
     Raises:
-        InputError: a number out of range.
+        InputError: a number out of range, or a name that is no task's.
     """
 
-    task: str
+    task: Task  # or its name, which is then described
     algorithm: str = "sac"
     preset: str = "paper"
     encoder: str = FULL  # a file, or a shipped encoder's name; full: the whole observation
@@ -69,9 +72,12 @@ class Run:
     steps: int = 100_000
     evaluate_every: int = 10_000  # steps
     evaluation_episodes: int = 10
-    episode_steps: int = EPISODE_STEPS  # control steps in an episode
+    begin_from: str = ""  # the folder of a finished run, whose policy this one begins with
 
     def __post_init__(self) -> None:
+        given: Any = self.task
+        if not isinstance(given, Task):
+            object.__setattr__(self, "task", describe(given))
         for name, limit in _LIMITS.items():
             if not 1 <= getattr(self, name) <= limit:
                 words = name.replace("_", " ")
@@ -85,9 +91,10 @@ class Run:
         """Check that the run can start.
 
         Raises:
-            InputError: an unknown task, algorithm or preset, or an unusable encoder.
+            InputError: an unknown algorithm or preset, an unusable encoder, or a policy that this
+                run can't begin with.
         """
-        self.describe(find(self.encoder, get_task(self.task).name))
+        self.describe(find(self.encoder, self.task))
 
     def describe(self, encoder: Encoder) -> dict[str, Any]:
         """All settings that two equal runs share, as plain JSON.
@@ -95,8 +102,9 @@ class Run:
         Raises:
             InputError: as `check`.
         """
-        return {
-            "task": get_task(self.task).name,
+        settings = {
+            "task": self.task.name,
+            "environment": self.task.as_json(),
             "algorithm": self.algorithm,
             "preset": self.preset,
             **asdict(get_preset(self.preset, self.algorithm)),
@@ -106,8 +114,12 @@ class Run:
             "steps": self.steps,
             "evaluate_every": self.evaluate_every,
             "evaluation_episodes": self.evaluation_episodes,
-            "episode_steps": self.episode_steps,
+            "from": None,
         }
+        if self.begin_from:
+            folder = Path(self.begin_from)
+            settings["from"] = policy_to_begin_with(folder, settings, encoder.latent_size)
+        return settings
 
 
 def train(
@@ -135,7 +147,7 @@ def train(
         InputError: as `Run.check`; or the folder holds another run, or is in use.
         StoppedError: `stop` was true.
     """
-    encoder = find(run.encoder, get_task(run.task).name)
+    encoder = find(run.encoder, run.task)
     settings = plain(run.describe(encoder))
     if ended := _read_ended(folder, settings):
         return ended
@@ -152,7 +164,7 @@ def read_result(run: Run, folder: Path) -> dict[str, Any] | None:
     Raises:
         InputError: as `Run.check`, or the folder holds another run.
     """
-    encoder = find(run.encoder, get_task(run.task).name)
+    encoder = find(run.encoder, run.task)
     return _read_ended(folder, plain(run.describe(encoder)))
 
 
@@ -168,8 +180,8 @@ def _read_ended(folder: Path, settings: dict[str, Any]) -> dict[str, Any] | None
     if not exists(folder / RUN):
         return None
     result = read_run(folder)
-    if differing := differences(result["settings"], settings):
-        raise InputError(f"{folder} holds another run: {differing}; choose another folder")
+    if others := differing(result["settings"], settings):
+        raise InputError(f"{folder} holds another run: {others}; choose another folder")
     return result
 
 
@@ -192,14 +204,14 @@ def _train(
 
     preset = get_preset(run.preset, run.algorithm)
     seed = training_seed(run.seed)
-    env = make_env(run.task, preset.num_envs, seed, encoder, run.episode_steps)
+    env = make_env(run.task, preset.num_envs, seed, encoder)
     agent = make_agent(run.algorithm, preset, env, run.seed)
     env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
+    if run.begin_from:
+        begin(agent.policy, Path(run.begin_from), settings["from"], folder)
     agent.set_logger(Logger(None, [Scalars(folder / "tensorboard", history.first_step)]))
 
-    evaluator = Evaluator(
-        run.task, encoder, run.evaluation_episodes, episode_steps=run.episode_steps
-    )
+    evaluator = Evaluator(run.task, encoder, run.evaluation_episodes)
     recorder = Recorder(history, evaluator, run.evaluate_every, watch)
     failure = _learn(agent, run.steps, [recorder, checkpointer])
 
@@ -228,8 +240,8 @@ def _learn(agent: BaseAlgorithm, steps: int, callbacks: Sequence[BaseCallback]) 
     try:
         with _unchecked_distributions():
             agent.learn(steps, callback=[*callbacks])
-    except DivergedError as error:
-        failure = str(error)
+    except (DivergedError, EnvironmentFailure) as error:
+        failure = _one_line(str(error))
     except NonFiniteActionError:
         failure = "the policy's actions are not finite"
     else:
@@ -237,6 +249,11 @@ def _learn(agent: BaseAlgorithm, steps: int, callbacks: Sequence[BaseCallback]) 
     finally:
         agent.logger.close()
     return f"{failure} after {agent.num_timesteps:,} steps"
+
+
+def _one_line(text: str) -> str:
+    """Text as run.json may hold it, whatever an environment says."""
+    return "".join(c if c.isprintable() else "?" for c in text)[: MAX_LINE // 2]
 
 
 @contextmanager
