@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from jbrep.envs.episodes import Episodes
 from stable_baselines3 import SAC
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
 
 from jbrep.cli.rl import _Bar
 from jbrep.encoders import find
-from jbrep.envs.episodes import Episodes
 from jbrep.errors import InputError
 from jbrep.files import container
 from jbrep.rl import Run, StoppedError, checkpoint, train

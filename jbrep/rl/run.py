@@ -18,7 +18,7 @@ from jbrep.encoders import FULL, Encoder, find, save
 from jbrep.encoders.file import fingerprint
 from jbrep.envs.checks import NonFiniteActionError
 from jbrep.envs.description import describe
-from jbrep.envs.lanes import EnvironmentFailure
+from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.files.lock import exclusive
@@ -239,7 +239,7 @@ def _learn(agent: BaseAlgorithm, steps: int, callbacks: Sequence[BaseCallback]) 
     try:
         with unchecked_distributions():
             agent.learn(steps, callback=[*callbacks])
-    except (DivergedError, EnvironmentFailure) as error:
+    except (DivergedError, EnvironmentFailedError) as error:
         failure = _one_line(str(error))
     except NonFiniteActionError:
         failure = "the policy's actions are not finite"
