@@ -342,6 +342,6 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
             "qvel": now.qvel.copy(),
             "target_position": now.target_position.copy(),
             "target_quaternion": self.simulation.target_quaternion.copy(),
-            "body": self.simulation.bodies[:, None],
+            "body": self.simulation.body_numbers[:, None],
         }
         return arrays | dict.fromkeys((f"_{name}" for name in arrays), self._every_lane)

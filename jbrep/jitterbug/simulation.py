@@ -95,7 +95,7 @@ class Simulation:
         self._forward(lanes)
 
     @property
-    def bodies(self) -> Array:
+    def body_numbers(self) -> Array:
         """The number of each lane's body, -1 for the published one, (n,)."""
         return self._numbers.astype(np.float64)
 
@@ -111,7 +111,7 @@ class Simulation:
             "warmstart": self._warmstart.copy(),
         }
         if self._body is not None or (self._numbers != bodies.PUBLISHED).any():
-            state["body"] = self.bodies
+            state["body"] = self.body_numbers
         return state
 
     def restore(
