@@ -406,9 +406,8 @@ def test_the_card_tells_layers_and_ranges_and_fits_the_terminal(encoder):
     assert fingerprint(encoder) in text
     assert re.search(r"environment +Jitterbug/FaceDirection-v0\n", text)
     assert re.search(r"motor_velocity \[rad/s\] +-15 +17", text)
-    assert "arguments" not in text
     of_pendulum = card(make(task=PENDULUM), "here", 80)
-    assert re.search(r"arguments +g=1.6\n", of_pendulum)
+    assert re.search(r"environment +Pendulum-v1, g=1.6\n", of_pendulum)
     assert re.search(r"\nobs_2 +-3 +5", of_pendulum)
     for name in ("dae-8", "full"):
         lines = card(find(name, TASK), f"{name}, shipped", 80).splitlines()
@@ -534,7 +533,7 @@ def test_a_name_that_ships_takes_precedence_over_a_file(encoder, tmp_path, monke
 def test_info_tells_what_an_encoder_of_any_environment_is(tmp_path):
     told = jbrep("encoder", "info", "full", "--task", "Pendulum-v1", "--env", "g=1.6").output
     assert "source      full, scaled by the usual ranges" in told
-    assert "arguments   g=1.6" in told
+    assert "environment Pendulum-v1, g=1.6\n" in told
     save(make(task=PENDULUM), tmp_path / "it")
     told = json.loads(jbrep("encoder", "info", tmp_path / "it", "--json").stdout)
     assert (told["environment"], told["arguments"]) == ("Pendulum-v1", {"g": 1.6})

@@ -50,12 +50,10 @@ def card(encoder: Encoder, source: str, width: int) -> str:
         width: columns to fit.
     """
     told = describe(encoder, source)
-    arguments = {"arguments": arguments_of(encoder.task)} if told["arguments"] else {}
     lines = {
         "source": source,
         "task": f"{told['task']}, {told['size']} features to {told['latent_size']}",
-        "environment": told["environment"],
-        **arguments,
+        "environment": ", ".join(filter(None, (encoder.task.id, arguments_of(encoder.task)))),
         "kind": told["kind"],
         "encoder": _shape(encoder.size, told["encoder"]),
         "decoder": _shape(encoder.latent_size, told["decoder"]),
