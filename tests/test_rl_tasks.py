@@ -12,7 +12,7 @@ from command import jbrep
 
 from jbrep.encoders import find
 from jbrep.envs import describe
-from jbrep.envs.lanes import EnvironmentFailure
+from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
 from jbrep.files import container
 from jbrep.rl import Run, StoppedError, train
@@ -147,7 +147,7 @@ def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
     before = (tmp_path / CHECKPOINT).read_bytes()
 
     def fail(*_):
-        raise EnvironmentFailure("out of order")
+        raise EnvironmentFailedError("out of order")
 
     with monkeypatch.context() as patch:
         patch.setattr("jbrep.envs.lanes.Lanes.restore", fail)
