@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from jbrep.jitterbug.heuristics import HEURISTICS, episode_returns
+from jbrep.envs import Lanes, describe
+from jbrep.envs.recording import episode_returns
+from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.jitterbug.tasks import Array
 
 EPISODES = 50
@@ -20,7 +22,7 @@ def main() -> None:
         cells = []
         for candidate in (policy, uniform):
             low, median, high = np.percentile(
-                episode_returns(task, candidate, EPISODES), (10, 50, 90)
+                episode_returns(Lanes(describe(task), EPISODES), candidate), (10, 50, 90)
             )
             cells.append(f"{median:.0f} [{low:.0f}, {high:.0f}]")
         print(f"| {task:18} | {cells[0]:16} | {cells[1]:16} |", flush=True)

@@ -21,10 +21,11 @@ def write_again(source, folder):
     """Commit the shards of a data set to another folder, as a collector would."""
     manifest = read_manifest(source)
 
-    def make(shard, tick):
-        return open_shard(source, manifest, shard)
+    def produce(first, missing, tick):
+        for shard in range(first, len(manifest.shards)):
+            yield open_shard(source, manifest, shard)
 
-    return write_shards(manifest.settings, folder, make).manifest
+    return write_shards(manifest.settings, folder, produce).manifest
 
 
 def contents(folder):

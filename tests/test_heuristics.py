@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from jbrep.jitterbug.heuristics import HEURISTICS, TURN, WALK, episode_returns, turn_by, walk_toward
+from jbrep.envs import Lanes, describe
+from jbrep.envs.recording import episode_returns
+from jbrep.jitterbug.heuristics import HEURISTICS, TURN, WALK, turn_by, walk_toward
 from jbrep.jitterbug.tasks import TASKS
 
 LEAST = {
@@ -26,7 +28,7 @@ def state(motor_angle, motor_velocity, turning=0.0):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_median_return_of_ten_episodes(task):
-    assert np.median(episode_returns(task, HEURISTICS[task], 10)) >= LEAST[task]
+    assert np.median(episode_returns(Lanes(describe(task), 10), HEURISTICS[task])) >= LEAST[task]
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 from command import wait_for, wait_for_the_end_of, workers_of
 
-from jbrep.study.pool import Pool, stop_requested
+from jbrep.pool import Pool, stop_requested
 
 PARENT = """
 import sys

@@ -16,7 +16,9 @@ from typing import Any
 import cma
 import numpy as np
 
-from jbrep.jitterbug.heuristics import HEURISTICS, episode_returns
+from jbrep.envs import Lanes, describe
+from jbrep.envs.recording import episode_returns
+from jbrep.jitterbug.heuristics import HEURISTICS
 
 SEARCH_EPISODES, TEST_EPISODES = 24, 50
 TEST_SEED = 1_000_000
@@ -38,6 +40,9 @@ def main() -> None:
         if parameter.default is not parameter.empty
     }
 
+    task = describe(arguments.task)
+    search_lanes, test_lanes = Lanes(task, SEARCH_EPISODES), Lanes(task, TEST_EPISODES)
+
     def with_factors(factors: np.ndarray) -> dict[str, Any]:
         factor = iter(factors)
         return {
@@ -47,7 +52,7 @@ def main() -> None:
 
     def score(factors: np.ndarray, seed: int) -> float:
         candidate = partial(policy, **with_factors(factors))
-        returns = episode_returns(arguments.task, candidate, SEARCH_EPISODES, seed)
+        returns = episode_returns(search_lanes, candidate, seed)
         return float(np.median(returns) + np.mean(returns)) / 2
 
     size = sum(len(asdict(gait)) for gait in gaits.values())
@@ -61,9 +66,7 @@ def main() -> None:
         search.tell(candidates, [-score(candidate, seed) for candidate in candidates])
         if search.countiter % REPORT_EVERY == 0:
             constants = with_factors(search.mean)
-            test = episode_returns(
-                arguments.task, partial(policy, **constants), TEST_EPISODES, TEST_SEED
-            )
+            test = episode_returns(test_lanes, partial(policy, **constants), TEST_SEED)
             low, median, high = np.percentile(test, (10, 50, 90))
             print(
                 f"generation {search.countiter}: {median:.0f} [{low:.0f}, {high:.0f}] {constants}"

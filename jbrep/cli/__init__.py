@@ -6,6 +6,7 @@ from jbrep.cli.base import Cli
 from jbrep.cli.data import collect, data
 from jbrep.cli.doctor import doctor
 from jbrep.cli.encoders import encoder, evaluate, train_dae, train_encoder
+from jbrep.cli.env import env
 from jbrep.cli.inspect import inspect
 from jbrep.cli.policies import behaviour, evaluate_policy
 from jbrep.cli.render import render
@@ -16,11 +17,11 @@ from jbrep.cli.study import report, study
 @click.group(cls=Cli, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="jbrep")
 def main() -> None:
-    """Reduced-order representations of the Jitterbug, and what they do to learning."""
+    """Reduced-order representations of robots, and what they do to learning."""
 
 
 _COMMANDS = (
-    *(collect, data, train_dae, train_encoder, evaluate, encoder),
+    *(env, collect, data, train_dae, train_encoder, evaluate, encoder),
     *(rl, evaluate_policy, behaviour, study, report, inspect),
     *(render, doctor),
 )

@@ -3,6 +3,7 @@
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import click
 
 from jbrep.cli.base import (
     COUNT,
+    POSITIVE,
     RESUMES,
     as_json,
     echo_json,
@@ -18,88 +20,98 @@ from jbrep.cli.base import (
     printable,
     stoppable,
 )
+from jbrep.cli.environment import given_task, import_option, task_options
 from jbrep.text import terminal_width
 
 _threads = click.option(
-    "--threads", type=click.IntRange(1, 4096), help="Threads to use; all cores by default."
+    "--threads",
+    type=click.IntRange(1, 4096),
+    help="Threads of a batch, or processes; as many as cores by default.",
 )
 _lanes = click.option(
     "--lanes",
     type=click.IntRange(1, 100_000),
     default=100,
     show_default=True,
-    help="Robots stepped at once.",
+    help="Environments of a batch, stepped at once.",
 )
 _data = click.argument("data", type=click.Path(path_type=Path))
 
 
 @click.command(epilog=example("jbrep collect --task face_direction --steps 5M --out data/face"))
-@click.option("--task", required=True, help="A Jitterbug task, such as face_direction.")
-@click.option(
-    "--steps",
-    required=True,
-    type=COUNT,
-    help="Control steps, rounded up to whole episodes of 1,000.",
-)
+@task_options()
+@click.option("--steps", required=True, type=COUNT, help="How many; the last episode is completed.")
 @click.option("--seed", default=0, show_default=True, help="Root of every episode's seed.")
 @click.option(
     "--policy",
     default="uniform",
     show_default=True,
-    help="uniform, heuristic, constant:drive=0.5 or ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3.",
+    help="uniform, constant:drive=0.5, ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3, or, for the "
+    "Jitterbug, heuristic.",
 )
-@click.option("--store-state", is_flag=True, help="Store qpos and qvel, for jbrep data derive.")
-@click.option("--shard-episodes", default=100, show_default=True, help="Episodes per shard.")
+@click.option(
+    "--store-state",
+    is_flag=True,
+    help="Store the Jitterbug's qpos and qvel, for jbrep data derive.",
+)
+@click.option(
+    "--shard-episodes",
+    type=POSITIVE,
+    help="Episodes in a shard; by default so many that a shard has 100,000 steps in a batch of the "
+    "Jitterbug, 20,000 in others.",
+)
 @_lanes
 @_threads
+@click.option("--backend", default="local", show_default=True, help="local, or ray for a cluster.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A folder.")
 def collect(
-    task: str,
     steps: int,
     seed: int,
     policy: str,
     store_state: bool,
-    shard_episodes: int,
+    shard_episodes: int | None,
     lanes: int,
     threads: int | None,
+    backend: str,
     out: Path,
+    **options: Any,
 ) -> None:
     """Collect the states that a policy visits.
 
     The same command resumes an unfinished data set and leaves a finished one as it is. The numbers
-    of lanes and threads don't change the data.
+    of lanes and threads and the backend don't change the data.
     """
     from jbrep.collect import collect as run
+    from jbrep.collect.collector import usual_shard_episodes
     from jbrep.collect.policies import parse_policy, policy_settings
     from jbrep.dataset import Settings
-    from jbrep.jitterbug.tasks import EPISODE_STEPS
 
-    how = policy_settings(parse_policy(policy))
+    task = given_task(options)
+    assert task is not None
+    if not task.reproducible:
+        click.echo(
+            f"{task.name} is not reproducible: no episode can be simulated again, to verify or to "
+            "repair the data set",
+            err=True,
+        )
     settings = Settings(
         task=task,
-        policy=how,
+        policy=policy_settings(parse_policy(policy)),
         steps=steps,
         seed=seed,
-        shard_episodes=shard_episodes,
         store_state=store_state,
     )
-    whole = settings.episodes * EPISODE_STEPS
-    if whole != settings.steps:
-        click.echo(
-            f"{settings.steps:,} steps are rounded up to {whole:,}: episodes have {EPISODE_STEPS:,}"
-        )
+    settings = replace(settings, shard_episodes=shard_episodes or usual_shard_episodes(settings))
     with stoppable(RESUMES):
-        _report(out, run(settings, out, lanes, threads))
+        _report(out, run(settings, out, lanes, threads, backend))
 
 
 def _report(out: Path, written: Any) -> None:
     """Print what the folder holds now, and how fast it was written."""
     manifest, rows, seconds = written
     size = sum(entry.bytes for entry in manifest.shards) / 1e6
-    total = sum(entry.rows for entry in manifest.shards)
-    settings = manifest.settings
-    plural = "s" if settings.episodes > 1 else ""
-    what = f"{settings.episodes:,} episode{plural} of {settings.task}, {total:,} rows"
+    plural = "s" if manifest.episodes > 1 else ""
+    what = f"{manifest.episodes:,} episode{plural} of {manifest.task.name}, {manifest.rows:,} rows"
     click.echo(printable(f"{what}, {size:,.1f} MB in {out}"))
     if rows:
         click.echo(f"{rows:,} rows in {seconds:,.0f} s, {rows / seconds:,.0f} a second")
@@ -130,6 +142,7 @@ def info(data: Path, as_json: bool) -> None:
 @data.command(epilog=example("jbrep data verify data/face --replay 50"))
 @_data
 @click.option("--replay", default=0, help="Episodes to simulate again and compare bit for bit.")
+@import_option
 @_threads
 @click.pass_context
 def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> None:
@@ -153,14 +166,16 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
     if problems:
         ctx.exit(1)
     manifest = dataset.manifest
-    shards = f"{len(manifest.shards)} of {manifest.settings.num_shards} shards"
-    click.echo(printable(f"{data}: no problems in {len(dataset):,} rows, {shards}"))
+    shards = f"{len(manifest.shards)} shard{'s' if len(manifest.shards) != 1 else ''}"
+    unfinished = "" if manifest.complete else "; unfinished"
+    click.echo(printable(f"{data}: no problems in {len(dataset):,} rows, {shards}{unfinished}"))
     if replay:
         click.echo(f"{replay} episodes simulated again: equal in every bit")
 
 
 @data.command(epilog=example("jbrep data repair data/face"))
 @_data
+@import_option
 @_lanes
 @_threads
 def repair(data: Path, lanes: int, threads: int | None) -> None:

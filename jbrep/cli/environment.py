@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from jbrep.envs.task import Task
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
+_TASK = click.option(
+    "--task", help="One of the Jitterbug's, such as face_direction, or a Gymnasium id: Hopper-v5."
+)
 _ARGUMENTS = ("env", "episode_steps", "features")
 
 
@@ -37,13 +40,10 @@ def import_option(command: _Command) -> _Command:
     )(command)
 
 
-def task_options(command: _Command) -> _Command:
-    """The options from which `given_task` makes a task."""
+def task_options(named: bool = True) -> Callable[[_Command], _Command]:
+    """The options from which `given_task` makes a task; --task is left out unless `named`."""
     options = (
-        click.option(
-            "--task",
-            help="One of the Jitterbug's, such as face_direction, or a Gymnasium id: Hopper-v5.",
-        ),
+        *([_TASK] if named else []),
         click.option(
             "--env",
             multiple=True,
@@ -62,9 +62,13 @@ def task_options(command: _Command) -> _Command:
         ),
         import_option,
     )
-    for option in reversed(options):
-        command = option(command)
-    return command
+
+    def decorate(command: _Command) -> _Command:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
 
 
 def given_task(options: dict[str, Any], required: bool = True) -> "Task | None":

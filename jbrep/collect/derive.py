@@ -1,6 +1,6 @@
 """Deriving another task's data set: the same motion, with its observations and rewards."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,22 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collect.collector import Written, write_shards
+from jbrep.collect.collector import Missing, Produce, Written, write_shards
 from jbrep.collect.policies import make_policy
-from jbrep.dataset import Dataset
+from jbrep.dataset import Dataset, Settings, version1
 from jbrep.dataset.manifest import new_manifest, open_shard
-from jbrep.dataset.schema import (
-    EPISODES,
-    STATE_COLUMNS,
-    Columns,
-    episode_columns,
-    episode_returns,
-    episode_seed,
-)
+from jbrep.dataset.schema import EPISODES, Columns, all_specs, episode_columns, episode_returns
+from jbrep.envs.checks import check_counts
+from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, differences
-from jbrep.jitterbug.episodes import Tick
-from jbrep.jitterbug.simulation import Simulation, check_counts
-from jbrep.jitterbug.tasks import Task, get_task
+from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.tasks import TASKS, JitterbugTask, get_task
 
 _LANES = 500
 
@@ -63,6 +57,10 @@ def derive(
     """
     dataset = Dataset(source)
     settings = dataset.manifest.settings
+    if dataset.task.name not in TASKS:
+        raise InputError(
+            f"{source} is of {dataset.task.name}: only the Jitterbug's tasks share their motion"
+        )
     if not settings.store_state:
         raise InputError(f"{source} has no states: collect it with --store-state")
     if not dataset.manifest.complete:
@@ -73,28 +71,40 @@ def derive(
             f"observations: run jbrep collect --task {task_name} instead"
         )
     check_counts(1, num_threads)
-    task = get_task(task_name)
-    settings = replace(settings, task=task.name, store_state=store_state)
+    task, before = get_task(task_name), dataset.task
+    described = task.describe(before.arguments, before.max_episode_steps)
+    settings = replace(settings, task=described, store_state=store_state)
     differing = differences(dataset.manifest.versions, new_manifest(settings).versions)
     if differing:
         raise InputError(
             f"{source} was collected with other versions: {differing}; a derived data set needs "
             "the same"
         )
+    if (dataset.episodes["length"] < before.max_episode_steps).any():
+        raise InputError(
+            f"the physics diverged in {source}, after which no state is stored: run jbrep collect "
+            f"--task {task_name} instead"
+        )
+    return write_shards(settings, folder, _deriving(dataset, task, settings, num_threads))
 
-    def make(shard: int, tick: Tick) -> Columns:
-        columns = open_shard(source, dataset.manifest, shard)
-        numbers = settings.shard_range(shard)
-        seeds = [episode_seed(settings.seed, number) for number in numbers]
-        return _as_task(columns, task, seeds, settings.specs(), tick, num_threads)
 
-    return write_shards(settings, folder, make)
+def _deriving(
+    dataset: Dataset, task: JitterbugTask, settings: Settings, num_threads: int | None
+) -> Produce:
+    """Make the shards of a data set as another task observes and rewards them."""
+
+    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
+        names = all_specs(settings.task, settings.store_state)
+        for shard in range(first, len(dataset.manifest.shards)):
+            columns = version1.with_ends(open_shard(dataset.folder, dataset.manifest, shard))
+            yield _as_task(columns, task, names, tick, num_threads)
+
+    return produce
 
 
 def _as_task(
     columns: Columns,
-    task: Task,
-    seeds: Sequence[int],
+    task: JitterbugTask,
     names: Iterable[str],
     tick: Tick,
     num_threads: int | None,
@@ -102,7 +112,7 @@ def _as_task(
     """The columns of a shard as another task observes and rewards them."""
     own = episode_columns(columns)
     length = own["length"]
-    starts = [task.start(np.random.default_rng(seed)) for seed in seeds]
+    starts = [task.start(np.random.default_rng(int(seed))) for seed in own["seed"]]
     target = {
         "target_position": np.stack([start.target_position for start in starts]),
         "target_quaternion": np.stack([start.target_quaternion for start in starts]),
@@ -112,7 +122,7 @@ def _as_task(
     ends = np.cumsum(length)
     final = ends + np.arange(len(length))
     states = Stored(
-        *(np.insert(columns[n], ends, own[f"final_{n}"], axis=0) for n in STATE_COLUMNS),
+        *(np.insert(columns[n], ends, own[f"final_{n}"], axis=0) for n in ("qpos", "qvel")),
         *(np.repeat(values, length + 1, axis=0) for values in target.values()),
     )
     observation, reward = _read(states, task, num_threads)
@@ -126,7 +136,7 @@ def _as_task(
     return {name: changed.get(name, columns[name]) for name in names}
 
 
-def _read(states: Stored, task: Task, num_threads: int | None) -> tuple[Array, Array]:
+def _read(states: Stored, task: JitterbugTask, num_threads: int | None) -> tuple[Array, Array]:
     """Observations (n, d) and rewards (n,) of the states."""
     n = len(states.qpos)
     lanes = min(_LANES, n)

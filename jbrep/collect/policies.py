@@ -1,18 +1,19 @@
 """Policies to collect with, each determined by its kind and a few constants."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from jbrep.envs.recording import Actor as Actor
+from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError, choose
-from jbrep.jitterbug.episodes import Actor as Actor
-from jbrep.jitterbug.episodes import open_loop
 from jbrep.jitterbug.heuristics import HEURISTICS
-from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, Task
 
-_MAX_SIGMA = 1e6  # far beyond what alternates between full drives
+_MAX_SIGMA = 1e6  # far beyond what alternates between the bounds
+_BLOCK = 1000  # steps that actions are drawn for at a time
 
 
 class Policy(Protocol):
@@ -21,46 +22,78 @@ class Policy(Protocol):
     kind: ClassVar[str]
     open_loop: ClassVar[bool]  # whether actions don't depend on what is observed
 
-    def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
-        """Act in n new episodes, drawing from each one's generator only."""
+    def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
+        """Act in n new episodes with these seeds; what is drawn depends on each one's alone.
+
+        Raises:
+            InputError: it can't act in this task.
+        """
+
+
+def generators(task: Task, seeds: Sequence[int]) -> list[np.random.Generator]:
+    """A policy's random generator for each episode.
+
+    It is NumPy's default one with the episode's seed, beyond the numbers that the environment
+    draws from its own: after them where they are known, else 2**127 numbers further.
+    """
+    streams = [np.random.PCG64(seed) for seed in seeds]
+    if task.draws is None:
+        return [np.random.Generator(stream.jumped()) for stream in streams]
+    return [np.random.Generator(stream.advance(task.draws)) for stream in streams]
+
+
+def within_bounds(task: Task, drives: Array) -> Array:
+    """Actions (..., k) from drives in [-1, 1], which stand for the task's bounds."""
+    low, high = np.array(task.action_low), np.array(task.action_high)
+    if (low == -1).all() and (high == 1).all():
+        return drives  # scaling would round
+    return np.clip((low + high) / 2 + drives * (high - low) / 2, low, high)
 
 
 @dataclass(frozen=True)
 class Uniform:
-    """Uniformly random drives in [-1, 1], a new one for each step."""
+    """Uniformly random actions within the bounds, a new one for each step."""
 
     kind: ClassVar[str] = "uniform"
     open_loop: ClassVar[bool] = True
 
-    def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
-        """Draw all actions of the episodes."""
-        return open_loop(np.stack([r.uniform(-1, 1, (EPISODE_STEPS, 1)) for r in randoms], axis=1))
+    def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
+        """Draw the actions of the episodes, some steps at a time."""
+        randoms, shape = generators(task, seeds), (_BLOCK, task.action_size)
+
+        def blocks() -> Iterator[NDArray[Any]]:
+            while True:
+                yield np.stack(
+                    [r.uniform(task.action_low, task.action_high, shape) for r in randoms], axis=1
+                )
+
+        return _one_by_one(blocks())
 
 
 @dataclass(frozen=True)
 class Constant:
-    """The same drive throughout."""
+    """The same action throughout."""
 
     kind: ClassVar[str] = "constant"
     open_loop: ClassVar[bool] = True
-    drive: float = 1.0  # in [-1, 1]
+    drive: float = 1.0  # in [-1, 1], from the lower bound to the upper
 
     def __post_init__(self) -> None:
         if not -1 <= self.drive <= 1:
             raise InputError(f"the constant drive is {self.drive}: it must be in [-1, 1]")
 
-    def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
+    def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Nothing is drawn."""
-        actions = np.full((len(randoms), 1), self.drive)
+        actions = within_bounds(task, np.full((len(seeds), task.action_size), self.drive))
         return lambda observation: actions
 
 
 @dataclass(frozen=True)
 class OrnsteinUhlenbeck:
-    """An Ornstein-Uhlenbeck process that starts at its mean, clipped to [-1, 1].
+    """An Ornstein-Uhlenbeck process for each action, from its mean on, clipped to [-1, 1].
 
-    dx = theta (mu - x) dt + sigma dW, in steps of the control timestep (Uhlenbeck and Ornstein,
-    1930); its stationary standard deviation is sigma / sqrt(2 theta).
+    dx = theta (mu - x) dt + sigma dW, in steps of the task's time step (Uhlenbeck and Ornstein,
+    1930); its stationary standard deviation is sigma / sqrt(2 theta). From -1 to 1 are the bounds.
     """
 
     kind: ClassVar[str] = "ornstein-uhlenbeck"
@@ -70,23 +103,38 @@ class OrnsteinUhlenbeck:
     sigma: float = 0.3  # [1/sqrt(s)]
 
     def __post_init__(self) -> None:
-        rate = self.theta * CONTROL_TIMESTEP
-        if not (-1 <= self.mu <= 1 and 0 <= rate <= 1 and 0 <= self.sigma <= _MAX_SIGMA):
+        if not (-1 <= self.mu <= 1 and self.theta >= 0 and 0 <= self.sigma <= _MAX_SIGMA):
             raise InputError(
-                f"{self}: mu must be in [-1, 1], theta in [0, {1 / CONTROL_TIMESTEP:g}], "
-                f"sigma in [0, {_MAX_SIGMA:g}]"
+                f"{self}: mu must be in [-1, 1], theta at least 0, sigma in [0, {_MAX_SIGMA:g}]"
             )
 
-    def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
-        """Draw all actions of the episodes."""
-        noise = np.stack([r.standard_normal((EPISODE_STEPS, 1)) for r in randoms], axis=1)
-        drives = np.empty_like(noise)
-        drive = np.full_like(noise[0], self.mu)
-        for step, increment in enumerate(noise):
-            drives[step] = drive
-            drive = drive + self.theta * CONTROL_TIMESTEP * (self.mu - drive)
-            drive = drive + self.sigma * np.sqrt(CONTROL_TIMESTEP) * increment
-        return open_loop(np.clip(drives, -1, 1))
+    def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
+        """Draw the actions of the episodes, some steps at a time."""
+        if task.timestep is None:
+            raise InputError(
+                f"the time step of {task.name} is not known, which {self.kind} needs: give it as "
+                "timestep in a file of --features"
+            )
+        if self.theta * task.timestep > 1:
+            raise InputError(
+                f"theta is {self.theta:g}: with steps of {task.timestep:g} s it must be in "
+                f"[0, {1 / task.timestep:g}]"
+            )
+        return _one_by_one(self._blocks(task, task.timestep, generators(task, seeds)))
+
+    def _blocks(
+        self, task: Task, timestep: float, randoms: Sequence[np.random.Generator]
+    ) -> Iterator[NDArray[Any]]:
+        shape = (_BLOCK, task.action_size)
+        drive = np.full((len(randoms), task.action_size), self.mu)
+        while True:
+            noise = np.stack([r.standard_normal(shape) for r in randoms], axis=1)
+            drives = np.empty_like(noise)
+            for step, increment in enumerate(noise):
+                drives[step] = drive
+                drive = drive + self.theta * timestep * (self.mu - drive)
+                drive = drive + self.sigma * np.sqrt(timestep) * increment
+            yield within_bounds(task, np.clip(drives, -1, 1))
 
 
 @dataclass(frozen=True)
@@ -96,9 +144,20 @@ class Heuristic:
     kind: ClassVar[str] = "heuristic"
     open_loop: ClassVar[bool] = False
 
-    def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
+    def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Nothing is drawn."""
+        if task.name not in HEURISTICS:
+            raise InputError(
+                f"{task.name} has no hand-written policy: choose another policy than {self.kind}; "
+                f"those that have one are {', '.join(HEURISTICS)}"
+            )
         return HEURISTICS[task.name]
+
+
+def _one_by_one(blocks: Iterator[NDArray[Any]]) -> Actor:
+    """The actor that plays blocks of actions (steps, n, k), one step after the other."""
+    actions = (action for block in blocks for action in block)
+    return lambda observation: next(actions)
 
 
 POLICIES = {policy.kind: policy for policy in (Uniform, Heuristic, Constant, OrnsteinUhlenbeck)}

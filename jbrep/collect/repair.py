@@ -8,6 +8,7 @@ from pathlib import Path
 
 from jbrep.collect.collector import LANES, simulate_shard
 from jbrep.collect.policies import make_policy
+from jbrep.dataset import version1
 from jbrep.dataset.manifest import (
     BACKUP,
     MANIFEST,
@@ -22,10 +23,9 @@ from jbrep.dataset.manifest import (
     write_shard,
 )
 from jbrep.dataset.shard import column_hashes
+from jbrep.envs.checks import check_counts
 from jbrep.errors import DamageError, InputError
 from jbrep.files.lock import exclusive
-from jbrep.jitterbug.simulation import check_counts
-from jbrep.jitterbug.tasks import EPISODE_STEPS
 from jbrep.progress import Progress
 
 
@@ -107,9 +107,13 @@ def _is_intact(folder: Path, manifest: Manifest, shard: int) -> bool:
 def _restore(
     folder: Path, manifest: Manifest, shard: int, lanes: int, num_threads: int | None
 ) -> Entry:
-    settings, committed = manifest.settings, manifest.shards[shard].sha256
-    total = len(settings.shard_range(shard)) * EPISODE_STEPS
-    with Progress(total=total, unit="step", unit_scale=True, desc=shard_name(shard)) as progress:
+    settings, entry, path = manifest.settings, manifest.shards[shard], folder / shard_name(shard)
+    if not settings.task.reproducible:
+        raise InputError(
+            f"{path} can't be restored: {settings.task.name} is not reproducible, the same seed "
+            "and actions lead to other states; collect again in another folder"
+        )
+    with Progress(total=entry.rows, unit="step", unit_scale=True, desc=path.name) as progress:
         columns = simulate_shard(
             settings,
             make_policy(settings.policy),
@@ -117,10 +121,13 @@ def _restore(
             progress.update,
             lanes,
             num_threads,
+            most_episodes=entry.episodes,
         )
-    if column_hashes(columns) != committed:
+    if manifest.format_version == 1:
+        columns = version1.columns(columns)
+    if column_hashes(columns) != entry.sha256:
         raise InputError(
-            f"{folder / shard_name(shard)} can't be restored here: it comes out differently; use "
-            f"the machine it was made on, and these versions: {dict(manifest.versions)}"
+            f"{path} can't be restored here: it comes out differently; use the machine it was made "
+            f"on, and these versions: {dict(manifest.versions)}"
         )
     return write_shard(folder, manifest, shard, columns)

@@ -1,17 +1,17 @@
-"""Simulating stored episodes again, from their starts and actions."""
+"""Playing stored episodes again, from their seeds and actions."""
 
 from collections.abc import Iterator, Sequence
+from itertools import chain, repeat
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import Dataset, Episode
-from jbrep.dataset.schema import STATE_COLUMNS
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.make import is_batched
+from jbrep.envs.recording import Read, Recording, Tick, read_nothing, read_states, record
 from jbrep.errors import InputError
-from jbrep.jitterbug.episodes import Recording, Tick, open_loop, record
-from jbrep.jitterbug.simulation import Simulation
-from jbrep.jitterbug.tasks import EPISODE_STEPS
 from jbrep.progress import Progress
 
 _LANES = 100
@@ -20,29 +20,33 @@ _LANES = 100
 def replay_problems(
     dataset: Dataset, episodes: int, num_threads: int | None = None
 ) -> Iterator[str]:
-    """Simulate some episodes again and compare every bit.
+    """Play some episodes again and compare every bit.
 
     Args:
         dataset: with the episodes.
         episodes: how many; they are drawn at random, always the same ones.
-        num_threads: threads to simulate on; None takes one for each core.
+        num_threads: threads to step a batch on; None takes one for each core.
 
     Yields:
         A line for each episode that differs.
 
     Raises:
-        InputError: there are fewer episodes.
+        InputError: there are fewer episodes, or the environment isn't reproducible.
     """
     total = len(dataset.episodes["length"])
     if not 0 <= episodes <= total:
         raise InputError(f"{episodes} episodes can't be replayed: the data set has {total:,}")
+    if episodes:
+        check_reproducible(dataset, "episodes can't be replayed")
     numbers = np.sort(np.random.default_rng(0).permutation(total)[:episodes])
     chosen = [dataset.episode(int(number)) for number in numbers]
-    with Progress(total=episodes * EPISODE_STEPS, unit="step", unit_scale=True, leave=False) as bar:
-        for first in range(0, episodes, _LANES):
-            some = chosen[first : first + _LANES]
-            names = [name for name in STATE_COLUMNS if name in dataset.columns]
-            recording = simulate_again(some, names, num_threads, bar.update)
+    steps = sum(map(len, chosen))
+    lanes = _LANES if is_batched(dataset.task) else 1
+    with Progress(total=steps, unit="step", unit_scale=True, leave=False) as bar:
+        for first in range(0, episodes, lanes):
+            some = chosen[first : first + lanes]
+            read = read_states if dataset.manifest.settings.store_state else read_nothing
+            recording = simulate_again(some, read, bar.update, num_threads)
             for lane, episode in enumerate(some):
                 if not _is_equal(recording, lane, episode):
                     versions = dict(dataset.manifest.versions)
@@ -52,38 +56,56 @@ def replay_problems(
                     )
 
 
+def check_reproducible(dataset: Dataset, what: str) -> None:
+    """Make sure that episodes come out the same again.
+
+    Raises:
+        InputError: the environment doesn't do that.
+    """
+    if not dataset.task.reproducible:
+        raise InputError(
+            f"{what}: {dataset.task.name} is not reproducible, the same seed and actions lead to "
+            "other states"
+        )
+
+
 def simulate_again(
-    episodes: Sequence[Episode], readings: Sequence[str], num_threads: int | None, tick: Tick
+    episodes: Sequence[Episode], read: Read, tick: Tick, num_threads: int | None = None
 ) -> Recording:
-    """Simulate stored episodes, one in each lane; after its last action a lane gets zeros.
+    """Play stored episodes again, one in each lane; after its last action a lane gets others.
 
     Args:
         episodes: of one data set, at least one.
-        readings: names of the fields of `Readings` to record.
-        num_threads: threads to simulate on; None takes one for each core.
+        read: what to record besides observations and rewards.
         tick: called after each step.
+        num_threads: threads to step a batch on; None takes one for each core.
     """
-    records = [episode.record for episode in episodes]
-    simulation = Simulation(episodes[0].dataset.task, len(episodes), num_threads)
-    simulation.restore(
-        qpos=np.stack([stored["initial_qpos"] for stored in records]),
-        qvel=np.stack([stored["initial_qvel"] for stored in records]),
-        target_position=np.stack([stored["target_position"] for stored in records]),
-        target_quaternion=np.stack([stored["target_quaternion"] for stored in records]),
-    )
-    actions = np.zeros((max(map(len, episodes)), len(episodes), 1))
+    task = episodes[0].dataset.task
+    lanes = Lanes(task, len(episodes), num_threads)
+    lanes.reset(range(len(episodes)), [int(episode.record["seed"]) for episode in episodes])
+    middle = (np.array(task.action_low) + np.array(task.action_high)) / 2
+    actions = np.tile(middle, (max(map(len, episodes)), len(episodes), 1))
     for lane, episode in enumerate(episodes):
         actions[: len(episode), lane] = episode["action"]
-    return record(simulation, open_loop(actions), len(actions), readings, tick)
+    remaining = chain(actions, repeat(np.tile(middle, (len(episodes), 1))))
+    recording = record(lanes, lambda observation: next(remaining), tick, read)
+    lanes.close()
+    return recording
 
 
 def _is_equal(recording: Recording, lane: int, episode: Episode) -> bool:
     """Whether a lane went through what is stored of an episode, to the last bit."""
-    length, ends = len(episode), episode.record
+    length, stored = len(episode), episode.record
+    if recording.length[lane] < length:
+        return False
     pairs = [(recording.reward[:length, lane], episode["reward"])]
-    for name, values in recording.states.items():
+    states: dict[str, NDArray[Any]] = {"observation": recording.observation, **recording.arrays}
+    for name, values in states.items():
         pairs.append((values[:length, lane], episode[name]))
-        pairs.append((values[length, lane], ends[f"final_{name}"]))
+        pairs.append((values[length, lane], stored[f"final_{name}"]))
+    for name, values in recording.start.items():
+        column = f"initial_{name}" if name in episode.dataset.task.state else name
+        pairs.append((values[lane], stored[column]))
     return all(_same_bits(*pair) for pair in pairs)
 
 

@@ -1,12 +1,12 @@
 """A data set on one screen, or as JSON."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from jbrep.dataset.reader import Dataset
+from jbrep.envs.task import Task
 from jbrep.text import facts, number, table
 
 _HEADER = ("feature", "unit", "min", "mean", "max", "std", "nominal")
@@ -21,14 +21,14 @@ def describe(dataset: Dataset) -> dict[str, Any]:
     manifest, episodes = dataset.manifest, dataset.episodes
     return {
         "folder": str(dataset.folder),
-        **asdict(manifest.settings),
+        **manifest.settings.as_json(),
         "rows": len(dataset),
         "episodes": len(episodes["length"]),
-        "diverged": int(episodes["diverged"].sum()),
-        "return": _returns(episodes["return"]),
+        "terminated": int(episodes["terminated"].sum()),
+        "steps_per_episode": _spread(episodes["length"]),
+        "return": _spread(episodes["return"]),
         "columns": list(dataset.columns),
         "shards": len(manifest.shards),
-        "num_shards": manifest.settings.num_shards,
         "complete": manifest.complete,
         "bytes": sum(entry.bytes for entry in manifest.shards),
         "versions": dict(manifest.versions),
@@ -43,14 +43,14 @@ def card(dataset: Dataset, width: int = 80) -> str:
     policy, returns = about["policy"], about["return"]
     constants = (f"{name} {value}" for name, value in policy.items() if name != "kind")
     named = {
-        "task": f"{about['task']}, {dataset.task.size} features",
+        "task": _task_line(dataset.task),
         "policy": ", ".join([policy["kind"], *constants]),
         "seed": f"{about['seed']}",
-        "rows": f"{about['rows']:,} in {about['episodes']:,} episodes",
-        "ended early": f"{about['diverged']:,} episodes, where the physics diverged",
+        "rows": f"{about['rows']:,}",
+        "episodes": _episodes_line(about),
         "columns": ", ".join(about["columns"]),
-        "files": f"{about['shards']:,} of {about['num_shards']:,} shards, "
-        f"{about['bytes'] / 1e6:,.1f} MB" + ("" if about["complete"] else "; unfinished"),
+        "files": f"{about['shards']:,} shards, {about['bytes'] / 1e6:,.1f} MB"
+        + ("" if about["complete"] else f"; unfinished, {about['steps']:,} rows were asked for"),
         "made with": ", ".join(f"{name} {version}" for name, version in about["versions"].items()),
         "fingerprint": about["fingerprint"],
     }
@@ -60,27 +60,45 @@ def card(dataset: Dataset, width: int = 80) -> str:
             f"median {of['median']} [10 % {of['p10']}, 90 % {of['p90']}], mean {of['mean']}, "
             f"from {of['min']} to {of['max']}"
         )
+    if not dataset.task.reproducible:
+        named["note"] = "the environment is not reproducible: no episode can be simulated again"
     parts = [f"{dataset.folder}\n{facts(named, width)}"]
     if about["features"]:
         parts.append(table(_HEADER, map(_cells, about["features"]), width))
     return "\n\n".join(parts)
 
 
+def _task_line(task: Task) -> str:
+    actions = f"{task.action_size} action{'s' if task.action_size > 1 else ''}"
+    parts = [task.name, f"{task.size} features", actions]
+    arguments = [f"{name}={value}" for name, value in task.arguments.items()]
+    return ", ".join([*parts, *arguments])
+
+
+def _episodes_line(about: Mapping[str, Any]) -> str:
+    line = f"{about['episodes']:,}"
+    if lengths := about["steps_per_episode"]:
+        low, high = lengths["min"], lengths["max"]
+        line += f" of {low:,.0f}" + (f" to {high:,.0f} steps" if low != high else " steps")
+    ended = about["terminated"]
+    return f"{line}, {ended:,} terminated by a state" if ended else line
+
+
 def _cells(feature: Mapping[str, Any]) -> list[str]:
     values = [number(feature[name], ".4g") for name in _HEADER[2:6]]
-    low, high = (number(value, ".4g") for value in feature["nominal"])
-    return [feature["feature"], feature["unit"], *values, f"[{low}, {high}]"]
+    low, high = feature["nominal"]
+    usual = "-" if low is None else f"[{number(low, '.4g')}, {number(high, '.4g')}]"
+    return [feature["feature"], feature["unit"], *values, usual]
 
 
-def _returns(returns: Any) -> dict[str, float | None]:
+def _spread(values: Any) -> dict[str, float | None]:
     """Median, 10 % and 90 % quantiles, mean and extrema over the episodes, if there are any."""
-    if not len(returns):
+    if not len(values):
         return {}
-    median, p10, p90 = np.percentile(returns, (50, 10, 90))
-    values = {"median": median, "p10": p10, "p90": p90, "mean": returns.mean()}
-    return {
-        n: _finite(v) for n, v in (values | {"min": returns.min(), "max": returns.max()}).items()
-    }
+    median, p10, p90 = np.percentile(values, (50, 10, 90))
+    named = {"median": median, "p10": p10, "p90": p90, "mean": values.mean()}
+    named |= {"min": values.min(), "max": values.max()}
+    return {name: _finite(value) for name, value in named.items()}
 
 
 def _features(dataset: Dataset) -> list[dict[str, Any]]:

@@ -9,7 +9,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from jbrep.dataset.schema import EPISODES, FORMAT, FORMAT_VERSION, Columns
+from jbrep.dataset import version1
+from jbrep.dataset.schema import EPISODES, FORMAT, FORMAT_VERSION, Columns, Spec, all_specs
 from jbrep.dataset.settings import Settings
 from jbrep.dataset.shard import (
     REPAIR,
@@ -21,9 +22,9 @@ from jbrep.dataset.shard import (
     map_file,
     shard_image,
 )
+from jbrep.envs.task import Task, read_task
 from jbrep.errors import DamageError, InputError, check_version
 from jbrep.files.storage import exists, read_regular, write_whole
-from jbrep.jitterbug.tasks import EPISODE_STEPS, Task
 
 MANIFEST = "manifest.json"
 BACKUP = "manifest.backup.json"
@@ -38,6 +39,7 @@ class Entry:
 
     bytes: int
     rows: int
+    episodes: int
     xxh3: str  # of the file
     sha256: Mapping[str, str]  # of each column
 
@@ -49,16 +51,29 @@ class Manifest:
     settings: Settings
     versions: Mapping[str, str]  # of the packages that made it
     shards: tuple[Entry, ...] = ()
+    format_version: int = FORMAT_VERSION
 
     @property
     def task(self) -> Task:
         """The task whose features the observations hold."""
-        return self.settings.definition
+        return self.settings.task
+
+    @property
+    def rows(self) -> int:
+        """Number of rows committed."""
+        return sum(entry.rows for entry in self.shards)
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes committed."""
+        return sum(entry.episodes for entry in self.shards)
 
     @property
     def complete(self) -> bool:
-        """Whether every shard has been committed."""
-        return len(self.shards) == self.settings.num_shards
+        """Whether all that the settings ask for has been committed."""
+        if self.format_version == 1:
+            return self.episodes == version1.episodes(self.settings)
+        return self.rows >= self.settings.steps
 
     @property
     def fingerprint(self) -> str:
@@ -66,25 +81,50 @@ class Manifest:
         parts = (f"{name} {digest}\n" for e in self.shards for name, digest in e.sha256.items())
         return hashlib.sha256("".join(parts).encode()).hexdigest()
 
-    def row_counts(self, shard: int, rows: int) -> dict[str, int]:
-        """Number of rows of each column of a shard."""
-        episodes = len(self.settings.shard_range(shard))
-        return {n: episodes if n.startswith(EPISODES) else rows for n in self.settings.specs()}
+    def specs(self) -> dict[str, Spec]:
+        """The columns of each shard."""
+        return all_specs(self.task, self.settings.store_state, self.format_version)
+
+    def episode_range(self, shard: int) -> range:
+        """Numbers of the episodes in a committed shard."""
+        first = shard * self.settings.shard_episodes
+        return range(first, first + self.shards[shard].episodes)
+
+    def row_counts(self, shard: int) -> dict[str, int]:
+        """Number of rows of each column of a committed shard."""
+        entry = self.shards[shard]
+        return {n: entry.episodes if n.startswith(EPISODES) else entry.rows for n in self.specs()}
 
     def attributes(self, shard: int, rows: int) -> dict[str, Any]:
         """The HDF5 attributes of a shard's file."""
+        settings = self.settings.as_json()
+        if self.format_version == 1:
+            del settings["environment"]
+        else:
+            settings["environment"] = json.dumps(settings["environment"])
         return {
             "format": FORMAT,
-            "format_version": FORMAT_VERSION,
+            "format_version": self.format_version,
             "shard": shard,
             "rows": rows,
             "feature_names": list(self.task.feature_names),
             "feature_units": [feature.unit for feature in self.task.features],
-            **asdict(self.settings),
+            **settings,
             "policy": json.dumps(self.settings.policy),
             "store_state": int(self.settings.store_state),  # booleans are rare in HDF5
             "versions": json.dumps(self.versions),
         }
+
+    def as_json(self) -> dict[str, Any]:
+        """The manifest as plain JSON, in the version of its format."""
+        record = {
+            "format": FORMAT,
+            "format_version": self.format_version,
+            "settings": self.settings.as_json(),
+            "versions": dict(self.versions),
+            "shards": [asdict(entry) for entry in self.shards],
+        }
+        return version1.record(record) if self.format_version == 1 else record
 
 
 def shard_name(shard: int) -> str:
@@ -93,10 +133,13 @@ def shard_name(shard: int) -> str:
 
 
 def new_manifest(settings: Settings) -> Manifest:
-    """A manifest without shards, with the installed versions."""
+    """A manifest without shards, with the installed versions of jbrep's and the environment's."""
     from importlib.metadata import version  # slow to import, and readers don't need it
 
-    return Manifest(settings, {name: version(name) for name in _PACKAGES})
+    from jbrep.envs.names import environment_versions
+
+    versions = {name: version(name) for name in _PACKAGES}
+    return Manifest(settings, versions | environment_versions(settings.task.id))
 
 
 def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
@@ -123,7 +166,7 @@ def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
         raise damage from None
     check_version(path, version, FORMAT_VERSION)
     try:
-        return _parse(record)
+        return _parse(version1.mapped(record) if version == 1 else record)
     except (ValueError, KeyError, TypeError, AttributeError):
         raise damage from None
 
@@ -162,21 +205,36 @@ def _text(record: dict[str, Any]) -> bytes:
 
 
 def _parse(record: dict[str, Any]) -> Manifest:
-    settings = Settings(**record["settings"])
-    shards = tuple(Entry(**entry) for entry in record["shards"])
-    columns = set(settings.specs())
-    if len(shards) > settings.num_shards or any(e.sha256.keys() != columns for e in shards):
+    settings = dict(record["settings"])
+    task = read_task(settings.pop("environment"))
+    if settings.pop("task") != task.name:
         raise ValueError
-    for shard, entry in enumerate(shards):
-        most = EPISODE_STEPS * len(settings.shard_range(shard))
+    shards = tuple(Entry(**entry) for entry in record["shards"])
+    versions = record["versions"]
+    if not set(_PACKAGES) <= set(versions):
+        raise ValueError
+    if not all(
+        re.fullmatch(r"[\w.+!-]+", word, re.ASCII) for each in versions.items() for word in each
+    ):
+        raise ValueError
+    version = record["format_version"]
+    manifest = Manifest(Settings(task=task, **settings), versions, shards, version)
+    _check_shards(manifest)
+    return manifest
+
+
+def _check_shards(manifest: Manifest) -> None:
+    """Make sure that the shards' numbers are possible, all but the last one full."""
+    columns, full = set(manifest.specs()), manifest.settings.shard_episodes
+    for shard, entry in enumerate(manifest.shards):
+        episodes, last = operator.index(entry.episodes), shard == len(manifest.shards) - 1
+        most = manifest.task.max_episode_steps * episodes
+        if not (episodes == full or (last and 1 <= episodes <= full)):
+            raise ValueError
         if operator.index(entry.bytes) < 0 or not 0 <= operator.index(entry.rows) <= most:
             raise ValueError
-    versions = record["versions"]
-    if set(versions) != set(_PACKAGES):
-        raise ValueError
-    if not all(re.fullmatch(r"[\w.+!-]+", number, re.ASCII) for number in versions.values()):
-        raise ValueError
-    return Manifest(settings, versions, shards)
+        if entry.sha256.keys() != columns:
+            raise ValueError
 
 
 def open_shard(
@@ -205,7 +263,9 @@ def open_shard(
             )
         if checked is not None:
             checked.add(state)
-    return Shard(path, content, manifest.settings.specs(), manifest.row_counts(shard, entry.rows))
+    return Shard(
+        path, content, manifest.specs(), manifest.row_counts(shard), manifest.task.max_episode_steps
+    )
 
 
 def hdf5_files(folder: Path) -> list[Path]:
@@ -271,11 +331,11 @@ def write_shard(folder: Path, manifest: Manifest, shard: int, columns: Columns) 
     Raises:
         InputError: it can't be written.
     """
-    rows = len(columns["step"])
+    rows, episodes = len(columns["step"]), len(columns[EPISODES + "length"])
     hashes = column_hashes(columns)
     image = shard_image(columns, hashes, manifest.attributes(shard, rows))
     write_whole(folder / shard_name(shard), image)
-    return Entry(len(image), rows, file_hash(image), hashes)
+    return Entry(len(image), rows, episodes, file_hash(image), hashes)
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
@@ -284,6 +344,5 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     Raises:
         InputError: it can't be written.
     """
-    record = {"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(manifest)}
     for name in (BACKUP, MANIFEST):
-        write_whole(folder / name, _text(record))
+        write_whole(folder / name, _text(manifest.as_json()))

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.dataset import version1
 from jbrep.dataset.columns import Batches, Column, Scaler
 from jbrep.dataset.manifest import (
     check_files,
@@ -51,12 +52,12 @@ class Episode:
         return int(self.rows.stop - self.rows.start)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Its rows of a column, an observable or a feature, (len(self), ...)."""
+        """Its rows of a column, a group of features or a feature, (len(self), ...)."""
         return self.dataset[name][self.rows]
 
     @property
     def record(self) -> dict[str, Any]:
-        """What is stored once per episode: seed, length, return, initial_qpos and more."""
+        """What is stored once per episode: seed, length, return, terminated and more."""
         return {name: column[self.number] for name, column in self.dataset.episodes.items()}
 
     def __repr__(self) -> str:
@@ -67,7 +68,8 @@ class Dataset:
     """A collected data set; every shard is checked against the manifest before it is read.
 
     `dataset["observation"]` is a `Column`: one array over all shards that copies only what is
-    asked for. So are the other columns, the observables (`dataset["velocity"]`) and the single
+    asked for. So are the other columns, the groups of
+    features (`dataset["velocity"]`) and the single
     features (`dataset["velocity_x"]`). While a collector writes, it is the part committed when
     the data set was opened. A shard that changes on disk is checked again when it is next used;
     arrays taken from it before are views of the file, and may change with it.
@@ -114,7 +116,7 @@ class Dataset:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns with a row for each control step."""
+        """Names of the columns with a row for each step."""
         return tuple(self._specs)
 
     def __getitem__(self, name: str) -> Column:
@@ -124,7 +126,7 @@ class Dataset:
         places = self._places
         if name not in places:
             raise InputError(
-                f"no column, observable or feature {name!r}: choose one of "
+                f"no column, group or feature {name!r}: choose one of "
                 f"{', '.join(dict.fromkeys((*self._specs, *places)))}"
             )
         place, row = places[name]
@@ -133,29 +135,22 @@ class Dataset:
 
     @cached_property
     def _places(self) -> dict[str, tuple[int | slice, tuple[int, ...]]]:
-        """Index in an observation, and shape of a row, of each observable and feature."""
-        places: dict[str, tuple[int | slice, tuple[int, ...]]] = {}
-        start = 0
-        for observable in self.task.observables:
-            size = len(observable.features)
-            places[observable.name] = slice(start, start + size), (size,)
-            for i, feature in enumerate(observable.features):
-                places[feature.name] = start + i, ()
-            start += size
-        return places
+        """Index in an observation, and shape of a row, of each group and feature."""
+        groups = {n: (place, (place.stop - place.start,)) for n, place in self.task.groups.items()}
+        return groups | {name: (i, ()) for i, name in enumerate(self.task.feature_names)}
 
     @cached_property
     def episodes(self) -> dict[str, NDArray[Any]]:
-        """Columns with a row for each episode: seed, length, return, initial_qpos and more."""
+        """Columns with a row for each episode: seed, length, return, terminated and more."""
         shards = [self._shard(k) for k in range(len(self.manifest.shards))]
-        specs = self.manifest.settings.specs()
-        return {
+        columns = {
             name.removeprefix(EPISODES): np.concatenate(
                 [np.empty(spec.shape(0), spec.dtype), *(shard[name] for shard in shards)]
             )
-            for name, spec in specs.items()
+            for name, spec in self.manifest.specs().items()
             if name.startswith(EPISODES)
         }
+        return dict(version1.with_ends(columns))
 
     @cached_property
     def _bounds(self) -> NDArray[np.int64]:
@@ -215,7 +210,7 @@ class Dataset:
 
         Args:
             rows: sorted row numbers; None takes all.
-            columns: names of columns, observables or features.
+            columns: names of columns, groups or features.
             size: rows per batch.
             seed: of the order.
             memory: limit of the rows held in memory [bytes].

@@ -7,16 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.jitterbug.tasks import QPOS_SIZE, QVEL_SIZE, Task
+from jbrep.envs.task import Task
+from jbrep.errors import InputError
 
 Columns = Mapping[str, NDArray[Any]]
 
 FORMAT = "jbrep data set"
-FORMAT_VERSION = 1
-STATE_COLUMNS = ("qpos", "qvel")  # stored on request
+FORMAT_VERSION = 2
 EPISODES = "episodes/"  # the HDF5 group of the columns with one row for each episode
 
 MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
+_EPISODE_BITS = {63: 32, 31: 20}  # of a seed, for the number of the episode
 
 
 @dataclass(frozen=True)
@@ -36,41 +37,43 @@ def _spec(dtype: str, *row: int) -> Spec:
 
 
 def step_specs(task: Task, store_state: bool) -> dict[str, Spec]:
-    """Columns with a row for each control step, in the order of episode, then step."""
+    """Columns with a row for each step, in the order of episode, then step."""
     specs = {
         "observation": _spec("<f4", task.size),  # before the action, in physical units
-        "action": _spec("<f4", 1),  # the drive that was held, in [-1, 1]
-        "reward": _spec("<f4"),  # of the state that the action led to
+        "action": _spec("<f4", task.action_size),  # within the task's bounds
+        "reward": _spec("<f4"),  # of the state that the action led to; 0 if the physics diverged
         "episode": _spec("<i4"),  # from 0 in the data set
         "step": _spec("<i4"),  # from 0 in the episode
     }
     if store_state:  # with the observation
-        specs |= {"qpos": _spec("<f8", QPOS_SIZE), "qvel": _spec("<f8", QVEL_SIZE)}
+        specs |= {name: _spec("<f8", width) for name, width in task.state.items()}
     return specs
 
 
-def episode_specs(task: Task, store_state: bool) -> dict[str, Spec]:
-    """Columns with a row for each episode."""
+def episode_specs(task: Task, store_state: bool, version: int = FORMAT_VERSION) -> dict[str, Spec]:
+    """Columns with a row for each episode.
+
+    In format version 1, an episode whose physics diverged lacks its last row.
+    """
+    ends = ("diverged",) if version == 1 else ("terminated", "truncated")
     specs = {
         "episode": _spec("<i4"),
         "seed": _spec("<i8"),
         "length": _spec("<i4"),  # rows stored
         "return": _spec("<f8"),  # sum of the rewards stored
-        "diverged": _spec("|u1"),  # 1 where the physics went non-finite after the last row
-        "initial_qpos": _spec("<f8", QPOS_SIZE),
-        "initial_qvel": _spec("<f8", QVEL_SIZE),
-        "target_position": _spec("<f8", 3),
-        "target_quaternion": _spec("<f8", 4),
+        **{name: _spec("|u1") for name in ends},
+        **{f"initial_{name}": _spec("<f8", width) for name, width in task.state.items()},
+        **{name: _spec("<f8", width) for name, width in task.constants.items()},
         "final_observation": _spec("<f4", task.size),  # after the last action
     }
     if store_state:
-        specs |= {"final_qpos": _spec("<f8", QPOS_SIZE), "final_qvel": _spec("<f8", QVEL_SIZE)}
+        specs |= {f"final_{name}": _spec("<f8", width) for name, width in task.state.items()}
     return {EPISODES + name: spec for name, spec in specs.items()}
 
 
-def all_specs(task: Task, store_state: bool) -> dict[str, Spec]:
+def all_specs(task: Task, store_state: bool, version: int = FORMAT_VERSION) -> dict[str, Spec]:
     """All columns of a shard, by their paths in the file."""
-    return step_specs(task, store_state) | episode_specs(task, store_state)
+    return step_specs(task, store_state) | episode_specs(task, store_state, version)
 
 
 def episode_columns(columns: Columns) -> dict[str, NDArray[Any]]:
@@ -82,14 +85,25 @@ def episode_columns(columns: Columns) -> dict[str, NDArray[Any]]:
     }
 
 
-def episode_seed(root: int, episode: int) -> int:
+def episode_seed(task: Task, root: int, episode: int) -> int:
     """The seed of an episode: (root + 1) * 2**32 + episode.
 
     No two episodes share one, within a data set or between data sets of different root seeds,
     and none is as small as the seeds that people choose. `env.reset(seed=...)` with it starts
-    the same episode.
+    the same episode. For an environment that takes seeds of 31 bits only, it is
+    (root + 1) * 2**20 + episode.
+
+    Raises:
+        InputError: a root or an episode beyond what such an environment can have.
     """
-    return ((root + 1) << 32) + episode
+    bits = _EPISODE_BITS[task.seed_bits]
+    seed = ((root + 1) << bits) + episode
+    if episode >> bits or seed >> task.seed_bits:
+        raise InputError(
+            f"{task.name} takes seeds of {task.seed_bits} bits: the data set's seed must be at "
+            f"most {(1 << (task.seed_bits - bits)) - 2:,}, with at most {1 << bits:,} episodes"
+        )
+    return seed
 
 
 def episode_bounds(lengths: NDArray[Any]) -> NDArray[np.int64]:

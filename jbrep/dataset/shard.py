@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from jbrep.dataset.schema import EPISODES, Columns, Spec
 from jbrep.errors import DamageError, InputError
 from jbrep.files.storage import regular_size
-from jbrep.jitterbug.tasks import EPISODE_STEPS
 
 REPAIR = "run jbrep data repair to restore it"
 FileState = tuple[int, ...] | None  # see `file_state`
@@ -90,18 +89,25 @@ class Shard(Mapping[str, NDArray[Any]]):
         content: its bytes.
         specs: the expected columns, no more and no fewer.
         rows: number of rows of each.
+        max_length: rows of the longest episode that is possible.
 
     Raises:
         DamageError: at the use of a column, if the file is structured differently.
     """
 
     def __init__(
-        self, path: Path, content: mmap.mmap, specs: Mapping[str, Spec], rows: Mapping[str, int]
+        self,
+        path: Path,
+        content: mmap.mmap,
+        specs: Mapping[str, Spec],
+        rows: Mapping[str, int],
+        max_length: int,
     ):
         self._path = path
         self._content = content
         self._specs = specs
         self._rows = rows
+        self._max_length = max_length
         self._views: dict[str, NDArray[Any]] = {}
 
     def __iter__(self) -> Iterator[str]:
@@ -130,7 +136,7 @@ class Shard(Mapping[str, NDArray[Any]]):
     def _check_lengths(self, lengths: NDArray[Any]) -> None:
         """Check that the episodes have as many rows as the shard: they locate its rows."""
         rows = self._rows["step"]
-        if lengths.min() < 0 or lengths.max() > EPISODE_STEPS or lengths.sum() != rows:
+        if lengths.min() < 0 or lengths.max() > self._max_length or lengths.sum() != rows:
             raise self._damage(f"the lengths of its episodes don't add up to {rows:,} rows")
 
     def _damage(self, what: str) -> DamageError:

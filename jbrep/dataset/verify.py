@@ -3,10 +3,12 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from jbrep.dataset import version1
 from jbrep.dataset.manifest import (
     BACKUP,
     Manifest,
@@ -25,11 +27,9 @@ from jbrep.dataset.schema import (
     episode_seed,
 )
 from jbrep.dataset.shard import REPAIR, column_hash
+from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError
-from jbrep.jitterbug.tasks import EPISODE_STEPS, Task
 from jbrep.progress import Progress
-
-_BOUNDED = ("rad", "1")  # units of wrapped angles and unit quaternions: their ranges are bounds
 
 
 def find_problems(folder: Path) -> Iterator[str]:
@@ -92,12 +92,17 @@ def _content_problems(manifest: Manifest, shard: int, columns: Columns) -> Itera
 
 
 def _range_problems(task: Task, columns: Columns) -> Iterator[str]:
-    ranges = [("action", columns["action"], -1.0, 1.0), ("reward", columns["reward"], 0.0, 1.0)]
+    names = [f"action {i}" for i in range(task.action_size)]
+    bounds = zip(names, columns["action"].T, task.action_low, task.action_high, strict=True)
+    ranges: list[tuple[str, NDArray[Any], float, float]] = list(bounds)
+    reward_low = -np.inf if task.reward_low is None else min(task.reward_low, 0)
+    reward_high = np.inf if task.reward_high is None else max(task.reward_high, 0)
+    ranges.append(("reward", columns["reward"], reward_low, reward_high))
     for values in (columns["observation"], columns[EPISODES + "final_observation"]):
         ranges += [
             (feature.name, values[:, i], feature.low, feature.high)
             for i, feature in enumerate(task.features)
-            if feature.unit in _BOUNDED
+            if feature.bounded and feature.low is not None and feature.high is not None
         ]
     for name, values, low, high in ranges:
         if len(values) and not np.float32(low) <= values.min() <= values.max() <= np.float32(high):
@@ -108,22 +113,18 @@ def _range_problems(task: Task, columns: Columns) -> Iterator[str]:
 def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
     """Episode columns that are inconsistent with the settings or with each other."""
     settings, rows = manifest.settings, manifest.shards[shard].rows
-    own = episode_columns(columns)
-    numbers = np.array(settings.shard_range(shard))
-    seeds = [episode_seed(settings.seed, int(number)) for number in numbers]
+    own = version1.with_ends(episode_columns(columns))
+    numbers = np.array(manifest.episode_range(shard))
+    seeds = [episode_seed(manifest.task, settings.seed, int(number)) for number in numbers]
     lengths = own["length"]
     first = episode_bounds(lengths)[:-1]
-    starts = [manifest.task.start(np.random.default_rng(seed)) for seed in seeds]
     checks: dict[str, tuple[ArrayLike, ArrayLike]] = {
         "episode numbers": (own["episode"], numbers),
         "seeds": (own["seed"], np.array(seeds)),
-        "divergence": (own["diverged"], lengths < EPISODE_STEPS),
+        "ends of episodes": (own["terminated"] | own["truncated"], np.ones_like(own["truncated"])),
         "the rows' episode": (columns["episode"], np.repeat(numbers, lengths)),
         "the rows' step": (columns["step"], np.arange(rows) - np.repeat(first, lengths)),
         "returns": (own["return"], episode_returns(columns["reward"], lengths)),
-        "initial orientations": (own["initial_qpos"][:, 3:7], [s.quaternion for s in starts]),
-        "target positions": (own["target_position"], [s.target_position for s in starts]),
-        "target orientations": (own["target_quaternion"], [s.target_quaternion for s in starts]),
     }
     for what, (stored, expected) in checks.items():
         if not np.array_equal(stored, expected):

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -72,24 +72,26 @@ def _describe(name: str, arguments: str, max_episode_steps: int | None) -> Task:
         raise InputError(f"{spec.id} can't be used: {error}") from error
 
 
-def _probe(id: str, arguments: Mapping[str, Any], max_episode_steps: int | None) -> Task:
-    env, fresh = (make_env(id, arguments, max_episode_steps) for _ in range(2))
+def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None) -> Task:
+    env, fresh = (make_env(env_id, arguments, max_episode_steps) for _ in range(2))
     try:
-        action = _checked_action(id, env.action_space)
-        spec = env.spec or find_spec(id)
-        limit = max_episode_steps or spec.max_episode_steps or _find_limit(env, id)
-        timestep = getattr(env.unwrapped, "dt", None)
+        action = _checked_action(env_id, env.action_space)
+        spec = env.spec or find_spec(env_id)
+        limit = max_episode_steps or spec.max_episode_steps or _find_limit(env, env_id)
+        episodes = [_play(env, seed=1), _play(env, seed=0), _play(fresh, seed=0)]
+        timestep: Any = getattr(env.unwrapped, "dt", None)
         return Task(
-            id=find_spec(id).id,
-            name=find_spec(id).id,
-            features=tuple(_features(id, env.observation_space)),
+            id=find_spec(env_id).id,
+            name=find_spec(env_id).id,
+            features=tuple(_features(env_id, env.observation_space)),
             action_low=tuple(np.ravel(action.low).astype(float).tolist()),
             action_high=tuple(np.ravel(action.high).astype(float).tolist()),
             max_episode_steps=limit,
             arguments=dict(arguments),
             timestep=float(timestep) if _is_positive(timestep) else None,
             solved_return=spec.reward_threshold,
-            reproducible=_is_reproducible(env, fresh),
+            terminates=True if any(each.terminated for each in episodes) else None,
+            reproducible=episodes[1].content == episodes[2].content,
             seed_bits=_seed_bits(env),
         )
     finally:
@@ -97,26 +99,28 @@ def _probe(id: str, arguments: Mapping[str, Any], max_episode_steps: int | None)
         fresh.close()
 
 
-def _checked_action(id: str, space: spaces.Space[Any]) -> spaces.Box:
+def _checked_action(env_id: str, space: spaces.Space[Any]) -> spaces.Box:
     if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
         raise InputError(
-            f"{id} has actions in {space}: only continuous ones are possible, a Box of floats"
+            f"{env_id} has actions in {space}: only continuous ones are possible, a Box of floats"
         )
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         raise InputError(
-            f"{id} has actions without bounds, {space}: wrap it, such as in "
+            f"{env_id} has actions without bounds, {space}: wrap it, such as in "
             "gymnasium.wrappers.RescaleAction, so that they have finite ones"
         )
     return space
 
 
-def _features(id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
+def _features(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
     """The features of a flat observation, named by the keys of dictionaries, else numbered."""
     flat = flatten_space(space) if space.is_np_flattenable else None
     if not isinstance(flat, spaces.Box):
-        raise InputError(f"{id} has observations in {space}: they can't be made one flat array")
+        raise InputError(f"{env_id} has observations in {space}, which don't make one flat array")
     if any(_is_image(part) for _, part in _parts("", space)):
-        raise InputError(f"{id} has images as observations, {space}: only features are possible")
+        raise InputError(
+            f"{env_id} has images as observations, {space}: only features are possible"
+        )
     place = 0
     for name, part in _parts("", space):
         size = spaces.utils.flatdim(part)
@@ -154,18 +158,22 @@ def _is_image(space: spaces.Space[Any]) -> bool:
     )
 
 
-def _find_limit(env: gymnasium.Env[Any, Any], id: str) -> int:
+def _find_limit(env: gymnasium.Env[Any, Any], env_id: str) -> int:
     """The time limit that an environment keeps by itself."""
-    for episode in range(3):
-        env.action_space.seed(episode)
+    space: Any = env.action_space
+    for episode in range(6):
+        random = np.random.default_rng(episode)
+        share = episode % 2  # of random action: one that stands still may last longer
         env.reset(seed=episode)
         for step in range(1, _LONGEST_PROBE + 1):
-            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            action = (space.low + space.high) / 2
+            action = action + share * (random.uniform(space.low, space.high) - action)
+            _, _, terminated, truncated, _ = env.step(action.astype(space.dtype))
             if truncated:
                 return step
             if terminated:
                 break
-    raise InputError(f"{id} has no time limit: give one with --episode-steps")
+    raise InputError(f"{env_id} has no time limit: give one with --episode-steps")
 
 
 def _is_positive(value: Any) -> bool:
@@ -182,25 +190,26 @@ def _seed_bits(env: gymnasium.Env[Any, Any]) -> int:
     return wide
 
 
-def _is_reproducible(env: gymnasium.Env[Any, Any], fresh: gymnasium.Env[Any, Any]) -> bool:
-    """Whether an instance that has been used and a fresh one give the same bits."""
-    _episode(env, seed=1)
-    return _episode(env, seed=0) == _episode(fresh, seed=0)
+class _Played(NamedTuple):
+    """The first steps of an episode."""
+
+    content: list[bytes]  # of what each step gave
+    terminated: bool
 
 
-def _episode(env: gymnasium.Env[Any, Any], seed: int) -> list[bytes]:
-    """The bytes of what an episode's first steps give under random actions."""
+def _play(env: gymnasium.Env[Any, Any], seed: int) -> _Played:
+    """Play an episode's first steps with random actions."""
     random = np.random.default_rng(seed)
     space: Any = env.action_space
     observation, _ = env.reset(seed=seed)
-    given = [_bytes(env, observation)]
+    content = [_bytes(env, observation)]
     for _ in range(_PROBE_STEPS):
         action = random.uniform(space.low, space.high).astype(space.dtype)
         observation, reward, terminated, truncated, _ = env.step(action)
-        given.append(_bytes(env, observation, reward, terminated, truncated))
+        content.append(_bytes(env, observation, reward, terminated, truncated))
         if terminated or truncated:
-            break
-    return given
+            return _Played(content, bool(terminated))
+    return _Played(content, False)
 
 
 def _bytes(env: gymnasium.Env[Any, Any], observation: Any, *others: Any) -> bytes:
@@ -238,5 +247,7 @@ def _known(row: Any, names: tuple[str, ...]) -> dict[str, Any]:
     kinds = {name: (str,) if name in ("name", "unit", "group") else (int, float) for name in names}
     for name, value in row.items():
         if type(value) not in kinds[name]:
-            raise ValueError(f"{name} is {value!r}: it must be {'text' if str in kinds[name] else 'a number'}")
+            raise ValueError(
+                f"{name} is {value!r}: it must be {'text' if str in kinds[name] else 'a number'}"
+            )
     return {name: value if isinstance(value, str) else float(value) for name, value in row.items()}

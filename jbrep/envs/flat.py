@@ -1,7 +1,6 @@
 """Observations of any structure as one flat array."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,4 +21,4 @@ def flattener(space: spaces.Space[Any]) -> Flatten:
     if isinstance(space, spaces.Tuple):
         each = [flattener(part) for part in space.spaces]
         return lambda given: np.concatenate([f(part) for f, part in zip(each, given, strict=True)])
-    return partial(flatten, space)
+    return lambda given: np.asarray(flatten(space, given))

@@ -16,12 +16,12 @@ from jbrep.errors import InputError
 
 
 def make_env(
-    id: str, arguments: Mapping[str, Any], max_episode_steps: int | None = None, **options: Any
+    env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None = None, **options: Any
 ) -> gymnasium.Env[Any, Any]:
     """One instance, as Gymnasium makes it.
 
     Args:
-        id: in the registry, or a short name.
+        env_id: in the registry, or a short name.
         arguments: of the environment.
         max_episode_steps: the time limit; None takes the registered one.
         options: more arguments, such as render_mode.
@@ -29,7 +29,7 @@ def make_env(
     Raises:
         InputError: it can't be made; the message says why.
     """
-    spec = find_spec(id)
+    spec = find_spec(env_id)
     if max_episode_steps is not None:
         options["max_episode_steps"] = max_episode_steps  # None would lift the registered limit
     try:
@@ -38,7 +38,7 @@ def make_env(
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"can't make {id}{_with(arguments)}: {one_line(error)}") from error
+        raise InputError(f"can't make {env_id}{_with(arguments)}: {one_line(error)}") from error
 
 
 def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:

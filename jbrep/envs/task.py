@@ -92,22 +92,28 @@ class Task:
                 f"the number of steps in an episode is {self.max_episode_steps}: it must be at "
                 f"least 1 and at most {MAX_EPISODE_STEPS:,}"
             )
+        if self.seed_bits not in SEED_BITS or not (self.draws is None or 0 <= self.draws < 1 << 32):
+            raise ValueError("its seeds or draws are out of range")
+        self._check_features()
+        self._check_actions()
+
+    def _check_features(self) -> None:
         if not 1 <= self.size <= _MAX_FEATURES or len(set(self.feature_names)) < self.size:
             raise ValueError(f"it must have 1 to {_MAX_FEATURES:,} features of different names")
         if sum(place.stop - place.start for place in self.groups.values()) != self.size:
             raise ValueError("features of a group must stand side by side")
-        for word in (*self.feature_names, *self.groups, *self.state, *self.constants):
+        for word in (*self.feature_names, *self.groups, *self.arrays):
             if not _WORD.fullmatch(word):
                 raise ValueError(f"the name {word!r} must be a letter, then letters, digits or ._-")
+        if any(not 1 <= width <= _MAX_FEATURES for width in self.arrays.values()):
+            raise ValueError(f"an array of its states must have 1 to {_MAX_FEATURES:,} numbers")
+
+    def _check_actions(self) -> None:
         bounds = list(zip(self.action_low, self.action_high, strict=True))
         if not 1 <= len(bounds) <= _MAX_ACTIONS or not all(
             math.isfinite(low) and math.isfinite(high) and low < high for low, high in bounds
         ):
             raise ValueError(f"its actions must have 1 to {_MAX_ACTIONS:,} numbers, finite bounds")
-        if self.seed_bits not in SEED_BITS or not (self.draws is None or 0 <= self.draws < 1 << 32):
-            raise ValueError("its seeds or draws are out of range")
-        if any(not 1 <= width <= _MAX_FEATURES for width in self.arrays.values()):
-            raise ValueError("a state has an array of no width, or of too much")
 
     @property
     def slug(self) -> str:
@@ -192,6 +198,21 @@ def read_task(record: Any) -> Task:
     named = [dict(zip(names, row, strict=True)) for row in rows]
     task: Task = typed({**record, "features": named}, Task)
     return task
+
+
+def as_task(given: Any) -> Task:
+    """A task, or the one of that name, described.
+
+    Raises:
+        InputError: it is neither, or as `describe`.
+    """
+    if isinstance(given, Task):
+        return given
+    if isinstance(given, str):
+        from jbrep.envs.description import describe  # imports Gymnasium
+
+        return describe(given)
+    raise InputError(f"the task is {given!r}: it must be a name or a Task")
 
 
 def _ranged(feature: Feature) -> bool:

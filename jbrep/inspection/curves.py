@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from jbrep.encoders import FULL
 from jbrep.inspection.blueprint import TRAINING_STEP, curves_layout
 from jbrep.inspection.recording import Colour, Recording, palette
-from jbrep.jitterbug.tasks import Array
 from jbrep.stats import RunCurve
+from jbrep.stats.bootstrap import Array
 from jbrep.stats.runs import in_order, with_failure_returns
 
 _RUN_WIDTH = 1.0  # [points]
@@ -55,7 +55,7 @@ def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
             path_of_run = f"{label}/seed-{run.seed}"
             _send(recording, path_of_run, run.curve(), name, colours[name], _RUN_WIDTH)
         _send(recording, f"{label}/median", median_curve(group), name, colours[name], _MEDIAN_WIDTH)
-    groups = sorted({label.rpartition("/")[0] for label in labels})
+    groups = sorted({f"{run.task}/{run.algorithm}" for run in runs})
     recording.write(path, curves_layout(groups, max(int(run.curve()[0][-1]) for run in runs)))
 
 

@@ -234,12 +234,9 @@ class JitterbugTask:
         return tuple(f.name for f in self.features)
 
     @cached_property
-    def _centre(self) -> Array:
-        return np.array([(f.high + f.low) / 2 for f in self.features])
-
-    @cached_property
-    def _half_width(self) -> Array:
-        return np.array([(f.high - f.low) / 2 for f in self.features])
+    def plain(self) -> Task:
+        """The task as plain data, with the usual time limit."""
+        return self.describe()
 
     @cached_property
     def _start_ranges(self) -> Array:
@@ -289,17 +286,15 @@ class JitterbugTask:
 
     def scale(self, observation: Array) -> Array:
         """Scale by the nominal ranges: physical units (n, d) to about [-1, 1]."""
-        return (observation - self._centre) / self._half_width
+        return self.plain.scale(observation)
 
     def unscale(self, scaled: Array) -> Array:
         """The inverse of `scale`."""
-        return scaled * self._half_width + self._centre
+        return self.plain.unscale(scaled)
 
     def split(self, observation: NDArray[_Float]) -> dict[str, NDArray[_Float]]:
         """Split flat observations (..., d) by observable; the parts are views."""
-        ends = np.cumsum([len(o.features) for o in self.observables])[:-1]
-        parts = np.split(observation, ends, axis=-1)
-        return {o.name: part for o, part in zip(self.observables, parts, strict=True)}
+        return self.plain.split(observation)
 
     def start(self, random: np.random.Generator | np.random.RandomState) -> Start:
         """Draw how an episode begins.

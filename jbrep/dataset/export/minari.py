@@ -1,11 +1,12 @@
 """Exporting to Minari's HDF5 storage, with the environment that it recovers."""
 
+import copy
 import json
 import os
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 
 import gymnasium
@@ -16,9 +17,10 @@ from minari.namespace import NAMESPACE_METADATA_FILENAME
 
 import jbrep.jitterbug.simulation  # noqa: F401  Minari makes the environment: load MuJoCo before
 from jbrep.dataset import Dataset
+from jbrep.envs.names import find_spec
+from jbrep.envs.task import Task
 from jbrep.files.publish import publish_folder, unfinished
 from jbrep.files.storage import exists, write_whole
-from jbrep.jitterbug.tasks import environment_id
 from jbrep.progress import Progress
 
 _ROOT = "MINARI_DATASETS_PATH"  # Minari takes the folder of its data sets from the environment only
@@ -27,7 +29,7 @@ _ROOT = "MINARI_DATASETS_PATH"  # Minari takes the folder of its data sets from 
 def write(dataset: Dataset, out: Path) -> str:
     """Add a data set to a folder of Minari data sets; returns how to open it."""
     settings = dataset.manifest.settings
-    name = f"jitterbug/{settings.task}/{settings.policy['kind']}-v0"
+    name = f"{_namespace(settings.task)}/{settings.policy['kind']}-v0"
     path = out / name
     path.parent.mkdir(parents=True, exist_ok=True)
     with unfinished(path) as root:  # Minari ignores hidden folders
@@ -43,16 +45,31 @@ def write(dataset: Dataset, out: Path) -> str:
     return f"{_ROOT}={out} and minari.load_dataset({name!r})"
 
 
+def _namespace(task: Task) -> str:
+    """Jitterbug's tasks stand together; another's id has no version there."""
+    if task.id.startswith("Jitterbug/"):
+        return f"jitterbug/{task.slug}"
+    return re.sub(r"[^A-Za-z0-9_/-]+", "-", task.id)
+
+
 def _create(dataset: Dataset, name: str) -> None:
     settings, versions = dataset.manifest.settings, dataset.manifest.versions
     minari.create_dataset_from_buffers(
         name,
         _episodes(dataset),
-        env=gymnasium.spec(environment_id(settings.task)),
+        env=_environment(settings.task),
         algorithm_name=settings.policy["kind"],
-        description=f"{json.dumps(asdict(settings))} {dataset.manifest.fingerprint}",
+        description=f"{json.dumps(settings.as_json())} {dataset.manifest.fingerprint}",
         requirements=[f"{package}=={versions[package]}" for package in ("jbrep", "mujoco")],
     )
+
+
+def _environment(task: Task) -> gymnasium.envs.registration.EnvSpec:
+    """What Minari recovers the environment from: with the arguments and the time limit."""
+    spec = copy.deepcopy(find_spec(task.id))
+    spec.kwargs.update(task.arguments)
+    spec.max_episode_steps = task.max_episode_steps
+    return spec
 
 
 @contextmanager
@@ -71,14 +88,14 @@ def _episodes(dataset: Dataset) -> Iterator[EpisodeBuffer]:
     for number in Progress(range(len(dataset.episodes["length"])), unit="episode", desc="minari"):
         episode = dataset.episode(number)
         if not len(episode):
-            continue  # it diverged in its first step: Minari has no episodes without steps
-        ends = episode.record
+            continue  # it diverged in its first step (format version 1): Minari refuses it
+        ends, is_last = episode.record, np.arange(len(episode)) == len(episode) - 1
         yield EpisodeBuffer(
             seed=int(ends["seed"]),
             observations=np.append(episode["observation"], ends["final_observation"][None], axis=0),
             actions=episode["action"],
             rewards=episode["reward"].astype(np.float64),
-            terminations=np.zeros(len(episode), dtype=bool),
-            truncations=np.arange(len(episode)) == len(episode) - 1,
+            terminations=is_last & bool(ends["terminated"]),
+            truncations=is_last & bool(ends["truncated"]),
             infos={},
         )

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,7 @@ def _write_steps(dataset: Dataset, path: Path, name: str) -> None:
             pa.field(name, pa.from_numpy_dtype(dtype), nullable=False, metadata={"unit": unit})
             for name, dtype, unit in _numeric_columns(dataset)
         ],
-        metadata={"jbrep": json.dumps(asdict(dataset.manifest.settings))},
+        metadata={"jbrep": json.dumps(dataset.manifest.settings.as_json())},
     )
     coding = {"compression": "zstd", "use_dictionary": False, "use_byte_stream_split": True}
     with pq.ParquetWriter(path, schema, **coding) as writer:
@@ -60,7 +59,7 @@ def _numeric_columns(dataset: Dataset) -> Iterator[tuple[str, np.dtype[Any], str
             yield name, column.dtype, "1"
         else:
             for i in range(column.shape[1]):
-                yield f"{name}_{i}", column.dtype, "MuJoCo's"
+                yield f"{name}_{i}", column.dtype, ""
 
 
 def _flat(values: NDArray[Any]) -> list[NDArray[Any]]:

@@ -1,0 +1,133 @@
+"""Where shards are made: in this process, in others on this machine, or on a Ray cluster."""
+
+import os
+from collections.abc import Callable, Iterator
+from itertools import count
+from typing import Any
+
+from jbrep.collect.collector import Missing, Produce, shards_in_turn, simulate_shard
+from jbrep.collect.policies import make_policy
+from jbrep.dataset.schema import Columns
+from jbrep.dataset.settings import Settings
+from jbrep.envs.make import is_batched
+from jbrep.envs.names import import_modules, imported_modules
+from jbrep.envs.recording import Tick
+from jbrep.errors import InputError, choose
+from jbrep.pool import Pool, stop_requested
+
+_ATTEMPTS = 5  # at a shard whose worker is killed
+
+Backend = Callable[[Settings, int, int | None], Produce]
+
+
+def local(settings: Settings, lanes: int, num_threads: int | None) -> Produce:
+    """A batch's shards in turn on threads; other environments' side by side in processes."""
+    workers = num_threads or os.cpu_count() or 1
+    if is_batched(settings.task) or workers == 1:
+        return shards_in_turn(settings, lanes, num_threads)
+    return _in_processes(settings, workers)
+
+
+def _in_processes(settings: Settings, workers: int) -> Produce:
+    """Shards made side by side, given in order; one whose worker is killed is made again."""
+
+    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
+        if not missing.wants(first + 1):  # one shard alone
+            yield from shards_in_turn(settings, 1, 1)(first, missing, tick)
+            return
+        made: dict[int, Columns] = {}
+        started, attempts = first, dict[int, int]()
+        with Pool[int, Columns | str](make_shard, workers, lambda: None) as pool:
+
+            def submit(shard: int) -> None:
+                pool.submit(shard, imported_modules(), settings, shard, missing.rows)
+
+            for shard in count(first):
+                while shard not in made:
+                    while not pool.is_full and (started == shard or missing.wants(started)):
+                        submit(started)
+                        started += 1
+                    number, columns = pool.result()
+                    if isinstance(columns, str):
+                        raise InputError(columns)
+                    if columns is not None:
+                        made[number] = columns
+                        continue
+                    attempts[number] = attempts.get(number, 0) + 1
+                    if attempts[number] == _ATTEMPTS:
+                        raise InputError(
+                            f"the worker of shard {number} was killed {_ATTEMPTS} times, perhaps "
+                            "because memory ran out: try fewer --threads"
+                        )
+                    submit(number)
+                yield made.pop(shard)
+
+    return produce
+
+
+def make_shard(
+    modules: tuple[str, ...], settings: Settings, shard: int, rows: int
+) -> Columns | str:
+    """A shard, in a process of its own; the message of an error that a user can mend."""
+    try:
+        import_modules(modules)
+        policy = make_policy(settings.policy)
+        return simulate_shard(settings, policy, shard, _stop_on_request, 1, 1, rows)
+    except InputError as error:
+        return str(error)
+
+
+def _stop_on_request(steps: int) -> None:
+    if stop_requested():
+        raise SystemExit
+
+
+def on_ray(settings: Settings, lanes: int, num_threads: int | None) -> Produce:
+    """Shards made side by side on the Ray cluster that RAY_ADDRESS names, or else on a local one.
+
+    Only this process writes to the data set's folder. The shards of a node that dies are made
+    again on another.
+    """
+
+    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
+        import ray
+
+        if not ray.is_initialized():
+            ray.init(num_cpus=None if "RAY_ADDRESS" in os.environ else num_threads, **_QUIET)
+        make = ray.remote(num_cpus=1, max_retries=_ATTEMPTS - 1)(make_shard)
+        started, made = first, dict[int, Any]()
+        try:
+            for shard in count(first):
+                ahead = shard + 2 * int(ray.cluster_resources().get("CPU", 1))
+                while started == shard or (started < ahead and missing.wants(started)):
+                    made[started] = make.remote(imported_modules(), settings, started, missing.rows)
+                    started += 1
+                columns = ray.get(made.pop(shard))
+                if isinstance(columns, str):
+                    raise InputError(columns)
+                yield columns
+        except ray.exceptions.RayError as error:
+            reason = str(error).strip().partition("\n")[0]
+            raise InputError(f"the cluster could not make shard {shard}: {reason}") from error
+        finally:
+            for job in made.values():
+                ray.cancel(job, force=True)
+
+    return produce
+
+
+_QUIET: dict[str, Any] = {
+    "log_to_driver": False,
+    "logging_level": "ERROR",
+    "include_dashboard": False,
+}
+_BACKENDS: dict[str, Backend] = {"local": local, "ray": on_ray}
+
+
+def get_backend(name: str) -> Backend:
+    """A place to make shards.
+
+    Raises:
+        InputError: there is none of that name; the message lists them.
+    """
+    return choose(name, _BACKENDS, "backend")

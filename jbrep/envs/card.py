@@ -1,0 +1,70 @@
+"""A task's description on one screen."""
+
+from collections.abc import Iterator
+
+from jbrep.envs.task import Feature, Task
+from jbrep.text import facts, table
+
+_HEADER = ("feature", "unit", "usual range")
+_MOST_FEATURES = 60  # shown
+
+
+def card(task: Task, width: int = 80) -> str:
+    """What a task is, as text of at most `width` columns."""
+    shown = task.features[:_MOST_FEATURES]
+    parts = [f"{task.name}\n{facts(dict(_facts(task)), width)}"]
+    parts.append(table(_HEADER, map(_cells, shown), width))
+    if len(shown) < task.size:
+        parts.append(f"... and {task.size - len(shown):,} more; --json lists all")
+    return "\n\n".join(parts)
+
+
+def _facts(task: Task) -> Iterator[tuple[str, str]]:
+    if task.name != task.id:
+        yield "id", task.id
+    if task.arguments:
+        yield "arguments", ", ".join(f"{n}={value}" for n, value in task.arguments.items())
+    yield "observation", f"{_count(task.size, 'feature')}"
+    yield "action", f"{_count(task.action_size, 'number')} in {_bounds(task)}"
+    step = "" if task.timestep is None else f" of {task.timestep:g} s"
+    yield "time limit", f"{task.max_episode_steps:,} steps{step}"
+    if task.terminates is None:
+        yield "terminates", "not within the few episodes that were tried"
+    else:
+        yield "terminates", "yes: a state can end an episode" if task.terminates else "no"
+    if task.reward_low is not None or task.reward_high is not None:
+        yield "reward", f"in {_range(task.reward_low, task.reward_high)}"
+    if task.solved_return is not None:
+        yield "solved", f"from a return of {task.solved_return:,g}"
+    if task.state:
+        yield "states", ", ".join(f"{name} ({width})" for name, width in task.state.items())
+    yield "reproducible", _reproducible(task)
+
+
+def _reproducible(task: Task) -> str:
+    if task.reproducible:
+        return "yes: with the same seed and actions a fresh and a used instance give the same bits"
+    return (
+        "no: with the same seed and actions a fresh and a used instance differ, so data sets can't "
+        "be repaired and stopped runs can't be resumed"
+    )
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'s' if number != 1 else ''}"
+
+
+def _bounds(task: Task) -> str:
+    bounds = [_range(*each) for each in zip(task.action_low, task.action_high, strict=True)]
+    return ", ".join(dict.fromkeys(bounds))
+
+
+def _range(low: float | None, high: float | None) -> str:
+    ends = ["-inf" if low is None else f"{low:g}", "inf" if high is None else f"{high:g}"]
+    return f"[{', '.join(ends)}]"
+
+
+def _cells(feature: Feature) -> tuple[str, ...]:
+    known = feature.low is not None or feature.high is not None
+    usual = _range(feature.low, feature.high) if known else "-"
+    return feature.name, feature.unit or "-", usual
