@@ -313,6 +313,33 @@ def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
     assert len(write(found.values(), tmp_path)) == 4
 
 
+def test_of_a_wide_robot_the_worst_features_are_shown():
+    """Humanoid's 348 would make a figure of 14,000 pixels, with names that nobody can read."""
+    features = [{"name": f"obs_{i}", "r2": [1 - i / 348, None, None]} for i in range(348)]
+    features[347]["r2"][0] = None  # a feature that never varies isn't the worst
+    correlation = np.eye(348).tolist()
+    encoders = {
+        name: {
+            **{"kind": kind, "latent": 348, "corruption": []},
+            "reconstruction": {"features": features, "mse": [0.1, 0.1, 0.1], "pca_mse": [0.1]},
+            "latent_units": {"correlation": correlation},
+        }
+        for name, kind in (("dae-348", "dae"), ("raw", "identity"))
+    }
+    evaluation = {"data": {"task": "Humanoid-v5"}, "encoders": encoders}
+    by_feature, correlations = encoder_plots(evaluation)
+    assert len(by_feature.rows) == 2 * 348
+    assert "Of 348 features the 40 worst are shown; all are in the table." in by_feature.caption
+    figure = drawn(by_feature)
+    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert names == [f"obs_{i}" for i in range(307, 347)]
+    assert "the 40 worst of 348 features" in figure.axes[0].get_title(loc="left")
+    assert figure.get_figheight() < 8
+    for axes in drawn(correlations).axes[:2]:
+        assert len(axes.get_xticks()) < 20
+        assert not any("obs" in label.get_text() for label in axes.get_xticklabels())
+
+
 @pytest.fixture(scope="module")
 def behaviours():
     sources = ("constant:drive=0.5", "heuristic")

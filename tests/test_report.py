@@ -5,6 +5,7 @@ import json
 import random
 import re
 import shutil
+from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from jbrep.report.tables import read_tables
 from jbrep.report.words import answers
 from jbrep.rl.files import ENCODER, Evaluation, write_rows, write_run
 from jbrep.rollouts.sources import find_episode
+from jbrep.stats import RunCurve, analyse
 from jbrep.study.config import Study, read_study
 from jbrep.study.heuristics import HEURISTIC_RETURNS, write_heuristics
 from jbrep.study.plan import Plan
@@ -485,6 +487,42 @@ def test_a_run_of_a_newer_jbrep_is_named(tmp_path):
     path.write_text(path.read_text().replace('version": 1', 'version": 7'))
     with pytest.raises(InputError, match=r"run\.json has format version 7: this jbrep reads up"):
         read_results(plan.folder)
+
+
+@pytest.mark.parametrize("study", ["desk", "yaw"])
+def test_results_of_the_first_release_are_read_and_are_those_of_today(study):
+    """From returns.csv, the same numbers as in statistics.json, but for the profiles."""
+    tables = read_tables(Path("results") / study)
+    facts = {run["label"]: tables.record["labels"][run["label"]] for run in tables.record["runs"]}
+    by_run = defaultdict(lambda: defaultdict(list))
+    for row in tables.returns:
+        by_run[row[:4]][row.step].append(row.episode_return)
+    runs = [
+        RunCurve(
+            *(*key, "", np.array(list(by_step)), np.array(list(by_step.values()))),
+            total_steps=facts["/".join(key[:3])]["settings"]["steps"],
+            return_floor=0,
+            solved=900,
+        )
+        for key, by_step in by_run.items()
+    ]
+    planned = read_study(Path("studies") / f"{study}.toml").comparisons
+    first = tables.analysis.tolist()
+    compared = {
+        (g["task"], g["algorithm"]): {each["representation"] for each in g["labels"]}
+        for g in first["groups"]
+    }
+    kept = [run for run in runs if run.representation in compared[run.task, run.algorithm]]
+    today = analyse(kept, planned=planned).tolist()
+    assert first["groups"][0]["profile_returns"] == np.linspace(0, 1000, 51).tolist()
+    for analysis in (today, first):
+        for group in analysis["groups"]:
+            del group["profile_returns"]
+            for label in group["labels"]:
+                del label["profile"], label["settings"]
+    assert today == first
+    reached = first["groups"][0]["labels"][0]["numbers"]["reached_solved"][0]
+    assert reached == 1  # each run of full came to 900
 
 
 @pytest.mark.parametrize("study", ["ddpg", "desk", "yaw"])

@@ -1,5 +1,6 @@
 """Studies: their files, preparation, workers, kills, clusters and results."""
 
+import csv
 import dataclasses
 import json
 import os
@@ -12,16 +13,20 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
+import robots
 from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
 
 from jbrep.encoders import load
+from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.rl.files import CHECKPOINT, RUN, read_run, write_run
 from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, read_study
+from jbrep.study.heuristics import HEURISTIC_RETURNS, write_heuristics
 from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.progress import Progress, duration
@@ -484,6 +489,58 @@ def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     told = jbrep("study", tmp_path / "tiny.toml", "--out", out)
     assert told.exit_code == 1
     assert told.stderr.endswith("2 runs crashed: the same command tries them again\n")
+
+
+MIXED = """
+tasks = ["Robots/Pendulum-v1", "face_direction"]
+algorithms = ["sac"]
+representations = ["full", "dae-2"]
+seeds = 2
+steps = 104
+evaluate_every = 104
+evaluation_episodes = 2
+episode_steps = 50
+data = {steps = 1000}
+training = {epochs = 2}
+"""
+
+
+def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monkeypatch):
+    """Its workers import the package; its report is made where that is missing."""
+    monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 2)
+    path, out = tmp_path / "mixed.toml", tmp_path / "mixed"
+    path.write_text(MIXED)
+    with monkeypatch.context() as once:
+        once.setattr("jbrep.report.write_report", lambda folder, out: [])
+        told = jbrep("study", path, "--out", out, "--workers", 2, "--import", "robots")
+    assert told.exit_code == 0, told.output
+    monkeypatch.delitem(gymnasium.registry, robots.ID)
+    told = jbrep("report", out)
+    assert told.exit_code == 0, told.output
+    assert f"{robots.ID}/sac/dae-2" in (out / "report.html").read_text()
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["runs"], summary["missing"], summary["failed"]) == (8, [], [])
+    returns = {task: [] for task in (robots.ID, "face_direction")}
+    for task, _, _, _, _, _, each in list(csv.reader((out / RETURNS).open()))[1:]:
+        returns[task].append(float(each))
+    assert {len(each) for each in returns.values()} == {2 * 2 * 2 * 2}
+    assert max(returns[robots.ID]) < 0 <= min(returns["face_direction"])
+    assert max(returns["face_direction"]) <= 50
+    played = [line.split(",")[0] for line in (out / HEURISTIC_RETURNS).read_text().splitlines()]
+    assert played == ["task", "face_direction", "face_direction"]
+    assert {folder.name for folder in (out / "runs").iterdir()} == {
+        "Robots-Pendulum-v1",
+        "face_direction",
+    }
+    refused = jbrep("study", path, "--out", out)
+    assert "unknown task 'Robots/Pendulum-v1'" in refused.stderr
+    assert "--import PACKAGE" in refused.stderr
+
+
+def test_no_hand_written_policy_no_table(tmp_path):
+    (tmp_path / HEURISTIC_RETURNS).write_text("of other runs")
+    assert write_heuristics([describe("Pendulum-v1")], tmp_path) is None
+    assert not (tmp_path / HEURISTIC_RETURNS).exists()
 
 
 def test_one_study_at_a_time(done):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from jbrep.envs.checks import check_actions
 from jbrep.envs.description import describe
 from jbrep.envs.lanes import Lanes, State
 from jbrep.envs.task import Array, Task
@@ -92,7 +93,8 @@ class TaskVecEnv(VecEnv):
         observation_space, action_space = agent_spaces(task, encoder)
         self._latent_size = observation_space.shape[0]
         self._represent(np.zeros((num_envs, task.size)))  # the encoder may refuse it
-        self._actions: NDArray[np.floating[Any]] = np.zeros((num_envs, task.action_size))
+        self._low, self._high = np.array(task.action_low), np.array(task.action_high)
+        self._actions = np.zeros((num_envs, task.action_size))
         self._first_seeds = np.zeros(num_envs, np.int64)
         self._episodes = np.zeros(num_envs, np.int64)  # k of each lane's episode
         super().__init__(num_envs, observation_space, action_space)
@@ -109,8 +111,13 @@ class TaskVecEnv(VecEnv):
         return self._represent(self._start(range(self.num_envs)))
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
-        """Keep the actions, (num_envs, k), for `step_wait`."""
-        self._actions = actions
+        """Keep the actions, (num_envs, k), for `step_wait`.
+
+        An algorithm that works on actions in [-1, 1] rounds when it scales them to their bounds,
+        and may leave these by a bit: they are clipped.
+        """
+        checked = check_actions(actions, self.num_envs, self.task.action_size)
+        self._actions = np.minimum(np.maximum(checked, self._low), self._high)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Take one step in every lane; where an episode ends, start the next."""

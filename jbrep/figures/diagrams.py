@@ -15,7 +15,7 @@ from jbrep.figures.plot import Plot
 from jbrep.figures.style import COLUMN, PAGE, Looks, ink, plain
 
 _MOST = 20  # units of a layer that are drawn
-_BOX = 22  # characters on a line of a box
+_BOX = 19  # characters on a line of a box
 
 
 class Settings(TypedDict):
@@ -197,7 +197,8 @@ def _draw_system(boxes: Sequence[tuple[str, str]], action: str, reduced: str) ->
         )
         axes.add_patch(box)
         axes.text(x + 0.5, 0.76, name, ha="center", va="center", weight="bold", color=colour)
-        lines = "\n".join(fill(line, _BOX) for line in what.splitlines())
+        parts = what.replace("/", "/\n").splitlines()
+        lines = "\n".join(fill(part, _BOX) for part in parts)
         axes.text(x + 0.5, 0.4, plain(lines), ha="center", va="center", size=6.5)
         if i:
             _arrow(axes, (x - 0.25, 0.5), (x, 0.5))

@@ -259,7 +259,7 @@ def _draw_profiles(analysis: Analysis, looks: Looks) -> Figure:
         if extent.contain(group.solved):
             axes.axvline(group.solved, **solved_line_style())
         axes.set_title(plain(group.name))
-        axes.set(xlim=extent, ylim=(-0.02, 1.02))
+        axes.set(xlim=extent.with_room(0.02), ylim=(-0.02, 1.02))
         axes.set(xlabel="final return", ylabel="share of runs above")
     below(figure, panels.ravel())
     return figure

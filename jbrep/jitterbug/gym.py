@@ -121,7 +121,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
                 f"{', '.join(self.metadata['render_modes'])}; human needs a display"
             )
         self._simulation = Simulation(self.task, 1, 1)
-        self.model = self._simulation.model
+        self.model = self._simulation.model_of(0)
         self.observation_space = self._view.space
         self.action_space = _ACTIONS
         self.render_mode = render_mode

@@ -1,6 +1,7 @@
 """A stable-baselines3 agent from a preset, and the evaluation of its policy."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from operator import attrgetter
 from typing import Any
 
@@ -11,11 +12,12 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from torch.distributions import Distribution
 
 from jbrep.dae.adam import allocate_adam_state
 from jbrep.encoders import Encoder
 from jbrep.envs.lanes import Lanes
-from jbrep.envs.recording import episode_returns
+from jbrep.envs.recording import Actor, episode_returns
 from jbrep.envs.sb3 import TaskVecEnv, agent_spaces
 from jbrep.envs.task import Array, Task
 from jbrep.rl.files import EVALUATION_SEED
@@ -27,7 +29,7 @@ def make_env(task: Task, num_envs: int, seed: int, encoder: Encoder) -> VecMonit
     return VecMonitor(TaskVecEnv(task, num_envs, seed, encoder, num_threads=1))
 
 
-class Spaces(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+class Spaces(gymnasium.Env[Any, Any]):
     """What a policy needs to know of a task to be built, without making the environment."""
 
     def __init__(self, task: Task, encoder: Encoder):
@@ -39,9 +41,7 @@ def training_seed(seed: int) -> int:
     return int(np.random.SeedSequence(seed).generate_state(1)[0]) >> 1
 
 
-def make_agent(
-    algorithm: str, preset: Preset, env: VecEnv | Spaces, seed: int
-) -> BaseAlgorithm:
+def make_agent(algorithm: str, preset: Preset, env: VecEnv | Spaces, seed: int) -> BaseAlgorithm:
     """An untrained agent on the CPU, with its optimisers' state allocated."""
     settings: dict[str, Any] = {**preset.settings}
     if preset.noise:
@@ -71,6 +71,36 @@ def trained_parts(agent: BaseAlgorithm) -> Iterator[tuple[str, Any]]:
     return ((name, attrgetter(name)(agent)) for name in names)
 
 
+@contextmanager
+def unchecked_distributions() -> Iterator[None]:
+    """Let NaN through torch's distributions, which would raise a bare ValueError.
+
+    It then shows in an action, a loss or a weight, each of which is checked.
+    """
+    before = Distribution._validate_args
+    Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        Distribution.set_default_validate_args(before)
+
+
+def deterministic(policy: BasePolicy | BaseAlgorithm, encoder: Encoder, task: Task) -> Actor:
+    """The policy's most likely actions, within their bounds despite rounding.
+
+    They are not finite where its weights aren't.
+    """
+    bounds = agent_spaces(task, encoder)[1]
+
+    def act(observation: Array) -> NDArray[np.float32]:
+        seen = encoder(observation.astype(np.float32))
+        with unchecked_distributions():
+            actions = policy.predict(seen, deterministic=True)[0]
+        return np.clip(actions, bounds.low, bounds.high)
+
+    return act
+
+
 class Evaluator:
     """Plays deterministic policies, in the same episodes each time.
 
@@ -92,9 +122,5 @@ class Evaluator:
             NonFiniteActionError: the policy's actions are not finite.
             EnvironmentFailure: the environment fails in the middle of an episode.
         """
-
-        def act(observation: Array) -> NDArray[np.float32]:
-            seen = self._encoder(observation.astype(np.float32))
-            return policy.predict(seen, deterministic=True)[0]
-
+        act = deterministic(policy, self._encoder, self._lanes.task)
         return episode_returns(self._lanes, act, self._seed)

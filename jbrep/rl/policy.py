@@ -17,7 +17,7 @@ from jbrep.envs.task import Array, Task, read_task
 from jbrep.errors import DamageError, InputError, choose
 from jbrep.files import container
 from jbrep.files.storage import exists
-from jbrep.rl.agent import Spaces, make_agent
+from jbrep.rl.agent import Spaces, deterministic, make_agent
 from jbrep.rl.checkpoint import MAX_BYTES, PARAMETERS
 from jbrep.rl.fields import MAX_STEPS, check_settings, from_version_1, whole_number
 from jbrep.rl.files import (
@@ -51,19 +51,19 @@ class Trained(NamedTuple):
         return self.encoder.representation
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
-        """Act deterministically; nothing is drawn."""
-        return self._act
+        """Act deterministically; nothing is drawn.
 
-    def _act(self, observation: Array) -> NDArray[np.float32]:
-        seen = self.encoder.encode(observation.astype(np.float32))
-        try:
-            actions = self.policy.predict(seen, deterministic=True)[0]
-            finite = np.isfinite(actions).all()
-        except ValueError:  # torch's distributions refuse NaN
-            finite = np.False_
-        if not finite:
-            raise InputError("the policy's actions are not finite: it can't be played")
-        return actions
+        The actor raises an InputError for actions that are not finite.
+        """
+        act = deterministic(self.policy, self.encoder, self.task)
+
+        def checked(observation: Array) -> NDArray[Any]:
+            actions = act(observation)
+            if not np.isfinite(actions).all():
+                raise InputError("the policy's actions are not finite: it can't be played")
+            return actions
+
+        return checked
 
 
 def load_run(folder: Path) -> Trained:

@@ -2,8 +2,8 @@
 
 import hashlib
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -12,7 +12,6 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from torch.distributions import Distribution
 
 from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import FULL, Encoder, find, save
@@ -24,7 +23,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder, write_whole
-from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
+from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed, unchecked_distributions
 from jbrep.rl.beginning import begin, policy_to_begin_with
 from jbrep.rl.checkpoint import Checkpointer
 from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_LINE, MAX_SEED, MAX_STEPS
@@ -238,7 +237,7 @@ def _train(
 def _learn(agent: BaseAlgorithm, steps: int, callbacks: Sequence[BaseCallback]) -> str:
     """Train up to that step; why training failed, or nothing."""
     try:
-        with _unchecked_distributions():
+        with unchecked_distributions():
             agent.learn(steps, callback=[*callbacks])
     except (DivergedError, EnvironmentFailure) as error:
         failure = _one_line(str(error))
@@ -254,20 +253,6 @@ def _learn(agent: BaseAlgorithm, steps: int, callbacks: Sequence[BaseCallback]) 
 def _one_line(text: str) -> str:
     """Text as run.json may hold it, whatever an environment says."""
     return "".join(c if c.isprintable() else "?" for c in text)[: MAX_LINE // 2]
-
-
-@contextmanager
-def _unchecked_distributions() -> Iterator[None]:
-    """Let NaN through torch's distributions, which would raise a bare ValueError.
-
-    It then shows in an action, a loss or a weight, each of which is checked.
-    """
-    before = Distribution._validate_args
-    Distribution.set_default_validate_args(False)
-    try:
-        yield
-    finally:
-        Distribution.set_default_validate_args(before)
 
 
 def _cpu() -> str:

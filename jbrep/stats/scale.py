@@ -67,6 +67,6 @@ def _round_numbers(returns: Array, floor: float | None) -> Array:
     exponent = math.floor(math.log10(width / _POINTS))
     unit = 10.0**exponent
     step = unit * next((s for s in (1, 2, 5) if s * unit >= width / _POINTS), 10)
-    first = math.floor(low / step) - (floor is None)
+    first = math.ceil(low / step) - 1 if floor is None else math.floor(low / step)
     last = max(math.ceil(high / step), first + 1)
     return np.round(step * np.arange(first, last + 1), max(0, -exponent))
