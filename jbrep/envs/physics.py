@@ -95,7 +95,7 @@ class MotionReader:
         return {name: np.stack([getattr(p.data, name) for p in every]) for name in _STATE}
 
     def _read_batch(self, lanes: Lanes) -> dict[str, Array]:
-        self._models = [lanes.envs.simulation.model] * lanes.num_lanes
+        self._models = [lanes.envs.simulation.model_of(i) for i in range(lanes.num_lanes)]
         now = lanes.arrays
         return {
             "qpos": now["qpos"],

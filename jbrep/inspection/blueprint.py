@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -31,8 +32,8 @@ _TAIL = 0.3  # [s] of the latent's path that are drawn as a line
 _NEAR = 1.0  # [s] shown before and after the current time: plots of signals at motor frequency
 _USUAL_TIMESTEP = 0.01  # [s] where a task's isn't known
 _MOST_PLOTS = 12  # on a page
-_EYE, _LOOK = (1.3, -2.5, 1.6), (0.0, 0.0, 0.4)  # in sizes of the robot, from its place
-_NEAR_EYE, _NEAR_LOOK = (0.9, -1.3, 0.65), (0.0, 0.0, 0.03)
+_EYE = (1.3, -2.5, 1.2)  # in sizes of the robot, from its root
+_NEAR_EYE = (0.9, -1.3, 0.65)  # likewise
 
 
 def episode_layout(task: Task, robot: Robot | None, encoder: Encoder | None) -> rrb.Blueprint:
@@ -136,7 +137,11 @@ def _world(name: str, robot: Robot, task: Task) -> rrb.Spatial3DView:
         origin=WORLD,
         contents=[f"{WORLD}/**", f"- {ALIGNED}/**"],
         name=name,
-        eye_controls=_eye(robot, _EYE, _LOOK, tracking_entity=_root(robot)),
+        eye_controls=rrb.EyeControls3D(
+            position=robot.place + robot.size * np.array(_EYE),
+            look_target=robot.place,
+            tracking_entity=_root(robot),
+        ),
         overrides={TRAIL: _window(task, None)},
         background=_BACKGROUND,
         line_grid=_checks(robot),
@@ -149,7 +154,9 @@ def _aligned(robot: Robot) -> rrb.Spatial3DView:
         origin=_root(robot),
         contents=[f"{ROBOT}/**", f"{ALIGNED}/**"],
         name="decoded orientation, overlaid on the robot",
-        eye_controls=_eye(robot, _NEAR_EYE, _NEAR_LOOK),
+        eye_controls=rrb.EyeControls3D(
+            position=robot.size * np.array(_NEAR_EYE), look_target=(0, 0, 0)
+        ),
         background=_BACKGROUND,
         line_grid=False,
     )
@@ -157,13 +164,6 @@ def _aligned(robot: Robot) -> rrb.Spatial3DView:
 
 def _root(robot: Robot) -> str:
     return f"{ROBOT}/{robot.names[robot.root]}"
-
-
-def _eye(
-    robot: Robot, eye: Sequence[float], look: Sequence[float], **others: Any
-) -> rrb.EyeControls3D:
-    place, target = ([robot.size * x for x in point] for point in (eye, look))
-    return rrb.EyeControls3D(position=place, look_target=target, **others)
 
 
 def _checks(robot: Robot) -> rrb.LineGrid3D:

@@ -42,8 +42,8 @@ class Robot:
         root: number of the body that carries the robot's others.
         bodies: numbers of the robot's bodies, the root first.
         others: numbers of all other bodies, such as the world and a target.
-        size: from the root's origin to the farthest point of the robot in the model's reference
-            pose [m].
+        place: of the root in the model's reference pose, (3,) [m].
+        size: from the root's origin to the farthest point of the robot, in the same pose [m].
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -53,7 +53,7 @@ class Robot:
         roots = model.body_rootid if self.root else np.zeros(model.nbody, int)
         self.bodies = np.flatnonzero(roots == self.root).tolist()
         self.others = np.flatnonzero(roots != self.root).tolist()
-        self.size = self._size()
+        self.place, self.size = self._reach()
 
     @property
     def weight(self) -> float:
@@ -61,12 +61,13 @@ class Robot:
         gravity = float(np.linalg.norm(self.model.opt.gravity))
         return float(self.model.body_subtreemass[self.root]) * gravity
 
-    def _size(self) -> float:
+    def _reach(self) -> tuple[Array, float]:
         data = mujoco.MjData(self.model)
         mujoco.mj_kinematics(self.model, data)
         geoms = [g for body in self.bodies for g in self.geoms(body)]
         away = np.linalg.norm(data.geom_xpos[geoms] - data.xpos[self.root], axis=1)
-        return float((away + self.model.geom_rbound[geoms]).max(initial=0)) or _DEFAULT_SIZE
+        size = float((away + self.model.geom_rbound[geoms]).max(initial=0)) or _DEFAULT_SIZE
+        return data.xpos[self.root].copy(), size
 
     def geoms(self, body: int) -> list[int]:
         """Numbers of a body's geoms that can be drawn."""
