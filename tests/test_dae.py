@@ -8,6 +8,7 @@ from torch.nn.functional import mse_loss
 from jbrep.dae import checkpoint
 from jbrep.dae.gradient import Gradient
 from jbrep.dae.network import ARCHITECTURES, Autoencoder, layers
+from jbrep.dae.order import RUN, shuffled
 from jbrep.dae.training import Trainer, Training, default_batch_size, get_device, prefetch
 from jbrep.encoders.encoder import run
 from jbrep.errors import InputError
@@ -107,6 +108,36 @@ def test_every_row_comes_once_with_noise_of_its_own():
     assert abs(np.corrcoef(noise[:-1].ravel(), noise[1:].ravel())[0, 1]) < 0.02  # samples
     assert len(np.unique(noise.round(6))) > 25_000
     assert abs(np.corrcoef(noise[:, 0], clean[:, 0])[0, 1]) < 0.1
+
+
+def test_rows_of_one_pool_are_permuted_uniformly():
+    ours = shuffled(5000, 5000, torch.Generator().manual_seed(3))
+    assert torch.equal(ours, torch.randperm(5000, generator=torch.Generator().manual_seed(3)))
+
+
+def test_more_rows_come_in_pools_of_shuffled_runs():
+    order = shuffled(10 * RUN, 4 * RUN + 100, torch.Generator().manual_seed(0))
+    pools = [sorted({*(rows // RUN).tolist()}) for rows in order.split(4 * RUN)]
+    assert [len(runs) for runs in pools] == [4, 4, 2]
+    assert pools[0] != [0, 1, 2, 3]
+    assert (order.diff() == 1).float().mean() < 0.01  # shuffled within a pool, too
+    again, other = (shuffled(10 * RUN, 4 * RUN, torch.Generator().manual_seed(s)) for s in (0, 1))
+    assert torch.equal(order, again)
+    assert not torch.equal(order, other)
+
+
+@pytest.mark.parametrize("count", [10 * RUN, 10 * RUN + 1, 11 * RUN - 1])
+def test_pools_have_every_row_once(count):
+    order = shuffled(count, 4 * RUN, torch.Generator().manual_seed(0))
+    assert torch.equal(order.sort().values, torch.arange(count))
+
+
+def test_every_row_comes_once_from_pools_too():
+    data = rows(5 * RUN)
+    it = Trainer(Training.of(4, batch_size=100, noise=0), data, data[:50], pool=RUN * 16 * 4)
+    taken = torch.cat([clean for clean, _ in it._batches(1)], 1).T
+    torch.testing.assert_close(taken.sum(1).sort().values, data.sum(1).sort().values)
+    assert not torch.equal(taken, torch.cat([clean for clean, _ in it._batches(2)], 1).T)
 
 
 def test_latent_sizes_see_the_same_order_and_noise():

@@ -9,6 +9,7 @@ import click
 import pytest
 
 from jbrep.cli import main
+from jbrep.envs import describe
 from jbrep.study.config import as_study
 
 ROOT = Path(__file__).parent.parent
@@ -33,9 +34,26 @@ def test_the_python_runs(block, monkeypatch, tmp_path):
     exec(compile(block, "block", "exec"), {})
 
 
-@pytest.mark.parametrize("block", found(r"^```toml\n(.*?)^```"))
+TOML = found(r"^```toml\n(.*?)^```")
+FEATURES = [block for block in TOML if "[[features]]" in block.values[0]]
+
+
+@pytest.mark.parametrize("block", [block for block in TOML if block not in FEATURES])
 def test_the_studies_are_studies(block):
     assert as_study(tomllib.loads(block)).seeds == tuple(range(10))
+
+
+def test_the_features_are_those_of_the_environment_shown(tmp_path):
+    page = (ROOT / "docs" / "environments.md").read_text()
+    environment = next(
+        b for b in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if "Env)" in b
+    )
+    exec(compile(environment, "block", "exec"), {})
+    (features,) = FEATURES
+    (tmp_path / "features.toml").write_text(features.values[0])
+    task = describe("Cart-v0", features=tmp_path / "features.toml")
+    assert [(f.name, f.unit) for f in task.features] == [("position", "m"), ("speed", "m/s")]
+    assert (task.reward_high, task.timestep, task.reproducible) == (0, 0.1, True)
 
 
 @pytest.mark.parametrize("line", found(r"^ {4}jbrep ([^\n]*)"))

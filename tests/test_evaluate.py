@@ -1,6 +1,8 @@
 """Diagnostics: against closed forms, other libraries, and sums by hand."""
 
 import json
+import re
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from sklearn.decomposition import PCA
 from sklearn.linear_model import Ridge
 from sklearn.metrics import r2_score
 from sklearn.preprocessing import StandardScaler
+from wide import make_feature, make_task, wide
 
 from jbrep import figures
 from jbrep.dataset import Dataset, ScaledDataset, Scaler
@@ -20,7 +23,7 @@ from jbrep.encoders import Encoder, Layer, find, save
 from jbrep.errors import InputError
 from jbrep.evaluate import diagnose, files
 from jbrep.evaluate.files import EVALUATION, write
-from jbrep.evaluate.held_out import HeldOut
+from jbrep.evaluate.held_out import MAX_NUMBERS, HeldOut, sample_rows
 from jbrep.evaluate.latent import intrinsic_dimension, latent
 from jbrep.evaluate.readout import correlation, dynamics, neighbours, probes
 from jbrep.evaluate.reconstruction import NOISES, corruption, reconstruction
@@ -108,6 +111,51 @@ def test_held_out_rows_know_their_episodes(held_out):
     steps = held_out.data.dataset["step"]
     np.testing.assert_array_equal(steps[followed + 1], steps[followed] + 1)
     assert len(followed) == 3 * 999
+
+
+def test_of_very_many_episodes_groups_are_resampled():
+    lengths = np.random.default_rng(0).integers(1, 4, 12_000)
+    it = HeldOut(wide(lengths.tolist(), features=4))
+    rows = it.data.test
+    assert len(it) == 2400
+    assert it.num_groups == 1000
+    place = [it.place(rows[part]) for part in it.slices(rows)]
+    assert {len(np.unique(episodes)) for episodes in place} == {2, 3}
+    np.testing.assert_array_equal(np.concatenate(place), it.place(rows))
+    assert it.row_counts.ravel().tolist() == [len(episodes) for episodes in place]
+    worst = reconstruction(make(it.data, pca(it.data, 1)), it)["worst_episodes"]
+    errors = [episode["mse"] for episode in worst]
+    assert errors == sorted(errors, reverse=True)
+    assert all(lengths[episode["episode"]] for episode in worst)
+
+
+def test_sums_of_parts_are_those_of_the_whole(held_out):
+    rows = held_out.data.test
+    values = held_out.data.load(rows)
+    parts = ((values[i : i + 700], values[i : i + 700, :3]) for i in range(0, len(rows), 700))
+    for ours, whole in zip(
+        held_out.sums_of_parts(rows, parts), held_out.sums(rows, values, values[:, :3]), strict=True
+    ):
+        np.testing.assert_allclose(ours, whole, rtol=1e-12)
+
+
+def test_a_sample_of_wide_rows_is_smaller():
+    rows = np.arange(10**6)
+    assert len(sample_rows(rows, 10**5, 22)) == 10**5
+    assert len(sample_rows(rows, 10**5, 348)) == MAX_NUMBERS // 348
+    assert len(sample_rows(rows, 10**5, 10**9)) == 2
+
+
+def test_all_held_out_rows_are_judged_in_little_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr("jbrep.dataset.columns._CHUNK_NUMBERS", 1 << 16)
+    data = wide([500] * 40, features=100, folder=tmp_path)
+    data.train, data.test = data.test, data.train
+    it, coder = HeldOut(data), make(data, pca(data, 3))
+    tracemalloc.start()
+    reconstruction(coder, it)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < len(data.test) * data.task.size * 4
 
 
 def test_a_sample_is_in_order_and_of_any_step(held_out):
@@ -256,6 +304,60 @@ def test_every_task_has_its_quantities():
     assert with_target == {"move_to_position", "move_to_pose"}
 
 
+def test_any_other_robots_truth_is_every_feature():
+    features = [
+        make_feature("height", "m", -1, 1, bounded=True),
+        make_feature("yaw", "rad", -np.pi, np.pi, bounded=True),
+        make_feature("turns", "rad", -np.pi, np.pi),
+        make_feature("knee", "rad", -0.5, 0.5, bounded=True),
+        make_feature("unknown"),
+    ]
+    robot = make_task(features, name="my_package/Robot-v0")
+    rows = np.random.default_rng(0).uniform(-3, 3, (20, 5))
+    result = quantities(robot, rows)
+    assert list(result) == ["height", "yaw", "turns", "knee", "unknown"]
+    np.testing.assert_array_equal(result["turns"], rows[:, 2:3])
+    np.testing.assert_allclose(result["yaw"], np.stack((np.cos(rows[:, 1]), np.sin(rows[:, 1])), 1))
+    columns = state(robot, rows)
+    assert list(columns) == ["height", "yaw_cos", "yaw_sin", "turns", "knee", "unknown"]
+    np.testing.assert_array_equal(columns["knee"], rows[:, 3])
+
+
+def test_a_wide_robot_can_be_judged(tmp_path, monkeypatch):
+    monkeypatch.setattr("jbrep.evaluate.readout.MAX_NUMBERS", 1 << 19)
+    data = wide([1, 300, 2, 1, 250, 99, 1, 180], features=70)
+    evaluation = write({"r-20": make(data, random_projection(data, 20, 0))}, data, tmp_path)
+    everything, ours = evaluation["encoders"].values()
+    for result in everything, ours:
+        gtc = result["correlation"]
+        assert gtc["state_dimensions"] == 70
+        assert len(gtc["dimensions"]) == 2 * (1 << 19) // (1000 * 70)
+        assert result["probes"]["obs_0"] == [None, None, None]  # it is constant
+    assert gtc["dimensions"].keys() == everything["correlation"]["dimensions"].keys()
+    assert all(everything["probes"][f"obs_{i}"][0] > 0.8 for i in range(1, 70))
+    shown = evaluation_text(evaluation, 100)
+    assert "14 of its 70 dimensions" in " ".join(shown.split())
+    assert re.search(r"probes, mean +worst probe", shown)
+    assert max(map(len, shown.splitlines())) <= 100
+
+
+def test_episodes_of_one_row_have_no_dynamics(tmp_path):
+    data = wide([1] * 20, features=6)
+    result = write({"r-2": make(data, random_projection(data, 2, 0))}, data, tmp_path)
+    for judged in result["encoders"].values():
+        assert set(map(tuple, judged["dynamics"].values())) == {(None, None, None)}
+        assert judged["reconstruction"]["mse"][0] is not None
+    assert " nan" not in evaluation_text(result)
+
+
+def test_a_feature_that_is_constant_where_it_is_judged_has_no_r2(tmp_path):
+    data = wide([50] * 10, features=6)
+    data.dataset.arrays["observation"][data.test, 3] = 1.7
+    features = reconstruction(make(data, pca(data, 2)), HeldOut(data))["features"]
+    assert features[3]["r2"][0] is None
+    assert features[4]["r2"][0] is not None
+
+
 def test_probes_are_ridge_regressions(held_out, coder):
     train, test = observed(held_out, "train"), observed(held_out, "test")
     result = probes(coder, held_out)
@@ -287,6 +389,16 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     still = r2_score(true, unseen[:, :4], multioutput="variance_weighted")
     assert result["persistence"][0] == pytest.approx(still, abs=1e-3)
     assert result["linear"][0] > result["persistence"][0]
+    changes = []
+    for rows in (held_out.data.train, held_out.data.test):
+        kept = rows[dataset["step"][rows] < 999]
+        changes.append(dataset["observation"][kept + 1] - dataset["observation"][kept])
+    changes = [c / changes[0].std(axis=0) for c in changes]
+    predicted = (
+        Ridge(1.0).fit(scaler.transform(known), changes[0]).predict(scaler.transform(unseen))
+    )
+    expected = r2_score(changes[1], predicted, multioutput="variance_weighted")
+    assert result["change"][0] == pytest.approx(expected, abs=1e-3)
 
 
 def test_mixing_the_units_does_not_change_how_well_the_next_is_read(held_out, coder):

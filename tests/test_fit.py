@@ -3,17 +3,20 @@
 import re
 import shutil
 import signal
+import tracemalloc
 from contextlib import contextmanager
-from functools import partial
 
 import numpy as np
 import pytest
+import torch
 from command import jbrep, start, wait_for
 from small import settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from wide import wide
 
 from jbrep.collect import write_shards
-from jbrep.dae.training import Training
+from jbrep.dae import checkpoint
+from jbrep.dae.training import Trainer, Training
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.manifest import open_shard, read_manifest
 from jbrep.encoders import load
@@ -22,7 +25,7 @@ from jbrep.files.lock import exclusive
 from jbrep.methods import fit
 from jbrep.methods.fit import KINDS, Fitter
 from jbrep.methods.held_out import ratio_to_pca
-from jbrep.methods.rows import training_rows
+from jbrep.methods.rows import available_memory, training_rows, watched_rows
 
 
 @pytest.fixture(scope="module")
@@ -141,11 +144,87 @@ def test_what_another_process_finished_before_the_lock_is_left_as_it_is(
     assert [e.step for e in events.Scalars("train_loss")] == [1, 2, 3]  # once
 
 
-def test_rows_that_do_not_fit_in_memory_give_the_same_file(data, tmp_path, monkeypatch):
+def test_rows_that_do_not_fit_in_memory_give_the_same_file(data, tmp_path):
     one = Fitter(data, tmp_path / "memory").fit("dae", how()).path
-    monkeypatch.setattr(fit, "training_rows", partial(training_rows, memory=1000))
-    other = Fitter(data, tmp_path / "disk").fit("dae", how()).path
+    other = Fitter(data, tmp_path / "disk", memory=1000).fit("dae", how()).path
     assert one.read_bytes() == other.read_bytes()
+
+
+def epochs(data, memory, training, path=None):
+    """Weights after training in pools far smaller than the data, perhaps from a checkpoint."""
+    train = training_rows(data, torch.device("cpu"), memory)
+    trainer = Trainer(training, train, watched_rows(data, torch.device("cpu")), pool=1 << 20)
+    if path:
+        checkpoint.restore(trainer, {}, path)
+    list(trainer.epochs())
+    return trainer
+
+
+def test_a_training_from_disk_is_that_from_memory_and_resumes_in_either(tmp_path):
+    data = wide([700] * 8, features=40, folder=tmp_path)
+    half, whole = (how(batch_size=256, epochs=n) for n in (1, 2))
+    memory, disk = (epochs(data, limit, whole) for limit in (1 << 30, 1 << 18))
+    assert memory.history == disk.history
+    for limit in (1 << 30, 1 << 18):
+        checkpoint.save(epochs(data, limit, half), {}, tmp_path / "at")
+        for other in (1 << 30, 1 << 18):
+            resumed = epochs(data, other, whole, tmp_path / "at")
+            for name, parameter in memory.network.state_dict().items():
+                assert torch.equal(resumed.network.state_dict()[name], parameter)
+
+
+def test_training_from_disk_takes_little_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr("jbrep.dataset.columns._CHUNK_NUMBERS", 1 << 16)
+    data = wide([500] * 40, folder=tmp_path)
+    size = data.train.size * 348 * 4
+    peaks = []
+    for memory in (1 << 30, 1 << 20):
+        tracemalloc.start()
+        train = training_rows(data, torch.device("cpu"), memory)
+        trainer = Trainer(how(batch_size=128, epochs=1), train, torch.zeros(9, 348), pool=1 << 22)
+        list(trainer.epochs())
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[0] > size > 10 * peaks[1]
+
+
+def test_half_of_the_free_memory_is_taken_but_at_least_a_gibibyte(monkeypatch):
+    for free, taken in ((8 << 30, 4 << 30), (1 << 20, 1 << 30)):
+        sizes = {"SC_AVPHYS_PAGES": free >> 12, "SC_PAGE_SIZE": 1 << 12}
+        monkeypatch.setattr("os.sysconf", sizes.__getitem__)
+        assert available_memory(torch.device("cpu")) == taken
+
+
+def test_fewer_held_out_rows_of_a_wide_robot_are_watched(monkeypatch):
+    monkeypatch.setattr("jbrep.methods.rows._WATCHED_NUMBERS", 348 * 30)
+    assert watched_rows(wide([50] * 10), torch.device("cpu")).shape == (30, 348)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_constant_huge_and_tiny_features_give_finite_encoders(kind, tmp_path):
+    data = wide([1, 300, 2, 120, 77])
+    assert data.constant_features == ("obs_0",)
+    encoder = Fitter(data, tmp_path).fit(kind, how(batch_size=100)).encoder
+    rows = data.dataset["observation"][data.test]
+    back = (encoder.decode(encoder(rows)) - rows) / data.scaler.half_width
+    assert encoder.header["metrics"]["held_out_mse"] == pytest.approx(np.mean(back**2), rel=1e-3)
+    assert np.abs(back).max() < 4
+    assert encoder.header["task"] == "Humanoid-v5"
+
+
+def test_observations_that_cannot_be_reduced_are_refused(tmp_path):
+    single = Fitter(wide([20] * 5, features=1), tmp_path)
+    with pytest.raises(
+        InputError, match="Humanoid-v5 has one feature, which can't be reduced: use"
+    ):
+        single.fit("pca", how(1))
+    assert single.fit("identity", how()).encoder.latent_size == 1
+    data = wide([20] * 5)
+    data.scaler.high[7] = 1e13
+    with pytest.raises(
+        InputError, match=r"the observations in .* are too large to be encoded: ten"
+    ):
+        Fitter(data, tmp_path).check("dae", how())
 
 
 def test_an_encoder_is_compared_with_pca(data, tmp_path):

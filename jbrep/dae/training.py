@@ -16,6 +16,7 @@ from torch.optim import Adam
 from jbrep.dae.adam import allocate_adam_state
 from jbrep.dae.gradient import Gradient
 from jbrep.dae.network import Autoencoder, get_architecture
+from jbrep.dae.order import POOL, shuffled
 from jbrep.errors import InputError
 
 NOISE = 0.1  # standard deviation, of features scaled to [-1, 1]
@@ -150,6 +151,7 @@ class Trainer:
         training: its settings.
         train: scaled rows to train on, (n, d), on the device to train on.
         test: scaled rows to report the loss on, (m, d), on the same device.
+        pool: bytes of rows that are shuffled together; see `jbrep.dae.order.shuffled`.
 
     Attributes:
         network: after the last epoch.
@@ -162,13 +164,14 @@ class Trainer:
         InputError: there is no latent size.
     """
 
-    def __init__(self, training: Training, train: Rows, test: Tensor):
+    def __init__(self, training: Training, train: Rows, test: Tensor, pool: int = POOL):
         if training.latent is None:
             raise InputError("an autoencoder needs a latent size")
         self.training = training
         self._train, self._test = train, test
         architecture = get_architecture(training.architecture)
         count, features = train.shape
+        self._pool = pool // (features * test.element_size())  # rows
         network = Autoencoder(architecture, features, training.latent, training.seed)
         self.network = network.to(train.device)
         self.best = _copy(self.network)
@@ -231,7 +234,7 @@ class Trainer:
         rows, noise = self._train, self.training.noise
         words = np.random.SeedSequence((self.training.seed, number)).generate_state(1, np.uint64)
         generator = torch.Generator(rows.device).manual_seed(int(words[0]))
-        order = torch.randperm(rows.shape[0], generator=generator, device=rows.device)
+        order = shuffled(rows.shape[0], self._pool, generator)
         for batches in order.split(_DRAWN_AT_ONCE * self._batch_size):
             clean = rows.index_select(0, batches).T.contiguous()
             if noise:

@@ -1,5 +1,6 @@
 """Columns over all shards of a data set, scaling fitted to them, and shuffled batches."""
 
+import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,8 @@ from jbrep.errors import InputError
 
 Array = NDArray[Any]
 
-_CHUNK = 1 << 16  # rows processed at a time
+_CHUNK = 1 << 16  # rows processed at a time, at most
+_CHUNK_NUMBERS = 1 << 22  # in those rows: fewer of them where they are wide
 
 
 class Column:
@@ -89,8 +91,9 @@ class Column:
 
     def parts(self, rows: NDArray[np.int64]) -> Iterator[Array]:
         """The given rows in their order, copied some at a time."""
-        for start in range(0, len(rows), _CHUNK):
-            yield self[rows[start : start + _CHUNK]]
+        size = max(1, min(_CHUNK, _CHUNK_NUMBERS // math.prod(self.shape[1:])))
+        for start in range(0, len(rows), size):
+            yield self[rows[start : start + size]]
 
     def __repr__(self) -> str:
         return f"Column(shape={self.shape}, dtype={self.dtype}, shards={len(self._ends)})"

@@ -70,8 +70,10 @@ class Lanes:
         num_lanes: n.
         observation: the current one of each lane, (n, d) in physical units.
         arrays: the current ones of the task's `state` and `constants`, (n, width) each.
+        info: all that a batch tells of its lanes, by name, (n, ...) each.
         terminated, truncated: how each lane's episode has ended, (n,).
-        ended: whether it has, (n,).
+        active: whether it goes on, (n,).
+        num_active: in how many lanes it does.
         envs: the environments themselves: a batch, or one for each lane.
 
     Raises:
@@ -86,14 +88,20 @@ class Lanes:
         self.envs = self._engine.envs
         self.observation = np.zeros((num_lanes, task.size))
         self.arrays: Mapping[str, Array] = {}
-        self.ended = np.ones(num_lanes, dtype=np.bool_)
-        self.terminated, self.truncated = self.ended.copy(), self.ended.copy()
-        self._some_ended = True  # so that steps need not look at each lane
+        self.info: Mapping[str, Any] = {}
+        self._names = tuple(task.arrays)
+        self.terminated = self.truncated = np.ones(num_lanes, dtype=np.bool_)
+        self._count()
         self._seeds = np.zeros(num_lanes, np.int64)
         self._steps = np.zeros(num_lanes, np.int64)
 
     def __repr__(self) -> str:
         return f"Lanes({self.task.name}, {self.num_lanes:,})"
+
+    @property
+    def ended(self) -> Flags:
+        """Whether each lane's episode has ended, (n,)."""
+        return ~self.active
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int]) -> Array:
         """Start an episode in each of the lanes, with its seed.
@@ -105,11 +113,11 @@ class Lanes:
         self._seeds[at], self._steps[at] = seeds, 0
         self.terminated, self.truncated = self.terminated.copy(), self.truncated.copy()
         self.terminated[at] = self.truncated[at] = False
-        self._set_ended()
+        self._count()
         observation, info = self._engine.reset(lanes, seeds)
         self._check(observation, np.zeros(self.num_lanes), "reset gave")
         self._see(observation, info)
-        return self.observation
+        return observation
 
     def step(self, actions: ArrayLike) -> Step:
         """Take one step in every lane whose episode goes on.
@@ -121,19 +129,22 @@ class Lanes:
                 finite; the message has the lane's seed and step.
         """
         checked = check_actions(actions, self.num_lanes, self.task.action_size)
-        active = ~self.ended
+        active = self.active
         self._steps += active
         observation, reward, terminated, truncated, info = self._engine.step(checked, active)
-        if self._some_ended:
-            observation = np.where(active[:, None], observation, self.observation)
+        arrays = {name: info[name] for name in self._names}
+        if self.num_active < self.num_lanes:
+            here = active[:, None]
+            observation = np.where(here, observation, self.observation)
+            arrays = {n: np.where(here, values, self.arrays[n]) for n, values in arrays.items()}
             reward = np.where(active, reward, 0.0)
             terminated = np.where(active, terminated, self.terminated)
             truncated = np.where(active, truncated, self.truncated)
         self._check(observation, reward, "gave")
+        self.observation, self.arrays, self.info = observation, arrays, info
         self.terminated, self.truncated = terminated, truncated
-        self._set_ended()
-        self._see(observation, info)
-        return Step(observation, reward, terminated, truncated, self.arrays)
+        self._count()
+        return Step(observation, reward, terminated, truncated, arrays)
 
     @property
     def state(self) -> State:
@@ -156,10 +167,10 @@ class Lanes:
         engine = dict(state)
         self._seeds, self._steps = engine.pop("seeds").copy(), engine.pop("steps").copy()
         self.terminated, self.truncated = engine.pop("terminated"), engine.pop("truncated")
-        self._set_ended()
+        self._count()
         expected = engine.pop("observation")
         observation, info = self._engine.restore(engine)
-        observation = np.where(self.ended[:, None], expected, observation)
+        observation = np.where(self.active[:, None], observation, expected)
         if observation.tobytes() != expected.astype(np.float64).tobytes():
             raise InputError(
                 f"{self.task.name} is not reproducible here: the same seed and actions lead to "
@@ -171,13 +182,13 @@ class Lanes:
         """Free what the environments hold."""
         self._engine.close()
 
-    def _set_ended(self) -> None:
-        self.ended = self.terminated | self.truncated
-        self._some_ended = bool(self.ended.any())
-
     def _see(self, observation: Array, info: Mapping[str, Any]) -> None:
-        self.observation = observation
-        self.arrays = {name: info[name] for name in self.task.arrays}
+        self.observation, self.info = observation, info
+        self.arrays = {name: info[name] for name in self._names}
+
+    def _count(self) -> None:
+        self.active = ~(self.terminated | self.truncated)
+        self.num_active = int(np.count_nonzero(self.active))
 
     def _check(self, observation: Array, reward: Array, did: str) -> None:
         """Make sure that all numbers are finite."""
@@ -233,7 +244,8 @@ class _Separate:
             make_env(task.id, task.arguments, task.max_episode_steps) for _ in range(num_lanes)
         ]
         self._flat = flattener(self.envs[0].observation_space)
-        self._action: Any = self.envs[0].action_space
+        space: Any = self.envs[0].action_space
+        self._action_type, self._action_shape = space.dtype, space.shape
         self._observation = np.zeros((num_lanes, task.size))
         self._arrays = {name: np.zeros((num_lanes, w)) for name, w in task.arrays.items()}
         self._seeds = [0] * num_lanes
@@ -280,8 +292,8 @@ class _Separate:
 
     def _step(self, lane: int) -> Any:
         """Step with the last action."""
-        action = self._actions[lane][-1].astype(self._action.dtype, copy=False)
-        return self.envs[lane].step(action.reshape(self._action.shape))
+        action = self._actions[lane][-1].astype(self._action_type, copy=False)
+        return self.envs[lane].step(action.reshape(self._action_shape))
 
     def _put(self, lane: int, observation: Any, info: Mapping[str, Any]) -> None:
         flat = self._flat(observation)

@@ -26,8 +26,8 @@ class Played(NamedTuple):
 
 def play(lanes: Lanes, act: Actor) -> Iterator[Played]:
     """Step lanes until every episode has ended; while a step is yielded, they are where it led."""
-    while (active := ~lanes.ended).any():
-        observation = lanes.observation
+    while lanes.num_active:
+        observation, active = lanes.observation, lanes.active
         action = act(observation)
         yield Played(observation, action, active, lanes.step(action))
 
@@ -88,29 +88,25 @@ def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = read_nothing) -> R
         tick: called after each step.
         read: what else to record.
     """
-    start, first = _copied(lanes.arrays), _copied(read(lanes))
-    observations = [lanes.observation.astype(np.float32)]
-    actions: list[NDArray[Any]] = []
-    rewards: list[NDArray[np.float32]] = []
-    arrays = {name: [values] for name, values in first.items()}
-    length = np.zeros(lanes.num_lanes, np.int32)
+    start, reads = _copied(lanes.arrays), [_copied(read(lanes))]
+    observations = [lanes.observation]
+    actives, actions, rewards = [], [], []
     for played in play(lanes, act):
-        observations.append(played.step.observation.astype(np.float32))
+        observations.append(played.step.observation)
+        actives.append(played.active)
         actions.append(played.action)
-        rewards.append(played.step.reward.astype(np.float32))
-        for name, values in _copied(read(lanes)).items():
-            arrays[name].append(values)
-        length += played.active
-        tick(int(played.active.sum()))
+        rewards.append(played.step.reward)
+        reads.append(_copied(read(lanes)))
+        tick(int(np.count_nonzero(played.active)))
     return Recording(
         start=start,
-        observation=np.stack(observations),
-        arrays={name: np.stack(values) for name, values in arrays.items()},
+        observation=np.stack(observations).astype(np.float32),
+        arrays={name: np.stack([each[name] for each in reads]) for name in reads[0]},
         action=np.stack(actions),
-        reward=np.stack(rewards),
+        reward=np.stack(rewards).astype(np.float32),
         terminated=lanes.terminated,
         truncated=lanes.truncated,
-        length=length,
+        length=np.stack(actives).sum(axis=0, dtype=np.int32),
     )
 
 
@@ -118,7 +114,9 @@ def _copied(arrays: Mapping[str, Array]) -> dict[str, Array]:
     return {name: values.copy() for name, values in arrays.items()}
 
 
-def episode_returns(lanes: Lanes, act: Actor, first_seed: int = 0) -> Array:
+def episode_returns(
+    lanes: Lanes, act: Actor, first_seed: int = 0, tick: Tick = lambda steps: None
+) -> Array:
     """Returns of one whole episode in each lane under a policy, (n,).
 
     Lane i starts like a Gymnasium environment reset with `first_seed` + i.
@@ -127,4 +125,5 @@ def episode_returns(lanes: Lanes, act: Actor, first_seed: int = 0) -> Array:
     total = np.zeros(lanes.num_lanes)
     for played in play(lanes, act):
         total += played.step.reward
+        tick(int(played.active.sum()))
     return total

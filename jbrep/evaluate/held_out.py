@@ -1,29 +1,45 @@
 """The held-out episodes that encoders are judged on."""
 
+from collections.abc import Iterable, Sequence
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
+from jbrep.dataset.scaled import sample
 from jbrep.stats.bootstrap import Array, by_episode
 
 Rows = NDArray[np.int64]
+
+MAX_GROUPS = 1000  # of episodes, to resample
+MAX_NUMBERS = 1 << 23  # in an array of sampled rows: 64 MiB
+
+
+def sample_rows(rows: Rows, most: int, width: int) -> Rows:
+    """A sample of at most `most` rows, fewer where `width` numbers of each take much memory."""
+    return sample(rows, max(2, min(most, MAX_NUMBERS // width)))
 
 
 class HeldOut:
     """Held-out rows of a data set, by episode.
 
+    Sums are of groups of episodes, which intervals resample: a group for each episode or, of more
+    than 1,000 episodes, 1,000 groups of neighbouring ones, equally many in each give or take one.
+
     Attributes:
         data: the data set, split and scaled.
         numbers: of the held-out episodes within the data set, (episodes,).
+        num_groups: groups of episodes.
     """
 
     def __init__(self, data: ScaledDataset):
         self.data = data
         self._ends = np.cumsum(data.dataset.episodes["length"], dtype=np.int64)
         self.numbers = np.unique(self._episode(data.test))
+        self.num_groups = min(len(self.numbers), MAX_GROUPS)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -35,22 +51,41 @@ class HeldOut:
         """The position of each held-out row's episode among the held-out ones, (n,)."""
         return np.searchsorted(self.numbers, self._episode(rows))
 
+    def _group(self, rows: Rows) -> Rows:
+        return self.place(rows) * self.num_groups // len(self)
+
+    def slices(self, rows: Rows) -> list[slice]:
+        """Where the rows of each group are among these."""
+        bounds = np.searchsorted(self._group(rows), np.arange(self.num_groups + 1)).tolist()
+        return [slice(*pair) for pair in pairwise(bounds)]
+
     def followed(self, rows: Rows) -> Rows:
         """Those rows whose next row belongs to the same episode."""
         return rows[self._ends[self._episode(rows)] > rows + 1]
 
     def sums(self, rows: Rows, *values: NDArray[Any]) -> list[Array]:
-        """Sums of each array (n, k) over the rows of each held-out episode, (episodes, k)."""
-        place = self.place(rows)
-        return [by_episode(v, place, len(self)) for v in values]
+        """Sums of each array (n, k) over the rows of each group, (groups, k)."""
+        group = self._group(rows)
+        return [by_episode(v, group, self.num_groups) for v in values]
+
+    def sums_of_parts(self, rows: Rows, parts: Iterable[Sequence[NDArray[Any]]]) -> list[Array]:
+        """The same of arrays too large for memory, which come a few rows at a time."""
+        totals: list[Array] = []
+        start = 0
+        for values in parts:
+            stop = start + len(values[0])
+            sums = self.sums(rows[start:stop], *values)
+            totals = [t + s for t, s in zip(totals, sums, strict=True)] if totals else sums
+            start = stop
+        return totals
 
     @cached_property
     def row_counts(self) -> Array:
-        """Rows of each held-out episode, (episodes, 1)."""
+        """Rows of each group, (groups, 1)."""
         return self.sums(self.data.test, np.ones((len(self.data.test), 1)))[0]
 
     @cached_property
     def variation(self) -> list[Array]:
-        """Sums of scaled features and of their squares over each held-out episode."""
-        scaled = self.data.load(self.data.test)
-        return self.sums(self.data.test, scaled, scaled**2)
+        """Sums of scaled features and of their squares over each group, (groups, d)."""
+        scaled = (chunk.astype(np.float64) for chunk in self.data.chunks(self.data.test))
+        return self.sums_of_parts(self.data.test, ((chunk, chunk**2) for chunk in scaled))

@@ -1,14 +1,18 @@
-"""What can be read from a latent: the robot's state, and the next latent."""
+"""What can be read from a latent: the robot's state, and what comes next.
+
+Everything is measured on samples of rows, fewer where rows are wide: no array has more than
+MAX_NUMBERS numbers.
+"""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
-from jbrep.evaluate.held_out import HeldOut, Rows
+from jbrep.evaluate.held_out import MAX_GROUPS, MAX_NUMBERS, HeldOut, Rows, sample_rows
 from jbrep.evaluate.truth import quantities, state
 from jbrep.stats.bootstrap import Array, Interval, bootstrap, r_squared, variation
 
@@ -25,40 +29,74 @@ _PENALTY = 1.0  # of the ridge, on standardised latents
 def probes(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
     """R^2 of a ridge regression of each quantity on the latent, fitted on training rows.
 
-    The cosine and sine of an angle count together.
+    The cosine and sine of an angle count together. At most 100,000 rows are fitted to, and as many
+    judged; of more than 83 features, fewer.
     """
     data = held_out.data
-    train, test = sample(data.train, _ROWS), sample(data.test, _ROWS)
+    size = data.task.size
+    train, test = (sample_rows(rows, _ROWS, size) for rows in (data.train, data.test))
     seen, unseen = data.dataset["observation"][train], data.dataset["observation"][test]
     known, true = (quantities(data.task, rows) for rows in (seen, unseen))
-    latents, unseen_latents = encoder.encode(seen), encoder.encode(unseen)
-    scores = {}
-    for name, values in known.items():
-        predicted = _ridge().fit(latents, values).predict(unseen_latents)
-        scores[name] = _explained(predicted, true[name], test, held_out).tolist()
-    return scores
+    fitted = _fit(encoder.encode(seen), np.hstack(list(known.values())))
+    scores = _explained(
+        fitted(encoder.encode(unseen)),
+        np.hstack(list(true.values())),
+        test,
+        held_out,
+        [values.shape[1] for values in true.values()],
+    )
+    return dict(zip(true, scores.tolist(), strict=True))
+
+
+class _Steps(NamedTuple):
+    """Some rows that have a next one, with what leads to it."""
+
+    rows: Rows  # (n,)
+    latent: NDArray[Any]  # (n, l)
+    action: NDArray[Any]  # (n, k)
+    next_latent: NDArray[Any]  # (n, l)
+    change: NDArray[Any]  # of the observation to the next one, (n, d)
 
 
 def dynamics(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
-    """R^2 of the next latent: predicted linearly from latent and action, and as unchanged.
+    """How well latent and action foretell, by a ridge regression, what comes next.
 
-    The latent is whitened first, so that every direction in which it varies counts alike, however
-    its units are scaled and mixed.
+    R^2 of the next latent, predicted from latent and action, and predicted as unchanged; and R^2 of
+    the change of the observation from latent and action, each feature's change scaled to unit
+    variance. The latent is whitened first, so that every direction in which it varies counts alike,
+    however its units are scaled and mixed.
+
+    Fitted to at most 100,000 training rows and judged on as many held-out ones, fewer of more than
+    83 features; the last row of an episode is left out. None where fewer than two are left.
     """
     data = held_out.data
-    steps = []
-    for rows in (data.train, data.test):
-        chosen = held_out.followed(sample(rows, _ROWS))
-        now, then = (encoder.encode(data.dataset["observation"][r]) for r in (chosen, chosen + 1))
-        steps.append((chosen, now, data.dataset["action"][chosen], then))
-    whitened = _whitening(steps[0][1])
-    steps = [(rows, whitened(now), act, whitened(then)) for rows, now, act, then in steps]
-    (_, *known), (test, now, action, then) = steps
-    predicted = _ridge().fit(np.hstack(known[:2]), known[2]).predict(np.hstack((now, action)))
-    return {
-        "linear": _explained(predicted, then, test, held_out).tolist(),
-        "persistence": _explained(now, then, test, held_out).tolist(),
+    seen, unseen = (_steps(encoder, held_out, rows) for rows in (data.train, data.test))
+    if min(len(seen.rows), len(unseen.rows)) < 2:
+        return dict.fromkeys(("linear", "persistence", "change"), [None] * 3)
+    whitened = _whitening(seen.latent)
+    spread = seen.change.std(axis=0, dtype=np.float64)
+    spread[spread == 0] = 1
+    before, now = (np.hstack((whitened(s.latent), s.action)) for s in (seen, unseen))
+    after, then = whitened(seen.next_latent), whitened(unseen.next_latent)
+    width = after.shape[1]
+    fitted = _fit(before, np.hstack((after, seen.change / spread)))(now)
+    results = {
+        "linear": (fitted[:, :width], then),
+        "persistence": (now[:, :width], then),
+        "change": (fitted[:, width:], unseen.change / spread),
     }
+    return {
+        name: _explained(predicted, true, unseen.rows, held_out).tolist()[0]
+        for name, (predicted, true) in results.items()
+    }
+
+
+def _steps(encoder: Encoder, held_out: HeldOut, rows: Rows) -> _Steps:
+    dataset = held_out.data.dataset
+    chosen = held_out.followed(sample_rows(rows, _ROWS, held_out.data.task.size))
+    now, then = (dataset["observation"][r] for r in (chosen, chosen + 1))
+    latent, next_latent = encoder.encode(now), encoder.encode(then)
+    return _Steps(chosen, latent, dataset["action"][chosen], next_latent, then - now)
 
 
 def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
@@ -74,12 +112,15 @@ def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
     return lambda values: (values - mean) @ matrix
 
 
-def _ridge() -> Any:
+def _fit(values: NDArray[Any], wanted: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
+    """Ridge regressions of all columns (n, k) on standardised values (n, l), as a map."""
     from sklearn.linear_model import Ridge  # not at the top: it takes seconds
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    return make_pipeline(StandardScaler(), Ridge(_PENALTY))
+    model = make_pipeline(StandardScaler(), Ridge(_PENALTY))
+    model.fit(values.astype(np.float64), wanted)  # features may be as good as collinear
+    return lambda others: model.predict(others.astype(np.float64)).reshape(len(others), -1)
 
 
 def neighbours(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
@@ -89,11 +130,16 @@ def neighbours(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
     neighbours, as in the S-RL Toolbox (Raffin et al. 2018), but for thousands of rows rather than
     five, over the whole state with every dimension standardised, and with neighbours from training
     episodes only, never from the same episode. Unrelated rows give 2.
+
+    The rows are a sample of 5,000, their neighbours from one of 20,000; fewer of each of more than
+    300 features.
     """
     from sklearn.neighbors import NearestNeighbors
 
     data = held_out.data
-    test, train = sample(data.test, _QUERIES), sample(data.train, _REFERENCES)
+    size = data.task.size
+    test = sample_rows(data.test, _QUERIES, _NEIGHBOURS * size)
+    train = sample_rows(data.train, _REFERENCES, size)
     queries, references = (data.dataset["observation"][rows] for rows in (test, train))
     query_states, reference_states = (
         np.stack(list(state(data.task, rows).values()), 1) for rows in (queries, references)
@@ -119,41 +165,58 @@ def correlation(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
 
     For each dimension of the state, the largest absolute correlation with a unit of the latent; as
     in the S-RL Toolbox, but other dimensions of the state are not counted as units.
+
+    Its cost grows as latent units times dimensions of the state, so of a robot with more than 128
+    features only some dimensions are looked at, the same ones for every encoder: 48 of 348.
+    `state_dimensions` says how many there are. The rows are a sample of at most 50,000.
     """
     data = held_out.data
-    test = sample(data.test, _CORRELATED)
+    size = data.task.size
+    test = sample_rows(data.test, _CORRELATED, size)
     observation = data.dataset["observation"][test]
     truth = state(data.task, observation)
-    left, right = encoder.encode(observation), np.stack(list(truth.values()), 1)
+    names = sample(np.array(list(truth)), max(1, 2 * MAX_NUMBERS // (MAX_GROUPS * size))).tolist()
+    left, right = encoder.encode(observation), np.stack([truth[name] for name in names], 1)
     z, s = (np.asarray(v - v.mean(axis=0), np.float64) for v in (left, right))
-    products = (z[:, :, None] * s[:, None, :]).reshape(len(test), -1)
-    sums = held_out.sums(test, z, s, z**2, s**2, products, np.ones((len(test), 1)))
+    sums = held_out.sums(test, z, s, z**2, s**2, np.ones((len(test), 1)))
+    products = np.stack([z[rows].T @ s[rows] for rows in held_out.slices(test)])
 
-    def largest(z: Array, s: Array, zz: Array, ss: Array, zs: Array, n: Array) -> Array:
+    def largest(z: Array, s: Array, zz: Array, ss: Array, n: Array, zs: Array) -> Array:
         spread_z, spread_s = variation(z, zz, n), variation(s, ss, n)
-        shared = zs.reshape(*z.shape, -1) - z[..., :, None] * s[..., None, :] / n[..., None]
+        shared = zs - z[..., :, None] * s[..., None, :] / n[..., None]
         spread = np.sqrt(spread_z[..., :, None] * spread_s[..., None, :])
-        return np.where(spread > 0, np.abs(shared) / spread, 0).max(axis=-2)
+        by_name = np.where(spread > 0, np.abs(shared) / spread, 0).max(axis=-2)
+        return np.append(by_name, by_name.mean(axis=-1, keepdims=True), axis=-1)
 
-    by_name = bootstrap(largest, *sums).tolist()
+    *by_name, mean = bootstrap(largest, *sums, products).tolist()
     return {
-        "mean": bootstrap(lambda *sums: largest(*sums).mean(axis=-1), *sums).tolist(),
-        "dimensions": dict(zip(truth, by_name, strict=True)),
+        "mean": mean,
+        "dimensions": dict(zip(names, by_name, strict=True)),
+        "state_dimensions": len(truth),
     }
 
 
 def _explained(
-    predicted: NDArray[Any], true: NDArray[Any], rows: Rows, held_out: HeldOut
+    predicted: Array,
+    true: NDArray[Any],
+    rows: Rows,
+    held_out: HeldOut,
+    widths: list[int] | None = None,
 ) -> Interval:
-    """R^2 of predicted columns (n, k), all together."""
+    """R^2 of each part of predicted columns (n, k), (parts,); the columns of a part count together.
+
+    The parts have these widths; None for all columns as one part.
+    """
     true = np.asarray(true, np.float64)
-    predicted = predicted.reshape(true.shape)  # scikit-learn gives one column as (n,)
     shifted = true - true.mean(axis=0)  # keeps the digits of a small variation
     sums = held_out.sums(
         rows, (predicted - true) ** 2, shifted, shifted**2, np.ones((len(rows), 1))
     )
+    starts = np.cumsum([0, *(widths or [true.shape[1]])])[:-1]
 
     def statistic(residual: Array, total: Array, squares: Array, n: Array) -> Array:
-        return r_squared(residual.sum(axis=-1), variation(total, squares, n).sum(axis=-1))
+        about_mean = variation(total, squares, n)
+        parts = (np.add.reduceat(v, starts, axis=-1) for v in (residual, about_mean))
+        return r_squared(*parts)
 
     return bootstrap(statistic, *sums)

@@ -1,7 +1,8 @@
 """What an encoder and its decoder lose, from clean and from corrupted observations."""
 
+from collections.abc import Iterator
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
 from jbrep.evaluate.held_out import HeldOut, Rows
 from jbrep.methods.controls import Layers, linear_denoiser, pca
-from jbrep.stats.bootstrap import Array, bootstrap, r_squared, variation
+from jbrep.stats.bootstrap import Array, bootstrap, by_episode, r_squared, variation
 
 NOISES = (0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # of features scaled to [-1, 1]
 _QUANTILES = (0.5, 0.9, 0.99, 0.999, 1)
@@ -19,26 +20,31 @@ _CORRUPTED_ROWS = 100_000
 _WORST = 5
 
 
+class _Losses(NamedTuple):
+    """Squared errors of scaled features."""
+
+    sums: Array  # of each feature over each group of episodes, (groups, d)
+    by_row: NDArray[np.float32]  # means over the features of each row, (n,)
+
+    @property
+    def means(self) -> Array:
+        """Sums over each group of the means over features, (groups, 1)."""
+        return self.sums.mean(axis=1, keepdims=True)
+
+
 def reconstruction(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
     """Errors over all held-out rows, of features scaled to [-1, 1] and in physical units.
 
     They come with the error of PCA with as many components, fitted on the training part.
     """
-    data = held_out.data
-    errors = _errors(encoder, data, data.test)
-    (sums,) = held_out.sums(data.test, errors)
+    losses = _losses(encoder, held_out, held_out.data.test)
+    quantiles = np.quantile(losses.by_row, _QUANTILES).tolist()
     return {
-        "mse": bootstrap(_mean, sums, held_out.row_counts).tolist(),
-        **_compared_with_pca(encoder.latent_size, sums, held_out),
-        "features": _by_feature(sums, held_out),
-        "quantiles": dict(
-            zip(
-                map(str, _QUANTILES),
-                np.quantile(errors.mean(axis=1), _QUANTILES).tolist(),
-                strict=True,
-            )
-        ),
-        "worst_episodes": _worst(sums, held_out),
+        "mse": bootstrap(_mean, losses.means, held_out.row_counts).tolist(),
+        **_compared_with_pca(encoder.latent_size, losses.means, held_out),
+        "features": _by_feature(losses.sums, held_out),
+        "quantiles": dict(zip(map(str, _QUANTILES), quantiles, strict=True)),
+        "worst_episodes": _worst(losses.by_row, held_out),
     }
 
 
@@ -46,14 +52,13 @@ def corruption(encoder: Encoder, held_out: HeldOut) -> list[dict[str, Any]]:
     """Errors of reconstructing clean rows from corrupted ones, at each noise level.
 
     They come with the error of the corrupted rows themselves, and with that of the best linear
-    denoiser of the same latent size at that level.
+    denoiser of the same latent size at that level. All are of a sample of at most 100,000 rows.
     """
-    data = held_out.data
-    rows = sample(data.test, _CORRUPTED_ROWS)
+    rows = sample(held_out.data.test, _CORRUPTED_ROWS)
     (counts,) = held_out.sums(rows, np.ones((len(rows), 1)))
     levels = []
     for noise in NOISES:
-        (ours,) = held_out.sums(rows, _errors(encoder, data, rows, noise))
+        ours = _losses(encoder, held_out, rows, noise).means
         best = _best_linear(held_out, encoder.latent_size, noise)
         levels.append(
             {
@@ -66,49 +71,58 @@ def corruption(encoder: Encoder, held_out: HeldOut) -> list[dict[str, Any]]:
     return levels
 
 
-def _mean(squares: Array, rows: Array) -> Array:
-    """Mean over rows and features, from sums of squares (..., d)."""
-    return squares.mean(axis=-1) / rows[..., 0]
+def _mean(total: Array, rows: Array) -> Array:
+    """Mean over rows, from the sums (..., 1) of a value of each row."""
+    return (total / rows)[..., 0]
+
+
+def _losses(encoder: Encoder, held_out: HeldOut, rows: Rows, noise: float = 0) -> _Losses:
+    """What is lost of those rows, corrupted by the same noise for every encoder."""
+    by_row: list[NDArray[np.float32]] = []
+
+    def parts() -> Iterator[list[NDArray[np.float32]]]:
+        for errors in _errors(encoder, held_out.data, rows, noise):
+            by_row.append(errors.mean(axis=1))
+            yield [errors]
+
+    (sums,) = held_out.sums_of_parts(rows, parts())
+    return _Losses(sums, np.concatenate(by_row))
 
 
 def _errors(
-    encoder: Encoder, data: ScaledDataset, rows: Rows, noise: float = 0
-) -> NDArray[np.float32]:
-    """Squared errors of each scaled feature, (n, d), with the same noise for every encoder."""
+    encoder: Encoder, data: ScaledDataset, rows: Rows, noise: float
+) -> Iterator[NDArray[np.float32]]:
+    """Squared errors of each scaled feature, (n, d), some rows at a time."""
     width = data.scaler.half_width
     random = np.random.default_rng(0)
-    errors = []
     for observation in data.observations(rows):
         drawn = random.standard_normal(observation.shape, np.float32) if noise else 0
         back = encoder.decode(encoder.encode(observation + noise * drawn * width))
-        errors.append(np.square((back - observation) / width))
-    return np.concatenate(errors)
+        yield np.square((back - observation) / width)
 
 
 @lru_cache(1024)  # since encoders of one size share it
 def _best_linear(held_out: HeldOut, latent: int, noise: float) -> Array:
-    """Sums of squared errors of the best linear denoiser, by episode."""
+    """The sums over each group of the best linear denoiser's errors, (groups, 1)."""
     data = held_out.data
-    rows = sample(data.test, _CORRUPTED_ROWS)
     linear = _linear(data, linear_denoiser(latent, noise, data.moments))
-    return held_out.sums(rows, _errors(linear, data, rows, noise))[0]
+    return _losses(linear, held_out, sample(data.test, _CORRUPTED_ROWS), noise).means
 
 
 @lru_cache(1024)
 def _pca(held_out: HeldOut, latent: int) -> Array:
-    """Sums of squared errors of PCA, by episode."""
+    """The sums over each group of PCA's errors, (groups, 1)."""
     data = held_out.data
-    linear = _linear(data, pca(data, latent))
-    return held_out.sums(data.test, _errors(linear, data, data.test))[0]
+    return _losses(_linear(data, pca(data, latent)), held_out, data.test).means
 
 
 def _linear(data: ScaledDataset, layers: tuple[Layers, Layers]) -> Encoder:
     return Encoder({"name": "linear"}, data.scaler, *layers)
 
 
-def _compared_with_pca(latent: int, sums: Array, held_out: HeldOut) -> dict[str, Any]:
+def _compared_with_pca(latent: int, means: Array, held_out: HeldOut) -> dict[str, Any]:
     linear = _pca(held_out, latent)
-    ratio = bootstrap(lambda ours, pca: ours.sum(axis=-1) / pca.sum(axis=-1), sums, linear)
+    ratio = bootstrap(_mean, means, linear)
     return {
         "pca_mse": bootstrap(_mean, linear, held_out.row_counts).tolist(),
         "ratio_to_pca": ratio.tolist() if latent < held_out.data.task.size else None,
@@ -130,9 +144,12 @@ def _by_feature(sums: Array, held_out: HeldOut) -> list[dict[str, Any]]:
     ]
 
 
-def _worst(sums: Array, held_out: HeldOut) -> list[dict[str, Any]]:
+def _worst(by_row: NDArray[np.float32], held_out: HeldOut) -> list[dict[str, Any]]:
     """The episodes with the largest mean errors."""
-    errors = _mean(sums, np.maximum(held_out.row_counts, 1))
+    place = held_out.place(held_out.data.test)
+    both = np.stack((by_row, np.ones_like(by_row)), axis=1)
+    total, rows = by_episode(both, place, len(held_out)).T
+    errors = total / rows
     order = np.argsort(-errors, kind="stable")[:_WORST]
     seeds = held_out.data.dataset.episodes["seed"]
     return [

@@ -8,6 +8,7 @@ from jbrep.encoders import FULL
 from jbrep.text import interval, number, table
 
 _NOISE = 0.1  # the level of corruption that is shown
+_MANY = 8  # quantities from which probes are summed up
 
 
 def evaluation_text(evaluation: Mapping[str, Any], width: int | None = None) -> str:
@@ -24,7 +25,7 @@ def evaluation_text(evaluation: Mapping[str, Any], width: int | None = None) -> 
         "episodes",
         _losses(encoders, width),
         "What can be read from the latent: R² of linear probes; KNN-MSE (2: nothing); GTC (1: the "
-        "units are the state itself); R² of the next latent, whitened",
+        f"units are the state itself{_drawn(encoders)}); R² of the next latent, whitened",
         _readings(encoders, width),
         "Latent units: dead ones, the most saturated one, participation ratio, intrinsic dimension",
         _units(encoders, width),
@@ -58,13 +59,20 @@ def _losses(encoders: Mapping[str, Any], width: int | None) -> str:
     return table((*header, "worst feature, R²"), rows, width)
 
 
+def _drawn(encoders: Mapping[str, Any]) -> str:
+    """How many dimensions of the state the GTC looks at, if not at all."""
+    gtc = encoders[FULL]["correlation"]
+    judged, whole = len(gtc["dimensions"]), gtc.get("state_dimensions")
+    return f"; {judged} of its {whole} dimensions" if whole and judged < whole else ""
+
+
 def _readings(encoders: Mapping[str, Any], width: int | None) -> str:
-    probes = list(encoders[FULL]["probes"])
-    header = ("encoder", *(name.replace("_", " ") for name in probes), "KNN-MSE", "GTC", "next")
+    probes = {label: _probes(diagnostics["probes"]) for label, diagnostics in encoders.items()}
+    header = ("encoder", *probes[FULL], "KNN-MSE", "GTC", "next")
     rows = [
         (
             label,
-            *(number(diagnostics["probes"][name][0], ".2f") for name in probes),
+            *probes[label].values(),
             number(diagnostics["neighbours"]["mse"][0], ".2f"),
             number(diagnostics["correlation"]["mean"][0], ".2f"),
             number(diagnostics["dynamics"]["linear"][0], ".2f"),
@@ -72,6 +80,20 @@ def _readings(encoders: Mapping[str, Any], width: int | None) -> str:
         for label, diagnostics in encoders.items()
     ]
     return table(header, rows, width)
+
+
+def _probes(scores: Mapping[str, Any]) -> dict[str, str]:
+    """R² of each quantity; of many, of those that vary, the mean and the least."""
+    if len(scores) <= _MANY:
+        return {name.replace("_", " "): number(score[0], ".2f") for name, score in scores.items()}
+    known = {name: score[0] for name, score in scores.items() if score[0] is not None}
+    if not known:
+        return {"probes, mean": "-", "worst probe": "-"}
+    worst = min(known, key=known.__getitem__)
+    return {
+        "probes, mean": number(sum(known.values()) / len(known), ".2f"),
+        "worst probe": f"{worst} {number(known[worst], '.2f')}",
+    }
 
 
 def _units(encoders: Mapping[str, Any], width: int | None) -> str:

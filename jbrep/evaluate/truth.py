@@ -1,59 +1,121 @@
-"""The robot's state in terms of heading, speed and angles, computed from observations."""
+"""The ground truth of a robot, computed from its observations: what a latent is searched for."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jbrep.jitterbug.tasks import Task
+from jbrep.jitterbug.tasks import TASKS
 
 Array = NDArray[np.float64]
+Columns = dict[str, Array]
 
-_REPLACED = ("orientation_w", "orientation_x", "orientation_y", "orientation_z")
-_ANGLES = ("motor_angle", "angle_to_target")
+_TURN = 2 * math.pi  # [rad]
+_ROTATION = ("orientation_w", "orientation_x", "orientation_y", "orientation_z")
 
 
-def quantities(task: Task, observation: ArrayLike) -> dict[str, Array]:
+class Task(Protocol):
+    """What the ground truth needs to know of a task."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def features(self) -> Sequence[Any]:
+        """Its features, each with name, unit, low, high and whether it is bounded."""
+
+
+class _Truth(NamedTuple):
+    """The ground truth of a task.
+
+    Attributes:
+        quantities: computed from the features (n,) by name, (n, k) each.
+        replaced: the features that the quantities say everything about.
+    """
+
+    quantities: Callable[[Columns], Columns]
+    replaced: frozenset[str]
+
+
+def quantities(task: Task, observation: ArrayLike) -> Columns:
     """What a controller needs to know from observations (n, d) in physical units.
 
-    Angles are cosine and sine, (n, 2); the rest is (n, 1): the heading of the robot's face in the
-    world, its uprightness (cosine of the tilt), its forward speed [m/s], the motor's phase, and, if
-    the task has them, the angle to the target's yaw and the bearing of the target's position from
-    the face, counter-clockwise.
+    An angle is its cosine and sine, (n, 2); the rest is (n, 1). Of the Jitterbug: the heading of
+    its face in the world, its uprightness (cosine of the tilt), its forward speed [m/s], the
+    motor's phase, and, if the task has them, the angle to the target's yaw and the bearing of the
+    target's position from the face, counter-clockwise. Of any other robot: every feature; it is an
+    angle if its unit is rad and it is bounded to one turn.
     """
-    return _quantities(_features(task, observation))
+    return _truth(task).quantities(_features(task, observation))
 
 
-def state(task: Task, observation: ArrayLike) -> dict[str, Array]:
+def state(task: Task, observation: ArrayLike) -> Columns:
     """The whole state as columns (n,) by name: the quantities above and all other features."""
-    features = _features(task, observation)
-    columns: dict[str, Array] = {}
-    for name, values in _quantities(features).items():
+    features, truth = _features(task, observation), _truth(task)
+    columns: Columns = {}
+    for name, values in truth.quantities(features).items():
         endings = ("_cos", "_sin") if values.shape[1] == 2 else ("",)
         columns |= {name + end: column for end, column in zip(endings, values.T, strict=True)}
-    others = features.keys() - {*_REPLACED, *_ANGLES}
+    others = features.keys() - truth.replaced
     return columns | {name: features[name] for name in features if name in others}
 
 
-def _features(task: Task, observation: ArrayLike) -> dict[str, Array]:
+def _truth(task: Task) -> _Truth:
+    """A task's own ground truth, or every feature."""
+    if task.name in _TRUTHS:
+        return _TRUTHS[task.name]
+    angles = frozenset(f.name for f in task.features if _is_angle(f))
+    everything = frozenset(f.name for f in task.features)
+    return _Truth(lambda features: _every(features, angles), everything)
+
+
+def _is_angle(feature: Any) -> bool:
+    """Whether a feature jumps from one end of its range to the other."""
+    if feature.unit != "rad" or not feature.bounded:
+        return False
+    return math.isclose(feature.high - feature.low, _TURN, rel_tol=0.01)
+
+
+def _features(task: Task, observation: ArrayLike) -> Columns:
     columns = np.asarray(observation, np.float64).T
-    return dict(zip(task.feature_names, columns, strict=True))
+    return dict(zip((f.name for f in task.features), columns, strict=True))
 
 
-def _quantities(f: dict[str, Array]) -> dict[str, Array]:
-    w, x, y, z = (f[name] for name in _REPLACED)
+def _every(features: Columns, angles: frozenset[str]) -> Columns:
+    return {
+        name: _on_circle(column) if name in angles else column[:, None]
+        for name, column in features.items()
+    }
+
+
+def _jitterbug(f: Columns) -> Columns:
+    w, x, y, z = (f[name] for name in _ROTATION)
     face = _direction(2 * (w * z - x * y), 2 * (x * x + z * z) - 1)  # the robot's -Y axis
     speed = face[:, 0] * f["velocity_x"] + face[:, 1] * f["velocity_y"]
     columns = {
         "heading": face,
         "uprightness": (1 - 2 * (x * x + y * y))[:, None],
         "forward_speed": speed[:, None],
-        "motor_phase": _direction(np.cos(f["motor_angle"]), np.sin(f["motor_angle"])),
+        "motor_phase": _on_circle(f["motor_angle"]),
     }
     if "angle_to_target" in f:
-        angle = f["angle_to_target"]
-        columns["angle_to_target"] = _direction(np.cos(angle), np.sin(angle))
+        columns["angle_to_target"] = _on_circle(f["angle_to_target"])
     if "target_x" in f:
         columns["bearing_of_target"] = _direction(-f["target_y"], f["target_x"])
     return columns
+
+
+_TRUTHS = dict.fromkeys(
+    TASKS, _Truth(_jitterbug, frozenset((*_ROTATION, "motor_angle", "angle_to_target")))
+)
+
+
+def _on_circle(angle: Array) -> Array:
+    """Cosine and sine, (n, 2)."""
+    return np.stack((np.cos(angle), np.sin(angle)), axis=1)
 
 
 def _direction(x: Array, y: Array) -> Array:

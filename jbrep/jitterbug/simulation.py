@@ -8,10 +8,11 @@ from mujoco.batch import Batch
 from numpy.typing import ArrayLike, NDArray
 
 from jbrep.envs.checks import check_counts
-from jbrep.jitterbug import model
+from jbrep.jitterbug import bodies, model
 from jbrep.jitterbug.tasks import QUATERNION, Array, JitterbugTask, Readings, yaw_direction
 
 _UP_TO_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 # on a position, velocity or acceleration that isn't finite, MuJoCo warns and resets the lane
 _NOT_FINITE = slice(
     int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1
@@ -27,31 +28,46 @@ class Simulation:
         task: what is observed and rewarded.
         num_lanes: n, the number of robots.
         num_threads: threads to step them on; None takes one for each core.
+        body: number of the robots' body, 0 to 2^31 - 1, "random" for another in each episode, or
+            None for the published robot's; see `jbrep.jitterbug.bodies`.
+        materials: bodies differ in their densities and the motor's gear, too.
 
     Attributes:
         readings: what the tasks read of the current states; a new object after each step.
-        model: the compiled MuJoCo model.
         target_quaternion: of the lanes' targets, (n, 4).
 
     Raises:
-        InputError: a number below 1.
+        InputError: a number below 1; no such body.
     """
 
-    def __init__(self, task: JitterbugTask, num_lanes: int, num_threads: int | None = None):
+    def __init__(
+        self,
+        task: JitterbugTask,
+        num_lanes: int,
+        num_threads: int | None = None,
+        body: int | str | None = None,
+        materials: bool = False,
+    ):
         check_counts(num_lanes, num_threads)
+        bodies.check_body(body, materials)
         model.stop_profiling()
         self.task = task
         self.num_lanes = num_lanes
-        self.model = model.fast_model()
+        self._body = body
+        self._materials = materials
+        first = body if isinstance(body, int) else bodies.PUBLISHED
+        self._numbers = np.full(num_lanes, first, np.int64)
+        self._models = [model.fast_model(self._drawn(first))] * num_lanes
+        self._shown: dict[int, mujoco.MjModel] = {}
         # persistent: a step reuses what has already been computed for the readings
-        self._batch = Batch(self.model, num_lanes, num_threads or 0, persistent=True)
+        self._batch = Batch(self._models[0], num_lanes, num_threads or 0, persistent=True)
         self._control = self._batch.bind("ctrl")
-        body = self.model.body("jitterbug").id
+        core = self._models[0].body("jitterbug").id
         self._warnings = self._batch.warning[:, _NOT_FINITE, 1]
         self._views = (
             self._batch.bind("qpos"),
             self._batch.bind("qvel"),
-            self._batch.bind("xmat")[:, body],
+            self._batch.bind("xmat")[:, core],
             self._batch.bind("sensordata"),
             self._batch.bind("mocap_pos")[:, 0],
             np.zeros((num_lanes, 2)),
@@ -64,7 +80,12 @@ class Simulation:
         return f"Simulation({self.task.name}, {self.num_lanes:,} lanes)"
 
     def reset(self, lanes: Sequence[int], randoms: Iterable[np.random.Generator]) -> None:
-        """Start an episode in each of the lanes, drawn from its own generator."""
+        """Start an episode in each of the lanes, drawn from its own generator.
+
+        A random body doesn't change what else is drawn from the generator, now or later.
+        """
+        randoms = list(randoms)
+        self._put_bodies(lanes, [bodies.number_of(self._body, random) for random in randoms])
         self._batch.reset(lanes, stage=mujoco.mjtStage.mjSTAGE_NONE)
         for lane, random in zip(lanes, randoms, strict=True):
             start = self.task.start(random)
@@ -74,16 +95,24 @@ class Simulation:
         self._forward(lanes)
 
     @property
+    def body_numbers(self) -> Array:
+        """The number of each lane's body, -1 for the published one, (n,)."""
+        return self._numbers.astype(np.float64)
+
+    @property
     def state(self) -> dict[str, Array]:
-        """A copy of what `restore` takes."""
+        """A copy of what `restore` takes, (n, ...) each; with `body` if there are other bodies."""
         now = self.readings
-        return {
+        state = {
             "qpos": now.qpos.copy(),
             "qvel": now.qvel.copy(),
             "target_position": now.target_position.copy(),
             "target_quaternion": self.target_quaternion.copy(),
             "warmstart": self._warmstart.copy(),
         }
+        if self._body is not None or (self._numbers != bodies.PUBLISHED).any():
+            state["body"] = self.body_numbers
+        return state
 
     def restore(
         self,
@@ -92,13 +121,17 @@ class Simulation:
         target_position: Array,
         target_quaternion: Array,
         warmstart: ArrayLike = 0.0,
+        body: Array | None = None,
     ) -> None:
         """Put all lanes in stored states: (n, 16), (n, 15), (n, 3) and (n, 4).
 
         The same actions then lead through the same states, bit for bit. After an episode's first
-        state this also takes the warm start (n, 15) of MuJoCo's solver.
+        state this also takes the warm start (n, 15) of MuJoCo's solver. `body` holds the numbers
+        of the bodies (n,), -1 for the published robot's; without it, the lanes keep theirs.
         """
         lanes = range(self.num_lanes)
+        if body is not None:
+            self._put_bodies(lanes, body)
         self._batch.reset(lanes, stage=mujoco.mjtStage.mjSTAGE_NONE)
         self.readings.qpos[:] = qpos
         self.readings.qvel[:] = qvel
@@ -106,6 +139,20 @@ class Simulation:
         self.target_quaternion[:] = target_quaternion
         self._warmstart[:] = warmstart
         self._forward(lanes)
+
+    def _drawn(self, number: int) -> bodies.Body | None:
+        return None if number == bodies.PUBLISHED else bodies.draw(number, self._materials)
+
+    def _put_bodies(self, lanes: Sequence[int], numbers: Iterable[float]) -> None:
+        changed = False
+        for lane, number in zip(lanes, numbers, strict=True):
+            if number != self._numbers[lane]:
+                self._numbers[lane] = number
+                self._models[lane] = model.fast_model(self._drawn(int(number)))
+                changed = True
+        if changed:
+            self._batch.set_models(self._models)
+            self._shown.clear()
 
     def _forward(self, lanes: Sequence[int]) -> None:
         self.readings.target_axis[:] = yaw_direction(self.target_quaternion)
@@ -132,8 +179,17 @@ class Simulation:
         """The rewards of the current states, (n,)."""
         return self.task.reward(self.readings)
 
+    def model_of(self, lane: int) -> mujoco.MjModel:
+        """The model of a lane's robot as described; a new one once it has another body."""
+        number = int(self._numbers[lane])
+        if number not in self._shown:
+            self._shown[number] = model.plain_model(self._drawn(number))
+        return self._shown[number]
+
     def copy_data(self, lane: int, data: mujoco.MjData | None = None) -> mujoco.MjData:
-        """A lane as a MuJoCo data object with positions up to date, to render or inspect."""
-        data = self._batch.get_data(lane, data)
-        mujoco.mj_fwdPosition(self.model, data)
+        """A lane as a MuJoCo data object of `model_of(lane)`, to render or inspect."""
+        shown = self.model_of(lane)
+        data = data or mujoco.MjData(shown)
+        mujoco.mj_setState(shown, data, self._batch.state[lane], _STATE)
+        mujoco.mj_forward(shown, data)
         return data

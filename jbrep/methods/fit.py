@@ -21,8 +21,7 @@ from jbrep.dae.training import (
     get_device,
 )
 from jbrep.dataset import ScaledDataset
-from jbrep.dataset.scaled import sample
-from jbrep.encoders import Encoder, load, save
+from jbrep.encoders import FULL, Encoder, load, save
 from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import HELD_OUT_MSE, SUFFIX
 from jbrep.encoders.names import EncoderName
@@ -31,10 +30,9 @@ from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder
 from jbrep.methods.controls import Layers, pca, random_projection
 from jbrep.methods.held_out import held_out_error
-from jbrep.methods.rows import load_rows, training_rows
+from jbrep.methods.rows import training_rows, watched_rows
 from jbrep.progress import Progress
 
-_WATCHED = 100_000  # held-out rows whose loss is reported after each epoch
 _TRAINED = ("latent", "architecture", "epochs", "batch_size", "learning_rate", "seed")
 
 
@@ -93,12 +91,21 @@ class Fitter:
         data: to learn from.
         folder: created if it doesn't exist.
         device: to train on: cpu, cuda, or auto.
+        memory: bytes that training rows may take: more are read from disk in each epoch, to the
+            same file; None for half of what is free.
     """
 
-    def __init__(self, data: ScaledDataset, folder: Path, device: str = "auto"):
+    def __init__(
+        self,
+        data: ScaledDataset,
+        folder: Path,
+        device: str = "auto",
+        memory: int | None = None,
+    ):
         self._data = data
         self._folder = folder
         self._device = get_device(device)
+        self._memory = memory
 
     def fit(self, kind: str, training: Training) -> Fitted:
         """Make an encoder, unless its file is complete already.
@@ -136,7 +143,7 @@ class Fitter:
             settings["batch_size"] = training.batch_size or default_batch_size(
                 len(self._data.train)
             )
-        _check(kind, settings, self._data.task.size)
+        _check(kind, settings, self._data)
         header = self._header(kind, settings)
         return header, self._folder / f"{header['name']}{SUFFIX}"
 
@@ -148,6 +155,7 @@ class Fitter:
             "kind": kind,
             "name": str(EncoderName(kind, **parts)),
             "task": self._data.task.name,
+            "environment": self._data.task.as_json(),
             "features": list(self._data.task.feature_names),
             "training": settings,
             "data": {
@@ -212,19 +220,29 @@ class Fitter:
     @cached_property
     def _rows(self) -> tuple[Rows, Tensor]:
         """Training rows, and a sample of the held-out ones, on the device."""
-        watched = sample(self._data.test, _WATCHED)
-        train = training_rows(self._data, self._device)
-        return train, load_rows(self._data, watched, self._device)
+        train = training_rows(self._data, self._device, self._memory)
+        return train, watched_rows(self._data, self._device)
 
 
-def _check(kind: str, settings: Mapping[str, Any], size: int) -> None:
-    """Make sure that a kind's settings fit observations of that size.
+def _check(kind: str, settings: Mapping[str, Any], data: ScaledDataset) -> None:
+    """Make sure that an encoder of that kind, with those settings, can be made from the data.
 
     Raises:
-        InputError: they don't.
+        InputError: it can't.
     """
+    size = data.task.size
+    try:
+        Encoder({"name": kind}, data.scaler, (), ())
+    except InputError as error:
+        raise InputError(
+            f"the observations in {data.dataset.folder} are too large to be encoded: {error}"
+        ) from None
     if "latent" in settings:
         latent = settings["latent"]
+        if size == 1:
+            raise InputError(
+                f"{data.task.name} has one feature, which can't be reduced: use {FULL}"
+            )
         if latent is None:
             raise InputError(f"{kind} needs a latent size, from 1 to {size - 1}")
         if not 1 <= latent < size:
