@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jbrep.envs.checks import check_actions
+from jbrep.envs.checks import NonFiniteActionError, check_actions
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import get_task
@@ -95,13 +95,14 @@ def test_numbers_below_one_are_refused(lanes, threads):
         Simulation(get_task("face_direction"), lanes, threads)
 
 
+@pytest.mark.parametrize("size", [1, 3])
 @pytest.mark.parametrize("actions", [np.zeros(2), np.zeros((2, 2)), np.zeros((3, 1)), 0.5])
-def test_actions_of_another_shape_are_refused(actions):
-    with pytest.raises(InputError, match=r"actions have shape .*: it must be \(2, 1\)"):
-        check_actions(actions, 2, 1)
+def test_actions_of_another_shape_are_refused(actions, size):
+    with pytest.raises(InputError, match=rf"actions have shape .*: it must be \(2, {size}\)"):
+        check_actions(actions, 2, size)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_actions_that_are_not_finite_are_refused(value):
-    with pytest.raises(InputError, match="actions are not finite"):
+    with pytest.raises(NonFiniteActionError, match="actions are not finite"):
         check_actions(np.array([[0.0], [value]]), 2, 1)
