@@ -1,5 +1,6 @@
 """Text for a terminal: numbers, tables and facts that fit its width."""
 
+import re
 import shutil
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -79,3 +80,11 @@ def number(value: float | None, form: str) -> str:
     if form == SIGNIFICANT and abs(value) >= 1000:
         form = ",.0f"  # 1,190, not 1.19e+03
     return format(value, f"z{form}")  # no negative zero
+
+
+def slug(text: str) -> str:
+    """A name for a file or folder: a hyphen for each character but letters, digits, '.', '_', '-'.
+
+    Letters are those of ASCII: dm_control/cheetah-run-v0 becomes dm_control-cheetah-run-v0.
+    """
+    return re.sub(r"[^A-Za-z0-9._-]", "-", text)

@@ -15,19 +15,22 @@ import onnxruntime
 import pytest
 import safetensors.numpy
 import torch
+from command import jbrep
 
 from jbrep.dataset import DamageError, Scaler
 from jbrep.encoders import Encoder, Layer, find, load, save, shipped
-from jbrep.encoders.card import card, describe
+from jbrep.encoders.card import card
+from jbrep.encoders.card import describe as described
 from jbrep.encoders.file import fingerprint
 from jbrep.encoders.onnx import export
 from jbrep.encoders.shipped import names, source_of
-from jbrep.envs import JitterbugVecEnv
+from jbrep.envs import Feature, JitterbugVecEnv, Task, describe
 from jbrep.errors import InputError
 from jbrep.files import container
 from jbrep.jitterbug.tasks import TASKS
 
-TASK = TASKS["face_direction"]
+TASK = describe("face_direction")
+PENDULUM = describe("Pendulum-v1", {"g": 1.6})
 RANDOM = np.random.default_rng(0)
 
 
@@ -36,21 +39,28 @@ def layer(inputs, outputs, activation):
     return Layer(weight.astype(np.float32), bias.astype(np.float32), activation)
 
 
-def header(**changes):
-    facts = {"kind": "dae", "name": "dae-3", "task": TASK.name}
+def header(task=TASK, **changes):
+    facts = {"kind": "dae", "name": "dae-3", "task": task.name, "environment": task.as_json()}
     records = {"training": {"latent": 3}, "data": {"seed": 0}, "versions": {}}
     records["metrics"] = {"held_out_mse": 0.1}
-    return {**facts, "features": list(TASK.feature_names), **records, **changes}
+    return {**facts, "features": list(task.feature_names), **records, **changes}
 
 
-def make(encoder=None, decoder=None, **changes):
-    low = -np.arange(1, 17, dtype=np.float32)
+def make(encoder=None, decoder=None, task=TASK, **changes):
+    size = task.size
+    low = -np.arange(1, size + 1, dtype=np.float32)
     return Encoder(
-        header(**changes),
+        header(task, **changes),
         Scaler(low, 2 - low),
-        encoder or (layer(16, 5, "relu"), layer(5, 3, "tanh")),
-        decoder or (layer(3, 16, "linear"),),
+        encoder or (layer(size, 5, "relu"), layer(5, 3, "tanh")),
+        decoder or (layer(3, size, "linear"),),
     )
+
+
+def numbered(size, **features):
+    """A task of which nothing is known but the size of its observations."""
+    named = tuple(Feature(f"obs_{i}", **features) for i in range(size))
+    return Task(f"Robot{size}-v0", f"Robot{size}-v0", named, (-1.0,), (1.0,), 1000)
 
 
 @pytest.fixture
@@ -199,11 +209,19 @@ def test_hostile_sizes_end_at_once(tmp_path):
 
 def forged(encoder, path, **changes):
     """A file with a valid checksum over whatever a forger chose."""
-    head = {"format": "jbrep encoder", "format_version": 1, **encoder.header}
+    head = {"format": "jbrep encoder", "format_version": 2, **encoder.header}
     head |= {"encoder": ["relu", "tanh"], "decoder": ["linear"], **changes.pop("header", {})}
     tensors = {n: t for n, t in {**encoder.tensors(), **changes}.items() if t is not None}
     container.write(path, tensors, head)
     return path
+
+
+def nested(levels):
+    """An environment with an argument of so many lists in lists."""
+    deep = []
+    for _ in range(levels):
+        deep = [deep]
+    return {**TASK.as_json(), "arguments": {"deep": deep}}
 
 
 @pytest.mark.parametrize(
@@ -254,7 +272,15 @@ def forged(encoder, path, **changes):
         ({"header": {"name": "\x1b[2J"}}, "invalid encoder name .*: use lower-case letters"),
         ({"header": {"metrics": 3}}, "the header has no metrics"),
         ({"header": {"metrics": {"held_out_mse": float("inf")}}}, "number that is not finite"),
-        ({"header": {"format_version": 2}}, "has format version 2"),
+        ({"header": {"environment": 7}}, "the header has no environment, or not as a dict"),
+        ({"header": {"environment": {}}}, "environment of dae-3 can't be used: a task must be"),
+        ({"header": {"environment": nested(600)}}, "environment of dae-3 can't be used"),
+        ({"header": {"task": "Ant-v5"}}, "is for Ant-v5, but its environment is face_direction"),
+        (
+            {"header": {"features": [*TASK.feature_names[:15], "angle"]}},
+            "dae-3 has angle as feature 15, where face_direction has angle_to_target",
+        ),
+        ({"header": {"format_version": 3}}, "has format version 3"),
         ({"header": {"format_version": 0}}, "its format version is 0"),
         ({"header": {"format_version": -1}}, "its format version is -1"),
         ({"header": {"format": "other"}}, "is not a jbrep encoder"),
@@ -305,21 +331,48 @@ def test_tampering_with_a_weight_is_found(encoder, tmp_path):
         load(tmp_path / "encoder")
 
 
-def test_features_that_differ_are_named(encoder):
+def test_an_encoder_of_another_environment_or_other_features_is_refused(encoder):
     encoder.check_task(TASK)
-    with pytest.raises(
-        InputError, match="made for face_direction, whose features differ from thos"
-    ):
-        encoder.check_task(TASKS["move_to_pose"])
+    with pytest.raises(InputError, match="made for face_direction, not for move_to_pose"):
+        encoder.check_task(describe("move_to_pose"))
+    one, other = numbered(3), replace(PENDULUM, name="other", id="other")
+    assert one.feature_names == PENDULUM.feature_names  # as of every robot of three features
+    for task in (one, other):
+        with pytest.raises(
+            InputError, match=f"dae-3 was made for Pendulum-v1, not for {task.name}"
+        ):
+            make(task=PENDULUM).check_task(task)
+    renamed = replace(PENDULUM, features=(Feature("x"), Feature("y"), Feature("speed")))
+    with pytest.raises(InputError, match="dae-3 was made for other features of Pendulum-v1"):
+        make(task=PENDULUM).check_task(renamed)
+    make(task=PENDULUM).check_task(describe("Pendulum-v1"))  # with other arguments
+
+
+def old(encoder, features):
+    """The same as version 1 had it, with those features."""
+    facts = {name: value for name, value in encoder.header.items() if name != "environment"}
+    return replace(encoder, header={**facts, "features": list(features)})
+
+
+def test_version_1_is_of_the_jitterbug_and_features_that_differ_are_named(encoder, tmp_path):
+    save(old(encoder, TASK.feature_names), tmp_path / "old")
+    assert b'\\"format_version\\": 1' in (tmp_path / "old").read_bytes()
+    assert load(tmp_path / "old").task == TASK
     permuted = list(TASK.feature_names)
     permuted[4], permuted[7] = permuted[7], permuted[4]
     with pytest.raises(
         InputError, match="velocity_x as feature 4, where face_direction has orientation_x"
     ):
-        replace(encoder, header=header(features=permuted)).check_task(TASK)
-    fewer = replace(encoder, header=header(features=list(TASK.feature_names[:15])))
+        old(encoder, permuted).check_task(TASK)
     with pytest.raises(InputError, match=r"has nothing as feature 15, where .* angle_to_target"):
-        fewer.check_task(TASK)
+        old(encoder, TASK.feature_names[:15]).check_task(TASK)
+
+
+def test_the_environment_comes_back_from_the_file(tmp_path):
+    save(make(task=PENDULUM), tmp_path / "it")
+    again = load(tmp_path / "it")
+    assert again.task == PENDULUM
+    assert again.task.arguments == {"g": 1.6}
 
 
 def test_the_environment_shows_latents_and_refuses_another_task(encoder):
@@ -341,7 +394,7 @@ def test_onnx_gives_what_torch_gives(encoder, rows, tmp_path):
     np.testing.assert_allclose(latent, tensor.numpy(), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(back, encoder.decode(tensor).numpy(), rtol=1e-4, atol=1e-4)
     stored = session.get_modelmeta().custom_metadata_map["jbrep"]
-    assert json.loads(stored)["features"] == list(TASK.feature_names)
+    assert json.loads(stored)["environment"] == TASK.as_json()
     with pytest.raises(InputError, match=r"it.onnx exists already"):
         export(encoder, tmp_path / "it.onnx")
 
@@ -351,30 +404,38 @@ def test_the_card_tells_layers_and_ranges_and_fits_the_terminal(encoder):
     assert "16 -> 5 relu -> 3 tanh" in text
     assert "encoders/dae-3.safetensors" in text
     assert fingerprint(encoder) in text
-    assert re.search(r"motor_velocity +-15 +17", text)
+    assert re.search(r"environment +Jitterbug/FaceDirection-v0\n", text)
+    assert re.search(r"motor_velocity \[rad/s\] +-15 +17", text)
+    of_pendulum = card(make(task=PENDULUM), "here", 80)
+    assert re.search(r"environment +Pendulum-v1, g=1.6\n", of_pendulum)
+    assert re.search(r"\nobs_2 +-3 +5", of_pendulum)
     for name in ("dae-8", "full"):
-        lines = card(find(name, TASK.name), f"{name}, shipped", 80).splitlines()
+        lines = card(find(name, TASK), f"{name}, shipped", 80).splitlines()
         assert max(map(len, lines)) <= 80
 
 
 def test_the_card_as_json_has_the_same(encoder):
-    told = json.loads(json.dumps(describe(encoder, "here")))
+    told = json.loads(json.dumps(described(encoder, "here")))
     assert told["encoder"] == [
         {"units": 5, "activation": "relu"},
         {"units": 3, "activation": "tanh"},
     ]
-    assert told["features"][13] == {"name": TASK.feature_names[13], "low": -14, "high": 16}
+    feature = {"name": "motor_angle", "unit": "rad", "low": -14, "high": 16}
+    assert told["features"][13] == feature
     assert (told["source"], told["sha256"]) == ("here", fingerprint(encoder))
+    assert (told["environment"], told["arguments"]) == ("Jitterbug/FaceDirection-v0", {})
+    assert described(make(task=PENDULUM), "here")["arguments"] == {"g": 1.6}
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_encoders_ship_for_every_task(task):
+@pytest.mark.parametrize("name", TASKS)
+def test_encoders_ship_for_every_task_of_the_jitterbug(name):
+    task = describe(name)
     sizes = [f"{kind}-{latent}" for kind in ("dae", "pca", "random") for latent in (12, 8, 4)]
     assert names(task) == (*sizes[:3], "full", *sizes[3:])
     errors = {}
     for name in names(task):
         encoder = find(name, task)
-        encoder.check_task(TASKS[task])
+        assert encoder.task == task
         source = encoder.header["data"]
         assert source["train_rows"] + source["test_rows"] == 5_000_000
         assert source["fingerprint"] == find("full", task).header["data"]["fingerprint"]
@@ -394,10 +455,59 @@ def test_shipped_files_keep_their_bytes_when_saved_again(tmp_path):
 
 
 def test_the_full_observation_goes_by_one_name(encoder):
-    full = find("full", TASK.name)
-    assert fingerprint(full) == fingerprint(find("identity", TASK.name))
+    full = find("full", TASK)
+    assert fingerprint(full) == fingerprint(find("identity", TASK))
     assert (full.representation, encoder.representation) == ("full", "dae-3")
-    assert source_of("full", TASK.name) == "full, shipped"
+    assert source_of("full", TASK) == "full, shipped"
+
+
+@pytest.mark.parametrize(
+    ("task", "source", "reading"),
+    [
+        (PENDULUM, "full, scaled by the usual ranges", (1, 1, 8)),
+        (numbered(3), "full, unscaled", (1, 1, 1)),
+        (numbered(3, low=-1e20, high=1e20), "full, unscaled", (1, 1, 1)),
+        (numbered(3, low=1.0, high=1.0 + 1e-12), "full, unscaled", (1, 1, 1)),
+        (
+            replace(numbered(2), features=(Feature("x", "m", -2.0, 4.0), Feature("y"))),
+            "full, scaled by the usual ranges where they are known",
+            (4, 1),
+        ),
+    ],
+)
+def test_the_full_observation_of_any_task(task, source, reading, tmp_path):
+    """It is scaled where it can be, and says whether it is."""
+    full = find("full", task)
+    assert source_of("full", task) == source
+    np.testing.assert_array_equal(full(np.array(reading)), np.ones(task.size))
+    assert (full.representation, full.task) == ("full", task)
+    save(full, tmp_path / "it")
+    assert fingerprint(load(tmp_path / "it")) == fingerprint(find("identity", task))
+
+
+def test_nothing_else_ships_for_other_tasks(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert names(PENDULUM) == ()
+    with pytest.raises(InputError, match=r"no encoder 'dae-8': give a file, or full$"):
+        find("dae-8", PENDULUM)
+    save(make(task=PENDULUM), tmp_path / "full")
+    assert find("full", PENDULUM).name == "identity"
+    assert find("./full", PENDULUM).name == "dae-3"
+    assert source_of("./full", PENDULUM) == "./full"
+
+
+@pytest.mark.parametrize("size", [1, 348, 4096])
+def test_observations_and_latents_of_any_size(size, tmp_path):
+    """One feature, as many as Humanoid-v5 has, and the most; as a file and as ONNX."""
+    latent, task = max(size - 48, 1) % 400, numbered(size)
+    wide = make((layer(size, latent, "tanh"),), (layer(latent, size, "linear"),), task)
+    save(wide, tmp_path / "it")
+    export(load(tmp_path / "it"), tmp_path / "it.onnx")
+    rows = RANDOM.normal(size=(2, size)).astype(np.float32)
+    (given,) = onnxruntime.InferenceSession(tmp_path / "it.onnx").run(
+        ["latent"], {"observation": rows}
+    )
+    np.testing.assert_allclose(given, wide(rows), rtol=1e-4, atol=1e-4)
 
 
 def test_an_encoder_is_shown_on_one_line(encoder):
@@ -407,14 +517,25 @@ def test_an_encoder_is_shown_on_one_line(encoder):
 def test_a_name_that_ships_takes_precedence_over_a_file(encoder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save(encoder, tmp_path / "dae-8")
-    assert source_of("dae-8", TASK.name) == "dae-8, shipped"
-    assert source_of("./dae-8", TASK.name) == "./dae-8"
+    assert source_of("dae-8", TASK) == "dae-8, shipped"
+    assert source_of("./dae-8", TASK) == "./dae-8"
     assert source_of("dae-8", None) == "dae-8"
-    assert find("dae-8", TASK.name).latent_size == 8
-    assert find("./dae-8", TASK.name).latent_size == 3
+    assert find("dae-8", TASK).latent_size == 8
+    assert find("./dae-8", TASK).latent_size == 3
     with pytest.raises(
         InputError, match=r"no encoder 'dae-9': .* ships for face_direction: dae-12"
     ):
-        find("dae-9", TASK.name)
+        find("dae-9", TASK)
     with pytest.raises(InputError, match="made for face_direction"):
-        find("./dae-8", "move_to_pose")
+        find("./dae-8", describe("move_to_pose"))
+
+
+def test_info_tells_what_an_encoder_of_any_environment_is(tmp_path):
+    told = jbrep("encoder", "info", "full", "--task", "Pendulum-v1", "--env", "g=1.6").output
+    assert "source      full, scaled by the usual ranges" in told
+    assert "environment Pendulum-v1, g=1.6\n" in told
+    save(make(task=PENDULUM), tmp_path / "it")
+    told = json.loads(jbrep("encoder", "info", tmp_path / "it", "--json").stdout)
+    assert (told["environment"], told["arguments"]) == ("Pendulum-v1", {"g": 1.6})
+    told = jbrep("encoder", "export", "dae-8", "--task", "Pendulum-v1", "--out", tmp_path / "no")
+    assert told.stderr == "Error: no encoder 'dae-8': give a file, or full\n"

@@ -55,6 +55,8 @@ def runs():
                 yield RunCurve(
                     *(task, algorithm, label, seed, "s", STEPS, returns.clip(0, 1000)),
                     total_steps=50_000,
+                    return_floor=0,
+                    solved=900,
                     failed_at=30_000 if (label, seed) == ("pca-4", 3) else None,
                 )
 
@@ -207,16 +209,21 @@ def cut_marks(axes, markers):
 
 def test_no_interval_stretches_an_axis_and_cuts_are_marked(analysis):
     wide = with_interval(analysis, "final_return_sd", (40, 2, 5000))
-    _, right = drawn(study_plots(wide, [], {}, {})[1]).axes
+    left, right = drawn(study_plots(wide, [], {}, {})[1]).axes
     _, high = right.get_ylim()
-    assert high == pytest.approx(520)  # returns in [0, 1000] have an SD of some 500 at most
+    low, top = left.get_ylim()
+    assert high == pytest.approx(1.04 * (top - low) / 1.08 / 2)  # the SD of two far apart
     assert (0, high, "^") in cut_marks(right, "^v")
+    largest = max(max(label.by_run["final_return"]) for label in wide.groups[0].labels)
     wide = with_interval(analysis, "final_return_mean", (500, -900, 1900))
     left, _ = drawn(study_plots(wide, [], {}, {})[1]).axes
-    assert cut_marks(left, "^v") == [(0.16, -40, "v"), (0.16, 1040, "^")]
+    low, high = left.get_ylim()
+    assert (low, high) == pytest.approx((-0.05 * largest, 1.3 * largest))  # not below the floor
+    assert cut_marks(left, "^v") == [(0.16, low, "v"), (0.16, high, "^")]
     wide = with_interval(analysis, "mean_return_mean", (500, 400, 1900))
     (axes,) = drawn(study_plots(wide, [], {}, {})[3]).axes
-    assert axes.get_ylim()[1] == pytest.approx(1040)
+    largest = max(max(label.by_run["mean_return"]) for label in wide.groups[0].labels)
+    assert axes.get_ylim()[1] == pytest.approx(1.3 * largest)
     assert cut_marks(axes, "^v") == [(0.16, axes.get_ylim()[1], "^")]
 
 
@@ -249,11 +256,12 @@ def test_a_ratio_of_zero_is_marked_at_the_edge():
 
 
 def test_a_profile_falls_from_all_runs_to_none(analysis):
-    label = analysis.groups[0].labels[0]
+    group = analysis.groups[0]
+    label = group.labels[0]
     share = label.profile.value
     assert share[0] == 1
     assert share[-1] == 0
-    at = analysis.profile_returns.tolist().index(900)
+    at = group.profile_returns.tolist().index(900)
     assert share[at] == (label.by_run["final_return"] > 900).mean()
     assert np.all(np.diff(share) <= 0)
 
@@ -303,6 +311,33 @@ def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
     expected = evaluation["encoders"]["dae-12"]["latent_units"]["correlation"]
     np.testing.assert_array_equal(matrix, np.array(expected, float))
     assert len(write(found.values(), tmp_path)) == 4
+
+
+def test_of_a_wide_robot_the_worst_features_are_shown():
+    """Humanoid's 348 would make a figure of 14,000 pixels, with names that nobody can read."""
+    features = [{"name": f"obs_{i}", "r2": [1 - i / 348, None, None]} for i in range(348)]
+    features[347]["r2"][0] = None  # a feature that never varies isn't the worst
+    correlation = np.eye(348).tolist()
+    encoders = {
+        name: {
+            **{"kind": kind, "latent": 348, "corruption": []},
+            "reconstruction": {"features": features, "mse": [0.1, 0.1, 0.1], "pca_mse": [0.1]},
+            "latent_units": {"correlation": correlation},
+        }
+        for name, kind in (("dae-348", "dae"), ("raw", "identity"))
+    }
+    evaluation = {"data": {"task": "Humanoid-v5"}, "encoders": encoders}
+    by_feature, correlations = encoder_plots(evaluation)
+    assert len(by_feature.rows) == 2 * 348
+    assert "Of 348 features the 40 worst are shown; all are in the table." in by_feature.caption
+    figure = drawn(by_feature)
+    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert names == [f"obs_{i}" for i in range(307, 347)]
+    assert "the 40 worst of 348 features" in figure.axes[0].get_title(loc="left")
+    assert figure.get_figheight() < 8
+    for axes in drawn(correlations).axes[:2]:
+        assert len(axes.get_xticks()) < 20
+        assert not any("obs" in label.get_text() for label in axes.get_xticklabels())
 
 
 @pytest.fixture(scope="module")

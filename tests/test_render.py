@@ -13,11 +13,14 @@ from conftest import needs_egl
 from PIL import Image
 
 from jbrep.cli import main
+from jbrep.envs import describe
+from jbrep.envs.make import make_env
+from jbrep.envs.physics import Motion, physics_of
 from jbrep.errors import InputError
 from jbrep.jitterbug.model import plain_model
 from jbrep.render.film import Film, Pace
 from jbrep.render.formats import encode_gif, encode_mp4, get_format
-from jbrep.render.pictures import Camera, add_caption, band_height
+from jbrep.render.pictures import Camera, add_caption, band_height, find_camera
 from jbrep.rollouts.sources import find_episode
 
 SIZE = (96, 64)
@@ -105,8 +108,9 @@ def test_side_by_side(tmp_path):
 def test_a_frame_shows_what_mujoco_renders(name, episode):
     model = plain_model()
     data = mujoco.MjData(model)
-    data.qpos[:] = episode.qpos[40]
-    data.mocap_pos[0], data.mocap_quat[0] = episode.target_position, episode.target_quaternion
+    arrays = episode.motion.arrays
+    data.qpos[:] = arrays["qpos"][40]
+    data.mocap_pos[:], data.mocap_quat[:] = arrays["mocap_pos"][40], arrays["mocap_quat"][40]
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, 120, 160) as renderer:
         renderer.update_scene(data, name)
@@ -119,6 +123,50 @@ def test_a_frame_shows_what_mujoco_renders(name, episode):
     assert same(frame[below:, :158], expected[below:, :158], 3)
     assert same(frame[below:, 162:], expected[below:, 2:], 3)
     assert not same(frame[:below, :160], expected[:below], 20)
+
+
+@needs_egl
+@pytest.mark.parametrize("task", ["Hopper-v5", "Reacher-v5", "dm_control/cheetah-run-v0"])
+def test_any_robot_of_mujoco_is_filmed(task):
+    episode = find_episode("uniform", 0, describe(task, max_episode_steps=30))
+    with Camera(None, *SIZE) as camera:
+        film = Film([episode], camera, Pace(fps=50))
+        assert film.seconds == pytest.approx(len(episode) * episode.task.timestep, abs=0.01)
+        first, *_, last = [np.asarray(frame)[band_height(SIZE[1]) :] for frame in film.frames()]
+    moved = np.abs(first.astype(int) - last).max(axis=2) > 40
+    assert 0.002 < moved.mean() < 0.5  # the robot, not its surroundings
+
+
+def test_a_camera_that_follows_the_robot():
+    """The model's own one, or else from aside: Reacher's model has none."""
+    for name, kind in (("Hopper-v5", 0), ("dm_control/cheetah-run-v0", 0), ("face_direction", 1)):
+        assert find_camera(physics_of(make_env(name, {})).model, None) == kind
+    model = physics_of(make_env("Reacher-v5", {})).model
+    assert model.body(find_camera(model, None).trackbodyid).name == "body0"
+
+
+@needs_egl
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"motion": None}, "Hopper-v5 has no MuJoCo model and data: only MuJoCo's robots can be"),
+        ({"motion": None, "note": "It differs"}, "It differs: only MuJoCo's robots can be filmed"),
+        ({"task": {"timestep": None}}, "the time step of Hopper-v5 is not known: give it as"),
+    ],
+)
+def test_what_can_t_be_filmed(change, message, camera):
+    episode = find_episode("uniform", 0, describe("Hopper-v5", max_episode_steps=3))
+    if "task" in change:
+        change = {"task": replace(episode.task, **change["task"])}
+    with pytest.raises(InputError, match=message):
+        Film([replace(episode, **change)], camera, Pace())
+
+
+def test_a_robot_without_mujoco_is_one_line(tmp_path):
+    result = render("uniform", "--task", "Pendulum-v1", "--out", tmp_path / "a.mp4")
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    assert "Pendulum-v1 has no MuJoCo model and data" in result.stderr
+    assert not list(tmp_path.iterdir())
 
 
 @needs_egl
@@ -139,10 +187,13 @@ def test_speed_and_frames(pace, frames, last, episode, camera):
 
 @needs_egl
 def test_one_that_ends_before_the_others_stands_still(episode, camera):
+    arrays = {name: values[:21] for name, values in episode.motion.arrays.items()}
     short = replace(
         episode,
-        **{name: getattr(episode, name)[:21] for name in ("qpos", "qvel", "rotation", "velocity")},
+        observation=episode.observation[:21],
         action=episode.action[:20],
+        reward=episode.reward[:20],
+        motion=Motion(episode.motion.model, arrays),
     )
     film = Film([episode, short], camera, Pace(fps=5, seconds=1))
     frames = [np.asarray(frame) for frame in film.frames()]
@@ -194,13 +245,13 @@ def test_an_mp4_keeps_what_it_is_given(tmp_path):
         (("--size", "9000x9000"), "both must be even and from 64 to 3840"),
         (("--fps", 0), "frames per second is 0: it must be from 1 to 50"),
         (("--speed", "nan"), "speed is nan: it must be from 0.01 to 100"),
-        (("--seconds", 11), "simulated seconds is 11: it must be from 0.01 to 10"),
+        (("--seconds", 0), "simulated seconds is 0: it must be from 0.001 to 3600"),
         (("--episode", 1, "uniform"), "differ in their task or start: only episodes"),
         (("--episode", 4), "has no episode 4: it has 4, numbered from 0"),
         (("nowhere",), "nowhere is no data set, no run with a policy or checkpoint, and no policy"),
         (("--size", "3840x64", *["uniform"] * 2), "are 11,520 pixels wide: at most 7,680"),
         (
-            ("--out", "a.gif", "--size", "1920x1080", "--seconds", "10"),
+            ("--out", "a.gif", "--size", "1920x1080", "--seconds", 10),
             "a.gif would have 259,200,000 pixels: at most 200,000,000 fit into a .gif",
         ),
     ],
@@ -246,13 +297,13 @@ def test_missing_opengl_is_one_line(platform, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_opengl_that_fails_late_is_one_line(monkeypatch):
+def test_opengl_that_fails_late_is_one_line(monkeypatch, episode):
     def fail(*arguments):
         raise mujoco.FatalError("an OpenGL platform library has not been loaded")
 
     monkeypatch.setattr(mujoco, "Renderer", fail, raising=False)
     with pytest.raises(InputError, match=r"MuJoCo finds none \(an OpenGL platform library"):
-        Camera()
+        Camera().picture(episode.motion, 0)
 
 
 def test_a_suffix_in_capitals():

@@ -5,6 +5,7 @@ import json
 import random
 import re
 import shutil
+from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,18 +13,20 @@ import numpy as np
 import pytest
 
 from jbrep.encoders import find, save
+from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.figures import write
 from jbrep.files.tables import write_csv
 from jbrep.report import report, write_report
 from jbrep.report.columns import are_numbers
-from jbrep.report.facts import reproduce
+from jbrep.report.facts import reproduce, setting_rows
 from jbrep.report.markdown import escape, markdown
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, SUMMARY
 from jbrep.report.tables import read_tables
 from jbrep.report.words import answers
 from jbrep.rl.files import ENCODER, Evaluation, write_rows, write_run
 from jbrep.rollouts.sources import find_episode
+from jbrep.stats import RunCurve, analyse
 from jbrep.study.config import Study, read_study
 from jbrep.study.heuristics import HEURISTIC_RETURNS, write_heuristics
 from jbrep.study.plan import Plan
@@ -337,11 +340,16 @@ def test_the_page_says_how_to_reproduce_it(whole):
 def test_runs_without_a_study_are_made_again_each_in_a_folder_of_its_own(whole):
     tables = read_tables(whole)
     labels = tables.record["labels"]
-    labels["move_to_pose/sac/full"] = labels["face_direction/sac/full"]
+    other = labels["face_direction/sac/full"]
+    settings = {**other["settings"], "task": "dm_control/cheetah-run-v0"}
+    labels["dm_control/cheetah-run-v0/sac/full"] = {**other, "settings": settings}
+    assert setting_rows(tables)[0][1:] == ("face_direction/sac", "dm_control/cheetah-run-v0/sac")
     tables.record["study"] = None
     typed = [line for _, code in reproduce(tables) for line in code.splitlines()]
     folders = [line.split()[-1] for line in typed if line.startswith("jbrep rl")]
-    assert sorted(folders) == sorted(f"a-study/{label}/seed-0" for label in labels)
+    assert sorted(folders) == sorted(
+        f"a-study/{label.replace('dm_control/', 'dm_control-')}/seed-0" for label in labels
+    )
 
 
 def test_where_nothing_was_compared_the_claims_say_so(whole):
@@ -379,13 +387,15 @@ def test_of_single_runs_it_shows_what_there_is(tmp_path):
 
 def test_heuristics_are_played_once_on_the_starts_of_evaluation(tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 4)
-    rows = list(csv.reader(write_heuristics(STUDY.tasks, tmp_path).read_text().splitlines()))
+    rows = list(
+        csv.reader(write_heuristics(map(describe, STUDY.tasks), tmp_path).read_text().splitlines())
+    )
     assert rows[0] == ["task", "episode", "return"]
     assert len(rows) == 1 + 4
     alone = find_episode("heuristic", 3, "face_direction").reward.sum()
     assert float(rows[4][2]) == pytest.approx(alone, abs=1e-3)
     monkeypatch.setattr("jbrep.study.heuristics.episode_returns", None)
-    write_heuristics(STUDY.tasks, tmp_path)
+    write_heuristics(map(describe, STUDY.tasks), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -410,14 +420,14 @@ def test_heuristics_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
         ),
         (
             "statistics.json",
-            lambda text: text.replace('version": 1', 'version": 2'),
-            "statistics.json has format version 2: this jbrep reads up to 1",
+            lambda text: text.replace('version": 2', 'version": 3'),
+            "statistics.json has format version 3: this jbrep reads up to 2",
         ),
         ("statistics.json", lambda text: text.replace('"grid"', '"gird"'), "grid is missing"),
         ("returns.csv", lambda text: text[:-1] + ",", "returns.csv is damaged or cut short"),
         ("returns.csv", lambda text: text + f"a,b,c,0,{10**30},0,1\n", "returns.csv is damaged or"),
         ("returns.csv", lambda text: text + "a,b,c,0,0,0,nan\n", "returns.csv is damaged or"),
-        ("returns.csv", lambda text: text + "a,b,c,0,0,0,1e9\n", "returns.csv is damaged or"),
+        ("returns.csv", lambda text: text + "a,b,c,0,0,0,1e16\n", "returns.csv is damaged or"),
         ("returns.csv", lambda text: text + '"' + "a" * 200_000, "returns.csv is damaged or"),
         ("heuristics.csv", lambda text: text + "x", "heuristics.csv is damaged or cut short"),
         ("heuristics.csv", lambda text: b"\xff", "heuristics.csv is damaged: it is not UTF-8"),
@@ -480,6 +490,42 @@ def test_a_run_of_a_newer_jbrep_is_named(tmp_path):
     path.write_text(path.read_text().replace('version": 1', 'version": 7'))
     with pytest.raises(InputError, match=r"run\.json has format version 7: this jbrep reads up"):
         read_results(plan.folder)
+
+
+@pytest.mark.parametrize("study", ["desk", "yaw"])
+def test_results_of_the_first_release_are_read_and_are_those_of_today(study):
+    """From returns.csv, the same numbers as in statistics.json, but for the profiles."""
+    tables = read_tables(Path("results") / study)
+    facts = {run["label"]: tables.record["labels"][run["label"]] for run in tables.record["runs"]}
+    by_run = defaultdict(lambda: defaultdict(list))
+    for row in tables.returns:
+        by_run[row[:4]][row.step].append(row.episode_return)
+    runs = [
+        RunCurve(
+            *(*key, "", np.array(list(by_step)), np.array(list(by_step.values()))),
+            total_steps=facts["/".join(key[:3])]["settings"]["steps"],
+            return_floor=0,
+            solved=900,
+        )
+        for key, by_step in by_run.items()
+    ]
+    planned = read_study(Path("studies") / f"{study}.toml").comparisons
+    first = tables.analysis.tolist()
+    compared = {
+        (g["task"], g["algorithm"]): {each["representation"] for each in g["labels"]}
+        for g in first["groups"]
+    }
+    kept = [run for run in runs if run.representation in compared[run.task, run.algorithm]]
+    today = analyse(kept, planned=planned).tolist()
+    assert first["groups"][0]["profile_returns"] == np.linspace(0, 1000, 51).tolist()
+    for analysis in (today, first):
+        for group in analysis["groups"]:
+            del group["profile_returns"]
+            for label in group["labels"]:
+                del label["profile"], label["settings"]
+    assert today == first
+    reached = first["groups"][0]["labels"][0]["numbers"]["reached_solved"][0]
+    assert reached == 1  # each run of full came to 900
 
 
 @pytest.mark.parametrize("study", ["ddpg", "desk", "yaw"])

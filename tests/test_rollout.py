@@ -10,15 +10,26 @@ from jbrep.collect import collect
 from jbrep.collect.policies import Heuristic
 from jbrep.dataset import Dataset, Settings
 from jbrep.encoders import find
+from jbrep.envs import Lanes, describe
+from jbrep.envs.make import make_env
+from jbrep.envs.physics import physics_of, root_of
+from jbrep.envs.recording import episode_returns
 from jbrep.errors import InputError
-from jbrep.jitterbug.heuristics import HEURISTICS, episode_returns
+from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, read_evaluations
 from jbrep.rl.policy import load_untrained
+from jbrep.rollouts.behaviour import observe
+from jbrep.rollouts.jitterbug import read, reward_terms
 from jbrep.rollouts.rollout import play, replay
 from jbrep.rollouts.sources import Player, find_episode, find_player
+
+SHORT = {
+    name: describe(name, max_episode_steps=30)
+    for name in ("Hopper-v5", "Pendulum-v1", "dm_control/cheetah-run-v0")
+}
 
 
 @pytest.fixture(scope="module")
@@ -31,76 +42,93 @@ def run(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def hopper(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("hopper")
+    collect(Settings(task=SHORT["Hopper-v5"], policy={"kind": "uniform"}, steps=90), folder)
+    return Dataset(folder)
+
+
+def stored(dataset, episode):
+    """What a data set has of an episode's observations, actions and rewards."""
+    part = dataset.episode(episode)
+    last = part.record["final_observation"][None]
+    return np.concatenate((part["observation"], last)), part["action"], part["reward"]
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_replay_gives_the_stored_episode(task):
     dataset = Dataset(f"data/sample/{task}")
-    rows, rollout = slice(1000, 2000), replay(dataset, 1)
-    np.testing.assert_array_equal(
-        rollout.observation[:-1].astype(np.float32), dataset["observation"][rows]
-    )
-    np.testing.assert_array_equal(
-        rollout.observation[-1].astype(np.float32), dataset.episodes["final_observation"][1]
-    )
-    np.testing.assert_array_equal(rollout.reward.astype(np.float32), dataset["reward"][rows])
-    np.testing.assert_array_equal(rollout.action, dataset["action"][rows])
+    rollout = replay(dataset, 1)
+    for ours, theirs in zip(
+        (rollout.observation, rollout.action, rollout.reward), stored(dataset, 1), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
     assert rollout.seed == dataset.episodes["seed"][1]
     assert rollout.time[-1] == pytest.approx(10)
+    assert (rollout.note, len(rollout.motion)) == ("", 1001)
+    own, readings = TASKS[task], read(rollout.motion)
+    np.testing.assert_array_equal(own.observe(readings).astype(np.float32), rollout.observation)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_terms_multiply_to_the_reward(task):
     rollout = replay(Dataset(f"data/sample/{task}"), 0)
-    product = np.prod(list(rollout.terms.values()), axis=0)
-    np.testing.assert_allclose(product[1:], rollout.reward, rtol=1e-12)
+    terms = reward_terms(rollout.task, rollout.motion)
+    product = np.prod(list(terms.values()), axis=0)
+    np.testing.assert_allclose(product[1:], rollout.reward, rtol=1e-6, atol=1e-37)
 
 
 def test_a_run_plays_the_episodes_that_it_was_evaluated_on(run):
     rows = read_evaluations(run)
     last = [row.episode_return for row in rows if row.step == rows[-1].step]
-    played = [find_episode(str(run), episode).reward.sum() for episode in (0, 1)]
+    played = [find_episode(str(run), episode).episode_return for episode in (0, 1)]
     np.testing.assert_allclose(played, last, atol=2e-3)
 
 
 def test_a_policy_before_training_is_the_one_that_was_evaluated_first(run):
     first = [e.episode_return for e in read_evaluations(run) if e.step == 0]
     before = load_untrained(run)
-    player = Player("before", TASKS[before.task], before.begin)
-    played = [rollout.reward.sum() for rollout in player.play([0, 1])]
-    np.testing.assert_allclose(played, first, atol=2e-3)
+    player = Player("before", before.task, before.begin)
+    np.testing.assert_allclose(player.returns(2), first, atol=2e-3)
 
 
 def test_a_named_policy_plays_alone_as_among_others():
-    alone = find_episode("heuristic", 1, "move_to_pose")
-    returns = episode_returns("move_to_pose", HEURISTICS["move_to_pose"], 2, EVALUATION_SEED)
-    assert alone.reward.sum() == pytest.approx(returns[1], abs=1e-9)
+    task = describe("move_to_pose")
+    alone = find_episode("heuristic", 1, task)
+    returns = episode_returns(Lanes(task, 2), HEURISTICS["move_to_pose"], EVALUATION_SEED)
+    assert alone.episode_return == pytest.approx(returns[1], rel=1e-6)
+    np.testing.assert_array_equal(find_player("heuristic", task).returns(2), returns)
 
 
 def test_the_target_turns_where_it_is_told():
-    player = find_player("heuristic", "face_direction")
+    player = find_player("heuristic", describe("face_direction"))
     (rollout,) = player.play([0], target_yaw=np.pi / 4)
-    angles = rollout.readings.angle_to_target
-    faces = np.arctan2(-rollout.rotation[:, 4], -rollout.rotation[:, 1])
-    np.testing.assert_allclose(np.cos(angles), np.cos(np.pi / 4 - faces), atol=1e-12)
+    readings = read(rollout.motion)
+    faces = np.arctan2(-readings.rotation[:, 4], -readings.rotation[:, 1])
+    angles = rollout.observation[:, -1]
+    np.testing.assert_allclose(np.cos(angles), np.cos(np.pi / 4 - faces), atol=1e-6)
     assert np.abs(angles[-200:]).mean() < np.abs(angles[0])
 
 
 def test_a_policy_plays_through_an_encoder():
-    player = find_player("heuristic", "face_direction")
+    task = describe("face_direction", max_episode_steps=20)
+    player = find_player("heuristic", task)
     direct, whole, blurred = (
         p.play([0])[0]
         for p in (
             player,
-            *(player.with_reconstruction(find(e, "face_direction")) for e in ("identity", "pca-4")),
+            *(player.with_reconstruction(find(e, task)) for e in ("identity", "pca-4")),
         )
     )
-    np.testing.assert_allclose(whole.action[:20], direct.action[:20], atol=1e-4)
-    assert np.abs(blurred.action[:20] - direct.action[:20]).max() > 0.01
+    np.testing.assert_allclose(whole.action, direct.action, atol=1e-4)
+    assert np.abs(blurred.action - direct.action).max() > 0.01
     assert blurred.name == "heuristic on pca-4, decoded"
     with pytest.raises(InputError, match="move_to_pose"):
-        player.with_reconstruction(find("pca-4", "move_to_pose"))
+        player.with_reconstruction(find("pca-4", describe("move_to_pose")))
 
 
-def test_an_episode_that_diverges_when_played_ends_before_it_does(monkeypatch, tmp_path):
+def test_an_episode_that_diverges_ends_and_shows_its_last_finite_state(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo logs there
     step, counts = Simulation.step, {}
 
@@ -111,40 +139,94 @@ def test_an_episode_that_diverges_when_played_ends_before_it_does(monkeypatch, t
         return step(simulation, action)
 
     monkeypatch.setattr(Simulation, "step", spoil)
-    played = find_player("heuristic", "move_to_pose").play([0, 1])
-    assert [len(rollout) for rollout in played] == [1000, 10]
+    whole, short = find_player("heuristic", describe("move_to_pose")).play([0, 1])
+    assert (len(whole), len(short), short.truncated) == (1000, 11, True)
+    assert short.reward[-1] == 0
+    np.testing.assert_array_equal(short.observation[11], short.observation[10])
     start = TASKS["move_to_pose"].start(np.random.default_rng(EVALUATION_SEED + 1))
-    np.testing.assert_array_equal(played[1].target_position, start.target_position)
-    np.testing.assert_array_equal(played[1].target_quaternion, start.target_quaternion)
-    returns = episode_returns("move_to_pose", HEURISTICS["move_to_pose"], 2, EVALUATION_SEED)
-    np.testing.assert_allclose(returns, [rollout.reward.sum() for rollout in played])
+    readings = read(short.motion)
+    np.testing.assert_array_equal(readings.qpos[11], readings.qpos[10])
+    np.testing.assert_array_equal(readings.target_position, np.tile(start.target_position, (12, 1)))
 
 
-def test_an_episode_that_diverged_ends_before_it_did(tmp_path):
-    settings = Settings(task="face_direction", policy={"kind": "uniform"}, steps=1000)
-    collect(settings, tmp_path / "d")
-    dataset = Dataset(tmp_path / "d")
-    dataset.episodes["length"][0] = 300
-    rollout = replay(dataset, 0)
-    assert len(rollout) == 300
-    assert rollout.observation.shape == (301, 16)
+@pytest.mark.parametrize(("task", "joints"), [("Hopper-v5", 6), ("dm_control/cheetah-run-v0", 9)])
+def test_the_motion_is_what_was_observed(task, joints):
+    """Both observe all positions but the first, then all velocities."""
+    rollout = find_episode("uniform", 1, SHORT[task])
+    assert 10 < len(rollout) <= 30
+    assert rollout.terminated != rollout.truncated
+    assert rollout.motion.qpos.shape == (len(rollout) + 1, joints)
+    seen = np.concatenate((rollout.motion.qpos[:, 1:], rollout.motion.qvel), axis=1)
+    np.testing.assert_allclose(seen.clip(-10, 10), rollout.observation, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(rollout.motion.arrays["ctrl"][1:], rollout.action, rtol=1e-6)
+    assert find_player("uniform", SHORT[task]).returns(2)[1] == pytest.approx(
+        rollout.episode_return, rel=1e-5, abs=1e-5
+    )
+
+
+def test_a_robot_without_mujoco_has_no_motion():
+    rollout = find_episode("uniform", 0, SHORT["Pendulum-v1"])
+    assert (len(rollout), rollout.motion, rollout.note) == (30, None, "")
+    assert rollout.episode_return < 0
+    np.testing.assert_allclose(np.diff(rollout.time), 0.05)
+
+
+def test_the_physics_of_environments():
+    for name, root in (("Hopper-v5", "torso"), ("dm_control/cheetah-run-v0", "torso")):
+        physics = physics_of(make_env(name, {}))
+        assert physics.model.body(root_of(physics.model)).name == root
+        assert physics.data.qpos.shape == (physics.model.nq,)
+    own = physics_of(make_env("face_direction", {}))
+    assert own.model.body(root_of(own.model)).name == "jitterbug"
+    assert physics_of(make_env("Pendulum-v1", {})) is None
+
+
+def test_a_data_set_of_any_robot_is_replayed(hopper):
+    for episode in (0, 1):
+        rollout = replay(hopper, episode)
+        assert (rollout.note, len(rollout.motion)) == ("", len(rollout) + 1)
+        for ours, theirs in zip(
+            (rollout.observation, rollout.action, rollout.reward),
+            stored(hopper, episode),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_what_comes_out_differently_is_shown_as_stored(hopper):
+    spoilt = Dataset(hopper.folder)
+    spoilt.episodes["seed"][0] += 1
+    rollout = replay(spoilt, 0)
+    assert rollout.motion is None
+    assert rollout.note.endswith("it differs, as Hopper-v5 isn't reproducible here")
+    np.testing.assert_array_equal(rollout.observation, stored(hopper, 0)[0])
+
+
+def test_what_can_t_be_simulated_here_is_shown_as_stored(hopper):
+    elsewhere = Dataset(hopper.folder)
+    elsewhere.task = replace(elsewhere.task, id="Theirs/Hopper-v5")
+    rollout = replay(elsewhere, 0)
+    assert rollout.motion is None
+    assert "is shown without the robot: unknown task 'Theirs/Hopper-v5'" in rollout.note
+    np.testing.assert_array_equal(rollout.observation, stored(hopper, 0)[0])
 
 
 def test_arrays_of_the_wrong_shape_are_named_with_both_shapes():
     rollout = replay(Dataset("data/sample/face_direction"), 0)
     with pytest.raises(
-        InputError, match=r"1000 actions has qvel of shape \(999, 15\): it must be \(1001, 15\)"
+        InputError, match=r"1000 actions has reward of shape \(999,\): it must be \(1000,\)"
     ):
-        replace(rollout, qvel=rollout.qvel[:999])
+        replace(rollout, reward=rollout.reward[:999])
     assert repr(rollout) == (
         "Rollout('data/sample/face_direction, episode 0': face_direction, 1,000 steps)"
     )
 
 
 def test_episodes_may_be_shorter():
-    (rollout,) = play(TASKS["face_direction"], Heuristic().begin, "heuristic", [0], steps=20)
-    assert len(rollout) == 20
-    assert rollout.qpos.shape == (21, 16)
+    task = describe("face_direction", max_episode_steps=20)
+    (rollout,) = play(task, Heuristic().begin, "heuristic", [0])
+    assert (len(rollout), rollout.truncated, rollout.terminated) == (20, True, False)
+    assert rollout.motion.qpos.shape == (21, 16)
 
 
 @pytest.mark.parametrize(
@@ -152,18 +234,31 @@ def test_episodes_may_be_shorter():
     [
         ("nowhere", 0, None, "nowhere is no data set, no run with a policy or checkpoint, and no"),
         ("heuristic", 0, None, "policy heuristic needs a --task"),
-        ("heuristic", 0, "fly", "unknown task 'fly'"),
         ("heuristic", -1, "face_direction", "there is no episode -1"),
+        ("heuristic", 0, "Pendulum-v1", "Pendulum-v1 has no hand-written policy"),
         ("constant:drive=2", 0, "face_direction", "the constant drive is 2.0"),
         ("data/sample/face_direction", 4, None, "has no episode 4: it has 4, numbered from 0"),
         ("data/sample/face_direction", -1, None, "has no episode -1"),
+        ("data/sample/face_direction", 0, "move_to_pose", "is of face_direction, not of move_to"),
     ],
 )
 def test_mistakes(source, episode, task, message):
     with pytest.raises(InputError, match=message):
-        find_episode(source, episode, task)
+        find_episode(source, episode, task and describe(task))
 
 
-def test_a_run_is_of_its_task(run):
-    with pytest.raises(InputError, match="is a run of face_direction, not of move_to_pose"):
-        find_player(str(run), "move_to_pose")
+def test_a_data_set_has_its_own_time_limit():
+    with pytest.raises(InputError, match="has its own arguments, time limit and features"):
+        find_episode("data/sample/face_direction", 0, describe("face_direction", None, 20))
+
+
+def test_a_run_is_of_its_task_and_plays_it_for_longer_or_shorter(run):
+    with pytest.raises(InputError, match="is of face_direction, not of move_to_pose"):
+        find_player(str(run), describe("move_to_pose"))
+    player = find_player(str(run), describe("face_direction", max_episode_steps=20))
+    assert [len(rollout) for rollout in player.play([0])] == [20]
+
+
+def test_behaviour_is_the_jitterbugs():
+    with pytest.raises(InputError, match="uniform is of Pendulum-v1: only the Jitterbug's tasks"):
+        observe(["uniform"], SHORT["Pendulum-v1"], 1, 0.0)

@@ -1,15 +1,24 @@
-"""The stable-baselines3 environment: its contract, resets, encoders and mistakes."""
+"""The stable-baselines3 environment: its contract, seeds, resets, encoders and mistakes."""
 
+import itertools
+
+import cart
 import numpy as np
 import pytest
 from gymnasium import spaces
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from jbrep.envs import JitterbugVecEnv
-from jbrep.envs.episodes import Episodes
+from jbrep.encoders import find
+from jbrep.envs import JitterbugVecEnv, Lanes, TaskVecEnv, describe
+from jbrep.envs.checks import NonFiniteActionError
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
+
+FACE = describe("face_direction", max_episode_steps=100)
+CART = describe(cart.ID)
+MANY = (FACE, CART, describe("Pendulum-v1", max_episode_steps=30), describe("Hopper-v5"))
+each_task = pytest.mark.parametrize("task", MANY, ids=lambda task: task.name)
 
 
 class Halves:
@@ -21,8 +30,10 @@ class Halves:
         return observation.reshape(len(observation), 8, 2).mean(axis=2)
 
 
-def actions(steps, lanes):
-    return np.random.default_rng(0).uniform(-1, 1, (steps, lanes, 1)).astype(np.float32)
+def actions(steps, lanes, task=FACE):
+    low, high = task.action_low, task.action_high
+    drawn = np.random.default_rng(0).uniform(low, high, (steps, lanes, task.action_size))
+    return drawn.astype(np.float32)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -37,24 +48,60 @@ def test_spaces_and_types(task):
     assert (reward.dtype, reward.shape, done.dtype, infos) == (np.float32, (2,), bool, [{}, {}])
 
 
-def test_it_resets_in_the_step_that_ends_the_episode():
-    environment, plain = JitterbugVecEnv("face_direction", 2, seed=4), Episodes("face_direction", 2)
-    task = TASKS["face_direction"]
-    scaled = lambda o: task.scale(o).astype(np.float32)  # noqa: E731
-    np.testing.assert_array_equal(environment.reset(), scaled(plain.reset([4, 5])))
-    for step, action in enumerate(actions(1001, 2), start=1):
+def test_actions_have_the_bounds_of_the_task():
+    environment = TaskVecEnv(cart.ID, 2)
+    assert environment.action_space == cart.Cart.action_space
+    assert environment.observation_space.shape == (2,)
+
+
+@each_task
+def test_it_resets_in_the_step_that_ends_the_episode(task):
+    """Each lane goes through the episodes of its seeds, as lanes do that are reset by hand."""
+    environment, lanes = TaskVecEnv(task, 3, seed=4), Lanes(task, 3)
+    scaled = lambda observation: task.scale(observation).astype(np.float32)  # noqa: E731
+    np.testing.assert_array_equal(environment.reset(), scaled(lanes.reset(range(3), [4, 5, 6])))
+    ends, counters = set(), [itertools.count(1) for _ in range(3)]
+    for action in actions(150, 3, task):
         observation, reward, done, infos = environment.step(action)
-        expected = plain.step(action)
-        np.testing.assert_array_equal(observation, scaled(expected.observation))
+        expected = lanes.step(action)
         np.testing.assert_array_equal(reward, expected.reward.astype(np.float32))
-        assert done.all() == done.any() == (step == 1000)
-        if step == 1000:
-            for lane, info in enumerate(infos):
-                assert info["TimeLimit.truncated"] is True
-                assert info["non_finite"] is False
-                final = scaled(expected.final_observation)[lane]
-                np.testing.assert_array_equal(info["terminal_observation"], final)
-                assert not np.array_equal(final, observation[lane])
+        np.testing.assert_array_equal(done, expected.terminated | expected.truncated)
+        for lane in np.flatnonzero(done):
+            info, terminated = infos[lane], bool(expected.terminated[lane])
+            ends.add(terminated)
+            assert info["TimeLimit.truncated"] is not terminated
+            assert info.get("non_finite") is (False if task is FACE else None)
+            final = scaled(expected.observation)[lane]
+            np.testing.assert_array_equal(info["terminal_observation"], final)
+            assert not np.array_equal(final, observation[lane])
+            words = np.random.SeedSequence([4 + lane, next(counters[lane])]).generate_state(1)
+            lanes.reset([lane], [int(words[0]) >> 1])
+        assert not any(infos[lane] for lane in np.flatnonzero(~done))
+        np.testing.assert_array_equal(observation, scaled(lanes.observation))
+    assert ends == {cart.ID: {True, False}, "Hopper-v5": {True}}.get(task.name, {False})
+
+
+@each_task
+def test_the_middle_of_an_episode_is_restored_to_the_same_bits(task):
+    one, other = TaskVecEnv(task, 3, seed=1), TaskVecEnv(task, 3, seed=7)
+    one.reset()
+    drive = actions(200, 3, task)
+    for action in drive[:70]:
+        one.step(action)
+    other.restore(one.state)
+    for action in drive[70:]:  # past the ends of episodes
+        expected, continued = one.step(action), other.step(action)
+        for ours, theirs in zip(continued[:3], expected[:3], strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_an_environment_that_is_not_reproducible_is_not_restored():
+    task = describe(cart.ID, {"drifts": True})
+    assert not task.reproducible
+    one, other = TaskVecEnv(task, 1), TaskVecEnv(task, 1)
+    one.reset()
+    with pytest.raises(InputError, match=r"Test/Cart-v0 is not reproducible here"):
+        other.restore(one.state)
 
 
 def test_every_step_gives_fresh_arrays():
@@ -81,8 +128,9 @@ def test_lane_i_has_the_episodes_of_seed_plus_i(lanes, threads):
         return np.concatenate(rows)
 
     drive = actions(60, 1)[:, 0]
-    alone = JitterbugVecEnv("move_in_direction", 1, seed=10 + lanes - 1, num_threads=1)
-    among = JitterbugVecEnv("move_in_direction", lanes, seed=10, num_threads=threads)
+    task = describe("move_in_direction", max_episode_steps=40)
+    alone = TaskVecEnv(task, 1, seed=10 + lanes - 1, num_threads=1)
+    among = TaskVecEnv(task, lanes, seed=10, num_threads=threads)
     np.testing.assert_array_equal(tape(alone, 0, drive), tape(among, lanes - 1, drive))
 
 
@@ -96,16 +144,15 @@ def test_seeds_count_once_and_again_when_set():
 
 
 def test_the_encoder_sees_observations_in_physical_units_also_terminal_ones():
-    plain = JitterbugVecEnv("face_direction", 2)
-    coded = JitterbugVecEnv("face_direction", 2, encoder=Halves())
+    plain, coded = TaskVecEnv(FACE, 2), TaskVecEnv(FACE, 2, encoder=Halves())
     assert coded.observation_space.shape == (8,)
 
     def check(latent, scaled):
-        expected = Halves()(TASKS["face_direction"].unscale(scaled.astype(float)))
+        expected = Halves()(FACE.unscale(scaled.astype(float)))
         np.testing.assert_allclose(latent, expected, rtol=1e-5, atol=1e-4)
 
     check(coded.reset(), plain.reset())
-    for action in actions(1000, 2):
+    for action in actions(100, 2):
         observation, _, _, infos = plain.step(action)
         latent, _, done, coded_infos = coded.step(action)
         check(latent, observation)
@@ -121,7 +168,7 @@ def test_a_lane_that_diverges_is_flagged_and_the_others_go_on():
     for action in drive[:10]:
         before = one.step(action)[0]
         other.step(action)
-    one.episodes.simulation.readings.qvel[1] = np.nan
+    one.lanes.envs.simulation.readings.qvel[1] = np.nan
     for step, action in enumerate(drive[10:]):
         observation, reward, done, infos = one.step(action)
         expected = other.step(action)
@@ -129,21 +176,26 @@ def test_a_lane_that_diverges_is_flagged_and_the_others_go_on():
         assert done.tolist() == [False, step == 0, False]
         if done.any():
             assert infos[1]["non_finite"] is True
+            assert infos[1]["TimeLimit.truncated"] is True
             assert reward[1] == 0
             np.testing.assert_array_equal(infos[1]["terminal_observation"], before[1])
         assert np.isfinite(observation).all()
 
 
-def test_vec_monitor_counts_returns():
-    environment = VecMonitor(JitterbugVecEnv("move_from_origin", 2))
+@each_task
+def test_vec_monitor_counts_returns(task):
+    environment = VecMonitor(TaskVecEnv(task, 2))
     environment.reset()
-    total = np.zeros(2)
-    for action in actions(1000, 2):
-        _, reward, _, infos = environment.step(action)
-        total += reward
-    for lane, info in enumerate(infos):
-        assert info["episode"]["r"] == pytest.approx(total[lane], rel=1e-4)
-        assert info["episode"]["l"] == 1000
+    total, length, episodes = np.zeros(2), np.zeros(2), 0
+    for action in actions(100, 2, task):
+        _, reward, done, infos = environment.step(action)
+        total, length = total + reward, length + 1
+        for lane in np.flatnonzero(done):
+            assert infos[lane]["episode"]["r"] == pytest.approx(total[lane], rel=1e-4)
+            assert infos[lane]["episode"]["l"] == length[lane] <= task.max_episode_steps
+            total[lane] = length[lane] = 0
+            episodes += 1
+    assert episodes >= 2
 
 
 def test_an_agent_learns_on_it():
@@ -154,9 +206,20 @@ def test_an_agent_learns_on_it():
     assert not before.equal(agent.policy.state_dict()["action_net.weight"])
 
 
+def test_the_environment_gets_actions_within_its_bounds():
+    """Scaled to them from [-1, 1], as SAC's are, they round to beyond; the cart refuses those."""
+    environment = TaskVecEnv(CART, 1)
+    agent = SAC("MlpPolicy", environment, device="cpu", buffer_size=10)
+    largest = agent.policy.unscale_action(np.ones((1, 2), np.float32))
+    assert not environment.action_space.contains(largest[0])
+    environment.reset()
+    environment.step(largest)
+    environment.step(np.full((1, 2), -1e9))
+
+
 def test_attributes_are_shared_by_the_lanes():
-    environment = JitterbugVecEnv("face_direction", 3)
-    assert environment.get_attr("task", [0, 2]) == [TASKS["face_direction"]] * 2
+    environment = TaskVecEnv(FACE, 3)
+    assert environment.get_attr("task", [0, 2]) == [FACE] * 2
     assert environment.get_attr("render_mode") == [None] * 3
     assert environment.env_is_wrapped(VecMonitor, 1) == [False]
     assert environment.env_method("has_attr", "task") == [True] * 3
@@ -170,6 +233,10 @@ def test_mistakes_are_named():
         JitterbugVecEnv("fly", 1)
     with pytest.raises(InputError, match="the number of lanes is 0: it must be at least 1"):
         JitterbugVecEnv("face_direction", 0)
+    with pytest.raises(InputError, match="is described with its time limit"):
+        TaskVecEnv(FACE, 1, max_episode_steps=7)
+    with pytest.raises(InputError, match="made for face_direction, not for Test/Cart-v0"):
+        TaskVecEnv(CART, 1, encoder=find("dae-8", FACE))
 
     class Liar(Halves):
         latent_size = 7
@@ -180,5 +247,5 @@ def test_mistakes_are_named():
     environment.reset()
     with pytest.raises(InputError, match=r"shape \(2,\)"):
         environment.step(np.zeros(2))
-    with pytest.raises(InputError, match="not finite"):
+    with pytest.raises(NonFiniteActionError, match="not finite"):
         environment.step(np.full((2, 1), np.nan))

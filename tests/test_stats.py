@@ -54,6 +54,8 @@ def make(representation="full", seed=0, level=500.0, **changes):
         "steps": steps,
         "returns": np.clip(rise[:, None] + noise, 0, 1000),
         "total_steps": 10_000,
+        "return_floor": 0.0,
+        "solved": 900.0,
     }
     return RunCurve(**{**facts, **changes})
 
@@ -92,10 +94,12 @@ def shapes(n, random, studies=3000):
         ({"returns": np.ones((1, 11))}, r"shape \(1, 11\)"),
         (
             {"returns": np.full((11, 3), np.nan)},
-            "returns aren't finite; set failed_at",
+            r"returns aren't finite, or beyond 1e\+15; set failed_at",
         ),
-        ({"returns": np.full((11, 3), 1001.0)}, r"returns are in \[1001, 1001\]; they must be in"),
-        ({"returns": np.full((11, 3), -1.0)}, r"returns are in \[-1, -1\]"),
+        ({"returns": np.full((11, 3), -1e16)}, "returns aren't finite, or beyond"),
+        ({"returns": np.full((11, 3), -1.0)}, "least return is -1; its task has none below 0"),
+        ({"return_floor": -np.inf}, "its return_floor is -inf; give a number, or None if unknown"),
+        ({"solved": np.nan}, "its solved is nan"),
         (
             {"steps": [10_000], "returns": np.ones((1, 9))},
             "evaluations is 1; a curve needs",
@@ -139,6 +143,11 @@ TWO = [make(seed=0), make(seed=1)]
             "the baseline 'full': train some, or choose .*: da",
         ),
         ([*TWO, make("dae-8", 0, task="x"), make("dae-8", 1, task="x")], "x/sac has no runs of"),
+        ([*TWO, make(seed=2, solved=None)], "its runs say different solved: 900.0, None; give one"),
+        (
+            [make(seed=i, steps=[], returns=[], failed_at=0, return_floor=None) for i in range(2)],
+            "face_direction/sac: every run failed before its first evaluation",
+        ),
         (
             [*TWO, make(seed=2, steps=[10_000, 12_000], total_steps=12_000)],
             "one run end at step 10000, those of another begin at 10000",
@@ -213,7 +222,8 @@ def test_scalars_of_a_straight_line():
     np.testing.assert_allclose(final_return(curves, grid), [475, 500])
     np.testing.assert_allclose(steps_to(curves, grid, 252.5), [505, 0])
     np.testing.assert_array_equal(steps_to(curves, grid, 501), [np.inf, np.inf])
-    assert np.isnan(steps_to(curves, grid, 0)).all()
+    np.testing.assert_array_equal(steps_to(curves - 1000, grid, -747.5), [505, 0])
+    assert np.isnan(steps_to(curves, grid, np.nan)).all()
 
 
 def test_the_first_crossing_counts():
@@ -409,7 +419,9 @@ def test_verdicts_at_their_borders():
         assert verdict(claim, 0, 0.999, 1) == below
         assert verdict(claim, np.nan, np.nan, 1) == "undecided"
     baseline = np.array([400.0, 600])
-    assert [float(claim.boundary(baseline)) for claim in CLAIMS] == [-25, 1, 0]
+    assert [float(claim.boundary(baseline, 0)) for claim in CLAIMS] == [-25, 1, 0]
+    assert [float(claim.boundary(baseline - 1000, -900)) for claim in CLAIMS] == [-20, 1, 0]
+    assert float(CLAIMS[0].boundary(baseline, 600)) == 0  # no gain, no margin
 
 
 def test_a_p_value_agrees_with_its_interval():
@@ -435,9 +447,9 @@ def with_moments(mean, sd, n, random):
 def test_seeds_needed_are_those_of_the_t_test(effect):
     random = np.random.default_rng(1)
     x, y = with_moments(effect, 1, 10, random), with_moments(0, 1, 10, random)
-    assert near(seeds_needed(FASTER_LEARNING, x, y, 0.95), lambda n: power_of_t(n, effect))
+    assert near(seeds_needed(FASTER_LEARNING, x, y, 0, 0.95), lambda n: power_of_t(n, effect))
     assert near(
-        seeds_needed(FASTER_LEARNING, -x, -y, 0.996), lambda n: power_of_t(n, effect, 0.004)
+        seeds_needed(FASTER_LEARNING, -x, -y, 0, 0.996), lambda n: power_of_t(n, effect, 0.004)
     )
 
 
@@ -445,7 +457,7 @@ def test_few_runs_are_not_taken_to_vary_less_than_they_do():
     """With a variance that is by a third too small, 20 seeds would do."""
     y = np.array([-1.0, 0, 1])
     assert power_of_t(20, 0.8) < POWER < power_of_t(30, 0.8)
-    assert seeds_needed(FASTER_LEARNING, y + 0.8, y, 0.95) == 40
+    assert seeds_needed(FASTER_LEARNING, y + 0.8, y, 0, 0.95) == 40
 
 
 def power_of_t(n, effect, alpha=0.05):
@@ -457,8 +469,8 @@ def power_of_t(n, effect, alpha=0.05):
 def test_no_verdict_is_promised_that_the_permutation_test_can_not_give():
     random = np.random.default_rng(0)
     steady, wild = random.normal(size=5), 1e6 * random.normal(size=5)
-    assert seeds_needed(LESS_VARIANCE, steady, wild, 0.95) == 5  # p can be 2 / 252
-    assert seeds_needed(LESS_VARIANCE, steady, wild, 0.999) == 10
+    assert seeds_needed(LESS_VARIANCE, steady, wild, 0, 0.95) == 5  # p can be 2 / 252
+    assert seeds_needed(LESS_VARIANCE, steady, wild, 0, 0.999) == 10
 
 
 def test_a_part_of_a_study_is_judged_as_strictly_as_the_whole():
@@ -475,7 +487,7 @@ def test_seeds_needed_are_those_of_the_f_test(ratio):
 
     normal = stats.norm.ppf((np.arange(20) + 0.5) / 20)
     normal /= normal.std(ddof=1)
-    found = seeds_needed(LESS_VARIANCE, np.sqrt(ratio) * normal, normal, 0.95)
+    found = seeds_needed(LESS_VARIANCE, np.sqrt(ratio) * normal, normal, 0, 0.95)
     assert near(found, power_of_f)
 
 
@@ -489,7 +501,7 @@ def near(found, power):
 def test_the_larger_the_effect_the_fewer_seeds():
     random = np.random.default_rng(0)
     y = with_moments(500, 30, 10, random)
-    found = [seeds_needed(FASTER_LEARNING, y + shift, y, 0.99) for shift in (2, 10, 20, 40, 100)]
+    found = [seeds_needed(FASTER_LEARNING, y + shift, y, 0, 0.99) for shift in (2, 10, 20, 40, 100)]
     assert found[0] == "> 320"
     assert found[1:] == sorted(found[1:], reverse=True)
     assert found[-1] == 5
@@ -674,7 +686,10 @@ DAMAGES = [
     (lambda whole, group: whole.update(groups={}), "groups must be a list"),
     (lambda whole, group: whole.update(groups=[]), "each group must begin with the baseline"),
     (lambda whole, group: whole.update(seed=True), "seed must be a whole number"),
-    (lambda whole, group: whole["profile_returns"].pop(), "each profile must have as many values"),
+    (lambda whole, group: group["profile_returns"].pop(), "each profile must have as many values"),
+    (lambda whole, group: group["profile_returns"].reverse(), "two ascending returns"),
+    (lambda whole, group: group.update(profile_returns=[-1e308, 1e308]), "two ascending returns"),
+    (lambda whole, group: group["thresholds"].clear(), "thresholds: ; expected steps_to_50"),
     (lambda whole, group: group["grid"].pop(), "the curve of full doesn't fit the grid"),
     (lambda whole, group: group["grid"].reverse(), "two ascending steps"),
     (lambda whole, group: group.update(grid="x"), r"groups\[0\].grid"),

@@ -1,5 +1,6 @@
 """Studies: their files, preparation, workers, kills, clusters and results."""
 
+import csv
 import dataclasses
 import json
 import os
@@ -12,17 +13,21 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
+import robots
 from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
 
 from jbrep.encoders import load
+from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl.files import CHECKPOINT, RUN, read_run, write_run
 from jbrep.rl.presets import PRESETS, get_preset
+from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, read_study
-from jbrep.study.plan import Plan
+from jbrep.study.heuristics import HEURISTIC_RETURNS, write_heuristics
+from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.progress import Progress, duration
 from jbrep.study.results import (
@@ -93,6 +98,13 @@ def test_a_study_from_toml(tmp_path):
     [
         ("tasks", "task", "unknown task: it must be one of tasks, algorithms"),
         ("face_direction", "fly", "unknown task 'fly'"),
+        ("face_direction", "..", "unknown task '..': it must be a name or a Gymnasium id"),
+        ("face_direction", "my_robots:Robot-v0", "only; elsewhere give the id alone, and --import"),
+        (
+            '"face_direction"',
+            '"Robots/Ant-v0", "Robots-Ant-v0"',
+            "Robots/Ant-v0 and Robots-Ant-v0 would share a folder",
+        ),
         ('"a2c"', '"dqn"', "unknown algorithm 'dqn'"),
         ('"a2c"', '"a2c-best"', "unknown preset 'best'"),
         ('"pca-8"', '"fit-8"', "unknown kind 'fit'"),
@@ -114,7 +126,21 @@ def test_a_study_from_toml(tmp_path):
         ("steps = 80", "steps = 0", "steps is 0: it must be"),
         ("steps = 80", f"steps = {10**23}", "steps"),
         ("evaluate_every = 80", "evaluate_every = 0", "evaluate every is 0: it must be"),
-        ("steps = 80", "steps = 80\nepisode_steps = 0", "episode steps"),
+        ("steps = 80", "steps = 80\nepisode_steps = 0", "episode_steps is 0: it must be between"),
+        (
+            "steps = 80",
+            "steps = 80\nepisode_steps = 1.5",
+            "episode_steps is 1.5: it must be of typ",
+        ),
+        ("steps = 80", "steps = 80\nenvironment = 7", "environment is 7: it must be a table"),
+        *(
+            (
+                "steps = 80",
+                f"steps = 80\nenvironment.g = {value}",
+                "environment has a date, or a num",
+            )
+            for value in ("1979-05-27", "inf")
+        ),
         ("steps = 80", "steps = '80'", "steps is '80': it must be of type int"),
         ("steps = 80", "", "steps is missing"),
         ("steps = 80", "steps = 80\ndata = 7", "data is 7: it must be a table"),
@@ -169,6 +195,61 @@ def test_a_study_that_is_not_there(tmp_path):
         read_study(tmp_path / "none.toml")
 
 
+def test_a_study_is_read_without_its_environments(tmp_path, monkeypatch):
+    """Their package may be gone by then."""
+    monkeypatch.setattr("jbrep.study.plan.describe", None)
+    settings = {**dataclasses.asdict(TINY), "tasks": ["Robots/Gone-v0"], "environment": {"g": 1}}
+    (tmp_path / STUDY).write_text(json.dumps(settings))
+    plan = read_plan(tmp_path)
+    assert plan.study.environment == {"g": 1}
+    names = [cell.name for cell in plan.unfinished]
+    assert names[0] == "Robots-Gone-v0/a2c/full/seed-0"
+    assert plan.data("Robots/Gone-v0") == tmp_path / "data" / "Robots-Gone-v0"
+
+
+@pytest.mark.parametrize("steps", [None, 1000])
+def test_a_time_limit_may_be_said_or_left_to_the_task(steps, tmp_path):
+    """Studies of the first release say 1,000, or nothing."""
+    settings = {**dataclasses.asdict(TINY), "episode_steps": steps}
+    del settings["environment"]
+    (tmp_path / STUDY).write_text(json.dumps(settings))
+    for now in (None, 1000):
+        Plan(dataclasses.replace(TINY, episode_steps=now), tmp_path).write()
+    with pytest.raises(InputError, match=r"another study: episode_steps 1000 \(now: 100\)"):
+        Plan(dataclasses.replace(TINY, episode_steps=100), tmp_path).write()
+
+
+def test_arguments_and_time_limit_are_those_of_the_environments(tmp_path):
+    study = dataclasses.replace(
+        TINY, tasks=("Pendulum-v1",), environment={"g": 1.6}, episode_steps=70
+    )
+    plan = Plan(study, tmp_path)
+    task = plan.run(plan.cells[0]).task
+    assert (task.id, task.arguments, task.max_episode_steps) == ("Pendulum-v1", {"g": 1.6}, 70)
+    plan.write()
+    other = Plan(dataclasses.replace(study, environment={"g": 9.8}), tmp_path)
+    with pytest.raises(InputError, match=r"another study: environment .*'g': 1.6"):
+        other.write()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"environment": {"spring": 1}}, "can't make Pendulum-v1 with {'spring': 1}"),
+        ({"representations": ("full", "pca-3"), "data": Data(steps=9)}, "pca-3 doesn't reduce the"),
+        (
+            {"representations": ("full", "pca-2")},
+            "no encoder 'pca-2' ships for Pendulum-v1: choose one of full, or let the study train",
+        ),
+    ],
+)
+def test_what_the_environment_rules_out_is_said_first(changes, message, tmp_path):
+    study = dataclasses.replace(TINY, tasks=("Pendulum-v1",), representations=("full",))
+    with pytest.raises(InputError, match=message):
+        run_study(Plan(dataclasses.replace(study, **changes), tmp_path / "it"), None, 1)
+    assert not (tmp_path / "it").exists()
+
+
 def test_every_cell_has_its_run(done):
     names = {cell.name for cell in done.cells}
     assert len(names) == 4
@@ -215,11 +296,20 @@ def test_what_is_finished_is_not_run_again_and_seeds_may_come(done, tmp_path, mo
         run_study(other, None, 1)
 
 
-def test_it_makes_data_and_encoders(tmp_path):
+def test_it_makes_data_and_encoders(tmp_path, monkeypatch):
+    """Only the Jitterbug's tasks are derived from each other."""
+    derived = []
+
+    def derive(source, task, folder):
+        derived.append(task)
+        return derive_really(source, task, folder)
+
+    derive_really = prepare_module.derive
+    monkeypatch.setattr(prepare_module, "derive", derive)
     study = dataclasses.replace(
         TINY,
-        tasks=("face_direction", "move_to_pose"),
-        representations=("full", "dae-8", "random-4"),
+        tasks=("Pendulum-v1", "face_direction", "move_to_pose"),
+        representations=("full", "dae-2", "random-1"),
         data=Data(steps=2000, seed=5),
         training={"epochs": 2, "batch_size": 256},
     )
@@ -229,13 +319,14 @@ def test_it_makes_data_and_encoders(tmp_path):
     prints = set()
     for cell in plan.cells:
         encoder = load(Path(plan.run(cell).encoder))
-        encoder.check_task(TASKS[cell.task])
+        assert encoder.task == plan.task(cell.task)
         assert encoder.header["data"]["seed"] == 5
         prints.add((cell.task, encoder.header["data"]["fingerprint"]))
         plan.run(cell).check()
-    assert len(prints) == 2
+    assert len(prints) == 3
+    assert derived == ["move_to_pose"]
     stamp = {p: p.stat().st_mtime_ns for p in plan.folder.rglob("*.safetensors")}
-    assert len(stamp) == 6
+    assert len(stamp) == 9
     prepare(plan)
     assert {p: p.stat().st_mtime_ns for p in stamp} == stamp
 
@@ -253,12 +344,19 @@ def test_a_data_set_from_elsewhere(collected, tmp_path):
         wrong = dataclasses.replace(study, representations=("full", name))
         with pytest.raises(InputError, match=message):
             run_study(Plan(wrong, tmp_path / "wrong"), None, 1)
-    with pytest.raises(InputError, match="no encoder 'pca-5'"):
+    with pytest.raises(InputError, match=r"no encoder 'pca-5' ships for .*: choose one of dae-12"):
         run_study(
             Plan(dataclasses.replace(TINY, representations=("full", "pca-5")), tmp_path / "w"),
             *(None, 1),
         )
     assert not (tmp_path / "w").exists()
+
+
+def test_a_data_set_of_another_environment(collected, tmp_path):
+    data = Data(folder=str(collected))
+    study = dataclasses.replace(TINY, tasks=("move_to_pose",), data=data)
+    with pytest.raises(InputError, match=r"face_direction was made for face_direction, not for mo"):
+        run_study(Plan(study, tmp_path / "it"), None, 1)
 
 
 def in_this_process(plan, cells, workers):
@@ -391,6 +489,58 @@ def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     told = jbrep("study", tmp_path / "tiny.toml", "--out", out)
     assert told.exit_code == 1
     assert told.stderr.endswith("2 runs crashed: the same command tries them again\n")
+
+
+MIXED = """
+tasks = ["Robots/Pendulum-v1", "face_direction"]
+algorithms = ["sac"]
+representations = ["full", "dae-2"]
+seeds = 2
+steps = 104
+evaluate_every = 104
+evaluation_episodes = 2
+episode_steps = 50
+data = {steps = 1000}
+training = {epochs = 2}
+"""
+
+
+def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monkeypatch):
+    """Its workers import the package; its report is made where that is missing."""
+    monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 2)
+    path, out = tmp_path / "mixed.toml", tmp_path / "mixed"
+    path.write_text(MIXED)
+    with monkeypatch.context() as once:
+        once.setattr("jbrep.report.write_report", lambda folder, out: [])
+        told = jbrep("study", path, "--out", out, "--workers", 2, "--import", "robots")
+    assert told.exit_code == 0, told.output
+    monkeypatch.delitem(gymnasium.registry, robots.ID)
+    told = jbrep("report", out)
+    assert told.exit_code == 0, told.output
+    assert f"{robots.ID}/sac/dae-2" in (out / "report.html").read_text()
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["runs"], summary["missing"], summary["failed"]) == (8, [], [])
+    returns = {task: [] for task in (robots.ID, "face_direction")}
+    for task, _, _, _, _, _, each in list(csv.reader((out / RETURNS).read_text().splitlines()))[1:]:
+        returns[task].append(float(each))
+    assert {len(each) for each in returns.values()} == {2 * 2 * 2 * 2}
+    assert max(returns[robots.ID]) < 0 <= min(returns["face_direction"])
+    assert max(returns["face_direction"]) <= 50
+    played = [line.split(",")[0] for line in (out / HEURISTIC_RETURNS).read_text().splitlines()]
+    assert played == ["task", "face_direction", "face_direction"]
+    assert {folder.name for folder in (out / "runs").iterdir()} == {
+        "Robots-Pendulum-v1",
+        "face_direction",
+    }
+    refused = jbrep("study", path, "--out", out)
+    assert "unknown task 'Robots/Pendulum-v1'" in refused.stderr
+    assert "--import PACKAGE" in refused.stderr
+
+
+def test_no_hand_written_policy_no_table(tmp_path):
+    (tmp_path / HEURISTIC_RETURNS).write_text("of other runs")
+    assert write_heuristics([describe("Pendulum-v1")], tmp_path) is None
+    assert not (tmp_path / HEURISTIC_RETURNS).exists()
 
 
 def test_one_study_at_a_time(done):

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from jbrep.text import facts, table
+from jbrep.text import facts, slug, table
 
 HEADER = ("encoder", "error", "ratio", "worst feature")
 ROWS = [("dae-8", "0.01", "1.10", "velocity_x"), ("dae-12", "0.002", "1.05", "motor_angle")]
@@ -63,3 +63,9 @@ def test_short_work_leaves_nothing_in_a_log():
 def test_a_closed_standard_error_stops_nothing():
     shell = ["bash", "-c", '"$0" -c "$1" 2>&-', sys.executable, STEPS]
     subprocess.run(shell, check=True)
+
+
+def test_a_slug_has_hyphens_for_what_a_path_should_not_hold():
+    assert slug("dm_control/cheetah-run-v0") == "dm_control-cheetah-run-v0"
+    assert slug("my_package:Env-v0 \u00e9\n..") == "my_package-Env-v0---.."
+    assert slug("face_direction") == "face_direction"

@@ -17,6 +17,7 @@ from jbrep.cli.base import (
     printable,
     stoppable,
 )
+from jbrep.cli.environment import given_task, task_options
 from jbrep.errors import InputError
 from jbrep.text import terminal_width
 
@@ -212,6 +213,7 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path, as_json: bool) -> 
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders import find
+    from jbrep.encoders.card import arguments_of
     from jbrep.encoders.shipped import source_of
     from jbrep.evaluate.files import EVALUATION, write
     from jbrep.evaluate.summary import evaluation_text
@@ -219,8 +221,8 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path, as_json: bool) -> 
     from jbrep.figures import write as write_plots
 
     scaled = ScaledDataset(Dataset(data))
-    encoders = [find(name, scaled.task.name) for name in encoder]
-    sources = [source_of(name, scaled.task.name) for name in encoder]
+    encoders = [find(name, scaled.task) for name in encoder]
+    sources = [source_of(name, scaled.task) for name in encoder]
     labels = _labels([each.representation for each in encoders], sources)
     labelled = dict(zip(labels, encoders, strict=True))
     with stoppable("the same command starts over"):
@@ -228,7 +230,8 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path, as_json: bool) -> 
         pictures = write_plots(encoder_plots(evaluation), out)
     for label, source in zip(labels, sources, strict=True):
         line = source if source.startswith(label) else f"{label}: {source}"
-        click.echo(printable(line), err=as_json)
+        arguments = arguments_of(labelled[label].task)
+        click.echo(printable(f"{line}, made with {arguments}" if arguments else line), err=as_json)
     for label, seen in evaluation["seen"].items():
         if seen == "maybe":
             click.echo(
@@ -262,18 +265,21 @@ def encoder() -> None:
 
 
 _which = click.argument("encoder")
-_task = click.option("--task", help="Its task, for an encoder that ships.")
 
 
 @encoder.command(epilog=example("jbrep encoder info dae-8 --task face_direction"))
 @_which
-@_task
+@task_options()
 @as_json
-def info(encoder: str, task: str | None, as_json: bool) -> None:
-    """Show what an encoder is and where it comes from."""
+def info(encoder: str, as_json: bool, **options: Any) -> None:
+    """Show what an encoder is and where it comes from.
+
+    ENCODER is a file, or, given its --task, the name of one that ships.
+    """
     from jbrep.encoders.card import card, describe
     from jbrep.encoders.shipped import find_alone, source_of
 
+    task = given_task(options, required=False)
     shown, source = find_alone(encoder, task), source_of(encoder, task)
     if as_json:
         return echo_json(describe(shown, source))
@@ -286,16 +292,18 @@ def info(encoder: str, task: str | None, as_json: bool) -> None:
     epilog=example("jbrep encoder export dae-8 --task face_direction --out dae-8.onnx")
 )
 @_which
-@_task
+@task_options()
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A new .onnx file.")
-def export(encoder: str, task: str | None, out: Path) -> None:
+def export(encoder: str, out: Path, **options: Any) -> None:
     """Write an encoder and its decoder as ONNX.
 
     The input is `observation`, in physical units; the outputs are `latent` and `reconstruction`.
+    ENCODER is as for `info`.
     """
     from jbrep.encoders.onnx import export as run
     from jbrep.encoders.shipped import find_alone, source_of
 
+    task = given_task(options, required=False)
     run(find_alone(encoder, task), out)
     click.echo(f"exported {printable(source_of(encoder, task))}")
     click.echo(f"open it with onnxruntime.InferenceSession({str(out)!r})")

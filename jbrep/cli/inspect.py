@@ -5,11 +5,12 @@ import subprocess
 import sys
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import click
 
 from jbrep.cli.base import COUNT, example, printable, stoppable
-from jbrep.cli.policies import origin
+from jbrep.cli.environment import given_task, task_options
 from jbrep.errors import InputError
 
 _ADDRESS = "127.0.0.1"
@@ -20,7 +21,7 @@ _KEEPER = ("sh", "-c", "read -r _; kill 0")
 @click.command(epilog=example("jbrep inspect data/face --episode 3 --encoder dae-8 --view"))
 @click.argument("source", required=False)
 @click.option("--episode", type=COUNT, help="Its number, from 0; 0 if not given.")
-@click.option("--task", help="Of a policy, or of an encoder without a SOURCE.")
+@task_options()
 @click.option("--encoder", help="A file, or a name that ships; a run's own if not given.")
 @click.option("--traverse", is_flag=True, help="Show what each unit of the latent moves.")
 @click.option(
@@ -36,26 +37,29 @@ _KEEPER = ("sh", "-c", "read -r _; kill 0")
 def inspect(
     source: str | None,
     episode: int | None,
-    task: str | None,
     encoder: str | None,
     traverse: bool,
     out: Path | None,
     view: bool,
     serve: bool,
+    **options: Any,
 ) -> None:
     """Record an episode, encoder or study to see in Rerun.
 
     SOURCE is a data set, a run, a folder with several runs, an encoder's file, or a policy such as
-    heuristic. An unfinished run plays its last checkpoint. With an encoder, the decoded robot
-    stands beside the true one.
+    uniform, which needs a --task, as does an encoder by its name. An unfinished run plays its last
+    checkpoint. The robot is shown where MuJoCo simulates it; with an encoder, what is decoded is
+    shown beside what was observed, and for the Jitterbug the decoded robot beside the true one.
     """
     if view and serve:
         raise InputError("--view and --serve exclude each other: choose one")
     from jbrep.inspection import inspect as record
 
-    path = record(source, episode, task, encoder, traverse, out)
-    if encoder:
-        click.echo(printable(f"encoder: {origin(encoder)}"))
+    def tell(line: str) -> None:
+        click.echo(printable(line))
+
+    task = given_task(options, required=False)
+    path = record(source, episode, task, encoder, traverse, out, tell)
     click.echo(printable(f"{path}" if view or serve else f"{path}; open it with: rerun {path}"))
     if view:
         _run_viewer(path)

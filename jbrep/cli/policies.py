@@ -1,7 +1,7 @@
 """What policies do."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,9 +14,11 @@ from jbrep.cli.base import (
     printable,
     stoppable,
 )
+from jbrep.cli.environment import given_task, task_options
 from jbrep.errors import InputError
 
 if TYPE_CHECKING:
+    from jbrep.envs.task import Task
     from jbrep.rollouts.sources import Player
 
 _TASK = "face_direction"
@@ -28,7 +30,7 @@ _TASK = "face_direction"
     "--episodes", default=20, show_default=True, type=POSITIVE, help="How many, the same each time."
 )
 @click.option("--trust", is_flag=True, help="Read a zip file from elsewhere, which can run code.")
-@click.option("--task", help=f"Of a zip file or of a policy by name; {_TASK} if not given.")
+@task_options()
 @click.option("--algorithm", default="sac", show_default=True, help="Of a zip file.")
 @click.option(
     "--encoder",
@@ -40,23 +42,27 @@ def evaluate_policy(
     policy: str,
     episodes: int,
     trust: bool,
-    task: str | None,
     algorithm: str,
     encoder: str | None,
     as_json: bool,
+    **options: Any,
 ) -> None:
     """Show the returns of a policy.
 
     POLICY is a folder of jbrep rl, a zip file that stable-baselines3 wrote, or a policy by its
-    name, such as heuristic. A run that is under way or was stopped plays its last checkpoint. Of a
+    name, such as heuristic; a zip file and a name need a --task, which is face_direction if not
+    given. A run that is under way or was stopped plays its last checkpoint. Of a
     folder only numbers are read. A zip file from elsewhere runs as code when it is opened, so it
     needs --trust. A policy by name may act on what an encoder's latent is decoded to: the return
     that it loses measures what the latent lacks.
     """
     import numpy as np
 
-    player = _find(policy, task, algorithm, encoder, trust)
-    returns = np.array([rollout.reward.sum() for rollout in player.play_first(episodes)])
+    from jbrep.encoders.shipped import source_of
+
+    player = _find(policy, given_task(options, required=False), algorithm, encoder, trust)
+    source = None if encoder is None else source_of(encoder, player.task)
+    returns = player.returns(episodes)
     low, median, high = np.percentile(returns, (10, 50, 90))
     if as_json:
         echo_json(
@@ -64,7 +70,7 @@ def evaluate_policy(
                 "policy": policy,
                 "task": player.task.name,
                 "representation": player.representation,
-                **({} if encoder is None else {"encoder": origin(encoder)}),
+                **({} if source is None else {"encoder": source}),
                 **({} if player.step is None else {"step": player.step}),
                 "episodes": episodes,
                 "returns": returns.tolist(),
@@ -74,8 +80,8 @@ def evaluate_policy(
             }
         )
         return
-    if encoder is not None:
-        click.echo(printable(f"encoder: {origin(encoder)}"))
+    if source is not None:
+        click.echo(printable(f"encoder: {source}"))
     click.echo(
         printable(
             f"{_title(policy, player)}: median return {median:.0f} [{low:.0f}, {high:.0f}] "
@@ -95,11 +101,12 @@ def _title(policy: str, player: "Player") -> str:
 
 
 def _find(
-    policy: str, task: str | None, algorithm: str, encoder: str | None, trust: bool
+    policy: str, task: "Task | None", algorithm: str, encoder: str | None, trust: bool
 ) -> "Player":
     """The policy of a run, by name, or in a zip file."""
     from jbrep.collect.policies import POLICIES
     from jbrep.encoders import find
+    from jbrep.envs.description import describe
     from jbrep.files.storage import exists
     from jbrep.rollouts.sources import as_player, find_player, run_folder
 
@@ -108,7 +115,7 @@ def _find(
         if encoder:
             raise InputError(f"{policy} is a run, which has its own encoder: leave out --encoder")
         return find_player(policy, task)
-    task = task or _TASK
+    task = task or describe(_TASK)
     if policy.partition(":")[0] in POLICIES:
         player = find_player(policy, task)
         return player.with_reconstruction(find(encoder, task)) if encoder else player
@@ -123,27 +130,18 @@ def _find(
     return as_player(policy, load_zip(path, task, algorithm, encoder or FULL, trust))
 
 
-def origin(encoder: str) -> str:
-    """Where an encoder is taken from: "dae-8, shipped", or its file."""
-    from jbrep.encoders.shipped import names
-    from jbrep.jitterbug.tasks import TASKS
-
-    ships = any(encoder in names(task) for task in TASKS)
-    return f"{encoder}, shipped" if ships else encoder
-
-
 @click.command(epilog=example("jbrep behaviour runs/full runs/dae-4 --out behaviour"))
 @click.argument("policies", nargs=-1, required=True)
-@click.option("--task", help="Of policies by name, such as move_in_direction.")
+@task_options()
 @click.option("--episodes", default=100, show_default=True, type=POSITIVE, help="Of each policy.")
 @click.option(
     "--target-yaw", default=45.0, show_default=True, help="Where every target points [degrees]."
 )
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A folder.")
 def behaviour(
-    policies: tuple[str, ...], task: str | None, episodes: int, target_yaw: float, out: Path
+    policies: tuple[str, ...], episodes: int, target_yaw: float, out: Path, **options: Any
 ) -> None:
-    """Draw how policies turn the motor and where they go.
+    """Draw how policies turn the Jitterbug's motor and where they go.
 
     A policy is the folder of a run, shown before and after training, or a name, such as heuristic.
     All play the same episodes.
@@ -153,7 +151,7 @@ def behaviour(
     from jbrep.figures import behaviour_plots, write
     from jbrep.rollouts.behaviour import SPEEDS, observe
 
-    yaw = np.deg2rad(target_yaw)
+    yaw, task = np.deg2rad(target_yaw), given_task(options, required=False)
     with stoppable("the same command starts again"):
         shared_task, behaviours = observe(policies, task, episodes, yaw)
     for each in behaviours:

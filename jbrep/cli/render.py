@@ -1,10 +1,12 @@
 """Videos."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from jbrep.cli.base import COUNT, example, printable, stoppable
+from jbrep.cli.environment import given_task, task_options
 
 
 class _Size(click.ParamType[tuple[int, int]]):
@@ -31,32 +33,35 @@ class _Size(click.ParamType[tuple[int, int]]):
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="A new file, .mp4 or .gif."
 )
-@click.option("--task", help="The task of policies by name, such as move_to_pose.")
+@task_options()
 @click.option("--episode", default=0, show_default=True, type=COUNT, help="Its number, from 0.")
 @click.option(
-    "--camera", default="tracking", show_default=True, help="overhead, tracking or egocentric."
+    "--camera",
+    help="One that the robot's model has: of the Jitterbug overhead, tracking or egocentric. If "
+    "not given, one that follows the robot.",
 )
 @click.option("--size", type=_Size(), help="Of each picture; default 640x480, in a GIF 320x240.")
 @click.option("--fps", type=float, help="Frames per second; default 25, in a GIF 12.5.")
 @click.option("--speed", default=1.0, show_default=True, help="0.25 is slow motion.")
 @click.option(
-    "--seconds", default=10.0, show_default=True, help="Simulated seconds to show, from the start."
+    "--seconds", type=float, help="Simulated seconds to show, from the start; all if not given."
 )
 def render(
     sources: tuple[str, ...],
     out: Path,
-    task: str | None,
     episode: int,
-    camera: str,
+    camera: str | None,
     size: tuple[int, int] | None,
     fps: float | None,
     speed: float,
-    seconds: float,
+    seconds: float | None,
+    **options: Any,
 ) -> None:
     """Make a video of episodes, side by side.
 
     A source is the folder of a data set or of a run, or the name of a policy, such as uniform,
-    heuristic or constant:drive=0.5. The motor turns up to 23 times a second: at full speed and 25
+    heuristic or constant:drive=0.5, which needs a --task. The robot must be one of MuJoCo. The
+    Jitterbug's motor turns up to 23 times a second: at full speed and 25
     frames per second it seems to creep backwards; --speed 0.25 shows how it turns.
     """
     from jbrep.opengl import find_opengl
@@ -69,6 +74,7 @@ def render(
 
     form = get_format(out)
     pace = Pace(form.fps if fps is None else fps, speed, seconds)
+    task = given_task(options, required=False)
     with stoppable("no video was written"), Camera(camera, *(size or form.size)) as seen_by:
         rollouts = [find_episode(source, episode, task) for source in sources]
         film = Film(rollouts, seen_by, pace)

@@ -11,15 +11,21 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, STOP_SIGNALS, example, on_stop, printable
+from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, on_stop, printable
+from jbrep.cli.environment import given_task, task_options
+from jbrep.text import SIGNIFICANT, number
 
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
+_NOT_REPRODUCIBLE = (
+    "{} is not reproducible: the same seed gives other numbers the next time, and a run that is "
+    "stopped can't be resumed"
+)
 
 
 @click.command(
     epilog=example("jbrep rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a")
 )
-@click.option("--task", required=True, help="A Jitterbug task, such as face_direction.")
+@task_options()
 @click.option(
     "--algorithm", default="sac", show_default=True, help="ddpg, td3, sac, ppo, a2c or trpo."
 )
@@ -35,10 +41,10 @@ _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again end
     show_default=True,
     help="A file, or a shipped encoder's name; full is the whole observation, scaled alike.",
 )
-@click.option("--steps", default=100_000, show_default=True, type=COUNT, help="Control steps.")
+@click.option("--steps", default=100_000, show_default=True, type=COUNT, help="Of training.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
 @click.option(
-    "--evaluate-every", default=10_000, show_default=True, type=COUNT, help="In control steps."
+    "--evaluate-every", default=10_000, show_default=True, type=COUNT, help="In steps of training."
 )
 @click.option(
     "--evaluation-episodes",
@@ -46,6 +52,14 @@ _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again end
     show_default=True,
     type=COUNT,
     help="Of the deterministic policy, each time, from starts that training doesn't use.",
+)
+@click.option(
+    "--from",
+    "begin_from",
+    default="",
+    metavar="RUN",
+    help="Begin with the final weights of a finished run of the same algorithm and sizes, such as "
+    "one on another body; optimisers and SAC's entropy coefficient start anew.",
 )
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="A folder for this run."
@@ -63,21 +77,26 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
         from jbrep.rl import Run, StoppedError, train
         from jbrep.rl.files import EVALUATIONS, RUN, read_evaluations
 
+        settings["task"] = given_task(settings)
         run = Run(**settings)
         run.check()
         source = source_of(run.encoder, run.task)
+        if not run.task.reproducible:
+            click.echo(_NOT_REPRODUCIBLE.format(run.task.name), err=True)
         try:
             with closing(_Bar(run.steps, f"{run.algorithm} on {source}")) as bar:
                 result = train(run, out, bar.show, stop=lambda: bool(received))
         except StoppedError as error:
-            click.echo(f"{error}; the same command resumes it", err=True)
+            resumes = f"; {RESUMES}" if run.task.reproducible else ""
+            click.echo(f"{error}{resumes}", err=True)
             context.exit(128 + received[0])  # as a shell reports a command that a signal ended
     if "reason" in result:
         click.echo(f"the run failed: {result['reason']}; see {out / RUN}", err=True)
         context.exit(1)
     click.echo(printable(f"encoder: {source}"))
     rows = read_evaluations(out)
-    returns = ", ".join(f"{e.episode_return:.0f}" for e in rows if e.step == rows[-1].step)
+    last = [e.episode_return for e in rows if e.step == rows[-1].step]
+    returns = ", ".join(number(each, SIGNIFICANT) for each in last)
     name = result["settings"]["representation"]
     click.echo(f"returns on {name} at the end: {returns}; all evaluations: {out / EVALUATIONS}")
 
@@ -98,7 +117,7 @@ class _Bar:
                 total=self._steps, initial=step, desc=self._name, unit="step", delay=0.5
             )
         self._progress.update(step - self._progress.n)
-        evaluation = "-" if mean is None else f"{mean:.0f}"
+        evaluation = number(mean, SIGNIFICANT)
         self._progress.set_postfix(evaluation=evaluation, refresh=False)
 
     def close(self) -> None:

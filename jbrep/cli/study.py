@@ -13,6 +13,7 @@ from jbrep.cli.base import (
     printable,
     stoppable,
 )
+from jbrep.cli.environment import import_option
 
 
 @click.command(epilog=example("jbrep study studies/smoke.toml --out runs/smoke"))
@@ -30,6 +31,7 @@ from jbrep.cli.base import (
     help="local, for this machine, or ray, for the cluster that RAY_ADDRESS names.",
 )
 @click.option("--dry-run", is_flag=True, help="List the runs and estimate the time.")
+@import_option
 @click.pass_context
 def study(
     context: click.Context,
@@ -43,6 +45,7 @@ def study(
     """Train a grid of agents, and judge the paper's claims.
 
     STUDY is a TOML file of tasks, algorithms, representations and seeds, such as those in studies/.
+    Tasks are the Jitterbug's, by their names, and any environments, by their Gymnasium ids.
     Data sets and encoders are made first. Stopped or killed, the same command resumes the study;
     runs that have ended are never run again.
     """
@@ -53,13 +56,14 @@ def study(
     from jbrep.study.runner import get_backend
     from jbrep.study.study import dry_run as dry_run_text
     from jbrep.study.study import run_study
+    from jbrep.text import terminal_width
 
     plan = Plan(read_study(study), out or Path("runs") / study.stem)
     run, count = get_backend(backend), workers or cpu_count()
     for notice in plan.study.notices:
         click.echo(notice, err=True)
     if dry_run:
-        click.echo(dry_run_text(plan, count))
+        click.echo(dry_run_text(plan, count, terminal_width()))
         return
     with stoppable(RESUMES):
         crashed = run_study(plan, run, count)

@@ -133,10 +133,13 @@ def shard_name(shard: int) -> str:
 
 
 def new_manifest(settings: Settings) -> Manifest:
-    """A manifest without shards, with the installed versions."""
+    """A manifest without shards, with the installed versions of jbrep's and the environment's."""
     from importlib.metadata import version  # slow to import, and readers don't need it
 
-    return Manifest(settings, {name: version(name) for name in _PACKAGES})
+    from jbrep.envs.names import environment_versions
+
+    versions = {name: version(name) for name in _PACKAGES}
+    return Manifest(settings, versions | environment_versions(settings.task.id))
 
 
 def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
@@ -208,9 +211,11 @@ def _parse(record: dict[str, Any]) -> Manifest:
         raise ValueError
     shards = tuple(Entry(**entry) for entry in record["shards"])
     versions = record["versions"]
-    if set(versions) != set(_PACKAGES):
+    if not set(_PACKAGES) <= set(versions):
         raise ValueError
-    if not all(re.fullmatch(r"[\w.+!-]+", number, re.ASCII) for number in versions.values()):
+    if not all(
+        re.fullmatch(r"[\w.+!-]+", word, re.ASCII) for each in versions.items() for word in each
+    ):
         raise ValueError
     version = record["format_version"]
     manifest = Manifest(Settings(task=task, **settings), versions, shards, version)

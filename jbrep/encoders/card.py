@@ -1,10 +1,12 @@
 """An encoder's card: what it is, where it comes from, what it reads."""
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
 from jbrep.encoders.encoder import Encoder, Layer
 from jbrep.encoders.file import fingerprint
+from jbrep.envs.task import Task
 from jbrep.text import facts, table
 
 _RECORDS = ("training", "data", "metrics", "versions")
@@ -17,12 +19,14 @@ def describe(encoder: Encoder, source: str) -> dict[str, Any]:
         encoder: the encoder.
         source: where it was taken from, as `shipped.source_of` says it.
     """
-    header, scaler = encoder.header, encoder.scaler
-    ranges = zip(encoder.feature_names, scaler.low, scaler.high, strict=True)
+    header, scaler, task = encoder.header, encoder.scaler, encoder.task
+    ranges = zip(task.features, scaler.low, scaler.high, strict=True)
     return {
         "name": encoder.name,
         "source": source,
-        "task": header["task"],
+        "task": task.name,
+        "environment": task.id,
+        "arguments": dict(task.arguments),
         "kind": header["kind"],
         "size": encoder.size,
         "latent_size": encoder.latent_size,
@@ -31,7 +35,8 @@ def describe(encoder: Encoder, source: str) -> dict[str, Any]:
         **{name: header[name] for name in _RECORDS},
         "sha256": fingerprint(encoder),
         "features": [
-            {"name": name, "low": float(low), "high": float(high)} for name, low, high in ranges
+            {"name": feature.name, "unit": feature.unit, "low": float(low), "high": float(high)}
+            for feature, low, high in ranges
         ],
     }
 
@@ -48,14 +53,26 @@ def card(encoder: Encoder, source: str, width: int) -> str:
     lines = {
         "source": source,
         "task": f"{told['task']}, {told['size']} features to {told['latent_size']}",
+        "environment": ", ".join(filter(None, (encoder.task.id, arguments_of(encoder.task)))),
         "kind": told["kind"],
         "encoder": _shape(encoder.size, told["encoder"]),
         "decoder": _shape(encoder.latent_size, told["decoder"]),
         **{name: _listed(told[name]) for name in _RECORDS},
         "sha256": told["sha256"],
     }
-    rows = [(f["name"], f"{f['low']:.4g}", f"{f['high']:.4g}") for f in told["features"]]
+    rows = [
+        (str(feature), f"{f['low']:.4g}", f"{f['high']:.4g}")
+        for feature, f in zip(encoder.task.features, told["features"], strict=True)
+    ]
     return f"{encoder.name}\n{facts(lines, width)}\n\n{table(('feature', 'low', 'high'), rows)}"
+
+
+def arguments_of(task: Task) -> str:
+    """The arguments of a task's environment as a command line takes them: body=7, g=1.6."""
+    return ", ".join(
+        f"{name}={value if isinstance(value, str) else json.dumps(value)}"
+        for name, value in task.arguments.items()
+    )
 
 
 def _layers(layers: tuple[Layer, ...]) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import zip_longest
 from typing import Any, NamedTuple, TypeVar
 
@@ -9,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import Scaler
+from jbrep.envs.task import Task, check_same, read_task
 from jbrep.errors import InputError
-from jbrep.jitterbug.tasks import Task
+from jbrep.jitterbug.tasks import get_task
 
 Float32 = NDArray[np.float32]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor
@@ -18,7 +20,7 @@ Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 FULL = "full"  # the representation that is the whole observation
 IDENTITY = "identity"  # the kind of encoder that leaves the scaled observation as it is
 _MAX_UNITS = 4096  # in a layer
-_MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
+MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
 
 
 class Layer(NamedTuple):
@@ -110,9 +112,9 @@ class Encoder:
             raise InputError(f"tensor {name} has shape {tensor.shape}, expected {expected}")
         if tensor.dtype != np.float32:
             raise InputError(f"tensor {name} has type {tensor.dtype}, expected float32")
-        if not (np.abs(tensor) < _MAX_MAGNITUDE).all():
+        if not (np.abs(tensor) < MAX_MAGNITUDE).all():
             raise InputError(
-                f"tensor {name} holds a number that is not finite or not below {_MAX_MAGNITUDE:g}"
+                f"tensor {name} holds a number that is not finite or not below {MAX_MAGNITUDE:g}"
             )
 
     def __repr__(self) -> str:
@@ -145,6 +147,36 @@ class Encoder:
     def latent_size(self) -> int:
         """Length l of a latent."""
         return len(self.encoder[-1].bias) if self.encoder else self.size
+
+    @cached_property
+    def task(self) -> Task:
+        """The task whose observations it was made from, with the arguments of its environment.
+
+        Raises:
+            InputError: the header's description can't be used, or is of other features.
+        """
+        try:
+            task = self._described_task()
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"the environment of {self.name} can't be used: {error}") from None
+        if self.header["task"] != task.name:
+            raise InputError(
+                f"{self.name} is for {self.header['task']}, but its environment is {task.name}"
+            )
+        if self.feature_names != task.feature_names:
+            pairs = enumerate(
+                zip_longest(self.feature_names, task.feature_names, fillvalue="nothing")
+            )
+            place, (ours, its) = next((i, pair) for i, pair in pairs if pair[0] != pair[1])
+            raise InputError(
+                f"{self.name} has {ours} as feature {place}, where {task.name} has {its}"
+            )
+        return task
+
+    def _described_task(self) -> Task:
+        if "environment" in self.header:
+            return read_task(self.header["environment"])
+        return get_task(self.header["task"]).describe()  # version 1 knew the Jitterbug's alone
 
     @property
     def feature_names(self) -> tuple[str, ...]:
@@ -209,17 +241,9 @@ class Encoder:
     def check_task(self, task: Task) -> None:
         """Make sure that it can read this task's observations.
 
+        Other arguments of the same environment will do, such as another body of the same robot.
+
         Raises:
-            InputError: it was made for other features, or for these in another order.
+            InputError: it was made for another environment or other features.
         """
-        ours, theirs = self.feature_names, task.feature_names
-        if ours == theirs:
-            return
-        if self.header["task"] != task.name:
-            raise InputError(
-                f"{self.name} was made for {self.header['task']}, whose features differ from those "
-                f"of {task.name}: use an encoder made for {task.name}"
-            )
-        pairs = enumerate(zip_longest(ours, theirs, fillvalue="nothing"))
-        place, (one, other) = next((i, pair) for i, pair in pairs if pair[0] != pair[1])
-        raise InputError(f"{self.name} has {one} as feature {place}, where {task.name} has {other}")
+        check_same(task, self.task, self.name)

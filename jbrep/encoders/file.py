@@ -17,7 +17,7 @@ from jbrep.files.container import Tensors
 from jbrep.files.storage import write_whole
 
 FORMAT = "jbrep encoder"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # version 1 has no environment: it is the Jitterbug's
 SUFFIX = ".safetensors"
 HELD_OUT_MSE = "held_out_mse"  # the metric that every encoder has
 _TEXTS = ("kind", "name", "task")
@@ -61,7 +61,10 @@ def _whole_header(encoder: Encoder) -> dict[str, Any]:
         part: [layer.activation for layer in getattr(encoder, part)]
         for part in ("encoder", "decoder")
     }
-    return {"format": FORMAT, "format_version": FORMAT_VERSION, **encoder.header, **activations}
+    version = (
+        FORMAT_VERSION if "environment" in encoder.header else 1
+    )  # the bytes of old files stay
+    return {"format": FORMAT, "format_version": version, **encoder.header, **activations}
 
 
 def load(path: Path) -> Encoder:
@@ -103,12 +106,16 @@ def _encoder(header: dict[str, Any], tensors: Tensors) -> Encoder:
     if scaler.low.shape != expected:
         raise InputError(f"tensor low has shape {scaler.low.shape}, expected {expected}")
     del header["format"], header["format_version"]
-    return Encoder(header, scaler, tuple(parts["encoder"]), tuple(parts["decoder"]))
+    encoder = Encoder(header, scaler, tuple(parts["encoder"]), tuple(parts["decoder"]))
+    encoder.task  # noqa: B018  checked before it is needed
+    return encoder
 
 
 def _check(header: dict[str, Any]) -> None:
     """Make sure that every field is there and of its type."""
     fields = [(name, str) for name in _TEXTS] + [(name, dict) for name in _RECORDS]
+    if header["format_version"] > 1:
+        fields.append(("environment", dict))
     for name, kind in [*fields, ("features", list), ("encoder", list), ("decoder", list)]:
         if not isinstance(header.get(name), kind):
             raise InputError(f"the header has no {name}, or not as a {kind.__name__}")

@@ -19,7 +19,8 @@ def export(encoder: Encoder, path: Path) -> None:
     """Write encoder and decoder, with the scaling, as one model.
 
     Its input is `observation`, (n, d) float32 in physical units; its outputs are `latent`, (n, l),
-    and `reconstruction`, (n, d) in physical units. Its metadata has the header.
+    and `reconstruction`, (n, d) in physical units. Its metadata has the header, which describes the
+    environment.
 
     Raises:
         InputError: the file exists already, or can't be written.
@@ -53,7 +54,8 @@ def model(encoder: Encoder) -> onnx.ModelProto:
         ir_version=8,
         producer_name="jbrep",
     )
-    helper.set_model_props(made, {"jbrep": json.dumps(dict(encoder.header))})
+    header = {**encoder.header, "environment": encoder.task.as_json()}
+    helper.set_model_props(made, {"jbrep": json.dumps(header)})
     onnx.checker.check_model(made, full_check=True)
     return made
 

@@ -1,48 +1,52 @@
-"""Encoders that ship with the package, by name."""
+"""Encoders by name: those that ship with the package, and the whole observation of any task."""
 
 from pathlib import Path
 
 from jbrep.encoders.encoder import FULL, IDENTITY, Encoder
 from jbrep.encoders.file import SUFFIX, load
+from jbrep.encoders.identity import SCALINGS, identity
 from jbrep.encoders.names import EncoderName
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
-from jbrep.jitterbug.tasks import get_task
 
 _FOLDER = Path(__file__).parent / "shipped"
 
 
-def names(task: str) -> tuple[str, ...]:
-    """Names of the encoders that ship for a task, by kind, the largest latent first.
+def names(task: Task) -> tuple[str, ...]:
+    """Names of the encoders that ship for a task, by kind, the largest latent first; often none.
 
     `full` is the identity, whose file is called after its kind.
     """
-    stems = (path.name.removesuffix(SUFFIX) for path in (_FOLDER / task).glob(f"*{SUFFIX}"))
+    stems = (path.name.removesuffix(SUFFIX) for path in (_FOLDER / task.slug).glob(f"*{SUFFIX}"))
     shown = (FULL if stem == IDENTITY else stem for stem in stems)
     return tuple(sorted(shown, key=lambda name: EncoderName.parse(name).order))
 
 
-def find(name: str | Path, task: str) -> Encoder:
+def find(name: str | Path, task: Task) -> Encoder:
     """The encoder that ships for a task under that name, or the one in a file.
 
-    A shipped name takes precedence; write ./dae-8 for a file of that name.
+    A shipped name takes precedence; write ./dae-8 for a file of that name. `full` is there for
+    every task: where none ships, its features are scaled by their usual ranges, if they have any.
 
     Raises:
         InputError: there is neither, the file can't be used, or it was made for another task.
     """
-    if shipped := _shipped(name, get_task(task).name):
-        return load(shipped)
-    if not exists(name):
+    if _is_made(name, task):
+        return identity(task)
+    path = _shipped(name, task) or Path(name)
+    if not exists(path):
+        ships = ", ".join(names(task))
         raise InputError(
-            f"no encoder {str(name)!r}: give a file, or one that ships for {task}: "
-            f"{', '.join(names(task))}"
+            f"no encoder {str(name)!r}: give a file, or "
+            + (f"one that ships for {task.name}: {ships}" if ships else FULL)
         )
-    encoder = load(Path(name))
-    encoder.check_task(get_task(task))
+    encoder = load(path)
+    encoder.check_task(task)
     return encoder
 
 
-def find_alone(name: str, task: str | None) -> Encoder:
+def find_alone(name: str | Path, task: Task | None) -> Encoder:
     """An encoder by name and task, or by its file alone.
 
     Raises:
@@ -55,13 +59,23 @@ def find_alone(name: str, task: str | None) -> Encoder:
     return load(Path(name))
 
 
-def source_of(name: str | Path, task: str | None) -> str:
-    """Where `find` and `find_alone` take an encoder from: "dae-8, shipped", or the file's path."""
+def source_of(name: str | Path, task: Task | None) -> str:
+    """Where `find` and `find_alone` take an encoder from.
+
+    Such as "dae-8, shipped"; "full, unscaled" where none ships; or a file's path.
+    """
+    if task and _is_made(name, task):
+        return f"{name}, {SCALINGS[identity(task).header['training']['scaling']]}"
     return f"{name}, shipped" if task and _shipped(name, task) else str(name)
 
 
-def _shipped(name: str | Path, task: str) -> Path | None:
+def _is_made(name: str | Path, task: Task) -> bool:
+    """Whether the name is of the whole observation of a task for which that doesn't ship."""
+    return str(name) in (FULL, IDENTITY) and FULL not in names(task)
+
+
+def _shipped(name: str | Path, task: Task) -> Path | None:
     """The file that ships for a task under that name, if there is one."""
     stem = IDENTITY if str(name) == FULL else str(name)
-    known = stem == IDENTITY or stem in names(task)
-    return _FOLDER / task / f"{stem}{SUFFIX}" if known else None
+    ships = (FULL if stem == IDENTITY else stem) in names(task)
+    return _FOLDER / task.slug / f"{stem}{SUFFIX}" if ships else None

@@ -70,6 +70,7 @@ class Lanes:
         num_lanes: n.
         observation: the current one of each lane, (n, d) in physical units.
         arrays: the current ones of the task's `state` and `constants`, (n, width) each.
+        info: all that a batch tells of its lanes, by name, (n, ...) each.
         terminated, truncated: how each lane's episode has ended, (n,).
         active: whether it goes on, (n,).
         num_active: in how many lanes it does.
@@ -87,6 +88,7 @@ class Lanes:
         self.envs = self._engine.envs
         self.observation = np.zeros((num_lanes, task.size))
         self.arrays: Mapping[str, Array] = {}
+        self.info: Mapping[str, Any] = {}
         self._names = tuple(task.arrays)
         self.terminated = self.truncated = np.ones(num_lanes, dtype=np.bool_)
         self._count()
@@ -114,7 +116,7 @@ class Lanes:
         self._count()
         observation, info = self._engine.reset(lanes, seeds)
         self._check(observation, np.zeros(self.num_lanes), "reset gave")
-        self.observation, self.arrays = observation, {n: info[n] for n in self._names}
+        self._see(observation, info)
         return observation
 
     def step(self, actions: ArrayLike) -> Step:
@@ -139,7 +141,7 @@ class Lanes:
             terminated = np.where(active, terminated, self.terminated)
             truncated = np.where(active, truncated, self.truncated)
         self._check(observation, reward, "gave")
-        self.observation, self.arrays = observation, arrays
+        self.observation, self.arrays, self.info = observation, arrays, info
         self.terminated, self.truncated = terminated, truncated
         self._count()
         return Step(observation, reward, terminated, truncated, arrays)
@@ -174,11 +176,15 @@ class Lanes:
                 f"{self.task.name} is not reproducible here: the same seed and actions lead to "
                 "another state, so this can't continue where it stopped"
             )
-        self.observation, self.arrays = observation, {n: info[n] for n in self._names}
+        self._see(observation, info)
 
     def close(self) -> None:
         """Free what the environments hold."""
         self._engine.close()
+
+    def _see(self, observation: Array, info: Mapping[str, Any]) -> None:
+        self.observation, self.info = observation, info
+        self.arrays = {name: info[name] for name in self._names}
 
     def _count(self) -> None:
         self.active = ~(self.terminated | self.truncated)

@@ -2,16 +2,17 @@
 
 import difflib
 from collections.abc import Iterable
-from importlib import import_module
+from importlib import import_module, metadata
+from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-import jbrep  # noqa: F401  registers the Jitterbug's
 from jbrep.errors import InputError
 
 _NAMESPACE = "Jitterbug"
 _REGISTERED_BY = {"dm_control": "shimmy"}  # the package whose import registers a namespace's ids
+_BESIDES = {"shimmy": ("dm-control",)}  # packages that one's environments come from
 _imported: list[str] = []
 
 
@@ -79,6 +80,23 @@ def name_given(text: str) -> str:
     if colon:
         import_modules([module])
     return name
+
+
+def environment_versions(env_id: str) -> dict[str, str]:
+    """Versions of the packages that an environment comes from, but jbrep's own.
+
+    Raises:
+        InputError: as `find_spec`.
+    """
+    entry_point: Any = find_spec(env_id).entry_point
+    maker = getattr(entry_point, "func", entry_point)  # shimmy's are partial functions
+    module = maker if isinstance(maker, str) else getattr(maker, "__module__", "")
+    package = module.partition(":")[0].partition(".")[0]
+    if package == "jbrep":
+        return {}
+    distributions = metadata.packages_distributions().get(package, [])
+    names = {"gymnasium", *distributions, *_BESIDES.get(package, ())}
+    return {name: metadata.version(name) for name in sorted(names)}
 
 
 def _import_quietly(module: str) -> None:

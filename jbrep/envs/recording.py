@@ -114,7 +114,9 @@ def _copied(arrays: Mapping[str, Array]) -> dict[str, Array]:
     return {name: values.copy() for name, values in arrays.items()}
 
 
-def episode_returns(lanes: Lanes, act: Actor, first_seed: int = 0) -> Array:
+def episode_returns(
+    lanes: Lanes, act: Actor, first_seed: int = 0, tick: Tick = lambda steps: None
+) -> Array:
     """Returns of one whole episode in each lane under a policy, (n,).
 
     Lane i starts like a Gymnasium environment reset with `first_seed` + i.
@@ -123,4 +125,5 @@ def episode_returns(lanes: Lanes, act: Actor, first_seed: int = 0) -> Array:
     total = np.zeros(lanes.num_lanes)
     for played in play(lanes, act):
         total += played.step.reward
+        tick(int(played.active.sum()))
     return total

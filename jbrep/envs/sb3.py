@@ -1,4 +1,4 @@
-"""The stable-baselines3 environment: many Jitterbugs, observed in full or through an encoder."""
+"""The stable-baselines3 environment: many lanes of a task, observed in full or by an encoder."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -9,16 +9,17 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from jbrep.encoders import Encoder
-from jbrep.envs.episodes import Episodes, LaneState
+from jbrep.envs.checks import check_actions
+from jbrep.envs.description import describe
+from jbrep.envs.lanes import Lanes, State
+from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
-from jbrep.jitterbug.tasks import EPISODE_STEPS, Array
 
 Float32 = NDArray[np.float32]
 
 
 class LatentEncoder(Protocol):
-    """What the environment requires of an encoder."""
+    """What the environment requires of an encoder; its `check_task`, if it has one, is called."""
 
     @property
     def latent_size(self) -> int:
@@ -28,109 +29,153 @@ class LatentEncoder(Protocol):
         """Encode observations (n, d) in physical units as latents (n, l)."""
 
 
-class JitterbugVecEnv(VecEnv):
-    """Many Jitterbugs for stable-baselines3, stepped together as one MuJoCo batch.
+def agent_spaces(task: Task, encoder: LatentEncoder | None) -> tuple[spaces.Box, spaces.Box]:
+    """The spaces of what an agent observes and of its actions."""
+    size = encoder.latent_size if encoder else task.size
+    low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
+    return spaces.Box(-np.inf, np.inf, (size,), np.float32), spaces.Box(low, high)
 
-    Observations are float32, scaled by the nominal ranges. With an encoder the agent sees latents
-    instead, terminal ones too; the encoder gets observations in physical units. Lane i is seeded
-    with `seed + i`.
+
+class TaskVecEnv(VecEnv):
+    """Many lanes of a task for stable-baselines3, stepped together where that is possible.
+
+    Observations are float32, scaled by the task's usual ranges. With an encoder the agent sees
+    latents instead, terminal ones too; the encoder gets observations in physical units.
+
+    The first episode of lane i has the seed `seed + i`, as in a Gymnasium environment; episode k
+    from 1 on has a number below 2^31 drawn from (seed + i, k), so that each episode can be played
+    again by itself.
 
     Args:
-        task: a key of `jbrep.jitterbug.tasks.TASKS`.
-        num_envs: the number of robots.
-        seed: the seed of the first lane.
+        task: a task, or the name or id of one.
+        num_envs: the number of lanes.
+        seed: of the first lane.
         encoder: a `jbrep.encoders.Encoder`, or any function of float32 observations in physical
             units with a `latent_size`; None gives the full observation.
-        num_threads: threads to step them on; None takes one for each core.
-        max_episode_steps: the time limit [control steps].
+        num_threads: threads to step the lanes on; None takes one for each core.
+        max_episode_steps: the time limit of a task given by its name [steps].
 
     Attributes:
         task: the task.
-        episodes: the episodes under way in the lanes.
+        lanes: the episodes under way.
 
-    When an episode ends, `infos[i]` holds `terminal_observation`, `TimeLimit.truncated` (always
-    true: no state ends a task) and `non_finite` (whether the physics diverged).
+    When an episode ends, `infos[i]` holds `terminal_observation` and `TimeLimit.truncated`, whether
+    it ended without a terminal state; the Jitterbug's also `non_finite`, whether its physics
+    diverged.
 
     Raises:
         InputError: unknown task, a number below 1, an encoder made for other features or whose
-            output doesn't have its `latent_size`; actions of another shape than (num_envs, 1).
+            output doesn't have its `latent_size`; actions of another shape than (num_envs, k).
         NonFiniteActionError: actions that are not finite.
+        EnvironmentFailedError: the environment fails in the middle of an episode.
     """
 
     render_mode = None
 
     def __init__(
         self,
-        task: str,
+        task: Task | str,
         num_envs: int,
         seed: int = 0,
         encoder: LatentEncoder | None = None,
         num_threads: int | None = None,
-        max_episode_steps: int = EPISODE_STEPS,
+        max_episode_steps: int | None = None,
     ):
-        self.episodes = Episodes(task, num_envs, num_threads, max_episode_steps)
-        self.task = self.episodes.task
+        if isinstance(task, str):
+            task = describe(task, max_episode_steps=max_episode_steps)
+        elif max_episode_steps not in (None, task.max_episode_steps):
+            raise InputError(f"{task.name} is described with its time limit: describe it anew")
+        self.task = task
         self._encoder = encoder
-        self._size = encoder.latent_size if encoder else self.task.size
-        self._actions: NDArray[np.floating[Any]] = np.zeros((num_envs, 1))
-        if isinstance(encoder, Encoder):
-            encoder.check_task(self.task)
-        self._represent(np.zeros((num_envs, self.task.size)))  # the encoder may refuse it
-        super().__init__(
-            num_envs,
-            spaces.Box(-np.inf, np.inf, (self._size,), np.float32),
-            spaces.Box(-1, 1, (1,), np.float32),
-        )
+        if check_task := getattr(encoder, "check_task", None):
+            check_task(task)
+        self.lanes = Lanes(task, num_envs, num_threads)
+        observation_space, action_space = agent_spaces(task, encoder)
+        self._latent_size = observation_space.shape[0]
+        self._represent(np.zeros((num_envs, task.size)))  # the encoder may refuse it
+        self._low, self._high = np.array(task.action_low), np.array(task.action_high)
+        self._actions = np.zeros((num_envs, task.action_size))
+        self._first_seeds = np.zeros(num_envs, np.int64)
+        self._episodes = np.zeros(num_envs, np.int64)  # k of each lane's episode
+        super().__init__(num_envs, observation_space, action_space)
         self.seed(seed)
 
     def reset(self) -> Float32:
-        """Start an episode in every lane, from the seeds if they were set since the last reset."""
-        observation = self.episodes.reset(self._seeds)
+        """Start an episode in every lane: the first one if seeds were set since, else the next."""
+        self._episodes += 1
+        for lane, seed in enumerate(self._seeds):
+            if seed is not None:
+                self._first_seeds[lane], self._episodes[lane] = seed, 0
         self._reset_seeds()
         self._reset_options()
-        return self._represent(observation)
+        return self._represent(self._start(range(self.num_envs)))
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
-        """Keep the actions, (num_envs, 1), for `step_wait`."""
-        self._actions = actions
+        """Keep the actions, (num_envs, k), for `step_wait`.
+
+        An algorithm that works on actions in [-1, 1] rounds when it scales them to their bounds,
+        and may leave these by a bit: they are clipped.
+        """
+        checked = check_actions(actions, self.num_envs, self.task.action_size)
+        self._actions = np.minimum(np.maximum(checked, self._low), self._high)
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Take one control step in every lane."""
-        outcome = self.episodes.step(self._actions)
+        """Take one step in every lane; where an episode ends, start the next."""
+        step = self.lanes.step(self._actions)
+        observation, done = step.observation, self.lanes.ended
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        if lanes := outcome.ended:
-            finals = self._represent(outcome.final_observation[lanes])
-            for lane, final in zip(lanes, finals, strict=True):
+        if done.any():
+            ended = np.flatnonzero(done).tolist()
+            told = self.lanes.info.get("non_finite")
+            finals = self._represent(observation[ended])
+            for lane, final in zip(ended, finals, strict=True):
                 infos[lane] = {
                     "terminal_observation": final,
-                    "TimeLimit.truncated": True,
-                    "non_finite": bool(outcome.diverged[lane]),
+                    "TimeLimit.truncated": not step.terminated[lane],
                 }
-        reward = outcome.reward.astype(np.float32)
-        return self._represent(outcome.observation), reward, outcome.done, infos
+                if told is not None:
+                    infos[lane]["non_finite"] = bool(told[lane])
+            self._episodes[ended] += 1
+            observation = self._start(ended)
+        return self._represent(observation), step.reward.astype(np.float32), done, infos
 
     @property
-    def state(self) -> LaneState:
+    def state(self) -> State:
         """A copy of what `restore` takes: everything that decides how the lanes continue."""
-        return self.episodes.state
+        own = {"first_seeds": self._first_seeds.copy(), "episodes": self._episodes.copy()}
+        return own | self.lanes.state
 
-    def restore(self, state: LaneState) -> None:
-        """Continue from where the state was taken, to the same bits."""
-        self.episodes.restore(state)
+    def restore(self, state: State) -> None:
+        """Continue from where the state was taken, to the same bits.
+
+        Raises:
+            InputError: the environment isn't reproducible.
+        """
+        lanes = dict(state)
+        self._first_seeds, self._episodes = lanes.pop("first_seeds"), lanes.pop("episodes")
+        self.lanes.restore(lanes)
+
+    def _start(self, lanes: Sequence[int]) -> Array:
+        """Start the episode in each of the lanes that its counter says."""
+        return self.lanes.reset(
+            lanes, [_episode_seed(int(self._first_seeds[i]), int(self._episodes[i])) for i in lanes]
+        )
 
     def _represent(self, observation: Array) -> Float32:
         if self._encoder is None:
             return self.task.scale(observation).astype(np.float32)
         latent = np.asarray(self._encoder(observation.astype(np.float32)), dtype=np.float32)
-        if latent.shape != (len(observation), self._size):
+        if latent.shape != (len(observation), self._latent_size):
             raise InputError(
                 f"the encoder returned shape {latent.shape} for {len(observation)} observations of "
-                f"{self.task.name}: its latent_size asks for ({len(observation)}, {self._size})"
+                f"{self.task.name}: its latent_size asks for ({len(observation)}, "
+                f"{self._latent_size})"
             )
         return latent
 
     def close(self) -> None:
-        """Do nothing: no resource is held."""
+        """Free what the environments hold."""
+        self.lanes.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Get an attribute of this environment, which the lanes share."""
@@ -158,3 +203,13 @@ class JitterbugVecEnv(VecEnv):
         elif indices is not None:
             lanes = list(indices)
         return [value() for _ in lanes]
+
+
+JitterbugVecEnv = TaskVecEnv  # the name of the first release
+
+
+def _episode_seed(first: int, episode: int) -> int:
+    """The seed of a lane's episode, from that of its first and the number of episodes before."""
+    if episode == 0:
+        return first
+    return int(np.random.SeedSequence([first, episode]).generate_state(1)[0]) >> 1

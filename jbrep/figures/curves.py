@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
+from jbrep.figures.limits import Limits, limits
 from jbrep.figures.plot import Plot
 from jbrep.figures.style import (
     COLUMN,
@@ -20,7 +21,6 @@ from jbrep.figures.style import (
     solved_line_style,
     with_runs,
 )
-from jbrep.jitterbug.tasks import SOLVED_RETURN
 from jbrep.stats.analysis import GroupAnalysis
 
 Groups = Sequence[GroupAnalysis]
@@ -48,16 +48,34 @@ class Return(NamedTuple):
 
 def curves(groups: Groups, heuristics: Heuristics, looks: Looks) -> Plot:
     """Every representation on one axis, tasks by algorithms."""
+    extents = _extents(groups, heuristics)
+    caption = "Return of the deterministic policy over training: median and 10 to 90 % over n runs."
+    if any(heuristics.get(task) for task in extents):
+        caption += " Dashed: the hand-written policy's median on the same starts."
+    solved = {group.solved for group in groups if extents[group.task].contain(group.solved)}
+    if solved:
+        values = ", ".join(f"{value:,g}" for value in sorted(solved))
+        caption += f" Dotted: the return from which on a task counts as solved ({values})."
     return Plot(
         "representations",
         "Return over training by representation",
-        "Return of the deterministic policy over training: median and 10 to 90 % over n runs. "
-        "Dashed: the hand-written policy's median on the same starts; dotted: "
-        f"{SOLVED_RETURN:.0f}, from which on the paper calls a task solved.",
+        caption,
         _COLUMNS,
         list(_rows(groups)),
-        lambda: _grid_of_curves(groups, heuristics, looks),
+        lambda: _grid_of_curves(groups, heuristics, extents, looks),
     )
+
+
+def _extents(groups: Groups, heuristics: Heuristics) -> dict[str, Limits]:
+    """The limits of returns for each task, which its algorithms share."""
+    returns = defaultdict(list)
+    for group in groups:
+        if played := heuristics.get(group.task):
+            returns[group.task].append(float(np.median(played)))
+        for label in group.labels:
+            returns[group.task] += [*label.curve.p10, *label.curve.p90]
+    facts = {group.task: (group.return_floor, group.solved) for group in groups}
+    return {task: limits(values, *facts[task]) for task, values in returns.items()}
 
 
 def every_run(returns: Sequence[Return], looks: Looks) -> Plot:
@@ -77,7 +95,7 @@ def every_run(returns: Sequence[Return], looks: Looks) -> Plot:
         "Every run",
         "Mean return of each evaluation, a line for each of n runs; thick: their median.",
         ("task", "algorithm", "representation", "seed", "step", "mean_return"),
-        [(*key, f"{mean:.3f}") for key, mean in means.items()],
+        [(*key, cell(mean)) for key, mean in means.items()],
         lambda: _draw_runs(means, looks),
     )
 
@@ -94,16 +112,19 @@ def _rows(groups: Groups) -> Iterator[tuple[Any, ...]]:
 
 def cell(value: float) -> str:
     """A number in a figure's table; nothing for what isn't finite."""
-    return f"{value:.3f}" if np.isfinite(value) else ""
+    return f"{value:.7g}" if np.isfinite(value) else ""
 
 
-def _grid_of_curves(groups: Groups, heuristics: Heuristics, looks: Looks) -> Figure:
+def _grid_of_curves(
+    groups: Groups, heuristics: Heuristics, extents: Mapping[str, Limits], looks: Looks
+) -> Figure:
     look, names = looks(), names_with_runs(groups)
 
     def draw(axes: Axes, group: GroupAnalysis) -> None:
         if returns := heuristics.get(group.task):
             axes.axhline(float(np.median(returns)), label="hand-written", **reference())
-        axes.axhline(SOLVED_RETURN, **solved_line_style())
+        if extents[group.task].contain(group.solved):
+            axes.axhline(group.solved, **solved_line_style())
         for label in group.labels:
             style, curve = look[label.representation], label.curve
             axes.fill_between(
@@ -119,7 +140,7 @@ def _grid_of_curves(groups: Groups, heuristics: Heuristics, looks: Looks) -> Fig
                 **style,
             )
 
-    return _grid(groups, draw)
+    return _grid(groups, extents, draw)
 
 
 def names_with_runs(groups: Groups) -> dict[str, str]:
@@ -131,14 +152,16 @@ def names_with_runs(groups: Groups) -> dict[str, str]:
     return {name: with_runs(name, each) for name, each in counts.items()}
 
 
-def _grid(groups: Groups, draw: Callable[[Axes, GroupAnalysis], None]) -> Figure:
+def _grid(
+    groups: Groups, extents: Mapping[str, Limits], draw: Callable[[Axes, GroupAnalysis], None]
+) -> Figure:
     """A panel for each task (rows) and algorithm (columns), over steps of training."""
     tasks = list(dict.fromkeys(group.task for group in groups))
     algorithms = list(dict.fromkeys(group.algorithm for group in groups))
     by_place = {(group.task, group.algorithm): group for group in groups}
     width = COLUMN if len(algorithms) == 1 else PAGE
     figure = Figure(figsize=(width, 0.5 + (2.0 if len(algorithms) < 3 else 1.6) * len(tasks)))
-    panels = figure.subplots(len(tasks), len(algorithms), squeeze=False, sharey=True)
+    panels = figure.subplots(len(tasks), len(algorithms), squeeze=False, sharey="row")
     for (i, j), axes in np.ndenumerate(panels):
         group = by_place.get((tasks[i], algorithms[j]))
         if group is None:
@@ -146,16 +169,17 @@ def _grid(groups: Groups, draw: Callable[[Axes, GroupAnalysis], None]) -> Figure
             continue
         draw(axes, group)
         axes.set_title(plain(f"{tasks[i]}, {algorithms[j]}"))
-        _training_axes(axes, group.grid[-1])
+        _training_axes(axes, group.grid[-1], extents[group.task])
         axes.set_xlabel("training step" if i == len(tasks) - 1 else "")
         axes.set_ylabel("" if j else "return")
     below(figure, panels.ravel())
     return figure
 
 
-def _training_axes(axes: Axes, last: float, ticks: int = 5) -> None:
-    """Steps from 0 on, returns from 0 to 1,000."""
-    axes.set(xlim=(0, max(last, 1)), ylim=(-15, 1015), yticks=range(0, 1001, 250))
+def _training_axes(axes: Axes, last: float, extent: Limits, ticks: int = 5) -> None:
+    """Steps from 0 on, and returns."""
+    axes.set(xlim=(0, max(last, 1)), ylim=extent.with_room(0.015))
+    axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(ticks))
 
@@ -183,7 +207,10 @@ def _draw_runs(means: Mapping[Evaluated, float], looks: Looks) -> Figure:
     names = [name for name in look if any(key[2] == name for key in means)]
     groups = list(dict.fromkeys(key[:2] for key in means))
     figure = Figure(figsize=(PAGE, 0.35 + 1.35 * len(groups)))
-    panels = figure.subplots(len(groups), len(names), squeeze=False, sharey=True, sharex="row")
+    panels = figure.subplots(len(groups), len(names), squeeze=False, sharey="row", sharex="row")
+    of_task = defaultdict(list)
+    for (task, *_), mean in means.items():
+        of_task[task].append(mean)
     for (i, j), axes in np.ndenumerate(panels):
         runs: dict[int, dict[int, float]] = defaultdict(dict)
         for (*label, seed, step), mean in means.items():
@@ -196,7 +223,8 @@ def _draw_runs(means: Mapping[Evaluated, float], looks: Looks) -> Figure:
         group = f"{', '.join(groups[i])}\n" if j == 0 else ""
         axes.set_title(plain(group) + with_runs(names[j], [len(runs)]))
         last = max(key[4] for key in means if key[:2] == groups[i])
-        _training_axes(axes, last, ticks=5 if len(names) < 5 else 3)
+        extent = limits(of_task[groups[i][0]])
+        _training_axes(axes, last, extent, ticks=5 if len(names) < 5 else 3)
         axes.set_xlabel("training step" if i == len(groups) - 1 else "")
         axes.set_ylabel("" if j else "return")
     return figure

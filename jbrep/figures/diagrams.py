@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any, TypedDict
+from textwrap import fill
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,9 +13,9 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from jbrep.figures.plot import Plot
 from jbrep.figures.style import COLUMN, PAGE, Looks, ink, plain
-from jbrep.jitterbug.tasks import CONTROL_TIMESTEP
 
 _MOST = 20  # units of a layer that are drawn
+_BOX = 19  # characters on a line of a box
 
 
 class Settings(TypedDict):
@@ -62,11 +63,20 @@ class EncoderRecord(TypedDict):
     metrics: Metrics
 
 
+class TaskRecord(TypedDict):
+    """What is drawn of a task's description."""
+
+    action_low: list[float]  # of each action
+    action_high: list[float]
+    timestep: float | None  # [s]
+
+
 class LabelRecord(TypedDict):
     """A label in runs.json."""
 
     settings: Settings
     encoder: EncoderRecord
+    task: NotRequired[TaskRecord]
 
 
 def diagrams(labels: Mapping[str, LabelRecord], looks: Looks) -> list[Plot]:
@@ -146,8 +156,11 @@ def system(shared: LabelRecord, looks: Looks) -> Plot:
     settings, encoder = shared["settings"], shared["encoder"]
     latent = encoder["encoder"][-1][0]
     hidden = "-".join(map(str, settings["hidden"]))
+    task = shared.get("task")
+    action = _action(task) if task else ""
+    step = f" of {task['timestep']:g} s" if task and task["timestep"] else ""
     boxes = [
-        ("robot", f"{settings['task']}\nMuJoCo, 1 motor"),
+        ("robot", settings["task"] + (f"\nsteps{step}" if step else "")),
         ("observation", f"{encoder['size']} features\nscaled to [-1, 1]"),
         ("encoder", f"{encoder['name']}\n{encoder['size']} to {latent}"),
         ("latent", f"{latent} numbers"),
@@ -156,14 +169,22 @@ def system(shared: LabelRecord, looks: Looks) -> Plot:
     return Plot(
         "system",
         "The system",
-        f"What an agent sees and does in each control step of {CONTROL_TIMESTEP:g} s.",
+        f"What an agent sees and does in each step{step}.",
         ("part", "what"),
-        [(name, what.replace("\n", ", ")) for name, what in [*boxes, ("action", "1 drive")]],
-        lambda: _draw_system(boxes, looks()[settings["representation"]]["color"]),
+        [(name, what.replace("\n", ", ")) for name, what in [*boxes, ("action", action)]],
+        lambda: _draw_system(boxes, action, looks()[settings["representation"]]["color"]),
     )
 
 
-def _draw_system(boxes: Sequence[tuple[str, str]], reduced: str) -> Figure:
+def _action(task: TaskRecord) -> str:
+    """Such as 6 numbers in [-1, 1]; without bounds where they differ."""
+    count = len(task["action_low"])
+    numbers = "1 number" if count == 1 else f"{count} numbers"
+    bounds = set(zip(task["action_low"], task["action_high"], strict=False))
+    return f"{numbers} in [{{:g}}, {{:g}}]".format(*bounds.pop()) if len(bounds) == 1 else numbers
+
+
+def _draw_system(boxes: Sequence[tuple[str, str]], action: str, reduced: str) -> Figure:
     """Boxes in a row, the encoder and its latent in the colour of the representation."""
     figure = Figure(figsize=(PAGE, 1.45))
     axes: Axes = figure.subplots()
@@ -176,15 +197,16 @@ def _draw_system(boxes: Sequence[tuple[str, str]], reduced: str) -> Figure:
         )
         axes.add_patch(box)
         axes.text(x + 0.5, 0.76, name, ha="center", va="center", weight="bold", color=colour)
-        axes.text(x + 0.5, 0.4, plain(what), ha="center", va="center", size=6.5)
+        parts = what.replace("/", "/\n").splitlines()
+        lines = "\n".join(fill(part, _BOX) for part in parts)
+        axes.text(x + 0.5, 0.4, plain(lines), ha="center", va="center", size=6.5)
         if i:
             _arrow(axes, (x - 0.25, 0.5), (x, 0.5))
     last = 1.25 * (len(boxes) - 1) + 0.5
     axes.plot([last, last, 0.5], [0.1, -0.3, -0.3], color=ink(), lw=0.8, solid_capstyle="butt")
     _arrow(axes, (0.5, -0.3), (0.5, 0.1))
-    axes.text(
-        (last + 0.5) / 2, -0.33, "action: 1 drive in [-1, 1]", ha="center", va="top", size=6.5
-    )
+    words = f"action: {action}" if action else "action"
+    axes.text((last + 0.5) / 2, -0.33, words, ha="center", va="top", size=6.5)
     return figure
 
 

@@ -7,16 +7,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
+from numpy.typing import NDArray
 
 from jbrep.encoders import FULL
 from jbrep.encoders.encoder import IDENTITY
 from jbrep.figures.curves import below
 from jbrep.figures.plot import Plot
 from jbrep.figures.style import COLUMN, PAGE, ink, plain, reference, styles
+from jbrep.stats.bootstrap import Array
 
 Encoders = Mapping[str, Any]  # of evaluation.json, by label
 
 _ERROR = ("mse", "low", "high")
+_MOST = 40  # features in a picture, and names on an axis
 
 
 def encoder_plots(evaluation: Mapping[str, Any]) -> list[Plot]:
@@ -44,10 +47,13 @@ def _sizes(encoders: Encoders) -> list[int]:
 
 def _error_by_feature(task: str, encoders: Encoders) -> Plot:
     """R^2 of each feature (rows) for each encoder (columns)."""
+    count = len(next(iter(encoders.values()))["reconstruction"]["features"])
+    part = f" Of {count} features the {_MOST} worst are shown; all are in the table."
     return Plot(
         "error_by_feature",
         f"{task}: reconstruction of each feature",
-        "R² of each feature's reconstruction on held-out episodes.",
+        "R² of each feature's reconstruction on held-out episodes."
+        + (part if count > _MOST else ""),
         ("encoder", "feature", "r2", "low", "high"),
         [
             (label, feature["name"], *feature["r2"])
@@ -63,6 +69,9 @@ def _draw_features(task: str, encoders: Encoders) -> Figure:
     values = np.array(
         [[f["r2"][0] for f in e["reconstruction"]["features"]] for e in encoders.values()], float
     ).T
+    count = len(values)
+    worst = _worst(values)
+    features, values = [features[i] for i in worst], values[worst]
     width = max(COLUMN, 1.7 + 0.29 * len(encoders))
     figure = Figure(figsize=(width, 1.0 + 0.16 * len(features)))
     axes: Axes = figure.subplots()
@@ -74,9 +83,20 @@ def _draw_features(task: str, encoders: Encoders) -> Figure:
     axes.set_yticks(range(len(features)), [f["name"] for f in features])
     axes.set_xticks(range(len(encoders)), [plain(n) for n in encoders], rotation=60, ha="right")
     _bare(axes)
-    axes.set_title(f"{task}: reconstruction of each feature")
+    which = "each feature" if count == len(features) else f"the {_MOST} worst of {count} features"
+    axes.set_title(plain(f"{task}:\nreconstruction of {which}"))
     figure.colorbar(picture, label="R² on held-out episodes")
     return figure
+
+
+def _worst(r2: Array) -> NDArray[np.int64]:
+    """The features with the least mean R² over encoders, in the order of the observation.
+
+    Args:
+        r2: (features, encoders); NaN, of a feature that doesn't vary, counts as 1.
+    """
+    order = np.argsort(np.nan_to_num(r2, nan=1).mean(axis=1), kind="stable")
+    return np.sort(order[:_MOST])
 
 
 def _bare(axes: Axes) -> None:
@@ -198,8 +218,9 @@ def _draw_correlation(task: str, encoders: Encoders) -> Figure:
         picture = axes.imshow(values, cmap="RdBu_r", vmin=-1, vmax=1)
         names = _unit_names(e)
         unit, size, angle = ("feature", 5, 90) if e["kind"] == IDENTITY else ("latent unit", 6.5, 0)
-        axes.set_xticks(range(len(names)), names, size=size, rotation=angle)
-        axes.set_yticks(range(len(names)), names, size=size)
+        if len(names) <= _MOST:  # otherwise some numbers
+            axes.set_xticks(range(len(names)), names, size=size, rotation=angle)
+            axes.set_yticks(range(len(names)), names, size=size)
         axes.set(title=plain(label), xlabel=unit, ylabel=unit)
         _bare(axes)
     figure.colorbar(picture, ax=panels.tolist(), label="correlation", shrink=0.8, aspect=15 * rows)

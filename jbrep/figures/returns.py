@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from jbrep.figures.curves import Groups, below, cell, names_with_runs
+from jbrep.figures.limits import Limits, limits
 from jbrep.figures.plot import Plot
 from jbrep.figures.style import (
     COLUMN,
@@ -20,17 +21,15 @@ from jbrep.figures.style import (
     reference,
     solved_line_style,
 )
-from jbrep.jitterbug.tasks import SOLVED_RETURN
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.claims import LESS_VARIANCE
 from jbrep.stats.comparison import Comparison
-from jbrep.stats.runs import MAX_RETURN
 
 _ENDS = ("low", "high")
 _LABEL = ("task", "algorithm", "representation")
 _JITTER = 0.16  # between the outermost runs and the middle of their representation
-_MAX_SD = MAX_RETURN / 2  # of many returns in [0, 1000]
+_ROOM = 0.04  # of an axis, at its ends, for whole markers
 _MAX_DECADES = 4  # of a variance ratio, on each side of 1
 _CUT = " A triangle at an edge: the interval goes beyond it."
 
@@ -96,7 +95,7 @@ def profiles(analysis: Analysis, looks: Looks) -> Plot:
             (group.task, group.algorithm, label.representation, *row)
             for group in analysis.groups
             for label in group.labels
-            for row in zip(analysis.profile_returns, *label.profile, strict=True)
+            for row in zip(group.profile_returns, *label.profile, strict=True)
         ],
         lambda: _draw_profiles(analysis, looks),
     )
@@ -134,11 +133,13 @@ def _draw_final(groups: Groups, looks: Looks) -> Figure:
     figure, panels = _panels(groups, 2)
     look = looks()
     for (left, right), group in zip(panels, groups, strict=True):
-        left.axhline(SOLVED_RETURN, **solved_line_style())
-        left.set(ylabel="final return", ylim=(-40, 1040))
+        extent = _extent(group, "final_return", group.solved)
+        if extent.contain(group.solved):
+            left.axhline(group.solved, **solved_line_style())
+        left.set(ylabel="final return", ylim=extent.with_room(_ROOM))
         _draw_runs(left, group, look, "final_return")
         deviations = [label.numbers["final_return_sd"] for label in group.labels]
-        _from_zero(right, deviations, _MAX_SD)
+        _from_zero(right, deviations, extent.width / 2)  # more than of any such returns
         right.set_ylabel("SD over runs")
         _name_columns(right, group)
         for i, (label, deviation) in enumerate(zip(group.labels, deviations, strict=True)):
@@ -150,12 +151,17 @@ def _draw_learning(groups: Groups, looks: Looks) -> Figure:
     figure, panels = _panels(groups, 1)
     look = looks()
     for (axes,), group in zip(panels, groups, strict=True):
-        means = [label.numbers["mean_return_mean"] for label in group.labels]
-        values = np.concatenate([label.by_run["mean_return"] for label in group.labels])
-        _from_zero(axes, [*means, Interval(values.max(), np.nan, np.nan)], MAX_RETURN)
-        axes.set_ylabel("mean return")
+        extent = _extent(group, "mean_return")
+        axes.set(ylabel="mean return", ylim=extent.with_room(_ROOM))
         _draw_runs(axes, group, look, "mean_return")
     return figure
+
+
+def _extent(group: GroupAnalysis, value: str, solved: float = np.nan) -> Limits:
+    """The limits of a number of all runs, and of the intervals of its means."""
+    runs = np.concatenate([label.by_run[value] for label in group.labels])
+    means = [label.numbers[f"{value}_mean"] for label in group.labels]
+    return limits(runs, group.return_floor, solved).with_ends(means, group.return_floor)
 
 
 def _from_zero(axes: Axes, intervals: Sequence[Interval], limit: float) -> None:
@@ -163,7 +169,7 @@ def _from_zero(axes: Axes, intervals: Sequence[Interval], limit: float) -> None:
     ends = [end for each in intervals for end in each if end <= limit]
     cut = any(each.high > limit for each in intervals)
     top = max([*ends, *(each.value for each in intervals), limit if cut else 0]) or 1
-    axes.set_ylim(-0.04 * top, 1.04 * top)  # with room for whole markers
+    axes.set_ylim(Limits(0, top).with_room(_ROOM))
 
 
 def _draw_runs(axes: Axes, group: GroupAnalysis, look: Styles, value: str) -> None:
@@ -244,14 +250,16 @@ def _draw_profiles(analysis: Analysis, looks: Looks) -> Figure:
     look, names = looks(), names_with_runs(groups)
     for (axes,), group in zip(panels, groups, strict=True):
         for label in group.labels:
-            colour, returns = look[label.representation]["color"], analysis.profile_returns
+            colour, returns = look[label.representation]["color"], group.profile_returns
             share, low, high = label.profile
             axes.fill_between(returns, low, high, step="post", color=colour, alpha=0.12, lw=0)
             name = names[label.representation]
             axes.step(returns, share, where="post", color=colour, label=name)
-        axes.axvline(SOLVED_RETURN, **solved_line_style())
+        extent = limits(group.profile_returns, solved=group.solved)
+        if extent.contain(group.solved):
+            axes.axvline(group.solved, **solved_line_style())
         axes.set_title(plain(group.name))
-        axes.set(xlim=(0, 1000), ylim=(-0.02, 1.02))
+        axes.set(xlim=extent.with_room(0.02), ylim=(-0.02, 1.02))
         axes.set(xlabel="final return", ylabel="share of runs above")
     below(figure, panels.ravel())
     return figure

@@ -65,7 +65,7 @@ def reference() -> dict[str, Any]:
 
 
 def solved_line_style() -> dict[str, Any]:
-    """The line from which on the paper calls a task solved."""
+    """The line at the return from which on a task counts as solved."""
     return {"color": ink(), "linestyle": ":", "linewidth": 0.8, "alpha": 0.65, "label": "solved"}
 
 

@@ -1,68 +1,86 @@
 """The viewer's layout of each recording."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from jbrep.encoders import Encoder
+from jbrep.envs.task import Array, Task
 from jbrep.inspection.ghost import ALIGNED
 from jbrep.inspection.latent import PATH
 from jbrep.inspection.recording import PROVENANCE
+from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import ROBOT, TRAIL, WORLD
-from jbrep.inspection.signals import STEP, TIME
-from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, Array, Task
-from jbrep.stats.runs import MAX_RETURN
+from jbrep.inspection.signals import (
+    STEP,
+    TIME,
+    Panel,
+    action_panels,
+    feature_panels,
+    latent_panels,
+)
+from jbrep.rollouts.jitterbug import jitterbug_task
 
 TRAVERSE = "traverse"  # a timeline, and the parent entity of its series
 TRAINING_STEP = "training_step"
 _BACKGROUND = (38, 42, 50)
-_CHECKS = rrb.LineGrid3D(spacing=0.01, color=(255, 255, 255, 24), stroke_width=0.7)
 _TAIL = 0.3  # [s] of the latent's path that are drawn as a line
 _NEAR = 1.0  # [s] shown before and after the current time: plots of signals at motor frequency
-_ROOT = f"{ROBOT}/jitterbug"
+_USUAL_TIMESTEP = 0.01  # [s] where a task's isn't known
+_MOST_PLOTS = 12  # on a page
+_EYE = (1.3, -2.5, 1.2)  # in sizes of the robot, from its root
+_NEAR_EYE = (0.9, -1.3, 0.65)  # likewise
 
 
-def episode_layout(task: Task, encoder: Encoder | None) -> rrb.Blueprint:
-    """The robot on the left, its signals on the right."""
+def episode_layout(task: Task, robot: Robot | None, encoder: Encoder | None) -> rrb.Blueprint:
+    """The robot on the left, its signals on the right; the signals alone if there is no robot."""
+    near = _window(task, _NEAR, _NEAR)
     about = rrb.TextDocumentView(origin=PROVENANCE, name="provenance")
-    near = _window(_NEAR, _NEAR)
-    action = _series("action", ["action"], time_ranges=near)
-    motor = rrb.Horizontal(action, _series("reward", ["reward/**"]))
+    acting = [_series(name, [name], time_ranges=near) for name, _ in action_panels(task)]
+    motor = rrb.Horizontal(*_pages("action", acting), _series("reward", ["reward/**"]))
     if encoder is None:
-        numbers: list[rrb.Container | rrb.View] = [
-            rrb.Tabs(_features("observation", task, ["observation"]), about),
-            motor,
-        ]
-        return _blueprint(rrb.Horizontal(_world("robot"), _column(numbers)), TIME)
+        observed = _features("observation", task, ["observation"])
+        scene = [_world("robot", robot, task)] if robot else []
+        return _episode(task, scene, [rrb.Tabs(*observed, about), motor])
     both = _features("observation (thick) and decoded", task, ["observation", "reconstruction"])
-    errors = _features("error", task, ["error"], "scaled", ("error/bodies", "error/total"))
-    latent = _series("latent", ["latent/units"], time_ranges=near)
-    scene = rrb.Vertical(
-        _world("robot and decoded robot: blue is 1 mm off, yellow 10 cm"),
-        rrb.Horizontal(_aligned(), _path()),
-        row_shares=[1.6, 1],
-    )
-    numbers = [rrb.Tabs(both, errors, about), latent, motor]
-    return _blueprint(rrb.Horizontal(scene, _column(numbers)), TIME)
+    has_ghost = robot is not None and jitterbug_task(task) is not None
+    others = ("error/bodies", "error/total") if has_ghost else ("error/total",)
+    errors = _features("error", task, ["error"], "scaled", others)
+    units = [
+        _series(
+            _title("latent", panel, encoder.latent_size),
+            [f"latent/{panel.name}"],
+            time_ranges=near,
+        )
+        for panel in latent_panels(encoder.latent_size)
+    ]
+    numbers = [rrb.Tabs(*both, *errors, about), _tabs(_pages("latent", units)), motor]
+    return _episode(task, _decoded_scene(task, robot, has_ghost), numbers)
 
 
-def traversal_layout(places: Array) -> rrb.Blueprint:
+def traversal_layout(units: int, robot: Robot | None, places: Array) -> rrb.Blueprint:
     """The row of robots above, plots of the features that their units move below."""
-    half = places[:, 0].max() + 0.1
+    plots = [_series(f"unit {i}", [f"{TRAVERSE}/unit_{i}/most"]) for i in range(units)]
+    summary = rrb.TextDocumentView(origin=f"{TRAVERSE}/summary", name="what each unit moves")
+    about = rrb.TextDocumentView(origin=PROVENANCE, name="provenance")
+    below = rrb.Horizontal(
+        _tabs(_pages("units", plots)), rrb.Tabs(summary, about), column_shares=[1.4, 1]
+    )
+    if robot is None:
+        return _blueprint(below, TRAVERSE)
+    half = places[:, 0].max() + 1.3 * robot.size
     eye = rrb.EyeControls3D(position=(0, -0.75 * half, 0.25 * half), look_target=(0, 0, 0.04))
     view = rrb.Spatial3DView(
         origin=WORLD,
         name="a robot for each unit",
         eye_controls=eye,
         background=_BACKGROUND,
-        line_grid=_CHECKS,
+        line_grid=_checks(robot),
     )
-    plots = [_series(f"unit {i}", [f"{TRAVERSE}/unit_{i}/most"]) for i in range(len(places))]
-    summary = rrb.TextDocumentView(origin=f"{TRAVERSE}/summary", name="what each unit moves")
-    about = rrb.TextDocumentView(origin=PROVENANCE, name="provenance")
-    below = rrb.Horizontal(rrb.Grid(*plots), rrb.Tabs(summary, about), column_shares=[1.4, 1])
     return _blueprint(rrb.Vertical(view, below), TRAVERSE)
 
 
@@ -74,21 +92,13 @@ def curves_layout(groups: Sequence[str], last_step: int) -> rrb.Blueprint:
             end=rrb.TimeRangeBoundary.absolute(seq=last_step),
         )
     )
-    plots = [
-        _series(
-            f"{group}: mean return",
-            [f"{group}/**"],
-            axis_x=training,
-            axis_y=rrb.ScalarAxis(range=(0, MAX_RETURN)),
-        )
-        for group in groups
-    ]
+    plots = [_series(f"{group}: mean return", [f"{group}/**"], axis_x=training) for group in groups]
     text = rrb.TextDocumentView(origin=PROVENANCE, name="runs")
     layout = rrb.Horizontal(rrb.Grid(*plots), text, column_shares=[2, 1])
     return _blueprint(layout, TRAINING_STEP)
 
 
-def _blueprint(layout: rrb.Container, timeline: str) -> rrb.Blueprint:
+def _blueprint(layout: rrb.Container | rrb.View, timeline: str) -> rrb.Blueprint:
     return rrb.Blueprint(
         layout,
         rrb.TimePanel(state="collapsed", timeline=timeline),
@@ -97,52 +107,84 @@ def _blueprint(layout: rrb.Container, timeline: str) -> rrb.Blueprint:
     )
 
 
-def _column(numbers: Sequence[rrb.Container | rrb.View]) -> rrb.Vertical:
-    """Stacked views, of which the first takes more than half of the height."""
-    return rrb.Vertical(*numbers, row_shares=[1.2 * len(numbers), *[1.2] * (len(numbers) - 2), 1])
+def _episode(
+    task: Task, scene: Sequence[rrb.Container | rrb.View], numbers: Sequence[rrb.Container]
+) -> rrb.Blueprint:
+    """Stacked views on the right, of which the first takes more than half of the height."""
+    shares = [1.2 * len(numbers), *[1.2] * (len(numbers) - 2), 1]
+    column = rrb.Vertical(*numbers, row_shares=shares)
+    timeline = STEP if task.timestep is None else TIME
+    return _blueprint(rrb.Horizontal(*scene, column) if scene else column, timeline)
 
 
-def _world(name: str) -> rrb.Spatial3DView:
+def _decoded_scene(
+    task: Task, robot: Robot | None, has_ghost: bool
+) -> list[rrb.Container | rrb.View]:
+    """The robot, with its ghost where there is one, and the path of the latent."""
+    path = _path(task)
+    if robot is None:
+        return [path]
+    if not has_ghost:
+        return [rrb.Vertical(_world("robot", robot, task), path, row_shares=[1.6, 1])]
+    world = _world("robot and decoded robot: blue is 1 mm off, yellow 10 cm", robot, task)
+    below = rrb.Horizontal(_aligned(robot), path)
+    return [rrb.Vertical(world, below, row_shares=[1.6, 1])]
+
+
+def _world(name: str, robot: Robot, task: Task) -> rrb.Spatial3DView:
     """The scene, seen by a camera that follows the robot."""
-    eye = rrb.EyeControls3D(
-        position=(0.1, -0.19, 0.12), look_target=(0, 0, 0.03), tracking_entity=_ROOT
-    )
     return rrb.Spatial3DView(
         origin=WORLD,
         contents=[f"{WORLD}/**", f"- {ALIGNED}/**"],
         name=name,
-        eye_controls=eye,
-        overrides={TRAIL: _window(None)},
+        eye_controls=rrb.EyeControls3D(
+            position=robot.place + robot.size * np.array(_EYE),
+            look_target=robot.place,
+            tracking_entity=_root(robot),
+        ),
+        overrides={TRAIL: _window(task, None)},
         background=_BACKGROUND,
-        line_grid=_CHECKS,
+        line_grid=_checks(robot),
     )
 
 
-def _aligned() -> rrb.Spatial3DView:
+def _aligned(robot: Robot) -> rrb.Spatial3DView:
     """Seen from the robot: its decoded orientation and motor angle."""
-    eye = rrb.EyeControls3D(position=(0.07, -0.1, 0.05), look_target=(0, 0, 0.002))
     return rrb.Spatial3DView(
-        origin=_ROOT,
+        origin=_root(robot),
         contents=[f"{ROBOT}/**", f"{ALIGNED}/**"],
         name="decoded orientation, overlaid on the robot",
-        eye_controls=eye,
+        eye_controls=rrb.EyeControls3D(
+            position=robot.size * np.array(_NEAR_EYE), look_target=(0, 0, 0)
+        ),
         background=_BACKGROUND,
         line_grid=False,
     )
 
 
-def _path() -> rrb.Spatial2DView:
+def _root(robot: Robot) -> str:
+    return f"{ROBOT}/{robot.names[robot.root]}"
+
+
+def _checks(robot: Robot) -> rrb.LineGrid3D:
+    """Lines on the floor, 1 cm apart for a robot of some cm, 10 cm for one ten times as large."""
+    spacing = 10.0 ** math.floor(math.log10(robot.size / 3))
+    return rrb.LineGrid3D(spacing=spacing, color=(255, 255, 255, 24), stroke_width=0.7)
+
+
+def _path(task: Task) -> rrb.Spatial2DView:
     """The latent's first two principal components."""
+    tail = f"{_TAIL} s" if task.timestep else f"{round(_TAIL / _USUAL_TIMESTEP)} steps"
     return rrb.Spatial2DView(
         origin="latent",
         contents=[f"{PATH}/**"],
-        name=f"latent: two principal components, the last {_TAIL} s as a line",
-        overrides={PATH: _window(_TAIL)},
+        name=f"latent: two principal components, the last {tail} as a line",
+        overrides={PATH: _window(task, _TAIL)},
         background=_BACKGROUND,
     )
 
 
-def _window(before: float | None, after: float = 0.0) -> rrb.VisibleTimeRanges:
+def _window(task: Task, before: float | None, after: float = 0.0) -> rrb.VisibleTimeRanges:
     """The seconds shown before and after the current time; None shows all before."""
     edge = rrb.TimeRangeBoundary
     ends = []
@@ -150,7 +192,7 @@ def _window(before: float | None, after: float = 0.0) -> rrb.VisibleTimeRanges:
         if seconds is None:
             ends.append((edge.infinite(), edge.infinite()))
         else:
-            steps = round(seconds / CONTROL_TIMESTEP)
+            steps = round(seconds / (task.timestep or _USUAL_TIMESTEP))
             ends.append((edge.cursor_relative(seq=steps), edge.cursor_relative(seconds=seconds)))
     starts, stops = ends
     return rrb.VisibleTimeRanges(
@@ -163,18 +205,44 @@ def _window(before: float | None, after: float = 0.0) -> rrb.VisibleTimeRanges:
 
 def _features(
     name: str, task: Task, roots: Sequence[str], unit: str = "", others: Sequence[str] = ()
-) -> rrb.Grid:
-    """A plot for each observable, then one for each of the other entities."""
-    plots = [
-        _series(
-            f"{observable.name} [{unit or observable.features[0].unit}]",
-            [f"{root}/{observable.name}" for root in roots],
-            plot_legend=rrb.PlotLegend(visible=False),
-            time_ranges=_window(_NEAR, _NEAR),
+) -> list[rrb.Grid]:
+    """Pages with a plot for each panel of features, then one for each of the other entities."""
+    plots = []
+    for panel in feature_panels(task):
+        shown = unit or task.features[panel.place][0].unit
+        plots.append(
+            _series(
+                f"{panel.name} [{shown}]" if shown else panel.name,
+                [f"{root}/{panel.name}" for root in roots],
+                plot_legend=rrb.PlotLegend(visible=False),
+                time_ranges=_window(task, _NEAR, _NEAR),
+            )
         )
-        for observable in task.observables
+    return _pages(name, [*plots, *(_series(each, [each]) for each in others)])
+
+
+def _title(name: str, panel: Panel, size: int) -> str:
+    """A plot's title; of one among several, with the numbers of its lines."""
+    start, stop, _ = panel.place.indices(size)
+    return name if stop - start == size else f"{name} {start}-{stop - 1}"
+
+
+def _pages(name: str, plots: Sequence[rrb.View]) -> list[rrb.Grid]:
+    """Plots on as many pages as they need, in two columns."""
+    count = -(-len(plots) // _MOST_PLOTS)
+    parts = [plots[len(plots) * i // count : len(plots) * (i + 1) // count] for i in range(count)]
+    return [
+        rrb.Grid(
+            *part,
+            name=name if count == 1 else f"{name}, {i} of {count}",
+            grid_columns=min(2, len(part)),
+        )
+        for i, part in enumerate(parts, start=1)
     ]
-    return rrb.Grid(*plots, *(_series(each, [each]) for each in others), name=name, grid_columns=2)
+
+
+def _tabs(pages: Sequence[rrb.Grid]) -> rrb.Container:
+    return pages[0] if len(pages) == 1 else rrb.Tabs(*pages)
 
 
 def _series(name: str, contents: Sequence[str], **settings: Any) -> rrb.TimeSeriesView:

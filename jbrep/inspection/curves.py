@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from jbrep.encoders import FULL
 from jbrep.inspection.blueprint import TRAINING_STEP, curves_layout
 from jbrep.inspection.recording import Colour, Recording, palette
-from jbrep.jitterbug.tasks import Array
 from jbrep.stats import RunCurve
-from jbrep.stats.runs import in_order
+from jbrep.stats.bootstrap import Array
+from jbrep.stats.runs import in_order, with_failure_returns
 
 _RUN_WIDTH = 1.0  # [points]
 _MEDIAN_WIDTH = 4.0  # [points]
@@ -23,7 +23,7 @@ _MEDIAN_WIDTH = 4.0  # [points]
 def median_curve(runs: Sequence[RunCurve]) -> tuple[NDArray[np.int64], Array]:
     """Median over runs at the steps at which all were evaluated.
 
-    A failed run counts as return 0 from the step at which it failed.
+    A failed run counts as its failure_return from the step at which it failed.
     """
     whole = [run.steps for run in runs if run.failed_at is None] or [runs[0].curve()[0]]
     steps: NDArray[np.int64] = reduce(np.intersect1d, whole)
@@ -43,7 +43,7 @@ def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
         InputError: the file can't be written.
     """
     labels = defaultdict(list)
-    for run in sorted(runs, key=lambda run: (run.label, run.seed)):
+    for run in sorted(with_failure_returns(runs), key=lambda run: (run.label, run.seed)):
         labels[run.label].append(run)
     representations = in_order((run.representation for run in runs), FULL)
     colours = dict(zip(representations, palette(len(representations)), strict=True))
@@ -55,7 +55,7 @@ def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
             path_of_run = f"{label}/seed-{run.seed}"
             _send(recording, path_of_run, run.curve(), name, colours[name], _RUN_WIDTH)
         _send(recording, f"{label}/median", median_curve(group), name, colours[name], _MEDIAN_WIDTH)
-    groups = sorted({label.rpartition("/")[0] for label in labels})
+    groups = sorted({f"{run.task}/{run.algorithm}" for run in runs})
     recording.write(path, curves_layout(groups, max(int(run.curve()[0][-1]) for run in runs)))
 
 

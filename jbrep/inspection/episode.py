@@ -8,12 +8,13 @@ import numpy as np
 from jbrep.encoders import Encoder
 from jbrep.encoders.file import fingerprint
 from jbrep.inspection.blueprint import episode_layout
-from jbrep.inspection.ghost import Ghost, send_ghost
+from jbrep.inspection.ghost import send_ghost
 from jbrep.inspection.latent import send_encoding
 from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import send_scene
-from jbrep.inspection.signals import send_signals, times_at
+from jbrep.inspection.signals import send_signals, send_terms, times_at
+from jbrep.rollouts.jitterbug import jitterbug_task
 from jbrep.rollouts.rollout import Rollout
 
 
@@ -28,28 +29,37 @@ def record_episode(rollout: Rollout, path: Path, encoder: Encoder | None = None)
     Raises:
         InputError: the file can't be written.
     """
-    about = provenance(rollout, encoder)
-    recording = Recording(rollout.name, about, rollout.qpos, rollout.action)
-    robot, times = Robot(), times_at(np.arange(len(rollout) + 1))
-    send_scene(recording, robot, times, rollout)
+    task, motion = rollout.task, rollout.motion
+    content = (rollout.observation, rollout.action, *([motion.qpos] if motion else []))
+    recording = Recording(rollout.name, provenance(rollout, encoder), *content)
+    times = times_at(task, np.arange(len(rollout) + 1))
+    robot = Robot(motion.model) if motion else None
     send_signals(recording, rollout)
+    if robot and motion:
+        send_scene(recording, robot, times, motion)
+        send_terms(recording, task, motion)
     if encoder:
-        ghost = Ghost.of(
-            encoder, rollout.task, encoder.encode(rollout.observation.astype(np.float32))
-        )
-        send_ghost(recording, robot, times, rollout, ghost)
-        send_encoding(recording, times, rollout, encoder, ghost)
-    recording.write(path, episode_layout(rollout.task, encoder))
+        latent = encoder.encode(rollout.observation)
+        decoded = encoder.decode(latent).astype(np.float64)
+        send_encoding(recording, times, rollout, encoder, latent, decoded)
+        if robot and motion and jitterbug_task(task):
+            send_ghost(recording, robot, times, task, motion, decoded)
+    recording.write(path, episode_layout(task, robot, encoder))
 
 
 def provenance(rollout: Rollout, encoder: Encoder | None) -> str:
     """The origin of an episode and its encoder, as Markdown."""
-    facts = {
-        "task": rollout.task.name,
+    facts = {"task": rollout.task.name}
+    if rollout.task.arguments:
+        facts["arguments"] = f"`{dict(rollout.task.arguments)}`"
+    facts |= {
         "seed": f"{rollout.seed}",
         "steps": f"{len(rollout):,}",
-        "return": f"{rollout.reward.sum():.1f}",
+        "return": f"{rollout.episode_return:.1f}",
+        "end": "terminated" if rollout.terminated else "truncated",
     }
+    if rollout.note:
+        facts["note"] = rollout.note
     if encoder:
         facts |= {
             "encoder": f"{encoder.name} ({encoder.header['kind']})",

@@ -1,17 +1,16 @@
-"""An encoder's reconstruction of an episode: the decoded robot, a ghost, and its errors."""
+"""The Jitterbug as decoded from a latent: a ghost, and its distance from the robot."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.encoders import Encoder
+from jbrep.envs.physics import Motion
+from jbrep.envs.task import Array, Task
 from jbrep.inspection.recording import ORANGE, SKY, Recording
 from jbrep.inspection.robot import Robot, rotate
-from jbrep.jitterbug.tasks import Array, Task
-from jbrep.rollouts.rollout import Rollout
+from jbrep.jitterbug.tasks import MOTOR_QPOS, POSITION, QPOS_SIZE, QUATERNION
 
 GHOST = "world/ghost"
 ALIGNED = "world/aligned"
@@ -27,29 +26,15 @@ _HEADING_RADIUS = 0.001  # [m]
 _TARGET_RADIUS = 0.006  # [m]
 
 
-class Ghost(NamedTuple):
-    """An episode of n states, encoded to l units and decoded again."""
-
-    latent: NDArray[np.float32]  # (n, l)
-    observation: Array  # decoded, (n, d) in physical units
-    qpos: Array  # (n, 16) of the decoded robot
-
-    @classmethod
-    def of(cls, encoder: Encoder, task: Task, latent: NDArray[np.float32]) -> "Ghost":
-        """The decoded states of latents (n, l)."""
-        decoded = encoder.decode(latent).astype(np.float64)
-        return cls(latent, decoded, as_qpos(task, decoded))
-
-
 def as_qpos(task: Task, observation: Array) -> Array:
     """Positions (n, 16) from observations (n, d); the legs, which they lack, are at rest."""
     parts = task.split(observation)
     given = parts["orientation"].any(axis=1, keepdims=True)
     turned = np.where(given, parts["orientation"], (1.0, 0.0, 0.0, 0.0))
-    qpos = np.zeros((len(observation), 16))
-    qpos[:, :3] = parts["position"]
-    qpos[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
-    qpos[:, 15] = parts["motor_angle"][:, 0] - np.pi / 2
+    qpos = np.zeros((len(observation), QPOS_SIZE))
+    qpos[:, POSITION] = parts["position"]
+    qpos[:, QUATERNION] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    qpos[:, MOTOR_QPOS] = parts["motor_angle"][:, 0] - np.pi / 2
     return qpos
 
 
@@ -66,36 +51,44 @@ def send_ghost(
     recording: Recording,
     robot: Robot,
     times: Sequence[rr.TimeColumn],
-    rollout: Rollout,
-    ghost: Ghost,
+    task: Task,
+    motion: Motion,
+    decoded: Array,
 ) -> None:
-    """Send the decoded robot at its decoded position, and again at the true one."""
-    there = robot.origins(rollout.qpos)
-    apart = {
-        name: np.linalg.norm(origin - there[name], axis=1)
-        for name, origin in robot.origins(ghost.qpos).items()
-    }
-    colours = {name: shades(errors) for name, errors in apart.items()}
-    robot.draw(recording, GHOST, times, ghost.qpos, colours, legs(robot))
-    aligned = np.concatenate((rollout.qpos[:, :3], ghost.qpos[:, 3:]), axis=1)
-    plain = dict.fromkeys(robot.bodies, np.array(_ALIGNED_COLOUR, np.uint8))
-    robot.draw(recording, ALIGNED, times, aligned, plain, legs(robot))
-    millimetres = 1e3 * np.stack(list(apart.values()), axis=1)
-    recording.send_series("error/bodies", times, millimetres, [f"{name} [mm]" for name in apart])
-    _send_goal(recording, times, rollout.task, ghost)
+    """Send the decoded robot at its decoded position, and again at the true one.
 
-
-def legs(robot: Robot) -> list[str]:
-    """The bodies that no task observes."""
-    return [name for name in robot.bodies if name.startswith("leg")]
+    Args:
+        recording: to draw in.
+        robot: the Jitterbug.
+        times: of the states.
+        task: one of the Jitterbug's.
+        motion: what the robot really went through, n states.
+        decoded: observations (n, d) in physical units.
+    """
+    qpos = as_qpos(task, decoded)
+    ghost, true = robot.poses(Motion(robot.model, {"qpos": qpos})), robot.poses(motion)
+    apart = np.linalg.norm(ghost.position - true.position, axis=2)[:, robot.bodies]
+    colours = shades(apart.ravel()).reshape(*apart.shape, 4)
+    robot.draw(recording, GHOST, times, ghost, robot.bodies, colours)
+    aligned = np.concatenate((motion.qpos[:, POSITION], qpos[:, QUATERNION.start :]), axis=1)
+    turned = robot.poses(Motion(robot.model, {"qpos": aligned}))
+    plain = np.array(_ALIGNED_COLOUR, np.uint8)
+    robot.draw(recording, ALIGNED, times, turned, robot.bodies, plain)
+    names = [f"{robot.names[body]} [mm]" for body in robot.bodies]
+    recording.send_series("error/bodies", times, 1e3 * apart, names)
+    _send_goal(recording, times, task, decoded, qpos)
 
 
 def _send_goal(
-    recording: Recording, times: Sequence[rr.TimeColumn], task: Task, ghost: Ghost
+    recording: Recording,
+    times: Sequence[rr.TimeColumn],
+    task: Task,
+    decoded: Array,
+    qpos: Array,
 ) -> None:
     """Send the decoded target, if the task observes it."""
-    parts = task.split(ghost.observation)
-    origin, turned = ghost.qpos[:, :3], ghost.qpos[:, 3:7]
+    parts = task.split(decoded)
+    origin, turned = qpos[:, POSITION], qpos[:, QUATERNION]
     if "target" in parts:
         points = rr.Points3D.columns(positions=origin + rotate(turned, parts["target"]))
         recording.send_columns(f"{GHOST}/target", times, points)

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from jbrep.encoders import Encoder
-from jbrep.inspection.ghost import Ghost
+from jbrep.envs.task import Array
 from jbrep.inspection.recording import SKY, YELLOW, Recording
-from jbrep.inspection.signals import send_decoded, send_features
-from jbrep.jitterbug.tasks import Array
+from jbrep.inspection.signals import latent_panels, send_decoded, send_features
 from jbrep.rollouts.rollout import Rollout
 
 PATH = "latent/path"
@@ -22,18 +22,20 @@ def send_encoding(
     times: Sequence[rr.TimeColumn],
     rollout: Rollout,
     encoder: Encoder,
-    ghost: Ghost,
+    latent: NDArray[np.float32],
+    decoded: Array,
 ) -> None:
-    """Send decoded features, their errors in scaled units, and the latent."""
+    """Send decoded features (n, d), their errors in scaled units, and the latent (n, l)."""
     task = rollout.task
-    send_decoded(recording, times, task, ghost.observation)
-    errors = (ghost.observation - rollout.observation) / encoder.scaler.half_width
+    send_decoded(recording, times, task, decoded)
+    errors = (decoded - rollout.observation) / encoder.scaler.half_width
     send_features(recording, "error", times, task, errors.astype(np.float32), "scaled")
     total = np.sqrt(np.square(errors).mean(axis=1, keepdims=True))
     recording.send_series("error/total", times, total, ["root mean square [scaled]"])
     names = [f"unit {i}" for i in range(encoder.latent_size)]
-    recording.send_series("latent/units", times, ghost.latent, names)
-    _send_path(recording, times, ghost.latent.astype(np.float64))
+    for name, place in latent_panels(encoder.latent_size):
+        recording.send_series(f"latent/{name}", times, latent[:, place], names[place])
+    _send_path(recording, times, latent.astype(np.float64))
 
 
 def principal_components(latent: Array) -> Array:

@@ -1,21 +1,20 @@
-"""The robot as a tree of Rerun entities, named as in its MuJoCo model."""
+"""A robot of any MuJoCo model as Rerun entities, one for each body."""
 
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from functools import cached_property
-from typing import Any
+import re
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from jbrep.envs.physics import Motion, root_of
+from jbrep.envs.task import Array
 from jbrep.inspection.recording import Recording
-from jbrep.jitterbug.model import plain_model
-from jbrep.jitterbug.tasks import Array
+from jbrep.inspection.shapes import XYZW, is_shown, shapes
 
-ROOT = "jitterbug"
-_XYZW = [1, 2, 3, 0]  # Rerun's order of a quaternion's components, from MuJoCo's
+_DEFAULT_SIZE = 1.0  # [m] of a model without geoms
 
 
 def rotate(quaternion: Array, vector: Array) -> Array:
@@ -25,146 +24,111 @@ def rotate(quaternion: Array, vector: Array) -> Array:
     return vector + 2 * (scalar * across + np.cross(axis, across))
 
 
-def multiply(first: Array, second: Array) -> Array:
-    """Products (..., 4) of quaternions: the rotation by the second, then by the first."""
-    scalar, axis = first[..., :1], first[..., 1:]
-    other, along = second[..., :1], second[..., 1:]
-    real = scalar * other - (axis * along).sum(-1, keepdims=True)
-    return np.concatenate((real, scalar * along + other * axis + np.cross(axis, along)), axis=-1)
+class Poses(NamedTuple):
+    """Where the bodies of a model are in n states, in the world."""
 
-
-def transform(position: Array, quaternion: Array) -> rr.ComponentColumnList:
-    """Positions (n, 3) and quaternions (n, 4) as columns."""
-    return rr.Transform3D.columns(translation=position, quaternion=quaternion[:, _XYZW])
+    position: Array  # (n, bodies, 3) [m]
+    quaternion: Array  # (n, bodies, 4)
 
 
 class Robot:
-    """Bodies and geoms of the model, and their poses in a state.
+    """The bodies of a model, and which of them are the robot.
+
+    That is the heaviest tree of bodies that can move; all of them where none can.
 
     Attributes:
         model: the MuJoCo model.
-        bodies: names of the robot's bodies, each after its parent.
+        names: of all bodies as parts of paths, each a different one.
+        root: number of the body that carries the robot's others.
+        bodies: numbers of the robot's bodies, the root first.
+        others: numbers of all other bodies, such as the world and a target.
+        place: of the root in the model's reference pose, (3,) [m].
+        size: from the root's origin to the farthest point of the robot, in the same pose [m].
     """
 
-    def __init__(self) -> None:
-        self.model = plain_model()
-        names = [self.model.body(i).name for i in range(self.model.nbody)]
-        self.bodies = tuple(names[names.index(ROOT) :])
+    def __init__(self, model: mujoco.MjModel):
+        self.model = model
+        self.names = _names(model)
+        self.root = root_of(model)
+        roots = model.body_rootid if self.root else np.zeros(model.nbody, int)
+        self.bodies = np.flatnonzero(roots == self.root).tolist()
+        self.others = np.flatnonzero(roots != self.root).tolist()
+        self.place, self.size = self._reach()
 
-    @cached_property
-    def paths(self) -> dict[str, str]:
-        """The path of each body's entity, from the root's."""
-        paths = {ROOT: ROOT}
-        for name in self.bodies[1:]:
-            paths[name] = f"{paths[self._parent(name)]}/{name}"
-        return paths
+    @property
+    def weight(self) -> float:
+        """The robot's weight [N]."""
+        gravity = float(np.linalg.norm(self.model.opt.gravity))
+        return float(self.model.body_subtreemass[self.root]) * gravity
 
-    def _parent(self, body: str) -> str:
-        return self.model.body(self.model.body(body).parentid[0]).name
+    def _reach(self) -> tuple[Array, float]:
+        data = mujoco.MjData(self.model)
+        mujoco.mj_kinematics(self.model, data)
+        geoms = [g for body in self.bodies for g in self.geoms(body)]
+        away = np.linalg.norm(data.geom_xpos[geoms] - data.xpos[self.root], axis=1)
+        size = float((away + self.model.geom_rbound[geoms]).max(initial=0)) or _DEFAULT_SIZE
+        return data.xpos[self.root].copy(), size
 
-    def poses(self, qpos: Array) -> dict[str, tuple[Array, Array]]:
-        """The pose of each body in its parent's frame, the root's in the world.
+    def geoms(self, body: int) -> list[int]:
+        """Numbers of a body's geoms that can be drawn."""
+        address, count = self.model.body_geomadr[body], self.model.body_geomnum[body]
+        return [g for g in range(address, address + count) if is_shown(self.model, g)]
 
-        Args:
-            qpos: n states, (n, 16).
-
-        Returns:
-            Positions (n, 3) and quaternions (n, 4).
-        """
-        poses = {ROOT: (qpos[:, :3], qpos[:, 3:7])}
-        for name in self.bodies[1:]:  # each turns about an axis through its origin
-            body = self.model.body(name)
-            joint = self.model.joint(body.jntadr[0])
-            half = qpos[:, joint.qposadr] / 2
-            turned = np.concatenate((np.cos(half), np.sin(half) * joint.axis), axis=1)
-            poses[name] = np.tile(body.pos, (len(qpos), 1)), turned
-        return poses
-
-    def origins(self, qpos: Array) -> dict[str, Array]:
-        """The position of each body in the world, (n, 3), in states (n, 16)."""
-        poses = self.poses(qpos)
-        world = {ROOT: poses[ROOT]}
-        for name in self.bodies[1:]:
-            (origin, turned), (position, quaternion) = world[self._parent(name)], poses[name]
-            world[name] = origin + rotate(turned, position), multiply(turned, quaternion)
-        return {name: position for name, (position, _) in world.items()}
+    def poses(self, motion: Motion) -> Poses:
+        """Where all bodies are in each state."""
+        data = mujoco.MjData(self.model)
+        position = np.empty((len(motion), self.model.nbody, 3))
+        quaternion = np.empty((len(motion), self.model.nbody, 4))
+        for state in range(len(motion)):
+            motion.put(data, state)
+            mujoco.mj_kinematics(self.model, data)
+            position[state], quaternion[state] = data.xpos, data.xquat
+        return Poses(position, quaternion)
 
     def draw(
         self,
         recording: Recording,
         root: str,
         times: Sequence[rr.TimeColumn],
-        qpos: Array,
-        colours: Mapping[str, NDArray[np.uint8]] | None = None,
-        still: Sequence[str] = (),
+        poses: Poses,
+        bodies: Iterable[int],
+        colours: NDArray[np.uint8] | None = None,
     ) -> None:
-        """Draw the robot below an entity.
+        """Draw bodies as entities below another.
 
         Args:
             recording: to draw in.
             root: the entity.
             times: of the states.
-            qpos: the states, (n, 16).
-            colours: of each body, (n, 4), or (4,) at all times; the materials' if not given.
-            still: bodies that don't move relative to their parents.
+            poses: of all bodies in n states.
+            bodies: numbers of those to draw.
+            colours: of each of them in each state, (n, len(bodies), 4), or of all, (4,); their
+                own if not given.
         """
-        for name, (position, quaternion) in self.poses(qpos).items():
-            path, columns = f"{root}/{self.paths[name]}", []
-            if name in still:
-                turned = rr.Quaternion(xyzw=quaternion[0, _XYZW])
-                recording.send(path, rr.Transform3D(translation=position[0], quaternion=turned))
+        for i, body in enumerate(bodies):
+            path, geoms = f"{root}/{self.names[body]}", self.geoms(body)
+            columns = []
+            place, turned = poses.position[:, body], poses.quaternion[:, body][:, XYZW]
+            if (place == place[0]).all() and (turned == turned[0]).all():
+                still = rr.Transform3D(
+                    translation=place[0], quaternion=rr.Quaternion(xyzw=turned[0])
+                )
+                recording.send(path, still)
             else:
-                columns.append(transform(position, quaternion))
-            if colours is None:
-                self.draw_geoms(recording, path, name)
-            else:
-                columns += self._draw_merged(recording, path, name, colours[name])
+                columns.append(rr.Transform3D.columns(translation=place, quaternion=turned))
+            fixed = colours if colours is not None and colours.ndim == 1 else None
+            for shape in shapes(self.model, geoms, colour=fixed):
+                recording.send(path, shape)
+                if colours is not None and fixed is None:
+                    columns.append(type(shape).columns(colors=colours[:, i]))
             if columns:
                 recording.send_columns(path, times, *columns)
 
-    def draw_geoms(self, recording: Recording, path: str, body: str) -> None:
-        """Draw a body's geoms as entities below its own, in their materials' colours."""
-        for geom in self._geoms(body):
-            colour = np.round(255 * self.model.mat_rgba[geom.matid[0]]).astype(np.uint8)
-            shape = _kind(geom).from_fields(**_fields([geom]), colors=[colour])
-            recording.send(f"{path}/{geom.name}", shape)
 
-    def _draw_merged(
-        self, recording: Recording, path: str, body: str, colours: NDArray[np.uint8]
-    ) -> list[rr.ComponentColumnList]:
-        """Draw a body's geoms on its own entity, which takes less space.
-
-        Returns:
-            Their colours as columns, if they change.
-        """
-        kinds = defaultdict(list)
-        for geom in self._geoms(body):
-            kinds[_kind(geom)].append(geom)
-        still = {"colors": [colours]} if colours.ndim == 1 else {}
-        for kind, geoms in kinds.items():
-            recording.send(path, kind.from_fields(**_fields(geoms), **still))
-        return [] if still else [kind.columns(colors=colours) for kind in kinds]
-
-    def _geoms(self, body: str) -> list[Any]:
-        address, count = self.model.body(body).geomadr[0], self.model.body(body).geomnum[0]
-        return [self.model.geom(address + i) for i in range(count)]
-
-
-def _kind(geom: Any) -> Any:
-    """Rerun's archetype for a geom."""
-    kinds = {mujoco.mjtGeom.mjGEOM_BOX: rr.Boxes3D, mujoco.mjtGeom.mjGEOM_CYLINDER: rr.Cylinders3D}
-    return kinds.get(mujoco.mjtGeom(geom.type[0]), rr.Ellipsoids3D)
-
-
-def _fields(geoms: Sequence[Any]) -> dict[str, Any]:
-    """All fields of an archetype but its colours, for geoms of one kind."""
-    sizes = np.array([geom.size for geom in geoms])
-    fields = {
-        "quaternions": [geom.quat[_XYZW] for geom in geoms],
-        "centers": [geom.pos for geom in geoms],
-        "fill_mode": rr.components.FillMode.Solid,
-    }
-    if _kind(geoms[0]) is rr.Cylinders3D:
-        return {**fields, "radii": sizes[:, 0], "lengths": 2 * sizes[:, 1]}
-    is_sphere = [geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE for geom in geoms]
-    return {**fields, "half_sizes": np.where(np.transpose([is_sphere]), sizes[:, :1], sizes)}
+def _names(model: mujoco.MjModel) -> list[str]:
+    """Names of the bodies as parts of paths, numbered where they have none or not their own."""
+    names: list[str] = []
+    for body in range(model.nbody):
+        name = re.sub(r"[^A-Za-z0-9_.-]", "_", model.body(body).name) or f"body_{body}"
+        names.append(name if name not in names else f"{name}_{body}")
+    return names

@@ -1,4 +1,4 @@
-"""The episode in three dimensions: robot, floor, target, trail and contacts."""
+"""The episode in three dimensions: robot, surroundings, trail and contacts."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,100 +8,121 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from jbrep.envs.physics import Motion
+from jbrep.envs.task import Array
 from jbrep.inspection.recording import GREEN, SKY, Recording
-from jbrep.inspection.robot import Robot, transform
-from jbrep.jitterbug.tasks import Array
-from jbrep.rollouts.rollout import Rollout
+from jbrep.inspection.robot import Robot
+from jbrep.inspection.shapes import XYZW
 
 WORLD = "world"
 ROBOT = f"{WORLD}/robot"
+SURROUNDINGS = f"{WORLD}/surroundings"
+FLOOR = f"{WORLD}/floor"
 TRAIL = f"{WORLD}/trail"
 CONTACTS = f"{WORLD}/contacts"
-_FLOOR_MARGIN = 0.3  # [m] beyond the path
-_FLOOR_THICKNESS = 0.001  # [m]
 _FLOOR_COLOUR = (58, 66, 80)
-_TRAIL_RADIUS = 0.0006  # [m]
-_CONTACT_RADIUS = 0.0012  # [m]
-_WEIGHT_LENGTH = 0.05  # [m] of the arrow for a force of the robot's weight
+# in sizes of the robot
+_FLOOR_MARGIN = 4.0  # beyond the path
+_FLOOR_THICKNESS = 0.013
+_TRAIL_RADIUS = 0.008
+_CONTACT_RADIUS = 0.016
+_WEIGHT_LENGTH = 0.65  # of the arrow for a force of the robot's weight
 
 
 class Contacts(NamedTuple):
-    """The contacts with the floor in each of n states."""
+    """The contacts in each of n states."""
 
     counts: NDArray[np.int64]  # (n,)
     points: Array  # (sum of the counts, 3) in the world [m]
     forces: Array  # (sum of the counts, 3) on the robot, in world axes [N]
 
 
-def contacts(robot: Robot, rollout: Rollout) -> Contacts:
-    """Find the contact points and forces in each state."""
-    model = robot.model
+def contacts(robot: Robot, motion: Motion) -> Contacts:
+    """Find the contact points and forces in each state.
+
+    Of two parts of the robot, the force is the one on the second.
+    """
+    model, is_robot = robot.model, np.isin(np.arange(robot.model.nbody), robot.bodies)
     data, force = mujoco.MjData(model), np.zeros(6)
     counts: list[int] = []
     points: list[Array] = []
     forces: list[Array] = []
-    drive = np.append(rollout.action[:, 0], rollout.action[-1:, 0])  # the last is held
-    for qpos, qvel, control in zip(rollout.qpos, rollout.qvel, drive, strict=True):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, control
+    for state in range(len(motion)):
+        motion.put(data, state)
         mujoco.mj_forward(model, data)
         touching = data.contact
         counts.append(data.ncon)
         points.append(touching.pos.copy())
         for i, frame in enumerate(touching.frame.reshape(-1, 3, 3)):
             mujoco.mj_contactForce(model, data, i, force)
-            forces.append(force[:3] @ frame)
+            second = touching.geom[i, 1]  # which the force acts on; below 0 for a flexible body
+            on_robot = second < 0 or is_robot[model.geom_bodyid[second]]
+            forces.append(force[:3] @ frame * (1 if on_robot else -1))
     return Contacts(np.array(counts), np.concatenate(points), np.reshape(forces, (-1, 3)))
 
 
 def send_scene(
-    recording: Recording, robot: Robot, times: Sequence[rr.TimeColumn], rollout: Rollout
+    recording: Recording, robot: Robot, times: Sequence[rr.TimeColumn], motion: Motion
 ) -> None:
-    """Send the robot, floor, target, trail and contacts."""
+    """Send the robot, its surroundings, trail and contacts."""
+    poses = robot.poses(motion)
+    path = poses.position[:, robot.root]
     recording.send(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    robot.draw(recording, ROBOT, times, rollout.qpos)
-    send_floor(recording, rollout.qpos[:, :2])
-    target = transform(rollout.target_position[None], rollout.target_quaternion[None])
-    recording.send_columns(f"{WORLD}/target", (), target)
-    robot.draw_geoms(recording, f"{WORLD}/target", "target")
-    _send_trail(recording, times, rollout.qpos[:, :2])
-    _send_contacts(recording, times, contacts(robot, rollout), _weight(robot))
+    robot.draw(recording, ROBOT, times, poses, robot.bodies)
+    robot.draw(recording, SURROUNDINGS, times, poses, robot.others)
+    send_floor(recording, robot, path)
+    _send_trail(recording, times, path, robot.size)
+    _send_contacts(recording, times, contacts(robot, motion), robot)
 
 
-def send_floor(recording: Recording, path: Array) -> None:
-    """Send a slab that reaches beyond all points (n, 2) of a path."""
-    low, high = path.min(axis=0) - _FLOOR_MARGIN, path.max(axis=0) + _FLOOR_MARGIN
-    slab = rr.Boxes3D(
-        half_sizes=[(*(high - low) / 2, _FLOOR_THICKNESS / 2)],
-        centers=[(*(high + low) / 2, -_FLOOR_THICKNESS)],
-        colors=[_FLOOR_COLOUR],
-        fill_mode=rr.components.FillMode.Solid,
-    )
-    recording.send(f"{WORLD}/floor", slab)
+def send_floor(recording: Recording, robot: Robot, path: Array) -> None:
+    """Send the model's planes as slabs that reach beyond a path (n, 3), or as far as they do."""
+    model, data = robot.model, mujoco.MjData(robot.model)
+    mujoco.mj_kinematics(model, data)
+    margin, thick = _FLOOR_MARGIN * robot.size, _FLOOR_THICKNESS * robot.size
+    for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
+        turned = data.geom_xmat[plane].reshape(3, 3)
+        along = (path - data.geom_xpos[plane]) @ turned  # in the plane's frame
+        ends = np.where(model.geom_size[plane, :2] > 0, model.geom_size[plane, :2], np.inf)
+        low = np.clip(along.min(axis=0)[:2] - margin, -ends, ends)
+        high = np.clip(along.max(axis=0)[:2] + margin, -ends, ends)
+        centre = np.array([*(low + high) / 2, -thick])
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, data.geom_xmat[plane])
+        slab = rr.Boxes3D(
+            half_sizes=[(*(high - low) / 2, thick / 2)],
+            centers=[data.geom_xpos[plane] + turned @ centre],
+            quaternions=[quaternion[XYZW]],
+            colors=[_FLOOR_COLOUR],
+            fill_mode=rr.components.FillMode.Solid,
+        )
+        name = model.geom(plane).name or f"plane_{plane}"
+        recording.send(f"{FLOOR}/{rr.escape_entity_path_part(name)}", slab)
 
 
-def _send_trail(recording: Recording, times: Sequence[rr.TimeColumn], path: Array) -> None:
-    """Send the path of the robot's origin, (n, 2), on the floor: a line for each step."""
-    ground = np.column_stack((path, np.full(len(path), _TRAIL_RADIUS)))
+def _send_trail(
+    recording: Recording, times: Sequence[rr.TimeColumn], path: Array, size: float
+) -> None:
+    """Send the path of the robot's origin, (n, 3), at the height 0: a line for each step."""
+    radius = _TRAIL_RADIUS * size
+    ground = np.column_stack((path[:, :2], np.full(len(path), radius)))
     pieces = np.stack((np.concatenate((ground[:1], ground[:-1])), ground), axis=1)
     recording.send_columns(TRAIL, times, rr.LineStrips3D.columns(strips=pieces))
-    style = rr.LineStrips3D.from_fields(colors=[SKY], radii=[_TRAIL_RADIUS])
-    recording.send(TRAIL, style)
+    recording.send(TRAIL, rr.LineStrips3D.from_fields(colors=[SKY], radii=[radius]))
 
 
 def _send_contacts(
-    recording: Recording, times: Sequence[rr.TimeColumn], touching: Contacts, weight: float
+    recording: Recording, times: Sequence[rr.TimeColumn], touching: Contacts, robot: Robot
 ) -> None:
-    arrows = touching.forces * (_WEIGHT_LENGTH / weight)
+    largest = float(np.linalg.norm(touching.forces, axis=1).max(initial=0))
+    unit = robot.weight or largest or 1.0
+    arrows = touching.forces * (_WEIGHT_LENGTH * robot.size / unit)
     points = rr.Points3D.columns(positions=touching.points).partition(touching.counts)
     forces = rr.Arrows3D.columns(origins=touching.points, vectors=arrows).partition(touching.counts)
     recording.send_columns(CONTACTS, times, points, forces)
+    radius = _CONTACT_RADIUS * robot.size
     recording.send(
         CONTACTS,
-        rr.Points3D.from_fields(colors=[GREEN], radii=[_CONTACT_RADIUS]),
-        rr.Arrows3D.from_fields(colors=[GREEN], radii=[_CONTACT_RADIUS / 2]),
+        rr.Points3D.from_fields(colors=[GREEN], radii=[radius]),
+        rr.Arrows3D.from_fields(colors=[GREEN], radii=[radius / 2]),
     )
-
-
-def _weight(robot: Robot) -> float:
-    """The robot's weight [N]."""
-    return float(robot.model.body("jitterbug").subtreemass[0] * -robot.model.opt.gravity[2])

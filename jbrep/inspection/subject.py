@@ -1,19 +1,20 @@
 """Recordings of whatever a user names: an episode, an encoder or a study."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import Encoder, find, load
 from jbrep.encoders.file import SUFFIX as ENCODER_SUFFIX
-from jbrep.encoders.shipped import find_alone
+from jbrep.encoders.shipped import find_alone, source_of
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
 from jbrep.inspection.curves import record_curves
 from jbrep.inspection.episode import record_episode
 from jbrep.inspection.recording import SUFFIX, check_out
 from jbrep.inspection.traversal import record_traversal
-from jbrep.jitterbug.tasks import get_task
 from jbrep.rl.files import ENCODER, is_run
 from jbrep.rollouts.rollout import Rollout
 from jbrep.rollouts.sources import find_episode, run_folder
@@ -26,22 +27,24 @@ _POLICY = "uniform"  # plays the episode that an encoder alone is shown on
 def inspect(
     source: str | None = None,
     episode: int | None = None,
-    task: str | None = None,
+    task: Task | None = None,
     encoder: str | None = None,
     traverse: bool = False,
     out: Path | None = None,
+    tell: Callable[[str], object] = lambda line: None,
 ) -> Path:
     """Write the Rerun recording of an episode, of a latent's units, or of a study's curves.
 
     Args:
         source: a data set's folder, a run's, or one with several runs below; an encoder's file, or
-            a policy's name; an encoder alone is shown on an episode under uniformly random drives.
+            a policy's name; an encoder alone is shown on an episode under uniformly random actions.
             A run that is not over plays its last checkpoint.
         episode: its number, from 0; the first if not given.
-        task: of a policy or encoder by its name.
+        task: of a policy or encoder by its name; a run plays it instead of its own.
         encoder: a file, or the name of one that ships; a run's own if not given.
         traverse: whether to show what each unit of the latent moves, instead of the episode.
         out: the .rrd file; one in inspect/, named after its content, if not given.
+        tell: called with a line on where an encoder is from, and on a robot that can't be shown.
 
     Returns:
         The file.
@@ -62,7 +65,11 @@ def inspect(
         record_curves(read_runs(Path(source)), source, out)
         return out
     rollout, shown = _find(source, episode or 0, task, encoder)
-    name = [rollout.task.name, *_words(source), f"episode-{episode or 0}"]
+    if encoder:
+        tell(f"encoder: {source_of(encoder, rollout.task)}")
+    if rollout.note:
+        tell(rollout.note)
+    name = [rollout.task.slug, *_words(source), f"episode-{episode or 0}"]
     if shown:
         name.append(shown.name)
     if not traverse:
@@ -89,33 +96,25 @@ def _is_other_folder(path: Path) -> bool:
 
 
 def _find(
-    source: str | None, episode: int, task: str | None, encoder: str | None
+    source: str | None, episode: int, task: Task | None, encoder: str | None
 ) -> tuple[Rollout, Encoder | None]:
     """The episode, and the encoder to show with it."""
     if source is None or source.endswith(ENCODER_SUFFIX):
         if (source is None) == (encoder is None):
             raise InputError("give a SOURCE to inspect, or one encoder with its --task")
-        shown = _load(source or encoder or "", task)
-        return find_episode(_POLICY, episode, shown.header["task"]), shown
+        shown = find_alone(source or encoder or "", task)
+        shown.check_task(task or shown.task)
+        return find_episode(_POLICY, episode, task or shown.task), shown
     if _is_other_folder(Path(source)):
         raise InputError(
             f"{source} is no data set, no run with a policy or checkpoint, and holds no finished "
             "run: jbrep collect makes a data set, jbrep rl a run"
         )
     rollout = find_episode(source, episode, task)
-    if task not in (None, rollout.task.name):
-        raise InputError(f"{source} is of {rollout.task.name}, not of {task}")
     if encoder:
-        return rollout, find(encoder, rollout.task.name)
+        return rollout, find(encoder, rollout.task)
     folder = run_folder(source)
     return rollout, _own(folder) if folder else None
-
-
-def _load(encoder: str, task: str | None) -> Encoder:
-    """An encoder whose features are those of its own task."""
-    loaded = find_alone(encoder, task)
-    loaded.check_task(get_task(loaded.header["task"]))
-    return loaded
 
 
 def _own(folder: Path) -> Encoder | None:

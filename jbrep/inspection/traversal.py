@@ -8,13 +8,17 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from jbrep.encoders import Encoder
+from jbrep.envs.physics import Motion
+from jbrep.envs.task import Array
 from jbrep.inspection.blueprint import TRAVERSE, traversal_layout
 from jbrep.inspection.episode import provenance
-from jbrep.inspection.ghost import Ghost, legs
+from jbrep.inspection.ghost import as_qpos
 from jbrep.inspection.recording import GREY, Recording
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import WORLD, send_floor
-from jbrep.jitterbug.tasks import Array
+from jbrep.inspection.signals import panels
+from jbrep.jitterbug.tasks import POSITION
+from jbrep.rollouts.jitterbug import jitterbug_task
 from jbrep.rollouts.rollout import Rollout
 
 POINTS = 101
@@ -37,7 +41,9 @@ def sweep(latent: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def record_traversal(rollout: Rollout, path: Path, encoder: Encoder) -> None:
-    """Write a recording with a robot for each unit, decoded while that unit alone varies.
+    """Write a recording of what is decoded while one unit after the other varies.
+
+    There is a robot for each unit where the episode has the motion of a Jitterbug.
 
     Args:
         rollout: the episode whose latents give the range of each unit.
@@ -47,23 +53,26 @@ def record_traversal(rollout: Rollout, path: Path, encoder: Encoder) -> None:
     Raises:
         InputError: the file can't be written.
     """
-    swept = sweep(encoder.encode(rollout.observation.astype(np.float32)))
+    swept = sweep(encoder.encode(rollout.observation))
     about = provenance(rollout, encoder)
     name = f"{encoder.name} on {rollout.name}: each unit of the latent"
     recording = Recording(name, about, swept)
     times = [rr.TimeColumn(TRAVERSE, sequence=np.arange(POINTS))]
-    robot, places = Robot(), _places(len(swept))
-    recording.send(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    send_floor(recording, places[:, :2])
+    places, robot = _places(len(swept)), None
+    if rollout.motion and jitterbug_task(rollout.task):
+        robot = Robot(rollout.motion.model)
+        recording.send(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        send_floor(recording, robot, places)
     moved = []
     for unit, (latent, place) in enumerate(zip(swept, places, strict=True)):
-        ghost = Ghost.of(encoder, rollout.task, latent)
-        _send_robot(recording, robot, times, ghost.qpos, unit, place)
-        scaled = encoder.scaler.scale(ghost.observation)
+        decoded = encoder.decode(latent).astype(np.float64)
+        if robot:
+            _send_robot(recording, robot, times, as_qpos(rollout.task, decoded), unit, place)
+        scaled = encoder.scaler.scale(decoded)
         moved.append(np.argsort(-np.ptp(scaled, axis=0))[:_MOST])
         _send_features(recording, times, scaled, unit, moved[-1], encoder.feature_names)
     recording.send_text(f"{TRAVERSE}/summary", _summary(encoder, rollout, swept, moved))
-    recording.write(path, traversal_layout(places))
+    recording.write(path, traversal_layout(len(swept), robot, places))
 
 
 def _places(units: int) -> Array:
@@ -82,9 +91,10 @@ def _send_robot(
     place: Array,
 ) -> None:
     """Send a unit's robot and label; decoded x and y are left out, to keep it in the row."""
-    here = np.concatenate((np.tile(place[:2], (len(qpos), 1)), qpos[:, 2:]), axis=1)
-    path = f"{WORLD}/unit_{unit}"
-    robot.draw(recording, path, times, here, still=legs(robot))
+    here, path = qpos.copy(), f"{WORLD}/unit_{unit}"
+    here[:, POSITION.start : POSITION.start + 2] = place[:2]
+    poses = robot.poses(Motion(robot.model, {"qpos": here}))
+    robot.draw(recording, path, times, poses, robot.bodies)
     above = [(*place[:2], _LABEL_HEIGHT)]
     label = rr.Points3D(
         above, labels=[f"unit {unit}"], colors=[GREY], radii=[0.0], show_labels=True
@@ -103,7 +113,8 @@ def _send_features(
     """Send all decoded features, and those that move most."""
     path = f"{TRAVERSE}/unit_{unit}"
     labels = [f"{name} [scaled]" for name in names]
-    recording.send_series(f"{path}/decoded", times, scaled, labels)
+    for name, place in panels({"decoded": slice(0, len(labels))}):
+        recording.send_series(f"{path}/{name}", times, scaled[:, place], labels[place])
     recording.send_series(f"{path}/most", times, scaled[:, most], [labels[i] for i in most])
 
 
@@ -116,7 +127,7 @@ def _summary(
         spans = np.ptp(encoder.decode(latent), axis=0)
         features = [rollout.task.features[i] for i in most]
         told = [
-            f"{feature.name} {spans[i]:.3g} {feature.unit}".removesuffix(" 1")
+            f"{feature.name} {spans[i]:.3g} {feature.unit}".removesuffix(" 1").rstrip()
             for i, feature in zip(most, features, strict=True)
         ]
         ends = f"{latent[0, unit]:.2f} | {latent[-1, unit]:.2f}"

@@ -155,6 +155,7 @@ class Fitter:
             "kind": kind,
             "name": str(EncoderName(kind, **parts)),
             "task": self._data.task.name,
+            "environment": self._data.task.as_json(),
             "features": list(self._data.task.feature_names),
             "training": settings,
             "data": {

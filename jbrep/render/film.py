@@ -11,13 +11,12 @@ from PIL import Image
 
 from jbrep.errors import InputError
 from jbrep.files.storage import make_folder, write_whole
-from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS
 from jbrep.progress import Progress
 from jbrep.render.formats import get_format
 from jbrep.render.pictures import Camera, add_caption, join
 from jbrep.rollouts.rollout import Rollout
 
-_LONGEST = EPISODE_STEPS * CONTROL_TIMESTEP  # [s]
+_LONGEST = 3600  # [s]
 _SPEEDS = (0.01, 100)
 _WIDEST = 7680  # [pixels]
 
@@ -29,7 +28,7 @@ class Pace:
     Args:
         fps: frames per second of the film.
         speed: simulated seconds per second of the film.
-        seconds: simulated seconds to show, from the start.
+        seconds: simulated seconds to show, from the start; all if None.
 
     Raises:
         InputError: a value out of range.
@@ -37,15 +36,15 @@ class Pace:
 
     fps: float = 25
     speed: float = 1
-    seconds: float = _LONGEST
+    seconds: float | None = None
 
     def __post_init__(self) -> None:
         for what, value, (low, high) in (
             ("frames per second", self.fps, (1, 50)),
             ("speed", self.speed, _SPEEDS),
-            ("simulated seconds", self.seconds, (CONTROL_TIMESTEP, _LONGEST)),
+            ("simulated seconds", self.seconds, (0.001, _LONGEST)),
         ):
-            if not low <= value <= high:
+            if value is not None and not low <= value <= high:
                 raise InputError(f"{what} is {value:g}: it must be from {low:g} to {high:g}")
 
 
@@ -53,13 +52,16 @@ class Pace:
 class Film:
     """Episodes side by side; one that ends before the others stands still afterwards.
 
+    Their robots must have been simulated by MuJoCo, and the time step of their task be known.
+
     Args:
         rollouts: the episodes, of the same task and from the same start.
         camera: shows each episode.
         pace: how fast to show them.
 
     Raises:
-        InputError: the tasks or starts differ, or the frames would be too wide.
+        InputError: there is no robot to show, the tasks or starts differ, or the frames would be
+            too wide.
     """
 
     rollouts: Sequence[Rollout]
@@ -72,6 +74,8 @@ class Film:
                 f"{len(self.rollouts)} pictures side by side are {self.width:,} pixels wide: at "
                 f"most {_WIDEST:,} are possible; choose a smaller --size"
             )
+        for rollout in self.rollouts:
+            _check_shown(rollout)
         first = self.rollouts[0]
         for other in self.rollouts[1:]:
             if not _start_alike(first, other):
@@ -91,15 +95,22 @@ class Film:
         return len(self) / self.pace.fps
 
     def __len__(self) -> int:
-        longest = CONTROL_TIMESTEP * max(map(len, self.rollouts))
-        shown = min(self.pace.seconds, longest)
+        longest = self.timestep * max(map(len, self.rollouts))
+        shown = longest if self.pace.seconds is None else min(self.pace.seconds, longest)
         return max(1, round(shown / self.pace.speed * self.pace.fps))
+
+    @property
+    def timestep(self) -> float:
+        """From one state to the next [s]."""
+        timestep = self.rollouts[0].task.timestep
+        assert timestep is not None  # checked
+        return timestep
 
     @property
     def states(self) -> NDArray[np.int_]:
         """The state nearest in time to each frame, (frames,), as if no episode ended."""
         times = np.arange(len(self)) * self.pace.speed / self.pace.fps
-        return np.rint(times / CONTROL_TIMESTEP).astype(int)
+        return np.rint(times / self.timestep).astype(int)
 
     def frames(self) -> Iterator[Image.Image]:
         """The frames in order."""
@@ -108,8 +119,9 @@ class Film:
 
     def _picture(self, rollout: Rollout, state: int) -> Image.Image:
         state = min(state, len(rollout))
-        so_far, now = rollout.reward[:state].sum(), rollout.time[state]
-        picture = Image.fromarray(self.camera.picture(rollout, state))
+        assert rollout.motion is not None  # checked
+        so_far, now = rollout.reward[:state].sum(dtype=np.float64), self.timestep * state
+        picture = Image.fromarray(self.camera.picture(rollout.motion, state))
         add_caption(picture, rollout.name, f"return {so_far:.0f}    {now:.2f} s")
         return picture
 
@@ -143,12 +155,27 @@ class Film:
             write_whole(path, encoded.read_bytes())
 
 
-def _start_alike(one: Rollout, other: Rollout) -> bool:
-    return one.task == other.task and all(
-        np.array_equal(a, b)
-        for a, b in (
-            (one.qpos[0], other.qpos[0]),
-            (one.target_position, other.target_position),
-            (one.target_quaternion, other.target_quaternion),
+def _check_shown(rollout: Rollout) -> None:
+    """Make sure that an episode has all that a film needs.
+
+    Raises:
+        InputError: it hasn't.
+    """
+    if rollout.motion is None:
+        why = rollout.note or f"{rollout.task.name} has no MuJoCo model and data"
+        raise InputError(f"{why}: only MuJoCo's robots can be filmed; jbrep inspect shows signals")
+    if rollout.task.timestep is None:
+        raise InputError(
+            f"the time step of {rollout.task.name} is not known: give it as timestep in a file of "
+            "--features"
         )
-    )
+
+
+def _start_alike(one: Rollout, other: Rollout) -> bool:
+    if one.task != other.task or one.motion is None or other.motion is None:
+        return False
+    places = [
+        (one.motion.arrays[name][0], other.motion.arrays[name][0])
+        for name in ("qpos", "mocap_pos", "mocap_quat")
+    ]
+    return all(np.array_equal(a, b) for a, b in places)

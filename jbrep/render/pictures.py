@@ -1,17 +1,17 @@
 """Pictures: a state as a camera of the model sees it, with a caption."""
 
 from collections.abc import Sequence
-from typing import Self
+from copy import copy
+from typing import NamedTuple, Self
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from jbrep.envs.physics import Motion, root_of
 from jbrep.errors import InputError, choose
-from jbrep.jitterbug.model import plain_model
 from jbrep.opengl import no_opengl, prepare_opengl
-from jbrep.rollouts.rollout import Rollout
 
 Pixels = NDArray[np.uint8]
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
@@ -22,6 +22,8 @@ _SHADOW_PIXELS = 4096
 _SHADOW_CONE = 0.4  # share of the light's cone that casts shadows
 _SAMPLES = 4  # per pixel
 
+_FOLLOWING = (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
+
 _BAND = (22, 27, 36, 190)
 _NAME = (255, 255, 255)
 _FACTS = (205, 214, 226)
@@ -31,35 +33,36 @@ _LINE = 2  # width of the line between pictures [pixels]
 _GAP = 0.6  # around the text, in heights of a letter
 
 
+class _Studio(NamedTuple):
+    """What pictures of one model are taken with."""
+
+    motion_model: mujoco.MjModel  # whose pictures they are; the renderer has a copy
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    renderer: mujoco.Renderer
+    camera: mujoco.MjvCamera | int
+
+
 class Camera:
-    """A camera of the model; close it after use.
+    """A camera of a robot's model; close it after use.
 
     Args:
-        name: overhead, tracking or egocentric.
+        name: of one that the model has; if None, its first that follows a body, or else one that
+            follows the robot from aside.
         width, height: of its pictures [pixels], even numbers.
 
     Raises:
-        InputError: no such camera, an invalid size, or no OpenGL.
+        InputError: an invalid size.
     """
 
-    def __init__(self, name: str = "tracking", width: int = 640, height: int = 480):
-        self.width, self.height = width, height
+    def __init__(self, name: str | None = None, width: int = 640, height: int = 480):
+        self._name, self.width, self.height = name, width, height
         low, high = _SIZES
         if not all(low <= side <= high and side % 2 == 0 for side in (width, height)):
             raise InputError(
                 f"the size is {width}x{height}: both must be even and from {low} to {high}"
             )
-        model = plain_model()
-        self._id = choose(name, {model.camera(i).name: i for i in range(model.ncam)}, "camera")
-        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_PIXELS, _SAMPLES
-        model.vis.map.shadowscale = _SHADOW_CONE
-        self._model, self._data = model, mujoco.MjData(model)
-        prepare_opengl()
-        try:
-            self._renderer = mujoco.Renderer(model, height, width)
-        except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
-            raise no_opengl(error) from error
+        self._studios: list[_Studio] = []
 
     def __enter__(self) -> Self:
         return self
@@ -68,17 +71,57 @@ class Camera:
         self.close()
 
     def close(self) -> None:
-        """Free the renderer."""
-        self._renderer.close()
+        """Free the renderers."""
+        for studio in self._studios:
+            studio.renderer.close()
+        self._studios = []
 
-    def picture(self, rollout: Rollout, state: int) -> Pixels:
-        """One of the n + 1 states of an episode, (height, width, 3)."""
-        self._data.qpos[:] = rollout.qpos[state]
-        self._data.mocap_pos[0] = rollout.target_position
-        self._data.mocap_quat[0] = rollout.target_quaternion
-        mujoco.mj_fwdPosition(self._model, self._data)
-        self._renderer.update_scene(self._data, self._id)
-        return self._renderer.render()
+    def picture(self, motion: Motion, state: int) -> Pixels:
+        """One of the states of an episode, (height, width, 3).
+
+        Raises:
+            InputError: the model has no such camera, or there is no OpenGL.
+        """
+        studio = self._studio(motion.model)
+        motion.put(studio.data, state)
+        mujoco.mj_fwdPosition(studio.model, studio.data)
+        studio.renderer.update_scene(studio.data, studio.camera)
+        return studio.renderer.render()
+
+    def _studio(self, model: mujoco.MjModel) -> _Studio:
+        """The studio for a model, made with its first picture."""
+        for studio in self._studios:
+            if studio.motion_model is model:
+                return studio
+        camera, own = find_camera(model, self._name), copy(model)
+        own.vis.global_.offwidth, own.vis.global_.offheight = self.width, self.height
+        own.vis.quality.shadowsize, own.vis.quality.offsamples = _SHADOW_PIXELS, _SAMPLES
+        own.vis.map.shadowscale = _SHADOW_CONE
+        prepare_opengl()
+        try:
+            renderer = mujoco.Renderer(own, self.height, self.width)
+        except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
+            raise no_opengl(error) from error
+        self._studios.append(_Studio(model, own, mujoco.MjData(own), renderer, camera))
+        return self._studios[-1]
+
+
+def find_camera(model: mujoco.MjModel, name: str | None) -> mujoco.MjvCamera | int:
+    """A camera of the model by its name, or the one that suits it, see `Camera`.
+
+    Raises:
+        InputError: there is none of that name.
+    """
+    if name is not None:
+        return choose(name, {model.camera(i).name: i for i in range(model.ncam)}, "camera")
+    for number in range(model.ncam):
+        if int(model.cam_mode[number]) in _FOLLOWING:
+            return number
+    camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    if root := root_of(model):
+        camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, root
+    return camera
 
 
 def join(pictures: Sequence[Image.Image]) -> Image.Image:

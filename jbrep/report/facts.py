@@ -11,7 +11,9 @@ from jbrep.figures.diagrams import EncoderRecord, LabelRecord
 from jbrep.report.tables import Tables
 from jbrep.rl.files import FAILED
 from jbrep.stats.runs import in_order
+from jbrep.stats.summary import shown_number
 from jbrep.study.record import learner
+from jbrep.text import SIGNIFICANT, number, slug
 
 Row = tuple[str, ...]
 Rows = list[Row]
@@ -44,11 +46,21 @@ def notices(tables: Tables) -> list[str]:
             "command resumes it."
         )
     if failed := failed_rows(tables):
-        lines.append(
-            f"{_runs(failed)} counted as return 0 from the step of failure on; the reasons are "
-            "given under Runs."
-        )
+        lines.append(f"{_runs(failed)} {_failing(tables)}; the reasons are given under Runs.")
     return [*lines, *(f"No statistics: {line}." for line in tables.record["left_out"])]
+
+
+def _failing(tables: Tables) -> str:
+    """What failed runs count as."""
+    groups = tables.analysis.groups if tables.analysis else ()
+    failed = [group for group in groups if any(label.failed for label in group.labels)]
+    if not failed:
+        return "marked as failed"
+    returns = " or ".join(dict.fromkeys(shown_number(group.failure_return) for group in failed))
+    return (
+        f"counted as return {returns}, the worst of the task and algorithm, from the step of "
+        "failure on"
+    )
 
 
 def _runs(which: Sequence[object]) -> str:
@@ -80,7 +92,7 @@ def _last(returns: Mapping[int, list[float]]) -> str:
     if not returns:
         return "-"
     final = returns[max(returns)]
-    return f"{sum(final) / len(final):.0f}"
+    return number(sum(final) / len(final), SIGNIFICANT)
 
 
 def failed_rows(tables: Tables) -> Rows:
@@ -101,8 +113,8 @@ def version_rows(tables: Tables) -> Rows:
     """A row for each package."""
     numbers: dict[str, dict[str, None]] = {}
     for versions in tables.record["versions"]:
-        for package, number in versions.items():
-            numbers.setdefault(package, {})[number] = None
+        for package, version in versions.items():
+            numbers.setdefault(package, {})[version] = None
     return [(package, ", ".join(each)) for package, each in numbers.items()]
 
 
@@ -133,8 +145,9 @@ def _layers(encoder: EncoderRecord) -> str:
 def setting_rows(tables: Tables) -> tuple[Row, Rows]:
     """The settings that agents share, a column for each task and algorithm."""
     columns: dict[str, Mapping[str, Any]] = {}
-    for label, shared in tables.record["labels"].items():
-        columns.setdefault(label.rpartition("/")[0], dict(_flat(shared["settings"])))
+    for shared in tables.record["labels"].values():
+        settings = shared["settings"]
+        columns.setdefault(f"{settings['task']}/{learner(settings)}", dict(_flat(settings)))
     names = dict.fromkeys(name for settings in columns.values() for name in settings)
     skipped = ("task", "representation", "encoder")
     rows = [
@@ -178,8 +191,8 @@ def reproduce(tables: Tables) -> list[tuple[str, str]]:
         toml = ("This file, as study.toml:", _toml(study))
         return [first, toml, ("All runs:", f"jbrep study study.toml --out {folder}"), report]
     commands = "\n".join(
-        _command(shared, f"{tables.name}/{label}/seed-0")
-        for label, shared in tables.record["labels"].items()
+        _command(shared, f"{tables.name}/{_folder(shared['settings'])}/seed-0")
+        for shared in tables.record["labels"].values()
     )
     return [first, ("Each run, here with one seed:", commands), report]
 
@@ -196,6 +209,11 @@ def _toml(study: Mapping[str, Any]) -> str:
         elif value is not None:
             lines.append(f"{name} = {json.dumps(value)}")
     return "\n".join(lines + below)
+
+
+def _folder(settings: Mapping[str, Any]) -> str:
+    """Of the runs with a label, below that of all; a task's id may contain a slash."""
+    return "/".join(map(slug, (settings["task"], learner(settings), settings["representation"])))
 
 
 def _command(shared: LabelRecord, out: str) -> str:

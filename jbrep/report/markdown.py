@@ -10,7 +10,7 @@ from jbrep.report.words import Answer, remark
 from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.claims import CLAIMS
 from jbrep.stats.comparison import Verdict
-from jbrep.stats.summary import label_rows
+from jbrep.stats.summary import label_rows, margin
 
 # what would be read as markup: an underscore within a word and a bracket without a link are not
 _MARKUP = re.compile(
@@ -37,6 +37,7 @@ def _lines(tables: Tables, answers: Sequence[Answer], picture: str) -> Iterator[
     for group in groups:
         if group.comparisons:
             yield from (f"Verdicts on {escape(group.name)}:", "", *_verdicts(group), "")
+            yield from (escape(f"{margin(group)}."), "")
     for answer in answers:
         yield from (f"**{escape(answer.headline)}.**", "")
         for finding in answer.findings:

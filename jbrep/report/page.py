@@ -19,7 +19,7 @@ from jbrep.report.tables import Tables
 from jbrep.report.words import Answer, remark
 from jbrep.stats import Analysis
 from jbrep.stats.claims import CLAIMS
-from jbrep.stats.summary import Rows, group_tables
+from jbrep.stats.summary import Rows, group_tables, margin
 
 _WIDEST = 1000  # of a figure [CSS pixels]
 _PER_INCH = 96  # CSS pixels: on a narrow screen a figure is shown at its size on paper
@@ -37,6 +37,7 @@ def page(tables: Tables, answers: Sequence[Answer], plots: Sequence[Plot]) -> st
         baseline=tables.analysis.baseline if tables.analysis else "",
         claims=CLAIMS,
         remark=remark,
+        margin=margin,
         answers=answers,
         are_numbers=are_numbers,
         figures=[_figure(plot) for plot in Progress(plots, unit="figure", delay=1, leave=False)],

@@ -16,7 +16,7 @@ from jbrep.stats.plain import to_plain
 
 PAGE, SUMMARY, MARKDOWN, FIGURES = "report.html", "summary.json", "summary.md", "figures"
 FORMAT = "jbrep summary"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # before, numbers of 900 had that in their names
 _MAIN_FIGURE = "representations"
 
 

@@ -2,24 +2,29 @@
 
 import csv
 import io
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypedDict
 
 from jbrep.errors import DamageError, InputError
 from jbrep.figures.curves import Return
-from jbrep.figures.diagrams import LabelRecord
+from jbrep.figures.diagrams import LabelRecord, TaskRecord
 from jbrep.files.storage import exists
 from jbrep.files.typed import read_json, typed
+from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, TASKS
 from jbrep.rl.files import read_text
 from jbrep.stats import Analysis
-from jbrep.stats.runs import MAX_RETURN
 from jbrep.study import record
 from jbrep.study.heuristics import HEURISTIC_RETURNS
 from jbrep.study.results import RETURNS, STATISTICS
 
-_MOST = 1 << 53  # of a whole number: a float holds it exactly
+_MOST = 1 << 53  # of a number: a float holds whole ones exactly
+# of the first release, which had no other robot
+_JITTERBUG: TaskRecord = {
+    "action_low": [-1.0],
+    "action_high": [1.0],
+    "timestep": CONTROL_TIMESTEP,
+}
 
 
 class RunRecord(TypedDict):
@@ -86,6 +91,9 @@ def _read_record(path: Path) -> Record:
         _check(checked)
     except ValueError as error:
         raise DamageError(f"{path} is damaged: {error}") from None
+    for shared in checked["labels"].values():
+        if shared["settings"]["task"] in TASKS:
+            shared.setdefault("task", _JITTERBUG)
     return checked
 
 
@@ -136,6 +144,6 @@ def _count(cell: str) -> int:
 
 def _episode_return(cell: str) -> float:
     number = float(cell)
-    if not -1 <= number <= MAX_RETURN + 1 or math.isnan(number):  # rounding is within 1
+    if not abs(number) <= _MOST:
         raise ValueError
     return number

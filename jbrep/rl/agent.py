@@ -1,33 +1,39 @@
 """A stable-baselines3 agent from a preset, and the evaluation of its policy."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from operator import attrgetter
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import VecMonitor
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from torch.distributions import Distribution
 
 from jbrep.dae.adam import allocate_adam_state
 from jbrep.encoders import Encoder
-from jbrep.envs.sb3 import JitterbugVecEnv
-from jbrep.jitterbug.tasks import EPISODE_STEPS
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.recording import Actor, episode_returns
+from jbrep.envs.sb3 import TaskVecEnv, agent_spaces
+from jbrep.envs.task import Array, Task
 from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rl.presets import ALGORITHMS, Preset
 
 
-def make_env(
-    task: str, num_envs: int, seed: int, encoder: Encoder, episode_steps: int = EPISODE_STEPS
-) -> VecMonitor:
-    """Jitterbugs seen through an encoder, stepped on one thread."""
-    env = JitterbugVecEnv(
-        task, num_envs, seed, encoder, num_threads=1, max_episode_steps=episode_steps
-    )
-    return VecMonitor(env)
+def make_env(task: Task, num_envs: int, seed: int, encoder: Encoder) -> VecMonitor:
+    """Lanes of a task seen through an encoder, stepped on one thread."""
+    return VecMonitor(TaskVecEnv(task, num_envs, seed, encoder, num_threads=1))
+
+
+class Spaces(gymnasium.Env[Any, Any]):
+    """What a policy needs to know of a task to be built, without making the environment."""
+
+    def __init__(self, task: Task, encoder: Encoder):
+        self.observation_space, self.action_space = agent_spaces(task, encoder)
 
 
 def training_seed(seed: int) -> int:
@@ -35,11 +41,12 @@ def training_seed(seed: int) -> int:
     return int(np.random.SeedSequence(seed).generate_state(1)[0]) >> 1
 
 
-def make_agent(algorithm: str, preset: Preset, env: VecMonitor, seed: int) -> BaseAlgorithm:
+def make_agent(algorithm: str, preset: Preset, env: VecEnv | Spaces, seed: int) -> BaseAlgorithm:
     """An untrained agent on the CPU, with its optimisers' state allocated."""
     settings: dict[str, Any] = {**preset.settings}
     if preset.noise:
-        settings["action_noise"] = preset.noise.make()
+        size = np.prod(env.action_space.shape or (), dtype=int)
+        settings["action_noise"] = preset.noise.make(int(size))
     agent = ALGORITHMS[algorithm](
         "MlpPolicy",
         env,
@@ -64,33 +71,56 @@ def trained_parts(agent: BaseAlgorithm) -> Iterator[tuple[str, Any]]:
     return ((name, attrgetter(name)(agent)) for name in names)
 
 
+@contextmanager
+def unchecked_distributions() -> Iterator[None]:
+    """Let NaN through torch's distributions, which would raise a bare ValueError.
+
+    It then shows in an action, a loss or a weight, each of which is checked.
+    """
+    before = Distribution._validate_args
+    Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        Distribution.set_default_validate_args(before)
+
+
+def deterministic(policy: BasePolicy | BaseAlgorithm, encoder: Encoder, task: Task) -> Actor:
+    """The policy's most likely actions, within their bounds despite rounding.
+
+    They are not finite where its weights aren't.
+    """
+    bounds = agent_spaces(task, encoder)[1]
+
+    def act(observation: Array) -> NDArray[np.float32]:
+        seen = encoder(observation.astype(np.float32))
+        with unchecked_distributions():
+            actions = policy.predict(seen, deterministic=True)[0]
+        return np.clip(actions, bounds.low, bounds.high)
+
+    return act
+
+
 class Evaluator:
     """Plays deterministic policies, in the same episodes each time.
 
     Args:
-        task: a key of TASKS.
+        task: what is played.
         encoder: the policy's view of the observation.
         episodes: the number of episodes.
         seed: of the first episode; the others take the numbers that follow.
-        episode_steps: the length of an episode [control steps].
     """
 
-    def __init__(
-        self,
-        task: str,
-        encoder: Encoder,
-        episodes: int,
-        seed: int = EVALUATION_SEED,
-        episode_steps: int = EPISODE_STEPS,
-    ):
-        self._env = make_env(task, episodes, seed, encoder, episode_steps)
-        self._seed = seed
+    def __init__(self, task: Task, encoder: Encoder, episodes: int, seed: int = EVALUATION_SEED):
+        self._lanes = Lanes(task, episodes, num_threads=1)
+        self._encoder, self._seed = encoder, seed
 
-    def returns(self, policy: BasePolicy | BaseAlgorithm) -> NDArray[np.float64]:
-        """The return of each episode, (episodes,)."""
-        self._env.seed(self._seed)
-        episodes = self._env.num_envs
-        returns, _ = evaluate_policy(
-            policy, self._env, n_eval_episodes=episodes, return_episode_rewards=True
-        )
-        return np.asarray(returns, dtype=np.float64)
+    def returns(self, policy: BasePolicy | BaseAlgorithm) -> Array:
+        """The return of each episode, (episodes,).
+
+        Raises:
+            NonFiniteActionError: the policy's actions are not finite.
+            EnvironmentFailedError: the environment fails in the middle of an episode.
+        """
+        act = deterministic(policy, self._encoder, self._lanes.task)
+        return episode_returns(self._lanes, act, self._seed)

@@ -14,17 +14,19 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
 
-from jbrep.envs.episodes import LaneState
-from jbrep.envs.sb3 import JitterbugVecEnv
-from jbrep.errors import DamageError, InputError, differences
+from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.envs.sb3 import TaskVecEnv
+from jbrep.errors import DamageError, InputError
 from jbrep.files import container
 from jbrep.files.container import Tensors
 from jbrep.files.storage import exists
 from jbrep.rl.agent import trained_parts
+from jbrep.rl.files import differing
 from jbrep.rl.recorder import History
 
 MAX_BYTES = 1 << 34
 PARAMETERS = "parameters."  # begins the names of what gradient steps change
+_LANES = "lanes."  # likewise, of what decides how the lanes continue
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 _ROLLOUT = ("_last_obs", "_last_episode_starts")
 _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -86,6 +88,10 @@ class Checkpointer(BaseCallback):
         if self._snapshot:
             try:
                 restore(self.model, self._snapshot)
+            except EnvironmentFailedError as error:
+                raise InputError(f"{self._path} can't be resumed: {error}") from None
+            except InputError:
+                raise
             except _MALFORMED:
                 raise self._damaged() from None
             self._snapshot = None  # a replay buffer can be large
@@ -104,17 +110,23 @@ class Checkpointer(BaseCallback):
     def _read(self) -> Snapshot:
         tensors, header = container.read(self._path, "checkpoint", MAX_BYTES)
         try:
-            differing = differences(dict(header["identity"]), self._identity)
-            if not differing:
+            objection = self._objection(dict(header["identity"]))
+            if not objection:
                 counters = dict(header["counters"])
                 self._history.resume(header["record"], int(counters["num_timesteps"]))
                 return Snapshot(tensors, counters)
         except _MALFORMED:
             raise self._damaged() from None
         raise InputError(
-            f"{self._path} belongs to another configuration: {differing}; choose another folder, "
-            "or delete the file to start over"
+            f"{self._path} {objection}; choose another folder, or delete the file to start over"
         )
+
+    def _objection(self, identity: Mapping[str, Any]) -> str:
+        """Why a checkpoint of that identity isn't this run's; empty if it is."""
+        if "environment" not in identity:
+            return "was written by an earlier jbrep, which seeded episodes differently"
+        others = differing(identity, self._identity)
+        return f"belongs to another configuration: {others}" if others else ""
 
     def _write(self) -> None:
         tensors, counters = take(self.model)
@@ -132,10 +144,9 @@ class Checkpointer(BaseCallback):
 def take(agent: BaseAlgorithm) -> Snapshot:
     """Take a snapshot of an agent between two rollouts; its tensors share the agent's memory."""
     monitor, env = _envs(agent)
-    lanes = env.state
     kind, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 draws there
     tensors = {f"{PARAMETERS}{name}": tensor.numpy() for name, tensor in _parameters(agent)}
-    tensors |= {f"physics.{name}": values for name, values in lanes.arrays.items()}
+    tensors |= {f"{_LANES}{name}": values for name, values in env.state.items()}
     tensors |= {f"noise.{i}": n.noise_prev for i, n in enumerate(_drifting_noises(agent))}
     tensors |= {f"rollout.{name}": getattr(agent, name) for name in _ROLLOUT}
     tensors |= {"returns": monitor.episode_returns, "lengths": monitor.episode_lengths}
@@ -143,7 +154,6 @@ def take(agent: BaseAlgorithm) -> Snapshot:
     counters = {name: getattr(agent, name) for name in _COUNTERS}
     counters |= {
         "numpy": (kind, position, has_gauss, gauss),
-        "generators": lanes.generators,
         "action_space": agent.action_space.np_random.bit_generator.state,
         "episodes": [{k: float(v) for k, v in e.items()} for e in agent.ep_info_buffer or ()],
     }
@@ -172,12 +182,13 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
         setattr(agent, name, counters[name])
     agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that TensorBoard shows
     monitor.episode_returns, monitor.episode_lengths = tensors["returns"], tensors["lengths"]
-    physics = {
-        name.removeprefix("physics."): values
-        for name, values in tensors.items()
-        if name.startswith("physics.")
-    }
-    env.restore(LaneState(physics, counters["generators"]))
+    env.restore(
+        {
+            name.removeprefix(_LANES): values
+            for name, values in tensors.items()
+            if name.startswith(_LANES)
+        }
+    )
     assert agent.ep_info_buffer is not None
     agent.ep_info_buffer.extend(counters["episodes"])
     agent.action_space.np_random.bit_generator.state = counters["action_space"]
@@ -186,11 +197,11 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
     np.random.set_state((kind, tensors["numpy"], *rest))  # noqa: NPY002
 
 
-def _envs(agent: BaseAlgorithm) -> tuple[VecMonitor, JitterbugVecEnv]:
+def _envs(agent: BaseAlgorithm) -> tuple[VecMonitor, TaskVecEnv]:
     monitor = agent.env
     assert isinstance(monitor, VecMonitor)
     env = monitor.unwrapped
-    assert isinstance(env, JitterbugVecEnv)
+    assert isinstance(env, TaskVecEnv)
     return monitor, env
 
 

@@ -5,17 +5,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jbrep.envs.task import MAX_EPISODE_STEPS, read_task
 from jbrep.errors import DamageError
+from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
 
 FINISHED, FAILED = "finished", "failed"
 MAX_STEPS = 10**12  # of training
-MAX_EPISODE_STEPS = 1_000_000
 MAX_EVALUATION_EPISODES = 10_000
 MAX_SEED = (1 << 31) - 1
 _MAX_LAYERS, _MAX_UNITS = 8, 1024  # of a policy's network
 _MAX_ENVS = 4096
 _MAX_SECONDS = 1e12
-_MAX_LINE = 1000  # characters
+MAX_LINE = 1000  # characters
 
 
 class Kind(NamedTuple):
@@ -39,16 +40,17 @@ def text(pattern: str, words: str) -> Kind:
 
 
 def _is_line(value: Any) -> bool:
-    return isinstance(value, str) and len(value) <= _MAX_LINE and value.isprintable()
+    return isinstance(value, str) and len(value) <= MAX_LINE and value.isprintable()
 
 
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float)
 
 
+_TASK = text(r"[\w./-]{1,200}", "a task's name or id")
 _NAME = text(r"[\w.-]{1,100}", "a name of letters, digits, dots, hyphens and underscores")
 _SHA256 = text("[0-9a-f]{64}", "64 hexadecimal digits")
-_LINE = Kind(_is_line, f"a line of at most {_MAX_LINE:,} characters")
+_LINE = Kind(_is_line, f"a line of at most {MAX_LINE:,} characters")
 _OBJECT = Kind(lambda value: isinstance(value, dict), "an object")
 
 _RUN = {
@@ -64,7 +66,8 @@ _RUN = {
 }
 _OPTIONAL = {"reason": _LINE, "policy_sha256": _SHA256}
 _SETTINGS = {
-    "task": _NAME,
+    "task": _TASK,
+    "environment": _OBJECT,
     "algorithm": _NAME,
     "preset": _NAME,
     "hidden": Kind(
@@ -88,8 +91,9 @@ _SETTINGS = {
     "steps": whole_number(1, MAX_STEPS),
     "evaluate_every": whole_number(1, MAX_STEPS),
     "evaluation_episodes": whole_number(1, MAX_EVALUATION_EPISODES),
-    "episode_steps": whole_number(1, MAX_EPISODE_STEPS),
+    "from": Kind(lambda v: v is None or _SHA256.allows(v), f"null or {_SHA256.words}"),
 }
+_VERSION_1 = {"task": _TASK, "episode_steps": whole_number(1, MAX_EPISODE_STEPS)}
 
 
 def check_run(path: Path, run: Mapping[str, Any]) -> None:
@@ -110,6 +114,25 @@ def check_settings(path: Path, settings: Mapping[str, Any]) -> None:
         DamageError: as `check_run`.
     """
     _check(path, settings, _SETTINGS, "settings.")
+    try:
+        task = read_task(settings["environment"])
+    except ValueError as error:
+        raise _damaged(path, f"settings.environment is invalid: {error}") from None
+    if task.name != settings["task"]:
+        raise _damaged(path, f"settings.environment is of {task.name}")
+
+
+def from_version_1(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a run of version 1 in the form of this one: a Jitterbug's, begun anew.
+
+    Raises:
+        InputError: an unknown task.
+        DamageError: a field isn't of its type or in range.
+    """
+    own = {"episode_steps": EPISODE_STEPS, **settings}
+    _check(path, own, _VERSION_1, "settings.")
+    task = get_task(own["task"]).describe(max_episode_steps=own.pop("episode_steps"))
+    return {**own, "environment": task.as_json(), "from": None}
 
 
 def _check(
@@ -118,7 +141,8 @@ def _check(
     for name, kind in kinds.items():
         if name not in values or not kind.allows(values[name]):
             state = "invalid" if name in values else "missing"
-            raise DamageError(
-                f"{path} is damaged or not from a jbrep run: {prefix}{name} is {state}, it must be "
-                f"{kind.words}"
-            )
+            raise _damaged(path, f"{prefix}{name} is {state}, it must be {kind.words}")
+
+
+def _damaged(path: Path, reason: str) -> DamageError:
+    return DamageError(f"{path} is damaged or not from a jbrep run: {reason}")

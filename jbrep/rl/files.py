@@ -8,25 +8,25 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jbrep.errors import DamageError, InputError, check_version
+from jbrep.errors import DamageError, InputError, check_version, differences
 from jbrep.files.storage import exists, read_regular, write_whole
 from jbrep.files.tables import write_csv
-from jbrep.jitterbug.tasks import EPISODE_STEPS
 from jbrep.rl.fields import FAILED as FAILED
 from jbrep.rl.fields import FINISHED as FINISHED
-from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_STEPS, check_run
+from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_STEPS, check_run, from_version_1
 
 FORMAT = "jbrep run"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 RUN = "run.json"  # written last: its presence means that the run has ended
 POLICY = "policy.zip"
 CHECKPOINT = "checkpoint.safetensors"  # until the run ends
+BEGINNING = "beginning.zip"  # the policy of another run that this one begins with, if it does
 ENCODER = "encoder.safetensors"
 EPISODES = "episodes.csv"
 EVALUATIONS = "evaluations.csv"
 EVALUATION_SEED = 1 << 31  # of an evaluation's first episode; seeds in training are smaller
 _MAX_TABLE_BYTES = 1 << 28
-_MAX_RUN_BYTES = 1 << 20
+_MAX_RUN_BYTES = 1 << 22
 
 
 class Episode(NamedTuple):
@@ -35,7 +35,7 @@ class Episode(NamedTuple):
     step: int  # of training, over all lanes, at its end
     lane: int
     episode_return: float
-    length: int  # control steps
+    length: int  # steps
     diverged: bool  # whether its physics did, which ended it
 
 
@@ -111,9 +111,7 @@ def write_run(folder: Path, run: Mapping[str, Any]) -> None:
 
 
 def read_run(folder: Path) -> dict[str, Any]:
-    """What run.json says of a run that has ended, every field checked.
-
-    Runs of earlier versions lack `episode_steps` among their settings: theirs was 1,000.
+    """What run.json says of a run that has ended, every field checked, in this version's form.
 
     Raises:
         InputError: there is none, or it is from a newer jbrep.
@@ -127,10 +125,37 @@ def read_run(folder: Path) -> dict[str, Any]:
     if run.pop("format", FORMAT) != FORMAT or type(version) is not int:
         raise DamageError(f"{path} is damaged or not from a jbrep run: its format is another")
     check_version(path, version, FORMAT_VERSION)
-    if isinstance(run.get("settings"), dict):
-        run["settings"].setdefault("episode_steps", EPISODE_STEPS)
+    if version == 1 and isinstance(run.get("settings"), dict):
+        run["settings"] = from_version_1(path, run["settings"])
     check_run(path, run)
     return run
+
+
+def read_finished(folder: Path) -> dict[str, Any]:
+    """What run.json says of a run that has ended well; it has the policy's hash.
+
+    Raises:
+        InputError: as `read_run`, or the run failed.
+        DamageError: as `read_run`, or there is no hash.
+    """
+    run = read_run(folder)
+    if run["status"] != FINISHED:
+        raise InputError(f"the run in {folder} {run['status']}: it has no policy")
+    if "policy_sha256" not in run:
+        raise DamageError(f"{folder / RUN} is damaged: policy_sha256 is missing")
+    return run
+
+
+def differing(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """The settings of two runs that differ, as text for a message; empty if none does."""
+    return differences(_flat(there), _flat(wanted))
+
+
+def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with those of the environment among them."""
+    own = dict(settings)
+    environment = own.pop("environment")
+    return {**own, **environment}
 
 
 def _read_json(path: Path) -> dict[str, Any]:

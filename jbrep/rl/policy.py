@@ -7,21 +7,31 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
-from jbrep.collect.policies import Actor
 from jbrep.encoders import Encoder, find, load
 from jbrep.encoders.file import fingerprint
+from jbrep.envs.recording import Actor
+from jbrep.envs.task import Array, Task, read_task
 from jbrep.errors import DamageError, InputError, choose
 from jbrep.files import container
 from jbrep.files.storage import exists
-from jbrep.jitterbug.tasks import EPISODE_STEPS, Array, Task, get_task
-from jbrep.rl.agent import make_agent, make_env
+from jbrep.rl.agent import Spaces, deterministic, make_agent
 from jbrep.rl.checkpoint import MAX_BYTES, PARAMETERS
-from jbrep.rl.fields import MAX_STEPS, check_settings, whole_number
-from jbrep.rl.files import CHECKPOINT, ENCODER, FINISHED, POLICY, RUN, is_run, read_run
+from jbrep.rl.fields import MAX_STEPS, check_settings, from_version_1, whole_number
+from jbrep.rl.files import (
+    BEGINNING,
+    CHECKPOINT,
+    ENCODER,
+    POLICY,
+    RUN,
+    is_run,
+    read_finished,
+    read_run,
+)
 from jbrep.rl.presets import ALGORITHMS, Preset
-from jbrep.rl.weights import one_line, read_file, read_weights
+from jbrep.rl.weights import fill, one_line, read_file, read_weights
 
 _WEIGHTS = f"{PARAMETERS}policy."
 
@@ -30,10 +40,9 @@ class Trained(NamedTuple):
     """A policy, and what it acts on."""
 
     policy: BasePolicy
-    task: str
+    task: Task
     encoder: Encoder
     evaluation_episodes: int = 1  # that the run's evaluations play at once
-    episode_steps: int = EPISODE_STEPS
     step: int | None = None  # of training, if it is not over
 
     @property
@@ -41,19 +50,20 @@ class Trained(NamedTuple):
         """What the policy observes."""
         return self.encoder.representation
 
-    def begin(self, task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
-        """Act deterministically; nothing is drawn."""
-        return self._act
+    def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
+        """Act deterministically; nothing is drawn.
 
-    def _act(self, observation: Array) -> Array:
-        seen = self.encoder.encode(observation.astype(np.float32))
-        try:
-            actions = self.policy.predict(seen, deterministic=True)[0]
-        except ValueError:  # torch's distributions refuse NaN
-            actions = np.full((len(seen), 1), np.nan)
-        if not np.isfinite(actions).all():
-            raise InputError("the policy's actions are not finite: it can't be played")
-        return actions
+        The actor raises an InputError for actions that are not finite.
+        """
+        act = deterministic(self.policy, self.encoder, self.task)
+
+        def checked(observation: Array) -> NDArray[Any]:
+            actions = act(observation)
+            if not np.isfinite(actions).all():
+                raise InputError("the policy's actions are not finite: it can't be played")
+            return actions
+
+        return checked
 
 
 def load_run(folder: Path) -> Trained:
@@ -74,13 +84,11 @@ def load_run(folder: Path) -> Trained:
         )
     if not exists(folder / RUN):
         return _load_checkpoint(folder)
-    run = read_run(folder)
-    if run["status"] != FINISHED:
-        raise InputError(f"the run in {folder} {run['status']}: it has no policy")
-    if "policy_sha256" not in run:
-        raise DamageError(f"{folder / RUN} is damaged: policy_sha256 is missing")
+    run = read_finished(folder)
     trained = _build(folder, run["settings"])
-    return _fill(trained, read_weights(folder / POLICY, run["policy_sha256"]), folder / POLICY)
+    path = folder / POLICY
+    fill(trained.policy, read_weights(path, run["policy_sha256"]), path)
+    return trained
 
 
 def load_untrained(folder: Path) -> Trained:
@@ -90,17 +98,21 @@ def load_untrained(folder: Path) -> Trained:
         InputError: as `load_run`.
         DamageError: a file isn't what was written.
     """
-    if exists(folder / RUN):
-        return _build(folder, read_run(folder)["settings"])
-    return _build(folder, _read_checkpoint(folder).settings)
+    ended = exists(folder / RUN)
+    settings = read_run(folder)["settings"] if ended else _read_checkpoint(folder).settings
+    trained = _build(folder, settings)
+    if settings["from"]:
+        path = folder / BEGINNING
+        fill(trained.policy, read_weights(path, settings["from"]), path)
+    return trained
 
 
-def load_zip(path: Path, task: str, algorithm: str, encoder: str, trust: bool) -> Trained:
+def load_zip(path: Path, task: Task, algorithm: str, encoder: str, trust: bool) -> Trained:
     """The policy of a stable-baselines3 zip file from elsewhere.
 
     Args:
         path: the file.
-        task: a key of TASKS.
+        task: which the policy was trained on.
         algorithm: a key of ALGORITHMS.
         encoder: what the policy was trained on: a file, or the name of one that ships.
         trust: whether the file may run code; without it nothing is read.
@@ -114,12 +126,13 @@ def load_zip(path: Path, task: str, algorithm: str, encoder: str, trust: bool) -
             "which runs as code when it is read; add --trust if you know who made it"
         )
     learner = choose(algorithm, ALGORITHMS, "algorithm")
-    seen = find(encoder, get_task(task).name)
+    seen = find(encoder, task)
     content = io.BytesIO(read_file(path.resolve()))
     try:
-        agent = learner.load(content, make_env(task, 1, 0, seen), device="cpu")
+        agent = learner.load(content, Spaces(task, seen), device="cpu")
     except Exception as error:  # whatever its pickled parts do
-        raise InputError(f"{path} is no {algorithm} policy for {task}: {one_line(error)}") from None
+        reason = one_line(error)
+        raise InputError(f"{path} is no {algorithm} policy for {task.name}: {reason}") from None
     return Trained(agent.policy, task, seen)
 
 
@@ -137,7 +150,8 @@ def _read_checkpoint(folder: Path) -> _Checkpoint:
     settings, counters = header.get("identity"), header.get("counters")
     if not isinstance(settings, dict) or not isinstance(counters, dict):
         raise DamageError(f"{path} is not a run's checkpoint")
-    settings.setdefault("episode_steps", EPISODE_STEPS)
+    if "environment" not in settings:
+        settings = from_version_1(path, settings)
     check_settings(path, settings)
     step = counters.get("num_timesteps", -1)
     if not whole_number(0, MAX_STEPS).allows(step):
@@ -153,35 +167,18 @@ def _read_checkpoint(folder: Path) -> _Checkpoint:
 def _load_checkpoint(folder: Path) -> Trained:
     checkpoint = _read_checkpoint(folder)
     trained = _build(folder, checkpoint.settings)._replace(step=checkpoint.step)
-    return _fill(trained, checkpoint.weights, folder / CHECKPOINT)
+    fill(trained.policy, checkpoint.weights, folder / CHECKPOINT)
+    return trained
 
 
 def _build(folder: Path, settings: Mapping[str, Any]) -> Trained:
     """What a run trains, as it begins."""
-    task, algorithm = get_task(settings["task"]), settings["algorithm"]
+    task, algorithm = read_task(settings["environment"]), settings["algorithm"]
     choose(algorithm, ALGORITHMS, "algorithm")
     encoder = load(folder / ENCODER)
     if fingerprint(encoder) != settings["encoder"]:
         raise InputError(f"{folder / ENCODER} is not the encoder that the run was made with")
     encoder.check_task(task)
     preset = Preset(tuple(settings["hidden"]), {})
-    agent = make_agent(algorithm, preset, make_env(task.name, 1, 0, encoder), settings["seed"])
-    return Trained(
-        agent.policy,
-        task.name,
-        encoder,
-        settings["evaluation_episodes"],
-        settings["episode_steps"],
-    )
-
-
-def _fill(trained: Trained, weights: Mapping[str, torch.Tensor], path: Path) -> Trained:
-    """The same with these weights: all that the policy has, and no others."""
-    try:
-        trained.policy.load_state_dict(weights)
-    except (AttributeError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(f"{path} doesn't fit the run's settings: {one_line(error)}") from None
-    acting = getattr(trained.policy, "actor", trained.policy)
-    if not all(bool(torch.isfinite(part).all()) for part in acting.parameters()):
-        raise DamageError(f"{path} is damaged: the policy's weights are not finite")
-    return trained
+    agent = make_agent(algorithm, preset, Spaces(task, encoder), settings["seed"])
+    return Trained(agent.policy, task, encoder, settings["evaluation_episodes"])

@@ -18,13 +18,13 @@ from jbrep.errors import choose
 
 
 class NormalNoise(NamedTuple):
-    """Independent Gaussian noise on each action, with mean 0."""
+    """Independent Gaussian noise on each number of an action, with mean 0."""
 
     sigma: float
 
-    def make(self) -> ActionNoise:
-        """The noise as a stable-baselines3 object."""
-        return NormalActionNoise(np.zeros(1), np.full(1, self.sigma))
+    def make(self, size: int) -> ActionNoise:
+        """The noise on actions of so many numbers, as a stable-baselines3 object."""
+        return NormalActionNoise(np.zeros(size), np.full(size, self.sigma))
 
 
 class OrnsteinUhlenbeckNoise(NamedTuple):
@@ -34,11 +34,10 @@ class OrnsteinUhlenbeckNoise(NamedTuple):
     sigma: float
     theta: float
 
-    def make(self) -> ActionNoise:
-        """The noise as a stable-baselines3 object, which takes a step for 0.01 units of time."""
-        return OrnsteinUhlenbeckActionNoise(
-            np.full(1, self.mean), np.full(1, self.sigma), self.theta
-        )
+    def make(self, size: int) -> ActionNoise:
+        """As for `NormalNoise`; stable-baselines3 takes a step for 0.01 units of time."""
+        mean, sigma = np.full(size, self.mean), np.full(size, self.sigma)
+        return OrnsteinUhlenbeckActionNoise(mean, sigma, self.theta)
 
 
 @dataclass(frozen=True)
@@ -47,8 +46,8 @@ class Preset:
 
     hidden: tuple[int, ...]  # units of the hidden layers of actor and critic, with ReLU
     settings: Mapping[str, Any]  # arguments of the algorithm's class
-    num_envs: int = 1  # robots stepped together
-    noise: NormalNoise | OrnsteinUhlenbeckNoise | None = None  # on the actions, in [-1, 1]
+    num_envs: int = 1  # lanes stepped together
+    noise: NormalNoise | OrnsteinUhlenbeckNoise | None = None  # on actions scaled to [-1, 1]
     optimizer: Mapping[str, Any] = field(default_factory=dict)  # arguments of Adam
 
 
@@ -106,7 +105,7 @@ _PAPER = {
     "trpo": Preset(_HIDDEN, {**_SHARED, "n_steps": 256}, num_envs=8, optimizer=_ON_POLICY),
 }
 
-_OFF_POLICY = {"learning_rate": 3e-4, "learning_starts": 1000, "train_freq": 4}  # 25 Hz
+_OFF_POLICY = {"learning_rate": 3e-4, "learning_starts": 1000, "train_freq": 4}
 _MODERN = {
     "ddpg": Preset((256, 256), _OFF_POLICY, noise=NormalNoise(0.2)),
     "td3": Preset((256, 256), _OFF_POLICY, noise=NormalNoise(0.2)),

@@ -97,8 +97,9 @@ class Recorder(BaseCallback):
         for lane in np.flatnonzero(self.locals["dones"]).tolist():
             info = self.locals["infos"][lane]
             total, length = float(info["episode"]["r"]), int(info["episode"]["l"])
+            diverged = info.get("non_finite", False)
             self._history.episodes.append(
-                Episode(self.num_timesteps, lane, total, length, info["non_finite"])
+                Episode(self.num_timesteps, lane, total, length, diverged)
             )
         due = self.num_timesteps % self._every < self.training_env.num_envs
         if due and self.num_timesteps < self.model._total_timesteps:

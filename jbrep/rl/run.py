@@ -2,8 +2,8 @@
 
 import hashlib
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -12,19 +12,21 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from torch.distributions import Distribution
 
 from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import FULL, Encoder, find, save
 from jbrep.encoders.file import fingerprint
-from jbrep.errors import InputError, differences
+from jbrep.envs.checks import NonFiniteActionError
+from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.envs.names import environment_versions
+from jbrep.envs.task import Task, as_task
+from jbrep.errors import InputError
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder, write_whole
-from jbrep.jitterbug.simulation import NonFiniteActionError
-from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
-from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
+from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed, unchecked_distributions
+from jbrep.rl.beginning import begin, policy_to_begin_with
 from jbrep.rl.checkpoint import Checkpointer
-from jbrep.rl.fields import MAX_EPISODE_STEPS, MAX_EVALUATION_EPISODES, MAX_SEED, MAX_STEPS
+from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_LINE, MAX_SEED, MAX_STEPS
 from jbrep.rl.files import (
     CHECKPOINT,
     ENCODER,
@@ -36,6 +38,7 @@ from jbrep.rl.files import (
     RUN,
     Episode,
     Evaluation,
+    differing,
     read_run,
     write_rows,
     write_run,
@@ -49,7 +52,6 @@ _LIMITS = {
     "steps": MAX_STEPS,
     "evaluate_every": MAX_STEPS,
     "evaluation_episodes": MAX_EVALUATION_EPISODES,
-    "episode_steps": MAX_EPISODE_STEPS,
 }
 
 
@@ -58,10 +60,10 @@ class Run:
     """What to train; together with the versions it decides every number, on one kind of CPU.
 
     Raises:
-        InputError: a number out of range.
+        InputError: a number out of range, or a name that is no task's.
     """
 
-    task: str
+    task: Task  # or its name, which is then described
     algorithm: str = "sac"
     preset: str = "paper"
     encoder: str = FULL  # a file, or a shipped encoder's name; full: the whole observation
@@ -69,9 +71,10 @@ class Run:
     steps: int = 100_000
     evaluate_every: int = 10_000  # steps
     evaluation_episodes: int = 10
-    episode_steps: int = EPISODE_STEPS  # control steps in an episode
+    begin_from: str = ""  # the folder of a finished run, whose policy this one begins with
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "task", as_task(self.task))
         for name, limit in _LIMITS.items():
             if not 1 <= getattr(self, name) <= limit:
                 words = name.replace("_", " ")
@@ -85,9 +88,10 @@ class Run:
         """Check that the run can start.
 
         Raises:
-            InputError: an unknown task, algorithm or preset, or an unusable encoder.
+            InputError: an unknown algorithm or preset, an unusable encoder, or a policy that this
+                run can't begin with.
         """
-        self.describe(find(self.encoder, get_task(self.task).name))
+        self.describe(find(self.encoder, self.task))
 
     def describe(self, encoder: Encoder) -> dict[str, Any]:
         """All settings that two equal runs share, as plain JSON.
@@ -95,8 +99,9 @@ class Run:
         Raises:
             InputError: as `check`.
         """
-        return {
-            "task": get_task(self.task).name,
+        settings = {
+            "task": self.task.name,
+            "environment": self.task.as_json(),
             "algorithm": self.algorithm,
             "preset": self.preset,
             **asdict(get_preset(self.preset, self.algorithm)),
@@ -106,8 +111,12 @@ class Run:
             "steps": self.steps,
             "evaluate_every": self.evaluate_every,
             "evaluation_episodes": self.evaluation_episodes,
-            "episode_steps": self.episode_steps,
+            "from": None,
         }
+        if self.begin_from:
+            folder = Path(self.begin_from)
+            settings["from"] = policy_to_begin_with(folder, settings, encoder.latent_size)
+        return settings
 
 
 def train(
@@ -135,7 +144,7 @@ def train(
         InputError: as `Run.check`; or the folder holds another run, or is in use.
         StoppedError: `stop` was true.
     """
-    encoder = find(run.encoder, get_task(run.task).name)
+    encoder = find(run.encoder, run.task)
     settings = plain(run.describe(encoder))
     if ended := _read_ended(folder, settings):
         return ended
@@ -152,7 +161,7 @@ def read_result(run: Run, folder: Path) -> dict[str, Any] | None:
     Raises:
         InputError: as `Run.check`, or the folder holds another run.
     """
-    encoder = find(run.encoder, get_task(run.task).name)
+    encoder = find(run.encoder, run.task)
     return _read_ended(folder, plain(run.describe(encoder)))
 
 
@@ -168,8 +177,8 @@ def _read_ended(folder: Path, settings: dict[str, Any]) -> dict[str, Any] | None
     if not exists(folder / RUN):
         return None
     result = read_run(folder)
-    if differing := differences(result["settings"], settings):
-        raise InputError(f"{folder} holds another run: {differing}; choose another folder")
+    if others := differing(result["settings"], settings):
+        raise InputError(f"{folder} holds another run: {others}; choose another folder")
     return result
 
 
@@ -183,7 +192,7 @@ def _train(
     stop: Callable[[], bool],
 ) -> dict[str, Any]:
     """The run, from its start or its checkpoint to its end."""
-    versions = {name: version(name) for name in _PACKAGES}
+    versions = environment_versions(run.task.id) | {name: version(name) for name in _PACKAGES}
     history = History()
     checkpointer = Checkpointer(
         folder / CHECKPOINT, {**settings, **versions}, history, save_every, stop
@@ -192,14 +201,14 @@ def _train(
 
     preset = get_preset(run.preset, run.algorithm)
     seed = training_seed(run.seed)
-    env = make_env(run.task, preset.num_envs, seed, encoder, run.episode_steps)
+    env = make_env(run.task, preset.num_envs, seed, encoder)
     agent = make_agent(run.algorithm, preset, env, run.seed)
     env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
+    if run.begin_from:
+        begin(agent.policy, Path(run.begin_from), settings["from"], folder)
     agent.set_logger(Logger(None, [Scalars(folder / "tensorboard", history.first_step)]))
 
-    evaluator = Evaluator(
-        run.task, encoder, run.evaluation_episodes, episode_steps=run.episode_steps
-    )
+    evaluator = Evaluator(run.task, encoder, run.evaluation_episodes)
     recorder = Recorder(history, evaluator, run.evaluate_every, watch)
     failure = _learn(agent, run.steps, [recorder, checkpointer])
 
@@ -226,10 +235,10 @@ def _train(
 def _learn(agent: BaseAlgorithm, steps: int, callbacks: Sequence[BaseCallback]) -> str:
     """Train up to that step; why training failed, or nothing."""
     try:
-        with _unchecked_distributions():
+        with unchecked_distributions():
             agent.learn(steps, callback=[*callbacks])
-    except DivergedError as error:
-        failure = str(error)
+    except (DivergedError, EnvironmentFailedError) as error:
+        failure = _one_line(str(error))
     except NonFiniteActionError:
         failure = "the policy's actions are not finite"
     else:
@@ -239,18 +248,9 @@ def _learn(agent: BaseAlgorithm, steps: int, callbacks: Sequence[BaseCallback]) 
     return f"{failure} after {agent.num_timesteps:,} steps"
 
 
-@contextmanager
-def _unchecked_distributions() -> Iterator[None]:
-    """Let NaN through torch's distributions, which would raise a bare ValueError.
-
-    It then shows in an action, a loss or a weight, each of which is checked.
-    """
-    before = Distribution._validate_args
-    Distribution.set_default_validate_args(False)
-    try:
-        yield
-    finally:
-        Distribution.set_default_validate_args(before)
+def _one_line(text: str) -> str:
+    """Text as run.json may hold it, whatever an environment says."""
+    return "".join(c if c.isprintable() else "?" for c in text)[: MAX_LINE // 2]
 
 
 def _cpu() -> str:

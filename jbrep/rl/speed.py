@@ -23,11 +23,9 @@ def estimate(run: Run) -> float:
     rollout = settings.get("train_freq", settings.get("n_steps", 1) * preset.num_envs)
     if issubclass(ALGORITHMS[run.algorithm], OffPolicyAlgorithm):
         settings["learning_starts"] = 0  # gradient steps from the first rollout on
-    env = make_env(run.task, preset.num_envs, 0, encoder, run.episode_steps)
+    env = make_env(run.task, preset.num_envs, 0, encoder)
     agent = make_agent(run.algorithm, replace(preset, settings=settings), env, 0)
-    evaluator = Evaluator(
-        run.task, encoder, run.evaluation_episodes, episode_steps=run.episode_steps
-    )
+    evaluator = Evaluator(run.task, encoder, run.evaluation_episodes)
     with single_torch_thread():
         started = time.perf_counter()
         agent.learn(max(rollout, _MIN_STEPS))

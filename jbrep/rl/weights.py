@@ -5,9 +5,11 @@ import io
 import pickletools
 import textwrap
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
+from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.errors import DamageError, InputError
 from jbrep.files.storage import read_regular
@@ -42,6 +44,27 @@ def read_weights(path: Path, sha256: str) -> dict[str, torch.Tensor]:
         raise DamageError(
             f"{path} is damaged, it holds no policy's weights: {one_line(error)}"
         ) from None
+
+
+def fill(policy: BasePolicy, weights: Mapping[str, torch.Tensor], path: Path) -> None:
+    """Put weights into a policy: all that it has, and no others.
+
+    Args:
+        policy: which they are of.
+        weights: by the names of its parameters.
+        path: of the file that they come from, for messages.
+
+    Raises:
+        InputError: they don't fit the policy.
+        DamageError: a weight that the policy acts by is not finite.
+    """
+    try:
+        policy.load_state_dict(weights)
+    except (AttributeError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(f"{path} doesn't fit the run's settings: {one_line(error)}") from None
+    acting = getattr(policy, "actor", policy)
+    if not all(bool(torch.isfinite(part).all()) for part in acting.parameters()):
+        raise DamageError(f"{path} is damaged: the policy's weights are not finite")
 
 
 def read_file(path: Path) -> bytes:

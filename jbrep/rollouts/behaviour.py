@@ -5,8 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.envs.task import Array, Task
+from jbrep.errors import InputError
 from jbrep.figures.behaviour import Behaviour
-from jbrep.jitterbug.tasks import Array, Task
+from jbrep.rollouts.jitterbug import jitterbug_task
 from jbrep.rollouts.sources import Player, find_player, find_untrained, run_folder
 
 SPEEDS = np.linspace(-180, 180, 73)  # edges of the bins of the motor's velocity [rad/s]
@@ -14,9 +16,11 @@ _CELL = 0.02  # edge of a cell of the floor [m]
 
 
 def observe(
-    sources: Sequence[str], task: str | None, episodes: int, target_yaw: float
+    sources: Sequence[str], task: Task | None, episodes: int, target_yaw: float
 ) -> tuple[Task, list[Behaviour]]:
     """What policies do in the same episodes; for a run, also the policy that it began with.
+
+    The tables are of the Jitterbug's motor, and of its place on the floor.
 
     Args:
         sources: as `find_player` takes them.
@@ -25,12 +29,17 @@ def observe(
         target_yaw: where every target points [rad].
 
     Raises:
-        InputError: as `find_player`, or policies of several tasks.
+        InputError: as `find_player`, or policies of several tasks, or of another robot's.
     """
     players: list[Player] = []
     for source in sources:
         player = find_player(source, task)
-        task = player.task.name
+        task = player.task
+        if jitterbug_task(task) is None:
+            raise InputError(
+                f"{source} is of {task.name}: only the Jitterbug's tasks have the motor and the "
+                "free body whose behaviour is drawn"
+            )
         if folder := run_folder(source):
             players.append(find_untrained(folder))
         players.append(player)
@@ -48,9 +57,10 @@ class _Visits:
         self._name = player.name
         returns, motor, position = [], [], []
         for rollout in player.play_first(episodes, target_yaw):
-            returns.append(rollout.reward.sum())
-            motor.append(rollout.qvel[:, -1].copy())  # a view would keep the whole rollout
-            position.append(rollout.qpos[:, :2].copy())
+            assert rollout.motion is not None  # the Jitterbug has one
+            returns.append(rollout.episode_return)
+            motor.append(rollout.motion.qvel[:, -1].copy())  # a view would keep the whole rollout
+            position.append(rollout.motion.qpos[:, :2].copy())
         self._returns, self._motor = np.array(returns), np.concatenate(motor)
         self.position = np.concatenate(position)
 

@@ -1,49 +1,39 @@
 """Single episodes to look at: replayed from a data set, or played by a policy."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jbrep.collect.replay import simulate_again
-from jbrep.dataset import Dataset
+from jbrep.dataset import Dataset, Episode
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.physics import Motion, MotionReader
+from jbrep.envs.recording import Actor, Recording, record
+from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
-from jbrep.jitterbug.episodes import Actor, Recording, record
-from jbrep.jitterbug.simulation import Simulation
-from jbrep.jitterbug.tasks import (
-    CONTROL_TIMESTEP,
-    EPISODE_STEPS,
-    QPOS_SIZE,
-    QVEL_SIZE,
-    Array,
-    Readings,
-    Task,
-    upright_term,
-    yaw_direction,
-)
 from jbrep.progress import Progress
+from jbrep.rollouts.jitterbug import hold_diverged, turn_targets
 
-Begin = Callable[[Task, Sequence[np.random.Generator]], Actor]  # as `Policy.begin`
-
-_STATES = {"qpos": QPOS_SIZE, "qvel": QVEL_SIZE, "rotation": 9, "velocity": 3}  # and their widths
+Begin = Callable[[Task, Sequence[int]], Actor]  # as `Policy.begin`
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
-    """An episode of n control steps; states are before, between and after the steps.
+    """An episode of n steps; states are before, between and after the steps.
 
     Args:
-        task: what is observed and rewarded.
+        task: whose episode it is.
         name: where the episode comes from, for titles.
-        seed: of the episode's start.
-        qpos: (n + 1, 16).
-        qvel: (n + 1, 15).
-        rotation: body to world, row by row, (n + 1, 9).
-        velocity: of the body's centre of mass, world frame [m/s], (n + 1, 3).
-        target_position: (3,).
-        target_quaternion: (4,).
-        action: the drives, (n, 1).
+        seed: of the episode.
+        observation: of each state in physical units, (n + 1, d).
+        action: (n, k).
+        reward: of each step, (n,).
+        terminated: whether a state ended the episode.
+        truncated: whether the time limit did, or physics that diverged.
+        motion: of the robot, n + 1 states; None where there is no MuJoCo.
+        note: why there is no motion though the environment may have one.
 
     Raises:
         InputError: an array of another shape.
@@ -52,21 +42,20 @@ class Rollout:
     task: Task
     name: str
     seed: int
-    qpos: Array
-    qvel: Array
-    rotation: Array
-    velocity: Array
-    target_position: Array
-    target_quaternion: Array
-    action: Array
+    observation: NDArray[np.float32]
+    action: NDArray[np.floating]
+    reward: NDArray[np.float32]
+    terminated: bool
+    truncated: bool
+    motion: Motion | None = None
+    note: str = ""
 
     def __post_init__(self) -> None:
         steps = len(self.action)
-        shapes: dict[str, tuple[int, ...]] = {
-            "action": (steps, 1),
-            **{name: (steps + 1, width) for name, width in _STATES.items()},
-            "target_position": (3,),
-            "target_quaternion": (4,),
+        shapes = {
+            "action": (steps, self.task.action_size),
+            "observation": (steps + 1, self.task.size),
+            "reward": (steps,),
         }
         for name, shape in shapes.items():
             if (actual := getattr(self, name).shape) != shape:
@@ -81,44 +70,22 @@ class Rollout:
         return f"Rollout({self.name!r}: {self.task.name}, {len(self):,} steps)"
 
     @property
-    def time(self) -> Array:
-        """Time of each state [s], (n + 1,)."""
-        return CONTROL_TIMESTEP * np.arange(len(self.qpos), dtype=np.float64)
-
-    @cached_property
-    def readings(self) -> Readings:
-        """The readings of all states, as a batch of n + 1."""
-        states = (len(self.qpos), 1)
-        return Readings(
-            self.qpos,
-            self.qvel,
-            self.rotation,
-            self.velocity,
-            np.tile(self.target_position, states),
-            np.tile(yaw_direction(self.target_quaternion[None]), states),
-        )
-
-    @cached_property
-    def observation(self) -> Array:
-        """Of each state, in physical units, (n + 1, d)."""
-        return self.task.observe(self.readings)
+    def episode_return(self) -> float:
+        """Sum of the rewards."""
+        return float(self.reward.sum(dtype=np.float64))
 
     @property
-    def reward(self) -> Array:
-        """Of the state that each step led to, (n,)."""
-        return self.task.reward(self.readings)[1:]
-
-    @property
-    def terms(self) -> dict[str, Array]:
-        """The factors of the reward of each state, (n + 1,) each."""
-        return {
-            term.__name__.removesuffix("_term"): term(self.readings)
-            for term in (upright_term, *self.task.terms)
-        }
+    def time(self) -> Array | None:
+        """Time of each state [s], (n + 1,); None where the task's time step isn't known."""
+        if self.task.timestep is None:
+            return None
+        return self.task.timestep * np.arange(len(self) + 1, dtype=np.float64)
 
 
 def replay(dataset: Dataset, episode: int) -> Rollout:
-    """Simulate an episode of a data set again from its start and actions, bit for bit.
+    """An episode of a data set, simulated again for the motion of its robot.
+
+    Where that isn't possible here, or leads elsewhere, it is as stored, with a note and no motion.
 
     Raises:
         InputError: the data set has no such episode, or it has no steps.
@@ -126,53 +93,86 @@ def replay(dataset: Dataset, episode: int) -> Rollout:
     stored = dataset.episode(episode)
     if not len(stored):
         raise InputError(f"episode {episode} of {dataset.folder} has no steps: choose another")
-    recording = simulate_again([stored], tuple(_STATES), num_threads=1, tick=lambda steps: None)
-    name, seed = f"{dataset.folder}, episode {episode}", int(stored.record["seed"])
-    return _rollout(dataset.task, recording, 0, name, seed)
+    rollout = _as_stored(stored)
+    read = MotionReader()
+    try:
+        recording = simulate_again([stored], read, tick=lambda steps: None)
+    except (InputError, ModuleNotFoundError) as error:
+        return replace(rollout, note=f"{rollout.name} is shown without the robot: {error}")
+    if not _is_same(recording, rollout):
+        note = (
+            f"{rollout.name} is shown as stored, without the robot: simulated again it differs, as "
+            f"{dataset.task.name} isn't reproducible here"
+        )
+        return replace(rollout, note=note)
+    return replace(rollout, motion=read.motion(recording, 0, len(rollout)))
+
+
+def _as_stored(episode: Episode) -> Rollout:
+    ends = episode.record
+    return Rollout(
+        task=episode.dataset.task,
+        name=f"{episode.dataset.folder}, episode {episode.number}",
+        seed=int(ends["seed"]),
+        observation=np.concatenate((episode["observation"], ends["final_observation"][None])),
+        action=episode["action"],
+        reward=episode["reward"],
+        terminated=bool(ends["terminated"]),
+        truncated=bool(ends["truncated"]),
+    )
+
+
+def _is_same(recording: Recording, rollout: Rollout) -> bool:
+    """Whether the first lane went through the rollout, to the last bit."""
+    steps = len(rollout)
+    return (
+        recording.observation[: steps + 1, 0].tobytes() == rollout.observation.tobytes()
+        and recording.reward[:steps, 0].tobytes() == rollout.reward.tobytes()
+    )
 
 
 def play(
-    task: Task,
-    begin: Begin,
-    name: str,
-    seeds: Sequence[int],
-    target_yaw: float | None = None,
-    steps: int = EPISODE_STEPS,
+    task: Task, begin: Begin, name: str, seeds: Sequence[int], target_yaw: float | None = None
 ) -> list[Rollout]:
-    """Play one episode for each seed; an episode ends before its physics diverges.
+    """Play one episode for each seed.
 
     Args:
-        task: what is observed and rewarded.
+        task: whose environment is made.
         begin: of the policy.
         name: of the policy.
         seeds: an episode starts like a Gymnasium environment reset with its seed.
-        target_yaw: orientation of the target in every episode [rad]; None draws it.
-        steps: length of an episode in control steps.
+        target_yaw: orientation of the Jitterbug's target in every episode [rad]; None draws it.
+
+    Raises:
+        InputError: the environment can't be made, or fails.
     """
-    simulation = Simulation(task, len(seeds))
-    randoms = [np.random.default_rng(seed) for seed in seeds]
-    simulation.reset(range(len(seeds)), randoms)
+    lanes = Lanes(task, len(seeds))
+    lanes.reset(range(len(seeds)), seeds)
     if target_yaw is not None:
-        turned = np.array([np.cos(target_yaw / 2), 0, 0, np.sin(target_yaw / 2)])
-        simulation.restore(
-            **simulation.state | {"target_quaternion": np.tile(turned, (len(seeds), 1))}
-        )
-    act = begin(task, randoms)
-    total = steps * len(seeds)
+        turn_targets(lanes, target_yaw)
+    act, read = begin(task, seeds), MotionReader()
+    total = task.max_episode_steps * len(seeds)
     with Progress(total=total, unit="step", unit_scale=True, leave=False, delay=1) as progress:
-        recording = record(simulation, act, steps, tuple(_STATES), progress.update)
-    return [_rollout(task, recording, lane, name, seed) for lane, seed in enumerate(seeds)]
+        recording = record(lanes, act, progress.update, read)
+    lanes.close()
+    return [_rollout(task, recording, lane, name, seed, read) for lane, seed in enumerate(seeds)]
 
 
-def _rollout(task: Task, recording: Recording, lane: int, name: str, seed: int) -> Rollout:
-    length = recording.length[lane]
-    return Rollout(
+def _rollout(
+    task: Task, recording: Recording, lane: int, name: str, seed: int, read: MotionReader
+) -> Rollout:
+    steps = int(recording.length[lane])
+    rollout = Rollout(
         task=task,
         name=name,
         seed=seed,
-        **{key: recording.states[key][: length + 1, lane] for key in _STATES},
-        # at the start: a lane that diverges loses its target
-        target_position=recording.start["target_position"][lane],
-        target_quaternion=recording.start["target_quaternion"][lane],
-        action=recording.action[:length, lane],
+        observation=recording.observation[: steps + 1, lane],
+        action=recording.action[:steps, lane],
+        reward=recording.reward[:steps, lane],
+        terminated=bool(recording.terminated[lane]),
+        truncated=bool(recording.truncated[lane]),
     )
+    motion = read.motion(recording, lane, steps)
+    if motion and rollout.truncated and steps < task.max_episode_steps:
+        motion = hold_diverged(task, motion)
+    return replace(rollout, motion=motion)

@@ -6,13 +6,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jbrep.collect.policies import POLICIES, Actor, parse_policy
+from jbrep.collect.policies import POLICIES, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import FULL, Encoder
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.make import is_batched
+from jbrep.envs.recording import Actor, episode_returns
+from jbrep.envs.task import Array, Task, check_same
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
-from jbrep.jitterbug.tasks import EPISODE_STEPS, Task, get_task
+from jbrep.progress import Progress
 from jbrep.rl.fields import MAX_EVALUATION_EPISODES
 from jbrep.rl.files import EVALUATION_SEED, POLICY, is_run
 from jbrep.rollouts.rollout import Begin, Rollout, play, replay
@@ -20,8 +24,9 @@ from jbrep.rollouts.rollout import Begin, Rollout, play, replay
 if TYPE_CHECKING:
     from jbrep.rl.policy import Trained
 
-_BATCH_STEPS = 10**6  # control steps that `play_first` holds in memory at once
-_MAX_STEPS = 10**7  # the same, that `play` may return: about 350 bytes each
+_BATCH_BYTES = 350 * 10**6  # of the steps that `play_first` holds in memory at once
+_MAX_BYTES = 10 * _BATCH_BYTES  # the same, that `play` may return
+_BATCH_LANES, _SEPARATE_LANES = 1000, 16  # that `returns` steps at once
 
 
 class Player(NamedTuple):
@@ -32,7 +37,6 @@ class Player(NamedTuple):
     begin: Begin
     representation: str = FULL  # what the policy observes
     evaluation_batch: int = 1  # episodes that its evaluation plays at once
-    episode_steps: int = EPISODE_STEPS
     step: int | None = None  # of training, if it is not over
 
     def play(self, episodes: Sequence[int], target_yaw: float | None = None) -> list[Rollout]:
@@ -45,13 +49,13 @@ class Player(NamedTuple):
         Raises:
             InputError: too many steps to hold in memory.
         """
-        if len(episodes) * self.episode_steps > _MAX_STEPS:
+        if len(episodes) * self._episode_bytes > _MAX_BYTES:
             raise InputError(
-                f"{self.name} plays {len(episodes):,} episodes of {self.episode_steps:,} steps at "
-                f"once: at most {_MAX_STEPS:,} steps are possible"
+                f"{self.name} plays {len(episodes):,} episodes of {self.task.max_episode_steps:,} "
+                f"steps at once: at most {_MAX_BYTES // self._episode_bytes:,} are possible"
             )
         seeds = [EVALUATION_SEED + episode for episode in episodes]
-        return play(self.task, self.begin, self.name, seeds, target_yaw, self.episode_steps)
+        return play(self.task, self.begin, self.name, seeds, target_yaw)
 
     def play_first(self, count: int, target_yaw: float | None = None) -> Iterator[Rollout]:
         """Play the first `count` of these episodes, with bounded memory.
@@ -59,13 +63,29 @@ class Player(NamedTuple):
         Raises:
             InputError: more episodes than an evaluation may have.
         """
-        if count > MAX_EVALUATION_EPISODES:
-            raise InputError(
-                f"{count:,} episodes are too many: at most {MAX_EVALUATION_EPISODES:,} are played"
-            )
-        batch = max(1, _BATCH_STEPS // self.episode_steps)
-        for start in range(0, count, batch):
-            yield from self.play(range(start, min(start + batch, count)), target_yaw)
+        for some in _batches(count, max(1, _BATCH_BYTES // self._episode_bytes)):
+            yield from self.play(some, target_yaw)
+
+    def returns(self, count: int) -> Array:
+        """Returns of the first `count` of these episodes, (count,).
+
+        Raises:
+            InputError: more episodes than an evaluation may have.
+        """
+        most = _BATCH_LANES if is_batched(self.task) else _SEPARATE_LANES
+        total, returns = count * self.task.max_episode_steps, []
+        with Progress(total=total, unit="step", unit_scale=True, leave=False, delay=1) as progress:
+            for some in _batches(count, most):
+                lanes, first = Lanes(self.task, len(some)), EVALUATION_SEED + some[0]
+                act = self.begin(self.task, range(first, first + len(some)))
+                returns.append(episode_returns(lanes, act, first, progress.update))
+                lanes.close()
+        return np.concatenate(returns)
+
+    @property
+    def _episode_bytes(self) -> int:
+        """About what an episode of the longest takes in memory."""
+        return (16 * self.task.size + 100) * self.task.max_episode_steps
 
     def with_reconstruction(self, encoder: Encoder) -> "Player":
         """The same policy, which now observes what an encoder's latent is decoded to.
@@ -77,8 +97,8 @@ class Player(NamedTuple):
         """
         encoder.check_task(self.task)
 
-        def begin(task: Task, randoms: Sequence[np.random.Generator]) -> Actor:
-            act = self.begin(task, randoms)
+        def begin(task: Task, seeds: Sequence[int]) -> Actor:
+            act = self.begin(task, seeds)
             return lambda seen: act(encoder.decode(encoder.encode(seen.astype(np.float32))))
 
         representation = f"{encoder.name}, decoded"
@@ -87,7 +107,21 @@ class Player(NamedTuple):
         )
 
 
-def find_episode(source: str, episode: int = 0, task: str | None = None) -> Rollout:
+def _batches(count: int, most: int) -> Iterator[range]:
+    """The first episodes of evaluation, at most so many at a time.
+
+    Raises:
+        InputError: more episodes than an evaluation may have.
+    """
+    if count > MAX_EVALUATION_EPISODES:
+        raise InputError(
+            f"{count:,} episodes are too many: at most {MAX_EVALUATION_EPISODES:,} are played"
+        )
+    for start in range(0, count, most):
+        yield range(start, min(start + most, count))
+
+
+def find_episode(source: str, episode: int = 0, task: Task | None = None) -> Rollout:
     """An episode of a data set by its number, or one under a policy that `find_player` knows.
 
     Those under a policy are the episodes of evaluation. A run's come out as they did when it was
@@ -95,10 +129,17 @@ def find_episode(source: str, episode: int = 0, task: str | None = None) -> Roll
     differently.
 
     Raises:
-        InputError: as `find_player`, or there is no such episode.
+        InputError: as `find_player`, or there is no such episode, or the data set is of another
+            task.
     """
     if exists(Path(source) / MANIFEST):
-        return replay(Dataset(source), episode)
+        dataset = Dataset(source)
+        _check_task(source, dataset.task, task)
+        if task not in (None, dataset.task):
+            raise InputError(
+                f"{source} has its own arguments, time limit and features: leave out --task"
+            )
+        return replay(dataset, episode)
     player = find_player(source, task)
     if episode < 0:
         raise InputError(f"there is no episode {episode}: they count from 0")
@@ -107,13 +148,14 @@ def find_episode(source: str, episode: int = 0, task: str | None = None) -> Roll
     return player.play([episode])[0]
 
 
-def find_player(source: str, task: str | None = None) -> Player:
+def find_player(source: str, task: Task | None = None) -> Player:
     """The policy of a run, or one by its name, such as heuristic or constant:drive=0.5.
 
     Args:
         source: the run's folder, or the policy.zip in it, or the name. A run that is not over plays
             its last checkpoint.
-        task: for a policy by its name; of a run, it must be the run's.
+        task: for a policy by its name. A run has its own; if one is given, it must be of the same
+            environment, and is played instead: with other arguments or another time limit.
 
     Raises:
         InputError: neither, or no task for a name, or a run of another task.
@@ -129,7 +171,7 @@ def find_player(source: str, task: str | None = None) -> Player:
         )
     if task is None:
         raise InputError(f"policy {source} needs a --task")
-    return Player(source, get_task(task), parse_policy(source).begin)
+    return Player(source, task, parse_policy(source).begin)
 
 
 def run_folder(source: str) -> Path | None:
@@ -150,24 +192,31 @@ def find_untrained(folder: Path) -> Player:
     return as_player(f"{folder}, before training", load_untrained(folder))
 
 
-def _of_run(folder: Path, task: str | None) -> Player:
+def _of_run(folder: Path, task: Task | None) -> Player:
     from jbrep.rl.policy import load_run  # imports torch
 
     trained = load_run(folder)
-    if task not in (None, trained.task):
-        raise InputError(f"{folder} is a run of {trained.task}, not of {task}")
+    _check_task(str(folder), trained.task, task)
     name = str(folder) if trained.step is None else f"{folder} at step {trained.step:,}"
-    return as_player(name, trained)
+    player = as_player(name, trained)
+    return player._replace(task=task) if task else player
+
+
+def _check_task(source: str, own: Task, given: Task | None) -> None:
+    """Make sure that a task that is given, if any, is the source's."""
+    if given and given.id != own.id:
+        raise InputError(f"{source} is of {own.name}, not of {given.name}")
+    if given:
+        check_same(given, own, source)
 
 
 def as_player(name: str, trained: "Trained") -> Player:
     """A trained policy with a name."""
     return Player(
         name,
-        get_task(trained.task),
+        trained.task,
         trained.begin,
         trained.representation,
         trained.evaluation_episodes,
-        trained.episode_steps,
         trained.step,
     )

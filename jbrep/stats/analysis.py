@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,15 @@ from jbrep.files.typed import read_json, typed
 from jbrep.stats.bootstrap import Array
 from jbrep.stats.claims import CLAIMS
 from jbrep.stats.comparison import Comparison, adjusted, compare, simultaneous_level
-from jbrep.stats.curves import common_grid
-from jbrep.stats.labels import PROFILE_RETURNS, RepresentationResult, describe, thresholds
+from jbrep.stats.curves import common_grid, on_grid
+from jbrep.stats.labels import RepresentationResult, check_names, describe
 from jbrep.stats.plain import READERS, to_plain
-from jbrep.stats.runs import Group, RunCurve, groups
+from jbrep.stats.runs import LARGEST_RETURN, Group, RunCurve, groups
+from jbrep.stats.scale import SOLVED, STEPS_TO, scale_of
+from jbrep.stats.version_1 import in_version_2
 
 FORMAT = "jbrep statistics"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +34,11 @@ class GroupAnalysis:
         algorithm: the algorithm's name.
         grid: training steps at which runs are compared, (g,).
         cut: which evaluations the grid leaves out, in words; None if it leaves out none.
-        thresholds: the return to reach for each of STEPS_TO.
+        return_floor: the least possible return of the task; NaN if unknown.
+        failure_return: what a failed run counts as from the step of failure on.
+        reference: the return that gains are counted from, as in `Scale`.
+        thresholds: the return to reach for each of STEPS_TO; NaN where there is none.
+        profile_returns: where performance profiles are evaluated, ascending, (k,).
         labels: results of each representation, the baseline first.
         comparisons: of the other representations with the baseline, in the same order.
 
@@ -44,21 +50,36 @@ class GroupAnalysis:
     algorithm: str
     grid: Array
     cut: str | None
+    return_floor: float
+    failure_return: float
+    reference: float
     thresholds: Mapping[str, float]
+    profile_returns: Array
     labels: tuple[RepresentationResult, ...]
     comparisons: tuple[Comparison, ...]
 
     def __post_init__(self) -> None:
-        if len(self.grid) < 2 or not np.all(np.diff(self.grid) > 0) or self.grid[0] < 0:
+        if not _ascend(self.grid) or self.grid[0] < 0:
             raise ValueError("the grid must have at least two ascending steps")
         names = [label.representation for label in self.labels]
         if not names or len(set(names)) < len(names):
             raise ValueError("each representation must have one result")
         if [comparison.representation for comparison in self.comparisons] != names[1:]:
             raise ValueError("each representation but the first must have one comparison")
+        check_names("thresholds", self.thresholds, STEPS_TO)
+        profile = self.profile_returns
+        if not _ascend(profile) or np.abs(profile).max() > 2 * LARGEST_RETURN:
+            raise ValueError("profile_returns must be at least two ascending returns")
         for label in self.labels:
             if len(label.curve.mean) != len(self.grid):
                 raise ValueError(f"the curve of {label.representation} doesn't fit the grid")
+            if np.shape(label.profile.value) != self.profile_returns.shape:
+                raise ValueError("each profile must have as many values as profile_returns")
+
+    @property
+    def solved(self) -> float:
+        """The return from which on the task counts as solved; NaN if unknown."""
+        return self.thresholds[SOLVED]
 
     @property
     def name(self) -> str:
@@ -75,7 +96,6 @@ class Analysis:
         seed: of all resampling.
         simultaneous_level: of each verdict's interval, so that all hold together at 95 %.
         groups: by task and algorithm.
-        profile_returns: where performance profiles are evaluated, (k,).
 
     Raises:
         ValueError: parts that don't fit together.
@@ -85,14 +105,11 @@ class Analysis:
     seed: int
     simultaneous_level: float
     groups: tuple[GroupAnalysis, ...]
-    profile_returns: Array = field(default_factory=PROFILE_RETURNS.copy)
 
     def __post_init__(self) -> None:
-        results = [label for group in self.groups for label in group.labels]
-        if not results or any(g.labels[0].representation != self.baseline for g in self.groups):
+        first = {group.labels[0].representation for group in self.groups}
+        if first != {self.baseline}:
             raise ValueError(f"each group must begin with the baseline {self.baseline}")
-        if any(np.shape(each.profile.value) != self.profile_returns.shape for each in results):
-            raise ValueError("each profile must have as many values as profile_returns")
 
     def to_json(self) -> str:
         """All of it as JSON; an interval is [value, low, high], null stands for not finite."""
@@ -105,7 +122,7 @@ class Analysis:
 
     @classmethod
     def from_json(cls, text: str, path: Path) -> "Analysis":
-        """What to_json wrote, with NaN for all that wasn't finite.
+        """What to_json wrote, also in the first release, with NaN for all that wasn't finite.
 
         Args:
             text: the JSON.
@@ -116,6 +133,8 @@ class Analysis:
             InputError: it is of a newer jbrep.
         """
         record = read_json(text, path, FORMAT, FORMAT_VERSION)
+        if record["format_version"] == 1:
+            record = in_version_2(record)
         try:
             analysis: Analysis = typed(record, cls, READERS)
         except ValueError as error:
@@ -155,16 +174,31 @@ def analyse(
 
 def _analyse_group(group: Group, family: int, seed: int) -> GroupAnalysis:
     """The results of a group; the p-values of its verdicts aren't adjusted yet."""
-    runs_of_baseline = next(iter(group.values()))
+    first = next(iter(group.values()))[0]
     grid, cut = common_grid(group)
-    reach = thresholds(runs_of_baseline, grid)
-    baseline, *others = (describe(runs, grid, reach, seed) for runs in group.values())
-    return GroupAnalysis(
-        task=runs_of_baseline[0].task,
-        algorithm=runs_of_baseline[0].algorithm,
-        grid=grid,
-        cut=cut,
-        thresholds=reach,
-        labels=(baseline, *others),
-        comparisons=tuple(compare(each, baseline, family, seed) for each in others),
+    curves = [np.stack([on_grid(run, grid) for run in runs]) for runs in group.values()]
+    scale = scale_of(curves, grid, first.return_floor, first.solved)
+    baseline, *others = (
+        describe(runs, of_runs, scale, seed)
+        for runs, of_runs in zip(group.values(), curves, strict=True)
     )
+    compared = (compare(each, baseline, scale.reference, family, seed) for each in others)
+    return GroupAnalysis(
+        task=first.task,
+        algorithm=first.algorithm,
+        cut=cut,
+        return_floor=_or_nan(first.return_floor),
+        failure_return=_or_nan(first.failure_return),
+        labels=(baseline, *others),
+        comparisons=tuple(compared),
+        **scale._asdict(),
+    )
+
+
+def _ascend(values: Array) -> bool:
+    """Whether values (n,) ascend and are at least two."""
+    return len(values) > 1 and bool(np.all(values[:-1] < values[1:]))
+
+
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else float(value)

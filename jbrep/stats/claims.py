@@ -11,7 +11,7 @@ from scipy.stats import permutation_test
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.intervals import constant, difference, variance_ratio, welch
 
-MARGIN = 0.05  # of the baseline's mean final return: a smaller loss counts as similar
+MARGIN = 0.05  # of the baseline's gain over the reference: a smaller loss counts as similar
 _PERMUTATIONS = 9999
 VERDICTS = {1: "supported", -1: "contradicted", 0: "undecided"}
 
@@ -26,7 +26,7 @@ class Claim(NamedTuple):
         boundary_name: what the boundary is called before its value; empty if it has no name.
         measure: what is compared, a value for each run.
         interval: from x (..., n), y (..., m) and a level, (...).
-        boundary: what the interval must exclude, from y, (...).
+        boundary: what the interval must exclude, from y and the reference, (...).
         side: 1 if an interval above the boundary supports the claim, -1 if one below does.
         p_value: two-sided, of lying on the boundary, from x (n,), y (m,), the boundary and a seed.
         allow_failures: whether the claim may be supported where runs of the representation failed.
@@ -40,7 +40,7 @@ class Claim(NamedTuple):
     boundary_name: str
     measure: str
     interval: Callable[[Array, Array, float], Interval]
-    boundary: Callable[[Array], Array]
+    boundary: Callable[[Array, float], Array]
     side: int
     p_value: Callable[[Array, Array, float, int], float]
     allow_failures: bool
@@ -95,15 +95,16 @@ def _least_of_permutations(runs: int) -> float:
     return 2 / comb(2 * runs, runs)
 
 
-def _margin(y: Array) -> Array:
-    return -MARGIN * y.mean(axis=-1)
+def _margin(y: Array, reference: float) -> Array:
+    """A share of the gain of y (..., m): returns may be negative, a gain isn't."""
+    return -MARGIN * np.maximum(y.mean(axis=-1) - reference, 0)
 
 
-def _zero(y: Array) -> Array:
+def _zero(y: Array, reference: float) -> Array:
     return np.zeros(y.shape[:-1])
 
 
-def _one(y: Array) -> Array:
+def _one(y: Array, reference: float) -> Array:
     return np.ones(y.shape[:-1])
 
 
@@ -113,7 +114,7 @@ SIMILAR_REWARD = Claim(
     name="similar reward",
     statement="The reduced state ends at a similar reward",
     quantity="difference of mean final returns",
-    boundary_name=f"the margin of {100 * MARGIN:.0f} %,",
+    boundary_name=f"the margin of {100 * MARGIN:.0f} % of the gain,",
     measure="final_return",
     interval=difference,
     boundary=_margin,

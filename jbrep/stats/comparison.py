@@ -9,8 +9,9 @@ from scipy.stats import levene
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.claims import CLAIMS, VERDICTS, Claim, decide
 from jbrep.stats.intervals import FEWEST, LEVEL, constant, difference, percentile, variance_ratio
-from jbrep.stats.labels import STEPS_TO, RepresentationResult, check_names, check_numbers, median
+from jbrep.stats.labels import RepresentationResult, check_names, check_numbers, median
 from jbrep.stats.power import seeds_needed
+from jbrep.stats.scale import STEPS_TO
 
 COMPARISON_NUMBERS = (
     "final_return_difference",
@@ -98,13 +99,18 @@ class Comparison:
 
 
 def compare(
-    label: RepresentationResult, baseline: RepresentationResult, family: int, seed: int
+    label: RepresentationResult,
+    baseline: RepresentationResult,
+    reference: float,
+    family: int,
+    seed: int,
 ) -> Comparison:
     """A representation against the baseline; the p-values of its verdicts aren't adjusted yet.
 
     Args:
         label: of the representation.
         baseline: of the same task and algorithm.
+        reference: the return that gains are counted from.
         family: the number of verdicts in the study.
         seed: of all resampling.
     """
@@ -130,7 +136,7 @@ def compare(
         representation=label.representation,
         numbers=numbers,
         brown_forsythe_p=_brown_forsythe(final, final_of_baseline),
-        verdicts=tuple(_judge(claim, label, baseline, family, seed) for claim in CLAIMS),
+        verdicts=tuple(_judge(claim, label, baseline, reference, family, seed) for claim in CLAIMS),
     )
 
 
@@ -161,15 +167,16 @@ def _judge(
     claim: Claim,
     label: RepresentationResult,
     baseline: RepresentationResult,
+    reference: float,
     family: int,
     seed: int,
 ) -> Verdict:
     x, y = label.by_run[claim.measure], baseline.by_run[claim.measure]
     level = simultaneous_level(family)
-    boundary = float(claim.boundary(y))
+    boundary = claim.boundary(y, reference)
     simultaneous = claim.interval(x, y, level)
-    decided = int(decide(claim, simultaneous, claim.boundary(y)))
-    p = claim.p_value(x, y, boundary, seed)
+    decided = int(decide(claim, simultaneous, boundary))
+    p = claim.p_value(x, y, float(boundary), seed)
     reason = _reason(claim, x, y)
     if not baseline.learned:  # then there is nothing to compare with
         decided, reason = 0, f"{baseline.representation} didn't learn"
@@ -179,11 +186,11 @@ def _judge(
         decided, reason = 0, f"{label.representation} didn't learn"
     elif decided and p > 1 - level:
         decided, reason = 0, "its p-value disagrees"
-    needed = None if decided or reason else seeds_needed(claim, x, y, level, seed)
+    needed = None if decided or reason else seeds_needed(claim, x, y, reference, level, seed)
     return Verdict(
         claim=claim.name,
         verdict=VERDICTS[decided],
-        boundary=boundary,
+        boundary=float(boundary),
         nominal=claim.interval(x, y, LEVEL),
         simultaneous=simultaneous,
         p=p,

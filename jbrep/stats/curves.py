@@ -128,9 +128,9 @@ def mean_return(curves: Array, grid: Array) -> Array:
 def steps_to(curves: Array, grid: Array, threshold: float) -> Array:
     """The first step at which each curve, (runs, g), reaches a return; inf if it never does.
 
-    NaN for a threshold that isn't above 0: there is nothing to reach.
+    NaN for a threshold of NaN: there is nothing to reach.
     """
-    if not threshold > 0:
+    if np.isnan(threshold):
         return np.full(len(curves), np.nan)
     above = curves >= threshold
     after = above.argmax(axis=1)  # also 0 where it is never reached

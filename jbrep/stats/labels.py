@@ -6,16 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binomtest, iqr, median_abs_deviation
 
-from jbrep.jitterbug.tasks import SOLVED_RETURN
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.curves import Curve, bands, final_return, iqm, mean_return, on_grid, steps_to
+from jbrep.stats.curves import Curve, bands, final_return, iqm, mean_return, steps_to
 from jbrep.stats.intervals import LEVEL, UNDEFINED, deviation, mean, percentile
 from jbrep.stats.reliability import TAIL_OF_RUNS, expected_shortfall, fixed_policy, within_runs
 from jbrep.stats.runs import RunCurve
+from jbrep.stats.scale import STEPS_TO, Scale
 
-PROFILE_RETURNS = np.linspace(0, 1000, 51)  # at which a performance profile is drawn
-SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the baseline's median final return
-STEPS_TO = tuple(f"steps_to_{name}" for name in (*SHARES, f"{SOLVED_RETURN:.0f}"))
 REACHED = {name: name.replace("steps_to", "reached") for name in STEPS_TO}
 WITHIN = (  # of one run
     "dispersion_across_time",
@@ -52,7 +49,8 @@ class RepresentationResult:
         curve: over the grid of the group.
         by_run: RUN_NUMBERS, (runs,) each, in the order of seeds.
         numbers: NUMBERS, each with its 95 % interval.
-        profile: the share of runs whose final return is above each of PROFILE_RETURNS, (51,).
+        profile: the share of runs whose final return is above each of the group's
+            profile_returns, (k,).
 
     Raises:
         ValueError: names or lengths that don't fit.
@@ -102,31 +100,22 @@ def check_numbers(numbers: Mapping[str, Interval], expected: Collection[str]) ->
         raise ValueError("each number must be one interval")
 
 
-def thresholds(baseline: list[RunCurve], grid: Array) -> dict[str, float]:
-    """The return to reach for each of STEPS_TO: shares of the baseline's median, and solved."""
-    median = float(np.median(final_return(_curves(baseline, grid), grid)))
-    returns = (*(share * median for share in SHARES.values()), SOLVED_RETURN)
-    return dict(zip(STEPS_TO, returns, strict=True))
-
-
-def describe(
-    runs: list[RunCurve], grid: Array, reach: Mapping[str, float], seed: int
-) -> RepresentationResult:
+def describe(runs: list[RunCurve], curves: Array, scale: Scale, seed: int) -> RepresentationResult:
     """The results of a representation.
 
     Args:
         runs: all of the representation, in the order of seeds.
-        grid: training steps at which runs are compared, (g,).
-        reach: the return to reach for each of STEPS_TO.
+        curves: of the runs, on the grid of the scale, (runs, g).
+        scale: of the group.
         seed: of the resamples.
     """
-    curves = _curves(runs, grid)
+    grid = scale.grid
     failed = np.array([run.failed_at is not None for run in runs])
     by_run = {
         "final_return": final_return(curves, grid),
         "mean_return": mean_return(curves, grid),
         "gain": final_return(curves, grid) - curves[:, 0],
-        **{name: steps_to(curves, grid, threshold) for name, threshold in reach.items()},
+        **{name: steps_to(curves, grid, each) for name, each in scale.thresholds.items()},
         **within_runs(curves, failed),
         **fixed_policy(runs, grid[-1]),
     }
@@ -138,18 +127,14 @@ def describe(
         curve=bands(curves, seed),
         by_run=by_run,
         numbers=_numbers(by_run, seed),
-        profile=profile(by_run["final_return"], seed),
+        profile=profile(by_run["final_return"], scale.profile_returns, seed),
     )
 
 
-def profile(final_return: Array, seed: int) -> Interval:
-    """A performance profile (Agarwal et al. 2021): shares of runs (n,) above PROFILE_RETURNS."""
-    above = (final_return > PROFILE_RETURNS[:, None]).astype(float)
+def profile(final_return: Array, returns: Array, seed: int) -> Interval:
+    """A performance profile (Agarwal et al. 2021): the shares of runs (n,) above returns (k,)."""
+    above = (final_return > returns[:, None]).astype(float)
     return percentile(lambda values: values.mean(axis=-1), above, seed=seed)
-
-
-def _curves(runs: list[RunCurve], grid: Array) -> Array:
-    return np.stack([on_grid(run, grid) for run in runs])
 
 
 def _numbers(by_run: Mapping[str, Array], seed: int) -> dict[str, Interval]:

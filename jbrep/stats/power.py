@@ -10,7 +10,9 @@ POWER = 0.8
 _STUDIES = 1000
 
 
-def seeds_needed(claim: Claim, x: Array, y: Array, level: float, seed: int = 0) -> int | str:
+def seeds_needed(
+    claim: Claim, x: Array, y: Array, reference: float, level: float, seed: int = 0
+) -> int | str:
     """The fewest seeds per representation with which four of five simulated studies are decided.
 
     The rule and the interval are those of the verdict; of the p-value only its smallest possible
@@ -21,6 +23,7 @@ def seeds_needed(claim: Claim, x: Array, y: Array, level: float, seed: int = 0) 
         claim: to be decided.
         x: a value for each run of the representation, (n,).
         y: a value for each run of the baseline, (m,).
+        reference: the return that gains are counted from.
         level: of the interval.
         seed: of the simulated studies.
     """
@@ -29,7 +32,8 @@ def seeds_needed(claim: Claim, x: Array, y: Array, level: float, seed: int = 0) 
             continue
         random = np.random.default_rng(seed)
         ours, theirs = _draw(x, count, random), _draw(y, count, random)
-        decided = decide(claim, claim.interval(ours, theirs, level), claim.boundary(theirs))
+        boundary = claim.boundary(theirs, reference)
+        decided = decide(claim, claim.interval(ours, theirs, level), boundary)
         if np.mean(decided != 0) >= POWER:
             return count
     return f"> {SEEDS[-1]}"

@@ -40,7 +40,7 @@ def drawdown(curves: Array) -> Array:
 def within_runs(curves: Array, failed: NDArray[np.bool_]) -> dict[str, Array]:
     """Dispersion and risk over the training of each run, (runs,) each.
 
-    NaN for a failed run, whose zeros would look like steadiness.
+    NaN for a failed run, whose constant return would look like steadiness.
 
     Args:
         curves: on the grid, (runs, g).

@@ -2,7 +2,8 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 from numbers import Integral
 
 import numpy as np
@@ -12,16 +13,16 @@ from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError
 from jbrep.stats.bootstrap import Array
 
-MAX_RETURN = 1000.0  # an episode's 1,000 steps, each with a reward in [0, 1]
-_ROUNDING = 1e-6 * MAX_RETURN
+LARGEST_RETURN = 1e15  # of either sign: beyond, a number has diverged
+_ROUNDING = 1e-6  # of returns, relative to the largest
 
 
 @dataclass(frozen=True, eq=False)
 class RunCurve:
     """The returns of a run's evaluations over training.
 
-    A failed run counts as return 0 from the step of failure on: rewards are never negative, so
-    failing can't count in favour of a representation.
+    A failed run counts as the worst from the step of failure on, so that failing can't count in
+    favour of a representation.
 
     Args:
         task: the task's name.
@@ -30,9 +31,13 @@ class RunCurve:
         seed: of the run.
         settings: a hash of the settings, or any text; equal for all runs under one label.
         steps: training steps of the evaluations, (k,), ascending.
-        returns: of each evaluation's episodes, (k, e), in [0, 1000].
+        returns: of each evaluation's episodes, (k, e).
         total_steps: training steps that were requested.
         failed_at: training step at which the run failed; None if it didn't.
+        return_floor: the least possible return of an episode of the task; None if unknown.
+        solved: the return from which on the task counts as solved; None if unknown.
+        failure_return: what the run counts as once it has failed; None for the floor.
+            `with_failure_returns` sets it for runs that are compared.
 
     Raises:
         InputError: a field that doesn't fit this description.
@@ -47,6 +52,9 @@ class RunCurve:
     returns: Array
     total_steps: int
     failed_at: int | None = None
+    return_floor: float | None = None
+    solved: float | None = None
+    failure_return: float | None = None
 
     def __post_init__(self) -> None:
         if not _is_whole(self.seed):
@@ -64,20 +72,30 @@ class RunCurve:
                 f"its returns have the shape {returns.shape}",
                 f"expected (evaluations, episodes), with {len(steps)} evaluations as in its steps",
             )
-        if not np.isfinite(returns).all():
-            raise self._error("its returns aren't finite", "set failed_at for a run that diverged")
-        if (
-            returns.size
-            and not -_ROUNDING <= returns.min() <= returns.max() <= MAX_RETURN + _ROUNDING
-        ):
+        if not (np.abs(returns) <= LARGEST_RETURN).all():
             raise self._error(
-                f"its returns are in [{returns.min():g}, {returns.max():g}]",
-                f"they must be in [0, {MAX_RETURN:g}]",
+                f"its returns aren't finite, or beyond {LARGEST_RETURN:g}",
+                "set failed_at for a run that diverged",
             )
+        self._check_bounds(returns)
         self._check_length(steps)
         for name, value in (("steps", steps), ("returns", returns.copy())):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+
+    def _check_bounds(self, returns: Array) -> None:
+        for what in ("return_floor", "solved", "failure_return"):
+            value = getattr(self, what)
+            if value is not None and not abs(value) <= LARGEST_RETURN:
+                raise self._error(f"its {what} is {value}", "give a number, or None if unknown")
+        if self.return_floor is None or not returns.size:
+            return
+        rounding = _ROUNDING * max(1, abs(self.return_floor), np.abs(returns).max())
+        if returns.min() < self.return_floor - rounding:
+            raise self._error(
+                f"its least return is {returns.min():g}",
+                f"its task has none below {self.return_floor:g}",
+            )
 
     def _check_length(self, steps: NDArray[np.int64]) -> None:
         if self.failed_at is None and len(steps) < 2:
@@ -102,12 +120,17 @@ class RunCurve:
         return f"{self.task}/{self.algorithm}/{self.representation}"
 
     def curve(self) -> tuple[NDArray[np.int64], Array]:
-        """Training steps and mean returns over episodes, (k,) each; a failed run ends with 0."""
+        """Training steps and mean returns over episodes, (k,) each.
+
+        A failed run ends with its failure_return: NaN where neither that nor the floor is known.
+        """
         steps, returns = self.steps, self.returns.mean(axis=1)
         if self.failed_at is None:
             return steps, returns
         before = steps < self.failed_at
-        return np.append(steps[before], self.failed_at), np.append(returns[before], 0.0)
+        last = self.return_floor if self.failure_return is None else self.failure_return
+        ends = np.nan if last is None else last
+        return np.append(steps[before], self.failed_at), np.append(returns[before], ends)
 
     def _error(self, wrong: str, expected: str) -> InputError:
         return InputError(f"run {self.label}, seed {self.seed}: {wrong}; {expected}")
@@ -120,14 +143,31 @@ def _is_whole(value: object) -> bool:
 Group = dict[str, list[RunCurve]]  # runs by seed, under their representation
 
 
+def with_failure_returns(runs: Sequence[RunCurve]) -> list[RunCurve]:
+    """The same runs with what a failed one counts as: the worst of its task and algorithm.
+
+    That is the least possible return of the task where it is known, else the worst return of any
+    episode in which a run of that task and algorithm was evaluated, whatever its representation.
+    It stays unknown, None, where none was evaluated.
+    """
+    worst: dict[tuple[str, str], float] = {}
+    for run in runs:
+        seen = run.returns.min(initial=np.inf) if run.return_floor is None else run.return_floor
+        key = run.task, run.algorithm
+        worst[key] = min(worst.get(key, np.inf), float(seen))
+    known = {key: value for key, value in worst.items() if np.isfinite(value)}
+    return [replace(run, failure_return=known.get((run.task, run.algorithm))) for run in runs]
+
+
 def groups(runs: Sequence[RunCurve], baseline: str) -> dict[tuple[str, str], Group]:
     """Runs by (task, algorithm), then by representation, the baseline first.
 
-    The order doesn't depend on that of the runs given.
+    The order doesn't depend on that of the runs given. Each run has its failure_return.
 
     Raises:
-        InputError: there is no run, something else than a run, a group without its baseline, or a
-            label with one run, with a seed twice, or with different settings.
+        InputError: there is no run, something else than a run, a group without its baseline,
+            without any evaluation, or with different facts of its task, or a label with one run,
+            with a seed twice, or with different settings.
     """
     by_group: dict[tuple[str, str], Group] = defaultdict(lambda: defaultdict(list))
     for run in runs:
@@ -136,6 +176,7 @@ def groups(runs: Sequence[RunCurve], baseline: str) -> dict[tuple[str, str], Gro
                 f"runs contain a {type(run).__name__}: give one RunCurve for each run; episodes "
                 "don't replace runs"
             )
+    for run in with_failure_returns(runs):
         by_group[run.task, run.algorithm][run.representation].append(run)
     if not by_group:
         raise InputError("there are no runs: give at least two of the baseline")
@@ -153,6 +194,7 @@ def _ordered(group: Group, key: tuple[str, str], baseline: str) -> Group:
     }
     for of_label in ordered.values():
         _check_label(of_label)
+    _check_task(list(chain.from_iterable(ordered.values())), "/".join(key))
     return ordered
 
 
@@ -163,6 +205,17 @@ def in_order(names: Iterable[str], baseline: str) -> list[str]:
         return name != baseline, EncoderName.parse(name).order, name
 
     return sorted(set(names), key=key)
+
+
+def _check_task(runs: list[RunCurve], name: str) -> None:
+    if runs[0].failure_return is None:
+        raise InputError(f"{name}: every run failed before its first evaluation: see why they did")
+    for what in ("return_floor", "solved"):
+        values = sorted({str(getattr(run, what)) for run in runs})
+        if len(values) > 1:
+            raise InputError(
+                f"{name}: its runs say different {what}: {', '.join(values)}; give one for a task"
+            )
 
 
 def _check_label(runs: list[RunCurve]) -> None:

@@ -3,14 +3,18 @@
 import math
 import textwrap
 
+import numpy as np
+
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.claims import LESS_VARIANCE
-from jbrep.stats.labels import REACHED, STEPS_TO, RepresentationResult
+from jbrep.stats.claims import LESS_VARIANCE, MARGIN
+from jbrep.stats.labels import REACHED, RepresentationResult
+from jbrep.stats.scale import STEPS_TO
 from jbrep.text import SIGNIFICANT, interval, number, table
 
 Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]  # a header, and the rows below it
 _KEY = "representation"
+_MOST_DIGITS = 9  # after the point
 
 
 def statistics_text(analysis: Analysis, width: int | None = None) -> str:
@@ -54,38 +58,65 @@ def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[tuple[str, Ro
             (f"Compared with {analysis.baseline}", comparison_rows(group)),
             (
                 f"Verdicts, by intervals at {level}, which hold together at 95 %; seeds: the "
-                "number per representation that would decide",
+                f"number per representation that would decide. {margin(group)}",
                 verdict_rows(group),
             ),
         ]
     return tables
 
 
+def margin(group: GroupAnalysis) -> str:
+    """The margin of the claim of similar reward, in a line."""
+    known = not math.isnan(group.return_floor)
+    what = "the least possible return" if known else "the mean return of its untrained policies"
+    return (
+        f"Similar reward: a loss of up to {100 * MARGIN:.0f} % of the gain of "
+        f"{group.labels[0].representation} over {what}, {shown_number(group.reference)}"
+    )
+
+
 def label_rows(group: GroupAnalysis) -> Rows:
-    """A row for each representation; after the steps, how many of its runs reached the return."""
+    """A row for each representation; after the steps, how many of its runs reached the return.
+
+    Steps to a return that isn't known are left out.
+    """
+    solved = [] if math.isnan(group.solved) else [f"to solved ({group.solved:,g})"]
     header = (
         *(_KEY, "runs", "failed", "final return", "mean return", "IQM of final"),
-        *("steps to 50 %", "to 90 %", "to 900"),
+        *("steps to 50 %", "to 90 %", *solved),
     )
+    form = _form(group)
     return header, [
         (
             label.representation,
             str(len(label.seeds)),
             str(len(label.failed)),
-            shown(label.numbers["final_return_mean"], ",.0f"),
-            shown(label.numbers["mean_return_mean"], ",.0f"),
-            shown(label.numbers["final_return_iqm"], ",.0f"),
-            *(_steps(label, name) for name in STEPS_TO),
+            shown(label.numbers["final_return_mean"], form),
+            shown(label.numbers["mean_return_mean"], form),
+            shown(label.numbers["final_return_iqm"], form),
+            *(_steps(label, name) for name in STEPS_TO[: 2 + len(solved)]),
         )
         for label in group.labels
     ]
 
 
+def _form(group: GroupAnalysis, more: int = 0) -> str:
+    """A format for returns: three digits of the range of final returns, or whole numbers.
+
+    Args:
+        group: with the returns.
+        more: digits, such as for their spread.
+    """
+    width = group.profile_returns[-1] - group.profile_returns[0]
+    return f",.{np.clip(2 - math.floor(math.log10(width)), 0, _MOST_DIGITS) + more}f"
+
+
 def spread_rows(group: GroupAnalysis) -> Rows:
     """A row for each representation."""
     names = ("final_return_sd", "final_return_iqr", "final_return_mad", "risk_across_runs")
+    form = _form(group, more=1)
     return (_KEY, "SD", "IQR", "MAD", "CVaR"), [
-        (label.representation, *(shown(label.numbers[name], ",.1f") for name in names))
+        (label.representation, *(shown(label.numbers[name], form) for name in names))
         for label in group.labels
     ]
 
@@ -102,11 +133,12 @@ def comparison_rows(group: GroupAnalysis) -> Rows:
         *(_KEY, "final return", "mean return", "P(improvement)", "variance ratio"),
         *("by bootstrap", "permutation p", "Brown-Forsythe p"),
     )
+    form = _form(group)
     return header, [
         (
             comparison.representation,
-            shown(comparison.numbers["final_return_difference"], ",.0f"),
-            shown(comparison.numbers["mean_return_difference"], ",.0f"),
+            shown(comparison.numbers["final_return_difference"], form),
+            shown(comparison.numbers["mean_return_difference"], form),
             shown(comparison.numbers["probability_of_improvement"], ".2f"),
             shown(comparison.numbers["variance_ratio"]),
             shown(comparison.numbers["variance_ratio_bootstrap"]),

@@ -1,5 +1,6 @@
 """What a study is: a TOML file, checked."""
 
+import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
@@ -10,16 +11,20 @@ from jbrep.dae.training import Training
 from jbrep.encoders import FULL
 from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.names import USUAL_ARCHITECTURE, EncoderName
+from jbrep.envs.names import find_spec
+from jbrep.envs.task import MAX_EPISODE_STEPS
 from jbrep.errors import InputError
 from jbrep.files.storage import read_regular
-from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
+from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.fit import get_kind
 from jbrep.rl.presets import get_preset
 from jbrep.rl.run import Run
+from jbrep.text import slug
 
 _MAX_BYTES = 1 << 20
 _MOST_SEEDS = (1 << 16) - 1
-_RUN_SETTINGS = ("steps", "evaluate_every", "evaluation_episodes", "episode_steps")
+_RUN_SETTINGS = ("steps", "evaluate_every", "evaluation_episodes")
+_ANY_TASK = TASKS["face_direction"].describe()
 _TRAINING: dict[str, tuple[type, ...]] = {  # settings of encoders, with their types
     "epochs": (int,),
     "batch_size": (int,),
@@ -103,16 +108,20 @@ class Learner:
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """Tasks x algorithms x representations x seeds, and the settings that all runs share."""
+    """Tasks x algorithms x representations x seeds, and the settings that all runs share.
 
-    tasks: tuple[str, ...]
+    No environment is made: `jbrep.study.prepare.check` finds out what that shows.
+    """
+
+    tasks: tuple[str, ...]  # the Jitterbug's by their names, others by their ids
     algorithms: tuple[str, ...]
     representations: tuple[str, ...]
     seeds: tuple[int, ...]
     steps: int
     evaluate_every: int = 10_000
     evaluation_episodes: int = 10
-    episode_steps: int = EPISODE_STEPS  # control steps in an episode
+    episode_steps: int | None = None  # time limit; None: each task's own
+    environment: Mapping[str, Any] = field(default_factory=dict)  # arguments of environments
     data: Data | None = None  # None: the shipped encoders
     training: Mapping[str, Any] = field(default_factory=dict)  # of encoders, other than the usual
 
@@ -121,18 +130,39 @@ class Study:
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
                 raise InputError(f"{name} is {list(values)}: it must have one or more, each once")
-        for task in self.tasks:
-            get_task(task)
+        self._check_tasks()
         for algorithm in self.algorithms:
             Learner.of(algorithm)
         for name in self.representations:
             Representation.of(name, self.training)
         for seed in self.seeds:
-            Run(task=self.tasks[0], seed=seed, **self.run_settings)  # checks the numbers
+            Run(task=_ANY_TASK, seed=seed, **self.run_settings)  # checks the numbers
         if self.data and bool(self.data.steps) == bool(self.data.folder):
             raise InputError("data must have either steps, to collect, or the folder of a data set")
         if self.training and not self.data:
             raise InputError("training is for encoders made by the study: [data] is missing")
+
+    def _check_tasks(self) -> None:
+        """Check what can be checked of tasks without making their environments."""
+        folders: dict[str, str] = {}
+        for task in self.tasks:
+            folder = slug(task)
+            if not folder.strip("."):
+                raise InputError(f"unknown task {task!r}: it must be a name or a Gymnasium id")
+            if (other := folders.setdefault(folder, task)) != task:
+                raise InputError(f"{other} and {task} would share a folder: study one of them here")
+        steps = self.episode_steps
+        if steps is not None and not 1 <= steps <= MAX_EPISODE_STEPS:
+            raise InputError(
+                f"episode_steps is {steps}: it must be between 1 and {MAX_EPISODE_STEPS:,}"
+            )
+        try:
+            json.dumps(self.environment, allow_nan=False)
+        except (TypeError, ValueError):
+            raise InputError(
+                "environment has a date, or a number that is not finite: its values must be text, "
+                "numbers, true or false, lists or tables"
+            ) from None
 
     @property
     def run_settings(self) -> dict[str, Any]:
@@ -172,7 +202,10 @@ def read_study(path: Path) -> Study:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid TOML: {error}") from None
     try:
-        return as_study(given)
+        study = as_study(given)
+        for task in study.tasks:
+            find_spec(task)
+        return study
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -213,8 +246,9 @@ def _typed(kind: Any, value: Any, name: str) -> Any:
             number = f", or how many (1 to {_MOST_SEEDS})" if name == "seeds" else ""
             raise InputError(f"{name} is {value!r}: it must be a list of {inner.__name__}{number}")
         return tuple(items)
-    if kind in (int, str) and type(value) is not kind:
-        raise InputError(f"{name} is {value!r}: it must be of type {kind.__name__}")
-    if name == "training" and not isinstance(value, dict):
-        raise InputError(f"training is {value!r}: it must be a table")
+    scalar = {int: int, int | None: int, str: str}.get(kind)
+    if scalar and type(value) is not scalar:
+        raise InputError(f"{name} is {value!r}: it must be of type {scalar.__name__}")
+    if kind == Mapping[str, Any] and not isinstance(value, dict):
+        raise InputError(f"{name} is {value!r}: it must be a table")
     return value

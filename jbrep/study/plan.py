@@ -7,12 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.encoders.file import SUFFIX
+from jbrep.envs.description import describe
+from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
 from jbrep.files.storage import exists, make_folder, read_regular, write_whole
 from jbrep.rl import Run
 from jbrep.rl.files import RUN
 from jbrep.rl.run import plain
 from jbrep.study.config import Learner, Representation, Study, as_study
+from jbrep.text import slug
 
 STUDY = "study.json"
 _GRID = ("tasks", "algorithms", "representations", "seeds")  # may be added to
@@ -23,7 +26,7 @@ _MAX_BYTES = 1 << 24
 class Cell:
     """One run of the grid."""
 
-    task: str
+    task: str  # its name
     learner: Learner
     representation: Representation
     seed: int
@@ -31,7 +34,7 @@ class Cell:
     @property
     def name(self) -> str:
         """Its folder below the study's folder of runs."""
-        parts = (self.task, self.learner.name, self.representation.name, f"seed-{self.seed}")
+        parts = (slug(self.task), self.learner.name, self.representation.name, f"seed-{self.seed}")
         return "/".join(parts)
 
 
@@ -78,10 +81,18 @@ class Plan:
         """The runs that have neither finished nor failed."""
         return [cell for cell in self.cells if not self.has_ended(cell)]
 
+    def task(self, name: str) -> Task:
+        """A task with the study's arguments and time limit; its environment is made once.
+
+        Raises:
+            InputError: as `describe`.
+        """
+        return describe(name, self.study.environment, self.study.episode_steps)
+
     def run(self, cell: Cell) -> Run:
         """What to train."""
         return Run(
-            task=cell.task,
+            task=self.task(cell.task),
             algorithm=cell.learner.algorithm,
             preset=cell.learner.preset,
             encoder=self._encoder(cell),
@@ -91,7 +102,11 @@ class Plan:
 
     def encoders(self, task: str) -> Path:
         """The folder of the encoders that the study trains for a task."""
-        return self.folder / "encoders" / task
+        return self.folder / "encoders" / slug(task)
+
+    def data(self, task: str) -> Path:
+        """The folder of the data set that the study collects for a task."""
+        return self.folder / "data" / slug(task)
 
     def _encoder(self, cell: Cell) -> str:
         name = cell.representation.encoder
@@ -110,11 +125,20 @@ class Plan:
         settings = self.as_json()
         if there := read_plan(self.folder):
             fixed = {name: value for name, value in settings.items() if name not in _GRID}
+            if self._has_limits_of(there):
+                del fixed["episode_steps"]
             if differing := differences(there.as_json(), fixed):
                 raise InputError(
                     f"{self.folder} holds another study: {differing}; choose another --out"
                 )
         write_whole(self.folder / STUDY, (json.dumps(settings, indent=2) + "\n").encode())
+
+    def _has_limits_of(self, other: "Plan") -> bool:
+        """Whether both give all tasks of this one the same time limit, said or not."""
+        steps = other.study.episode_steps
+        return steps == self.study.episode_steps or all(
+            steps in (None, task.max_episode_steps) for task in map(self.task, self.study.tasks)
+        )
 
     def as_json(self) -> dict[str, Any]:
         """The study as plain JSON."""

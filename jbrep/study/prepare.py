@@ -6,33 +6,48 @@ from jbrep.collect import collect
 from jbrep.collect.derive import derive
 from jbrep.dataset import Dataset, ScaledDataset, Settings
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.encoders import find
+from jbrep.encoders import FULL
+from jbrep.encoders.shipped import names
+from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
-from jbrep.jitterbug.tasks import get_task
+from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.fit import Fitter
-from jbrep.study.config import Data
+from jbrep.study.config import Data, Representation
 from jbrep.study.plan import Plan
+from jbrep.text import slug
 
 
 def check(plan: Plan) -> None:
-    """Check, before anything is collected or trained, that the runs will have their encoders.
+    """Check, before anything is collected or trained, that the runs can start.
 
     Raises:
-        InputError: no such shipped encoder, a latent size out of range, or no data set.
+        InputError: as `describe` for a task; no such shipped encoder, a latent size out of range,
+            or no data set of the task.
     """
-    study = plan.study
-    for task in study.tasks:
-        if study.data and study.data.folder:
-            Dataset(_existing(study.data, task))
+    data = plan.study.data
+    for name in plan.study.tasks:
+        task = plan.task(name)
+        if data and data.folder:
+            folder = _existing(data, name)
+            check_same(task, Dataset(folder).task, f"the data set {folder}")
         for representation in plan.representations:
-            if study.data is None:
-                find(representation.encoder, task)
-            elif (representation.training.latent or 0) >= get_task(task).size:
+            if data is None:
+                _check_shipped(representation, task)
+            elif (representation.training.latent or 0) >= task.size:
                 raise InputError(
-                    f"{representation.name} doesn't reduce the {get_task(task).size} features of "
-                    f"{task}: choose a smaller latent size"
+                    f"{representation.name} doesn't reduce the {task.size} features of "
+                    f"{name}: choose a smaller latent size"
                 )
+
+
+def _check_shipped(representation: Representation, task: Task) -> None:
+    shipped = names(task) or (FULL,)
+    if representation.name not in shipped:
+        raise InputError(
+            f"no encoder {representation.name!r} ships for {task.name}: choose one of "
+            f"{', '.join(shipped)}, or let the study train it, on the states that [data] gives"
+        )
 
 
 def prepare(plan: Plan) -> None:
@@ -45,26 +60,29 @@ def prepare(plan: Plan) -> None:
     if data is None:
         return
     for task in plan.study.tasks:
-        folder = _data(plan, data, task)
+        folder = _existing(data, task) if data.folder else _collect(plan, data, task)
         fitter = Fitter(ScaledDataset(Dataset(folder)), plan.encoders(task))
         for representation in plan.representations:
             fitter.fit(representation.kind, representation.training)
 
 
-def _data(plan: Plan, data: Data, task: str) -> Path:
-    """The folder of a task's data set: collected for the first task, derived for the others."""
-    if data.folder:
-        return _existing(data, task)
-    first = plan.study.tasks[0]
-    source = plan.folder / "data" / first
-    if task == first:
-        collect(Settings(task=task, steps=data.steps, seed=data.seed, store_state=True), source)
-        return source
-    derive(source, task, plan.folder / "data" / task)
-    return plan.folder / "data" / task
+def _collect(plan: Plan, data: Data, task: str) -> Path:
+    """Collect a task's data set; for the Jitterbug's other tasks, derive it from the first's."""
+    folder = plan.data(task)
+    first = next((name for name in plan.study.tasks if name in TASKS), task)
+    if task in TASKS and task != first:
+        derive(plan.data(first), task, folder)
+    else:
+        described = plan.task(task)
+        with_state = bool(described.state)
+        collect(
+            Settings(task=described, steps=data.steps, seed=data.seed, store_state=with_state),
+            folder,
+        )
+    return folder
 
 
 def _existing(data: Data, task: str) -> Path:
     """The folder of an existing data set: the given one, or the task's within it."""
     folder = Path(data.folder)
-    return folder if exists(folder / MANIFEST) else folder / task
+    return folder if exists(folder / MANIFEST) else folder / slug(task)

@@ -3,13 +3,14 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jbrep.encoders import FULL
+from jbrep.envs.task import Task, read_task
 from jbrep.errors import InputError
 from jbrep.files.storage import exists, write_whole
 from jbrep.files.tables import write_csv
@@ -39,14 +40,15 @@ def conclude(folder: Path) -> tuple[Results, list[Path]]:
 
     Returns:
         The results and the files: every return, what was run, the statistics if there are any, and
-        the returns of the hand-written policies.
+        the returns of hand-written policies if the tasks have any.
 
     Raises:
         InputError: as `read_results` and `write_results`.
     """
     results = read_results(folder)
-    tasks = {run.task for run in results.runs}
-    return results, [*write_results(results, folder), write_heuristics(tasks, folder)]
+    paths = write_results(results, folder)
+    heuristics = write_heuristics(map(_task, map(read_run, results.folders)), folder)
+    return results, [*paths, heuristics] if heuristics else paths
 
 
 def read_results(folder: Path) -> Results:
@@ -106,14 +108,20 @@ def _comparable(runs: list[RunCurve]) -> tuple[list[RunCurve], list[str]]:
     return kept, sorted(alone.values())
 
 
+def _task(run: Mapping[str, Any]) -> Task:
+    """The task of a run, from the contents of its run.json."""
+    return read_task(run["settings"]["environment"])
+
+
 def _curve(folder: Path) -> RunCurve:
     run = read_run(folder)
+    task = _task(run)
     settings = {name: value for name, value in run["settings"].items() if name != "seed"}
     evaluations = read_evaluations(folder)
     steps = sorted({each.step for each in evaluations})
     returns = [[e.episode_return for e in evaluations if e.step == step] for step in steps]
     return RunCurve(
-        task=settings["task"],
+        task=task.name,
         algorithm=learner(settings),
         representation=settings["representation"],
         seed=run["settings"]["seed"],
@@ -122,6 +130,8 @@ def _curve(folder: Path) -> RunCurve:
         returns=np.array(returns, dtype=np.float64),
         total_steps=max(run["steps"], settings["steps"]),
         failed_at=run["steps"] if run["status"] == FAILED else None,
+        return_floor=task.return_floor,
+        solved=task.solved_return,
     )
 
 

@@ -5,9 +5,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable
 from typing import Any
 
+from jbrep.envs.names import imported_modules
 from jbrep.errors import choose
-from jbrep.study.plan import Cell, Plan
 from jbrep.pool import Pool, stop_requested
+from jbrep.study.plan import Cell, Plan
 from jbrep.study.progress import say
 from jbrep.study.work import CRASHED, Outcome, work
 
@@ -99,4 +100,5 @@ def get_backend(name: str) -> Backend:
 
 def _job(plan: Plan, cell: Cell) -> tuple[Any, ...]:
     """The arguments of `work`."""
-    return cell.name, plan.run(cell), plan.folder_of(cell), stop_requested
+    run, folder = plan.run(cell), plan.folder_of(cell)
+    return cell.name, run, folder, stop_requested, imported_modules()

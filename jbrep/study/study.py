@@ -1,5 +1,6 @@
 """A study from start to end, and an estimate of how long it takes."""
 
+import textwrap
 from collections import Counter
 from contextlib import closing
 from dataclasses import replace
@@ -13,6 +14,7 @@ from jbrep.study.prepare import check, prepare
 from jbrep.study.progress import Progress, duration
 from jbrep.study.runner import Backend
 from jbrep.study.work import CRASHED
+from jbrep.text import table
 
 
 def run_study(plan: Plan, backend: Backend, workers: int) -> int:
@@ -46,8 +48,13 @@ def run_study(plan: Plan, backend: Backend, workers: int) -> int:
     return statuses[CRASHED]
 
 
-def dry_run(plan: Plan, workers: int) -> str:
+def dry_run(plan: Plan, workers: int, width: int | None = None) -> str:
     """The runs to go, and how long they would take, estimated from a few steps of each learner.
+
+    Args:
+        plan: the study.
+        workers: how many runs would go on at a time.
+        width: to fit [columns]; None for no limit.
 
     Raises:
         InputError: as `run_study`, as far as that is known beforehand.
@@ -58,14 +65,15 @@ def dry_run(plan: Plan, workers: int) -> str:
     seconds = {  # the encoder, which need not exist yet, makes little difference
         kind: estimate(replace(plan.run(cell), encoder=FULL)) for kind, cell in examples.items()
     }
-    lines = [f"{cell.name}  {duration(seconds[_kind(cell)])}" for cell in unfinished]
+    rows = [(cell.name, duration(seconds[_kind(cell)])) for cell in unfinished]
     total = sum(seconds[_kind(cell)] for cell in unfinished)
     done = len(plan.cells) - len(unfinished)
-    lines.append(
+    summary = (
         f"{len(unfinished)} runs to go, {done} done; {duration(total)} on one core, "
         f"{duration(total / workers)} with {workers} workers, besides data and encoders"
     )
-    return "\n".join(lines)
+    told = textwrap.fill(summary, width) if width else summary
+    return f"{table(('run', 'time'), rows, width)}\n\n{told}" if rows else told
 
 
 def _kind(cell: Cell) -> tuple[str, str]:

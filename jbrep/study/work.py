@@ -2,11 +2,12 @@
 
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from jbrep.envs.names import import_modules
 from jbrep.files.storage import make_folder
 from jbrep.rl import Run, StoppedError, train
 
@@ -25,7 +26,11 @@ class Outcome(NamedTuple):
 
 
 def work(
-    name: str, run: Run, folder: Path, stop: Callable[[], bool] = lambda: False
+    name: str,
+    run: Run,
+    folder: Path,
+    stop: Callable[[], bool] = lambda: False,
+    modules: Iterable[str] = (),
 ) -> Outcome | None:
     """Train; an error is reported in the outcome and stops no other run.
 
@@ -34,12 +39,14 @@ def work(
         run: what to train.
         folder: of this run alone.
         stop: whether to write a checkpoint and stop now.
+        modules: to import first, as they register environments.
 
     Returns:
         How the run ended; None if it was stopped.
     """
     try:
         make_folder(folder)
+        import_modules(modules)
         result = train(run, folder, _ProgressFile(folder), stop=stop)
     except StoppedError:
         return None

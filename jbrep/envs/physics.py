@@ -1,0 +1,115 @@
+"""MuJoCo behind an environment: its model and data, and what its state goes through."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.recording import Recording
+
+Array = NDArray[np.float64]
+
+# of an MjData: what a picture and the contact forces of a state follow from
+_STATE = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
+
+
+class Physics(NamedTuple):
+    """A running simulation."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+
+
+def physics_of(env: Any) -> Physics | None:
+    """The simulation behind one of Gymnasium's environments; None if it isn't MuJoCo's.
+
+    Known are those of Gymnasium and others like them, which have `model` and `data`, and those of
+    dm_control behind shimmy.
+    """
+    base = env.unwrapped
+    for owner in (base, getattr(getattr(base, "_env", None), "physics", None)):
+        model, data = (getattr(owner, name, None) for name in ("model", "data"))
+        model, data = (getattr(part, "ptr", part) for part in (model, data))  # dm_control wraps
+        if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+            return Physics(model, data)
+    return None
+
+
+def root_of(model: mujoco.MjModel) -> int:
+    """The body that carries the heaviest tree of those that can move; 0 where none can."""
+    roots = model.body_rootid[model.body_dofnum > 0].tolist()
+    return max(roots, key=lambda body: float(model.body_subtreemass[body]), default=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The n states of MuJoCo that a robot went through.
+
+    Args:
+        model: the robot and its surroundings.
+        arrays: of `mujoco.MjData`, (n, ...) each; those left out are as in a new one. `ctrl` is
+            what was held in the step that led to a state.
+    """
+
+    model: mujoco.MjModel
+    arrays: Mapping[str, Array]
+
+    def __len__(self) -> int:
+        return len(self.qpos)
+
+    @property
+    def qpos(self) -> Array:
+        """Positions of the joints, (n, nq)."""
+        return self.arrays["qpos"]
+
+    @property
+    def qvel(self) -> Array:
+        """Velocities of the joints, (n, nv)."""
+        return self.arrays["qvel"]
+
+    def put(self, data: mujoco.MjData, state: int) -> None:
+        """Set a data object to one of the states; nothing is computed from it."""
+        for name, values in self.arrays.items():
+            getattr(data, name)[:] = values[state]
+
+
+class MotionReader:
+    """Reads the physics of lanes while `jbrep.envs.recording.record` plays them."""
+
+    def __init__(self) -> None:
+        self._models: list[mujoco.MjModel] = []
+
+    def __call__(self, lanes: Lanes) -> dict[str, Array]:
+        """The state of each lane, (n, ...) each; nothing where there is no MuJoCo."""
+        if hasattr(lanes.envs, "simulation"):  # the Jitterbug's batch
+            return self._read_batch(lanes)
+        running = [physics_of(env) for env in lanes.envs] if isinstance(lanes.envs, list) else []
+        every = [physics for physics in running if physics]
+        if len(every) < lanes.num_lanes or len({p.model.nq for p in every}) > 1:
+            return {}
+        self._models = [physics.model for physics in every]
+        return {name: np.stack([getattr(p.data, name) for p in every]) for name in _STATE}
+
+    def _read_batch(self, lanes: Lanes) -> dict[str, Array]:
+        self._models = [lanes.envs.simulation.model_of(i) for i in range(lanes.num_lanes)]
+        now = lanes.arrays
+        return {
+            "qpos": now["qpos"],
+            "qvel": now["qvel"],
+            "mocap_pos": now["target_position"][:, None],
+            "mocap_quat": now["target_quaternion"][:, None],
+        }
+
+    def motion(self, recording: Recording, lane: int, steps: int) -> Motion | None:
+        """What the robot of a lane went through in its first steps; None without MuJoCo."""
+        if not recording.arrays:
+            return None
+        arrays = {name: read[: steps + 1, lane] for name, read in recording.arrays.items()}
+        if "ctrl" not in arrays:  # the Jitterbug's is its action
+            action = recording.action[:steps, lane]
+            arrays["ctrl"] = np.concatenate((np.zeros_like(action[:1]), action))
+        return Motion(self._models[lane], arrays)

@@ -1,0 +1,67 @@
+"""Beginning a run with the policy of another one."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.policies import BasePolicy
+
+from jbrep.encoders import load
+from jbrep.envs.task import read_task
+from jbrep.errors import InputError, differences
+from jbrep.files.storage import write_whole
+from jbrep.rl.files import BEGINNING, ENCODER, POLICY, read_finished
+from jbrep.rl.weights import fill, read_file, read_weights
+
+
+def policy_to_begin_with(folder: Path, settings: Mapping[str, Any], latent_size: int) -> str:
+    """The SHA-256 of a finished run's policy, once it is sure that a run can begin with it.
+
+    Args:
+        folder: of the finished run.
+        settings: of the run that is to begin.
+        latent_size: of its encoder.
+
+    Raises:
+        InputError: the run in the folder isn't finished, or differs in algorithm, network or in
+            the size of observation, latent or action.
+        DamageError: a file of it isn't what was written.
+    """
+    run = read_finished(folder)
+    there = _sizes(run["settings"], load(folder / ENCODER).latent_size)
+    if differing := differences(there, _sizes(settings, latent_size)):
+        raise InputError(
+            f"can't begin with the policy in {folder}, whose algorithm, network and sizes must be "
+            f"the same: {differing}"
+        )
+    return str(run["policy_sha256"])
+
+
+def _sizes(settings: Mapping[str, Any], latent_size: int) -> dict[str, Any]:
+    """What decides the names and shapes of a policy's weights."""
+    task = read_task(settings["environment"])
+    return {
+        "algorithm": settings["algorithm"],
+        "hidden": list(settings["hidden"]),
+        "features": task.size,
+        "latent": latent_size,
+        "actions": task.action_size,
+    }
+
+
+def begin(policy: BasePolicy, source: Path, sha256: str, folder: Path) -> None:
+    """Give an untrained policy the weights of a finished run's.
+
+    Args:
+        policy: untrained.
+        source: the folder of the finished run.
+        sha256: of its policy, see `policy_to_begin_with`.
+        folder: of the run that begins, where a copy is kept.
+
+    Raises:
+        InputError: the weights can't be read, or don't fit.
+        DamageError: they aren't what was written.
+    """
+    path = source / POLICY
+    fill(policy, read_weights(path, sha256), path)
+    write_whole(folder / BEGINNING, read_file(path))

@@ -1,0 +1,72 @@
+"""What all representations of a task and algorithm are measured by."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jbrep.stats.bootstrap import Array
+from jbrep.stats.curves import final_return
+
+SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the gain of the baseline's median run
+SOLVED = "steps_to_solved"
+STEPS_TO = (*(f"steps_to_{name}" for name in SHARES), SOLVED)
+_POINTS = 50  # of a performance profile, about, or half as many: round numbers
+
+
+class Scale(NamedTuple):
+    """What all representations of a task and algorithm are measured by.
+
+    Args:
+        grid: training steps at which runs are compared, (g,).
+        reference: the return that gains are counted from: the least possible return of the task
+            where it is known, else the baseline's mean return at the first step of the grid, that
+            is, of its untrained policies: the nearest thing to standing still that each run has.
+        thresholds: the return to reach for each of STEPS_TO, NaN where there is none.
+        profile_returns: at which performance profiles are evaluated, (k,): round numbers that
+            enclose all final returns.
+    """
+
+    grid: Array
+    reference: float
+    thresholds: Mapping[str, float]
+    profile_returns: Array
+
+
+def scale_of(
+    curves: Sequence[Array], grid: Array, floor: float | None, solved: float | None
+) -> Scale:
+    """The scale of a group of runs.
+
+    Args:
+        curves: of each representation's runs on the grid, (runs, g) each, the baseline first.
+        grid: training steps, (g,).
+        floor: the least possible return; None if unknown.
+        solved: the return from which on the task counts as solved; None if unknown.
+    """
+    finals = [final_return(each, grid) for each in curves]
+    reference = float(curves[0][:, 0].mean() if floor is None else floor)
+    gain = float(np.median(finals[0])) - reference
+    shares = [reference + share * gain if gain > 0 else np.nan for share in SHARES.values()]
+    thresholds = (*shares, np.nan if solved is None else float(solved))
+    return Scale(
+        grid=grid,
+        reference=reference,
+        thresholds=dict(zip(STEPS_TO, thresholds, strict=True)),
+        profile_returns=_round_numbers(np.concatenate(finals), floor),
+    )
+
+
+def _round_numbers(returns: Array, floor: float | None) -> Array:
+    """Round numbers, evenly spaced, from the floor or else below all returns to the largest."""
+    low, high = float(returns.min() if floor is None else floor), float(returns.max())
+    width = high - low
+    if width <= 1e-6 * abs(high):  # all runs return the same
+        width = abs(high) or 1.0
+    exponent = math.floor(math.log10(width / _POINTS))
+    unit = 10.0**exponent
+    step = unit * next((s for s in (1, 2, 5) if s * unit >= width / _POINTS), 10)
+    first = math.ceil(low / step) - 1 if floor is None else math.floor(low / step)
+    last = max(math.ceil(high / step), first + 1)
+    return np.round(step * np.arange(first, last + 1), max(0, -exponent))

@@ -1,0 +1,317 @@
+"""A study of a task with negative returns, no floor and no solved return: Pendulum's, made up."""
+
+import json
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from jbrep.errors import InputError
+from jbrep.figures import study_plots, write
+from jbrep.figures.curves import Return
+from jbrep.figures.limits import limits
+from jbrep.figures.style import PAPER
+from jbrep.files.tables import write_csv
+from jbrep.report import write_report
+from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
+from jbrep.stats.bootstrap import Interval
+
+TASK = "dm_control/pendulum-v0"
+STEPS = np.arange(0, 20_001, 2000)
+START = -1400.0  # the untrained policy's
+WORST = -1612.0  # of any episode: one of pca-1, in the middle of training
+LEVELS = {  # where runs of each representation end, and how far apart
+    "full": (-200, 8),
+    "dae-2": (-198, 1),
+    "dae-1": (-260, 8),
+    "pca-1": (-620, 60),
+}
+SEEDS = 12
+
+
+def make(name, seed, level, speed=3000, **changes):
+    """A run that rises from the untrained policy's return to another, two episodes at a time."""
+    random = np.random.default_rng([seed, *name.encode()])
+    start = START + random.normal(0, 20)
+    mean = level + (start - level) * np.exp(-STEPS / speed)
+    returns = mean[:, None] + random.normal(0, 2, (len(STEPS), 2))
+    if (name, seed) == ("pca-1", 3):
+        returns[4, 1] = WORST
+    facts = {"settings": "a1", "steps": STEPS, "returns": returns, "total_steps": 20_000}
+    return RunCurve(
+        **{"task": TASK, "algorithm": "sac", "representation": name, "seed": seed},
+        **{**facts, **changes},
+    )
+
+
+def study(levels=LEVELS):
+    """Runs of which one of dae-1 failed at step 9,000, and one of pca-1 before any evaluation."""
+    for name, (level, spread) in levels.items():
+        speed = 2000 if name == "dae-2" else 3000
+        for seed, apart in enumerate(np.linspace(-1.6, 1.6, SEEDS)):
+            changes = {"failed_at": 9000} if (name, seed) == ("dae-1", 5) else {}
+            if (name, seed) == ("pca-1", 0):
+                changes = {"steps": [], "returns": [], "failed_at": 0}
+            yield make(name, seed, level + spread * apart, speed, **changes)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return list(study())
+
+
+@pytest.fixture(scope="module")
+def analysis(runs):
+    """As a report has it: written and read."""
+    return Analysis.from_json(analyse(runs).to_json(), "statistics.json")
+
+
+@pytest.fixture(scope="module")
+def group(analysis):
+    return analysis.groups[0]
+
+
+def result(group, name):
+    return next(label for label in group.labels if label.representation == name)
+
+
+def verdicts(analysis, name):
+    comparisons = analysis.groups[0].comparisons
+    (found,) = [each for each in comparisons if each.representation == name]
+    return [(verdict.verdict, verdict.reason) for verdict in found.verdicts]
+
+
+def test_a_failed_run_counts_as_the_worst_of_its_task_and_algorithm(group):
+    assert group.failure_return == WORST
+    failed = result(group, "dae-1")
+    assert failed.failed == (5,)
+    assert failed.by_run["final_return"][5] == WORST
+    assert max(np.delete(failed.by_run["final_return"], 5)) < -200
+    assert result(group, "pca-1").by_run["mean_return"][0] == WORST  # never evaluated
+
+
+def test_failing_never_pays(runs):
+    """Not even where all runs of a representation fail, nor where they fail from the start."""
+    for at in (0, 4000):
+        failed = [make("dae-2", seed, -190, failed_at=at) for seed in range(SEEDS)]
+        kept = [run for run in runs if run.representation != "dae-2"]
+        similar, steadier, faster = verdicts(analyse([*kept, *failed]), "dae-2")
+        assert similar[0] == faster[0] == "contradicted"
+        assert steadier == ("undecided", "no variance")
+
+
+def test_a_floor_that_is_known_is_what_failed_runs_count_as(runs):
+    floor = [RunCurve(**{**vars(run), "return_floor": -3254.0}) for run in runs]
+    group = analyse(floor).groups[0]
+    assert group.failure_return == group.reference == -3254
+    assert result(group, "dae-1").by_run["final_return"][5] == -3254
+
+
+def test_gains_are_counted_from_the_untrained_policy(group):
+    full = result(group, "full")
+    start = np.mean([make("full", seed, 0).returns[0].mean() for seed in range(SEEDS)])
+    assert group.reference == pytest.approx(start)
+    assert np.isnan(group.return_floor)
+    margin = group.comparisons[0].verdicts[0].boundary
+    assert margin == pytest.approx(-0.05 * (full.by_run["final_return"].mean() - start))
+    assert -65 < margin < -55  # 5 % of some 1,200
+    half = group.thresholds["steps_to_50_percent"]
+    assert half == pytest.approx((np.median(full.by_run["final_return"]) + start) / 2)
+    assert full.numbers["steps_to_50_percent"].value == pytest.approx(3000 * np.log(2), rel=0.1)
+    assert full.numbers["reached_90_percent"].value == 1
+
+
+def test_what_counts_as_solved_is_unknown_and_not_made_up(analysis, group):
+    assert np.isnan(group.solved)
+    assert np.isnan(result(group, "full").by_run["steps_to_solved"]).all()
+    text = statistics_text(analysis)
+    assert "solved" not in text
+    assert "to 90 %" in text
+    assert "nan" not in text
+    what = f"full over the mean return of its untrained policies, {group.reference:,.0f}"
+    assert f"Similar reward: a loss of up to 5 % of the gain of {what}" in text
+
+
+def test_each_verdict_can_be_reached(analysis):
+    assert verdicts(analysis, "dae-2") == [("supported", None)] * 3
+    assert [verdict for verdict, _ in verdicts(analysis, "pca-1")] == ["contradicted"] * 3
+    assert verdicts(analysis, "dae-1")[0] == ("undecided", None)  # but for the failed run, similar
+    seeds = analysis.groups[0].comparisons[1].verdicts[0].seeds_needed
+    assert seeds is not None
+
+
+def test_a_baseline_that_learns_nothing_decides_nothing():
+    idle = [make(name, seed, START) for name in ("full", "dae-2") for seed in range(SEEDS)]
+    analysis = analyse(idle)
+    assert verdicts(analysis, "dae-2") == [("undecided", "full didn't learn")] * 3
+    (group,) = analysis.groups
+    assert group.comparisons[0].verdicts[0].boundary <= 0
+
+
+def test_a_baseline_that_ends_where_it_began_sets_nothing_to_reach():
+    worse = [make("full", seed, START - 50) for seed in range(3)]
+    (group,) = analyse(worse).groups
+    assert np.isnan([*group.thresholds.values()]).all()
+    assert group.labels[0].numbers["steps_to_50_percent"].tolist() == [None] * 3
+    assert "- " in statistics_text(analyse(worse))
+
+
+def test_groups_have_failures_of_their_own(runs):
+    """Of another task, or another algorithm on the same one, nothing is taken over."""
+    other = [RunCurve(**{**vars(run), "algorithm": "td3"}) for run in runs]
+    worse = RunCurve(**{**vars(other[0]), "returns": other[0].returns - 5000})
+    analysis = analyse([*runs, worse, *other[1:]])
+    sac, td3 = analysis.groups
+    assert sac.failure_return == WORST
+    assert td3.failure_return == worse.returns.min()
+
+
+def test_returns_below_the_floor_are_refused():
+    with pytest.raises(InputError, match=r"least return is -14\d\d\.\d+; its task has none below"):
+        make("full", 0, -200, return_floor=-1000)
+    rounded = np.full((len(STEPS), 2), -1000.0005)
+    assert make("full", 0, -200, return_floor=-1000, returns=rounded).return_floor == -1000
+
+
+# figures
+
+
+@pytest.fixture(scope="module")
+def returns(runs):
+    return [
+        Return(run.task, run.algorithm, run.representation, run.seed, int(step), i, float(each))
+        for run in runs
+        for step, episodes in zip(run.steps, run.returns, strict=True)
+        for i, each in enumerate(episodes)
+    ]
+
+
+def label_record(representation, size=3):
+    settings = {
+        **{"task": TASK, "algorithm": "sac", "preset": "paper", "representation": representation},
+        **{"encoder": "0" * 64, "hidden": [256, 256], "steps": 20_000},
+        **{"evaluate_every": 2000, "evaluation_episodes": 2},
+    }
+    latent = [(2, "tanh")] if representation != "full" else []
+    encoder = {
+        **{"name": representation, "kind": "dae" if latent else "identity", "size": size},
+        **{"encoder": latent, "decoder": [(size, "linear")] if latent else []},
+        **{"training": {}, "data": {}, "metrics": {}},
+    }
+    task = {"action_low": [-2.0] * 6, "action_high": [2.0] * 6, "timestep": 0.05}
+    return {"settings": settings, "encoder": encoder, "task": task}
+
+
+LABELS = {f"{TASK}/sac/{name}": label_record(name) for name in LEVELS}
+
+
+@pytest.fixture(scope="module")
+def plots(analysis, returns):
+    return {plot.name: plot for plot in study_plots(analysis, returns, {}, LABELS)}
+
+
+def drawn(plot):
+    with mpl.rc_context(PAPER):
+        return plot.draw()
+
+
+def test_axes_of_returns_are_those_of_the_data(plots, group):
+    finals = [value for label in group.labels for value in label.by_run["final_return"]]
+    lowest = {
+        "representations": min(min(label.curve.p10) for label in group.labels),
+        "final_return": min(finals),
+        "learning_rate": min(min(label.by_run["mean_return"]) for label in group.labels),
+        "every_run": START - 100,
+    }
+    for name, low in lowest.items():
+        ends = drawn(plots[name]).axes[0].get_ylim()
+        assert low - 150 < ends[0] <= low + 100
+        assert ends[1] < (-100 if name == "learning_rate" else 0)
+    first, *_, last = group.profile_returns
+    assert first < min(finals) <= first + 50
+    assert last - 50 < max(finals) <= last
+    assert drawn(plots["profiles"]).axes[0].get_xlim() == limits((first, last)).with_room(0.02)
+    for label in group.labels:
+        assert label.profile.value[0] == 1
+        assert label.profile.value[-1] == 0
+
+
+def test_nothing_is_drawn_of_what_is_unknown(plots):
+    for plot in plots.values():
+        figure = drawn(plot)
+        labels = {line.get_label() for axes in figure.axes for line in axes.lines}
+        assert not labels & {"solved", "hand-written"}
+        assert "solved" not in plot.caption
+        assert "hand-written" not in plot.caption
+
+
+def test_the_diagram_shows_the_task_as_it_is(plots):
+    rows = dict(plots["system"].rows)
+    assert rows["robot"] == f"{TASK}, steps of 0.05 s"
+    assert rows["action"] == "6 numbers in [-2, 2]"
+    assert rows["observation"].startswith("3 features")
+    label = label_record("dae-2")
+    del label["task"]
+    (system, _) = study_plots(None, [], {}, {"x": label})
+    assert dict(system.rows)["action"] == ""
+    label["task"] = {"action_low": [-2, -1], "action_high": [2, 1], "timestep": None}
+    (system, _) = study_plots(None, [], {}, {"x": label})
+    assert dict(system.rows) | {"robot": TASK, "action": "2 numbers"} == dict(system.rows)
+    assert "MuJoCo" not in str(rows)
+
+
+def test_the_line_at_the_solved_return_is_drawn_where_returns_come_near_it():
+    returns = [-400.0, -100.0, np.nan]
+    assert limits(returns) == (-400, -100)
+    assert limits(returns, solved=0) == (-400, 0)
+    assert limits(returns, solved=500.01) == (-400, -100)
+    assert limits(returns, floor=-1000, solved=500) == (-1000, 500)
+    assert limits([0.2, 0.2]) == (-0.3, 0.7)
+    assert not limits(returns).contain(np.nan)
+    near, far = Interval(-250, -420, -80), Interval(-250, -9000, np.nan)
+    assert limits(returns).with_ends([near]) == (-420, -80)
+    assert limits(returns).with_ends([far]) == (-475, -100)
+    assert limits(returns).with_ends([far], floor=-400) == (-400, -100)
+
+
+# the report
+
+
+@pytest.fixture(scope="module")
+def folder(analysis, runs, returns, tmp_path_factory):
+    """The tables of the study, and its report."""
+    folder = tmp_path_factory.mktemp("report")
+    (folder / "statistics.json").write_text(analysis.to_json())
+    header = ("task", "algorithm", "representation", "seed", "step", "episode", "return")
+    write_csv(folder / "returns.csv", header, returns)
+    record = {
+        **{"format": "jbrep runs", "format_version": 1, "study": None, "missing": {}},
+        **{"left_out": [], "versions": [{"jbrep": "0.2.0"}], "processors": ["a processor"]},
+        "labels": LABELS,
+        "runs": [
+            {
+                **{"label": run.label, "seed": run.seed, "reason": None, "seconds": 60.0},
+                "status": "finished" if run.failed_at is None else "failed",
+                "steps": run.total_steps if run.failed_at is None else run.failed_at,
+            }
+            for run in runs
+        ],
+    }
+    (folder / "runs.json").write_text(json.dumps(record))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jbrep.report.report.write", lambda plots, path: write(plots[:1], path))
+        write_report(folder)
+    return folder
+
+
+def test_the_report_says_what_failed_runs_count_as_and_what_the_margin_is(folder, group):
+    text = (folder / "summary.md").read_text()
+    assert "> 2 runs are counted as return -1,612, the worst of the task and algorithm" in text
+    assert f"Verdicts on {TASK}, sac:" in text
+    assert f"of its untrained policies, {group.reference:,.0f}." in text
+    assert "steps to 50 % | to 90 % |\n" in text
+    page = (folder / "report.html").read_text()
+    assert "over the mean return of its untrained policies" in page
+    assert "return 0" not in page + text
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["numbers"][f"{TASK}/sac/full"]["steps_to_solved"] == [None] * 3
