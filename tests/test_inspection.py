@@ -486,9 +486,10 @@ def test_shapes_of_every_kind():
     pill = model.geom("pill").id
     begin = np.ravel(found["Capsules3D"].translations.as_arrow_array().to_pylist())
     axis = data.geom_xmat[pill].reshape(3, 3)[:, 2]
-    np.testing.assert_allclose(begin + (0, 0, 1), data.geom_xpos[pill] - 0.2 * axis, atol=1e-6)
+    up = np.array([0, 0, 1])  # from the body's frame to the world's
+    np.testing.assert_allclose(begin + up, data.geom_xpos[pill] - 0.2 * axis, atol=1e-6)
     stone, mesh = model.geom("stone").id, found["Mesh3D"]
-    corners = np.array(mesh.vertex_positions.as_arrow_array().to_pylist()) + (0, 0, 1)
+    corners = np.array(mesh.vertex_positions.as_arrow_array().to_pylist()) + up
     expected = model.mesh_vert @ data.geom_xmat[stone].reshape(3, 3).T + data.geom_xpos[stone]
     apart = np.linalg.norm(corners[:, None] - expected, axis=2)
     np.testing.assert_allclose(apart.min(axis=0), 0, atol=1e-6)
