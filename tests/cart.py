@@ -15,28 +15,27 @@ class Cart(gymnasium.Env):
     """A point on a line, pushed by the sum of its actions; it falls off at 1.
 
     Args:
-        fail_at: the step of each episode at which it raises an error; 0 for none.
-        message: of that error.
+        fail_seed: of an episode that raises an error at its step 7.
         drifts: whether starts depend on how many there were in the process.
     """
 
     observation_space = spaces.Box(-np.inf, np.inf, (2,))
     action_space = spaces.Box(np.float32([-0.4, -1]), np.float32([0.7, 4]))
 
-    def __init__(self, fail_at=0, message="the motor is broken", drifts=False):
-        self.fail_at, self.message, self.drifts = fail_at, message, drifts
+    def __init__(self, fail_seed=-1, drifts=False):
+        self.fail_seed, self.drifts = fail_seed, drifts
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.steps = 0
+        self.steps, self.fails = 0, seed == self.fail_seed
         self.state = self.np_random.uniform(-0.5, 0.5, 2) + self.drifts * next(_drift) * 1e-3
         return self.state.astype(np.float32), {}
 
     def step(self, action):
         assert self.action_space.contains(action), action
         self.steps += 1
-        if self.steps == self.fail_at:
-            raise RuntimeError(self.message)
+        if self.fails and self.steps == 7:
+            raise RuntimeError("the motor\x1b[2J is broken" + "!" * 2000 + "\nand more")
         self.state = self.state + 0.05 * np.array([self.state[1], np.sum(action)])
         terminated = bool(abs(self.state[0]) > 1)
         return self.state.astype(np.float32), -abs(self.state[0]), terminated, False, {}

@@ -4,6 +4,7 @@ import os
 import shutil
 from ctypes.util import find_library
 
+import numpy as np
 import pytest
 import torch
 
@@ -33,6 +34,36 @@ def collected(tmp_path_factory):
 def copied(collected, tmp_path):
     """A copy of it to spoil."""
     return shutil.copytree(collected, tmp_path / "copied")
+
+
+@pytest.fixture
+def diverging(collected, monkeypatch, tmp_path):
+    """Of the episodes in `collected`, 1 goes non-finite in its 301st step and 2 in its first."""
+    from jbrep.dataset import Dataset
+    from jbrep.jitterbug.simulation import Simulation
+    from jbrep.jitterbug.tasks import QUATERNION
+
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs there
+    starts = Dataset(collected).episodes["initial_qpos"][:, QUATERNION]
+    reset, step, remaining = Simulation.reset, Simulation.step, {}
+
+    def begin(simulation, lanes, randoms):
+        reset(simulation, lanes, randoms)
+        for lane in lanes:
+            remaining.pop((simulation, lane), None)
+            for episode, steps in ((1, 300), (2, 0)):
+                if (simulation.readings.qpos[lane, QUATERNION] == starts[episode]).all():
+                    remaining[simulation, lane] = steps
+
+    def spoil(simulation, action):
+        for at in [at for at in remaining if at[0] is simulation]:
+            if remaining[at] == 0:
+                simulation.readings.qvel[at[1], 0] = np.nan
+            remaining[at] -= 1
+        return step(simulation, action)
+
+    monkeypatch.setattr(Simulation, "reset", begin)
+    monkeypatch.setattr(Simulation, "step", spoil)
 
 
 LONGEST = ("test_whole", "test_study", "test_rl", "test_cli", "test_report")

@@ -19,15 +19,15 @@ from jbrep import jitterbug
 from jbrep.collect import collect, write_shards
 from jbrep.collect import collector as collecting
 from jbrep.collect.derive import derive
+from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
 from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.manifest import open_shard, read_manifest, write_manifest
 from jbrep.dataset.schema import episode_seed
 from jbrep.dataset.verify import find_problems
-from jbrep.envs import environment_id
+from jbrep.envs import describe, environment_id
 from jbrep.errors import InputError
 from jbrep.files.lock import exclusive
-from jbrep.jitterbug.simulation import Simulation
 
 
 def test_rows_are_the_episodes_of_a_random_policy(collected):
@@ -172,7 +172,8 @@ def test_no_two_episodes_share_a_seed():
     """Between all episodes of neighbouring and of far roots, and no seed that people give."""
     roots = (0, 1, 2, 7, 2**20, 2**31 - 3, 2**31 - 2)
     numbers = (0, 1, 2, 99, 100, 4_999, 10**6, 2**31 - 1)
-    seeds = {episode_seed(root, number) for root in roots for number in numbers}
+    task = describe("face_direction")
+    seeds = {episode_seed(task, root, number) for root in roots for number in numbers}
     assert len(seeds) == len(roots) * len(numbers)
     assert min(seeds) >= 2**32
     assert max(seeds) < 2**63
@@ -188,44 +189,39 @@ def test_seeds_are_distinct_across_shards_and_data_sets(collected, tmp_path):
     assert len(np.unique(starts, axis=0)) == 8
 
 
-@pytest.fixture
-def diverging(monkeypatch, tmp_path):
-    """Lane 1 goes non-finite in its 301st step, lane 2 in its first."""
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs there
-    step, made = Simulation.step, {}
-
-    def spoil(simulation, action):
-        count = made[simulation] = made.get(simulation, -1) + 1
-        for lane, when in ((1, 300), (2, 0)):
-            if count == when and simulation.num_lanes == 4:
-                simulation.readings.qvel[lane, 0] = np.nan
-        return step(simulation, action)
-
-    monkeypatch.setattr(Simulation, "step", spoil)
-
-
 @pytest.mark.usefixtures("diverging")
-def test_an_episode_ends_before_its_physics_goes_non_finite(tmp_path, collected):
-    some = settings(steps=4000, shard_episodes=4)
-    collect(some, tmp_path / "data")
+def test_an_episode_ends_where_its_physics_goes_non_finite(tmp_path, collected):
+    """That step keeps its row, with reward 0; the last finite observation stands for the new one.
+
+    The rows that are missing then are made up for by another episode.
+    """
+    collect(settings(steps=3000, shard_episodes=4), tmp_path / "data")
     dataset = Dataset(tmp_path / "data")
-    np.testing.assert_array_equal(dataset.episodes["length"], [1000, 300, 0, 1000])
-    np.testing.assert_array_equal(dataset.episodes["diverged"], [0, 1, 1, 0])
+    np.testing.assert_array_equal(dataset.episodes["length"], [1000, 301, 1, 1000, 1000])
+    np.testing.assert_array_equal(dataset.episodes["truncated"], 1)
+    np.testing.assert_array_equal(dataset.episodes["terminated"], 0)
     whole = Dataset(collected)
-    kept = np.isin(whole["episode"][:], (0, 3)) | (
-        (whole["episode"][:] == 1) & (whole["step"][:] < 300)
-    )
+    length = dataset.episodes["length"][whole["episode"][:]]
+    kept = whole["step"][:] < length
+    last = np.cumsum(dataset.episodes["length"])[1:3] - 1
     for name in whole.columns:
-        np.testing.assert_array_equal(dataset[name], whole[name][kept])
+        expected = whole[name][kept]
+        if name == "reward":
+            assert (expected[last] > 0).any()
+            expected[last] = 0
+        np.testing.assert_array_equal(dataset[name], expected)
     final = dataset.episodes["final_observation"]
     np.testing.assert_array_equal(final[1], whole["observation"][1300])
     np.testing.assert_array_equal(final[2], whole["observation"][2000])
     assert not list(find_problems(dataset.folder))
-    assert not list(replay_problems(dataset, 4))
-    derive(dataset.folder, "move_to_pose", tmp_path / "derived")
-    derived = Dataset(tmp_path / "derived")
-    np.testing.assert_array_equal(derived.episodes["length"], [1000, 300, 0, 1000])
-    assert not list(find_problems(derived.folder))
+    assert not list(replay_problems(dataset, 5))
+    with pytest.raises(InputError, match=r"the physics diverged in .*: run jbrep collect --task"):
+        derive(dataset.folder, "move_to_pose", tmp_path / "derived")
+    assert not (tmp_path / "derived").exists()
+    before = contents(dataset.folder)
+    (dataset.folder / "shard-00000.h5").unlink()
+    assert list(repair(dataset.folder, lanes=3))
+    assert contents(dataset.folder) == before
 
 
 def test_kills_lose_at_most_the_open_shard(tmp_path):
@@ -312,10 +308,11 @@ def test_a_disk_that_is_really_full(collected, tmp_path):
         pytest.skip("no small file system can be mounted here")
     manifest = read_manifest(collected)
 
-    def make(shard, tick):
-        if shard == 2:
-            (disk / "ballast").write_bytes(bytes(2_200_000))
-        return open_shard(collected, manifest, shard)
+    def make(first, missing, tick):
+        for shard in range(first, 5):
+            if shard == 2:
+                (disk / "ballast").write_bytes(bytes(2_200_000))
+            yield open_shard(collected, manifest, shard)
 
     try:
         with pytest.raises(InputError, match=r"about 1,640,000 bytes are needed, 1,5[0-9,]+ are"):

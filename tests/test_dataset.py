@@ -104,7 +104,7 @@ def test_features_and_observables_by_name(dataset):
     np.testing.assert_array_equal(dataset["velocity"][10:20], observation[10:20, 7:10])
     assert dataset["velocity"].shape == (5000, 3)
     assert dataset["motor_velocity"][[3, 4999]].shape == (2,)
-    with pytest.raises(InputError, match="no column, observable or feature 'speed': choose one of"):
+    with pytest.raises(InputError, match="no column, group or feature 'speed': choose one of"):
         dataset["speed"]
 
 
@@ -253,7 +253,7 @@ def test_a_reader_sees_the_committed_part_while_a_collector_writes(
 def test_shards_committed_while_it_opens_are_no_strangers(collected, tmp_path, monkeypatch):
     folder = tmp_path / "growing"
 
-    def stop(shard, tick):
+    def stop(first, missing, tick):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -273,7 +273,7 @@ def test_shards_committed_while_it_opens_are_no_strangers(collected, tmp_path, m
 
 def test_the_card_tells_what_is_there(dataset, collected):
     text = card(dataset)
-    for part in ("face_direction, 16 features", "uniform", "5,000 in 5 episodes", "5 of 5 shards"):
+    for part in ("face_direction, 16 features", "uniform", "5 of 1,000 steps", "5 shards, 1.7 MB"):
         assert part in text
     low, median, high = np.percentile(dataset.episodes["return"], (10, 50, 90))
     assert f"median {median:.1f} [10 % {low:.1f}, 90 % {high:.1f}]" in text
@@ -317,7 +317,7 @@ def test_an_unfinished_data_set_is_called_so(collected, tmp_path):
     manifest.write_manifest(tmp_path, replace(whole, shards=()))
     empty = Dataset(tmp_path)
     assert len(empty) == len(empty["observation"][:]) == 0
-    assert "0 of 5 shards, 0.0 MB; unfinished" in card(empty)
+    assert "0 shards, 0.0 MB; unfinished, 5,000 rows were asked for" in card(empty)
     with pytest.raises(InputError, match="a split needs at least 2 episodes"):
         empty.split()
 
@@ -363,7 +363,7 @@ def test_mistakes_are_named(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"task": 3}, "the task is 3: it must be a name"),
+        ({"task": 3}, "the task is 3: it must be a name or a Task"),
         ({"seed": -1}, "the seed is -1: it must be from 0 to 2,147,483,646"),
         ({"seed": "one"}, "the seed is 'one': it must be a whole number"),
         ({"steps": 1.5}, "the number of steps is 1.5: it must be a whole number"),

@@ -43,7 +43,8 @@ def test_the_studies_are_studies(block):
     assert as_study(tomllib.loads(block)).seeds == tuple(range(10))
 
 
-def test_the_features_are_those_of_the_environment_shown(tmp_path):
+def test_the_features_are_those_of_the_environment_shown(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "environments.md").read_text()
     environment = next(
         b for b in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if "Env)" in b

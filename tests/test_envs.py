@@ -147,7 +147,7 @@ def test_a_lane_that_diverges_starts_anew_alone():
     many = gymnasium.make_vec(FACE, num_envs=3)
     many.reset(seed=0)
     many.step(np.zeros((3, 1)))
-    many.unwrapped._episodes.simulation.readings.qvel[1, 0] = np.inf
+    many.unwrapped.simulation.readings.qvel[1, 0] = np.inf
     observation, reward, terminated, truncated, info = many.step(np.zeros((3, 1)))
     np.testing.assert_array_equal(truncated, [False, True, False])
     assert reward[1] == 0

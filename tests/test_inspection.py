@@ -471,7 +471,8 @@ def test_shapes_of_every_kind():
     robot = Robot(model)
     assert (robot.names, robot.bodies, robot.others) == (["world", "a_b", "body_2"], [1], [0, 2])
     geoms = robot.geoms(1)
-    assert [model.geom(geom).name for geom in geoms] == "ball egg pill can brick stone".split()
+    drawn = [model.geom(geom).name for geom in geoms]
+    assert drawn == ["ball", "egg", "pill", "can", "brick", "stone"]
     assert own_colours(model, geoms)[:3].tolist() == [
         [0, 255, 0, 255],
         [255, 0, 0, 255],

@@ -1,3 +1,7 @@
+"""Policies: bounds, streams of their own, constants as people write them."""
+
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,20 +11,31 @@ from jbrep.collect.policies import (
     Heuristic,
     OrnsteinUhlenbeck,
     Uniform,
+    generators,
     make_policy,
     parse_policy,
     policy_settings,
+    within_bounds,
 )
+from jbrep.envs import Feature, Task, describe
 from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS
-from jbrep.jitterbug.tasks import TASKS
 
-TASK = TASKS["face_direction"]
+TASK = describe("face_direction")
+ARM = Task(
+    id="Arm-v0",
+    name="Arm-v0",
+    features=(Feature("x"),),
+    action_low=(-1.0, 0.0, -2.0),
+    action_high=(1.0, 10.0, 0.5),
+    max_episode_steps=50,
+    timestep=0.1,
+)
 
 
-def drives(policy, lanes=50, steps=1000, seed=0):
-    act = policy.begin(TASK, [np.random.default_rng(seed + lane) for lane in range(lanes)])
-    observation = np.zeros((lanes, TASK.size))
+def drives(policy, lanes=50, steps=1000, seed=0, task=TASK):
+    act = policy.begin(task, range(seed, seed + lanes))
+    observation = np.zeros((lanes, task.size))
     return np.stack([act(observation) for _ in range(steps)])
 
 
@@ -55,6 +70,8 @@ def test_ornstein_uhlenbeck_noise_starts_at_its_mean():
 def test_a_constant_drive_and_the_hand_written_policy():
     assert np.unique(drives(Constant(-0.3))) == -0.3
     assert Heuristic().begin(TASK, []) is HEURISTICS["face_direction"]
+    with pytest.raises(InputError, match="Arm-v0 has no hand-written policy: choose another"):
+        Heuristic().begin(ARM, [])
 
 
 def test_episodes_have_streams_of_their_own():
@@ -88,10 +105,53 @@ def test_policies_as_people_write_them(text, policy):
         ("constant:drive=fast", "drive is 'fast', but must be a number"),
         ("constant:drive=2", r"must be in \[-1, 1\]"),
         ("constant:drive=nan", r"must be in \[-1, 1\]"),
-        ("ornstein-uhlenbeck:theta=101", r"theta in \[0, 100\]"),
+        ("ornstein-uhlenbeck:theta=-1", r"theta at least 0"),
         ("ornstein-uhlenbeck:sigma=1e15", r"sigma in \[0, 1e\+06\]"),
     ],
 )
 def test_mistakes_are_named(text, message):
     with pytest.raises(InputError, match=message):
         parse_policy(text)
+
+
+@pytest.mark.parametrize("policy", [Uniform(), Constant(0.5), OrnsteinUhlenbeck(sigma=9)], ids=str)
+def test_actions_of_several_numbers_keep_to_the_bounds_of_each(policy):
+    actions = drives(policy, lanes=20, steps=200, task=ARM)
+    assert actions.shape == (200, 20, 3)
+    low, high = np.array(ARM.action_low), np.array(ARM.action_high)
+    assert (low <= actions).all()
+    assert (actions <= high).all()
+    if isinstance(policy, Constant):
+        np.testing.assert_array_equal(actions[0, 0], [0.5, 7.5, -0.125])
+    else:
+        share = (actions.mean(axis=(0, 1)) - low) / (high - low)
+        np.testing.assert_allclose(share, 0.5, atol=0.1)
+        np.testing.assert_allclose(np.corrcoef(actions.reshape(-1, 3).T), np.eye(3), atol=0.15)
+
+
+def test_drives_are_not_rescaled_where_the_bounds_are_those_of_drives():
+    """Scaling -1 + (x + 1) would change the last bits of most."""
+    rough = OrnsteinUhlenbeck(theta=1, sigma=3)
+    own = drives(rough, lanes=2, task=replace(ARM, timestep=TASK.timestep))[:, :, :1]
+    assert (own > -1).any()
+    wide = replace(ARM, action_low=(-1.0,), action_high=(1.0,), timestep=TASK.timestep, draws=6)
+    np.testing.assert_array_equal(drives(rough, lanes=2, task=wide), drives(rough, lanes=2))
+    x = np.random.default_rng(0).uniform(-1, 1, (100, 1))
+    assert within_bounds(wide, x) is x
+
+
+def test_a_policy_draws_beyond_what_the_environment_draws():
+    """The environment's generator has the same seed: its numbers must not come again as actions."""
+    known = generators(TASK, [7])[0].uniform(size=50)
+    whole = np.random.default_rng(7).uniform(size=56)
+    np.testing.assert_array_equal(known, whole[6:])
+    unknown = generators(ARM, [7])[0].uniform(size=1000)
+    assert not np.isin(unknown, np.random.default_rng(7).uniform(size=100_000)).any()
+
+
+def test_noise_needs_a_time_step_that_is_known_and_small_enough():
+    noise = OrnsteinUhlenbeck(theta=101)
+    with pytest.raises(InputError, match=r"theta is 101: with steps of 0.01 s .* in \[0, 100\]"):
+        noise.begin(TASK, [0])
+    with pytest.raises(InputError, match="the time step of Arm-v0 is not known, which ornstein"):
+        noise.begin(replace(ARM, timestep=None), [0])

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from jbrep.encoders import find, save
+from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.figures import write
 from jbrep.files.tables import write_csv
@@ -51,7 +52,8 @@ def write_a_run(plan, cell, failed=False, reason=TRAP):
     """A run's files as jbrep rl leaves them, with returns made up."""
     folder = plan.folder_of(cell)
     folder.mkdir(parents=True)
-    run, encoder = plan.run(cell), find(plan.run(cell).encoder, cell.task)
+    run = plan.run(cell)
+    encoder = find(run.encoder, run.task)
     save(encoder, folder / ENCODER)
     random = np.random.default_rng([cell.seed, len(cell.representation.name)])
     final = FINAL[cell.representation.name] + random.normal(0, 30)
@@ -386,13 +388,15 @@ def test_of_single_runs_it_shows_what_there_is(tmp_path):
 
 def test_heuristics_are_played_once_on_the_starts_of_evaluation(tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 4)
-    rows = list(csv.reader(write_heuristics(STUDY.tasks, tmp_path).read_text().splitlines()))
+    rows = list(
+        csv.reader(write_heuristics(map(describe, STUDY.tasks), tmp_path).read_text().splitlines())
+    )
     assert rows[0] == ["task", "episode", "return"]
     assert len(rows) == 1 + 4
-    alone = find_episode("heuristic", 3, "face_direction").reward.sum()
+    alone = find_episode("heuristic", 3, describe("face_direction")).reward.sum()
     assert float(rows[4][2]) == pytest.approx(alone, abs=1e-3)
     monkeypatch.setattr("jbrep.study.heuristics.episode_returns", None)
-    write_heuristics(STUDY.tasks, tmp_path)
+    write_heuristics(map(describe, STUDY.tasks), tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from jbrep.cli.rl import _Bar
 from jbrep.encoders import find
-from jbrep.envs.episodes import Episodes
+from jbrep.envs import Lanes, describe
 from jbrep.errors import InputError
 from jbrep.files import container
 from jbrep.rl import Run, StoppedError, checkpoint, train
@@ -32,9 +32,10 @@ from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, read_evaluations, 
 from jbrep.rl.policy import load_run, load_zip
 from jbrep.rl.presets import ALGORITHMS, PRESETS, get_preset
 
-TASK = "face_direction"
 STEPS = 100  # of an episode: little depends on its length
-QUICK = {"task": TASK, "evaluation_episodes": 1, "episode_steps": STEPS}
+TASK = describe("face_direction", max_episode_steps=STEPS)
+QUICK = {"task": TASK, "evaluation_episodes": 1}
+IMPORTS = "from jbrep.envs import Feature, Task"  # to evaluate the text of a run
 SHORT = Run(algorithm="a2c", encoder="dae-8", steps=80, **QUICK)
 
 
@@ -139,7 +140,7 @@ def test_plain_sb3_loads_the_policy_that_was_evaluated(short):
     rows = encoder(np.random.default_rng(0).normal(size=(50, 16)).astype(np.float32))
     expected = plain.predict(rows, deterministic=True)[0]
     np.testing.assert_array_equal(trained.policy.predict(rows, deterministic=True)[0], expected)
-    returns = Evaluator(TASK, trained.encoder, 1, episode_steps=STEPS).returns(trained.policy)
+    returns = Evaluator(TASK, trained.encoder, 1).returns(trained.policy)
     at_end = [e.episode_return for e in read_evaluations(short) if e.step == 80]
     np.testing.assert_allclose(returns, at_end, atol=5e-4)
 
@@ -147,13 +148,12 @@ def test_plain_sb3_loads_the_policy_that_was_evaluated(short):
 def test_evaluation_is_the_deterministic_policys_return():
     agent = agent_of("ppo")
     encoder = find("dae-8", TASK)
-    lanes = Episodes(TASK, 2, max_episode_steps=STEPS)
-    observation, total = lanes.reset([EVALUATION_SEED, EVALUATION_SEED + 1]), np.zeros(2)
+    lanes, total = Lanes(TASK, 2), np.zeros(2)
+    lanes.reset([0, 1], [EVALUATION_SEED, EVALUATION_SEED + 1])
     for _ in range(STEPS):
-        latent = encoder(observation.astype(np.float32))
-        outcome = lanes.step(agent.predict(latent, deterministic=True)[0])
-        observation, total = outcome.observation, total + outcome.reward
-    evaluator = Evaluator(TASK, encoder, 2, episode_steps=STEPS)
+        latent = encoder(lanes.observation.astype(np.float32))
+        total += lanes.step(agent.predict(latent, deterministic=True)[0]).reward
+    evaluator = Evaluator(TASK, encoder, 2)
     for _ in range(2):  # the same episodes each time
         np.testing.assert_allclose(evaluator.returns(agent), total, rtol=1e-5)
 
@@ -191,13 +191,14 @@ def test_training_starts_from_these_seeds_whatever_the_agent_seeds(tmp_path, mon
 def test_the_full_observation_is_scaled_as_encoders_scale_it():
     full, dae = find("identity", TASK), find("dae-8", TASK)
     env = make_env(TASK, 1, 7, full)
-    plain = Episodes(TASK, 1).reset([7]).astype(np.float32)
+    plain = Lanes(TASK, 1).reset([0], [7]).astype(np.float32)
     np.testing.assert_allclose(env.reset(), dae.scaler.scale(plain), rtol=1e-5, atol=1e-6)
 
 
 def test_neither_threads_nor_clock_nor_process_change_a_bit(short, tmp_path):
     text = (
         "import time, torch; from pathlib import Path; from jbrep.rl import Run, train\n"
+        f"{IMPORTS}\n"
         "torch.set_num_threads(2)\n"
         "for seconds in (0, 1 << 33):\n"  # zip files can't be dated before 1980 or after 2107
         "    time.time = lambda: seconds\n"
@@ -235,41 +236,17 @@ def test_a_run_that_another_process_has_just_finished_is_left_alone(short, tmp_p
     assert train(SHORT, folder) == read_run(short)
 
 
-def test_the_episodes_of_earlier_versions_had_1000_steps(short, tmp_path):
-    run = json.loads((short / "run.json").read_text())
-    del run["settings"]["episode_steps"]
-    (tmp_path / "run.json").write_text(json.dumps(run))
-    assert train(dataclasses.replace(SHORT, episode_steps=1000), tmp_path)["status"] == FINISHED
-    with pytest.raises(InputError, match=r"another run: episode_steps 1000 \(now: 100\)"):
-        train(SHORT, tmp_path)
-
-
-def test_mid_episode_the_environment_continues_bit_for_bit():
-    drive = np.random.default_rng(0).uniform(-1, 1, (120, 3, 1))
-    one, other = (Episodes(TASK, 3, max_episode_steps=STEPS) for _ in range(2))
-    one.reset([1, 2, 3])
-    other.reset([7, 8, 9])
-    for action in drive[:70]:
-        one.step(action)
-    state = one.state
-    other.restore(state._replace(generators=json.loads(json.dumps(state.generators))))
-    for action in drive[70:]:  # past the episode's end
-        expected, continued = one.step(action), other.step(action)
-        for name in ("observation", "reward", "done", "final_observation"):
-            np.testing.assert_array_equal(getattr(continued, name), getattr(expected, name))
-
-
 KILLED = {
     "ddpg": Run(algorithm="ddpg", encoder="dae-8", steps=300, **QUICK),
-    "sac": Run(algorithm="sac", preset="modern", steps=1100, **QUICK),
-    "ppo": Run(algorithm="ppo", encoder="dae-4", steps=4096, **QUICK),
+    "sac": Run(task="Hopper-v5", preset="modern", steps=1100, evaluation_episodes=1),
+    "ppo": Run(task="Pendulum-v1", algorithm="ppo", steps=4096, evaluation_episodes=1),
 }
 
 
 def kill(run, folder, checkpoints=2):
     """Train in another process; kill it when so many checkpoints have been written."""
     text = (
-        "from pathlib import Path; from jbrep.rl import Run, train;"
+        f"from pathlib import Path; from jbrep.rl import Run, train; {IMPORTS};"
         f"train({run!r}, Path({str(folder)!r}), save_every=0.05)"
     )
     process = subprocess.Popen([sys.executable, "-c", text], stderr=subprocess.PIPE, text=True)
@@ -314,7 +291,7 @@ def test_a_run_that_is_asked_to_stop_writes_a_checkpoint_and_resumes_from_there(
 
 
 def test_ctrl_c_stops_the_command_with_a_checkpoint(tmp_path):
-    settings = ("--task", TASK, "--steps", "1M", "--evaluation-episodes", 1, "--out", tmp_path)
+    settings = ("--task", TASK.name, "--steps", "1M", "--evaluation-episodes", 1, "--out", tmp_path)
     command = [sys.executable, "-c", "from jbrep.cli import main; main()", "rl"]
     process = subprocess.Popen(
         [*command, *map(str, settings)],
@@ -469,8 +446,6 @@ def test_a_zip_file_from_elsewhere_needs_trust(tmp_path):
         ({"evaluate_every": 10**23}, "evaluate every is 1000"),
         ({"evaluation_episodes": 0}, "evaluation episodes is 0"),
         ({"evaluation_episodes": 10_001}, "evaluation episodes is 10001: .* 1 and 10,000"),
-        ({"episode_steps": 0}, "episode steps is 0"),
-        ({"episode_steps": 1_000_001}, "episode steps is 1000001"),
     ],
 )
 def test_what_cannot_be_run_is_refused(change, message, tmp_path):

@@ -1,9 +1,11 @@
 """A run's folder read back: damaged, forged, under way; whatever comes, one line or a policy."""
 
 import bz2
+import functools
 import hashlib
 import io
 import json
+import operator
 import os
 import pickle
 import shutil
@@ -19,6 +21,7 @@ from stable_baselines3 import A2C
 
 from jbrep.encoders import find, save
 from jbrep.encoders.file import fingerprint
+from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.files import container
 from jbrep.rl import Run, train
@@ -28,7 +31,7 @@ from jbrep.rl.policy import load_run, load_untrained, load_zip
 from jbrep.rollouts.sources import find_player
 from jbrep.study.results import read_results, write_results
 
-TASK = "face_direction"
+TASK = describe("face_direction")
 SETTINGS = Run(task=TASK, algorithm="a2c", encoder="dae-8", steps=80, evaluation_episodes=1)
 
 
@@ -84,9 +87,10 @@ def change(folder, **changes):
     (folder / RUN).write_text(json.dumps({**record, **changes}))
 
 
-def shorten(folder, episode_steps=30):
+def shorten(folder, episode_steps=30, **others):
     settings = json.loads((folder / RUN).read_text())["settings"]
-    change(folder, settings={**settings, "episode_steps": episode_steps})
+    environment = {**settings["environment"], "max_episode_steps": episode_steps}
+    change(folder, settings={**settings, "environment": environment, **others})
 
 
 def policy_zip(weights, compression=zipfile.ZIP_STORED):
@@ -113,11 +117,13 @@ ODD = (
 
 
 def mutations(record):
-    """The record with each field, of the settings too, missing or of each odd value."""
-    for path in [(name,) for name in record] + [("settings", name) for name in record["settings"]]:
+    """The record with each field, of settings and environment too, missing or of odd values."""
+    settings = record["settings"]
+    paths = [(name,) for name in record] + [("settings", name) for name in settings]
+    for path in paths + [("settings", "environment", name) for name in settings["environment"]]:
         for value in (..., *ODD):
             mutant = json.loads(json.dumps(record))
-            parent = mutant if len(path) == 1 else mutant["settings"]
+            parent = functools.reduce(operator.getitem, path[:-1], mutant)
             if value is ...:
                 del parent[path[-1]]
             else:
@@ -171,7 +177,7 @@ def test_a_damaged_byte_of_a_run_is_refused_or_harmless(run):
         (b"{}", "status is missing, it must be finished or failed"),
         (b'{"seconds": NaN}', "JSON object of finite numbers"),
         (b'{"format": "jbrep study"}', "its format is another"),
-        (b'{"format_version": 7}', "has format version 7: this jbrep reads up to 1"),
+        (b'{"format_version": 7}', "has format version 7: this jbrep reads up to 2"),
     ],
 )
 def test_a_run_file_of_anything_else(content, message, run):
@@ -186,9 +192,10 @@ def test_a_run_of_an_earlier_version_is_read(run):
     record = json.loads((run / RUN).read_text())
     for name in ("format", "format_version"):
         del record[name]
-    record["settings"].pop("episode_steps", None)
+    for name in ("environment", "from"):
+        del record["settings"][name]
     (run / RUN).write_text(json.dumps(record))
-    assert read_run(run)["settings"]["episode_steps"] == 1000
+    assert read_run(run)["settings"]["environment"]["max_episode_steps"] == 1000
     assert load_run(run).task == TASK
 
 
@@ -328,7 +335,7 @@ def test_a_run_under_way_plays_its_checkpoint(under_way, trained):
     player = find_player(str(under_way))
     assert (player.name, player.step) == (f"{under_way} at step 40", 40)
     told = jbrep("evaluate-policy", under_way, "--episodes", 1).output
-    assert told.startswith(f"{TASK} on dae-8 at step 40: median return ")
+    assert told.startswith(f"{TASK.name} on dae-8 at step 40: median return ")
 
 
 def test_a_checkpoint_s_policy_is_the_agent_s_at_that_step(trained, tmp_path):
@@ -403,7 +410,7 @@ def test_evaluating_a_run(run):
     assert len(by_folder) <= 80
     assert jbrep("evaluate-policy", run / POLICY, "--episodes", 2).output == by_folder
     record = json.loads(jbrep("evaluate-policy", run, "--episodes", 2, "--json").output)
-    assert (record["task"], record["representation"]) == (TASK, "dae-8")
+    assert (record["task"], record["representation"]) == (TASK.name, "dae-8")
     assert record["median"] == pytest.approx(np.median(record["returns"]))
     assert record["percentile_10"] == pytest.approx(np.percentile(record["returns"], 10))
     assert (len(record["returns"]), record["episodes"]) == (2, 2)
@@ -420,7 +427,7 @@ def test_a_run_is_evaluated_as_it_was_while_it_trained(run):
     ("arguments", "message"),
     [
         (("--encoder", "dae-8"), "which has its own encoder: leave out --encoder"),
-        (("--task", "move_to_pose"), "is a run of face_direction, not of move_to_pose"),
+        (("--task", "move_to_pose"), "is of face_direction, not of move_to_pose"),
         (("--episodes", "1e9"), "1,000,000,000 episodes are too many: at most 10,000"),
     ],
 )
@@ -449,8 +456,7 @@ def test_episodes_are_as_long_as_the_run_s(run):
 
 
 def test_more_episodes_than_memory_holds_are_not_played(run):
-    settings = json.loads((run / RUN).read_text())["settings"]
-    change(run, settings={**settings, "evaluation_episodes": 10_000, "episode_steps": 10**6})
+    shorten(run, 10**6, evaluation_episodes=10_000)
     told = jbrep("inspect", run, "--out", run / "it.rrd")
     assert (told.exit_code, told.output.count("\n")) == (2, 1)
     assert "plays 10,000 episodes of 1,000,000 steps at once" in told.output
@@ -461,5 +467,6 @@ def test_another_encoder_is_not_the_run_s(run):
     assert "not the encoder that the run was made with" in refused(load_run, run)
     settings = json.loads((run / RUN).read_text())["settings"]
     own = fingerprint(find("pca-8", TASK))
-    change(run, settings={**settings, "encoder": own, "task": "move_to_pose"})
+    pose = {"task": "move_to_pose", "environment": describe("move_to_pose").as_json()}
+    change(run, settings={**settings, "encoder": own, **pose})
     assert "was made for face_direction" in refused(load_run, run)

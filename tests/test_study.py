@@ -521,7 +521,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["runs"], summary["missing"], summary["failed"]) == (8, [], [])
     returns = {task: [] for task in (robots.ID, "face_direction")}
-    for task, _, _, _, _, _, each in list(csv.reader((out / RETURNS).open()))[1:]:
+    for task, _, _, _, _, _, each in list(csv.reader((out / RETURNS).read_text().splitlines()))[1:]:
         returns[task].append(float(each))
     assert {len(each) for each in returns.values()} == {2 * 2 * 2 * 2}
     assert max(returns[robots.ID]) < 0 <= min(returns["face_direction"])

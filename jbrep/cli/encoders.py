@@ -269,7 +269,7 @@ _which = click.argument("encoder")
 
 @encoder.command(epilog=example("jbrep encoder info dae-8 --task face_direction"))
 @_which
-@task_options
+@task_options()
 @as_json
 def info(encoder: str, as_json: bool, **options: Any) -> None:
     """Show what an encoder is and where it comes from.
@@ -292,7 +292,7 @@ def info(encoder: str, as_json: bool, **options: Any) -> None:
     epilog=example("jbrep encoder export dae-8 --task face_direction --out dae-8.onnx")
 )
 @_which
-@task_options
+@task_options()
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A new .onnx file.")
 def export(encoder: str, out: Path, **options: Any) -> None:
     """Write an encoder and its decoder as ONNX.

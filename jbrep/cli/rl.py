@@ -25,7 +25,7 @@ _NOT_REPRODUCIBLE = (
 @click.command(
     epilog=example("jbrep rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a")
 )
-@task_options
+@task_options()
 @click.option(
     "--algorithm", default="sac", show_default=True, help="ddpg, td3, sac, ppo, a2c or trpo."
 )

@@ -1,9 +1,9 @@
 """Deriving another task's data set: the same motion, with its observations and rewards."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +22,7 @@ from jbrep.jitterbug.tasks import TASKS, JitterbugTask, get_task
 _LANES = 500
 
 Array = NDArray[Any]
-
-
-class Stored(NamedTuple):
-    """States of n robots, as `Simulation.restore` takes them."""
-
-    qpos: Array  # (n, 16)
-    qvel: Array  # (n, 15)
-    target_position: Array  # (n, 3)
-    target_quaternion: Array  # (n, 4)
+Body = Mapping[str, Any]  # arguments of `Simulation` that choose the robots' bodies
 
 
 def derive(
@@ -97,7 +89,7 @@ def _deriving(
         names = all_specs(settings.task, settings.store_state)
         for shard in range(first, len(dataset.manifest.shards)):
             columns = version1.with_ends(open_shard(dataset.folder, dataset.manifest, shard))
-            yield _as_task(columns, task, names, tick, num_threads)
+            yield _as_task(columns, task, names, settings.task.arguments, tick, num_threads)
 
     return produce
 
@@ -106,6 +98,7 @@ def _as_task(
     columns: Columns,
     task: JitterbugTask,
     names: Iterable[str],
+    body: Body,
     tick: Tick,
     num_threads: int | None,
 ) -> Columns:
@@ -121,11 +114,12 @@ def _as_task(
     row = np.arange(len(episode)) + episode  # its place once final states are inserted
     ends = np.cumsum(length)
     final = ends + np.arange(len(length))
-    states = Stored(
-        *(np.insert(columns[n], ends, own[f"final_{n}"], axis=0) for n in ("qpos", "qvel")),
-        *(np.repeat(values, length + 1, axis=0) for values in target.values()),
-    )
-    observation, reward = _read(states, task, num_threads)
+    constants = target | ({"body": own["body"][:, 0]} if "body" in own else {})
+    states = {
+        **{n: np.insert(columns[n], ends, own[f"final_{n}"], axis=0) for n in ("qpos", "qvel")},
+        **{name: np.repeat(values, length + 1, axis=0) for name, values in constants.items()},
+    }
+    observation, reward = _read(states, task, body, num_threads)
     tick(len(row))
     changed = {
         "observation": observation[row],
@@ -136,14 +130,16 @@ def _as_task(
     return {name: changed.get(name, columns[name]) for name in names}
 
 
-def _read(states: Stored, task: JitterbugTask, num_threads: int | None) -> tuple[Array, Array]:
-    """Observations (n, d) and rewards (n,) of the states."""
-    n = len(states.qpos)
+def _read(
+    states: Mapping[str, Array], task: JitterbugTask, body: Body, num_threads: int | None
+) -> tuple[Array, Array]:
+    """Observations (n, d) and rewards (n,) of the states, as `Simulation.restore` takes them."""
+    n = len(states["qpos"])
     lanes = min(_LANES, n)
-    simulation = Simulation(task, lanes, num_threads)
+    simulation = Simulation(task, lanes, num_threads, **body)
     observation, reward = np.empty((n, task.size), np.float32), np.empty(n, np.float32)
     for start in range(0, n, lanes):
         rows = slice(min(start, n - lanes), start + lanes)  # the last ones overlap
-        simulation.restore(*(values[rows] for values in states))
+        simulation.restore(**{name: values[rows] for name, values in states.items()})
         observation[rows], reward[rows] = simulation.observe(), simulation.reward()
     return observation, reward

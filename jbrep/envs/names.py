@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-import jbrep  # noqa: F401  registers the Jitterbug's
 from jbrep.errors import InputError
 
 _NAMESPACE = "Jitterbug"

@@ -67,7 +67,7 @@ class TaskVecEnv(VecEnv):
         InputError: unknown task, a number below 1, an encoder made for other features or whose
             output doesn't have its `latent_size`; actions of another shape than (num_envs, k).
         NonFiniteActionError: actions that are not finite.
-        EnvironmentFailure: the environment fails in the middle of an episode.
+        EnvironmentFailedError: the environment fails in the middle of an episode.
     """
 
     render_mode = None

@@ -49,23 +49,17 @@ class Return(NamedTuple):
 def curves(groups: Groups, heuristics: Heuristics, looks: Looks) -> Plot:
     """Every representation on one axis, tasks by algorithms."""
     extents = _extents(groups, heuristics)
-    lines = []
+    caption = "Return of the deterministic policy over training: median and 10 to 90 % over n runs."
     if any(heuristics.get(task) for task in extents):
-        lines.append("Dashed: the hand-written policy's median on the same starts.")
+        caption += " Dashed: the hand-written policy's median on the same starts."
     solved = {group.solved for group in groups if extents[group.task].contain(group.solved)}
     if solved:
         values = ", ".join(f"{value:,g}" for value in sorted(solved))
-        lines.append(f"Dotted: the return from which on a task counts as solved ({values}).")
+        caption += f" Dotted: the return from which on a task counts as solved ({values})."
     return Plot(
         "representations",
         "Return over training by representation",
-        " ".join(
-            (
-                "Return of the deterministic policy over training: median and 10 to 90 % over n "
-                "runs.",
-                *lines,
-            )
-        ),
+        caption,
         _COLUMNS,
         list(_rows(groups)),
         lambda: _grid_of_curves(groups, heuristics, extents, looks),

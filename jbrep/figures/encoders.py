@@ -84,7 +84,7 @@ def _draw_features(task: str, encoders: Encoders) -> Figure:
     axes.set_xticks(range(len(encoders)), [plain(n) for n in encoders], rotation=60, ha="right")
     _bare(axes)
     which = "each feature" if count == len(features) else f"the {_MOST} worst of {count} features"
-    axes.set_title(plain(f"{task}: reconstruction of {which}"))
+    axes.set_title(plain(f"{task}:\nreconstruction of {which}"))
     figure.colorbar(picture, label="R² on held-out episodes")
     return figure
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.stats.bootstrap import Interval
+from jbrep.stats.runs import LARGEST_RETURN
 
 _FILLED = 1 / 3  # of an axis, at least, by the returns themselves
 _BEYOND = 0.25  # of their range, for the ends of intervals on either side
@@ -54,12 +55,13 @@ def limits(returns: Iterable[float], floor: float = np.nan, solved: float = np.n
     that the returns would fill less than a third of the axis.
 
     Args:
-        returns: at least one; NaN is none.
+        returns: of which those that aren't finite, or beyond any return, don't count.
         floor: the least possible return; NaN if unknown.
         solved: NaN if unknown.
     """
-    values = [*returns, floor]
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    values = np.array([*returns, floor], float)
+    values = values[np.abs(values) <= LARGEST_RETURN]
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
     wider = Limits(float(np.fmin(low, solved)), float(np.fmax(high, solved)))
     if high - low >= _FILLED * wider.width:
         low, high = wider

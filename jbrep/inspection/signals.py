@@ -1,5 +1,6 @@
 """An episode's signals as lines, with an entity for each plot."""
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -35,7 +36,7 @@ def panels(groups: Mapping[str, slice]) -> Iterator[Panel]:
             yield Panel(name, place)
             continue
         bounds = [size * i // count for i in range(count + 1)]
-        for start, stop in zip(bounds, bounds[1:], strict=False):
+        for start, stop in itertools.pairwise(bounds):
             there = slice(place.start + start, place.start + stop)
             yield Panel(f"{name}_{start}-{stop - 1}", there)
 

@@ -121,12 +121,14 @@ def _draw(number: int, random: np.random.Generator) -> Body:
     )
 
 
-def check_body(body: Any) -> None:
+def check_body(body: Any, materials: Any) -> None:
     """Check the choice of a body: a number, "random", or None for the published robot.
 
     Raises:
         InputError: anything else.
     """
+    if type(materials) is not bool:
+        raise InputError(f"materials is {materials!r}: it must be true or false")
     if body is None or body == RANDOM:
         return
     if type(body) is not int or not 0 <= body < _NUMBERS:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from jbrep.envs.checks import check_actions
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, choose
+from jbrep.jitterbug.bodies import check_body
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, EPISODE_STEPS, Array, JitterbugTask, get_task
 from jbrep.opengl import has_display, no_opengl, prepare_opengl
@@ -23,6 +24,7 @@ Observation = NDArray[Any] | dict[str, NDArray[Any]]
 
 _FORMS = {form: form for form in ("flat", "dict")}
 _TYPES = {name: np.dtype(name) for name in ("float32", "float64")}
+_BODY_ARGUMENTS = {"body", "materials"}
 _ACTIONS = spaces.Box(-1, 1, (1,), np.float32)
 
 
@@ -66,14 +68,16 @@ def describe(arguments: Mapping[str, Any], max_episode_steps: int | None) -> Tas
     """A task as plain data, see `jbrep.envs.description`.
 
     Raises:
-        InputError: the observations are scaled or in a dictionary, or an argument doesn't exist.
+        InputError: an argument that doesn't change the robot, or no such body.
     """
-    others = {name: value for name, value in arguments.items() if name != "task"}
-    if others:
+    given = {name: value for name, value in arguments.items() if name != "task"}
+    if unknown := set(given) - _BODY_ARGUMENTS:
         raise InputError(
-            f"the Jitterbug has no argument {min(others)} that changes the robot: leave it out"
+            f"the Jitterbug has no argument {min(unknown)} that changes the robot: choose from "
+            f"{', '.join(sorted(_BODY_ARGUMENTS))}"
         )
-    return get_task(arguments["task"]).describe(others, max_episode_steps)
+    check_body(given.get("body"), given.get("materials", False))
+    return get_task(arguments["task"]).describe(given, max_episode_steps)
 
 
 class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -87,6 +91,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: "rgb_array", "depth_array", "human" or None.
         camera: "overhead", "tracking" or "egocentric".
         width, height: of a frame [pixels].
+        body, materials: as for `jbrep.jitterbug.simulation.Simulation`.
 
     When the physics diverges, the episode is truncated with the last finite observation, reward
     0 and `info["non_finite"]` true.
@@ -111,6 +116,8 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         camera: str = "tracking",
         width: int = 640,
         height: int = 480,
+        body: int | str | None = None,
+        materials: bool = False,
     ):
         self.task = get_task(task)
         self._view = _View(self.task, scaled, form)
@@ -120,14 +127,18 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
                 f"render_mode {render_mode!r} is not possible here: choose one of "
                 f"{', '.join(self.metadata['render_modes'])}; human needs a display"
             )
-        self._simulation = Simulation(self.task, 1, 1)
-        self.model = self._simulation.model_of(0)
+        self._simulation = Simulation(self.task, 1, 1, body, materials)
         self.observation_space = self._view.space
         self.action_space = _ACTIONS
         self.render_mode = render_mode
         self._frame: dict[str, Any] = {"camera_name": camera, "width": width, "height": height}
         self._renderer: Any = None
         self._data: Any = None
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The robot's model; a new one once it has another body."""
+        return self._simulation.model_of(0)
 
     @property
     def data(self) -> Any:
@@ -140,7 +151,11 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode; `options` are ignored."""
         super().reset(seed=seed)
+        before = self.model
         self._simulation.reset([0], [self.np_random])
+        if self.model is not before:
+            self.close()  # the renderer shows the other body
+            self._data = None
         self._observation = self._simulation.observe()[0]
         return self._view(self._observation), {}
 
@@ -191,10 +206,10 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
 
     Lane i of an environment that is reset with seed s has the episodes of a single environment
     reset with seed s + i. Infos hold `qpos`, `qvel`, `target_position` and `target_quaternion` of
-    each lane's state.
+    each lane's state, and the number of its `body`, -1 for the published one.
 
     Args:
-        task, scaled, form: as for `JitterbugEnv`.
+        task, scaled, form, body, materials: as for `JitterbugEnv`.
         num_envs: how many robots.
         max_episode_steps: the time limit, in control steps.
         num_threads: threads to step them on; None takes one for each core.
@@ -217,6 +232,8 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         num_threads: int | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
         dtype: str = "float32",
+        body: int | str | None = None,
+        materials: bool = False,
     ):
         if max_episode_steps < 1:
             raise InputError(
@@ -225,7 +242,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         if autoreset_mode not in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
             raise InputError(f"{autoreset_mode} is not possible: choose SAME_STEP or DISABLED")
         self.task = get_task(task)
-        self.simulation = Simulation(self.task, num_envs, num_threads)
+        self.simulation = Simulation(self.task, num_envs, num_threads, body, materials)
         self.metadata = {"autoreset_mode": autoreset_mode}
         self._resets = autoreset_mode == AutoresetMode.SAME_STEP
         self._view = _View(self.task, scaled, form, dtype)
@@ -325,5 +342,6 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
             "qvel": now.qvel.copy(),
             "target_position": now.target_position.copy(),
             "target_quaternion": self.simulation.target_quaternion.copy(),
+            "body": self.simulation.body_numbers[:, None],
         }
         return arrays | dict.fromkeys((f"_{name}" for name in arrays), self._every_lane)

@@ -49,7 +49,7 @@ class Simulation:
         materials: bool = False,
     ):
         check_counts(num_lanes, num_threads)
-        bodies.check_body(body)
+        bodies.check_body(body, materials)
         model.stop_profiling()
         self.task = task
         self.num_lanes = num_lanes
@@ -95,6 +95,11 @@ class Simulation:
         self._forward(lanes)
 
     @property
+    def body_numbers(self) -> Array:
+        """The number of each lane's body, -1 for the published one, (n,)."""
+        return self._numbers.astype(np.float64)
+
+    @property
     def state(self) -> dict[str, Array]:
         """A copy of what `restore` takes, (n, ...) each; with `body` if there are other bodies."""
         now = self.readings
@@ -106,7 +111,7 @@ class Simulation:
             "warmstart": self._warmstart.copy(),
         }
         if self._body is not None or (self._numbers != bodies.PUBLISHED).any():
-            state["body"] = self._numbers.astype(np.float64)
+            state["body"] = self.body_numbers
         return state
 
     def restore(

@@ -254,7 +254,8 @@ class JitterbugTask:
             arguments: of the environment.
             max_episode_steps: the time limit; 1,000 if not given.
         """
-        steps = max_episode_steps or EPISODE_STEPS
+        steps, given = max_episode_steps or EPISODE_STEPS, dict(arguments or {})
+        body = {"body": 1} if given.get("body") is not None else {}
         return Task(
             id=environment_id(self.name),
             name=self.name,
@@ -262,7 +263,7 @@ class JitterbugTask:
             action_low=(-1.0,),
             action_high=(1.0,),
             max_episode_steps=steps,
-            arguments=dict(arguments or {}),
+            arguments=given,
             timestep=CONTROL_TIMESTEP,
             reward_low=0.0,
             reward_high=1.0,
@@ -270,7 +271,7 @@ class JitterbugTask:
             terminates=False,
             draws=START_DRAWS,
             state={"qpos": QPOS_SIZE, "qvel": QVEL_SIZE},
-            constants={"target_position": 3, "target_quaternion": 4},
+            constants={"target_position": 3, "target_quaternion": 4, **body},
         )
 
     def observe(self, readings: Readings) -> Array:

@@ -120,7 +120,7 @@ class Evaluator:
 
         Raises:
             NonFiniteActionError: the policy's actions are not finite.
-            EnvironmentFailure: the environment fails in the middle of an episode.
+            EnvironmentFailedError: the environment fails in the middle of an episode.
         """
         act = deterministic(policy, self._encoder, self._lanes.task)
         return episode_returns(self._lanes, act, self._seed)

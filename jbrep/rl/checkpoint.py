@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
 
-from jbrep.envs.lanes import EnvironmentFailure
+from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.envs.sb3 import TaskVecEnv
 from jbrep.errors import DamageError, InputError
 from jbrep.files import container
@@ -88,7 +88,7 @@ class Checkpointer(BaseCallback):
         if self._snapshot:
             try:
                 restore(self.model, self._snapshot)
-            except EnvironmentFailure as error:
+            except EnvironmentFailedError as error:
                 raise InputError(f"{self._path} can't be resumed: {error}") from None
             except InputError:
                 raise

@@ -17,9 +17,9 @@ from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import FULL, Encoder, find, save
 from jbrep.encoders.file import fingerprint
 from jbrep.envs.checks import NonFiniteActionError
-from jbrep.envs.description import describe
-from jbrep.envs.lanes import EnvironmentFailure
-from jbrep.envs.task import Task
+from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.envs.names import environment_versions
+from jbrep.envs.task import Task, as_task
 from jbrep.errors import InputError
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder, write_whole
@@ -47,7 +47,7 @@ from jbrep.rl.policy_file import policy_zip
 from jbrep.rl.presets import get_preset
 from jbrep.rl.recorder import DivergedError, History, Recorder, Scalars, Watch
 
-_PACKAGES = ("gymnasium", "jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
+_PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 _LIMITS = {
     "steps": MAX_STEPS,
     "evaluate_every": MAX_STEPS,
@@ -74,9 +74,7 @@ class Run:
     begin_from: str = ""  # the folder of a finished run, whose policy this one begins with
 
     def __post_init__(self) -> None:
-        given: Any = self.task
-        if not isinstance(given, Task):
-            object.__setattr__(self, "task", describe(given))
+        object.__setattr__(self, "task", as_task(self.task))
         for name, limit in _LIMITS.items():
             if not 1 <= getattr(self, name) <= limit:
                 words = name.replace("_", " ")
@@ -194,7 +192,7 @@ def _train(
     stop: Callable[[], bool],
 ) -> dict[str, Any]:
     """The run, from its start or its checkpoint to its end."""
-    versions = {name: version(name) for name in _PACKAGES}
+    versions = environment_versions(run.task.id) | {name: version(name) for name in _PACKAGES}
     history = History()
     checkpointer = Checkpointer(
         folder / CHECKPOINT, {**settings, **versions}, history, save_every, stop
@@ -239,7 +237,7 @@ def _learn(agent: BaseAlgorithm, steps: int, callbacks: Sequence[BaseCallback]) 
     try:
         with unchecked_distributions():
             agent.learn(steps, callback=[*callbacks])
-    except (DivergedError, EnvironmentFailure) as error:
+    except (DivergedError, EnvironmentFailedError) as error:
         failure = _one_line(str(error))
     except NonFiniteActionError:
         failure = "the policy's actions are not finite"

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.figures.behaviour import Behaviour
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
+from jbrep.figures.behaviour import Behaviour
 from jbrep.rollouts.jitterbug import jitterbug_task
 from jbrep.rollouts.sources import Player, find_player, find_untrained, run_folder
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from jbrep.envs.names import imported_modules
 from jbrep.errors import choose
-from jbrep.study.plan import Cell, Plan
 from jbrep.pool import Pool, stop_requested
+from jbrep.study.plan import Cell, Plan
 from jbrep.study.progress import say
 from jbrep.study.work import CRASHED, Outcome, work
 

@@ -1,0 +1,241 @@
+"""Runs on tasks of any kind: sizes, terminations, failures, resuming by replay, version 1."""
+
+import csv
+import dataclasses
+import json
+import shutil
+
+import cart
+import numpy as np
+import pytest
+from command import jbrep
+
+from jbrep.encoders import find
+from jbrep.envs import describe
+from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.errors import InputError
+from jbrep.files import container
+from jbrep.rl import Run, StoppedError, train
+from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
+from jbrep.rl.files import (
+    CHECKPOINT,
+    EPISODES,
+    EVALUATION_SEED,
+    FAILED,
+    POLICY,
+    RUN,
+    read_evaluations,
+    read_run,
+)
+from jbrep.rl.policy import load_run, load_untrained
+from jbrep.rl.presets import ALGORITHMS, PRESETS, get_preset
+
+CART = describe(cart.ID)
+PENDULUM, HOPPER = describe("Pendulum-v1", max_episode_steps=50), describe("Hopper-v5")
+FAILING = dataclasses.replace(CART, arguments={"fail_seed": training_seed(0) + 3})
+
+
+SHORTER = {
+    "n_steps": 16,
+    "train_freq": 16,
+    "learning_starts": 50,
+    "gradient_steps": 4,
+    "batch_size": 32,
+}
+
+
+@pytest.fixture
+def short_rollouts(monkeypatch):
+    """The paper's settings with shorter rollouts and fewer updates."""
+    for algorithm, preset in PRESETS["paper"].items():
+        shorter = {name: value for name, value in SHORTER.items() if name in preset.settings}
+        quick = dataclasses.replace(preset, settings={**preset.settings, **shorter})
+        monkeypatch.setitem(PRESETS["paper"], algorithm, quick)
+
+
+def episodes_of(folder):
+    with (folder / EPISODES).open() as file:
+        return [{n: float(v) for n, v in row.items()} for row in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize("task", [PENDULUM, HOPPER], ids=lambda task: task.slug)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_algorithm_learns_on_any_task(algorithm, task, short_rollouts, tmp_path):
+    run = Run(task=task, algorithm=algorithm, steps=150, evaluation_episodes=2)
+    result = train(run, tmp_path)
+    assert result["status"] == "finished", result["reason"]
+    assert result["settings"]["task"] == task.name
+    playing = load_run(tmp_path)
+    assert playing.task == task
+    action = playing.begin(task, [0])(np.zeros((1, task.size)))
+    assert action.shape == (1, task.action_size)
+    before, after = load_untrained(tmp_path).policy.state_dict(), playing.policy.state_dict()
+    assert any(not before[name].equal(after[name]) for name in before)
+    episodes = episodes_of(tmp_path)
+    assert all(row["diverged"] == 0 for row in episodes)
+    if task is PENDULUM:
+        assert all(row.episode_return < 0 for row in read_evaluations(tmp_path))
+    elif episodes:
+        assert max(row["length"] for row in episodes) < HOPPER.max_episode_steps
+
+
+def test_evaluations_are_in_the_order_of_their_starts():
+    """Episodes of different lengths end in another order."""
+    encoder = find("full", HOPPER)
+    agent = make_agent("sac", get_preset("modern", "sac"), make_env(HOPPER, 1, 0, encoder), 0)
+    together = Evaluator(HOPPER, encoder, 4).returns(agent)
+    assert len(set(together.round(3))) == 4
+    for i, expected in enumerate(together):
+        (alone,) = Evaluator(HOPPER, encoder, 1, EVALUATION_SEED + i).returns(agent)
+        assert alone == pytest.approx(expected, rel=1e-4)
+
+
+def test_training_is_told_of_terminations(tmp_path):
+    """It must not take the value of a state after which an episode ended for good."""
+    encoder = find("full", HOPPER)
+    agent = make_agent("sac", get_preset("modern", "sac"), make_env(HOPPER, 1, 0, encoder), 0)
+    agent.learn(200)
+    buffer = agent.replay_buffer
+    assert buffer.dones[:200].any()
+    assert not buffer.timeouts[:200].any()
+
+
+@pytest.mark.parametrize("task", [PENDULUM, HOPPER, CART], ids=lambda task: task.slug)
+@pytest.mark.parametrize("algorithm", ["a2c", "sac"])
+def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, task, tmp_path):
+    run = Run(task=task, algorithm=algorithm, preset="modern", steps=320, evaluation_episodes=1)
+    one, other = tmp_path / "one", tmp_path / "other"
+    train(run, one)
+    steps = []
+    with pytest.raises(StoppedError):
+        train(run, other, lambda step, _: steps.append(step), stop=lambda: steps[-1] >= 64)
+    lengths = container.read(other / CHECKPOINT, "checkpoint")[0]["lanes.lengths"]
+    assert lengths.any()
+    train(run, other)
+    for name in ("episodes.csv", "evaluations.csv", POLICY):
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+
+
+def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
+    run = Run(task=FAILING, algorithm="a2c", steps=800, evaluation_episodes=1)
+    result = train(run, tmp_path)
+    assert result["status"] == FAILED
+    where = f"failed at step 7 of the episode with seed {training_seed(0) + 3}"
+    assert result["reason"].startswith(f"Test/Cart-v0 {where}: RuntimeError: the motor?[2J is")
+    assert result["reason"].endswith(" after 48 steps")  # of 8 lanes
+    assert read_run(tmp_path) == result
+    assert [row.step for row in read_evaluations(tmp_path)] == [0]
+    assert not (tmp_path / POLICY).exists()
+    with pytest.raises(InputError, match="failed: it has no policy"):
+        load_run(tmp_path)
+
+
+def test_the_command_says_that_an_environment_failed(tmp_path):
+    seed = training_seed(0)
+    command = ("rl", "--task", cart.ID, "--env", f"fail_seed={seed}", "--out", tmp_path / "run")
+    told = jbrep(*command, "--algorithm", "a2c", "--steps", 800, "--evaluation-episodes", 1)
+    assert told.exit_code == 1
+    (line,) = told.output.splitlines()
+    assert line.startswith("the run failed: Test/Cart-v0 failed at step 7 of the episode with seed")
+    assert line.isprintable()
+
+
+def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
+    run = Run(task=CART, algorithm="a2c", steps=320, evaluation_episodes=1)
+    with pytest.raises(StoppedError):
+        train(run, tmp_path, stop=iter((False, True)).__next__)
+    before = (tmp_path / CHECKPOINT).read_bytes()
+
+    def fail(*_):
+        raise EnvironmentFailedError("out of order")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("jbrep.envs.lanes.Lanes.restore", fail)
+        with pytest.raises(InputError, match="can't be resumed: out of order"):
+            train(run, tmp_path)
+    assert (tmp_path / CHECKPOINT).read_bytes() == before
+    assert not (tmp_path / RUN).exists()
+
+
+def test_an_environment_that_is_not_reproducible(tmp_path):
+    """The command says so at its start; a run that was stopped isn't resumed to something else."""
+    rl = ("rl", "--task", cart.ID, "--env", "drifts=true", "--algorithm", "a2c", "--steps", 80)
+    told = jbrep(*rl, "--evaluation-episodes", 1, "--out", tmp_path / "run")
+    assert told.exit_code == 0, told.output
+    assert told.stderr.startswith("Test/Cart-v0 is not reproducible: ")
+    assert told.stderr.count("\n") == 1
+    drifting = describe(cart.ID, {"drifts": True})
+    run = Run(task=drifting, algorithm="a2c", steps=80, evaluation_episodes=1)
+    with pytest.raises(StoppedError):
+        train(run, tmp_path / "stopped", stop=iter((False, True)).__next__)
+    with pytest.raises(InputError, match="Test/Cart-v0 is not reproducible here"):
+        train(run, tmp_path / "stopped")
+    assert (tmp_path / "stopped" / CHECKPOINT).exists()
+
+
+def test_arguments_and_time_limit_are_settings_of_a_run(tmp_path):
+    made = ("rl", "--task", "Pendulum-v1", "--env", "g=3.5", "--episode-steps", 40)
+    made = (*made, "--algorithm", "a2c", "--evaluation-episodes", 1, "--out", tmp_path / "run")
+    told = jbrep(*made, "--steps", 400)
+    assert told.exit_code == 0, told.output
+    assert "returns on full at the end: -" in told.output
+    run = read_run(tmp_path / "run")
+    task = describe("Pendulum-v1", {"g": 3.5}, 40)
+    assert run["settings"]["environment"] == task.as_json()
+    assert {row["length"] for row in episodes_of(tmp_path / "run")} == {40}
+    again = ("--steps", 400, "--episode-steps", 50, "--env", "g=3.5")
+    told = jbrep("rl", "--task", "Pendulum-v1", *again, *made[7:])
+    assert told.exit_code == 2
+    assert "holds another run: " in told.output
+    assert "max_episode_steps 40 (now: 50); choose another folder" in told.output
+
+
+@pytest.fixture(scope="module")
+def jitterbug_run(tmp_path_factory):
+    """A short run of the robot that version 1 had, and its checkpoint after 40 steps."""
+    folder = tmp_path_factory.mktemp("jitterbug")
+    run = Run(task="face_direction", algorithm="a2c", steps=80, evaluation_episodes=1)
+    with pytest.raises(StoppedError):
+        train(run, folder, stop=iter((False, True)).__next__)
+    shutil.copytree(folder, folder / "stopped")
+    train(run, folder)
+    return run, folder
+
+
+def as_version_1(settings, **changes):
+    """The settings as the first release wrote them, the earliest runs without episode_steps."""
+    new = ("environment", "from")
+    return {n: v for n, v in settings.items() if n not in new} | changes
+
+
+def test_a_run_of_version_1_is_left_alone(jitterbug_run, tmp_path):
+    run, folder = jitterbug_run
+    record = json.loads((folder / RUN).read_text())
+    for changes in ({}, {"episode_steps": 1000}):
+        old = {**record, "settings": as_version_1(record["settings"], **changes)}
+        (tmp_path / RUN).write_text(json.dumps({**old, "format_version": 1}))
+        assert train(run, tmp_path)["settings"] == record["settings"]
+    shorter = dataclasses.replace(run, task=describe("face_direction", max_episode_steps=100))
+    with pytest.raises(InputError, match=r"another run: max_episode_steps 1000 \(now: 100\)"):
+        train(shorter, tmp_path)
+    for changes, message in (
+        ({"task": "fly"}, "unknown task 'fly'"),
+        ({"task": ["x"]}, r"settings\.task is invalid"),
+        ({"episode_steps": 0}, r"settings\.episode_steps is invalid"),
+    ):
+        old = {**record, "settings": as_version_1(record["settings"], **changes)}
+        (tmp_path / RUN).write_text(json.dumps({**old, "format_version": 1}))
+        with pytest.raises(InputError, match=message):
+            read_run(tmp_path)
+
+
+def test_a_checkpoint_of_version_1_is_played_but_not_resumed(jitterbug_run, tmp_path):
+    run, folder = jitterbug_run
+    shutil.copytree(folder / "stopped", tmp_path, dirs_exist_ok=True)
+    tensors, header = container.read(tmp_path / CHECKPOINT, "checkpoint")
+    old = {**header, "identity": as_version_1(header["identity"], episode_steps=500)}
+    container.write(tmp_path / CHECKPOINT, tensors, old)
+    playing = load_run(tmp_path)
+    assert (playing.step, playing.task.max_episode_steps) == (40, 500)
+    with pytest.raises(InputError, match="was written by an earlier jbrep"):
+        train(run, tmp_path)
