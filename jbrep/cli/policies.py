@@ -16,12 +16,14 @@ from jbrep.cli.base import (
 )
 from jbrep.cli.environment import given_task, task_options
 from jbrep.errors import InputError
+from jbrep.text import SIGNIFICANT, number
 
 if TYPE_CHECKING:
     from jbrep.envs.task import Task
     from jbrep.rollouts.sources import Player
 
 _TASK = "face_direction"
+_LARGE = 10  # returns that are shown without decimals
 
 
 @click.command(epilog=example("jbrep evaluate-policy runs/a --episodes 100"))
@@ -82,9 +84,11 @@ def evaluate_policy(
         return
     if source is not None:
         click.echo(printable(f"encoder: {source}"))
+    form = ".0f" if max(abs(low), abs(high)) >= _LARGE else SIGNIFICANT
+    shown, least, most = (number(value, form) for value in (median, low, high))
     click.echo(
         printable(
-            f"{_title(policy, player)}: median return {median:.0f} [{low:.0f}, {high:.0f}] "
+            f"{_title(policy, player)}: median return {shown} [{least}, {most}] "
             f"(10-90 % of {episodes} episodes)"
         )
     )
