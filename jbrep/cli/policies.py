@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jbrep.rollouts.sources import Player
 
 _TASK = "face_direction"
-_LARGE = 10  # returns that are shown without decimals
+_LARGE = 1  # returns that are shown without decimals
 
 
 @click.command(epilog=example("jbrep evaluate-policy runs/a --episodes 100"))
