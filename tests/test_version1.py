@@ -11,11 +11,11 @@ from command import jbrep
 from small import contents, settings
 
 from jbrep.collect import collect
-from jbrep.collect.collector import simulate_shard
 from jbrep.collect.derive import derive
 from jbrep.collect.policies import Uniform
 from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
+from jbrep.collect.shards import simulate_shard
 from jbrep.dataset import Dataset, version1
 from jbrep.dataset.export import export
 from jbrep.dataset.manifest import (

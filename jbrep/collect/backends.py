@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 from itertools import count
 from typing import Any
 
-from jbrep.collect.collector import Missing, Produce, shards_in_turn, simulate_shard
 from jbrep.collect.policies import make_policy
+from jbrep.collect.shards import Missing, Produce, shards_in_turn, simulate_shard
 from jbrep.dataset.schema import Columns
 from jbrep.dataset.settings import Settings
 from jbrep.envs.make import is_batched

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collect.collector import Missing, Produce, Written, write_shards
+from jbrep.collect.collector import Written, write_shards
 from jbrep.collect.policies import make_policy
+from jbrep.collect.shards import Missing, Produce
 from jbrep.dataset import Dataset, Settings, version1
 from jbrep.dataset.manifest import new_manifest, open_shard
 from jbrep.dataset.schema import EPISODES, Columns, all_specs, episode_columns, episode_returns

@@ -6,8 +6,8 @@ from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
-from jbrep.collect.collector import LANES, simulate_shard
 from jbrep.collect.policies import make_policy
+from jbrep.collect.shards import LANES, simulate_shard
 from jbrep.dataset import version1
 from jbrep.dataset.manifest import (
     BACKUP,

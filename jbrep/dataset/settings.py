@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from jbrep.dataset.schema import MAX_ROOT_SEED, check_names, episode_seed, step_specs
-from jbrep.envs.task import Task, as_task
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
 
 _MAX_STEPS = 10**12
@@ -37,7 +37,11 @@ class Settings:
     store_state: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "task", as_task(self.task))
+        given: Any = self.task
+        if not isinstance(given, Task):
+            from jbrep.envs.description import as_task  # imports Gymnasium
+
+            object.__setattr__(self, "task", as_task(given))
         for name in _LIMITS:
             object.__setattr__(self, name, _checked_number(name, getattr(self, name)))
         check_names(self.task)

@@ -6,7 +6,7 @@ from jbrep.encoders.encoder import FULL, IDENTITY, Encoder
 from jbrep.encoders.file import SUFFIX, load
 from jbrep.encoders.identity import SCALINGS, identity
 from jbrep.encoders.names import EncoderName
-from jbrep.envs.task import Task, as_task
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
 
@@ -32,7 +32,10 @@ def find(name: str | Path, task: Task | str) -> Encoder:
     Raises:
         InputError: there is neither, the file can't be used, or it was made for another task.
     """
-    task = as_task(task)
+    if isinstance(task, str):
+        from jbrep.envs.description import describe  # imports Gymnasium
+
+        task = describe(task)
     if _is_made(name, task):
         return identity(task)
     path = _shipped(name, task) or Path(name)

@@ -53,6 +53,19 @@ def describe(
     return _with_features(task, features) if features else task
 
 
+def as_task(given: Task | str) -> Task:
+    """A task, or the one of that name, described.
+
+    Raises:
+        InputError: it is neither, or as `describe`.
+    """
+    if isinstance(given, Task):
+        return given
+    if not isinstance(given, str):
+        raise InputError(f"the task is {given!r}: it must be a name or a Task")
+    return describe(given)
+
+
 @lru_cache(maxsize=64)
 def _describe(name: str, arguments: str, max_episode_steps: int | None) -> Task:
     spec, given = find_spec(name), json.loads(arguments)

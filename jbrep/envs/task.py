@@ -222,21 +222,6 @@ def read_task(record: Any) -> Task:
     return task
 
 
-def as_task(given: Any) -> Task:
-    """A task, or the one of that name, described.
-
-    Raises:
-        InputError: it is neither, or as `describe`.
-    """
-    if isinstance(given, Task):
-        return given
-    if isinstance(given, str):
-        from jbrep.envs.description import describe  # imports Gymnasium
-
-        return describe(given)
-    raise InputError(f"the task is {given!r}: it must be a name or a Task")
-
-
 def _ranged(feature: Feature) -> bool:
     low, high = feature.low, feature.high
     return low is not None and high is not None and low < high

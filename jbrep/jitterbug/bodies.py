@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from jbrep.errors import InputError
-from jbrep.jitterbug.model import read_xml
+from jbrep.jitterbug.mjcf import read_xml
 from jbrep.jitterbug.tasks import Array
 
 RANDOM = "random"  # another body in each episode

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from jbrep.jitterbug import model, tasks
+from jbrep.jitterbug import tasks
+from jbrep.jitterbug.mjcf import read_xml
 from jbrep.jitterbug.tasks import Array, Readings
 from jbrep.opengl import prepare_opengl
 
@@ -96,7 +97,7 @@ def _factory(name: str) -> Callable[..., control.Environment]:
         environment_kwargs: dict[str, Any] | None = None,
     ) -> control.Environment:
         return control.Environment(
-            Physics.from_xml_string(model.read_xml()),
+            Physics.from_xml_string(read_xml()),
             Jitterbug(name, random=random),
             time_limit=time_limit,
             control_timestep=tasks.CONTROL_TIMESTEP,

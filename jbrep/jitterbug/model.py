@@ -1,28 +1,18 @@
 """The Jitterbug's MuJoCo model: as described, and the same robot compiled to step faster."""
 
-from __future__ import annotations
-
 import ctypes
 from functools import lru_cache
-from importlib import resources
-from typing import TYPE_CHECKING
 
 import mujoco
 from mujoco import _batch
 
+from jbrep.jitterbug.bodies import Body
+from jbrep.jitterbug.mjcf import read_xml
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP
-
-if TYPE_CHECKING:
-    from jbrep.jitterbug.bodies import Body
 
 PHYSICS_TIMESTEP = 0.0002  # [s]
 PHYSICS_STEPS = round(CONTROL_TIMESTEP / PHYSICS_TIMESTEP)  # in a control step
 _ARENA = 1 << 20  # [bytes] per robot; MuJoCo's own choice is 14 times as large
-
-
-def read_xml() -> str:
-    """The MJCF text."""
-    return resources.files(__package__).joinpath("jitterbug.xml").read_text()
 
 
 def plain_model(body: Body | None = None) -> mujoco.MjModel:

@@ -17,9 +17,10 @@ from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import FULL, Encoder, find, save
 from jbrep.encoders.file import fingerprint
 from jbrep.envs.checks import NonFiniteActionError
+from jbrep.envs.description import as_task
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.envs.names import environment_versions
-from jbrep.envs.task import Task, as_task
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder, write_whole

@@ -19,7 +19,7 @@ from jbrep.stats.labels import RepresentationResult, check_names, describe
 from jbrep.stats.plain import READERS, to_plain
 from jbrep.stats.runs import LARGEST_RETURN, Group, RunCurve, groups
 from jbrep.stats.scale import SOLVED, STEPS_TO, scale_of
-from jbrep.stats.version_1 import in_version_2
+from jbrep.stats.version1 import in_version_2
 
 FORMAT = "jbrep statistics"
 FORMAT_VERSION = 2

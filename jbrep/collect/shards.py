@@ -1,0 +1,169 @@
+"""Simulating the shards of a data set, each a function of its number and the settings."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from itertools import count
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.collect.policies import Policy, make_policy
+from jbrep.dataset.schema import EPISODES, Columns, all_specs, episode_returns, episode_seed
+from jbrep.dataset.settings import Settings
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.make import is_batched
+from jbrep.envs.recording import Recording, Tick, read_nothing, read_states, record
+
+LANES = 100  # of a batch
+
+Array = NDArray[Any]
+
+
+class Missing(Protocol):
+    """What a data set still lacks."""
+
+    @property
+    def rows(self) -> int:
+        """How many rows, at present."""
+
+    def wants(self, shard: int) -> bool:
+        """Whether a shard of that number is likely to be needed."""
+
+
+Produce = Callable[[int, Missing, Tick], Iterator[Columns]]  # shards in order, from a number on
+
+
+def shards_in_turn(settings: Settings, lanes: int, num_threads: int | None) -> Produce:
+    """Make one shard after the other, each with all threads."""
+    policy = make_policy(settings.policy)
+
+    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
+        for shard in count(first):
+            rows = missing.rows
+            yield simulate_shard(settings, policy, shard, tick, lanes, num_threads, rows)
+
+    return produce
+
+
+def simulate_shard(
+    settings: Settings,
+    policy: Policy,
+    shard: int,
+    tick: Tick,
+    lanes: int = LANES,
+    num_threads: int | None = None,
+    rows: float = math.inf,
+    most_episodes: int | None = None,
+) -> Columns:
+    """The columns of a shard: a function of its number and the settings only.
+
+    It ends early once it has enough rows: what it has is the beginning of the whole shard.
+
+    Args:
+        settings: of the data set.
+        policy: of the settings.
+        shard: its number.
+        tick: called with the number of steps made.
+        lanes: environments of a batch, stepped at once.
+        num_threads: threads to step a batch on; None takes one for each core.
+        rows: how many are enough.
+        most_episodes: how many of its episodes to make; None makes all.
+    """
+    first = shard * settings.shard_episodes
+    episodes = np.arange(first, first + settings.shard_episodes)[:most_episodes]
+    size = _lanes_in_block(settings, lanes)
+    blocks = list(_blocks(settings, policy, episodes, size, tick, num_threads, rows))
+    specs = all_specs(settings.task, settings.store_state)
+    return {name: np.concatenate([block[name] for block in blocks]) for name in specs}
+
+
+def _lanes_in_block(settings: Settings, lanes: int) -> int:
+    """Episodes played side by side: those that would wait for the longest one cost time."""
+    if not is_batched(settings.task):
+        return 1
+    return max(1, min(lanes, settings.shard_episodes))
+
+
+def _blocks(
+    settings: Settings,
+    policy: Policy,
+    episodes: Array,
+    size: int,
+    tick: Tick,
+    num_threads: int | None,
+    rows: float,
+) -> Iterator[Columns]:
+    """The columns of the episodes, some at a time, one in each lane, until there are enough."""
+    lanes: Lanes | None = None
+    while len(episodes) and rows > 0:
+        needed = math.ceil(min(rows / settings.task.max_episode_steps, len(episodes)))
+        block, episodes = np.split(episodes, [min(size, needed)])
+        if lanes is None or lanes.num_lanes != len(block):
+            lanes = Lanes(settings.task, len(block), num_threads)
+        columns = _simulate(settings, policy, block, lanes, tick)
+        rows -= len(columns["step"])
+        yield columns
+    if lanes is not None:
+        lanes.close()
+
+
+def _simulate(
+    settings: Settings, policy: Policy, episodes: Array, lanes: Lanes, tick: Tick
+) -> Columns:
+    """The columns of some episodes, one in each lane."""
+    task = settings.task
+    seeds = [episode_seed(task, settings.seed, int(episode)) for episode in episodes]
+    lanes.reset(range(lanes.num_lanes), seeds)
+    act = policy.begin(task, seeds)
+    recording = record(
+        lanes,
+        lambda observation: act(observation).astype(np.float32),  # as it is stored
+        tick,
+        read_states if settings.store_state else read_nothing,
+    )
+    rows = _rows(recording, episodes)
+    return rows | {
+        EPISODES + name: column
+        for name, column in _ends(settings, recording, episodes, seeds, rows["reward"])
+    }
+
+
+def _rows(recording: Recording, episodes: Array) -> dict[str, Array]:
+    """Columns with a row for each step, one episode after the other."""
+    steps = len(recording.reward)
+    step = np.arange(steps, dtype=np.int32)
+    kept = step < recording.length[:, None]
+    values: dict[str, Array] = {
+        "observation": recording.observation,
+        **recording.arrays,
+        "action": recording.action.astype(np.float32),
+        "reward": recording.reward,
+    }
+    rows: dict[str, Array] = {
+        "episode": np.repeat(episodes.astype(np.int32), recording.length),
+        "step": np.broadcast_to(step, kept.shape)[kept],
+    }
+    return rows | {name: each[:steps].swapaxes(0, 1)[kept] for name, each in values.items()}
+
+
+def _ends(
+    settings: Settings,
+    recording: Recording,
+    episodes: Array,
+    seeds: Sequence[int],
+    reward: Array,
+) -> Iterator[tuple[str, Array]]:
+    """Columns with a row for each episode; the reward is the column with a row for each step."""
+    length, task = recording.length, settings.task
+    yield "episode", episodes.astype(np.int32)
+    yield "seed", np.array(seeds, np.int64)
+    yield "length", length
+    yield "return", episode_returns(reward, length)
+    yield "terminated", recording.terminated.astype(np.uint8)
+    yield "truncated", recording.truncated.astype(np.uint8)
+    yield from ((f"initial_{name}", recording.start[name]) for name in task.state)
+    yield from ((name, recording.start[name]) for name in task.constants)
+    lanes = np.arange(len(episodes))
+    final: dict[str, Array] = {"observation": recording.observation, **recording.arrays}
+    yield from ((f"final_{name}", values[length, lanes]) for name, values in final.items())
