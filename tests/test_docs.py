@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 import click
+import gymnasium
 import pytest
 
 from jbrep.cli import main
@@ -32,6 +33,13 @@ def test_the_python_runs(block, monkeypatch, tmp_path):
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     exec(compile(block, "block", "exec"), {})
+
+
+@pytest.fixture(autouse=True)
+def registered_again():
+    """What a block registers, another may register, too."""
+    yield
+    gymnasium.registry.pop("Cart-v0", None)
 
 
 TOML = found(r"^```toml\n(.*?)^```")

@@ -488,7 +488,7 @@ def test_changed_tables_are_refused_or_shown(name, whole, tmp_path, monkeypatch)
 def test_a_run_of_a_newer_jbrep_is_named(tmp_path):
     plan = make_study(tmp_path / "new", left=11)
     path = plan.folder_of(plan.cells[0]) / "run.json"
-    path.write_text(path.read_text().replace('version": 1', 'version": 7'))
+    path.write_text(path.read_text().replace('version": 2', 'version": 7'))
     with pytest.raises(InputError, match=r"run\.json has format version 7: this jbrep reads up"):
         read_results(plan.folder)
 
