@@ -18,6 +18,7 @@ from jbrep.dae.network import ARCHITECTURES, Autoencoder
 from jbrep.dae.training import NOISE, Trainer, Training
 from jbrep.encoders import find
 from jbrep.encoders.encoder import run
+from jbrep.envs import describe
 
 ROWS = 4_000_000
 SIZE = 16
@@ -77,7 +78,7 @@ def compare_gradients() -> None:
 
 def compare_one_row() -> None:
     """What encode costs on one row beyond its own arithmetic."""
-    encoder = find("dae-8", "face_direction")
+    encoder = find("dae-8", describe("face_direction"))
     row = np.zeros((1, SIZE), np.float32)
     parts = {"NumPy": row, "torch": torch.from_numpy(row)}
     for library, values in parts.items():
