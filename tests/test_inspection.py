@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import rerun as rr
 from command import jbrep, start, wait_for, wait_for_the_end_of
 from rerun.chunk import RrdReader
 
@@ -20,8 +21,10 @@ from jbrep.envs.physics import Motion
 from jbrep.errors import InputError
 from jbrep.files import container
 from jbrep.inspection import inspect
+from jbrep.inspection.blueprint import curves_layout
 from jbrep.inspection.ghost import shades
 from jbrep.inspection.latent import principal_components
+from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot, rotate
 from jbrep.inspection.scene import contacts
 from jbrep.inspection.shapes import own_colours, shapes
@@ -459,6 +462,7 @@ SHAPES = """
       <geom name="stone" type="mesh" mesh="wedge" pos="0 0 .5" euler="0 90 0"/>
       <geom name="hidden" type="box" size="1 1 1" group="3"/>
       <geom name="clear" type="box" size="1 1 1" rgba="1 1 1 0"/>
+      <body name="bare"/>
     </body>
     <body><geom type="box" size=".1 .1 .1"/></body>
   </worldbody>
@@ -469,7 +473,11 @@ SHAPES = """
 def test_shapes_of_every_kind():
     model = mujoco.MjModel.from_xml_string(SHAPES)
     robot = Robot(model)
-    assert (robot.names, robot.bodies, robot.others) == (["world", "a_b", "body_2"], [1], [0, 2])
+    assert (robot.names, robot.bodies, robot.others) == (
+        ["world", "a_b", "bare", "body_3"],
+        [1, 2],
+        [0, 3],
+    )
     geoms = robot.geoms(1)
     drawn = [model.geom(geom).name for geom in geoms]
     assert drawn == ["ball", "egg", "pill", "can", "brick", "stone"]
@@ -498,6 +506,24 @@ def test_shapes_of_every_kind():
     normals = np.array(mesh.vertex_normals.as_arrow_array().to_pylist())
     outward = corners - expected.mean(axis=0)
     assert ((normals * outward).sum(axis=1) > 0).all()
+
+
+def test_bodies_that_stand_still_have_one_pose_and_bare_ones_no_shape(folder):
+    model = mujoco.MjModel.from_xml_string(SHAPES)
+    robot, motion = Robot(model), Motion(model, {"qpos": np.tile(model.qpos0, (3, 1))})
+    motion.qpos[:, 0] = (0, 1, 2)
+    recording = Recording("it", "shapes")
+    times = [rr.TimeColumn("step", sequence=np.arange(3))]
+    robot.draw(recording, "robot", times, robot.poses(motion), [1, 2, 3])
+    recording.write(folder / "shapes.rrd", curves_layout(["robot"], 2))
+    found = read(folder / "shapes.rrd")
+    assert [len(poses(found[f"/robot/{name}"])[0]) for name in ("a_b", "bare", "body_3")] == [
+        3,
+        3,
+        1,
+    ]
+    assert "Mesh3D:vertex_positions" in found["/robot/a_b"]
+    assert not any(":colors" in name for name in found["/robot/bare"])
 
 
 def test_the_force_of_a_contact_is_the_one_on_the_robot():

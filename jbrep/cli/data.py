@@ -101,7 +101,8 @@ def collect(
         seed=seed,
         store_state=store_state,
     )
-    settings = replace(settings, shard_episodes=shard_episodes or usual_shard_episodes(settings))
+    shard_episodes = shard_episodes or usual_shard_episodes(settings, out)
+    settings = replace(settings, shard_episodes=shard_episodes)
     with stoppable(RESUMES):
         _report(out, run(settings, out, lanes, threads, backend))
 
@@ -214,6 +215,7 @@ def derive(data: Path, task: str, store_state: bool, threads: int | None, out: P
 
 @data.command(epilog=example("jbrep data export data/face --to parquet --out face.parquet"))
 @_data
+@import_option
 @click.option("--to", required=True, help="minari, parquet or npz.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A new file or folder.")
 def export(data: Path, to: str, out: Path) -> None:

@@ -35,7 +35,7 @@ def _in_processes(settings: Settings, workers: int) -> Produce:
         if not missing.wants(first + 1):  # one shard alone
             yield from shards_in_turn(settings, 1, 1)(first, missing, tick)
             return
-        made: dict[int, Columns] = {}
+        made: dict[int, Columns | str] = {}
         started, attempts = first, dict[int, int]()
         with Pool[int, Columns | str](make_shard, workers, lambda: None) as pool:
 
@@ -48,8 +48,6 @@ def _in_processes(settings: Settings, workers: int) -> Produce:
                         submit(started)
                         started += 1
                     number, columns = pool.result()
-                    if isinstance(columns, str):
-                        raise InputError(columns)
                     if columns is not None:
                         made[number] = columns
                         continue
@@ -60,7 +58,7 @@ def _in_processes(settings: Settings, workers: int) -> Produce:
                             "because memory ran out: try fewer --threads"
                         )
                     submit(number)
-                yield made.pop(shard)
+                yield _columns(made.pop(shard))
 
     return produce
 
@@ -75,6 +73,13 @@ def make_shard(
         return simulate_shard(settings, policy, shard, _stop_on_request, 1, 1, rows)
     except InputError as error:
         return str(error)
+
+
+def _columns(result: Columns | str) -> Columns:
+    """What `make_shard` returned; its error only once the shard is needed."""
+    if isinstance(result, str):
+        raise InputError(result)
+    return result
 
 
 def _stop_on_request(steps: int) -> None:
@@ -102,10 +107,7 @@ def on_ray(settings: Settings, lanes: int, num_threads: int | None) -> Produce:
                 while started == shard or (started < ahead and missing.wants(started)):
                     made[started] = make.remote(imported_modules(), settings, started, missing.rows)
                     started += 1
-                columns = ray.get(made.pop(shard))
-                if isinstance(columns, str):
-                    raise InputError(columns)
-                yield columns
+                yield _columns(ray.get(made.pop(shard)))
         except ray.exceptions.RayError as error:
             reason = str(error).strip().partition("\n")[0]
             raise InputError(f"the cluster could not make shard {shard}: {reason}") from error

@@ -30,7 +30,7 @@ from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Recording, Tick, read_nothing, read_states, record
 from jbrep.errors import InputError, differences
 from jbrep.files.lock import exclusive
-from jbrep.files.storage import check_space, make_folder
+from jbrep.files.storage import check_space, exists, make_folder
 from jbrep.progress import Progress
 
 LANES = 100  # of a batch
@@ -206,17 +206,26 @@ def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
 
 
 def _flat(settings: Settings) -> dict[str, Any]:
-    """The settings with those of the environment beside them; equal names mean equal features."""
-    task = {n: v for n, v in settings.task.as_json().items() if n not in ("id", "name")}
+    """The settings with those of the environment beside them; equal names mean equal features.
+
+    Whether it terminates is left out: it is what was seen of some episodes.
+    """
+    others = ("id", "name", "terminates")
+    task = {n: v for n, v in settings.task.as_json().items() if n not in others}
     return {n: v for n, v in settings.as_json().items() if n != "environment"} | task
 
 
-def usual_shard_episodes(settings: Settings) -> int:
+def usual_shard_episodes(settings: Settings, folder: Path) -> int:
     """Episodes in a shard of the usual size, judging by the data set's first few.
 
     A batch's shards have 100,000 steps, each with all threads; other environments' 20,000, since
-    they are made side by side.
+    they are made side by side. A data set that is there already keeps its own number.
+
+    Raises:
+        InputError: the manifest in the folder can't be read.
     """
+    if exists(folder / MANIFEST):
+        return read_manifest(folder).settings.shard_episodes
     task = settings.task
     length = float(task.max_episode_steps)
     if task.terminates is not False:

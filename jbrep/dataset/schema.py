@@ -18,6 +18,10 @@ EPISODES = "episodes/"  # the HDF5 group of the columns with one row for each ep
 
 MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
 _EPISODE_BITS = {63: 32, 31: 20}  # of a seed, for the number of the episode
+_COLUMNS = {  # of every data set
+    *("observation", "action", "reward", "episode", "step"),
+    *("seed", "length", "return", "terminated", "truncated", "diverged"),
+}
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,17 @@ def episode_specs(task: Task, store_state: bool, version: int = FORMAT_VERSION) 
     if store_state:
         specs |= {f"final_{name}": _spec("<f8", width) for name, width in task.state.items()}
     return {EPISODES + name: spec for name, spec in specs.items()}
+
+
+def check_names(task: Task) -> None:
+    """Make sure that no array of the task's states would be stored in the place of a column.
+
+    Raises:
+        InputError: one has the name of a column.
+    """
+    for name in task.arrays:
+        if name in _COLUMNS or name.startswith(("initial_", "final_")):
+            raise InputError(f"{task.name} has an array {name!r}: data sets have such a column")
 
 
 def all_specs(task: Task, store_state: bool, version: int = FORMAT_VERSION) -> dict[str, Spec]:

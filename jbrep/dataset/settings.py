@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from jbrep.dataset.schema import MAX_ROOT_SEED, step_specs
+from jbrep.dataset.schema import MAX_ROOT_SEED, check_names, episode_seed, step_specs
 from jbrep.envs.task import Task, as_task
 from jbrep.errors import InputError
 
@@ -25,7 +25,8 @@ class Settings:
     """What determines the data, and how they are divided into shards.
 
     Raises:
-        InputError: an unknown task, a number out of range, or a value of the wrong type.
+        InputError: an unknown task, or one whose arrays have the names of other columns; a number
+            out of range, or a value of the wrong type.
     """
 
     task: Task  # or the name of one, which is described then
@@ -39,6 +40,8 @@ class Settings:
         object.__setattr__(self, "task", as_task(self.task))
         for name in _LIMITS:
             object.__setattr__(self, name, _checked_number(name, getattr(self, name)))
+        check_names(self.task)
+        episode_seed(self.task, self.seed, 0)  # may be too large
         if not isinstance(self.store_state, bool):
             raise InputError(f"store_state is {self.store_state!r}: it must be true or false")
         if self.store_state and not self.task.state:

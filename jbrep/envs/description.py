@@ -84,8 +84,8 @@ def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | N
             id=find_spec(env_id).id,
             name=find_spec(env_id).id,
             features=tuple(_features(env_id, env.observation_space)),
-            action_low=tuple(np.ravel(action.low).astype(float).tolist()),
-            action_high=tuple(np.ravel(action.high).astype(float).tolist()),
+            action_low=tuple((-_below(-action.low)).tolist()),
+            action_high=tuple(_below(action.high).tolist()),
             max_episode_steps=limit,
             arguments=dict(arguments),
             timestep=float(timestep) if _is_positive(timestep) else None,
@@ -110,6 +110,14 @@ def _checked_action(env_id: str, space: spaces.Space[Any]) -> spaces.Box:
             "gymnasium.wrappers.RescaleAction, so that they have finite ones"
         )
     return space
+
+
+def _below(bound: NDArray[Any]) -> NDArray[np.float64]:
+    """The largest numbers up to the bounds that 32 bits can hold, as actions have them, flat."""
+    single = np.ravel(bound).astype(np.float32)
+    return np.where(
+        single > np.ravel(bound), np.nextafter(single, np.float32(-np.inf)), single
+    ).astype(np.float64)
 
 
 def _features(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
@@ -236,13 +244,15 @@ def _with_features(task: Task, path: Path) -> Task:
         return type(task)(**{f: getattr(changed, f) for f in Task.__dataclass_fields__})
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{path} can't be used for {task.name}: {one_line(error)}") from None
 
 
 def _known(row: Any, names: tuple[str, ...]) -> dict[str, Any]:
     """The entries of a table, all of which must be known."""
-    if not isinstance(row, dict) or (unknown := set(row) - set(names)):
+    if not isinstance(row, dict):
+        raise ValueError(f"{row!r} must be a table")
+    if unknown := set(row) - set(names):
         raise ValueError(f"unknown {min(unknown)!r}: it must be one of {', '.join(names)}")
     kinds = {name: (str,) if name in ("name", "unit", "group") else (int, float) for name in names}
     for name, value in row.items():
@@ -250,4 +260,6 @@ def _known(row: Any, names: tuple[str, ...]) -> dict[str, Any]:
             raise ValueError(
                 f"{name} is {value!r}: it must be {'text' if str in kinds[name] else 'a number'}"
             )
+        if not isinstance(value, str) and not math.isfinite(value):
+            raise ValueError(f"{name} is {value!r}: it must be a finite number")
     return {name: value if isinstance(value, str) else float(value) for name, value in row.items()}

@@ -1,5 +1,6 @@
 """What a task is, as plain data: data sets, encoders and runs carry it, and need no environment."""
 
+import json
 import math
 import re
 from collections.abc import Mapping
@@ -21,7 +22,8 @@ SEED_BITS = (63, 31)  # that an environment may take
 _MAX_FEATURES = 4096
 _MAX_ACTIONS = 1024
 _WORD = re.compile(r"[A-Za-z][\w.-]{0,99}", re.ASCII)
-_ID = re.compile(r"[\w./-]{1,200}", re.ASCII)
+_ID = re.compile(r"(\w[\w-]{0,99}/)?\w[\w.-]{0,99}", re.ASCII)  # no part of a path leads upwards
+_MAX_UNIT = 40  # letters
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ class Task:
     def __post_init__(self) -> None:
         for name, what in (("id", self.id), ("name", self.name)):
             if not _ID.fullmatch(what):
-                raise ValueError(f"its {name} is {what!r}: letters, digits and ./_- are allowed")
+                raise ValueError(f"its {name} is {what!r}: it must be as in Namespace/Name-v0")
         if not 1 <= self.max_episode_steps <= MAX_EPISODE_STEPS:
             raise ValueError(
                 f"the number of steps in an episode is {self.max_episode_steps}: it must be at "
@@ -94,7 +96,14 @@ class Task:
             )
         if self.seed_bits not in SEED_BITS or not (self.draws is None or 0 <= self.draws < 1 << 32):
             raise ValueError("its seeds or draws are out of range")
+        if self.timestep is not None and self.timestep <= 0:
+            raise ValueError(f"the time step is {self.timestep:g}: it must be above 0")
+        try:
+            json.dumps(self.arguments, allow_nan=False)
+        except (TypeError, ValueError, RecursionError):
+            raise ValueError("its arguments must be plain JSON, all numbers finite") from None
         self._check_features()
+        self._check_ranges()
         self._check_actions()
 
     def _check_features(self) -> None:
@@ -105,11 +114,24 @@ class Task:
         for word in (*self.feature_names, *self.groups, *self.arrays):
             if not _WORD.fullmatch(word):
                 raise ValueError(f"the name {word!r} must be a letter, then letters, digits or ._-")
+        if self.state.keys() & self.constants.keys():
+            raise ValueError("the arrays that move and those that don't must have different names")
         if any(not 1 <= width <= _MAX_FEATURES for width in self.arrays.values()):
             raise ValueError(f"an array of its states must have 1 to {_MAX_FEATURES:,} numbers")
 
+    def _check_ranges(self) -> None:
+        for feature in self.features:
+            if len(feature.unit) > _MAX_UNIT or not feature.unit.isprintable():
+                raise ValueError(f"the unit of {feature.name} must be a word")
+        ranges = [(feature.name, feature.low, feature.high) for feature in self.features]
+        for name, low, high in (*ranges, ("a reward", self.reward_low, self.reward_high)):
+            if low is not None and high is not None and low > high:
+                raise ValueError(f"the range of {name} is from {low:g} to {high:g}: swap them")
+
     def _check_actions(self) -> None:
-        bounds = list(zip(self.action_low, self.action_high, strict=True))
+        bounds = list(zip(self.action_low, self.action_high, strict=False))
+        if len(self.action_low) != len(self.action_high):
+            raise ValueError("its actions must have as many lower bounds as upper ones")
         if not 1 <= len(bounds) <= _MAX_ACTIONS or not all(
             math.isfinite(low) and math.isfinite(high) and low < high for low, high in bounds
         ):

@@ -1,7 +1,7 @@
 """JSON values checked against type hints and turned into them."""
 
 import json
-import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -125,7 +125,10 @@ _SCALARS = {str: "text", int: "a whole number", float: "a number", bool: "true o
 
 def _scalar(value: Any, kind: Any, where: str) -> Any:
     if kind is Any:
-        return _clean(value)
+        try:
+            return _clean(value)
+        except RecursionError:
+            _need(False, where, "nested less deeply")
     if get_origin(kind) is Literal:
         choices = get_args(kind)
         _need(value in choices, where, f"one of {', '.join(choices)}")
@@ -134,7 +137,7 @@ def _scalar(value: Any, kind: Any, where: str) -> Any:
         _need(value is None, where, "null")
         return value
     if kind is float:
-        _need(type(value) in (int, float) and math.isfinite(value), where, "a number")
+        _need(type(value) in (int, float) and abs(value) <= sys.float_info.max, where, "a number")
         return float(value)
     _need(type(value) is kind, where, _SCALARS[kind])
     return _text(value) if kind is str else value

@@ -121,7 +121,8 @@ class Robot:
             else:
                 columns.append(rr.Transform3D.columns(translation=place, quaternion=turned))
             path = f"{root}/{self.names[body]}"
-            recording.send(path, *static)
+            if static:
+                recording.send(path, *static)
             if columns:
                 recording.send_columns(path, times, *columns)
 

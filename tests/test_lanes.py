@@ -1,0 +1,233 @@
+"""Lanes over any environment: resets, ends, snapshots, and environments that fail."""
+
+import environments
+import gymnasium
+import numpy as np
+import pytest
+
+from jbrep.envs import Lanes, describe
+from jbrep.envs.checks import NonFiniteActionError
+from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.envs.recording import open_loop, play, read_states, record
+from jbrep.errors import InputError
+
+TASKS = {
+    name: describe(name, max_episode_steps=30)
+    for name in ("face_direction", "Pendulum-v1", "Hopper-v5", "Sledges/Told-v0")
+}
+SLEDGE = describe("Sledges/Sledge-v0")
+BROKEN = {"raises": "RuntimeError: the rail broke$", "size": "an observation of 3 numbers instead"}
+NOT_FINITE = "gave an observation or reward that is not finite, at step 4 of the episode"
+each_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+
+
+def actions_of(task, seeds, steps):
+    """Actions (T, n, k), each lane's from its own seed."""
+    shape = (steps, task.action_size)
+    drawn = [
+        np.random.default_rng([seed, 1]).uniform(task.action_low, task.action_high, shape)
+        for seed in seeds
+    ]
+    return np.stack(drawn, axis=1).astype(np.float32)
+
+
+def played(task, seeds, lanes=None, steps=40):
+    """What so many lanes go through with these seeds."""
+    lanes = lanes or Lanes(task, len(seeds), 1)
+    lanes.reset(range(len(seeds)), seeds)
+    return record(lanes, open_loop(actions_of(task, seeds, steps)), lambda made: None, read_states)
+
+
+def assert_same_episode(one, i, other, j):
+    """Equal up to the end of the episode, bit for bit."""
+    length = one.length[i]
+    assert (length, one.terminated[i], one.truncated[i]) == (
+        *(other.length[j], other.terminated[j]),
+        other.truncated[j],
+    )
+    for name in ("observation", "reward"):
+        steps = length + (name == "observation")
+        mine, theirs = getattr(one, name)[:steps, i], getattr(other, name)[:steps, j]
+        np.testing.assert_array_equal(mine, theirs)
+    for name, values in one.arrays.items():
+        np.testing.assert_array_equal(values[: length + 1, i], other.arrays[name][: length + 1, j])
+    for name, values in one.start.items():
+        np.testing.assert_array_equal(values[i], other.start[name][j])
+
+
+@each_task
+def test_a_lane_s_episode_depends_on_its_seed_and_actions_alone(task):
+    """Neither on the lanes beside it, nor on the episodes before it."""
+    many = played(task, [5, 6, 7, 8])
+    for lane, seed in enumerate([5, 6, 7, 8]):
+        assert_same_episode(many, lane, played(task, [seed]), 0)
+    used = Lanes(task, 2, 1)
+    played(task, [1, 2], used)
+    assert_same_episode(many, 2, played(task, [9, 7], used), 1)
+
+
+@each_task
+def test_a_lane_is_the_environment_that_gymnasium_makes(task):
+    recording = played(task, [3])
+    environment = gymnasium.make(task.id, max_episode_steps=30)
+    observation, _ = environment.reset(seed=3)
+    actions = actions_of(task, [3], 40)[:, 0]
+    for step in range(recording.length[0]):
+        np.testing.assert_array_equal(recording.observation[step, 0], np.float32(observation))
+        observation, reward, terminated, truncated, _ = environment.step(actions[step])
+        assert recording.reward[step, 0] == np.float32(reward)
+    assert (terminated, truncated) == (recording.terminated[0], recording.truncated[0])
+
+
+def test_one_episode_is_the_same_with_any_number_of_threads():
+    task = TASKS["face_direction"]
+    recordings = [played(task, [1, 2, 3], Lanes(task, 3, threads)) for threads in (1, 3)]
+    for lane in range(3):
+        assert_same_episode(recordings[0], lane, recordings[1], lane)
+
+
+@each_task
+def test_chosen_lanes_are_reset_and_the_others_go_on(task):
+    lanes, undisturbed = Lanes(task, 3, 1), Lanes(task, 3, 1)
+    for each in (lanes, undisturbed):
+        each.reset([0, 1, 2], [4, 5, 6])
+    actions = actions_of(task, [4, 5, 6], 8)
+    for step, action in enumerate(actions):
+        if step == 4:
+            observation = lanes.reset([1], [9])
+            np.testing.assert_array_equal(observation[[0, 2]], undisturbed.observation[[0, 2]])
+            assert (observation[1] != undisturbed.observation[1]).any()
+        new, old = lanes.step(action), undisturbed.step(action)
+        for one, other in zip(new[:4], old[:4], strict=True):
+            np.testing.assert_array_equal(one[[0, 2]], other[[0, 2]])
+    alone = Lanes(task, 1, 1)
+    alone.reset([0], [9])
+    for action in actions[4:]:
+        alone.step(action[1:2])
+    np.testing.assert_array_equal(alone.observation[0], lanes.observation[1])
+
+
+def test_terminated_and_truncated_are_told_apart():
+    hopper, pendulum = played(TASKS["Hopper-v5"], range(6)), played(TASKS["Pendulum-v1"], [1, 2])
+    early = hopper.length < 30
+    assert early.any()
+    np.testing.assert_array_equal(hopper.terminated[early], True)
+    np.testing.assert_array_equal(hopper.truncated[early], False)
+    np.testing.assert_array_equal(pendulum.length, 30)
+    assert not pendulum.terminated.any()
+    assert pendulum.truncated.all()
+    both = played(describe("Sledges/Exact-v0"), [1])
+    assert (both.length[0], both.terminated[0], both.truncated[0]) == (7, True, True)
+
+
+def test_a_lane_that_has_ended_stands_still():
+    lanes = Lanes(SLEDGE, 4)
+    seeds = [0, 1, 2, 3]
+    lanes.reset(range(4), seeds)
+    last, ended_at = lanes.observation.copy(), {}
+    for step, each in enumerate(play(lanes, open_loop(actions_of(SLEDGE, seeds, 40)))):
+        before = ~each.active
+        np.testing.assert_array_equal(each.step.observation[before], last[before])
+        assert not each.step.reward[before].any()
+        np.testing.assert_array_equal(each.step.terminated[before], True)
+        assert lanes.num_active == (~lanes.ended).sum()
+        for lane in np.flatnonzero(lanes.ended):
+            ended_at.setdefault(lane, step)
+        last = each.step.observation.copy()
+    assert len(set(ended_at.values())) > 1
+    np.testing.assert_array_equal(lanes.reset([0], [0])[1:], last[1:])
+    assert lanes.ended.tolist() == [False, True, True, True]
+
+
+@each_task
+@pytest.mark.parametrize("fresh", [False, True], ids=["used", "fresh"])
+def test_a_state_is_continued_to_the_same_bits(fresh, task):
+    """With lanes at different steps of their episodes, one of them ended."""
+    lanes = Lanes(task, 4, 1)
+    lanes.reset(range(4), [1, 2, 3, 4])
+    actions = actions_of(task, [1, 2, 3, 4], 60)
+    for step, action in enumerate(actions[:35]):
+        if step in (20, 31):  # the time limit of all lanes is at 30
+            lanes.reset([step // 10 - 2], [step])
+        lanes.step(action)
+    assert lanes.ended.any()
+    assert not lanes.ended.all()
+    state = lanes.state
+    kept = {name: values.copy() for name, values in state.items()}
+    ends = lanes.terminated.copy(), lanes.truncated.copy()
+    expected = [lanes.step(action) for action in actions[35:45]]
+    other = Lanes(task, 4, 2) if fresh else lanes
+    other.restore(state)
+    np.testing.assert_array_equal(other.terminated, ends[0])
+    np.testing.assert_array_equal(other.truncated, ends[1])
+    np.testing.assert_array_equal(other.observation, kept["observation"])
+    for action, before in zip(actions[35:45], expected, strict=True):
+        for one, again in zip(before[:4], other.step(action)[:4], strict=True):
+            np.testing.assert_array_equal(one, again)
+    for name, values in kept.items():
+        np.testing.assert_array_equal(state[name], values)
+
+
+@pytest.mark.parametrize("name", ["Moody", "Worn"])
+def test_a_state_of_what_is_not_reproducible_is_not_passed_off_as_the_same(name):
+    task = describe(f"Sledges/{name}-v0")
+    lanes = Lanes(task, 2)
+    lanes.reset([0, 1], [1, 2])
+    lanes.step(actions_of(task, [1, 2], 1)[0])
+    with pytest.raises(InputError, match=f"Sledges/{name}-v0 is not reproducible here"):
+        lanes.restore(lanes.state)
+
+
+@pytest.mark.parametrize("how", ["raises", "size", "nan", "reward"])
+def test_an_environment_that_fails_is_named_with_its_seed_and_step(how):
+    task = describe("Sledges/Broken-v0", {"how": how, "seed": 12})
+    lanes = Lanes(task, 3)
+    lanes.reset(range(3), [11, 12, 13])
+    actions = actions_of(task, [11, 12, 13], 4)
+    for action in actions[:3]:
+        lanes.step(action)
+    with pytest.raises(EnvironmentFailedError, match=BROKEN.get(how, NOT_FINITE)) as failure:
+        lanes.step(actions[3])
+    assert "Sledges/Broken-v0" in str(failure.value)
+    assert "at step 4 of the episode with seed 12" in str(failure.value)
+    assert "\n" not in str(failure.value)
+
+
+def test_actions_have_as_many_numbers_as_the_task_s():
+    lanes = Lanes(SLEDGE, 2)
+    lanes.reset([0, 1], [0, 1])
+    for wrong in (np.zeros((2, 1)), np.zeros(3), np.zeros((3, 3))):
+        with pytest.raises(InputError, match=r"it must be \(2, 3\), one action for each lane"):
+            lanes.step(wrong)
+    with pytest.raises(NonFiniteActionError):
+        lanes.step(np.full((2, 3), np.nan))
+    with pytest.raises(InputError, match="the number of lanes is 0"):
+        Lanes(SLEDGE, 0)
+
+
+def test_a_vector_entry_point_of_another_kind_is_not_used():
+    """The sledge's raises an error; such ones usually reset a lane at its next step."""
+    assert gymnasium.spec(SLEDGE.id).vector_entry_point is environments.refuse
+    assert len(Lanes(SLEDGE, 2).envs) == 2
+
+
+def test_actions_are_stepped_as_they_are_stored():
+    """In 32 bits, within bounds that have 64."""
+    task = describe("Sledges/Exact-v0")
+    lanes = Lanes(task, 2)
+    lanes.reset([0, 1], [0, 1])
+    for action in ([task.action_low, task.action_high], [[0.2], [0.29]]):
+        observation = lanes.step(np.array(action)).observation
+        np.testing.assert_array_equal(observation[:, 0], np.float32(action)[:, 0])
+        np.testing.assert_array_equal(observation[:, 1], 0)
+
+
+def test_what_was_given_before_doesn_t_change():
+    lanes = Lanes(SLEDGE, 2)
+    first = lanes.reset([0, 1], [0, 1])
+    kept = first.copy()
+    step = lanes.step(np.zeros((2, 3)) + 0.2)
+    later = step.observation.copy()
+    lanes.step(np.zeros((2, 3)) + 0.2)
+    np.testing.assert_array_equal(first, kept)
+    np.testing.assert_array_equal(step.observation, later)

@@ -1,0 +1,356 @@
+"""Tasks: what is found out of an environment, what is refused, and what a stranger may write."""
+
+import json
+from dataclasses import replace
+
+import environments
+import gymnasium
+import numpy as np
+import pytest
+from command import jbrep
+
+from jbrep.dataset.schema import episode_seed
+from jbrep.envs import Feature, Lanes, Task, describe
+from jbrep.envs.names import import_modules, imported_modules, name_given
+from jbrep.envs.recording import episode_returns
+from jbrep.envs.task import check_same, read_task
+from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import TASKS, get_task
+
+SLEDGE = "Sledges/Sledge-v0"
+PLAIN = Task(
+    id="Arms/Reach-v0",
+    name="Arms/Reach-v0",
+    features=(Feature("x", "m", -1, 1, True, "place"), Feature("y", "m", group="place")),
+    action_low=(-1.0, 0.0),
+    action_high=(1.0, 2.5),
+    max_episode_steps=50,
+    arguments={"gain": 2, "path": ["a", None]},
+    reward_low=-2.0,
+    state={"angle": 2},
+    constants={"goal": 3},
+)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_jitterbug_s_tasks_are_described_without_making_them(name, monkeypatch):
+    monkeypatch.setattr(gymnasium, "make", None)
+    task = describe(name, max_episode_steps=7)
+    assert task == get_task(name).describe({}, 7)
+    assert task == replace(describe(task.id), max_episode_steps=7, solved_return=0.9 * 7)
+    assert (task.name, task.slug, task.timestep) == (name, name, 0.01)
+    assert gymnasium.spec(task.id).max_episode_steps == describe(name).max_episode_steps
+    assert gymnasium.spec(task.id).reward_threshold == describe(name).solved_return
+
+
+def test_an_environment_of_gymnasium():
+    hopper = describe("Hopper-v5")
+    assert (hopper.name, hopper.slug, hopper.size) == ("Hopper-v5", "Hopper-v5", 11)
+    assert hopper.feature_names == tuple(f"obs_{i}" for i in range(11))
+    assert (hopper.action_low, hopper.action_high) == ((-1.0,) * 3, (1.0,) * 3)
+    assert (hopper.max_episode_steps, hopper.timestep) == (1000, 0.008)
+    assert (hopper.terminates, hopper.reproducible, hopper.seed_bits) == (True, True, 63)
+    pendulum = describe("Pendulum-v1")
+    assert [(f.low, f.high) for f in pendulum.features] == [(-1, 1), (-1, 1), (-8, 8)]
+    assert (pendulum.action_low, pendulum.action_high) == ((-2.0,), (2.0,))
+    assert (pendulum.terminates, pendulum.timestep) == (None, 0.05)
+
+
+def test_one_of_the_dm_control_suite():
+    """It keeps its time limit for itself, and takes seeds of 32 bits only."""
+    pytest.importorskip("shimmy")
+    task = describe("dm_control/cartpole-swingup-v0")
+    assert gymnasium.spec(task.id).max_episode_steps is None
+    assert (task.max_episode_steps, task.seed_bits) == (1000, 31)
+    assert task.slug == "dm_control-cartpole-swingup-v0"
+    assert task.groups == {"position": slice(0, 3), "velocity": slice(3, 5)}
+    assert task.feature_names[2:4] == ("position_2", "velocity_0")
+    lanes = Lanes(replace(task, max_episode_steps=3), 1)
+    lanes.reset([0], [episode_seed(task, 2046, 0)])
+    most = r"seeds of 31 bits: .* be at most 2,046, with at most 1,048,576 episodes"
+    with pytest.raises(InputError, match=most):
+        episode_seed(task, 2047, 0)
+    with pytest.raises(InputError, match="takes seeds of 31 bits"):
+        episode_seed(task, 0, 1 << 20)
+    few = {episode_seed(task, root, n) for root in (0, 1, 2046) for n in (0, 1, 2**20 - 1)}
+    assert len(few) == 9
+    assert max(few) < 2**31
+
+
+def test_an_environment_of_another_package():
+    task = describe(SLEDGE)
+    assert task.features[0] == Feature("obs_0", group="obs")
+    assert task.action_low == (-1.0, 0.0, -2.0)
+    assert task.action_high == (1.0, 10.0, 0.5)
+    assert (task.timestep, task.solved_return, task.terminates) == (0.05, -3.0, True)
+    assert (task.slug, task.return_floor) == ("Sledges-Sledge-v0", None)
+    assert describe("Sledges/Endless-v0", max_episode_steps=30).max_episode_steps == 30
+
+
+def test_a_dictionary_s_keys_name_the_features_in_the_order_of_flattening():
+    task = describe("Sledges/Nested-v0")
+    assert task.feature_names == (
+        *("odd_key__0", "odd_key__1", "signs.part0_0", "signs.part0_1"),
+        *("signs.part1_0", "signs.part1_1", "signs.part1_2", "sledge.place", "sledge.speed"),
+    )
+    assert list(task.groups) == [
+        *("odd_key_", "signs.part0", "signs.part1", "sledge.place", "sledge.speed")
+    ]
+    lanes = Lanes(task, 1)
+    lanes.reset([0], [4])
+    environment = gymnasium.make(task.id)
+    observation, _ = environment.reset(seed=4)
+    flat = gymnasium.spaces.flatten(environment.observation_space, observation)
+    np.testing.assert_array_equal(lanes.observation[0], flat)
+    assert lanes.observation[0, 7] == observation["sledge"]["place"]
+    np.testing.assert_array_equal(lanes.observation[0, 4:7], [1, 0, 0])
+
+
+def test_an_environment_may_describe_itself():
+    task = describe("Sledges/Told-v0", {"rail": 2.0}, 9)
+    assert task == environments.Told.describe({"rail": 2.0}, 9)
+    assert task.arrays == {"heat": 1, "colour": 3}
+
+
+@pytest.mark.parametrize("name", ["Moody", "Worn"])
+def test_an_environment_that_is_not_reproducible_is_called_so(name):
+    """One that draws on its own, and one whose used instance differs from a fresh one."""
+    assert not describe(f"Sledges/{name}-v0").reproducible
+    assert "no: with the same seed and actions" in jbrep("env", f"Sledges/{name}-v0").output
+
+
+def test_bounds_are_those_that_actions_of_32_bits_can_keep():
+    task = describe("Sledges/Exact-v0")
+    assert 0.1 < task.action_low[0] < 0.1 + 1e-8
+    assert 0.3 - 3e-8 < task.action_high[0] < 0.3
+    assert np.float32(task.action_low[0]) == task.action_low[0]
+
+
+def test_arguments_reach_the_environment():
+    def returns(name, **arguments):
+        task = describe(name, arguments, 15)
+        assert task.arguments == arguments
+        lanes = Lanes(task, 2)
+        middle = np.tile(np.add(task.action_low, task.action_high) / 2, (2, 1))
+        return episode_returns(lanes, lambda observation: middle)
+
+    assert (returns("Pendulum-v1") == returns("Pendulum-v1", g=10.0)).all()
+    assert (returns("Pendulum-v1", g=1.6) != returns("Pendulum-v1")).all()
+    assert (returns(SLEDGE, wind=0.5) != returns(SLEDGE)).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("CartPole-v1", {}, "has actions in Discrete.2.: only continuous ones are possible"),
+        ("Sledges/Free-v0", {}, "has actions without bounds"),
+        ("Sledges/Filmed-v0", {}, "has images as observations"),
+        ("Sledges/Endless-v0", {}, "has no time limit: give one with --episode-steps"),
+        ("Pendulum", {}, "unknown task 'Pendulum'|Pendulum-v1"),
+        ("Pendulum-v9", {}, "Pendulum-v9"),
+        ("face_directoin", {}, "unknown task 'face_directoin': did you mean face_direction"),
+        ("environments:Sledges/Sledge-v0", {}, "names a module: importing it runs its code"),
+        ("Pendulum-v1", {"weight": 3}, "can't make Pendulum-v1 with {'weight': 3}: .*weight"),
+        ("Pendulum-v1", {"g": float("nan")}, "arguments must be plain JSON, all numbers finite"),
+        ("face_direction", {"scaled": True}, "has no argument scaled"),
+    ],
+)
+def test_what_can_t_be_a_task_is_said_in_one_line(name, arguments, message):
+    with pytest.raises(InputError, match=message) as refusal:
+        describe(name, arguments)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("steps", [0, -1, 1_000_001])
+def test_a_time_limit_out_of_range_is_refused(steps):
+    for name in ("face_direction", "Pendulum-v1"):
+        with pytest.raises(InputError, match=f"in an episode is {steps}: it must be at least 1"):
+            describe(name, max_episode_steps=steps)
+
+
+def test_modules_are_imported_for_a_command_line_only(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    (tmp_path / "sledges_too.py").write_text("import environments")
+    (tmp_path / "broken_package.py").write_text("1 / 0")
+    assert name_given(SLEDGE) == SLEDGE
+    assert imported_modules() == ()
+    assert name_given(f"sledges_too:{SLEDGE}") == SLEDGE
+    import_modules(["sledges_too"])
+    assert imported_modules() == ("sledges_too",)
+    for module, reason in (("none", "No module named 'none'"), ("broken_package", "division by")):
+        with pytest.raises(InputError, match=f"can't import {module}: .*{reason}"):
+            name_given(f"{module}:Some-v0")
+
+
+def test_a_task_as_json_is_read_again():
+    for task in (PLAIN, describe("move_to_pose"), describe("Hopper-v5"), describe(SLEDGE)):
+        text = json.dumps(task.as_json(), allow_nan=False)
+        assert read_task(json.loads(text)) == task
+        assert read_task(json.loads(text)).as_json() == task.as_json()
+
+
+FORGERIES = {
+    "id": ["", "..", "../up", "/etc/passwd", "a/b/c", "a//b", "os:system", "a\n", "x" * 300, 3],
+    "name": ["..", ".hidden", "a/../b", "\x1b[2J", None],
+    "features": [[], "x", [["x"]], [["x", "", None, None, False, "", 1]], 5000 * [["x"]], None],
+    "action_low": [[], [0.0], [-1, 2.5], [-1, None], ["-1", 0], [float("nan"), 0], [-1e999, 0]],
+    "max_episode_steps": [0, -1, 1_000_001, 10**400, 1.5, "50", True, None],
+    "arguments": [[], "x", {"g": float("inf")}, {"g": float("nan")}, None],
+    "timestep": [0, -0.1, float("inf"), "1", 10**400],
+    "reward_low": ["0", float("nan"), [0]],
+    "reward_high": [-3, -1e999],
+    "solved_return": ["many", float("inf")],
+    "terminates": ["yes", 1],
+    "reproducible": [None, "yes"],
+    "seed_bits": [64, 32, "63", None],
+    "draws": [-1, 1 << 32, 0.5],
+    "state": [{"../x": 1}, {"x\0": 1}, {"x": 0}, {"x": 10**9}, {"x": "1"}, {"goal": 3}, [1]],
+    "constants": [{"": 1}, {"x": -1}, None],
+}
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [(field, value) for field, values in FORGERIES.items() for value in values]
+)
+def test_a_forged_task_is_refused(field, value):
+    with pytest.raises(ValueError, match=r"it|must|name|action|range|arguments|seeds|unit"):
+        read_task({**PLAIN.as_json(), field: value})
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (0, "y"),  # twice
+        (0, "../x"),
+        (0, "\x1b[2J"),
+        (0, 3),
+        (1, "m\n"),
+        (1, "\x1b[2J"),
+        (1, "m" * 99),
+        (2, 2),  # above its upper end
+        (2, float("nan")),
+        (3, "1"),
+        (4, 1),
+        (0, 10**400),
+        (3, 10**400),
+        (5, "up/here"),
+    ],
+)
+def test_a_forged_feature_is_refused(place, value):
+    record = PLAIN.as_json()
+    record["features"][0][place] = value
+    with pytest.raises(ValueError, match=r"feature|name|unit|range"):
+        read_task(record)
+
+
+def test_features_of_a_group_stand_together():
+    features = (Feature("x", group="a"), Feature("y", group="b"), Feature("z", group="a"))
+    with pytest.raises(ValueError, match="features of a group must stand side by side"):
+        replace(PLAIN, features=features)
+
+
+def test_arguments_may_not_be_endless():
+    record = PLAIN.as_json()
+    for _ in range(5000):
+        record["arguments"] = {"more": record["arguments"]}
+    with pytest.raises(ValueError, match=r"arguments.* must be nested less deeply"):
+        read_task(record)
+
+
+def test_what_was_made_for_another_task_is_refused():
+    check_same(PLAIN, replace(PLAIN, arguments={"gain": 3}), "the encoder")
+    with pytest.raises(InputError, match="the encoder was made for Arms/Fetch-v0, not for Arms/R"):
+        check_same(PLAIN, replace(PLAIN, id="Arms/Fetch-v0", name="Arms/Fetch-v0"), "the encoder")
+    others = (Feature("x"), Feature("z"))
+    with pytest.raises(InputError, match="was made for other features of Arms/Reach-v0"):
+        check_same(PLAIN, replace(PLAIN, features=others), "the encoder")
+
+
+def test_scaling_is_by_the_ranges_that_are_known():
+    task = replace(PLAIN, features=(Feature("x", low=0, high=4), Feature("y"), Feature("z", low=1)))
+    values = np.array([[4.0, 7.0, 3.0], [0.0, -7.0, 0.0]])
+    np.testing.assert_array_equal(task.scale(values), [[1, 7, 3], [-1, -7, 0]])
+    np.testing.assert_array_equal(task.unscale(task.scale(values)), values)
+    assert PLAIN.return_floor == -100
+    np.testing.assert_array_equal(PLAIN.split(values[:, :2])["place"], values[:, :2])
+
+
+TABLE = """
+timestep = 0.1
+reward_high = 0
+solved_return = -5.0
+
+[[features]]
+name = "place"
+unit = "m"
+low = -1
+high = 1.5
+group = "sledge"
+
+[[features]]
+group = "sledge"
+"""
+
+
+def test_a_file_says_what_features_are(tmp_path):
+    path = tmp_path / "features.toml"
+    path.write_text(TABLE)
+    task = describe(SLEDGE, features=path)
+    assert task.features[0] == Feature("place", "m", -1, 1.5, group="sledge")
+    assert task.features[1] == Feature("obs_1", group="sledge")
+    assert (task.timestep, task.reward_high, task.solved_return) == (0.1, 0, -5)
+    assert task.groups == {"sledge": slice(0, 2)}
+    path.write_text("timestep = 2")
+    assert describe(SLEDGE, features=path) == replace(describe(SLEDGE), timestep=2.0)
+    told = jbrep("env", SLEDGE, "--features", path, "--env", "wind=0.5", "--json").output
+    assert read_task(json.loads(told)).arguments == {"wind": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[[features]]\nname = 'x'", r"a \[\[features\]\] for each of the 2 features"),
+        ("features = 3", r"a \[\[features\]\] for each of the 2 features"),
+        ("features = [1, 2]", "must be a table"),
+        (
+            "[[features]]\nnames = 'x'\n[[features]]",
+            "unknown 'names': it must be one of name, unit",
+        ),
+        ("speed = 1", "unknown 'speed': it must be one of timestep"),
+        ("[[features]]\nname = 3\n[[features]]", "name is 3: it must be text"),
+        ("[[features]]\nlow = '3'\n[[features]]", "low is '3': it must be a number"),
+        ("[[features]]\nlow = nan\n[[features]]", "low is nan: it must be a finite number"),
+        ("[[features]]\nlow = 2\nhigh = 1\n[[features]]", "range of obs_0 is from 2 to 1"),
+        ("[[features]]\nname = 'obs_1'\n[[features]]", "features of different names"),
+        ("[[features]]\nname = 'a b'\n[[features]]", "the name 'a b' must be a letter, then"),
+        ("timestep = -1", "the time step is -1: it must be above 0"),
+        ("timestep = true", "timestep is True: it must be a number"),
+        ("reward_low = 1\nreward_high = 0", "the range of a reward is from 1 to 0"),
+        ("[[features]]\nlow = 1" + 400 * "0" + "\n[[features]]", "too large"),
+        ("timestep = ", "TOML"),
+        ("\xff", "utf-8"),
+    ],
+)
+def test_a_mistaken_file_of_features_is_refused_in_one_line(text, message, tmp_path):
+    path = tmp_path / "features.toml"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=rf"features\.toml can't be used .*{message}") as refusal:
+        describe(SLEDGE, features=path)
+    assert "\n" not in str(refusal.value)
+    with pytest.raises(InputError, match=r"can't read .*none"):
+        describe(SLEDGE, features=tmp_path / "none")
+
+
+def test_a_command_says_what_is_missing(tmp_path):
+    for arguments, message in (
+        (("env", "Pendulum-v1", "--env", "g"), "--env g is no argument"),
+        (("env", "Pendulum-v1", "--env", "g=1", "--env", "g=2"), "a second one: write NAME=VALUE"),
+        (("collect", "--steps", 5, "--out", tmp_path / "x"), "give the --task"),
+        (("env", "Sledges/Endless-v0"), "has no time limit: give one with --episode-steps"),
+    ):
+        told = jbrep(*arguments)
+        assert (told.exit_code, told.output.count("\n")) == (2, 1), told.output
+        assert message in told.output
+    told = jbrep("env", "Sledges/Endless-v0", "--episode-steps", 9).output
+    assert "9 steps of 0.05 s" in told
