@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from jbrep.errors import InputError
 from jbrep.files.typed import typed
+from jbrep.text import slug
 
 Array = NDArray[np.float64]
 _Float = TypeVar("_Float", bound=np.floating[Any])
@@ -140,7 +141,7 @@ class Task:
     @property
     def slug(self) -> str:
         """The name as a part of paths."""
-        return re.sub(r"[^\w.-]+", "-", self.name)
+        return slug(self.name)
 
     @property
     def size(self) -> int:
@@ -218,7 +219,10 @@ def read_task(record: Any) -> Task:
     if not all(isinstance(row, list) and len(row) == len(names) for row in rows):
         raise ValueError(f"each feature must be a list of {len(names)}")
     named = [dict(zip(names, row, strict=True)) for row in rows]
-    task: Task = typed({**record, "features": named}, Task)
+    try:
+        task: Task = typed({**record, "features": named}, Task)
+    except RecursionError:
+        raise ValueError("its arguments are nested too deeply") from None
     return task
 
 

@@ -254,7 +254,8 @@ class JitterbugTask:
             arguments: of the environment.
             max_episode_steps: the time limit; 1,000 if not given.
         """
-        steps, given = max_episode_steps or EPISODE_STEPS, dict(arguments or {})
+        steps = EPISODE_STEPS if max_episode_steps is None else max_episode_steps
+        given = dict(arguments or {})
         body = {"body": 1} if given.get("body") is not None else {}
         return Task(
             id=environment_id(self.name),

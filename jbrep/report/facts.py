@@ -202,9 +202,9 @@ def _toml(study: Mapping[str, Any]) -> str:
     lines, below = [], []
     for name, value in study.items():
         if isinstance(value, Mapping):
-            cells = [
-                f"{key} = {json.dumps(each)}" for key, each in value.items() if each not in ("", 0)
-            ]
+            unset = ("", 0) if name == "data" else ()  # either steps or a folder is given there
+            given = {key: each for key, each in value.items() if each not in unset}
+            cells = [f"{key} = {json.dumps(each)}" for key, each in given.items()]
             below += ["", f"[{name}]", *cells] if cells else []
         elif value is not None:
             lines.append(f"{name} = {json.dumps(value)}")
