@@ -22,6 +22,7 @@ from timing import show, timed
 
 from jbrep import jitterbug
 from jbrep.encoders import find
+from jbrep.envs import describe
 from jbrep.rl import train
 from jbrep.rl.agent import make_agent, make_env
 from jbrep.rl.presets import get_preset
@@ -51,7 +52,7 @@ def agent_on_shimmy() -> BaseAlgorithm:
     preset = get_preset("paper", "ddpg")
     environment = FlattenObservation(DmControlCompatibilityV0(jitterbug.load(TASK, seed=0)))
     network = {"net_arch": list(preset.hidden), "activation_fn": torch.nn.ReLU}
-    noise = {"action_noise": preset.noise.make()}
+    noise = {"action_noise": preset.noise.make(1)}
     settings = {"seed": 0, "device": "cpu", "policy_kwargs": network, **preset.settings, **noise}
     return DDPG("MlpPolicy", environment, **settings).learn(4 * STEPS)
 
@@ -60,7 +61,8 @@ def agent_on_shimmy() -> BaseAlgorithm:
 def agent_on_jbrep() -> BaseAlgorithm:
     torch.set_num_threads(1)
     preset = get_preset("paper", "ddpg")
-    environment = make_env(TASK, preset.num_envs, 0, find("identity", TASK))
+    task = describe(TASK)
+    environment = make_env(task, preset.num_envs, 0, find("identity", task))
     return make_agent("ddpg", preset, environment, 0).learn(4 * STEPS)
 
 

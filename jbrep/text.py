@@ -1,5 +1,6 @@
 """Text for a terminal: numbers, tables and facts that fit its width."""
 
+import math
 import re
 import shutil
 import textwrap
@@ -12,6 +13,13 @@ _GAP = "  "  # between columns
 def terminal_width() -> int:
     """The width of the terminal in characters; without one COLUMNS, or else 80."""
     return shutil.get_terminal_size().columns
+
+
+def rounded(*values: float) -> list[str]:
+    """Numbers to read side by side: whole if one is 100 or more, else with three digits of it."""
+    largest = max(abs(value) for value in values)
+    decimals = 2 - math.floor(math.log10(largest)) if 0 < largest < 100 else 0
+    return [f"{value:,.{min(decimals, 9)}f}" for value in values]
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], width: int | None = None) -> str:

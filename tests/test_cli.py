@@ -135,7 +135,17 @@ def test_every_command_has_help_with_an_example(command):
             "'0' is too small: it must be at least 1. See",
         ),
         (
-            ("collect", "--task", "fly", "--steps", "1", "--policy", "sprint", "--out", "x"),
+            (
+                "collect",
+                "--task",
+                "face_direction",
+                "--steps",
+                "1",
+                "--policy",
+                "sprint",
+                "--out",
+                "x",
+            ),
             "unknown policy 'sprint'",
         ),
         (("rl", "--task", "fly", "--out", "x"), "choose one of move_from_origin"),
@@ -194,9 +204,9 @@ def test_a_data_set_from_collecting_to_exporting(tmp_path):
     assert re.search(r"2,000 rows in \d+ s, [\d,]+ a second", told)
     told = jbrep(*arguments, "--shard-episodes", 1, "--out", data)
     assert (told.exit_code, "complete already: nothing was done" in told.output) == (0, True)
-    assert "2,000 in 2 episodes" in jbrep("data", "info", data).output
+    assert re.search(r"episodes +2 of 1,000 steps\n", jbrep("data", "info", data).output)
     told = jbrep("data", "verify", data, "--replay", 2)
-    assert "no problems in 2,000 rows, 2 of 2 shards" in told.output
+    assert "no problems in 2,000 rows, 2 shards" in told.output
     assert "2 episodes simulated again: equal in every bit" in told.output
     told = jbrep("data", "derive", data, "--task", "move_in_direction", "--out", derived)
     assert "2 episodes of move_in_direction, 2,000 rows" in told.output
@@ -221,7 +231,7 @@ def test_steps_may_be_written_in_many_ways(text, steps):
 def test_a_part_of_an_episode_makes_a_whole_one(tmp_path):
     out = tmp_path / "data"
     result = jbrep("collect", "--task", "move_to_pose", "--steps", "1.1k", "--out", out)
-    assert "1,100 steps are rounded up to 2,000: episodes have 1,000\n2 episodes" in result.output
+    assert "2 episodes of move_to_pose, 2,000 rows" in result.output
 
 
 @pytest.mark.parametrize("text", ["many", "1.5", "k", "1e999", "nan"])

@@ -4,25 +4,32 @@ import json
 import re
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+import rerun as rr
 from command import jbrep, start, wait_for, wait_for_the_end_of
 from rerun.chunk import RrdReader
 
 from jbrep.encoders import find, save
 from jbrep.encoders.file import fingerprint
+from jbrep.envs import describe
+from jbrep.envs.physics import Motion
 from jbrep.errors import InputError
 from jbrep.files import container
 from jbrep.inspection import inspect
+from jbrep.inspection.blueprint import curves_layout
 from jbrep.inspection.ghost import shades
 from jbrep.inspection.latent import principal_components
-from jbrep.inspection.robot import Robot
+from jbrep.inspection.recording import Recording
+from jbrep.inspection.robot import Robot, rotate
 from jbrep.inspection.scene import contacts
+from jbrep.inspection.shapes import own_colours, shapes
+from jbrep.inspection.signals import MOST_LINES, panels
 from jbrep.inspection.traversal import POINTS, SPACING, sweep
-from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl import Run
 from jbrep.rl.agent import make_agent, make_env
 from jbrep.rl.files import (
@@ -36,6 +43,8 @@ from jbrep.rl.files import (
     write_run,
 )
 from jbrep.rl.presets import Preset
+from jbrep.rollouts import jitterbug
+from jbrep.rollouts.jitterbug import reward_terms
 from jbrep.rollouts.sources import find_episode
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
@@ -75,8 +84,8 @@ def poses(entity):
 
 
 @pytest.fixture(scope="module")
-def robot():
-    return Robot()
+def robot(rollout):
+    return Robot(rollout.motion.model)
 
 
 @pytest.fixture(scope="module")
@@ -112,54 +121,44 @@ def traversed(folder):
 
 def test_every_body_and_geom_of_the_model_is_there(entities, robot):
     assert len(robot.bodies) == 10
-    for name, path in robot.paths.items():
-        entity = entities[f"/world/robot/{path}"]
+    for body in robot.bodies:
+        entity = entities[f"/world/robot/{robot.names[body]}"]
         for part in (*poses(entity), entity["step"], entity["time"]):
             assert len(part) == ROWS
-        body = robot.model.body(name)
-        for geom in range(body.geomadr[0], body.geomadr[0] + body.geomnum[0]):
-            assert f"/world/robot/{path}/{robot.model.geom(geom).name}" in entities
-    assert {"/world/floor", "/world/target/target", "/world/target/target_pointer"} <= {*entities}
+        drawn = [name for name in entity if name.endswith(":colors")]
+        assert sum(len(entity[name].to_pylist()[0]) for name in drawn) == len(robot.geoms(body))
+    assert sum(len(robot.geoms(body)) for body in robot.bodies) == 22
+    assert {"/world/floor/floor", "/world/surroundings/target"} <= {*entities}
+    assert values(entities["/world/surroundings/target"], "Ellipsoids3D:colors").shape == (1, 2)
 
 
 def test_shapes_are_the_models(entities, robot):
-    weight = entities["/world/robot/jitterbug/weight/weight"]
+    weight = entities["/world/robot/weight"]
     geom = robot.model.geom("weight")
     np.testing.assert_allclose(values(weight, "Ellipsoids3D:half_sizes")[0, 0], geom.size)
     np.testing.assert_allclose(values(weight, "Ellipsoids3D:centers")[0, 0], geom.pos, rtol=1e-6)
-    assert values(weight, "Ellipsoids3D:colors").item() == 0xD93326FF  # .85 .2 .15
-    leg = entities["/world/robot/jitterbug/leg1_upper/leg1_lower/leg1_lower"]
+    assert values(weight, "Ellipsoids3D:colors")[0, 0] == 0xD93326FF  # .85 .2 .15
+    leg = entities["/world/robot/leg1_lower"]
     assert values(leg, "Cylinders3D:lengths").item() == pytest.approx(0.065)
-    foot = entities["/world/robot/jitterbug/leg1_upper/leg1_lower/leg1_foot"]
-    np.testing.assert_allclose(values(foot, "Ellipsoids3D:half_sizes")[0, 0], [0.003] * 3)
-    box = entities["/world/robot/jitterbug/core_lower"]
-    np.testing.assert_allclose(values(box, "Boxes3D:half_sizes")[0, 0], [0.008, 0.006, 0.008])
-
-
-def test_poses_are_mujocos(robot, rollout):
-    data, rows = mujoco.MjData(robot.model), range(0, ROWS, 100)
-    local, world = robot.poses(rollout.qpos), robot.origins(rollout.qpos)
-    for row in rows:
-        data.qpos[:] = rollout.qpos[row]
-        mujoco.mj_kinematics(robot.model, data)
-        for name in robot.bodies:
-            body = robot.model.body(name)
-            np.testing.assert_allclose(world[name][row], data.xpos[body.id], atol=1e-12)
-            back, turned = np.empty(4), np.empty(4)
-            mujoco.mju_negQuat(back, data.xquat[body.parentid[0]])
-            mujoco.mju_mulQuat(turned, back, data.xquat[body.id])
-            np.testing.assert_allclose(abs(turned @ local[name][1][row]), 1, atol=1e-12)
+    np.testing.assert_allclose(values(leg, "Ellipsoids3D:half_sizes")[0, 0], [0.003] * 3)
 
 
 def test_poses_are_the_episodes(entities, rollout):
+    motion = rollout.motion
     position, quaternion = poses(entities["/world/robot/jitterbug"])
-    np.testing.assert_array_equal(position, rollout.qpos[:, :3].astype(np.float32))
-    np.testing.assert_array_equal(quaternion, rollout.qpos[:, 3:7].astype(np.float32))
-    _, weight = poses(entities["/world/robot/jitterbug/weight"])
-    np.testing.assert_allclose(weight[:, 0], np.cos(rollout.qpos[:, 15] / 2), atol=1e-6)
-    target, turned = poses(entities["/world/target"])
-    np.testing.assert_array_equal(target[0], rollout.target_position.astype(np.float32))
-    np.testing.assert_allclose(turned[0], rollout.target_quaternion, atol=1e-7)
+    np.testing.assert_array_equal(position, motion.qpos[:, :3].astype(np.float32))
+    np.testing.assert_allclose(quaternion, motion.qpos[:, 3:7], atol=1e-7)
+    target, turned = poses(entities["/world/surroundings/target"])
+    np.testing.assert_allclose(target[0], motion.arrays["mocap_pos"][0, 0], atol=1e-7)
+    np.testing.assert_allclose(turned[0], motion.arrays["mocap_quat"][0, 0], atol=1e-7)
+    model, data = motion.model, mujoco.MjData(motion.model)
+    for row in range(0, ROWS, 250):
+        motion.put(data, row)
+        mujoco.mj_kinematics(model, data)
+        for name in ("leg3_lower", "weight"):
+            there, attitude = poses(entities[f"/world/robot/{name}"])
+            np.testing.assert_allclose(there[row], data.body(name).xpos, atol=1e-7)
+            np.testing.assert_allclose(attitude[row], data.body(name).xquat, atol=1e-7)
 
 
 def test_the_timelines(entities):
@@ -173,24 +172,26 @@ def test_the_timelines(entities):
 
 
 def test_series_are_the_episodes(entities, rollout):
-    for observable, part in zip(
-        rollout.task.observables, rollout.task.split(rollout.observation).values(), strict=True
-    ):
-        entity = entities[f"/observation/{observable.name}"]
-        np.testing.assert_array_equal(scalars(entity), part)
-        assert names(entity) == [f"{f.name} [{f.unit}]" for f in observable.features]
+    task = rollout.task
+    for group, place in task.groups.items():
+        entity = entities[f"/observation/{group}"]
+        np.testing.assert_array_equal(scalars(entity), rollout.observation[:, place])
+        assert names(entity) == [f"{f.name} [{f.unit}]" for f in task.features[place]]
     np.testing.assert_array_equal(scalars(entities["/action"]), rollout.action)
+    assert names(entities["/action"]) == ["action_0 [-1, 1]"]
     np.testing.assert_array_equal(scalars(entities["/reward/total"])[:, 0], rollout.reward)
     terms = entities["/reward/terms"]
-    np.testing.assert_array_equal(scalars(terms), np.transpose([*rollout.terms.values()]))
+    expected = reward_terms(task, rollout.motion)
+    np.testing.assert_array_equal(scalars(terms), np.transpose([*expected.values()]))
     assert names(terms) == ["upright [1]", "heading [1]"]
 
 
 def test_contacts_carry_the_robot(entities, robot, rollout):
-    found = contacts(robot, rollout)
-    weight = robot.model.body("jitterbug").subtreemass[0] * 9.81
+    found = contacts(robot, rollout.motion)
     lift = found.forces[:, 2].sum() / ROWS
-    assert lift == pytest.approx(weight, rel=0.1)  # over ten seconds, as it stays on the floor
+    assert lift == pytest.approx(
+        robot.weight, rel=0.1
+    )  # over ten seconds, as it stays on the floor
     assert np.abs(found.points[:, 2]).max() < 3e-3  # [m] half of how far a foot sinks in
     assert len({*found.counts}) > 1
     entity = entities["/world/contacts"]
@@ -202,8 +203,8 @@ def test_contacts_carry_the_robot(entities, robot, rollout):
 
 
 def test_what_is_decoded(entities, rollout):
-    encoder, task = find("dae-8", "face_direction"), rollout.task
-    latent = encoder.encode(rollout.observation.astype(np.float32))
+    encoder, task, qpos = find("dae-8", rollout.task), rollout.task, rollout.motion.qpos
+    latent = encoder.encode(rollout.observation)
     decoded = encoder.decode(latent).astype(float)
     np.testing.assert_array_equal(scalars(entities["/latent/units"]), latent)
     errors = (decoded - rollout.observation) / encoder.scaler.half_width
@@ -217,32 +218,39 @@ def test_what_is_decoded(entities, rollout):
     np.testing.assert_array_equal(position, decoded[:, :3].astype(np.float32))
     length = np.linalg.norm(decoded[:, 3:7], axis=1, keepdims=True)
     np.testing.assert_allclose(quaternion, decoded[:, 3:7] / length, atol=1e-6)
-    _, weight = poses(entities["/world/ghost/jitterbug/weight"])
+    _, weight = poses(entities["/world/ghost/weight"])
     half = (decoded[:, 13] - np.pi / 2) / 2
-    np.testing.assert_allclose(weight[:, [0, 3]].T, (np.cos(half), np.sin(half)), atol=1e-6)
-    apart = np.linalg.norm(decoded[:, :3] - rollout.qpos[:, :3], axis=1)
+    turned = np.stack((np.cos(half), 0 * half, 0 * half, np.sin(half)), axis=1)
+    x, y, z = (rotate(turned, np.tile(axis, (ROWS, 1))) for axis in np.eye(3))
+    for ours, axis in zip(np.eye(3), (x, y, z), strict=True):
+        np.testing.assert_allclose(
+            rotate(weight, np.tile(ours, (ROWS, 1))), rotate(quaternion, axis), atol=1e-5
+        )
+    apart = np.linalg.norm(decoded[:, :3] - qpos[:, :3], axis=1)
     bodies = entities["/error/bodies"]
     assert names(bodies)[0] == "jitterbug [mm]"
     np.testing.assert_allclose(scalars(bodies)[:, 0], 1e3 * apart)
+    shown = values(entities["/world/ghost/jitterbug"], "Boxes3D:colors")[:, 0]
+    expected = shades(apart).astype(np.uint32) @ (1 << np.array([24, 16, 8, 0], np.uint32))
+    np.testing.assert_array_equal(shown, expected)  # not one for all times, which would win
     aligned, attitude = poses(entities["/world/aligned/jitterbug"])
-    np.testing.assert_array_equal(aligned, rollout.qpos[:, :3].astype(np.float32))
+    np.testing.assert_array_equal(aligned, qpos[:, :3].astype(np.float32))
     np.testing.assert_array_equal(attitude, quaternion)
 
 
 def test_an_encoder_that_keeps_all_gives_the_robot_back(unchanged):
     found, true = read(unchanged), find_episode(POSE)
-    for path in ("jitterbug", "jitterbug/weight"):
-        for ours, theirs in zip(
-            poses(found[f"/world/ghost/{path}"]), poses(found[f"/world/robot/{path}"]), strict=True
-        ):
-            up_to_sign = np.where((ours * theirs).sum(axis=1, keepdims=True) < 0, -1, 1)
-            np.testing.assert_allclose(ours * up_to_sign, theirs, atol=1e-5)
-    leg = found["/world/ghost/jitterbug/leg1_upper"]
-    assert len(leg["Transform3D:translation"]) == 1  # static: legs are at rest
+    (place, turned), (there, attitude) = (
+        poses(found[f"/world/{which}/jitterbug"]) for which in ("ghost", "robot")
+    )
+    up_to_sign = np.where((turned * attitude).sum(axis=1, keepdims=True) < 0, -1, 1)
+    np.testing.assert_allclose(place, there, atol=1e-5)
+    np.testing.assert_allclose(turned * up_to_sign, attitude, atol=1e-5)
+    readings = jitterbug.read(true.motion)
     target = values(found["/world/ghost/target"], "Points3D:positions")[:, 0]
-    np.testing.assert_allclose(target, np.tile(true.target_position, (ROWS, 1)), atol=1e-5)
+    np.testing.assert_allclose(target, readings.target_position, atol=1e-5)
     heading = values(found["/world/ghost/heading"], "Arrows3D:vectors")[:, 0, :2]
-    axis = true.readings.target_axis
+    axis = readings.target_axis
     np.testing.assert_allclose(heading, np.linalg.norm(heading[0]) * axis, atol=1e-5)
 
 
@@ -271,19 +279,19 @@ def test_principal_components():
 @pytest.mark.parametrize("recording", ["recorded", "unchanged", "traversed"])
 def test_recordings_are_small_and_bring_their_layout(recording, request):
     path = request.getfixturevalue(recording)
-    limit = 3e6
-    assert path.stat().st_size < limit
+    assert path.stat().st_size < 4e6
     assert [store.application_id for store in RrdReader(path).blueprints()] == ["jbrep"]
 
 
 def test_the_provenance(entities, rollout):
     told = text(entities["/provenance"])
-    encoder = find("dae-8", "face_direction")
+    encoder = find("dae-8", rollout.task)
     for fact in (
         f"# {FACE}, episode 1",
         "- task: face_direction",
         f"- seed: {rollout.seed}",
-        f"- return: {rollout.reward.sum():.1f}",
+        f"- return: {rollout.episode_return:.1f}",
+        "- end: truncated",
         "- encoder: dae-8 (dae)",
         "- sizes: 16 features, 8 units",
         fingerprint(encoder),
@@ -308,8 +316,8 @@ def test_the_same_inputs_give_the_same_content(recorded, entities, folder):
 
 
 def test_a_traversal_shows_what_each_unit_decodes_to(traversed, rollout):
-    encoder, found = find("dae-8", "face_direction"), read(traversed)
-    latent = encoder.encode(rollout.observation.astype(np.float32))
+    encoder, found = find("dae-8", rollout.task), read(traversed)
+    latent = encoder.encode(rollout.observation)
     swept = sweep(latent)
     assert swept.shape == (8, POINTS, 8)
     for unit in range(8):
@@ -329,8 +337,206 @@ def test_a_traversal_shows_what_each_unit_decodes_to(traversed, rollout):
         assert f"| {most} " in row
         position, quaternion = poses(found[f"/world/unit_{unit}/jitterbug"])
         np.testing.assert_allclose(position[:, 0], SPACING * (unit - 3.5), atol=1e-6)
-        np.testing.assert_allclose(position[:, 2], decoded[:, 2])
+        np.testing.assert_allclose(position[:, 2], decoded[:, 2], rtol=1e-6)
         assert len(quaternion) == POINTS
+
+
+@pytest.fixture(scope="module")
+def short(folder):
+    """Recordings of episodes of at most 30 steps under uniformly random actions."""
+
+    def make(name, **given):
+        task = describe(name, max_episode_steps=30)
+        path = folder / f"{task.slug}.rrd"
+        return find_episode("uniform", 0, task), read(
+            inspect("uniform", 0, task, out=path, **given)
+        )
+
+    return make
+
+
+@pytest.mark.parametrize("name", ["Hopper-v5", "dm_control/cheetah-run-v0"])
+def test_any_robot_of_mujoco_is_recorded(name, short):
+    rollout, found = short(name, encoder="full")
+    robot, rows = Robot(rollout.motion.model), len(rollout) + 1
+    assert robot.names[robot.root] == "torso"
+    data = mujoco.MjData(robot.model)
+    rollout.motion.put(data, rows - 1)
+    mujoco.mj_kinematics(robot.model, data)
+    for body in robot.bodies:
+        position, quaternion = poses(found[f"/world/robot/{robot.names[body]}"])
+        assert len(position) == rows
+        np.testing.assert_allclose(position[-1], data.xpos[body], atol=1e-6)
+        np.testing.assert_allclose(quaternion[-1], data.xquat[body], atol=1e-6)
+    action = found["/action"]
+    np.testing.assert_array_equal(scalars(action), rollout.action)
+    assert names(action)[-1] == f"action_{rollout.task.action_size - 1} [-1, 1]"
+    np.testing.assert_array_equal(scalars(found["/reward/total"])[:, 0], rollout.reward)
+    assert found["/reward/total"]["time"].to_pylist()[-1].total_seconds() == pytest.approx(
+        len(rollout) * rollout.task.timestep
+    )
+    group = next(iter(rollout.task.groups))
+    np.testing.assert_allclose(
+        scalars(found[f"/reconstruction/{group}"]), scalars(found[f"/observation/{group}"])
+    )
+    assert any(path.startswith("/world/floor/") for path in found)
+    assert sum(len(each) for each in found["/world/contacts"]["Points3D:positions"].to_pylist()) > 0
+    assert not {"/world/ghost", "/reward/terms", "/error/bodies"} & {*found}
+
+
+def test_a_robot_without_mujoco_shows_its_signals(short):
+    rollout, found = short("Pendulum-v1", encoder="full")
+    np.testing.assert_array_equal(scalars(found["/observation/obs"]), rollout.observation)
+    assert names(found["/observation/obs"]) == ["obs_0", "obs_1", "obs_2"]
+    assert names(found["/action"]) == ["action_0 [-2, 2]"]
+    assert len(scalars(found["/latent/units"])) == 31
+    assert scalars(found["/error/total"]).max() < 1e-6
+    assert not any(path.startswith("/world") for path in found)
+    assert f"- return: {rollout.episode_return:.1f}" in text(found["/provenance"])
+
+
+def test_hundreds_of_features_are_many_plots_of_few_lines(short):
+    rollout, found = short("Humanoid-v5")
+    plots = {path: entity for path, entity in found.items() if path.startswith("/observation/")}
+    assert len(plots) == -(-rollout.task.size // MOST_LINES)
+    assert {len(names(entity)) for entity in plots.values()} <= {11, 12}
+    together = np.concatenate([scalars(plots[path]) for path in plots], axis=1)
+    assert sorted(together[5]) == sorted(rollout.observation[5].astype(float))
+    assert {"/action_0-7", "/action_8-16"} <= {*found}
+
+
+def test_a_time_step_that_is_not_known_leaves_the_steps(folder):
+    from jbrep.inspection.episode import record_episode
+
+    rollout = find_episode("uniform", 0, describe("Pendulum-v1", max_episode_steps=30))
+    rollout = replace(rollout, task=replace(rollout.task, timestep=None))
+    record_episode(rollout, folder / "steps.rrd", find("full", rollout.task))
+    entity = read(folder / "steps.rrd")["/observation/obs"]
+    assert entity["step"].to_pylist() == list(range(31))
+    assert "time" not in entity
+
+
+def test_a_note_stands_in_the_provenance_and_is_told(folder, monkeypatch, rollout):
+    differing = replace(rollout, motion=None, note="it differs here")
+    monkeypatch.setattr("jbrep.inspection.subject.find_episode", lambda *given: differing)
+    told = []
+    found = read(inspect(FACE, 1, out=folder / "note.rrd", tell=told.append))
+    assert told == ["it differs here"]
+    assert "- note: it differs here" in text(found["/provenance"])
+    assert not any(path.startswith("/world") for path in found)
+
+
+def test_a_traversal_of_any_robot_shows_series(folder):
+    task = describe("Pendulum-v1", max_episode_steps=30)
+    path = inspect("uniform", 0, task, "full", traverse=True, out=folder / "swept.rrd")
+    found = read(path)
+    assert scalars(found["/traverse/unit_2/decoded"]).shape == (POINTS, 3)
+    assert not any(each.startswith("/world") for each in found)
+
+
+def test_panels_have_few_lines_of_about_equal_number():
+    found = list(panels({"a": slice(0, 12), "b": slice(12, 25), "c": slice(25, 26)}))
+    assert found == [
+        ("a", slice(0, 12)),
+        ("b_0-5", slice(12, 18)),
+        ("b_6-12", slice(18, 25)),
+        ("c", slice(25, 26)),
+    ]
+
+
+SHAPES = """
+<mujoco>
+  <asset>
+    <material name="green" rgba="0 1 0 1"/>
+    <mesh name="wedge" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/>
+  </asset>
+  <worldbody>
+    <geom name="ground" type="plane" size="0 0 1"/>
+    <body name="a/b" pos="0 0 1">
+      <freejoint/>
+      <geom name="ball" type="sphere" size=".1" material="green"/>
+      <geom name="egg" type="ellipsoid" size=".1 .2 .3" rgba="1 0 0 1" material="green"/>
+      <geom name="pill" type="capsule" size=".05 .2" pos="1 2 3" euler="90 0 0"/>
+      <geom name="can" type="cylinder" size=".05 .2"/>
+      <geom name="brick" type="box" size=".1 .2 .3"/>
+      <geom name="stone" type="mesh" mesh="wedge" pos="0 0 .5" euler="0 90 0"/>
+      <geom name="hidden" type="box" size="1 1 1" group="3"/>
+      <geom name="clear" type="box" size="1 1 1" rgba="1 1 1 0"/>
+      <body name="bare"/>
+    </body>
+    <body><geom type="box" size=".1 .1 .1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_shapes_of_every_kind():
+    model = mujoco.MjModel.from_xml_string(SHAPES)
+    robot = Robot(model)
+    assert (robot.names, robot.bodies, robot.others) == (
+        ["world", "a_b", "bare", "body_3"],
+        [1, 2],
+        [0, 3],
+    )
+    geoms = robot.geoms(1)
+    drawn = [model.geom(geom).name for geom in geoms]
+    assert drawn == ["ball", "egg", "pill", "can", "brick", "stone"]
+    assert own_colours(model, geoms)[:3].tolist() == [
+        [0, 255, 0, 255],
+        [255, 0, 0, 255],
+        [128, 128, 128, 255],
+    ]
+    found = {type(each).__name__: each for each in shapes(model, geoms, own_colours(model, geoms))}
+    halves = found["Ellipsoids3D"].half_sizes.as_arrow_array().to_pylist()
+    np.testing.assert_allclose(halves, [[0.1] * 3, [0.1, 0.2, 0.3]], rtol=1e-6)
+    assert {*found} == {"Ellipsoids3D", "Capsules3D", "Cylinders3D", "Boxes3D", "Mesh3D"}
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    pill = model.geom("pill").id
+    begin = np.ravel(found["Capsules3D"].translations.as_arrow_array().to_pylist())
+    axis = data.geom_xmat[pill].reshape(3, 3)[:, 2]
+    up = np.array([0, 0, 1])  # from the body's frame to the world's
+    np.testing.assert_allclose(begin + up, data.geom_xpos[pill] - 0.2 * axis, atol=1e-6)
+    stone, mesh = model.geom("stone").id, found["Mesh3D"]
+    corners = np.array(mesh.vertex_positions.as_arrow_array().to_pylist()) + up
+    expected = model.mesh_vert @ data.geom_xmat[stone].reshape(3, 3).T + data.geom_xpos[stone]
+    apart = np.linalg.norm(corners[:, None] - expected, axis=2)
+    np.testing.assert_allclose(apart.min(axis=0), 0, atol=1e-6)
+    np.testing.assert_allclose(apart.min(axis=1), 0, atol=1e-6)
+    normals = np.array(mesh.vertex_normals.as_arrow_array().to_pylist())
+    outward = corners - expected.mean(axis=0)
+    assert ((normals * outward).sum(axis=1) > 0).all()
+
+
+def test_bodies_that_stand_still_have_one_pose_and_bare_ones_no_shape(folder):
+    model = mujoco.MjModel.from_xml_string(SHAPES)
+    robot, motion = Robot(model), Motion(model, {"qpos": np.tile(model.qpos0, (3, 1))})
+    motion.qpos[:, 0] = (0, 1, 2)
+    recording = Recording("it", "shapes")
+    times = [rr.TimeColumn("step", sequence=np.arange(3))]
+    robot.draw(recording, "robot", times, robot.poses(motion), [1, 2, 3])
+    recording.write(folder / "shapes.rrd", curves_layout(["robot"], 2))
+    found = read(folder / "shapes.rrd")
+    assert [len(poses(found[f"/robot/{name}"])[0]) for name in ("a_b", "bare", "body_3")] == [
+        3,
+        3,
+        1,
+    ]
+    assert "Mesh3D:vertex_positions" in found["/robot/a_b"]
+    assert not any(":colors" in name for name in found["/robot/bare"])
+
+
+def test_the_force_of_a_contact_is_the_one_on_the_robot():
+    """Of a ball on a box, MuJoCo gives the force on the box."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="box" size="1 1 .1"/>
+        <body pos="0 0 .199"><freejoint/><geom type="sphere" size=".1" mass="1"/></body>
+        </worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    arrays = {"qpos": data.qpos[None].copy(), "qvel": data.qvel[None].copy()}
+    (force,) = contacts(Robot(model), Motion(model, arrays)).forces
+    assert force[2] > 1
 
 
 def write_end(folder, representation, seed=0, status=FINISHED):
@@ -403,7 +609,7 @@ def test_a_run_shows_its_own_encoder(tmp_path, rollout, monkeypatch):
     monkeypatch.setattr("jbrep.inspection.subject.find_episode", lambda *given: rollout)
     for name in ("dae-4", "identity"):
         write_end(tmp_path, name)
-        save(find(name, "face_direction"), tmp_path / ENCODER)
+        save(find(name, describe("face_direction")), tmp_path / ENCODER)
         found = read(inspect(str(tmp_path), out=tmp_path / f"{name}.rrd"))
         assert ("/world/ghost/jitterbug" in found) == (name == "dae-4")
         other = read(inspect(str(tmp_path), encoder="dae-8", out=tmp_path / "other.rrd"))
@@ -411,7 +617,7 @@ def test_a_run_shows_its_own_encoder(tmp_path, rollout, monkeypatch):
 
 
 def test_a_run_under_way_shows_its_checkpoint(tmp_path):
-    encoder = find("dae-4", "face_direction")
+    encoder = find("dae-4", describe("face_direction"))
     settings = Run(task="face_direction", algorithm="a2c", encoder="dae-4").describe(encoder)
     settings |= {"evaluation_episodes": 1, "episode_steps": 50}
     preset = Preset(settings["hidden"], {})
@@ -430,7 +636,7 @@ def test_a_run_under_way_shows_its_checkpoint(tmp_path):
 
 def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
     file = Path("jbrep/encoders/shipped/face_direction/dae-4.safetensors")
-    by_name = inspect(encoder="dae-4", task="face_direction", out=tmp_path / "name.rrd")
+    by_name = inspect(encoder="dae-4", task=describe("face_direction"), out=tmp_path / "name.rrd")
     by_file = inspect(str(file), out=tmp_path / "file.rrd")
     ours, theirs = read(by_name), read(by_file)
     assert "# uniform" in text(ours["/provenance"])
@@ -450,7 +656,10 @@ def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
             "nowhere is no data set, no run with a policy or checkpoint, and no",
         ),
         ({"source": FACE, "episode": 9}, "has no episode 9: it has 4, numbered from 0"),
-        ({"source": FACE, "task": "move_to_pose"}, "is of face_direction, not of move_to_pose"),
+        (
+            {"source": FACE, "task": describe("move_to_pose")},
+            "is of face_direction, not of move_to_pose",
+        ),
         ({"source": FACE, "encoder": "dae-9"}, "no encoder 'dae-9'"),
         ({"source": FACE, "traverse": True}, "--traverse moves the units of a latent: give an"),
         ({"encoder": "dae-8"}, "no encoder at dae-8: for one that ships, give its --task, too"),
@@ -476,7 +685,12 @@ def test_mistakes(given, message):
 
 def test_a_study_has_no_episodes(tmp_path):
     study = str(write_study(tmp_path / "study"))
-    for given in ({"episode": 0}, {"encoder": "dae-8"}, {"traverse": True}, {"task": TASKS}):
+    for given in (
+        {"episode": 0},
+        {"encoder": "dae-8"},
+        {"traverse": True},
+        {"task": describe("face_direction")},
+    ):
         with pytest.raises(InputError, match="holds several runs, whose training curves"):
             inspect(study, **given)
 

@@ -199,7 +199,7 @@ def label_record(representation, size=3):
         **{"training": {}, "data": {}, "metrics": {}},
     }
     task = {"action_low": [-2.0] * 6, "action_high": [2.0] * 6, "timestep": 0.05}
-    return {"settings": settings, "encoder": encoder, "task": task}
+    return {"settings": {**settings, "environment": task}, "encoder": encoder}
 
 
 LABELS = {f"{TASK}/sac/{name}": label_record(name) for name in LEVELS}
@@ -251,10 +251,14 @@ def test_the_diagram_shows_the_task_as_it_is(plots):
     assert rows["action"] == "6 numbers in [-2, 2]"
     assert rows["observation"].startswith("3 features")
     label = label_record("dae-2")
-    del label["task"]
+    del label["settings"]["environment"]
     (system, _) = study_plots(None, [], {}, {"x": label})
     assert dict(system.rows)["action"] == ""
-    label["task"] = {"action_low": [-2, -1], "action_high": [2, 1], "timestep": None}
+    label["settings"]["environment"] = {
+        "action_low": [-2, -1],
+        "action_high": [2, 1],
+        "timestep": None,
+    }
     (system, _) = study_plots(None, [], {}, {"x": label})
     assert dict(system.rows) | {"robot": TASK, "action": "2 numbers"} == dict(system.rows)
     assert "MuJoCo" not in str(rows)

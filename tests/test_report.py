@@ -52,7 +52,8 @@ def write_a_run(plan, cell, failed=False, reason=TRAP):
     """A run's files as jbrep rl leaves them, with returns made up."""
     folder = plan.folder_of(cell)
     folder.mkdir(parents=True)
-    run, encoder = plan.run(cell), find(plan.run(cell).encoder, cell.task)
+    run = plan.run(cell)
+    encoder = find(run.encoder, run.task)
     save(encoder, folder / ENCODER)
     random = np.random.default_rng([cell.seed, len(cell.representation.name)])
     final = FINAL[cell.representation.name] + random.normal(0, 30)
@@ -392,7 +393,7 @@ def test_heuristics_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
     )
     assert rows[0] == ["task", "episode", "return"]
     assert len(rows) == 1 + 4
-    alone = find_episode("heuristic", 3, "face_direction").reward.sum()
+    alone = find_episode("heuristic", 3, describe("face_direction")).reward.sum()
     assert float(rows[4][2]) == pytest.approx(alone, abs=1e-3)
     monkeypatch.setattr("jbrep.study.heuristics.episode_returns", None)
     write_heuristics(map(describe, STUDY.tasks), tmp_path)
@@ -487,7 +488,7 @@ def test_changed_tables_are_refused_or_shown(name, whole, tmp_path, monkeypatch)
 def test_a_run_of_a_newer_jbrep_is_named(tmp_path):
     plan = make_study(tmp_path / "new", left=11)
     path = plan.folder_of(plan.cells[0]) / "run.json"
-    path.write_text(path.read_text().replace('version": 1', 'version": 7'))
+    path.write_text(path.read_text().replace('version": 2', 'version": 7'))
     with pytest.raises(InputError, match=r"run\.json has format version 7: this jbrep reads up"):
         read_results(plan.folder)
 

@@ -1,10 +1,12 @@
 """Episodes to look at are the very ones that were stored or evaluated."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command import jbrep
 
 from jbrep.collect import collect
 from jbrep.collect.policies import Heuristic
@@ -257,6 +259,14 @@ def test_a_run_is_of_its_task_and_plays_it_for_longer_or_shorter(run):
         find_player(str(run), describe("move_to_pose"))
     player = find_player(str(run), describe("face_direction", max_episode_steps=20))
     assert [len(rollout) for rollout in player.play([0])] == [20]
+
+
+def test_returns_of_any_size_and_sign_are_told():
+    told = ("--episode-steps", 30, "--episodes", 2)
+    negative = jbrep("evaluate-policy", "uniform", "--task", "Pendulum-v1", *told).output
+    assert re.match(r"Pendulum-v1, uniform: median return -\d+ \[-\d+, -\d+\] ", negative)
+    small = jbrep("evaluate-policy", "uniform", "--task", "dm_control/cheetah-run-v0", *told).output
+    assert re.search(r": median return 0\.\d+ \[0\.\d+, 0\.\d+\] ", small)
 
 
 def test_behaviour_is_the_jitterbugs():

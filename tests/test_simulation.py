@@ -1,10 +1,13 @@
 """Lanes are independent, bit for bit, whatever their number and that of the threads."""
 
+import mujoco
 import numpy as np
 import pytest
 
 from jbrep.envs.checks import NonFiniteActionError, check_actions
 from jbrep.errors import InputError
+from jbrep.jitterbug.bodies import PUBLISHED, draw
+from jbrep.jitterbug.model import PHYSICS_STEPS, plain_model
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import get_task
 
@@ -83,6 +86,147 @@ def test_copied_data_are_the_lane_s():
     np.testing.assert_array_equal(data.qpos, simulation.readings.qpos[2])
     np.testing.assert_array_equal(data.body("jitterbug").xmat, simulation.readings.rotation[2])
     np.testing.assert_allclose(data.geom("target").xpos, simulation.readings.target_position[2])
+
+
+def drive(simulation, steps=60):
+    """Observations under the same drive in all lanes, (T, n, d)."""
+    tape = []
+    for step in range(steps):
+        simulation.step(np.full((simulation.num_lanes, 1), 0.8 * np.sin(0.3 * step)))
+        tape.append(simulation.observe())
+    return np.array(tape)
+
+
+def with_bodies(seeds, body, **more):
+    """A simulation at the start of each seed's episode."""
+    simulation = Simulation(get_task("move_to_pose"), len(seeds), 2, body, **more)
+    simulation.reset(range(len(seeds)), [np.random.default_rng(seed) for seed in seeds])
+    return simulation
+
+
+def test_a_lane_moves_like_a_single_simulation_of_its_body():
+    simulation = with_bodies(range(3), "random", materials=True)
+    start, tape = simulation.state, []
+    drive(simulation)
+    for lane, number in enumerate(start["body"].astype(int)):
+        model = plain_model(draw(number, materials=True))
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = start["qpos"][lane], start["qvel"][lane]
+        for step in range(60):
+            data.ctrl[0] = 0.8 * np.sin(0.3 * step)
+            mujoco.mj_step(model, data, nstep=PHYSICS_STEPS)
+        tape.append(np.concatenate([data.qpos, data.qvel]))
+    now = simulation.readings
+    np.testing.assert_array_equal(np.hstack([now.qpos, now.qvel]), tape)
+
+
+def test_all_lanes_have_the_body_of_the_number():
+    simulation = with_bodies([4, 4], 7)
+    tape = drive(simulation)
+    np.testing.assert_array_equal(tape[:, 0], tape[:, 1])
+    np.testing.assert_array_equal(simulation.state["body"], [7, 7])
+    others = (drive(with_bodies([4], body)) for body in (8, None))
+    assert all(np.abs(tape[:, :1] - other).max() > 1e-3 for other in others)
+
+
+def test_a_random_body_is_the_episode_s_whatever_its_lane():
+    whole = with_bodies(range(6), "random")
+    numbers, tape = whole.state["body"], drive(whole)
+    assert len(set(numbers)) == 6
+    alone, moved = with_bodies([4], "random"), with_bodies([9, 4, 0], "random")
+    for simulation, lane in ((alone, 0), (moved, 1)):
+        assert simulation.state["body"][lane] == numbers[4]
+        np.testing.assert_array_equal(drive(simulation)[:, lane], tape[:, 4])
+
+
+def test_each_episode_of_a_generator_has_its_own_random_body():
+    random, numbers = np.random.default_rng(3), []
+    simulation = Simulation(get_task("face_direction"), 1, 1, "random")
+    for _ in range(5):
+        simulation.reset([0], [random])
+        numbers.append(simulation.state["body"][0])
+    assert len(set(numbers)) == 5
+
+
+def test_a_random_body_changes_nothing_else_that_is_drawn():
+    plain, other = np.random.default_rng(3), np.random.default_rng(3)
+    one = Simulation(get_task("move_to_pose"), 1, 1)
+    two = Simulation(get_task("move_to_pose"), 1, 1, "random")
+    for _ in range(2):
+        one.reset([0], [plain])
+        two.reset([0], [other])
+        for name in ("target_position", "target_quaternion"):
+            np.testing.assert_array_equal(one.state[name], two.state[name])
+        np.testing.assert_array_equal(one.state["qpos"][:, 3:], two.state["qpos"][:, 3:])
+        assert plain.bit_generator.state == other.bit_generator.state
+
+
+def test_a_new_body_in_one_lane_leaves_the_others_alone():
+    undisturbed, disturbed = with_bodies(range(3), "random"), with_bodies(range(3), "random")
+    drive(undisturbed)
+    drive(disturbed)
+    disturbed.reset([1], [np.random.default_rng(77)])
+    one, other = drive(undisturbed), drive(disturbed)
+    np.testing.assert_array_equal(one[:, [0, 2]], other[:, [0, 2]])
+    np.testing.assert_array_equal(other[:, 1], drive(with_bodies([77], "random"))[:, 0])
+
+
+@pytest.mark.parametrize("body", [None, 7, "random"])
+def test_a_restored_simulation_continues_with_its_bodies(body):
+    one = with_bodies(range(3), body)
+    drive(one, 20)
+    one.reset([1], [np.random.default_rng(9)])
+    drive(one, 20)
+    other = with_bodies([5, 6, 7], body)
+    other.restore(**one.state)
+    for name, values in one.state.items():
+        np.testing.assert_array_equal(other.state[name], values)
+        assert values.shape[0] == 3
+        assert values.dtype == np.float64
+    np.testing.assert_array_equal(drive(one), drive(other))
+
+
+def test_a_state_holds_bodies_only_where_there_are_others():
+    simulation = with_bodies(range(2), None)
+    assert "body" not in simulation.state
+    simulation.restore(**simulation.state, body=np.array([-1.0, 7.0]))
+    np.testing.assert_array_equal(simulation.state["body"], [PUBLISHED, 7])
+    simulation.reset([1], [np.random.default_rng(1)])
+    assert "body" not in simulation.state
+    np.testing.assert_array_equal(drive(simulation)[:, 1], drive(with_bodies([1], None))[:, 0])
+
+
+def test_a_state_without_bodies_leaves_the_lanes_theirs():
+    simulation = with_bodies(range(2), 7)
+    state = simulation.state
+    del state["body"]
+    simulation.restore(**state)
+    np.testing.assert_array_equal(simulation.state["body"], [7, 7])
+
+
+def test_a_lane_s_model_is_that_of_its_body():
+    simulation = with_bodies(range(2), "random")
+    for lane, number in enumerate(simulation.state["body"].astype(int)):
+        model = simulation.model_of(lane)
+        assert model is simulation.model_of(lane)
+        assert model.ntexdata > 1000  # to be rendered with
+        own, data = plain_model(draw(number)), simulation.copy_data(lane)
+        expected = mujoco.MjData(own)
+        expected.qpos[:] = simulation.readings.qpos[lane]
+        mujoco.mj_kinematics(own, expected)
+        for robot in (data, expected):
+            robot.geom("target").xpos[:] = robot.geom("target_pointer").xpos[:] = 0
+        np.testing.assert_array_equal(model.geom_size, own.geom_size)
+        np.testing.assert_array_equal(data.geom_xpos, expected.geom_xpos)
+    before = simulation.model_of(0)
+    simulation.reset([0], [np.random.default_rng(50)])
+    assert simulation.model_of(0) is not before
+
+
+@pytest.mark.parametrize("body", [-1, 2.5, "other"])
+def test_bodies_that_do_not_exist_are_refused(body):
+    with pytest.raises(InputError, match=r"body is .*whole number from 0"):
+        Simulation(get_task("face_direction"), 1, 1, body)
 
 
 def test_a_simulation_is_shown_on_one_line():

@@ -302,6 +302,23 @@ def test_what_is_finished_is_not_run_again_and_seeds_may_come(done, tmp_path, mo
         run_study(other, None, 1)
 
 
+def test_what_the_first_release_finished_is_not_run_again(done, tmp_path):
+    shutil.copytree(done.folder, tmp_path / "old")
+    for path in (tmp_path / "old").rglob(RUN):
+        run = json.loads(path.read_text())
+        for name in ("environment", "from"):
+            del run["settings"][name]
+        run["settings"]["episode_steps"] = 1000
+        path.write_text(json.dumps({**run, "format_version": 1}))
+    study = json.loads((tmp_path / "old" / STUDY).read_text())
+    del study["environment"]
+    (tmp_path / "old" / STUDY).write_text(json.dumps({**study, "episode_steps": 1000}))
+    assert run_study(Plan(TINY, tmp_path / "old"), None, 1) == 0  # nothing is left to run
+    assert [run.label for run in read_runs(tmp_path / "old")] == [
+        run.label for run in read_runs(done.folder)
+    ]
+
+
 def test_it_makes_data_and_encoders(tmp_path, monkeypatch):
     """Only the Jitterbug's tasks are derived from each other."""
     derived = []

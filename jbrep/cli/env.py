@@ -14,11 +14,12 @@ from jbrep.text import terminal_width
 @task_options(named=False)
 @as_json
 def env(as_json: bool, **options: Any) -> None:
-    """Say what a task is: features, actions, time limit, and whether it is reproducible.
+    """Say what a task is.
 
-    TASK is one of the Jitterbug's, such as face_direction, or an id in Gymnasium's registry; for
-    another package's, --import MODULE, or MODULE:ID, which imports it. The environment is made and
-    played for some steps; that it terminates is only known where it did.
+    Its features, actions and time limit, and whether it is reproducible. TASK is one of the
+    Jitterbug's, such as face_direction, or an id in Gymnasium's registry; for another package's,
+    --import MODULE, or MODULE:ID, which imports it. The environment is made and played for some
+    steps; that it terminates is only known where it did.
     """
     from jbrep.envs.card import card
 

@@ -16,6 +16,7 @@ from jbrep.cli.base import (
 )
 from jbrep.cli.environment import given_task, task_options
 from jbrep.errors import InputError
+from jbrep.text import rounded
 
 if TYPE_CHECKING:
     from jbrep.envs.task import Task
@@ -84,10 +85,15 @@ def evaluate_policy(
         click.echo(printable(f"encoder: {source}"))
     click.echo(
         printable(
-            f"{_title(policy, player)}: median return {median:.0f} [{low:.0f}, {high:.0f}] "
+            f"{_title(policy, player)}: median return {_interval(low, median, high)} "
             f"(10-90 % of {episodes} episodes)"
         )
     )
+
+
+def _interval(low: float, median: float, high: float) -> str:
+    at_low, at_median, at_high = rounded(low, median, high)
+    return f"{at_median} [{at_low}, {at_high}]"
 
 
 def _title(policy: str, player: "Player") -> str:
@@ -157,6 +163,6 @@ def behaviour(
     for each in behaviours:
         low, median, high = np.percentile(each.returns, (10, 50, 90))
         click.echo(
-            printable(f"{each.name}: median return {median:.0f} [{low:.0f}, {high:.0f}] (10-90 %)")
+            printable(f"{each.name}: median return {_interval(low, median, high)} (10-90 %)")
         )
     echo_paths(write(behaviour_plots(shared_task.name, behaviours, SPEEDS, yaw), out))

@@ -13,7 +13,7 @@ import click
 
 from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, on_stop, printable
 from jbrep.cli.environment import given_task, task_options
-from jbrep.text import SIGNIFICANT, number
+from jbrep.text import rounded
 
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 _NOT_REPRODUCIBLE = (
@@ -96,7 +96,7 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
     click.echo(printable(f"encoder: {source}"))
     rows = read_evaluations(out)
     last = [e.episode_return for e in rows if e.step == rows[-1].step]
-    returns = ", ".join(number(each, SIGNIFICANT) for each in last)
+    returns = ", ".join(rounded(*last))
     name = result["settings"]["representation"]
     click.echo(f"returns on {name} at the end: {returns}; all evaluations: {out / EVALUATIONS}")
 
@@ -117,7 +117,7 @@ class _Bar:
                 total=self._steps, initial=step, desc=self._name, unit="step", delay=0.5
             )
         self._progress.update(step - self._progress.n)
-        evaluation = number(mean, SIGNIFICANT)
+        evaluation = "-" if mean is None else rounded(mean)[0]
         self._progress.set_postfix(evaluation=evaluation, refresh=False)
 
     def close(self) -> None:

@@ -6,7 +6,7 @@ from jbrep.encoders.encoder import FULL, IDENTITY, Encoder
 from jbrep.encoders.file import SUFFIX, load
 from jbrep.encoders.identity import SCALINGS, identity
 from jbrep.encoders.names import EncoderName
-from jbrep.envs.task import Task
+from jbrep.envs.task import Task, as_task
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
 
@@ -23,8 +23,8 @@ def names(task: Task) -> tuple[str, ...]:
     return tuple(sorted(shown, key=lambda name: EncoderName.parse(name).order))
 
 
-def find(name: str | Path, task: Task) -> Encoder:
-    """The encoder that ships for a task under that name, or the one in a file.
+def find(name: str | Path, task: Task | str) -> Encoder:
+    """The encoder that ships for a task, or a task's name, under that name, or the one in a file.
 
     A shipped name takes precedence; write ./dae-8 for a file of that name. `full` is there for
     every task: where none ships, its features are scaled by their usual ranges, if they have any.
@@ -32,6 +32,7 @@ def find(name: str | Path, task: Task) -> Encoder:
     Raises:
         InputError: there is neither, the file can't be used, or it was made for another task.
     """
+    task = as_task(task)
     if _is_made(name, task):
         return identity(task)
     path = _shipped(name, task) or Path(name)

@@ -68,8 +68,8 @@ def _describe(name: str, arguments: str, max_episode_steps: int | None) -> Task:
         return _probe(spec.id, given, max_episode_steps)
     except InputError:
         raise
-    except ValueError as error:
-        raise InputError(f"{spec.id} can't be used: {error}") from error
+    except Exception as error:  # whatever the environment raises
+        raise InputError(f"{spec.id} failed when it was tried: {one_line(error)}") from error
 
 
 def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None) -> Task:

@@ -78,7 +78,7 @@ class Motion:
 
 
 class MotionReader:
-    """Reads the physics of lanes while `jbrep.envs.recording.record` plays them."""
+    """Reads the physics of lanes while `jbrep.envs.recording.record` plays their next episodes."""
 
     def __init__(self) -> None:
         self._models: list[mujoco.MjModel] = []
@@ -91,11 +91,12 @@ class MotionReader:
         every = [physics for physics in running if physics]
         if len(every) < lanes.num_lanes or len({p.model.nq for p in every}) > 1:
             return {}
-        self._models = [physics.model for physics in every]
+        self._models = self._models or [physics.model for physics in every]
         return {name: np.stack([getattr(p.data, name) for p in every]) for name in _STATE}
 
     def _read_batch(self, lanes: Lanes) -> dict[str, Array]:
-        self._models = [lanes.envs.simulation.model_of(i) for i in range(lanes.num_lanes)]
+        if not self._models:
+            self._models = [lanes.envs.simulation.model_of(i) for i in range(lanes.num_lanes)]
         now = lanes.arrays
         return {
             "qpos": now["qpos"],

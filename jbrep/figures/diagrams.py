@@ -18,6 +18,14 @@ _MOST = 20  # units of a layer that are drawn
 _BOX = 19  # characters on a line of a box
 
 
+class TaskRecord(TypedDict):
+    """What is drawn of a task's description."""
+
+    action_low: list[float]  # of each action
+    action_high: list[float]
+    timestep: float | None  # [s]
+
+
 class Settings(TypedDict):
     """What runs that differ by seed alone share; settings that nothing here reads come beside."""
 
@@ -30,6 +38,7 @@ class Settings(TypedDict):
     steps: int
     evaluate_every: int
     evaluation_episodes: int
+    environment: NotRequired[TaskRecord]
 
 
 class Training(TypedDict, total=False):
@@ -63,20 +72,11 @@ class EncoderRecord(TypedDict):
     metrics: Metrics
 
 
-class TaskRecord(TypedDict):
-    """What is drawn of a task's description."""
-
-    action_low: list[float]  # of each action
-    action_high: list[float]
-    timestep: float | None  # [s]
-
-
 class LabelRecord(TypedDict):
     """A label in runs.json."""
 
     settings: Settings
     encoder: EncoderRecord
-    task: NotRequired[TaskRecord]
 
 
 def diagrams(labels: Mapping[str, LabelRecord], looks: Looks) -> list[Plot]:
@@ -156,7 +156,7 @@ def system(shared: LabelRecord, looks: Looks) -> Plot:
     settings, encoder = shared["settings"], shared["encoder"]
     latent = encoder["encoder"][-1][0]
     hidden = "-".join(map(str, settings["hidden"]))
-    task = shared.get("task")
+    task = settings.get("environment")
     action = _action(task) if task else ""
     step = f" of {task['timestep']:g} s" if task and task["timestep"] else ""
     boxes = [

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jbrep.envs.physics import Motion, root_of
 from jbrep.envs.task import Array
 from jbrep.inspection.recording import Recording
-from jbrep.inspection.shapes import XYZW, is_shown, shapes
+from jbrep.inspection.shapes import XYZW, is_shown, own_colours, shapes
 
 _DEFAULT_SIZE = 1.0  # [m] of a model without geoms
 
@@ -106,21 +106,23 @@ class Robot:
                 own if not given.
         """
         for i, body in enumerate(bodies):
-            path, geoms = f"{root}/{self.names[body]}", self.geoms(body)
-            columns = []
+            geoms, columns = self.geoms(body), []
+            if colours is None or colours.ndim == 1:
+                own = own_colours(self.model, geoms)
+                fixed = own if colours is None else np.tile(colours, (len(geoms), 1))
+                static: list[Any] = shapes(self.model, geoms, fixed)
+            else:
+                static = shapes(self.model, geoms, None)
+                columns = [type(shape).columns(colors=colours[:, i]) for shape in static]
             place, turned = poses.position[:, body], poses.quaternion[:, body][:, XYZW]
             if (place == place[0]).all() and (turned == turned[0]).all():
-                still = rr.Transform3D(
-                    translation=place[0], quaternion=rr.Quaternion(xyzw=turned[0])
-                )
-                recording.send(path, still)
+                still = rr.Quaternion(xyzw=turned[0])
+                static.append(rr.Transform3D(translation=place[0], quaternion=still))
             else:
                 columns.append(rr.Transform3D.columns(translation=place, quaternion=turned))
-            fixed = colours if colours is not None and colours.ndim == 1 else None
-            for shape in shapes(self.model, geoms, colour=fixed):
-                recording.send(path, shape)
-                if colours is not None and fixed is None:
-                    columns.append(type(shape).columns(colors=colours[:, i]))
+            path = f"{root}/{self.names[body]}"
+            if static:
+                recording.send(path, *static)
             if columns:
                 recording.send_columns(path, times, *columns)
 

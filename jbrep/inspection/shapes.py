@@ -27,11 +27,16 @@ _KINDS: dict[int, Any] = {
 
 def is_shown(model: mujoco.MjModel, geom: int) -> bool:
     """Whether a geom is visible and of a kind that `shapes` knows; height fields aren't."""
-    seen = model.geom_group[geom] < _SHOWN_GROUPS and colour_of(model, geom)[3] > 0
+    seen = model.geom_group[geom] < _SHOWN_GROUPS and _colour_of(model, geom)[3] > 0
     return bool(seen) and int(model.geom_type[geom]) in _KINDS
 
 
-def colour_of(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
+def own_colours(model: mujoco.MjModel, geoms: Sequence[int]) -> NDArray[np.uint8]:
+    """The colours that the model gives to geoms, (len(geoms), 4)."""
+    return np.reshape([_colour_of(model, geom) for geom in geoms], (-1, 4)).astype(np.uint8)
+
+
+def _colour_of(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
     """A geom's colour, (4,): its own, or its material's as in MuJoCo; textures are left out."""
     rgba, material = model.geom_rgba[geom], model.geom_matid[geom]
     if material >= 0 and np.allclose(rgba, _NO_COLOUR):
@@ -40,25 +45,26 @@ def colour_of(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
 
 
 def shapes(
-    model: mujoco.MjModel, geoms: Sequence[int], colour: NDArray[np.uint8] | None = None
+    model: mujoco.MjModel, geoms: Sequence[int], colours: NDArray[np.uint8] | None
 ) -> list[Any]:
     """Geoms of one body in its frame, as an archetype for each of their kinds.
 
     Args:
         model: the model.
         geoms: their numbers; each must be one that `is_shown`.
-        colour: of all, (4,); their own if not given.
+        colours: of each geom, (len(geoms), 4); none if not given.
     """
     kinds: dict[Any, list[int]] = defaultdict(list)
-    for geom in geoms:
-        kinds[_KINDS[int(model.geom_type[geom])]].append(geom)
+    for i, geom in enumerate(geoms):
+        kinds[_KINDS[int(model.geom_type[geom])]].append(i)
     made = []
-    for kind, some in kinds.items():
-        colours = [colour_of(model, geom) if colour is None else colour for geom in some]
+    for kind, places in kinds.items():
+        some = [geoms[i] for i in places]
+        chosen = None if colours is None else colours[places]
         if kind is rr.Mesh3D:
-            made.append(_meshes(model, some, colours))
+            made.append(_meshes(model, some, chosen))
         else:
-            made.append(kind(**_fields(model, kind, some), colors=colours, fill_mode=_SOLID))
+            made.append(kind(**_fields(model, kind, some), colors=chosen, fill_mode=_SOLID))
     return made
 
 
@@ -85,7 +91,7 @@ def _matrices(model: mujoco.MjModel, geoms: Sequence[int]) -> Array:
 
 
 def _meshes(
-    model: mujoco.MjModel, geoms: list[int], colours: Sequence[NDArray[np.uint8]]
+    model: mujoco.MjModel, geoms: list[int], colours: NDArray[np.uint8] | None
 ) -> rr.Mesh3D:
     """Meshes as one, of separate triangles, which gives each of them its own normal."""
     parts = []
@@ -98,8 +104,9 @@ def _meshes(
     every = np.concatenate(parts)  # (triangles, 3, 3)
     normals = np.cross(every[:, 1] - every[:, 0], every[:, 2] - every[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    corners_of = [3 * len(part) for part in parts]
     return rr.Mesh3D(
         vertex_positions=every.reshape(-1, 3),
         vertex_normals=np.repeat(normals, 3, axis=0),
-        vertex_colors=np.repeat(colours, [3 * len(part) for part in parts], axis=0),
+        vertex_colors=None if colours is None else np.repeat(colours, corners_of, axis=0),
     )

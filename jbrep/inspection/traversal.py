@@ -16,7 +16,6 @@ from jbrep.inspection.ghost import as_qpos
 from jbrep.inspection.recording import GREY, Recording
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import WORLD, send_floor
-from jbrep.inspection.signals import panels
 from jbrep.jitterbug.tasks import POSITION
 from jbrep.rollouts.jitterbug import jitterbug_task
 from jbrep.rollouts.rollout import Rollout
@@ -113,8 +112,7 @@ def _send_features(
     """Send all decoded features, and those that move most."""
     path = f"{TRAVERSE}/unit_{unit}"
     labels = [f"{name} [scaled]" for name in names]
-    for name, place in panels({"decoded": slice(0, len(labels))}):
-        recording.send_series(f"{path}/{name}", times, scaled[:, place], labels[place])
+    recording.send_series(f"{path}/decoded", times, scaled, labels)
     recording.send_series(f"{path}/most", times, scaled[:, most], [labels[i] for i in most])
 
 

@@ -151,9 +151,9 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode; `options` are ignored."""
         super().reset(seed=seed)
-        before = self.model
+        before = self._simulation.body_numbers[0]
         self._simulation.reset([0], [self.np_random])
-        if self.model is not before:
+        if self._simulation.body_numbers[0] != before:
             self.close()  # the renderer shows the other body
             self._data = None
         self._observation = self._simulation.observe()[0]

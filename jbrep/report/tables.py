@@ -93,7 +93,7 @@ def _read_record(path: Path) -> Record:
         raise DamageError(f"{path} is damaged: {error}") from None
     for shared in checked["labels"].values():
         if shared["settings"]["task"] in TASKS:
-            shared.setdefault("task", _JITTERBUG)
+            shared["settings"].setdefault("environment", _JITTERBUG)
     return checked
 
 

@@ -19,7 +19,7 @@ from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.study.heuristics import write_heuristics
 from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.record import RECORD, as_json, learner, record
-from jbrep.text import table
+from jbrep.text import rounded, table
 
 RETURNS = "returns.csv"
 STATISTICS = "statistics.json"
@@ -185,6 +185,7 @@ def _last_evaluations(runs: list[RunCurve]) -> tuple[tuple[str, ...], Iterator[t
             return run.label, str(run.seed), f"{run.failed_at:,}", "failed", "-"
         low, median, high = np.percentile(run.returns[-1], (10, 50, 90))
         steps = f"{run.steps[-1]:,}"
-        return run.label, str(run.seed), steps, f"{median:.0f}", f"[{low:.0f}, {high:.0f}]"
+        at_low, at_median, at_high = rounded(low, median, high)
+        return run.label, str(run.seed), steps, at_median, f"[{at_low}, {at_high}]"
 
     return header, map(row, runs)

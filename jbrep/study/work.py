@@ -10,6 +10,7 @@ from typing import NamedTuple
 from jbrep.envs.names import import_modules
 from jbrep.files.storage import make_folder
 from jbrep.rl import Run, StoppedError, train
+from jbrep.text import rounded
 
 PROGRESS = "progress"
 ERROR = "error.txt"  # the traceback of a run that crashed
@@ -78,5 +79,5 @@ class _ProgressFile:
     def __call__(self, step: int, mean: float | None) -> None:
         now = time.monotonic()
         if now - self._written >= _WRITE_EVERY:
-            self._path.write_text(f"{step} {'-' if mean is None else f'{mean:.0f}'}")
+            self._path.write_text(f"{step} {'-' if mean is None else rounded(mean)[0]}")
             self._written = now
