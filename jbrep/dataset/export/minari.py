@@ -68,7 +68,7 @@ def _create(dataset: Dataset, name: str) -> None:
 
 
 def _actions(task: Task) -> spaces.Box:
-    low, high = np.float32(task.action_low), np.float32(task.action_high)
+    low, high = (np.array(ends, np.float32) for ends in (task.action_low, task.action_high))
     return spaces.Box(low, high, dtype=np.float32)
 
 
