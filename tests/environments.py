@@ -1,5 +1,9 @@
 """A third party's package: importing it registers small environments with Gymnasium."""
 
+import os
+import signal
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 from gymnasium import spaces
@@ -66,6 +70,28 @@ class Broken(Sledge):
             )
             reward = np.inf if self.how == "reward" else reward
         return observation, reward, *others
+
+
+class Deadly(Sledge):
+    """A sledge that takes its process along in an episode, the first so many times.
+
+    Args:
+        log: a file that has a letter for each time.
+        seed: of the episode.
+        times: how many.
+    """
+
+    def __init__(self, log="", seed=0, times=1):
+        super().__init__()
+        self.log, self.deadly, self.times = Path(log), seed, times
+
+    def reset(self, *, seed=None, options=None):
+        if seed == self.deadly:
+            with self.log.open("a") as file:
+                file.write("x")
+            if len(self.log.read_text()) <= self.times:
+                os.kill(os.getpid(), signal.SIGKILL)
+        return super().reset(seed=seed)
 
 
 class Moody(Sledge):
@@ -175,6 +201,7 @@ LIMIT = 40
 for _name, _made, _limit in (
     ("Sledge", Sledge, LIMIT),
     ("Broken", Broken, LIMIT),
+    ("Deadly", Deadly, LIMIT),
     ("Moody", Moody, LIMIT),
     ("Worn", Worn, LIMIT),
     ("Nested", Nested, LIMIT),

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -17,7 +16,14 @@ import gymnasium
 import numpy as np
 import pytest
 import robots
-from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
+from command import (
+    jbrep,
+    run_on_dying_cluster,
+    start,
+    wait_for,
+    wait_for_the_end_of,
+    workers_of,
+)
 
 from jbrep.encoders import load
 from jbrep.envs import describe
@@ -456,16 +462,7 @@ def test_a_stopped_study_leaves_checkpoints_and_a_killed_one_no_workers(tmp_path
 
 def test_on_a_cluster_that_loses_a_node(done, tmp_path):
     pytest.importorskip("ray")
-    script = Path(__file__).with_name("cluster.py")
-    told = subprocess.run(
-        [sys.executable, script, str(tmp_path / "ray")],
-        capture_output=True,
-        text=True,
-        timeout=600,
-        env={**os.environ, "HOME": str(tmp_path)},
-    )
-    assert told.returncode == 0, told.stderr[-3000:]
-    assert "a node died at work" in told.stdout
+    run_on_dying_cluster("study", tmp_path / "ray")
     runs = read_runs(tmp_path / "ray")
     expected = [run for run in read_runs(done.folder) if run.seed == 0]
     for ours, theirs in zip(runs, expected, strict=True):

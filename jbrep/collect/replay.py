@@ -36,8 +36,9 @@ def replay_problems(
     total = len(dataset.episodes["length"])
     if not 0 <= episodes <= total:
         raise InputError(f"{episodes} episodes can't be replayed: the data set has {total:,}")
-    if episodes:
-        check_reproducible(dataset, "episodes can't be replayed")
+    if not episodes:
+        return  # without a look at the environment, whose package need not be there
+    check_reproducible(dataset, "episodes can't be replayed")
     numbers = np.sort(np.random.default_rng(0).permutation(total)[:episodes])
     chosen = [dataset.episode(int(number)) for number in numbers]
     steps = sum(map(len, chosen))

@@ -9,9 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import gymnasium
 import minari
 import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 from minari.namespace import NAMESPACE_METADATA_FILENAME
 
@@ -58,18 +59,28 @@ def _create(dataset: Dataset, name: str) -> None:
         name,
         _episodes(dataset),
         env=_environment(settings.task),
+        observation_space=spaces.Box(-np.inf, np.inf, (settings.task.size,), np.float32),
+        action_space=_actions(settings.task),
         algorithm_name=settings.policy["kind"],
         description=f"{json.dumps(settings.as_json())} {dataset.manifest.fingerprint}",
         requirements=[f"{package}=={versions[package]}" for package in ("jbrep", "mujoco")],
     )
 
 
-def _environment(task: Task) -> gymnasium.envs.registration.EnvSpec:
-    """What Minari recovers the environment from: with the arguments and the time limit."""
+def _actions(task: Task) -> spaces.Box:
+    low, high = (np.array(ends, np.float32) for ends in (task.action_low, task.action_high))
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def _environment(task: Task) -> EnvSpec | None:
+    """What Minari recovers the environment from: with the arguments and the time limit.
+
+    None for one that was registered with a class or function: only a name can be written down.
+    """
     spec = copy.deepcopy(find_spec(task.id))
     spec.kwargs.update(task.arguments)
     spec.max_episode_steps = task.max_episode_steps
-    return spec
+    return None if callable(spec.entry_point) else spec
 
 
 @contextmanager

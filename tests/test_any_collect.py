@@ -1,0 +1,393 @@
+"""Data sets of any environment: in processes, killed and resumed, verified, repaired, read."""
+
+import json
+import os
+import shutil
+import signal
+import sys
+import time
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+from command import (
+    jbrep,
+    run_on_dying_cluster,
+    start,
+    wait_for,
+    wait_for_the_end_of,
+    workers_of,
+)
+from small import contents, settings
+
+from jbrep.collect import backends, collect
+from jbrep.collect.derive import derive
+from jbrep.collect.repair import repair
+from jbrep.collect.replay import replay_problems
+from jbrep.dataset import DamageError, Dataset
+from jbrep.dataset.export import FORMATS, export
+from jbrep.dataset.manifest import read_manifest
+from jbrep.dataset.schema import episode_seed
+from jbrep.dataset.verify import find_problems
+from jbrep.envs import describe
+from jbrep.envs.names import import_modules
+from jbrep.errors import InputError
+
+import_modules(["environments"])
+ID = "Sledges/Sledge-v0"
+SLEDGE = describe(ID)
+
+
+def some(task=SLEDGE, **changes):
+    """Settings of some 20 episodes."""
+    usual = {"task": task, "steps": 300, "shard_episodes": 5, "store_state": False}
+    return settings(**(usual | changes))
+
+
+LONG = some(steps=15_000, shard_episodes=50)
+
+
+@pytest.fixture(scope="module")
+def sledges(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sledges") / "data"
+    collect(some(), folder, num_threads=1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory):
+    """Collected in turn and in peace."""
+    folder = tmp_path_factory.mktemp("long") / "data"
+    collect(LONG, folder, num_threads=1)
+    return folder
+
+
+def test_it_is_the_fewest_whole_episodes_with_enough_rows(sledges):
+    dataset = Dataset(sledges)
+    episodes, count = dataset.episodes, len(dataset.episodes["length"])
+    assert 300 <= len(dataset) == episodes["length"].sum() < 300 + episodes["length"][-1]
+    assert [entry.episodes for entry in dataset.manifest.shards[:-1]] == [5] * ((count - 1) // 5)
+    assert len(set(episodes["length"].tolist())) > 3
+    assert (episodes["length"][episodes["terminated"] == 0] == 40).all()
+    np.testing.assert_array_equal(episodes["episode"], np.arange(count))
+    np.testing.assert_array_equal(episodes["seed"], 4 * 2**32 + np.arange(count))
+    owner = np.repeat(np.arange(count), episodes["length"])
+    np.testing.assert_array_equal(dataset["episode"], owner)
+    assert (episodes["return"] < 0).all()
+    assert dataset["action"].shape == (len(dataset), 3)
+    assert dataset["action"][:][:, 1].max() > 9
+    assert not list(find_problems(sledges))
+    assert not list(replay_problems(dataset, count))
+    told = jbrep("data", "info", sledges).output
+    assert f"{episodes['terminated'].sum()} terminated by a state" in told
+    assert f"{ID}, 2 features, 3 actions" in told
+
+
+def test_an_episode_is_the_one_that_gymnasium_s_environment_has(sledges):
+    dataset, environment = Dataset(sledges), gymnasium.make(ID)
+    for number in (0, 7):
+        episode = dataset.episode(number)
+        observation, _ = environment.reset(seed=int(episode.record["seed"]))
+        for row in range(len(episode)):
+            np.testing.assert_array_equal(episode["observation"][row], np.float32(observation))
+            observation, reward, terminated, truncated, _ = environment.step(episode["action"][row])
+            assert episode["reward"][row] == np.float32(reward)
+        ends = episode.record
+        np.testing.assert_array_equal(ends["final_observation"], np.float32(observation))
+        assert (terminated, truncated) == (ends["terminated"], ends["truncated"])
+
+
+@pytest.mark.parametrize("workers", [2, 3])
+def test_the_number_of_processes_changes_no_byte(workers, sledges, tmp_path):
+    collect(some(), tmp_path / "data", num_threads=workers)
+    assert contents(tmp_path / "data") == contents(sledges)
+
+
+def test_another_division_into_shards_has_the_same_rows(sledges, tmp_path):
+    collect(some(shard_episodes=8), tmp_path / "wide", num_threads=1)
+    wide, narrow = Dataset(tmp_path / "wide"), Dataset(sledges)
+    for name in wide.columns:
+        np.testing.assert_array_equal(wide[name], narrow[name])
+    for name in wide.episodes:
+        np.testing.assert_array_equal(wide.episodes[name], narrow.episodes[name])
+
+
+def deadly(tmp_path, times):
+    """A task whose environment kills its worker in an episode of the second shard."""
+    arguments = {"log": str(tmp_path / "log"), "times": times}
+    arguments["seed"] = episode_seed(SLEDGE, some().seed, 7)
+    return describe("Sledges/Deadly-v0", arguments)
+
+
+def test_the_shard_of_a_killed_worker_is_made_again(tmp_path):
+    task = deadly(tmp_path, times=1)
+    collect(some(task), tmp_path / "killed", num_threads=2)
+    assert (tmp_path / "log").read_text() == "xx"
+    collect(some(task), tmp_path / "peace", num_threads=1)
+    assert contents(tmp_path / "killed") == contents(tmp_path / "peace")
+
+
+def test_a_shard_that_kills_every_worker_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(backends, "_ATTEMPTS", 2)
+    with pytest.raises(InputError, match=r"worker of shard 1 was killed 2 times, perhaps because"):
+        collect(some(deadly(tmp_path, 99)), tmp_path / "data", num_threads=2)
+    assert len(Dataset(tmp_path / "data").episodes["length"]) in (0, 5)
+
+
+def test_a_stopped_and_a_killed_collector_are_resumed(long, tmp_path, monkeypatch):
+    """Ctrl-C ends it in seconds; neither leaves a worker behind nor changes a byte."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # `environments` is there
+    data = tmp_path / "data"
+    command = ("collect", "--task", f"environments:{ID}", "--steps", LONG.steps, "--seed", 3)
+    command += ("--shard-episodes", 50, "--threads", 2, "--out", data)
+    for number, shard, status in ((signal.SIGINT, 1, 130), (signal.SIGKILL, 6, -9)):
+        process = start(*command)
+        seen = (data / f"shard-{shard:05d}.h5").exists
+        assert wait_for(seen, process), process.communicate()
+        workers = workers_of(process.pid)
+        process.send_signal(number)
+        began = time.monotonic()
+        said = process.communicate(timeout=20)[1]
+        assert process.returncode == status, said
+        assert workers
+        wait_for_the_end_of(workers, seconds=10)
+        assert time.monotonic() - began < 10
+        assert "stopped; the same command resumes it" in said or number == signal.SIGKILL
+        assert not read_manifest(data).complete
+        assert not list(find_problems(data))
+    told = jbrep(*command)
+    assert told.exit_code == 0, told.output
+    assert contents(data) == contents(long)
+
+
+def test_on_a_cluster_that_loses_a_node(long, tmp_path):
+    pytest.importorskip("ray")
+    run_on_dying_cluster("data", tmp_path / "data")
+    assert contents(tmp_path / "data") == contents(long)
+
+
+def test_repair_restores_the_last_shard_and_others(sledges, tmp_path):
+    folder = tmp_path / "data"
+    collect(some(), folder, num_threads=1)
+    shards = sorted(folder.glob("*.h5"))
+    assert Dataset(folder).manifest.shards[-1].episodes < 5
+    shards[-1].unlink()
+    shards[1].write_bytes(b"spoiled")
+    assert [line.split()[-1] for line in repair(folder)] == ["restored", "restored"]
+    assert contents(folder) == contents(sledges)
+    assert not list(repair(folder))
+
+
+def test_an_environment_that_fails_ends_the_command_in_one_line(tmp_path):
+    """With its id, seed and step; the shards before are kept."""
+    seed = episode_seed(SLEDGE, 0, 7)  # in the second shard
+    command = ("collect", "--task", "Sledges/Broken-v0", "--env", f"seed={seed}", "--steps", 600)
+    command += ("--shard-episodes", 5, "--threads", 2, "--out", tmp_path / "data")
+    for _ in range(2):
+        told = jbrep(*command)
+        line = told.output.strip().splitlines()[-1]
+        assert told.exit_code == 2
+        assert line == (
+            f"Error: Sledges/Broken-v0 failed at step 4 of the episode with seed {seed}: "
+            "RuntimeError: the rail broke"
+        )
+    assert len(Dataset(tmp_path / "data").episodes["length"]) == 5
+
+
+def test_a_shard_that_fails_doesn_t_matter_until_it_is_needed():
+    """It was begun ahead of time; the one before it takes longer."""
+
+    class Missing:
+        rows = 10**6
+
+        def wants(self, shard):
+            return shard < 2
+
+    arguments = {"seed": episode_seed(SLEDGE, 3, 300)}
+    task = describe("Sledges/Broken-v0", arguments)
+    wide = some(task, steps=10**6, shard_episodes=300)
+    shards = backends.local(wide, 1, 2)(0, Missing(), lambda steps: None)
+    assert len(next(shards)["episodes/seed"]) == 300
+    with pytest.raises(InputError, match="Sledges/Broken-v0 failed at step 4"):
+        next(shards)
+
+
+@pytest.mark.parametrize("name", ["Moody", "Worn"])
+def test_a_data_set_of_what_is_not_reproducible_says_so(name, tmp_path):
+    data, env_id = tmp_path / "data", f"Sledges/{name}-v0"
+    command = ("collect", "--task", env_id, "--steps", 90, "--threads", 1, "--out", data)
+    told = jbrep(*command)
+    assert f"{env_id} is not reproducible: no episode can be simulated again" in told.stderr
+    for _ in range(3):  # although a pilot run may end otherwise each time
+        assert "it was complete already" in jbrep(*command).stdout
+    assert jbrep("data", "verify", data).exit_code == 0
+    told = jbrep("data", "verify", data, "--replay", 1)
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    assert f"episodes can't be replayed: {env_id} is not reproducible" in told.output
+    assert "note" in jbrep("data", "info", data).output
+    (data / "shard-00000.h5").unlink()
+    told = jbrep("data", "repair", data)
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    assert f"can't be restored: {env_id} is not reproducible" in told.output
+
+
+def test_arrays_of_states_are_stored_and_compared(tmp_path):
+    task = describe("Sledges/Told-v0")
+    collect(some(task, steps=100, store_state=True), tmp_path / "data", num_threads=1)
+    dataset = Dataset(tmp_path / "data")
+    np.testing.assert_array_equal(dataset["heat"][:, 0], dataset["step"][:] / 2)
+    episodes = dataset.episodes
+    np.testing.assert_array_equal(episodes["final_heat"][:, 0], episodes["length"] / 2)
+    assert not episodes["initial_heat"].any()
+    assert len(np.unique(episodes["colour"][:, 0])) == len(episodes["length"])
+    assert not list(replay_problems(dataset, 2))
+    with pytest.raises(InputError, match="only the Jitterbug's tasks share their motion"):
+        derive(tmp_path / "data", "face_direction", tmp_path / "derived")
+    with pytest.raises(InputError, match=f"{ID} has no states to store"):
+        some(store_state=True)
+    for name in ("reward", "length", "diverged", "final_heat"):
+        with pytest.raises(InputError, match=f"has an array '{name}': data sets have such"):
+            some(replace(task, state={name: 1}))
+
+
+def test_an_unwrapped_time_limit_and_flattened_dictionaries(tmp_path):
+    endless = describe("Sledges/Endless-v0", {"rail": 99.0}, 12)
+    collect(some(endless, steps=25), tmp_path / "endless", num_threads=1)
+    episodes = Dataset(tmp_path / "endless").episodes
+    assert episodes["length"].tolist() == [12, 12, 12]
+    assert (episodes["truncated"].tolist(), episodes["terminated"].any()) == ([1, 1, 1], False)
+    nested = describe("Sledges/Nested-v0")
+    collect(some(nested, steps=60), tmp_path / "nested", num_threads=1)
+    dataset = Dataset(tmp_path / "nested")
+    assert dataset["signs.part1"].shape == (len(dataset), 3)
+    np.testing.assert_array_equal(dataset["signs.part1"][:].argmax(1), dataset["step"][:] % 3)
+    assert not list(replay_problems(dataset, 3))
+
+
+def test_actions_are_stepped_in_the_32_bits_that_are_stored(tmp_path):
+    exact = describe("Sledges/Exact-v0")
+    for kind in ({"kind": "uniform"}, {"kind": "constant", "drive": 1}):
+        collect(some(exact, steps=20, policy=kind), tmp_path / kind["kind"], num_threads=1)
+        dataset = Dataset(tmp_path / kind["kind"])
+        assert dataset.episodes["length"].tolist() == [7, 7, 7]
+        assert dataset.episodes["terminated"].all()
+        assert dataset.episodes["truncated"].all()
+        seen, later = dataset["observation"][:], dataset["step"][:] > 0
+        np.testing.assert_array_equal(seen[later][:, 1], 0)
+        before = np.roll(dataset["action"][:][:, 0], 1)
+        np.testing.assert_array_equal(seen[later][:, 0], before[later])
+        assert not list(find_problems(tmp_path / kind["kind"]))
+
+
+def test_arguments_are_settings(sledges, tmp_path):
+    with pytest.raises(InputError, match=r"settings: arguments \{\} \(now: \{'wind': 0.5\}\)"):
+        collect(some(describe(ID, {"wind": 0.5})), sledges)
+    with pytest.raises(InputError, match=r"other settings: max_episode_steps 40 \(now: 9\)"):
+        collect(some(describe(ID, max_episode_steps=9)), sledges)
+    collect(some(describe(ID, {"wind": 0.5})), tmp_path / "windy", num_threads=1)
+    assert (Dataset(tmp_path / "windy")["reward"][:10] != Dataset(sledges)["reward"][:10]).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"task": replace(SLEDGE, seed_bits=31), "seed": 2047}, "seeds of 31 bits: the data set's"),
+        ({"task": f"environments:{ID}"}, "names a module: importing it runs its code"),
+        ({"task": "CartPole-v1"}, "only continuous ones are possible"),
+        ({"policy": {"kind": "heuristic"}}, f"{ID} has no hand-written policy"),
+    ],
+)
+def test_mistakes_leave_nothing_behind(change, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        collect(some(**change), tmp_path / "data")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def nothing_is_made(monkeypatch):
+    """No environment can be made, found or described, as where its package isn't installed."""
+
+    def refuse(*arguments, **keywords):
+        raise AssertionError("an environment was asked for")
+
+    for name in ("make", "make_vec", "spec"):
+        monkeypatch.setattr(gymnasium, name, refuse)
+    monkeypatch.setattr("jbrep.envs.names.import_module", refuse)
+    monkeypatch.setattr("jbrep.envs.description._describe", refuse)
+
+
+def test_reading_makes_no_environment(tmp_path, request):
+    folder = tmp_path / "hopper"
+    hopper = describe("Hopper-v5", max_episode_steps=30)
+    collect(some(hopper, steps=60), folder, num_threads=1)
+    request.getfixturevalue("nothing_is_made")
+    dataset = Dataset(folder)
+    assert dataset.task == hopper
+    assert dataset["obs_10"].shape == (len(dataset),)
+    dataset.split()
+    assert jbrep("data", "verify", folder).exit_code == 0
+    assert "Hopper-v5, 11 features, 3 actions" in jbrep("data", "info", folder).output
+    assert jbrep("data", "info", folder, "--json").exit_code == 0
+    for to in ("npz", "parquet"):
+        export(dataset, to, tmp_path / to)
+
+
+def test_a_data_set_whose_package_isn_t_imported(sledges, tmp_path, monkeypatch):
+    monkeypatch.delitem(gymnasium.registry, ID)
+    assert not list(find_problems(sledges))
+    for command in (("verify", sledges, "--replay", 1), ("export", sledges, "--to", "minari")):
+        told = jbrep("data", *command, *(("--out", tmp_path / "x") if "--to" in command else ()))
+        assert (told.exit_code, told.output.count("\n")) == (2, 1)
+        assert "for one of another package add --import PACKAGE" in told.output
+
+
+@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("name", ["Sledge", "Nested"])
+def test_exports_of_any_environment(name, to, tmp_path):
+    task = describe(f"Sledges/{name}-v0")
+    collect(some(task, steps=60), tmp_path / "data", num_threads=1)
+    dataset, out = Dataset(tmp_path / "data"), tmp_path / "out"
+    told = export(dataset, to, out)
+    if to == "npz":
+        with np.load(out) as arrays:
+            assert arrays["action"].shape == (len(dataset), 3)
+            np.testing.assert_array_equal(
+                arrays["episodes/terminated"], dataset.episodes["terminated"]
+            )
+    elif to == "parquet":
+        table = pytest.importorskip("pyarrow.parquet").read_table(out)
+        np.testing.assert_array_equal(table["action_2"].to_numpy(), dataset["action"][:, 2])
+        first = task.feature_names[0]
+        np.testing.assert_array_equal(table[first].to_numpy(), dataset[first])
+    else:
+        assert f"Sledges/{name}/uniform-v0" in told.replace("-v0/uni", "/uni")
+
+
+def test_a_stranger_s_task_goes_nowhere(sledges, tmp_path, nothing_is_made):
+    """Its manifest is whole, only that its task isn't one."""
+    from jbrep.dataset import manifest
+
+    folder = shutil.copytree(sledges, tmp_path / "data")
+    record = json.loads((folder / "manifest.json").read_bytes())
+    for change in (
+        {"id": "os:system"},
+        {"id": "../../up"},
+        {"name": "/etc/passwd"},
+        {"max_episode_steps": 10**400},
+        {"arguments": {"g": float("nan")}},
+        {"timestep": float("nan")},
+        {"state": {"length": 1}},
+        {"seed_bits": 31, "id": ID},
+        {"features": [["x\x1b[2J", "", None, None, False, ""]] * 2},
+    ):
+        changed = json.loads(json.dumps(record))
+        changed["settings"]["environment"] |= change
+        if "name" in change:
+            changed["settings"]["task"] = change["name"]
+        if "seed_bits" in change:
+            changed["settings"]["seed"] = 5000
+        (folder / "manifest.json").write_bytes(manifest._text(changed))
+        with pytest.raises(DamageError, match=r"manifest\.json is damaged: it isn't what jbrep"):
+            Dataset(folder)
+        assert jbrep("data", "info", folder).exit_code == 2
