@@ -16,8 +16,9 @@ EXTRAS = {  # what each extra is for; the empty name stands for the core
     "": "the robot and its environments, collect, data",
     "learn": "train-dae, train-encoder, evaluate, rl, study, report",
     "export": "data export, encoder export",
-    "cluster": "study --backend ray",
+    "cluster": "collect and study --backend ray",
     "render": "render",
+    "suite": "--task dm_control/...",
     "view": "inspect",
     "dev": "make check, test and bench",
 }

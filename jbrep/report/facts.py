@@ -223,4 +223,9 @@ def _command(shared: LabelRecord, out: str) -> str:
     for name in options:
         parts += [f"--{name.replace('_', '-')}", str(settings[name])]
     parts += ["--encoder", shared["encoder"]["name"], "--seed", "0", "--out", out]
+    environment: Mapping[str, Any] = settings.get("environment", {})
+    for name, value in environment.get("arguments", {}).items():
+        parts += ["--env", f"{name}={json.dumps(value)}"]
+    if steps := environment.get("max_episode_steps"):
+        parts += ["--episode-steps", str(steps)]
     return shlex.join(parts)
