@@ -7,7 +7,7 @@ slows down slows both sides.
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from multiprocessing import get_context
@@ -22,8 +22,7 @@ from timing import show, timed
 from torch.utils.data import DataLoader, TensorDataset
 
 from jbrep import jitterbug
-from jbrep.collect.collector import simulate_shard, write_shards
-from jbrep.collect.policies import Uniform
+from jbrep.collect import collect
 from jbrep.dataset import Dataset, Settings
 from jbrep.dataset.manifest import commit, new_manifest
 from jbrep.dataset.schema import EPISODES
@@ -84,10 +83,7 @@ def collected_rate(folder: Path) -> float:
     """Control steps per second of collecting a shard to the disk."""
     settings = Settings(task=TASK, steps=LANES * EPISODE_STEPS, shard_episodes=LANES)
 
-    def make(shard: int, tick: Callable[[int], object]) -> Any:
-        return simulate_shard(settings, Uniform(), shard, tick, LANES)
-
-    return settings.steps / timed(lambda: write_shards(settings, folder, make))
+    return settings.steps / timed(lambda: collect(settings, folder, LANES))
 
 
 def bare_rate() -> float:
@@ -141,11 +137,15 @@ def make_rows(folder: Path) -> Dataset:
     manifest = new_manifest(settings)
     folder.mkdir()
     random = np.random.default_rng(0)
-    for shard in range(settings.num_shards):
-        counts = manifest.row_counts(shard, 100 * EPISODE_STEPS)
+    episodes = settings.shard_episodes
+    while not manifest.complete:
         columns = {
-            name: random.integers(0, 100, spec.shape(counts[name])).astype(spec.dtype)
-            for name, spec in settings.specs().items()
+            name: random.integers(
+                0,
+                100,
+                spec.shape(episodes if name.startswith(EPISODES) else episodes * EPISODE_STEPS),
+            ).astype(spec.dtype)
+            for name, spec in manifest.specs().items()
         }
         columns[EPISODES + "length"][:] = EPISODE_STEPS
         manifest = commit(folder, manifest, columns)

@@ -38,7 +38,7 @@ def main(out: Path) -> None:
     show("replaying", replaying)
     show("recording", fastest(partial(record_episode, episode, out)), out.stat().st_size)
     for name in ("dae-8", "identity"):
-        encoder = find(name, TASK)
+        encoder = find(name, episode.task)
         seconds = fastest(partial(record_episode, episode, out, encoder))
         show(f"recording with {name}", seconds, out.stat().st_size)
         aim = "aim below 1 s and 3 MB"

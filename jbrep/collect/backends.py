@@ -44,7 +44,10 @@ def _in_processes(settings: Settings, workers: int) -> Produce:
 
             for shard in count(first):
                 while shard not in made:
-                    while not pool.is_full and (started == shard or missing.wants(started)):
+                    most = shard + 2 * workers  # held in memory until those before are made
+                    while not pool.is_full and (
+                        started == shard or (started < most and missing.wants(started))
+                    ):
                         submit(started)
                         started += 1
                     number, columns = pool.result()
