@@ -1,6 +1,7 @@
 """Data sets of the first release: read, verified, repaired and exported as they are."""
 
 import platform
+import re
 import shutil
 from importlib.metadata import version
 from pathlib import Path
@@ -29,6 +30,7 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.verify import find_problems
 from jbrep.errors import InputError
+from jbrep.jitterbug.tasks import TASKS
 
 RELEASED = Path(__file__).parent / "version1"  # what 0.1.0 wrote of two episodes, less its shards
 ENDS = {f"episodes/{name}" for name in ("diverged", "terminated", "truncated")}
@@ -120,3 +122,20 @@ def test_an_episode_that_diverged_lacks_its_last_row(tmp_path):
     with np.load(tmp_path / "npz") as archive:
         np.testing.assert_array_equal(archive["episodes/length"], [1000, 300, 0])
         assert len(archive["observation"]) == 1300
+
+
+def test_the_report_of_the_first_release_s_study_comes_from_its_tables(tmp_path):
+    folder = shutil.copytree(
+        "results/desk", tmp_path / "desk", ignore=shutil.ignore_patterns("figures")
+    )
+    before = (folder / "summary.md").read_text()
+    assert jbrep("report", folder).exit_code == 0
+    assert (folder / "report.html").stat().st_size > 10**6
+    verdicts = re.compile(r"(supported|contradicted|undecided)")
+    assert verdicts.findall((folder / "summary.md").read_text()) == verdicts.findall(before)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_first_release_s_samples_are_verified(task):
+    told = jbrep("data", "verify", f"data/sample/{task}", "--replay", 1)
+    assert (told.exit_code, "no problems in 4,000 rows, 1 shard" in told.output) == (0, True)
