@@ -147,10 +147,10 @@ def _find(
 def behaviour(
     policies: tuple[str, ...], episodes: int, target_yaw: float, out: Path, **options: Any
 ) -> None:
-    """Draw how policies turn the Jitterbug's motor and where they go.
+    """Draw how policies turn the motor and where they go.
 
-    A policy is the folder of a run, shown before and after training, or a name, such as heuristic.
-    All play the same episodes.
+    For the Jitterbug's tasks alone. A policy is the folder of a run, shown before and after
+    training, or a name, such as heuristic. All play the same episodes.
     """
     import numpy as np
 
