@@ -242,3 +242,54 @@ def test_triton_can_be_imported_after_rendering(renders):
     pytest.importorskip("triton")
     done = without_a_display(f"{_RENDERS[renders]}\nimport triton")
     assert done.returncode == 0, done.stderr
+
+
+def test_lanes_are_reset_by_hand_where_autoreset_is_off():
+    """By the mask, with seeds of their own; the others go on, those that have ended too."""
+    off = gymnasium.vector.AutoresetMode.DISABLED
+    many = gymnasium.make_vec(FACE, num_envs=3, max_episode_steps=5, autoreset_mode=off)
+    assert many.metadata["autoreset_mode"] is off
+    many.reset(seed=[4, 5, 6])
+    actions = np.random.default_rng(0).uniform(-1, 1, (8, 3, 1)).astype(np.float32)
+    for action in actions[:5]:
+        observation, _, _, truncated, info = many.step(action)
+    assert truncated.all()
+    assert "final_obs" not in info
+    mask = {"reset_mask": np.array([False, True, False])}
+    again, _ = many.reset(seed=[None, 9, None], options=mask)
+    np.testing.assert_array_equal(again[[0, 2]], observation[[0, 2]])
+    single = gymnasium.make(FACE, max_episode_steps=5)
+    np.testing.assert_array_equal(again[1], single.reset(seed=9)[0])
+    for action in actions[5:]:
+        observation, _, _, truncated, _ = many.step(action)
+        np.testing.assert_array_equal(observation[1], single.step(action[1])[0])
+        assert truncated.tolist() == [True, False, True]
+
+
+def test_a_vector_environment_s_state_is_continued_to_the_same_bits():
+    many = gymnasium.make_vec(FACE, num_envs=2, max_episode_steps=30, dtype="float64").unwrapped
+    assert many.single_observation_space.dtype == np.float64
+    many.reset(seed=3)
+    actions = np.random.default_rng(0).uniform(-1, 1, (40, 2, 1))
+    for action in actions[:20]:
+        many.step(action)
+    state = many.state
+    expected = [many.step(action)[:4] for action in actions[20:29]]  # none is reset
+    other = gymnasium.make_vec(FACE, num_envs=2, max_episode_steps=30, dtype="float64").unwrapped
+    for each in (many, other):
+        each.restore(state)
+        for action, before in zip(actions[20:29], expected, strict=True):
+            for one, again in zip(before, each.step(action)[:4], strict=True):
+                np.testing.assert_array_equal(one, again)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}, "SAME_STEP or DISABLED"),
+        ({"dtype": "float16"}, "unknown dtype 'float16': choose one of float32, float64"),
+    ],
+)
+def test_modes_and_types_of_a_vector_environment_that_can_t_be(options, message):
+    with pytest.raises(InputError, match=message):
+        gymnasium.make_vec(FACE, num_envs=2, **options)

@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints, is_typeddict
@@ -11,6 +12,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints,
 from jbrep.errors import DamageError, check_version
 
 Readers = Mapping[Any, Callable[[Any], Any]]  # by type: how to read values of that type
+_hints = cache(get_type_hints)  # slow, and asked for at each feature of a task
 
 
 def read_json(text: str, path: Path, kind: str, known: int) -> dict[str, Any]:
@@ -98,7 +100,7 @@ def _record(value: Any, kind: Any, part: Callable[..., Any], where: str) -> Any:
     _need(not missing, where, f"complete: {missing} is missing")
     own = {
         name: part(value[name], hint, f".{name}")
-        for name, hint in get_type_hints(kind).items()
+        for name, hint in _hints(kind).items()
         if name in value
     }
     if typed_dict:
