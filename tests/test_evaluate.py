@@ -50,9 +50,10 @@ def held_out(data):
 
 
 def make(scaled, parts, name="it-4", **changes):
-    facts = {"kind": "test", "name": name, "task": scaled.task.name, "data": {}}
-    features = list(scaled.task.feature_names)
-    return Encoder({**facts, "features": features, **changes}, scaled.scaler, *parts)
+    task = changes.pop("task", scaled.task)
+    facts = {"kind": "test", "name": name, "task": task.name, "environment": task.as_json()}
+    features = list(task.feature_names)
+    return Encoder({**facts, "data": {}, "features": features, **changes}, scaled.scaler, *parts)
 
 
 @pytest.fixture(scope="module")
@@ -545,8 +546,9 @@ def test_whether_an_encoder_may_have_seen_the_episodes(data):
 
 
 def test_other_features_are_refused(data):
-    with pytest.raises(InputError, match="made for move_to_pose, whose features differ"):
-        diagnose({"it": make(data, ((), ()), task="move_to_pose", features=["a"] * 16)}, data)
-    permuted = list(reversed(data.task.feature_names))
-    with pytest.raises(InputError, match="has angle_to_target as feature 0"):
-        diagnose({"it": make(data, ((), ()), features=permuted)}, data)
+    other = replace(data.task, id="Other-v0", name="Other-v0")
+    with pytest.raises(InputError, match="it-4 was made for Other-v0, not for face_direction"):
+        diagnose({"it": make(data, ((), ()), task=other)}, data)
+    permuted = replace(data.task, features=tuple(reversed(data.task.features)))
+    with pytest.raises(InputError, match="it-4 was made for other features of face_direction"):
+        diagnose({"it": make(data, ((), ()), task=permuted)}, data)

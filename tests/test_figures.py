@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.figures import behaviour_plots, encoder_plots, study_plots, write
 from jbrep.figures.curves import Return
@@ -343,7 +344,7 @@ def test_of_a_wide_robot_the_worst_features_are_shown():
 @pytest.fixture(scope="module")
 def behaviours():
     sources = ("constant:drive=0.5", "heuristic")
-    return observe(sources, "move_in_direction", episodes=3, target_yaw=np.pi / 4)[1]
+    return observe(sources, describe("move_in_direction"), episodes=3, target_yaw=np.pi / 4)[1]
 
 
 def test_a_constant_drive_turns_the_motor_one_way(behaviours):

@@ -304,11 +304,12 @@ def changed(source, folder, change, episodes=5):
     """A copy of a data set with other observations."""
     manifest = read_manifest(source)
 
-    def make(shard, tick):
-        columns = dict(open_shard(source, manifest, shard))
-        return {**columns, "observation": change(columns["observation"].copy())}
+    def produce(first, missing, tick):
+        for shard in range(first, episodes):
+            columns = dict(open_shard(source, manifest, shard))
+            yield {**columns, "observation": change(columns["observation"].copy())}
 
-    write_shards(settings(steps=1000 * episodes), folder, make)
+    write_shards(settings(steps=1000 * episodes), folder, produce)
     return Dataset(folder)
 
 

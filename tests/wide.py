@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from jbrep.dataset import Column, Dataset, ScaledDataset
+from jbrep.envs import Feature, Task
 
 SPREADS = {0: 0, 1: 1e8, 2: 1e-8}  # of the first features; about 1 of the others
 PLANE = 5  # dimensions in which nearly all variation lies
@@ -12,13 +13,19 @@ PLANE = 5  # dimensions in which nearly all variation lies
 
 def make_feature(name, unit="", low=None, high=None, bounded=False):
     """A feature as a task has it."""
-    return SimpleNamespace(name=name, unit=unit, low=low, high=high, bounded=bounded)
+    return Feature(name, unit, low, high, bounded)
 
 
 def make_task(features, name="Humanoid-v5"):
     """What encoders and diagnostics look at of a task."""
-    names = tuple(f.name for f in features)
-    return SimpleNamespace(name=name, features=features, size=len(features), feature_names=names)
+    return Task(
+        id=name,
+        name=name,
+        features=tuple(features),
+        action_low=(-1.0,) * 17,
+        action_high=(1.0,) * 17,
+        max_episode_steps=1000,
+    )
 
 
 class WideDataset:

@@ -222,10 +222,10 @@ def _command(shared: LabelRecord, out: str) -> str:
     parts = ["jbrep", "rl"]
     for name in options:
         parts += [f"--{name.replace('_', '-')}", str(settings[name])]
-    parts += ["--encoder", shared["encoder"]["name"], "--seed", "0", "--out", out]
     environment: Mapping[str, Any] = settings.get("environment", {})
     for name, value in environment.get("arguments", {}).items():
         parts += ["--env", f"{name}={json.dumps(value)}"]
     if steps := environment.get("max_episode_steps"):
         parts += ["--episode-steps", str(steps)]
+    parts += ["--encoder", shared["encoder"]["name"], "--seed", "0", "--out", out]
     return shlex.join(parts)
