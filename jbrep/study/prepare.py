@@ -1,8 +1,10 @@
 """The data sets and encoders that a study's runs need."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from jbrep.collect import collect
+from jbrep.collect.collector import usual_shard_episodes
 from jbrep.collect.derive import derive
 from jbrep.dataset import Dataset, ScaledDataset, Settings
 from jbrep.dataset.manifest import MANIFEST
@@ -75,10 +77,11 @@ def _collect(plan: Plan, data: Data, task: str) -> Path:
     else:
         described = plan.task(task)
         with_state = bool(described.state)
-        collect(
-            Settings(task=described, steps=data.steps, seed=data.seed, store_state=with_state),
-            folder,
+        settings = Settings(
+            task=described, steps=data.steps, seed=data.seed, store_state=with_state
         )
+        episodes = usual_shard_episodes(settings, folder)
+        collect(replace(settings, shard_episodes=episodes), folder)
     return folder
 
 
