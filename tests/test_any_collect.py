@@ -22,12 +22,13 @@ from command import (
 from small import contents, settings
 
 from jbrep.collect import backends, collect
+from jbrep.collect.collector import _Missing
 from jbrep.collect.derive import derive
 from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
 from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.export import FORMATS, export
-from jbrep.dataset.manifest import read_manifest
+from jbrep.dataset.manifest import new_manifest, read_manifest
 from jbrep.dataset.schema import episode_seed
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
@@ -102,6 +103,14 @@ def test_an_episode_is_the_one_that_gymnasium_s_environment_has(sledges):
 def test_the_number_of_processes_changes_no_byte(workers, sledges, tmp_path):
     collect(some(), tmp_path / "data", num_threads=workers)
     assert contents(tmp_path / "data") == contents(sledges)
+
+
+def test_shards_of_episodes_that_may_end_early_are_started_together():
+    """Though 900 episodes could have more rows than are needed, had they their full length."""
+    task = replace(SLEDGE, max_episode_steps=1000)
+    made = new_manifest(some(task, steps=200_000, shard_episodes=900))
+    assert _Missing(made).wants(1)
+    assert not _Missing(replace(made, settings=some(task, steps=900, shard_episodes=1))).wants(1)
 
 
 def test_another_division_into_shards_has_the_same_rows(sledges, tmp_path):

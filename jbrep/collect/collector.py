@@ -135,10 +135,10 @@ class _Missing:
         return self.manifest.settings.steps - self.manifest.rows
 
     def wants(self, shard: int) -> bool:
-        """Judging by the mean of the shards so far."""
+        """Judging by the mean of the shards so far, or else by the usual size."""
         settings, done = self.manifest.settings, len(self.manifest.shards)
         longest = settings.shard_episodes * settings.task.max_episode_steps
-        mean = self.manifest.rows / done if done else longest
+        mean = self.manifest.rows / done if done else min(longest, _SHARD_ROWS)
         return (shard - done) * mean < self.rows
 
 
