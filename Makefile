@@ -57,6 +57,7 @@ bench: $(READY) ## speed as ratios in one run, and what the hand-written policie
 	$(BIN)/python benchmarks/learning.py
 	$(BIN)/python benchmarks/inspection.py
 	$(BIN)/python benchmarks/heuristics.py
+	$(BIN)/python benchmarks/environments.py
 
 pictures: $(READY) ## the pictures in docs/, drawn anew
 	MUJOCO_GL=egl $(BIN)/python tools/pictures.py docs
