@@ -87,7 +87,7 @@ def walk_through(name: str, folder: Path) -> tuple[str, ...]:
     study = folder / "study.toml"
     study.write_text(STUDY.format(task=name, latent=latent, data=data))
     jbrep("study", study, "--out", folder / "study", module=module)
-    jbrep("report", folder / "study", module=module)
+    jbrep("report", folder / "study")
     recording = folder / "episode.rrd"
     jbrep("inspect", data, "--encoder", files[0], "--out", recording, module=module)
     return (
