@@ -138,7 +138,7 @@ def test_the_shard_of_a_killed_worker_is_made_again(tmp_path):
 
 
 def test_a_shard_that_kills_every_worker_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(backends, "_ATTEMPTS", 2)
+    monkeypatch.setattr(backends, "ATTEMPTS", 2)
     with pytest.raises(InputError, match=r"worker of shard 1 was killed 2 times, perhaps because"):
         collect(some(deadly(tmp_path, 99)), tmp_path / "data", num_threads=2)
     assert len(Dataset(tmp_path / "data").episodes["length"]) in (0, 5)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from itertools import count
 from typing import Any
 
+from jbrep.cluster import on_cluster
 from jbrep.collect.policies import make_policy
 from jbrep.collect.shards import Missing, Produce, shards_in_turn, simulate_shard
 from jbrep.dataset.schema import Columns
@@ -13,9 +14,7 @@ from jbrep.envs.make import is_batched
 from jbrep.envs.names import import_modules, imported_modules
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, choose
-from jbrep.pool import Pool, stop_requested
-
-_ATTEMPTS = 5  # at a shard whose worker is killed
+from jbrep.pool import ATTEMPTS, Pool, stop_requested
 
 Backend = Callable[[Settings, int, int | None], Produce]
 
@@ -55,9 +54,9 @@ def _in_processes(settings: Settings, workers: int) -> Produce:
                         made[number] = columns
                         continue
                     attempts[number] = attempts.get(number, 0) + 1
-                    if attempts[number] == _ATTEMPTS:
+                    if attempts[number] == ATTEMPTS:
                         raise InputError(
-                            f"the worker of shard {number} was killed {_ATTEMPTS} times, perhaps "
+                            f"the worker of shard {number} was killed {ATTEMPTS} times, perhaps "
                             "because memory ran out: try fewer --threads"
                         )
                     submit(number)
@@ -100,9 +99,7 @@ def on_ray(settings: Settings, lanes: int, num_threads: int | None) -> Produce:
     def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
         import ray
 
-        if not ray.is_initialized():
-            ray.init(num_cpus=None if "RAY_ADDRESS" in os.environ else num_threads, **_QUIET)
-        make = ray.remote(num_cpus=1, max_retries=_ATTEMPTS - 1)(make_shard)
+        make = on_cluster(make_shard, num_threads)
         started, made = first, dict[int, Any]()
         try:
             for shard in count(first):
@@ -121,11 +118,6 @@ def on_ray(settings: Settings, lanes: int, num_threads: int | None) -> Produce:
     return produce
 
 
-_QUIET: dict[str, Any] = {
-    "log_to_driver": False,
-    "logging_level": "ERROR",
-    "include_dashboard": False,
-}
 _BACKENDS: dict[str, Backend] = {"local": local, "ray": on_ray}
 
 

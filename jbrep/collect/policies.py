@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.envs.recording import Actor as Actor
+from jbrep.envs.recording import open_loop
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError, choose
 from jbrep.jitterbug.heuristics import HEURISTICS
@@ -156,8 +157,7 @@ class Heuristic:
 
 def _one_by_one(blocks: Iterator[NDArray[Any]]) -> Actor:
     """The actor that plays blocks of actions (steps, n, k), one step after the other."""
-    actions = (action for block in blocks for action in block)
-    return lambda observation: next(actions)
+    return open_loop(action for block in blocks for action in block)
 
 
 POLICIES = {policy.kind: policy for policy in (Uniform, Heuristic, Constant, OrnsteinUhlenbeck)}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from jbrep.dataset import Dataset, Episode
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
-from jbrep.envs.recording import Read, Recording, Tick, read_nothing, read_states, record
+from jbrep.envs.recording import Read, Recording, Tick, open_loop, read_nothing, read_states, record
 from jbrep.errors import InputError
 from jbrep.progress import Progress
 
@@ -88,8 +88,8 @@ def simulate_again(
     actions = np.tile(middle, (max(map(len, episodes)), len(episodes), 1))
     for lane, episode in enumerate(episodes):
         actions[: len(episode), lane] = episode["action"]
-    remaining = chain(actions, repeat(np.tile(middle, (len(episodes), 1))))
-    recording = record(lanes, lambda observation: next(remaining), tick, read)
+    afterwards = repeat(np.tile(middle, (len(episodes), 1)))
+    recording = record(lanes, open_loop(chain(actions, afterwards)), tick, read)
     lanes.close()
     return recording
 

@@ -1,6 +1,6 @@
 """Episodes: lanes stepped under a policy until every episode has ended, and recorded."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -32,8 +32,8 @@ def play(lanes: Lanes, act: Actor) -> Iterator[Played]:
         yield Played(observation, action, active, lanes.step(action))
 
 
-def open_loop(actions: NDArray[Any]) -> Actor:
-    """The actor that plays given actions (T, n, k), one after the other."""
+def open_loop(actions: Iterable[NDArray[Any]]) -> Actor:
+    """The actor that plays given actions (n, k), one after the other."""
     remaining = iter(actions)
     return lambda observation: next(remaining)
 

@@ -1,12 +1,13 @@
 """The ground truth of a robot, computed from its observations: what a latent is searched for."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jbrep.envs.task import Feature, Task
 from jbrep.jitterbug.tasks import TASKS
 
 Array = NDArray[np.float64]
@@ -14,18 +15,6 @@ Columns = dict[str, Array]
 
 _TURN = 2 * math.pi  # [rad]
 _ROTATION = ("orientation_w", "orientation_x", "orientation_y", "orientation_z")
-
-
-class Task(Protocol):
-    """What the ground truth needs to know of a task."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-
-    @property
-    def features(self) -> Sequence[Any]:
-        """Its features, each with name, unit, low, high and whether it is bounded."""
 
 
 class _Truth(NamedTuple):
@@ -72,16 +61,18 @@ def _truth(task: Task) -> _Truth:
     return _Truth(lambda features: _every(features, angles), everything)
 
 
-def _is_angle(feature: Any) -> bool:
+def _is_angle(feature: Feature) -> bool:
     """Whether a feature jumps from one end of its range to the other."""
     if feature.unit != "rad" or not feature.bounded:
+        return False
+    if feature.low is None or feature.high is None:
         return False
     return math.isclose(feature.high - feature.low, _TURN, rel_tol=0.01)
 
 
 def _features(task: Task, observation: ArrayLike) -> Columns:
     columns = np.asarray(observation, np.float64).T
-    return dict(zip((f.name for f in task.features), columns, strict=True))
+    return dict(zip(task.feature_names, columns, strict=True))
 
 
 def _every(features: Columns, angles: frozenset[str]) -> Columns:

@@ -1,18 +1,16 @@
 """The runs of a study, side by side: on this machine, or on a Ray cluster."""
 
-import os
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable
 from typing import Any
 
+from jbrep.cluster import on_cluster
 from jbrep.envs.names import imported_modules
 from jbrep.errors import choose
-from jbrep.pool import Pool, stop_requested
+from jbrep.pool import ATTEMPTS, Pool, stop_requested
 from jbrep.study.plan import Cell, Plan
 from jbrep.study.progress import say
 from jbrep.study.work import CRASHED, Outcome, work
-
-_ATTEMPTS = 5  # at a run whose worker is killed
 
 Backend = Callable[[Plan, Iterable[Cell], int], Generator[Outcome]]
 
@@ -35,7 +33,7 @@ def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generato
                 yield outcome
                 continue
             deaths[cell.name] += 1
-            if deaths[cell.name] == _ATTEMPTS:
+            if deaths[cell.name] == ATTEMPTS:
                 yield _killed(cell.name)
             else:
                 waiting.append(cell)
@@ -46,7 +44,7 @@ def _announce_stop() -> None:
 
 
 def _killed(name: str) -> Outcome:
-    reason = f"its worker was killed {_ATTEMPTS} times, perhaps because memory ran out"
+    reason = f"its worker was killed {ATTEMPTS} times, perhaps because memory ran out"
     return Outcome(name, CRASHED, f"{reason}: try fewer --workers")
 
 
@@ -59,9 +57,7 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome
     """
     import ray
 
-    if not ray.is_initialized():
-        ray.init(num_cpus=None if "RAY_ADDRESS" in os.environ else workers, **_QUIET)
-    task = ray.remote(num_cpus=1, max_retries=_ATTEMPTS - 1)(work)
+    task = on_cluster(work, workers)
     names = {task.remote(*_job(plan, cell)): cell.name for cell in cells}
     try:
         while names:
@@ -77,11 +73,6 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome
             ray.cancel(job, force=True)
 
 
-_QUIET: dict[str, Any] = {
-    "log_to_driver": False,
-    "logging_level": "ERROR",
-    "include_dashboard": False,
-}
 BACKENDS: dict[str, Backend] = {
     "local": on_this_machine,
     "ray": on_ray,
