@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from jbrep.encoders.encoder import Encoder, Layer
-from jbrep.encoders.file import fingerprint
 from jbrep.envs.task import Task
 from jbrep.text import facts, table
 
@@ -33,7 +32,7 @@ def describe(encoder: Encoder, source: str) -> dict[str, Any]:
         "encoder": _layers(encoder.encoder),
         "decoder": _layers(encoder.decoder),
         **{name: header[name] for name in _RECORDS},
-        "sha256": fingerprint(encoder),
+        "sha256": encoder.fingerprint,
         "features": [
             {"name": feature.name, "unit": feature.unit, "low": float(low), "high": float(high)}
             for feature, low, high in ranges

@@ -8,7 +8,6 @@ from typing import Any
 
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import Encoder
-from jbrep.encoders.file import fingerprint
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import diagnose
 from jbrep.files.storage import exists, make_folder, write_whole
@@ -33,7 +32,7 @@ def write(encoders: Mapping[str, Encoder], data: ScaledDataset, folder: Path) ->
             other encoders or data.
     """
     path = folder / EVALUATION
-    hashes = {label: fingerprint(encoder) for label, encoder in encoders.items()}
+    hashes = {label: encoder.fingerprint for label, encoder in encoders.items()}
     if exists(path):
         _check_same(path, {"data": data.dataset.manifest.fingerprint, "encoders": hashes})
     make_folder(folder)

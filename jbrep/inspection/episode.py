@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from jbrep.encoders import Encoder
-from jbrep.encoders.file import fingerprint
 from jbrep.inspection.blueprint import episode_layout
 from jbrep.inspection.ghost import send_ghost
 from jbrep.inspection.latent import send_encoding
@@ -64,7 +63,7 @@ def provenance(rollout: Rollout, encoder: Encoder | None) -> str:
         facts |= {
             "encoder": f"{encoder.name} ({encoder.header['kind']})",
             "sizes": f"{encoder.size} features, {encoder.latent_size} units",
-            "SHA-256": f"`{fingerprint(encoder)}`",
+            "SHA-256": f"`{encoder.fingerprint}`",
         }
     facts |= {package: version(package) for package in ("jbrep", "mujoco")}
     return "\n".join(
