@@ -67,6 +67,8 @@ def find_alone(name: str | Path, task: Task | None) -> BaseEncoder:
     """
     if task:
         return find(name, task)
+    if is_code(name):
+        raise InputError(f"{name} is code, which reads any task's observations: give its --task")
     if not exists(name):
         raise InputError(f"no encoder at {name}: for one that ships, give its --task, too")
     return load(Path(name))

@@ -59,6 +59,19 @@ class BaseEncoder(ABC):
             InputError: it can't.
         """
 
+    def check_decodes(self, why: str) -> None:
+        """Make sure that it can decode, where that is needed.
+
+        Raises:
+            InputError: it can't; the message says why that matters.
+        """
+        if not self.can_decode:
+            raise InputError(f"{self.name} has no decoder: {why}")
+
+    def scale(self, observation: Any) -> Any:
+        """Scale observations (..., d) to about [-1, 1], so that errors of features compare."""
+        return self.task.scale(observation)
+
     @abstractmethod
     def check_task(self, task: Task) -> None:
         """Make sure that it can read this task's observations.
