@@ -11,6 +11,7 @@ from jbrep.dataset.schema import MAX_ROOT_SEED, check_names, episode_seed, step_
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 
+IMPORTED = "imported"  # the kind of policy of data that were made elsewhere
 _MAX_STEPS = 10**12
 _MAX_SHARD_EPISODES = 1_000_000
 _MAX_LETTERS = 200  # of a text in a policy's constants
@@ -70,6 +71,11 @@ class Settings:
             "shard_episodes": self.shard_episodes,
             "store_state": self.store_state,
         }
+
+    @property
+    def is_imported(self) -> bool:
+        """Whether the data were made elsewhere: no episode can be simulated again."""
+        return self.policy["kind"] == IMPORTED
 
     def row_bytes(self) -> int:
         """Bytes for each step."""
