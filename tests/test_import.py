@@ -26,6 +26,7 @@ from jbrep.dataset.importing import import_data
 from jbrep.dataset.manifest import shard_name
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
+from jbrep.envs.task import check_same
 from jbrep.errors import InputError
 
 PENDULUM = "Pendulum-v1"
@@ -114,6 +115,8 @@ def test_without_the_final_observation_the_last_step_is_left_out(tmp_path):
 def test_a_described_task_brings_its_names_and_bounds(tmp_path):
     dataset = Dataset.write(tmp_path / "data", **arrays(), task=PENDULUM)
     assert dataset.task == describe(PENDULUM)
+    alone = Dataset.write(tmp_path / "alone", **arrays(), source=PENDULUM)
+    check_same(describe(PENDULUM), alone.task, "an encoder")  # so it works there
 
 
 def test_shards_are_of_the_usual_size_and_hold_many_chunks(tmp_path):
@@ -147,6 +150,14 @@ def test_what_is_exported_comes_back(to, collected, tmp_path):
         np.testing.assert_array_equal(table(back)[name], values, err_msg=name)
     assert back.task == replace(dataset.task, state={}, constants={})
     assert not list(find_problems(back.folder))
+
+
+def test_seeds_that_are_not_known_stay_so(written, tmp_path):
+    export(written, "minari", tmp_path)
+    import_data(str(tmp_path / written.task.slug / "imported-v0"), tmp_path / "back")
+    back = Dataset(tmp_path / "back")
+    same(back, arrays())
+    assert back.episodes["seed"].tolist() == [5, -1, 2**62]
 
 
 def d4rl(path, **changes):
@@ -297,6 +308,7 @@ BAD_ARRAYS = {
     "actions of type int64": {"actions": np.zeros((20, 1), int)},
     "no episode with a step": {n: v[:0] for n, v in arrays().items()},
     "final_observation for 2 episodes": {"final_observations": arrays()["final_observations"][:2]},
+    "seeds of type float64": {"seeds": [1, 2, np.nan]},
     "rewards of shape (3,)": {"rewards": np.zeros((20, 3))},
     "has an episode of 300 steps, but Pendulum-v1 has at most 200": arrays(lengths=(1, 1, 300)),
 }
@@ -323,6 +335,7 @@ BAD_TABLES = {
         "episode": np.where(np.arange(20) > 14, 4, gap("episode"))
     },
     "has string in the column 'joint 0'": {"joint 0": ["a"] * 20},
+    "the column 'step' has empty cells": {"step": [None, *range(19)]},
     "has no rewards": {"reward": None},
 }
 
@@ -365,6 +378,11 @@ def test_files_that_are_no_data_are_refused(tmp_path, minari_folder):
     with zipfile.ZipFile(tmp_path / "cut.npz", "w") as archive:
         for name in ("observations", "actions", "rewards", "terminals"):
             archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00")
+    d4rl(tmp_path / "bits.npz")
+    content = bytearray((tmp_path / "bits.npz").read_bytes())
+    content[200:220] = bytes(20)
+    (tmp_path / "bits.npz").write_bytes(content)
+    d4rl(tmp_path / "names.npz", feature_names=["one"])
     shutil.copytree(minari_folder / "cart/push-v0", tmp_path / "spoiled")
     (tmp_path / "spoiled/data/main_data.hdf5").write_bytes(b"nonsense")
     for name, problem in {
@@ -373,6 +391,8 @@ def test_files_that_are_no_data_are_refused(tmp_path, minari_folder):
         "a.hdf5": "unknown format '.hdf5': choose one of npz, parquet",
         "no.npz": "there is no file",
         "cut.npz": "has no array in observations.npy",
+        "bits.npz": "is damaged: observations has other bytes|has no array in observations",
+        "names.npz": "has 3 features, and names of 1",
         "spoiled": "can't be read as a Minari data set",
     }.items():
         with pytest.raises(InputError, match=problem) as caught:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jbrep.dataset.importing.episodes import Source
 from jbrep.dataset.importing.writer import write
-from jbrep.dataset.manifest import Manifest
+from jbrep.dataset.manifest import MANIFEST, Manifest
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, choose
 from jbrep.files.storage import exists
@@ -32,6 +32,8 @@ def open_source(given: str) -> Source:
             choose(suffix, {name: FORMATS[name] for name in ("npz", "parquet")}, "format")
         ).open_file
         return read(path)
+    if exists(path / MANIFEST):
+        raise InputError(f"{path} is a data set of jbrep's already: there is nothing to import")
     if suffix in FORMATS:
         raise InputError(f"there is no file {path}")
     opened: Source = import_module(FORMATS["minari"]).open_data_set(given)

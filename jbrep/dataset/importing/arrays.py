@@ -62,6 +62,8 @@ def from_list(name: str, columns: dict[str, Any], once: dict[str, Any]) -> Sourc
     given = {n: v for n, v in {**columns, **once}.items() if v is not None}
     check_columns(name, given)
     check_lengths(name, {n: len(v) for n, v in given.items()}, "episodes")
+    if "seed" in given:
+        given["seed"] = PerEpisode.of(name, {"seed": plain(name, "seed", given["seed"])}).seed
 
     def episodes() -> Iterator[Incoming]:
         for number in range(len(given["reward"])):

@@ -14,6 +14,7 @@ from jbrep.errors import InputError
 
 Array = NDArray[Any]
 WIDE = ("observation", "action", "next_observation", "final_observation")  # with many numbers a row
+_WHOLE = ("episode", "step", "seed")
 _IMAGE_AXES = 3  # height, width, colour
 
 
@@ -141,6 +142,8 @@ def check_kinds(name: str, columns: Mapping[str, tuple[np.dtype[Any], Sequence[i
             raise InputError(f"{name} has images, {shape}: only features are possible")
         if math.prod(row) == 0:
             raise InputError(f"{name} has {shape}: there must be at least one number")
+        if what in _WHOLE and dtype.kind not in "iu":
+            raise InputError(f"{name} has {what}s of type {dtype}: they must be whole numbers")
         if what == "action" and dtype.kind != "f":
             raise InputError(
                 f"{name} has actions of type {dtype}: only continuous ones are possible, floats"

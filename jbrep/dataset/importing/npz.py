@@ -1,6 +1,7 @@
 """Importing an npz file with arrays as Gymnasium's users name them, or as jbrep exports them."""
 
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -24,6 +25,10 @@ from jbrep.errors import InputError
 
 Array = NDArray[Any]
 _SUFFIX = ".npy"
+_DAMAGE = (  # what zipfile and NumPy raise at damaged files, and encrypted ones
+    *(ValueError, TypeError, KeyError, OSError, EOFError, RuntimeError),
+    *(NotImplementedError, zipfile.BadZipFile, zlib.error),
+)
 _ONCE = {  # what is known once for each episode
     "final_observation": ("episodes/final_observation", "final_observations"),
     "terminated": ("episodes/terminated",),
@@ -76,13 +81,20 @@ def open_file(path: Path) -> Source:
 def _archive(path: Path) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(path)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path} can't be read as an npz file: {reason}") from None
 
 
+def _opened(path: Path, archive: zipfile.ZipFile, member: str) -> IO[bytes]:
+    try:
+        return archive.open(member)
+    except _DAMAGE as error:
+        raise InputError(f"{path} is damaged: {member} can't be opened: {error}") from None
+
+
 def _header(path: Path, archive: zipfile.ZipFile, member: str) -> _Header:
-    with archive.open(member) as file:
+    with _opened(path, archive, member) as file:
         header = _read_header(path, member, file)
         size = archive.getinfo(member).file_size - file.tell()
     if header.dtype.hasobject:
@@ -103,7 +115,7 @@ def _read_header(path: Path, member: str, file: IO[bytes]) -> _Header:
             (2, 0): np.lib.format.read_array_header_2_0,
         }[version]
         shape, by_columns, dtype = read(file)
-    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile):
+    except _DAMAGE:
         raise InputError(f"{path} has no array in {member}: it must be a NumPy file") from None
     return _Header(shape, dtype, by_columns and len(shape) > 1)
 
@@ -118,7 +130,7 @@ def _chunks(path: Path, members: dict[str, str]) -> Iterator[Rows]:
     with ExitStack() as stack:
         archive = stack.enter_context(_archive(path))
         streams = {
-            name: _stream(path, member, stack.enter_context(archive.open(member)))
+            name: _stream(path, member, stack.enter_context(_opened(path, archive, member)))
             for name, member in members.items()
         }
         for chunk in zip(*streams.values(), strict=True):
@@ -147,7 +159,7 @@ def _stream(path: Path, member: str, file: IO[bytes]) -> Iterator[Array]:
 def _read(path: Path, member: str, file: IO[bytes], size: int) -> bytes:
     try:
         content = file.read(size)
-    except (zipfile.BadZipFile, OSError, EOFError):
+    except _DAMAGE:
         raise _cut_short(path, member) from None
     if len(content) != size:
         raise _cut_short(path, member)
@@ -184,8 +196,8 @@ def _features(
 
 
 def _whole(path: Path, archive: zipfile.ZipFile, name: str) -> Array:
-    with archive.open(f"{name}{_SUFFIX}") as file:
+    with _opened(path, archive, f"{name}{_SUFFIX}") as file:
         try:
             return np.lib.format.read_array(file, allow_pickle=False)
-        except (ValueError, OSError, EOFError, zipfile.BadZipFile):
+        except _DAMAGE:
             raise _cut_short(path, name) from None

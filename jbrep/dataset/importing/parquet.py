@@ -51,9 +51,9 @@ def open_file(path: Path) -> Source:
         name,
         [*scalars, *(["observation"] if features else []), *(["action"] if actions else [])],
     )
-    _check_types(name, schema, {"observation": features, "action": actions})
     columns = {"observation": features, "action": actions}
     columns |= {column: [given] for column, given in scalars.items()}
+    _check_types(name, schema, columns)
     once = _once(path)
 
     def episodes() -> Iterator[Incoming]:
@@ -94,11 +94,10 @@ def _check_types(name: str, schema: pa.Schema, columns: dict[str, list[str]]) ->
                 dtype = np.dtype(object)
             if dtype.kind not in "fiub":
                 raise InputError(
-                    f"{name} has {schema.field(column).type} in the column {column!r}: every "
-                    "column of a feature or an action must be of plain numbers"
+                    f"{name} has {schema.field(column).type} in the column {column!r}: it must be "
+                    "plain numbers"
                 )
-            if what == "action":
-                check_kinds(name, {what: (dtype, ())})
+            check_kinds(name, {what: (dtype, ())})
 
 
 def _chunks(path: Path, columns: dict[str, list[str]]) -> Iterator[Rows]:
@@ -112,6 +111,9 @@ def _chunks(path: Path, columns: dict[str, list[str]]) -> Iterator[Rows]:
 
 
 def _array(name: str, batch: pa.RecordBatch, columns: list[str]) -> NDArray[Any]:
+    for column in columns:
+        if batch.column(column).null_count:
+            raise InputError(f"the column {column!r} has empty cells: fill them, or leave them out")
     arrays = [batch.column(column).to_numpy(zero_copy_only=False) for column in columns]
     return np.stack(arrays, axis=1) if name in ("observation", "action") else arrays[0]
 

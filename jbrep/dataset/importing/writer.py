@@ -119,6 +119,11 @@ def _fitting(source: Source, survey: _Survey, task: Task | None) -> Task:
 def _from_data(source: Source, survey: _Survey) -> Task:
     box = spaces.Box(-np.inf, np.inf, (survey.size,))
     low, high = _action_bounds(source, survey)
+    if source.features and len(source.features) != survey.size:
+        raise InputError(
+            f"{source.name} has {survey.size} features, and names of {len(source.features)}: they "
+            "must be as many"
+        )
     try:
         return Task(
             id=source.label,
