@@ -335,7 +335,7 @@ BAD_TABLES = {
         "episode": np.where(np.arange(20) > 14, 4, gap("episode"))
     },
     "has string in the column 'joint 0'": {"joint 0": ["a"] * 20},
-    "the column 'step' has empty cells": {"step": [None, *range(19)]},
+    "empty cells in the column 'step'": {"step": [None, *range(19)]},
     "has no rewards": {"reward": None},
 }
 

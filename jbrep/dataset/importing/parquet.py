@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -105,15 +106,22 @@ def _chunks(path: Path, columns: dict[str, list[str]]) -> Iterator[Rows]:
     try:
         with pq.ParquetFile(path) as file:
             for batch in file.iter_batches(CHUNK, columns=wanted):
+                _check_full(path, batch)
                 yield {name: _array(name, batch, given) for name, given in columns.items()}
     except (OSError, pa.ArrowException) as error:
         raise _unreadable(path, error) from None
 
 
+def _check_full(path: Path, batch: pa.RecordBatch) -> None:
+    for column, values in zip(batch.schema.names, batch.columns, strict=True):
+        if values.null_count:
+            raise InputError(
+                f"{path} has empty cells in the column {column!r}: fill them, or leave the "
+                "episode out"
+            )
+
+
 def _array(name: str, batch: pa.RecordBatch, columns: list[str]) -> NDArray[Any]:
-    for column in columns:
-        if batch.column(column).null_count:
-            raise InputError(f"the column {column!r} has empty cells: fill them, or leave them out")
     arrays = [batch.column(column).to_numpy(zero_copy_only=False) for column in columns]
     return np.stack(arrays, axis=1) if name in ("observation", "action") else arrays[0]
 
@@ -125,7 +133,7 @@ def _once(path: Path) -> PerEpisode:
         return PerEpisode()
     try:
         table = pq.read_table(beside)
-        table = table.filter(pa.compute.greater(table["length"], 0))
+        table = table.filter(pc.greater(table["length"], 0))
         final = np.stack(table["final_observation"].to_numpy())
         once = {name: table[name].to_numpy() for name in ("terminated", "seed")}
         return PerEpisode.of(str(beside), {"final_observation": final, **once})
