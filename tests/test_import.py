@@ -10,6 +10,7 @@ import sys
 import warnings
 import zipfile
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -22,12 +23,22 @@ from jbrep.collect.replay import replay_problems
 from jbrep.dataset import Dataset
 from jbrep.dataset.card import card
 from jbrep.dataset.export import export
-from jbrep.dataset.importing import import_data
+from jbrep.dataset.importing import open_source, write
 from jbrep.dataset.manifest import shard_name
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
 from jbrep.envs.task import check_same
 from jbrep.errors import InputError
+from jbrep.evaluate.evaluation import seen
+from jbrep.rollouts.rollout import replay
+
+
+def import_data(given, folder, task=None):
+    """What `jbrep data import` does; why the task is made from the data alone, if it is."""
+    source = open_source(given)
+    write(source, folder, task)
+    return source.why_no_task
+
 
 PENDULUM = "Pendulum-v1"
 LENGTHS = (7, 1, 12)  # the middle one is terminated, the last one still going on
@@ -237,8 +248,7 @@ def minari_folder(tmp_path_factory):
 
 def test_a_minari_data_set_by_its_id(minari_folder, tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(minari_folder))
-    _, why_no_task = import_data("cart/push-v0", tmp_path / "data")
-    assert why_no_task == "it names no environment"
+    assert import_data("cart/push-v0", tmp_path / "data") == "it names no environment"
     dataset, given = Dataset(tmp_path / "data"), arrays()
     np.testing.assert_array_equal(dataset["observation"], given["observations"][8:])
     assert dataset.task.feature_names == ("position", "rest_0", "rest_1")
@@ -261,10 +271,27 @@ def minari_copy(minari_folder, tmp_path, **changes):
 def test_an_environment_that_is_not_here_gives_the_task_its_id(minari_folder, tmp_path):
     spec = {"id": "Carts/Cart-v3", "kwargs": {}, "max_episode_steps": 500}
     folder = minari_copy(minari_folder, tmp_path, env_spec=json.dumps(spec))
-    _, why_no_task = import_data(folder, tmp_path / "data")
-    assert "unknown task 'Carts/Cart-v3'" in why_no_task
+    assert "unknown task 'Carts/Cart-v3'" in import_data(folder, tmp_path / "data")
     assert Dataset(tmp_path / "data").task.id == "Carts/Cart-v3"
     assert Dataset(tmp_path / "data").task.max_episode_steps == 500
+
+
+@pytest.mark.parametrize(
+    ("env_id", "expected"),
+    [(PENDULUM, PENDULUM), ("MountainCarContinuous-v0", "Minari-cart-push-v0")],
+)
+def test_an_environment_that_is_here_is_described_if_it_fits(
+    env_id, expected, minari_folder, tmp_path
+):
+    spec = {"id": env_id, "kwargs": {}, "max_episode_steps": 50}
+    folder = minari_copy(minari_folder, tmp_path, env_spec=json.dumps(spec))
+    why_no_task = import_data(folder, tmp_path / "data")
+    task = Dataset(tmp_path / "data").task
+    assert (task.id, task.max_episode_steps) == (expected, 50)
+    if env_id == PENDULUM:
+        assert task == describe(PENDULUM, max_episode_steps=50)
+    else:
+        assert why_no_task == f"{env_id} has other sizes"
 
 
 def test_no_code_that_a_minari_data_set_names_is_run(minari_folder, tmp_path, monkeypatch):
@@ -410,11 +437,12 @@ def test_it_replaces_nothing(written):
 
 KILLED = """
 import os, sys
-from jbrep.dataset.importing import import_data, writer
+from pathlib import Path
+from jbrep.dataset.importing import open_source, writer
 def die(*arguments):
     os.kill(os.getpid(), 9)
 writer.publish_folder = die
-import_data(sys.argv[1], writer.Path(sys.argv[2]))
+writer.write(open_source(sys.argv[1]), Path(sys.argv[2]))
 """
 
 
@@ -439,9 +467,28 @@ def test_damage_is_noticed_and_nothing_is_simulated_again(written, tmp_path):
         list(repair(folder))
 
 
-def test_the_commands(collected, tmp_path):
+def test_it_is_shown_as_stored(written):
+    rollout = replay(written, 2)
+    assert (len(rollout), rollout.motion) == (12, None)
+    assert "episode 2 is shown without the robot" in rollout.note
+    assert "was imported, its episodes can't be simulated again" in rollout.note
+
+
+def test_whether_an_encoder_saw_imported_rows_is_not_known(written):
+    """The seed, which tells data sets apart that were collected, says nothing of them."""
+    trained = {"fingerprint": "", "policy": {"kind": "uniform"}, "seed": 5}
+    encoder = SimpleNamespace(header={"data": trained})
+    assert seen(encoder, SimpleNamespace(dataset=written)) == "maybe"
+
+
+def test_the_command(tmp_path):
     d4rl(tmp_path / "pole.npz")
     out = tmp_path / "data"
     done = jbrep("data", "import", tmp_path / "pole.npz", "--task", PENDULUM, "--out", out)
     assert (done.exit_code, done.stderr) == (0, "")
     assert done.stdout == f"3 episodes of {PENDULUM}, 20 rows, 0.0 MB in {out}\n"
+    done = jbrep("data", "import", tmp_path / "pole.npz", "--out", tmp_path / "alone")
+    assert done.stderr == "pole is made from the data alone: it names no environment\n"
+    done = jbrep("data", "import", tmp_path / "pole.npz", "--out", out)
+    assert done.exit_code == 2
+    assert done.stderr == f"Error: {out} exists already: choose another name\n"

@@ -249,13 +249,15 @@ def import_(source: str, out: Path, **options: Any) -> None:
     MINARI_DATASETS_PATH. Without --task, the task is the one that the source names, or is made from
     the data alone. See docs/data-format.md for the columns that a file must have.
     """
-    from jbrep.dataset.importing import import_data
+    from jbrep.dataset.importing import open_source, write
 
     task = given_task(options, required=False)
     with stoppable("nothing was imported"):
-        manifest, why_no_task = import_data(source, out, task)
-    if why_no_task:
-        line = f"{manifest.task.name} is made from the data alone: {why_no_task}"
+        with _deferred_stop():
+            opened = open_source(source)
+        manifest = write(opened, out, task)
+    if not (task or opened.task):
+        line = f"{manifest.task.name} is made from the data alone: {opened.why_no_task}"
         click.echo(printable(line), err=True)
     _report_size(out, manifest)
 

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from jbrep.dataset.importing.episodes import Source
 from jbrep.dataset.importing.writer import write
-from jbrep.dataset.manifest import MANIFEST, Manifest
-from jbrep.envs.task import Task
+from jbrep.dataset.manifest import MANIFEST
 from jbrep.errors import InputError, choose
 from jbrep.files.storage import exists
+
+__all__ = ["FORMATS", "Source", "open_source", "write"]
 
 FORMATS = {name: f"{__name__}.{name}" for name in ("minari", "npz", "parquet")}  # modules
 
@@ -38,22 +39,3 @@ def open_source(given: str) -> Source:
         raise InputError(f"there is no file {path}")
     opened: Source = import_module(FORMATS["minari"]).open_data_set(given)
     return opened
-
-
-def import_data(given: str, folder: Path, task: Task | None = None) -> tuple[Manifest, str]:
-    """Make a data set of one that was made elsewhere.
-
-    Args:
-        given: as `open_source` takes it.
-        folder: new.
-        task: that the data are of; by default the one that the source names, or else one that is
-            made from the data alone.
-
-    Returns:
-        The manifest, and why the task was made from the data alone; empty if it wasn't.
-
-    Raises:
-        InputError: the folder exists already, or the data can't be used; nothing is left then.
-    """
-    source = open_source(given)
-    return write(source, folder, task), "" if task or source.task else source.why_no_task

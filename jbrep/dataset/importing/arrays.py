@@ -83,7 +83,8 @@ def _listed(where: str, given: dict[str, Any]) -> Incoming | None:
     if len(observation) == len(arrays["reward"]) + 1 and final is None:
         arrays["observation"], final = observation[:-1], observation[-1]
     check_lengths(where, {n: len(v) for n, v in arrays.items()})
-    check_kinds(where, kinds(arrays))
+    last = {} if final is None else {"final_observation": np.asarray(final)[None]}
+    check_kinds(where, kinds({**arrays, **last}))
     ends = [arrays[n].astype(bool) for n in ("terminated", "truncated") if n in arrays]
     check_ends(where, *ends)
     return incoming(
@@ -91,7 +92,7 @@ def _listed(where: str, given: dict[str, Any]) -> Incoming | None:
         arrays["observation"],
         arrays["action"],
         arrays["reward"],
-        None if final is None else plain(where, "final_observation", np.atleast_1d(final)),
+        None if final is None else np.asarray(final),
         bool(arrays["terminated"][-1:].any()) if "terminated" in arrays else False,
         seed,
     )
