@@ -84,5 +84,5 @@ def _kind(cell: Cell) -> tuple[str, str, str]:
 
 
 def _example(run: Run) -> Run:
-    """A run that takes as long: an encoder that isn't code, and may not exist yet, hardly counts."""
+    """A run that takes as long; an encoder that is no code need not exist yet, and costs little."""
     return run if is_code(run.encoder) else replace(run, encoder=FULL)
