@@ -43,13 +43,9 @@ class Trained(NamedTuple):
     policy: BasePolicy
     task: Task
     encoder: BaseEncoder
+    representation: str  # what the policy observes, as tables call it
     evaluation_episodes: int = 1  # that the run's evaluations play at once
     step: int | None = None  # of training, if it is not over
-
-    @property
-    def representation(self) -> str:
-        """What the policy observes."""
-        return self.encoder.representation
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Act deterministically; nothing is drawn.
@@ -151,7 +147,7 @@ def load_zip(path: Path, task: Task, algorithm: str, encoder: str, trust: bool) 
     except Exception as error:  # whatever its pickled parts do
         reason = one_line(error)
         raise InputError(f"{path} is no {algorithm} policy for {task.name}: {reason}") from None
-    return Trained(agent.policy, task, seen)
+    return Trained(agent.policy, task, seen, seen.representation)
 
 
 class _Checkpoint(NamedTuple):
@@ -202,14 +198,17 @@ def _build(folder: Path, settings: Mapping[str, Any], given: Any = None) -> Trai
     encoder.check_task(task)
     preset = Preset(tuple(settings["hidden"]), {})
     agent = make_agent(algorithm, preset, Spaces(task, encoder), settings["seed"])
-    return Trained(agent.policy, task, encoder, settings["evaluation_episodes"])
+    name, episodes = settings["representation"], settings["evaluation_episodes"]
+    return Trained(agent.policy, task, encoder, name, episodes)
 
 
 def run_encoder(folder: Path, settings: Mapping[str, Any]) -> BaseEncoder:
     """The encoder in a run's folder, or what its code makes.
 
     Raises:
-        InputError: it is code whose module wasn't imported on request, or a user's own object.
+        InputError: it is code whose module wasn't imported on request, or a user's own object, or
+            it can't be used.
+        DamageError: its file isn't what was written.
     """
     if exists(folder / ENCODER):
         return load(folder / ENCODER)
