@@ -78,8 +78,9 @@ def collect(
 ) -> None:
     """Collect the states that a policy visits.
 
-    The same command resumes an unfinished data set and leaves a finished one as it is. The numbers
-    of lanes and threads and the backend don't change the data.
+    The same command resumes an unfinished data set and leaves a finished one as it is; with more
+    --steps it extends it, to the data that one command with as many collects. The numbers of lanes
+    and threads and the backend don't change the data.
     """
     from jbrep.collect import collect as run
     from jbrep.collect.collector import usual_shard_episodes

@@ -55,19 +55,20 @@ def collect(
 ) -> Written:
     """Collect a data set, or what is missing of it.
 
-    Neither lanes, threads nor backend change a byte.
+    Neither lanes, threads nor backend change a byte, nor does it whether a data set is collected at
+    once or extended.
 
     Args:
         settings: what to collect.
-        folder: new, or with an unfinished data set of the same settings.
+        folder: new, or with a data set of the same settings that is unfinished or has fewer steps.
         lanes: environments of a batch, stepped at once.
         num_threads: threads of a batch, or processes of other environments; None takes one for
             each core.
         backend: local, or ray for a cluster.
 
     Raises:
-        InputError: invalid settings, a data set of other settings in the folder, a shard that is
-            missing or damaged, too little disk space, or an environment that fails.
+        InputError: invalid settings, a data set of other settings or of more steps in the folder, a
+            shard that is missing or damaged, too little disk space, or an environment that fails.
     """
     policy = make_policy(settings.policy)
     policy.begin(settings.task, [0])  # may refuse the task
@@ -91,21 +92,36 @@ def write_shards(settings: Settings, folder: Path, produce: Produce) -> Written:
     began = time.monotonic()
     make_folder(folder)
     with exclusive(folder):
-        manifest = _begin(settings, folder)
-        before = manifest.rows
+        there = _begin(settings, folder)
+        manifest = there.extended(settings.steps)
         if not manifest.complete:
             with Progress(
-                total=settings.steps, initial=before, unit="step", unit_scale=True, desc=folder.name
+                total=settings.steps,
+                initial=manifest.rows,
+                unit="step",
+                unit_scale=True,
+                desc=folder.name,
             ) as progress:
-                manifest = _fill(folder, manifest, produce, progress)
-    return Written(manifest, manifest.rows - before, time.monotonic() - began)
+                manifest = _fill(folder, there, manifest, produce, progress)
+        elif manifest != there:
+            write_manifest(folder, manifest)
+    return Written(manifest, manifest.rows - there.rows, time.monotonic() - began)
 
 
-def _fill(folder: Path, manifest: Manifest, produce: Produce, progress: Any) -> Manifest:
+def _fill(
+    folder: Path, there: Manifest, manifest: Manifest, produce: Produce, progress: Any
+) -> Manifest:
+    """Commit shards until the data set is complete.
+
+    What is there counts until the first shard has been simulated, which may replace its last one.
+    """
     missing = _Missing(manifest)
     shards = produce(len(manifest.shards), missing, progress.update)
     try:
         for columns in shards:
+            if manifest.settings != there.settings:
+                write_manifest(folder, manifest)
+                there = manifest
             manifest = commit(folder, manifest, _cut(columns, missing.rows))
             missing.manifest = manifest
             progress.update(manifest.rows - progress.n)
@@ -154,12 +170,13 @@ def _cut(columns: Columns, rows: int) -> Columns:
 
 
 def _begin(settings: Settings, folder: Path) -> Manifest:
-    """The manifest to resume from, new if there is none."""
+    """The manifest to go on from, new if there is none."""
     files = hdf5_files(folder)
     if (folder / MANIFEST).exists() or files:
         manifest = read_manifest(folder)
         _check_same(manifest, new_manifest(settings), folder)
         check_files(folder, manifest, files)
+        check_space(folder, (settings.steps - manifest.settings.steps) * settings.row_bytes())
     else:
         manifest = new_manifest(settings)
         check_space(folder, settings.steps * settings.row_bytes())
@@ -168,21 +185,32 @@ def _begin(settings: Settings, folder: Path) -> Manifest:
 
 
 def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
-    """Check that resuming gives what an uninterrupted run gives."""
+    """Check that going on gives what an uninterrupted run gives."""
+    steps, own = wanted.settings.steps, there.settings.steps
     differing = differences(_flat(there.settings), _flat(wanted.settings))
-    if differing:
+    if differing and _flat(there.settings) != {**_flat(wanted.settings), "steps": own}:
         raise InputError(
             f"{folder} holds a data set with other settings: {differing}; "
             "choose another folder, or the same settings to resume"
+        )
+    if steps < own:
+        raise InputError(
+            f"{folder} was collected with {own:,} steps and has {there.rows:,} rows so far: it is "
+            f"left as it is; ask for at least as many steps, or choose another folder for {steps:,}"
+        )
+    if steps > own and there.format_version != wanted.format_version:
+        raise InputError(
+            f"{folder} has format version {there.format_version}, which can't be extended: collect "
+            "anew in another folder"
         )
     differing = differences(
         {**there.versions, "format": there.format_version},
         {**wanted.versions, "format": wanted.format_version},
     )
-    if differing and not there.complete:
+    if differing and not (there.complete and steps == own):
         raise InputError(
             f"{folder} was started with other versions: {differing}; "
-            "install those to resume, or choose another folder"
+            "install those to go on, or choose another folder"
         )
 
 

@@ -1,7 +1,6 @@
 """Verifying a data set: hashes, shapes, numbers and ranges."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -64,15 +63,13 @@ def find_problems(folder: Path) -> Iterator[str]:
 
 
 def _backup_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
-    """The backup equals the manifest, or is one shard ahead while the data set is unfinished."""
+    """The backup equals the manifest, or is the one that the collector writes next."""
     try:
         backup = read_manifest(folder, BACKUP)
     except InputError as error:
         yield str(error)
         return
-    ahead = len(backup.shards) - len(manifest.shards)
-    known = replace(backup, shards=backup.shards[: len(manifest.shards)])
-    if known != manifest or ahead not in (0, 1):
+    if not manifest.is_next(backup):
         yield f"{folder / BACKUP} is of another data set: {REPAIR}"
 
 
