@@ -373,6 +373,8 @@ def test_mistakes_are_named(tmp_path):
         ({"policy": {"kind": "constant", "drive": None}}, "it must be a kind and its constants"),
         ({"policy": {"kind": "imported", "source": "a" * 201}}, "it must be a kind and its const"),
         ({"policy": {"kind": "imported", "source": [1] * 1001}}, "it must be a kind and its const"),
+        ({"policy": {"kind": "mixture", "parts": [[1, "uniform"]] * 2}}, "it must be a kind and"),
+        ({"policy": {"kind": "mixture", "parts": [[0, {"kind": "a"}]] * 2}}, "it must be a kind"),
         ({"policy": {"kind": "imported", 1: 1}}, "it must be a kind and its constants"),
     ],
 )

@@ -84,7 +84,7 @@ def collect(
     """
     from jbrep.collect import collect as run
     from jbrep.collect.collector import usual_shard_episodes
-    from jbrep.collect.policies import parse_policy, policy_settings
+    from jbrep.collect.policies import parse_policy
     from jbrep.dataset import Settings
 
     task = given_task(options)
@@ -97,7 +97,7 @@ def collect(
         )
     settings = Settings(
         task=task,
-        policy=policy_settings(parse_policy(policy)),
+        policy=parse_policy(policy).settings(),
         steps=steps,
         seed=seed,
         store_state=store_state,

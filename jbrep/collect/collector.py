@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.collect.backends import get_backend
-from jbrep.collect.policies import make_policy, policy_settings
+from jbrep.collect.policies import Policy, make_policy
 from jbrep.collect.shards import LANES, Produce, simulate_shard
 from jbrep.dataset.manifest import (
     MANIFEST,
@@ -52,6 +52,7 @@ def collect(
     lanes: int = LANES,
     num_threads: int | None = None,
     backend: str = "local",
+    policy: Policy | None = None,
 ) -> Written:
     """Collect a data set, or what is missing of it.
 
@@ -65,16 +66,18 @@ def collect(
         num_threads: threads of a batch, or processes of other environments; None takes one for
             each core.
         backend: local, or ray for a cluster.
+        policy: in place of the one that the settings name.
 
     Raises:
         InputError: invalid settings, a data set of other settings or of more steps in the folder, a
             shard that is missing or damaged, too little disk space, or an environment that fails.
     """
-    policy = make_policy(settings.policy)
+    policy = policy or make_policy(settings.policy)
     policy.begin(settings.task, [0])  # may refuse the task
-    settings = replace(settings, policy=policy_settings(policy))
+    settings = replace(settings, policy=policy.settings())
     check_counts(lanes, num_threads)
-    return write_shards(settings, folder, get_backend(backend)(settings, lanes, num_threads))
+    produce = get_backend(backend)(settings, policy, lanes, num_threads)
+    return write_shards(settings, folder, produce)
 
 
 def write_shards(settings: Settings, folder: Path, produce: Produce) -> Written:
@@ -224,7 +227,7 @@ def _flat(settings: Settings) -> dict[str, Any]:
     return {n: v for n, v in settings.as_json().items() if n != "environment"} | task
 
 
-def usual_shard_episodes(settings: Settings, folder: Path) -> int:
+def usual_shard_episodes(settings: Settings, folder: Path, policy: Policy | None = None) -> int:
     """Episodes in a shard of the usual size, judging by the data set's first few.
 
     A batch's shards have 100,000 steps, each with all threads; other environments' 20,000, since
@@ -238,7 +241,7 @@ def usual_shard_episodes(settings: Settings, folder: Path) -> int:
     task = settings.task
     length = float(task.max_episode_steps)
     if task.terminates is not False:
-        policy = make_policy(settings.policy)
+        policy = policy or make_policy(settings.policy)
         pilot = replace(settings, shard_episodes=_PILOT)
         columns = simulate_shard(pilot, policy, 0, lambda steps: None)
         length = columns[EPISODES + "length"].mean()

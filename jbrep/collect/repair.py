@@ -6,7 +6,7 @@ from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
-from jbrep.collect.policies import make_policy
+from jbrep.collect.policies import Policy, make_policy
 from jbrep.collect.shards import LANES, simulate_shard
 from jbrep.dataset import version1
 from jbrep.dataset.manifest import (
@@ -29,7 +29,12 @@ from jbrep.files.lock import exclusive
 from jbrep.progress import Progress
 
 
-def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> Iterator[str]:
+def repair(
+    folder: Path,
+    lanes: int = LANES,
+    num_threads: int | None = None,
+    policy: Policy | None = None,
+) -> Iterator[str]:
     """Simulate damaged and missing shards again, and restore the manifest from its backup.
 
     A damaged backup is restored from the manifest. A file that isn't part of the data set is
@@ -39,6 +44,7 @@ def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> 
         folder: of the data set.
         lanes: robots stepped at once.
         num_threads: threads to step them on; None takes one for each core.
+        policy: in place of the one that the manifest names.
 
     Yields:
         A line for each file restored or renamed.
@@ -57,7 +63,7 @@ def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> 
         for shard in range(len(manifest.shards)):
             if _is_intact(folder, manifest, shard):
                 continue
-            entry = _restore(folder, manifest, shard, lanes, num_threads)
+            entry = _restore(folder, manifest, shard, lanes, num_threads, policy)
             shards = (*manifest.shards[:shard], entry, *manifest.shards[shard + 1 :])
             manifest = replace(manifest, shards=shards)
             yield f"{folder / shard_name(shard)} restored"
@@ -105,7 +111,12 @@ def _is_intact(folder: Path, manifest: Manifest, shard: int) -> bool:
 
 
 def _restore(
-    folder: Path, manifest: Manifest, shard: int, lanes: int, num_threads: int | None
+    folder: Path,
+    manifest: Manifest,
+    shard: int,
+    lanes: int,
+    num_threads: int | None,
+    policy: Policy | None,
 ) -> Entry:
     settings, entry, path = manifest.settings, manifest.shards[shard], folder / shard_name(shard)
     if not settings.task.reproducible:
@@ -116,7 +127,7 @@ def _restore(
     with Progress(total=entry.rows, unit="step", unit_scale=True, desc=path.name) as progress:
         columns = simulate_shard(
             settings,
-            make_policy(settings.policy),
+            policy or make_policy(settings.policy),
             shard,
             progress.update,
             lanes,

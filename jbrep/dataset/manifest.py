@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.dataset import version1
-from jbrep.dataset.schema import EPISODES, FORMAT, FORMAT_VERSION, Columns, Spec, all_specs
+from jbrep.dataset.schema import EPISODES, FORMAT, FORMAT_VERSION, Columns, Spec
 from jbrep.dataset.settings import Settings
 from jbrep.dataset.shard import (
     REPAIR,
@@ -83,7 +83,7 @@ class Manifest:
 
     def specs(self) -> dict[str, Spec]:
         """The columns of each shard."""
-        return all_specs(self.task, self.settings.store_state, self.format_version)
+        return self.settings.specs(self.format_version)
 
     def episode_range(self, shard: int) -> range:
         """Numbers of the episodes in a committed shard."""

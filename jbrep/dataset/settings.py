@@ -7,7 +7,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from jbrep.dataset.schema import MAX_ROOT_SEED, check_names, episode_seed, step_specs
+from jbrep.dataset.schema import (
+    FORMAT_VERSION,
+    MAX_ROOT_SEED,
+    MIXTURE_SPECS,
+    Spec,
+    all_specs,
+    check_names,
+    episode_seed,
+    step_specs,
+)
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 
@@ -71,6 +80,16 @@ class Settings:
             "store_state": self.store_state,
         }
 
+    @property
+    def weights(self) -> list[float]:
+        """The weights of a mixture's parts; of another policy, none."""
+        return [weight for weight, _ in self.policy["parts"]] if _is_mixture(self.policy) else []
+
+    def specs(self, version: int = FORMAT_VERSION) -> dict[str, Spec]:
+        """The columns of each shard, by their paths in the file."""
+        mixture = MIXTURE_SPECS if self.weights else {}
+        return all_specs(self.task, self.store_state, version) | mixture
+
     def row_bytes(self) -> int:
         """Bytes for each step."""
         specs = step_specs(self.task, self.store_state).values()
@@ -93,7 +112,34 @@ def _is_policy(policy: Any) -> bool:
     """A kind, which is a word, and constants."""
     if not isinstance(policy, Mapping) or not isinstance(policy.get("kind"), str):
         return False
-    return re.fullmatch("[a-z-]+", policy["kind"]) is not None and _is_plain(policy)
+    if not re.fullmatch("[a-z-]+", policy["kind"]) or not _is_plain(policy):
+        return False
+    return not _is_mixture(policy) or _has_parts(policy)
+
+
+def _is_mixture(policy: Mapping[str, Any]) -> bool:
+    return bool(policy["kind"] == "mixture")
+
+
+def _has_parts(mixture: Mapping[str, Any]) -> bool:
+    """Whether a mixture has weights, which are positive, and policies that are none."""
+    parts = mixture.get("parts")
+    return (
+        mixture.keys() == {"kind", "parts"}
+        and isinstance(parts, list)
+        and len(parts) > 1
+        and all(isinstance(part, list) and len(part) == 2 for part in parts)
+        and all(isinstance(weight, int | float) and weight > 0 for weight, _ in parts)
+        and all(_is_policy(policy) and not _is_mixture(policy) for _, policy in parts)
+    )
+
+
+def policy_text(policy: Mapping[str, Any]) -> str:
+    """A policy's kind and constants for people: "constant, drive 0.5"."""
+    if _is_mixture(policy):
+        return "; ".join(f"{weight:.3g} of {policy_text(part)}" for weight, part in policy["parts"])
+    constants = (f"{name} {value}" for name, value in policy.items() if name != "kind")
+    return ", ".join([policy["kind"], *constants])
 
 
 def _is_plain(value: Any) -> bool:

@@ -22,6 +22,7 @@ from jbrep.dataset.schema import (
     Columns,
     episode_bounds,
     episode_columns,
+    episode_part,
     episode_returns,
     episode_seed,
 )
@@ -123,6 +124,9 @@ def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Itera
         "the rows' step": (columns["step"], np.arange(rows) - np.repeat(first, lengths)),
         "returns": (own["return"], episode_returns(columns["reward"], lengths)),
     }
+    if weights := settings.weights:
+        parts = [episode_part(seed, weights) for seed in seeds]
+        checks["the episodes' policies"] = own["policy"], np.array(parts)
     for what, (stored, expected) in checks.items():
         if not np.array_equal(stored, expected):
             yield f"{what}: inconsistent with the settings, or with other columns"
