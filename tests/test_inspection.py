@@ -15,7 +15,6 @@ from command import jbrep, start, wait_for, wait_for_the_end_of
 from rerun.chunk import RrdReader
 
 from jbrep.encoders import find, save
-from jbrep.encoders.file import fingerprint
 from jbrep.envs import describe
 from jbrep.envs.physics import Motion
 from jbrep.errors import InputError
@@ -294,7 +293,7 @@ def test_the_provenance(entities, rollout):
         "- end: truncated",
         "- encoder: dae-8 (dae)",
         "- sizes: 16 features, 8 units",
-        fingerprint(encoder),
+        encoder.fingerprint,
         "- jbrep: ",
         "- mujoco: ",
     ):

@@ -20,7 +20,6 @@ from command import jbrep
 from stable_baselines3 import A2C
 
 from jbrep.encoders import find, save
-from jbrep.encoders.file import fingerprint
 from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.files import container
@@ -464,9 +463,9 @@ def test_more_episodes_than_memory_holds_are_not_played(run):
 
 def test_another_encoder_is_not_the_run_s(run):
     save(find("pca-8", TASK), run / ENCODER)
-    assert "not the encoder that the run was made with" in refused(load_run, run)
+    assert "is not the encoder that the run in" in refused(load_run, run)
     settings = json.loads((run / RUN).read_text())["settings"]
-    own = fingerprint(find("pca-8", TASK))
+    own = find("pca-8", TASK).fingerprint
     pose = {"task": "move_to_pose", "environment": describe("move_to_pose").as_json()}
     change(run, settings={**settings, "encoder": own, **pose})
     assert "was made for face_direction" in refused(load_run, run)

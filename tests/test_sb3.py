@@ -241,7 +241,7 @@ def test_mistakes_are_named():
     class Liar(Halves):
         latent_size = 7
 
-    with pytest.raises(InputError, match=r"shape \(2, 8\) .* latent_size asks for \(2, 7\)"):
+    with pytest.raises(InputError, match="latents of 8 numbers, but its latent_size is 7"):
         JitterbugVecEnv("face_direction", 2, encoder=Liar())
     environment = JitterbugVecEnv("face_direction", 2)
     environment.reset()

@@ -11,7 +11,6 @@ from rerun.chunk import RrdReader
 
 from jbrep.dataset import Dataset
 from jbrep.encoders import load
-from jbrep.encoders.file import fingerprint
 from jbrep.rl.files import ENCODER, read_evaluations
 
 SEEN = ("full", "dae-4")
@@ -44,7 +43,7 @@ def test_states_become_encoders_and_diagnostics(peace):
     assert judged["data"]["fingerprint"] == Dataset(data).manifest.fingerprint
     for encoder in map(load, paths):
         found = judged["encoders"][encoder.name]
-        assert found["sha256"] == fingerprint(encoder)
+        assert found["sha256"] == encoder.fingerprint
         error = encoder.header["metrics"]["held_out_mse"]
         assert found["reconstruction"]["mse"][0] == pytest.approx(error, rel=1e-3)
         assert encoder.header["data"]["train_rows"] == 3000
@@ -109,7 +108,7 @@ def test_a_recording_shows_the_agent_that_was_evaluated(peace, tmp_path):
     chunks = {chunk.entity_path: chunk for chunk in RrdReader(tmp_path / "it.rrd").stream()}
     (told,) = chunks["/provenance"].to_record_batch()["TextDocument:text"].to_pylist()[0]
     assert f"- return: {read_evaluations(run)[-1].episode_return:.1f}" in told
-    assert fingerprint(load(run / ENCODER)) in told
+    assert load(run / ENCODER).fingerprint in told
     assert "/world/ghost/jitterbug" in chunks
 
 

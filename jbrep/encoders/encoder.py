@@ -10,14 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import Scaler
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task, check_same, read_task
 from jbrep.errors import InputError
+from jbrep.files import container
 from jbrep.jitterbug.tasks import get_task
 
 Float32 = NDArray[np.float32]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 
 FULL = "full"  # the representation that is the whole observation
+FORMAT = "jbrep encoder"
+FORMAT_VERSION = 2  # version 1 has no environment: it is the Jitterbug's
 IDENTITY = "identity"  # the kind of encoder that leaves the scaled observation as it is
 _MAX_UNITS = 4096  # in a layer
 MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
@@ -55,7 +59,7 @@ class _Parts(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Encoder:
+class Encoder(BaseEncoder):
     """An encoder with its decoder and the scaling that both expect.
 
     It takes observations in physical units, as data sets and environments give them, and applies
@@ -65,7 +69,7 @@ class Encoder:
         header: its kind, name and origin as plain JSON, see docs/encoders.md.
         scaler: fitted on the training part of its data.
         encoder: layers from d scaled features to l latent units; empty for the identity.
-        decoder: layers from l latent units to d scaled features.
+        decoder: layers from l latent units to d scaled features; empty where there is no decoder.
 
     Raises:
         InputError: tensors whose shapes are inconsistent, whose type is not float32, or that hold
@@ -82,15 +86,10 @@ class Encoder:
         sizes = [self.size]
         for name, tensor in self.tensors().items():
             self._check(name, tensor, sizes)
-        if sizes[-1] != self.size:
+        if self.decoder and sizes[-1] != self.size:
             raise InputError(f"the last layer has {sizes[-1]} units, expected {self.size}")
         if max(sizes) > _MAX_UNITS:
             raise InputError(f"a layer has {max(sizes)} units: the limit is {_MAX_UNITS}")
-        if self.latent_size > self.size:
-            raise InputError(
-                f"the latent has {self.latent_size} units: there must not be more than the "
-                f"{self.size} features"
-            )
         for layer in (*self.encoder, *self.decoder):
             if layer.activation not in ACTIVATIONS:
                 choices = ", ".join(ACTIVATIONS)
@@ -134,9 +133,36 @@ class Encoder:
         return self.header["name"]
 
     @property
+    def kind(self) -> str:
+        """How it was made."""
+        return self.header["kind"]
+
+    @property
     def representation(self) -> str:
         """What an agent that sees its latent sees: `full` for the identity, else its name."""
-        return FULL if self.header["kind"] == IDENTITY else self.name
+        return FULL if self.kind == IDENTITY else self.name
+
+    @property
+    def can_decode(self) -> bool:
+        """Whether there is a decoder."""
+        return bool(self.decoder) or not self.encoder
+
+    @property
+    def file_header(self) -> dict[str, Any]:
+        """The header with the fields that its file needs."""
+        activations = {
+            part: [layer.activation for layer in getattr(self, part)]
+            for part in ("encoder", "decoder")
+        }
+        version = (
+            FORMAT_VERSION if "environment" in self.header else 1
+        )  # old files keep their bytes
+        return {"format": FORMAT, "format_version": version, **self.header, **activations}
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of its header and numbers: it identifies the encoder."""
+        return container.checksum(self.tensors(), self.file_header)
 
     @property
     def size(self) -> int:
@@ -201,10 +227,16 @@ class Encoder:
         """Decode latents (..., l) to reconstructed observations (..., d) in physical units.
 
         Raises:
-            InputError: latents of another length.
+            InputError: latents of another length, or there is no decoder.
         """
+        if not self.can_decode:
+            raise InputError(f"{self.name} has no decoder: it can't reconstruct observations")
         values, parts = self._prepare(latent, self.latent_size, "latents")
         return run(parts.decoder, values) * parts.half_width + parts.centre
+
+    def scale(self, observation: Float32) -> Float32:
+        """Scale observations (..., d) by the extrema of its training data."""
+        return self.scaler.scale(observation)
 
     def _prepare(self, values: Any, size: int, what: str) -> tuple[Any, _Parts]:
         """Values as float32, and this encoder's arrays on the device that they are on."""

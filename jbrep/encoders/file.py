@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 
 from jbrep.dataset import Scaler
-from jbrep.encoders.encoder import Encoder, Layer
+from jbrep.encoders.encoder import FORMAT, FORMAT_VERSION, Encoder, Layer
 from jbrep.errors import InputError, check_version
 from jbrep.files import container
 from jbrep.files.container import Tensors
 from jbrep.files.storage import write_whole
 
-FORMAT = "jbrep encoder"
-FORMAT_VERSION = 2  # version 1 has no environment: it is the Jitterbug's
 SUFFIX = ".safetensors"
 HELD_OUT_MSE = "held_out_mse"  # the metric that every encoder has
 _TEXTS = ("kind", "name", "task")
@@ -40,7 +38,7 @@ def save(encoder: Encoder, path: Path) -> None:
 
 def _pack(encoder: Encoder) -> bytes:
     """The bytes of an encoder's file, checked as `load` checks them."""
-    header = _whole_header(encoder)
+    header = encoder.file_header
     if reserved := [name for name in _RESERVED if name in encoder.header]:
         raise InputError(f"the header must not have {reserved[0]}, which saving adds")
     _encoder(json.loads(json.dumps(header)), encoder.tensors())
@@ -48,23 +46,6 @@ def _pack(encoder: Encoder) -> bytes:
     if len(content) > container.MAX_BYTES:
         raise InputError(f"{len(content):,} bytes are more than {container.MAX_BYTES:,}")
     return content
-
-
-def fingerprint(encoder: Encoder) -> str:
-    """SHA-256 of an encoder's header and numbers: it identifies the encoder."""
-    return container.checksum(encoder.tensors(), _whole_header(encoder))
-
-
-def _whole_header(encoder: Encoder) -> dict[str, Any]:
-    """The header with the fields that only the file needs."""
-    activations = {
-        part: [layer.activation for layer in getattr(encoder, part)]
-        for part in ("encoder", "decoder")
-    }
-    version = (
-        FORMAT_VERSION if "environment" in encoder.header else 1
-    )  # the bytes of old files stay
-    return {"format": FORMAT, "format_version": version, **encoder.header, **activations}
 
 
 def load(path: Path) -> Encoder:

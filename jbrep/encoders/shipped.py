@@ -1,11 +1,14 @@
 """Encoders by name: those that ship with the package, and the whole observation of any task."""
 
 from pathlib import Path
+from typing import Any
 
-from jbrep.encoders.encoder import FULL, IDENTITY, Encoder
+from jbrep.encoders.code import is_code, make
+from jbrep.encoders.encoder import FULL, IDENTITY
 from jbrep.encoders.file import SUFFIX, load
 from jbrep.encoders.identity import SCALINGS, identity
 from jbrep.encoders.names import EncoderName
+from jbrep.envs.encoding import BaseEncoder, as_encoder
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
@@ -23,19 +26,25 @@ def names(task: Task) -> tuple[str, ...]:
     return tuple(sorted(shown, key=lambda name: EncoderName.parse(name).order))
 
 
-def find(name: str | Path, task: Task | str) -> Encoder:
+def find(name: Any, task: Task | str) -> BaseEncoder:
     """The encoder that ships for a task, or a task's name, under that name, or the one in a file.
 
     A shipped name takes precedence; write ./dae-8 for a file of that name. `full` is there for
     every task: where none ships, its features are scaled by their usual ranges, if they have any.
+    A name such as mymodule:MyEncoder is of code (see `jbrep.encoders.code`); anything but a name is
+    an encoder itself, or a user's own (see `jbrep.envs.encoding.as_encoder`).
 
     Raises:
-        InputError: there is neither, the file can't be used, or it was made for another task.
+        InputError: there is none of these, the file can't be used, or it was made for another task.
     """
     if isinstance(task, str):
         from jbrep.envs.description import describe  # imports Gymnasium
 
         task = describe(task)
+    if not isinstance(name, (str, Path)):
+        return as_encoder(name, task)
+    if is_code(name):
+        return make(name, task)
     if _is_made(name, task):
         return identity(task)
     path = _shipped(name, task) or Path(name)
@@ -50,7 +59,7 @@ def find(name: str | Path, task: Task | str) -> Encoder:
     return encoder
 
 
-def find_alone(name: str | Path, task: Task | None) -> Encoder:
+def find_alone(name: str | Path, task: Task | None) -> BaseEncoder:
     """An encoder by name and task, or by its file alone.
 
     Raises:
@@ -58,6 +67,8 @@ def find_alone(name: str | Path, task: Task | None) -> Encoder:
     """
     if task:
         return find(name, task)
+    if is_code(name):
+        raise InputError(f"{name} is code, which reads any task's observations: give its --task")
     if not exists(name):
         raise InputError(f"no encoder at {name}: for one that ships, give its --task, too")
     return load(Path(name))
@@ -66,8 +77,11 @@ def find_alone(name: str | Path, task: Task | None) -> Encoder:
 def source_of(name: str | Path, task: Task | None) -> str:
     """Where `find` and `find_alone` take an encoder from.
 
-    Such as "dae-8, shipped"; "full, unscaled" where none ships; or a file's path.
+    Such as "dae-8, shipped"; "full, unscaled" where none ships; "mymodule:MyEncoder, code"; or a
+    file's path.
     """
+    if is_code(name):
+        return f"{name}, code"
     if task and _is_made(name, task):
         return f"{name}, {SCALINGS[identity(task).header['training']['scaling']]}"
     return f"{name}, shipped" if task and _shipped(name, task) else str(name)

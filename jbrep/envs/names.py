@@ -1,8 +1,10 @@
 """Names of tasks: the Jitterbug's five, and every id in Gymnasium's registry."""
 
 import difflib
+import sys
 from collections.abc import Iterable
 from importlib import import_module, metadata
+from types import ModuleType
 from typing import Any
 
 import gymnasium
@@ -50,13 +52,15 @@ def find_spec(name: str) -> EnvSpec:
 
 
 def import_modules(modules: Iterable[str]) -> None:
-    """Import modules that register environments; this runs their code.
+    """Import modules that a user names, also from the working directory; this runs their code.
 
     Raises:
         InputError: there is no such module, or its import fails.
     """
     for module in modules:
         try:
+            if "" not in sys.path:
+                sys.path.append("")  # after all that is installed
             import_module(module)
         except Exception as error:
             reason = f"{type(error).__name__}: {error}".partition("\n")[0]
@@ -68,6 +72,11 @@ def import_modules(modules: Iterable[str]) -> None:
 def imported_modules() -> tuple[str, ...]:
     """The modules imported so far, for other processes to import, too."""
     return tuple(_imported)
+
+
+def imported(module: str) -> ModuleType | None:
+    """A module, if `import_modules` was asked for it."""
+    return sys.modules[module] if module in _imported else None
 
 
 def name_given(text: str) -> str:

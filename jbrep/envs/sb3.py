@@ -1,7 +1,7 @@
 """The stable-baselines3 environment: many lanes of a task, observed in full or by an encoder."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from jbrep.envs.checks import check_actions
 from jbrep.envs.description import describe
+from jbrep.envs.encoding import BaseEncoder, as_encoder
 from jbrep.envs.lanes import Lanes, State
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
@@ -18,18 +19,7 @@ from jbrep.errors import InputError
 Float32 = NDArray[np.float32]
 
 
-class LatentEncoder(Protocol):
-    """What the environment requires of an encoder; its `check_task`, if it has one, is called."""
-
-    @property
-    def latent_size(self) -> int:
-        """l, the number of latent features."""
-
-    def __call__(self, observation: Float32, /) -> Float32:
-        """Encode observations (n, d) in physical units as latents (n, l)."""
-
-
-def agent_spaces(task: Task, encoder: LatentEncoder | None) -> tuple[spaces.Box, spaces.Box]:
+def agent_spaces(task: Task, encoder: BaseEncoder | None) -> tuple[spaces.Box, spaces.Box]:
     """The spaces of what an agent observes and of its actions."""
     size = encoder.latent_size if encoder else task.size
     low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
@@ -50,8 +40,9 @@ class TaskVecEnv(VecEnv):
         task: a task, or the name or id of one.
         num_envs: the number of lanes.
         seed: of the first lane.
-        encoder: a `jbrep.encoders.Encoder`, or any function of float32 observations in physical
-            units with a `latent_size`; None gives the full observation.
+        encoder: a `jbrep.encoders.Encoder`, or a user's own: an object with `encode`, a function,
+            or a torch module (see `jbrep.envs.encoding.OwnEncoder`); None gives the full
+            observation.
         num_threads: threads to step the lanes on; None takes one for each core.
         max_episode_steps: the time limit of a task given by its name [steps].
 
@@ -64,8 +55,8 @@ class TaskVecEnv(VecEnv):
     diverged.
 
     Raises:
-        InputError: unknown task, a number below 1, an encoder made for other features or whose
-            output doesn't have its `latent_size`; actions of another shape than (num_envs, k).
+        InputError: unknown task, a number below 1, an encoder made for other features or that
+            can't be used; actions of another shape than (num_envs, k).
         NonFiniteActionError: actions that are not finite.
         EnvironmentFailedError: the environment fails in the middle of an episode.
     """
@@ -77,7 +68,7 @@ class TaskVecEnv(VecEnv):
         task: Task | str,
         num_envs: int,
         seed: int = 0,
-        encoder: LatentEncoder | None = None,
+        encoder: Any = None,
         num_threads: int | None = None,
         max_episode_steps: int | None = None,
     ):
@@ -86,13 +77,9 @@ class TaskVecEnv(VecEnv):
         elif max_episode_steps not in (None, task.max_episode_steps):
             raise InputError(f"{task.name} is described with its time limit: describe it anew")
         self.task = task
-        self._encoder = encoder
-        if check_task := getattr(encoder, "check_task", None):
-            check_task(task)
+        self._encoder = None if encoder is None else as_encoder(encoder, task)
         self.lanes = Lanes(task, num_envs, num_threads)
-        observation_space, action_space = agent_spaces(task, encoder)
-        self._latent_size = observation_space.shape[0]
-        self._represent(np.zeros((num_envs, task.size)))  # the encoder may refuse it
+        observation_space, action_space = agent_spaces(task, self._encoder)
         self._low, self._high = np.array(task.action_low), np.array(task.action_high)
         self._actions = np.zeros((num_envs, task.action_size))
         self._first_seeds = np.zeros(num_envs, np.int64)
@@ -164,14 +151,7 @@ class TaskVecEnv(VecEnv):
     def _represent(self, observation: Array) -> Float32:
         if self._encoder is None:
             return self.task.scale(observation).astype(np.float32)
-        latent = np.asarray(self._encoder(observation.astype(np.float32)), dtype=np.float32)
-        if latent.shape != (len(observation), self._latent_size):
-            raise InputError(
-                f"the encoder returned shape {latent.shape} for {len(observation)} observations of "
-                f"{self.task.name}: its latent_size asks for ({len(observation)}, "
-                f"{self._latent_size})"
-            )
-        return latent
+        return self._encoder.encode(observation.astype(np.float32))
 
     def close(self) -> None:
         """Free what the environments hold."""

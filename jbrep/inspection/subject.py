@@ -5,9 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.encoders import Encoder, find, load
+from jbrep.encoders import find, load
 from jbrep.encoders.file import SUFFIX as ENCODER_SUFFIX
 from jbrep.encoders.shipped import find_alone, source_of
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
@@ -97,7 +98,7 @@ def _is_other_folder(path: Path) -> bool:
 
 def _find(
     source: str | None, episode: int, task: Task | None, encoder: str | None
-) -> tuple[Rollout, Encoder | None]:
+) -> tuple[Rollout, BaseEncoder | None]:
     """The episode, and the encoder to show with it."""
     if source is None or source.endswith(ENCODER_SUFFIX):
         if (source is None) == (encoder is None):
@@ -117,7 +118,7 @@ def _find(
     return rollout, _own(folder) if folder else None
 
 
-def _own(folder: Path) -> Encoder | None:
+def _own(folder: Path) -> BaseEncoder | None:
     """A run's encoder; None if the run observes the full state."""
     encoder = load(folder / ENCODER)
     return None if encoder.header["kind"] == "identity" else encoder

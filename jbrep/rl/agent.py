@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.distributions import Distribution
 
 from jbrep.dae.adam import allocate_adam_state
-from jbrep.encoders import Encoder
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import Actor, episode_returns
 from jbrep.envs.sb3 import TaskVecEnv, agent_spaces
@@ -24,7 +24,7 @@ from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rl.presets import ALGORITHMS, Preset
 
 
-def make_env(task: Task, num_envs: int, seed: int, encoder: Encoder) -> VecMonitor:
+def make_env(task: Task, num_envs: int, seed: int, encoder: BaseEncoder) -> VecMonitor:
     """Lanes of a task seen through an encoder, stepped on one thread."""
     return VecMonitor(TaskVecEnv(task, num_envs, seed, encoder, num_threads=1))
 
@@ -32,7 +32,7 @@ def make_env(task: Task, num_envs: int, seed: int, encoder: Encoder) -> VecMonit
 class Spaces(gymnasium.Env[Any, Any]):
     """What a policy needs to know of a task to be built, without making the environment."""
 
-    def __init__(self, task: Task, encoder: Encoder):
+    def __init__(self, task: Task, encoder: BaseEncoder):
         self.observation_space, self.action_space = agent_spaces(task, encoder)
 
 
@@ -85,7 +85,7 @@ def unchecked_distributions() -> Iterator[None]:
         Distribution.set_default_validate_args(before)
 
 
-def deterministic(policy: BasePolicy | BaseAlgorithm, encoder: Encoder, task: Task) -> Actor:
+def deterministic(policy: BasePolicy | BaseAlgorithm, encoder: BaseEncoder, task: Task) -> Actor:
     """The policy's most likely actions, within their bounds despite rounding.
 
     They are not finite where its weights aren't.
@@ -93,7 +93,7 @@ def deterministic(policy: BasePolicy | BaseAlgorithm, encoder: Encoder, task: Ta
     bounds = agent_spaces(task, encoder)[1]
 
     def act(observation: Array) -> NDArray[np.float32]:
-        seen = encoder(observation.astype(np.float32))
+        seen = encoder.encode(observation.astype(np.float32))
         with unchecked_distributions():
             actions = policy.predict(seen, deterministic=True)[0]
         return np.clip(actions, bounds.low, bounds.high)
@@ -111,7 +111,9 @@ class Evaluator:
         seed: of the first episode; the others take the numbers that follow.
     """
 
-    def __init__(self, task: Task, encoder: Encoder, episodes: int, seed: int = EVALUATION_SEED):
+    def __init__(
+        self, task: Task, encoder: BaseEncoder, episodes: int, seed: int = EVALUATION_SEED
+    ):
         self._lanes = Lanes(task, episodes, num_threads=1)
         self._encoder, self._seed = encoder, seed
 

@@ -87,12 +87,17 @@ _SETTINGS = {
     "optimizer": _OBJECT,
     "representation": _NAME,
     "encoder": _SHA256,
+    "encoder_code": Kind(lambda v: v is None or _is_line(v), "null or a name of code"),
+    "encoder_seed": Kind(
+        lambda v: v is None or whole_number(0, MAX_SEED).allows(v), "null or a whole number"
+    ),
     "seed": whole_number(0, MAX_SEED),
     "steps": whole_number(1, MAX_STEPS),
     "evaluate_every": whole_number(1, MAX_STEPS),
     "evaluation_episodes": whole_number(1, MAX_EVALUATION_EPISODES),
     "from": Kind(lambda v: v is None or _SHA256.allows(v), f"null or {_SHA256.words}"),
 }
+ADDED = {"encoder_code": None, "encoder_seed": None}  # what early runs of this version lack
 _VERSION_1 = {"task": _TASK, "episode_steps": whole_number(1, MAX_EPISODE_STEPS)}
 
 

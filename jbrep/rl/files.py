@@ -11,9 +11,15 @@ from typing import Any, NamedTuple
 from jbrep.errors import DamageError, InputError, check_version, differences
 from jbrep.files.storage import exists, read_regular, write_whole
 from jbrep.files.tables import write_csv
+from jbrep.rl.fields import (
+    ADDED,
+    MAX_EVALUATION_EPISODES,
+    MAX_STEPS,
+    check_run,
+    from_version_1,
+)
 from jbrep.rl.fields import FAILED as FAILED
 from jbrep.rl.fields import FINISHED as FINISHED
-from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_STEPS, check_run, from_version_1
 
 FORMAT = "jbrep run"
 FORMAT_VERSION = 2
@@ -127,6 +133,8 @@ def read_run(folder: Path) -> dict[str, Any]:
     check_version(path, version, FORMAT_VERSION)
     if version == 1 and isinstance(run.get("settings"), dict):
         run["settings"] = from_version_1(path, run["settings"])
+    if isinstance(run.get("settings"), dict):
+        run["settings"] = {**ADDED, **run["settings"]}
     check_run(path, run)
     return run
 

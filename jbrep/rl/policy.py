@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
-from jbrep.encoders import Encoder, find, load
-from jbrep.encoders.file import fingerprint
+from jbrep.encoders import find, load
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.recording import Actor
 from jbrep.envs.task import Array, Task, read_task
 from jbrep.errors import DamageError, InputError, choose
@@ -19,7 +19,7 @@ from jbrep.files import container
 from jbrep.files.storage import exists
 from jbrep.rl.agent import Spaces, deterministic, make_agent
 from jbrep.rl.checkpoint import MAX_BYTES, PARAMETERS
-from jbrep.rl.fields import MAX_STEPS, check_settings, from_version_1, whole_number
+from jbrep.rl.fields import ADDED, MAX_STEPS, check_settings, from_version_1, whole_number
 from jbrep.rl.files import (
     BEGINNING,
     CHECKPOINT,
@@ -41,7 +41,7 @@ class Trained(NamedTuple):
 
     policy: BasePolicy
     task: Task
-    encoder: Encoder
+    encoder: BaseEncoder
     evaluation_episodes: int = 1  # that the run's evaluations play at once
     step: int | None = None  # of training, if it is not over
 
@@ -66,11 +66,15 @@ class Trained(NamedTuple):
         return checked
 
 
-def load_run(folder: Path) -> Trained:
+def load_run(folder: Path, encoder: BaseEncoder | None = None) -> Trained:
     """The policy of a run; nothing that the folder holds is run as code.
 
     A finished run has its final policy, one that is under way or was stopped its checkpoint's. Only
     numbers are read of either; the network that they belong to is built from the run's settings.
+
+    Args:
+        folder: of the run.
+        encoder: the one that the run was made with, where its folder has none because it is code.
 
     Raises:
         InputError: no run there, a failed one, one without a checkpoint so far, or one whose files
@@ -83,15 +87,15 @@ def load_run(folder: Path) -> Trained:
             "minute after its start"
         )
     if not exists(folder / RUN):
-        return _load_checkpoint(folder)
+        return _load_checkpoint(folder, encoder)
     run = read_finished(folder)
-    trained = _build(folder, run["settings"])
+    trained = _build(folder, run["settings"], encoder)
     path = folder / POLICY
     fill(trained.policy, read_weights(path, run["policy_sha256"]), path)
     return trained
 
 
-def load_untrained(folder: Path) -> Trained:
+def load_untrained(folder: Path, encoder: BaseEncoder | None = None) -> Trained:
     """The policy that a run began with.
 
     Raises:
@@ -100,7 +104,7 @@ def load_untrained(folder: Path) -> Trained:
     """
     ended = exists(folder / RUN)
     settings = read_run(folder)["settings"] if ended else _read_checkpoint(folder).settings
-    trained = _build(folder, settings)
+    trained = _build(folder, settings, encoder)
     if settings["from"]:
         path = folder / BEGINNING
         fill(trained.policy, read_weights(path, settings["from"]), path)
@@ -152,6 +156,7 @@ def _read_checkpoint(folder: Path) -> _Checkpoint:
         raise DamageError(f"{path} is not a run's checkpoint")
     if "environment" not in settings:
         settings = from_version_1(path, settings)
+    settings = {**ADDED, **settings}
     check_settings(path, settings)
     step = counters.get("num_timesteps", -1)
     if not whole_number(0, MAX_STEPS).allows(step):
@@ -164,21 +169,39 @@ def _read_checkpoint(folder: Path) -> _Checkpoint:
     return _Checkpoint(settings, step, weights)
 
 
-def _load_checkpoint(folder: Path) -> Trained:
+def _load_checkpoint(folder: Path, encoder: BaseEncoder | None) -> Trained:
     checkpoint = _read_checkpoint(folder)
-    trained = _build(folder, checkpoint.settings)._replace(step=checkpoint.step)
+    trained = _build(folder, checkpoint.settings, encoder)._replace(step=checkpoint.step)
     fill(trained.policy, checkpoint.weights, folder / CHECKPOINT)
     return trained
 
 
-def _build(folder: Path, settings: Mapping[str, Any]) -> Trained:
+def _build(
+    folder: Path, settings: Mapping[str, Any], encoder: BaseEncoder | None = None
+) -> Trained:
     """What a run trains, as it begins."""
     task, algorithm = read_task(settings["environment"]), settings["algorithm"]
     choose(algorithm, ALGORITHMS, "algorithm")
-    encoder = load(folder / ENCODER)
-    if fingerprint(encoder) != settings["encoder"]:
-        raise InputError(f"{folder / ENCODER} is not the encoder that the run was made with")
+    encoder = encoder or run_encoder(folder, settings)
+    if encoder.fingerprint != settings["encoder"]:
+        raise InputError(
+            f"{encoder.name} is not the encoder that the run in {folder} was made with"
+        )
     encoder.check_task(task)
     preset = Preset(tuple(settings["hidden"]), {})
     agent = make_agent(algorithm, preset, Spaces(task, encoder), settings["seed"])
     return Trained(agent.policy, task, encoder, settings["evaluation_episodes"])
+
+
+def run_encoder(folder: Path, settings: Mapping[str, Any]) -> BaseEncoder:
+    """The encoder in a run's folder.
+
+    Raises:
+        InputError: there is none, since it is code.
+    """
+    if not exists(folder / ENCODER) and (code := settings["encoder_code"]):
+        raise InputError(
+            f"the run in {folder} was made with an encoder that is code, {code}: give it with "
+            f"--encoder {code}, which runs it"
+        )
+    return load(folder / ENCODER)

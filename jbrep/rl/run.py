@@ -15,9 +15,10 @@ from stable_baselines3.common.logger import Logger
 
 from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import FULL, Encoder, find, save
-from jbrep.encoders.file import fingerprint
+from jbrep.encoders.code import is_code
 from jbrep.envs.checks import NonFiniteActionError
 from jbrep.envs.description import as_task
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.envs.names import environment_versions
 from jbrep.envs.task import Task
@@ -67,11 +68,13 @@ class Run:
     task: Task  # or its name, which is then described
     algorithm: str = "sac"
     preset: str = "paper"
-    encoder: str = FULL  # a file, or a shipped encoder's name; full: the whole observation
+    encoder: Any = FULL  # a name or file, code, or a user's own encoder, as `find` takes it
     seed: int = 0
     steps: int = 100_000
     evaluate_every: int = 10_000  # steps
     evaluation_episodes: int = 10
+    representation: str = ""  # what tables call it; the encoder's own name by default
+    encoder_seed: int | None = None  # that the encoder was made with, if each run has its own
     begin_from: str = ""  # the folder of a finished run, whose policy this one begins with
 
     def __post_init__(self) -> None:
@@ -94,7 +97,7 @@ class Run:
         """
         self.describe(find(self.encoder, self.task))
 
-    def describe(self, encoder: Encoder) -> dict[str, Any]:
+    def describe(self, encoder: BaseEncoder) -> dict[str, Any]:
         """All settings that two equal runs share, as plain JSON.
 
         Raises:
@@ -106,8 +109,10 @@ class Run:
             "algorithm": self.algorithm,
             "preset": self.preset,
             **asdict(get_preset(self.preset, self.algorithm)),
-            "representation": encoder.representation,
-            "encoder": fingerprint(encoder),
+            "representation": self.representation or encoder.representation,
+            "encoder": encoder.fingerprint,
+            "encoder_code": str(self.encoder) if is_code(self.encoder) else None,
+            "encoder_seed": self.encoder_seed,
             "seed": self.seed,
             "steps": self.steps,
             "evaluate_every": self.evaluate_every,
@@ -185,7 +190,7 @@ def _read_ended(folder: Path, settings: dict[str, Any]) -> dict[str, Any] | None
 
 def _train(
     run: Run,
-    encoder: Encoder,
+    encoder: BaseEncoder,
     settings: dict[str, Any],
     folder: Path,
     watch: Watch,
@@ -198,7 +203,8 @@ def _train(
     checkpointer = Checkpointer(
         folder / CHECKPOINT, {**settings, **versions}, history, save_every, stop
     )
-    save(encoder, folder / ENCODER)  # now that no checkpoint of another run is there
+    if isinstance(encoder, Encoder):  # now that no checkpoint of another run is there
+        save(encoder, folder / ENCODER)
 
     preset = get_preset(run.preset, run.algorithm)
     seed = training_seed(run.seed)

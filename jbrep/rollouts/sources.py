@@ -9,7 +9,8 @@ import numpy as np
 from jbrep.collect.policies import POLICIES, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.encoders import FULL, Encoder
+from jbrep.encoders import FULL
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Actor, episode_returns
@@ -87,15 +88,16 @@ class Player(NamedTuple):
         """About what an episode of the longest takes in memory."""
         return (16 * self.task.size + 100) * self.task.max_episode_steps
 
-    def with_reconstruction(self, encoder: Encoder) -> "Player":
+    def with_reconstruction(self, encoder: BaseEncoder) -> "Player":
         """The same policy, which now observes what an encoder's latent is decoded to.
 
         The return that it loses measures what the latent lacks for acting.
 
         Raises:
-            InputError: an encoder for other observations.
+            InputError: an encoder for other observations, or one that can't decode.
         """
         encoder.check_task(self.task)
+        encoder.check_decodes("a policy by its name acts on decoded observations")
 
         def begin(task: Task, seeds: Sequence[int]) -> Actor:
             act = self.begin(task, seeds)

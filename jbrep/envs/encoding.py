@@ -1,0 +1,238 @@
+"""What an encoder is to all stages, and users' own encoders: objects and torch modules."""
+
+import hashlib
+import re
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.envs.task import Task
+from jbrep.errors import InputError
+
+Float32 = NDArray[np.float32]
+
+OWN = "own"  # the kind of a user's own encoder
+_NAME = re.compile(r"[\w.-]{1,100}", re.ASCII)
+_PROBES = 256  # observations by whose latents an own encoder is known
+_SPREAD = 1.0  # of these, in the features' usual ranges
+
+
+class BaseEncoder(ABC):
+    """What every stage uses of an encoder.
+
+    Attributes:
+        name: what tables call it.
+        kind: how it was made, such as dae, pca, identity, own.
+        task: whose observations it reads.
+        size: length d of an observation.
+        latent_size: length l of a latent.
+        can_decode: whether `decode` is possible.
+        fingerprint: SHA-256 that identifies it.
+    """
+
+    name: Any
+    kind: Any
+    task: Any
+    size: Any
+    latent_size: Any
+    can_decode: Any
+    fingerprint: Any
+
+    @property
+    def representation(self) -> str:
+        """What an agent that sees its latent sees."""
+        return str(self.name)
+
+    @abstractmethod
+    def encode(self, observation: Any) -> Any:
+        """Encode observations (..., d) in physical units as latents (..., l)."""
+
+    @abstractmethod
+    def decode(self, latent: Any) -> Any:
+        """Decode latents (..., l) to observations (..., d) in physical units.
+
+        Raises:
+            InputError: it can't.
+        """
+
+    def check_decodes(self, why: str) -> None:
+        """Make sure that it can decode, where that is needed.
+
+        Raises:
+            InputError: it can't; the message says why that matters.
+        """
+        if not self.can_decode:
+            raise InputError(f"{self.name} has no decoder: {why}")
+
+    def scale(self, observation: Any) -> Any:
+        """Scale observations (..., d) to about [-1, 1], so that errors of features compare."""
+        return self.task.scale(observation)
+
+    @abstractmethod
+    def check_task(self, task: Task) -> None:
+        """Make sure that it can read this task's observations.
+
+        Raises:
+            InputError: it was made for another environment or other features.
+        """
+
+
+def as_encoder(given: Any, task: Task) -> BaseEncoder:
+    """An encoder from whatever encodes, for a task's observations.
+
+    Args:
+        given: an encoder of jbrep; an object with `encode`, or any function; or a torch module.
+        task: whose observations it is to read.
+
+    Raises:
+        InputError: it was made for another task, or as `OwnEncoder`.
+    """
+    encoder = given if isinstance(given, BaseEncoder) else OwnEncoder(given, task)
+    encoder.check_task(task)
+    return encoder
+
+
+class OwnEncoder(BaseEncoder):
+    """A user's own encoder: an object with `encode`, a function, or a torch module.
+
+    It gets float32 observations (n, d) in physical units and returns latents (n, l). A torch module
+    gets a tensor on its own device, in evaluation mode and without gradients. Where there is no
+    `encode`, it is called. `latent_size`, `decode`, `name` and `check_task` are used if there
+    are any.
+
+    Args:
+        given: the user's object.
+        task: whose observations it reads.
+
+    Raises:
+        InputError: it can't be called, fails, or returns something else than finite latents of one
+            size, which is its `latent_size` if it has one.
+    """
+
+    kind = OWN
+
+    def __init__(self, given: Any, task: Task):
+        self.task, self.size = task, task.size
+        self.name = _name(given)
+        self._given = given
+        self._encode = getattr(given, "encode", given)
+        self._decode = getattr(given, "decode", None)
+        if isinstance(given, type) or not callable(self._encode):
+            raise InputError(f"{self.name} has no `encode` and can't be called: it is no encoder")
+        latents = self._apply(self._encode, self._probes, None)
+        declared = getattr(given, "latent_size", latents.shape[1])
+        if declared != latents.shape[1]:
+            raise InputError(
+                f"{self.name} returned latents of {latents.shape[1]} numbers, but its latent_size "
+                f"is {declared}"
+            )
+        self.latent_size = latents.shape[1]
+        self.fingerprint = hashlib.sha256(latents.tobytes()).hexdigest()
+
+    def __repr__(self) -> str:
+        return f"OwnEncoder({self.name}, {self.task.name}, {self.size} to {self.latent_size})"
+
+    @property
+    def can_decode(self) -> bool:
+        """Whether the user's object has `decode`."""
+        return self._decode is not None
+
+    @property
+    def _probes(self) -> Float32:
+        """Observations to try it on, (n, d)."""
+        scaled = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, (_PROBES, self.size))
+        return self.task.unscale(scaled).astype(np.float32)
+
+    def encode(self, observation: Any) -> Float32:
+        """As for `BaseEncoder`, with NumPy arrays.
+
+        Raises:
+            InputError: observations of another length, or as for the class.
+        """
+        return self._in_rows(self._encode, observation, self.size, self.latent_size)
+
+    def decode(self, latent: Any) -> Float32:
+        """As for `BaseEncoder`, with NumPy arrays."""
+        if self._decode is None:
+            raise InputError(f"{self.name} has no `decode`: it can't reconstruct observations")
+        return self._in_rows(self._decode, latent, self.latent_size, self.size)
+
+    def check_task(self, task: Task) -> None:
+        """Ask its own `check_task`, if it has one, else compare the number of features."""
+        if check := getattr(self._given, "check_task", None):
+            check(task)
+        elif task.size != self.size:
+            raise InputError(
+                f"{self.name} takes observations of {self.size} numbers, but {task.name} has "
+                f"{task.size}"
+            )
+
+    def _in_rows(self, function: Callable[..., Any], values: Any, size: int, width: int) -> Float32:
+        """Apply a function of rows to values (..., size), giving (..., width)."""
+        values = np.asarray(values, np.float32)
+        if not values.ndim or values.shape[-1] != size:
+            raise InputError(
+                f"{self.name} takes {size} numbers, but got an array of shape {values.shape}"
+            )
+        result = self._apply(function, values.reshape(-1, size), width)
+        return result.reshape(*values.shape[:-1], width)
+
+    def _apply(self, function: Callable[..., Any], rows: Float32, width: int | None) -> Float32:
+        """What the user's function makes of rows, (n, width), checked; of any width if None."""
+        try:
+            result = np.asarray(self._call(function, rows), np.float32)
+        except Exception as error:
+            raise InputError(f"{self.name} failed: {_reason(error)}") from error
+        if result.ndim != 2 or result.shape != (len(rows), width or result.shape[1]):
+            raise InputError(
+                f"{self.name} returned shape {result.shape} for {len(rows)} rows of "
+                f"{self.task.name}: expected ({len(rows)}, {width or 'its latent size'})"
+            )
+        if not np.isfinite(result).all():
+            raise InputError(f"{self.name} returned numbers that are not finite")
+        return result
+
+    def _call(self, function: Callable[..., Any], rows: Float32) -> Any:
+        if not _is_module(self._given):
+            return _as_array(function(rows))
+        import torch
+
+        module, training = self._given, self._given.training
+        numbers = (p for p in [*module.parameters(), *module.buffers()] if p.is_floating_point())
+        like = next(numbers, torch.empty(0))
+        tensor = torch.from_numpy(rows.copy()).to(like.device, like.dtype)
+        module.eval()
+        try:
+            with torch.no_grad():
+                return _as_array(function(tensor))
+        finally:
+            module.train(training)
+
+
+def _name(given: Any) -> str:
+    """What tables call a user's object: its name, if that is a word, else its class's."""
+    for name in (getattr(given, "name", None), getattr(given, "__name__", None)):
+        if isinstance(name, str) and _NAME.fullmatch(name):
+            return name
+    return type(given).__name__
+
+
+def _is_module(given: Any) -> bool:
+    torch = sys.modules.get("torch")  # whoever has a module has imported it
+    return torch is not None and isinstance(given, torch.nn.Module)
+
+
+def _as_array(result: Any) -> Any:
+    """A tensor as an array; anything else as it is."""
+    return result.detach().cpu().numpy() if hasattr(result, "detach") else result
+
+
+def _reason(error: Exception) -> str:
+    text = f"{type(error).__name__}: {error}".partition("\n")[0]
+    if "grad" in text:
+        text += " (an encoder runs without gradients)"
+    return text
