@@ -384,6 +384,6 @@ def test_invalid_settings_are_refused_in_words(change, message):
 
 
 def test_the_constants_of_a_policy_are_numbers_and_text_in_lists_and_tables():
-    parts = [[0.5, {"kind": "uniform"}], [0.5, {"kind": "trained", "run": "runs/a"}]]
+    parts = [[0.5, {"kind": "uniform"}], [0.5, {"kind": "imported", "source": "a"}]]
     policy = {"kind": "mixture", "parts": parts}
     assert settings(policy=policy).as_json()["policy"] == policy

@@ -7,6 +7,7 @@ import numpy as np
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
+from jbrep.dataset.settings import IMPORTED
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.encoder import IDENTITY
 from jbrep.envs.encoding import BaseEncoder
@@ -91,8 +92,10 @@ def seen(encoder: BaseEncoder, data: ScaledDataset) -> str:
     manifest = data.dataset.manifest
     if source.get("fingerprint") == manifest.fingerprint:
         return "no test row"
-    differs = "seed" in source and source["seed"] != manifest.settings.seed
-    return "none" if differs else "maybe"
+    kinds = {source.get("policy", {}).get("kind"), manifest.settings.policy["kind"]}
+    if "seed" not in source or IMPORTED in kinds:
+        return "maybe"
+    return "none" if source["seed"] != manifest.settings.seed else "maybe"
 
 
 def _describe(held_out: HeldOut) -> dict[str, Any]:
