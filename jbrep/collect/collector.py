@@ -1,9 +1,10 @@
 """The collector: a policy in many episodes, written to the shards of a data set."""
 
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +29,7 @@ from jbrep.envs.checks import check_counts
 from jbrep.envs.make import is_batched
 from jbrep.errors import InputError, differences
 from jbrep.files.lock import exclusive
-from jbrep.files.storage import check_space, exists, make_folder
+from jbrep.files.storage import check_space, exists, make_folder, read_regular, write_whole
 from jbrep.progress import Progress
 
 _MAX_SHARDS = 10_000
@@ -77,10 +78,15 @@ def collect(
     settings = replace(settings, policy=policy.settings())
     check_counts(lanes, num_threads)
     produce = get_backend(backend)(settings, policy, lanes, num_threads)
-    return write_shards(settings, folder, produce)
+    return write_shards(settings, folder, produce, policy.files())
 
 
-def write_shards(settings: Settings, folder: Path, produce: Produce) -> Written:
+def write_shards(
+    settings: Settings,
+    folder: Path,
+    produce: Produce,
+    files: Mapping[str, bytes] = MappingProxyType({}),
+) -> Written:
     """Commit the missing shards, until there are as many rows as the settings ask for.
 
     Args:
@@ -88,6 +94,7 @@ def write_shards(settings: Settings, folder: Path, produce: Produce) -> Written:
         folder: of the data set.
         produce: makes shards, one after the other; of the last, only the episodes that are needed
             are kept.
+        files: that the data set needs besides, by name.
 
     Raises:
         InputError: as `collect` does.
@@ -95,7 +102,7 @@ def write_shards(settings: Settings, folder: Path, produce: Produce) -> Written:
     began = time.monotonic()
     make_folder(folder)
     with exclusive(folder):
-        there = _begin(settings, folder)
+        there = _begin(settings, folder, files)
         manifest = there.extended(settings.steps)
         if not manifest.complete:
             with Progress(
@@ -172,19 +179,31 @@ def _cut(columns: Columns, rows: int) -> Columns:
     }
 
 
-def _begin(settings: Settings, folder: Path) -> Manifest:
+def _begin(settings: Settings, folder: Path, files: Mapping[str, bytes]) -> Manifest:
     """The manifest to go on from, new if there is none."""
-    files = hdf5_files(folder)
-    if (folder / MANIFEST).exists() or files:
+    shards = hdf5_files(folder)
+    if (folder / MANIFEST).exists() or shards:
         manifest = read_manifest(folder)
         _check_same(manifest, new_manifest(settings), folder)
-        check_files(folder, manifest, files)
+        check_files(folder, manifest, shards)
+        _keep(files, folder)
         check_space(folder, (settings.steps - manifest.settings.steps) * settings.row_bytes())
     else:
         manifest = new_manifest(settings)
         check_space(folder, settings.steps * settings.row_bytes())
+        _keep(files, folder)
         write_manifest(folder, manifest)
     return manifest
+
+
+def _keep(files: Mapping[str, bytes], folder: Path) -> None:
+    """Write files that aren't there."""
+    for name, content in files.items():
+        path = folder / name
+        if not exists(path):
+            write_whole(path, content)
+        elif read_regular(path, len(content)) != content:
+            raise InputError(f"{path} is another policy's file: choose another folder")
 
 
 def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:

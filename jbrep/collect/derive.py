@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.collect.collector import Written, write_shards
-from jbrep.collect.policies import make_policy
+from jbrep.collect.policies import acts_on_observations
 from jbrep.collect.shards import Missing, Produce
 from jbrep.dataset import Dataset, Settings, version1
 from jbrep.dataset.manifest import new_manifest, open_shard
@@ -58,7 +58,7 @@ def derive(
         raise InputError(f"{source} has no states: collect it with --store-state")
     if not dataset.manifest.complete:
         raise InputError(f"{source} is unfinished: resume it with the same jbrep collect")
-    if not make_policy(settings.policy).open_loop:
+    if acts_on_observations(settings.policy):
         raise InputError(
             f"{source} was collected by a {settings.policy['kind']} policy, which acts on "
             f"observations: run jbrep collect --task {task_name} instead"

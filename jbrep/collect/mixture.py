@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.dataset.policy import MIXTURE
 from jbrep.dataset.schema import episode_part
 from jbrep.envs.recording import Actor
 from jbrep.envs.task import Array, Task
@@ -19,17 +20,15 @@ if TYPE_CHECKING:
 class Mixture:
     """A policy for each episode, drawn from several with the given weights."""
 
-    kind: ClassVar[str] = "mixture"
     parts: "tuple[tuple[float, Policy], ...]"  # weights, which are positive, and policies
 
-    @property
-    def open_loop(self) -> bool:
-        """Whether no part acts on observations."""
-        return all(policy.open_loop for _, policy in self.parts)
+    def files(self) -> dict[str, bytes]:
+        """Those of its parts."""
+        return {name: file for _, policy in self.parts for name, file in policy.files().items()}
 
     def settings(self) -> dict[str, Any]:
         """The settings that `make_policy` takes."""
-        return {"kind": self.kind, "parts": [[w, policy.settings()] for w, policy in self.parts]}
+        return {"kind": MIXTURE, "parts": [[w, policy.settings()] for w, policy in self.parts]}
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Act with the part that is drawn for each episode.

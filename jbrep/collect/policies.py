@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.collect.mixture import Mixture
+from jbrep.dataset.policy import MIXTURE, TRAINED, parts_of
 from jbrep.envs.recording import Actor as Actor
 from jbrep.envs.recording import open_loop
 from jbrep.envs.task import Array, Task
@@ -23,9 +24,8 @@ _BLOCK = 1000  # steps that actions are drawn for at a time
 class Policy(Protocol):
     """How actions are chosen; it can be pickled, for workers."""
 
-    @property
-    def open_loop(self) -> bool:
-        """Whether actions don't depend on what is observed."""
+    def files(self) -> dict[str, bytes]:
+        """The files without which it can't act again, by their names in the data set's folder."""
 
     def settings(self) -> dict[str, Any]:
         """What determines it, as plain JSON: its kind and its constants."""
@@ -62,6 +62,11 @@ class Constants:
     """The base of policies that are frozen dataclasses of their constants."""
 
     kind: ClassVar[str]
+    open_loop: ClassVar[bool]  # whether actions don't depend on what is observed
+
+    def files(self) -> dict[str, bytes]:
+        """None are needed."""
+        return {}
 
     def settings(self) -> dict[str, Any]:
         """The settings that `make_policy` takes."""
@@ -195,6 +200,11 @@ def parse_policy(text: str, other: Callable[[str], Policy | None] = lambda text:
         return policy
     if not _WEIGHT.search(text):
         kind, _, constants = text.partition(":")
+        if kind not in POLICIES:
+            raise InputError(
+                f"unknown policy {kind!r}: choose one of {', '.join(POLICIES)}, the folder of a "
+                "run with a policy or checkpoint, or a mixture: uniform:0.8+heuristic:0.2"
+            )
         pairs = (pair.partition("=") for pair in constants.split(",") if pair)
         return _make(kind, {name.strip(): value for name, _, value in pairs})
     *parts, last = _WEIGHT.split(text)
@@ -218,14 +228,34 @@ def _weight(text: str) -> float:
     return weight
 
 
-def make_policy(settings: Mapping[str, Any]) -> Policy:
+def acts_on_observations(settings: Mapping[str, Any]) -> bool:
+    """Whether the policy of a manifest may act on what is observed."""
+    kinds = [part["kind"] for part in parts_of(settings)]
+    return not all(kind in POLICIES and POLICIES[kind].open_loop for kind in kinds)
+
+
+def _unreadable(settings: Mapping[str, Any]) -> Policy:
+    raise InputError(
+        f"a {settings['kind']} policy is more than its settings: give the one in its file"
+    )
+
+
+def make_policy(
+    settings: Mapping[str, Any], trained: Callable[[Mapping[str, Any]], Policy] = _unreadable
+) -> Policy:
     """Make a policy from its settings, as in a manifest.
+
+    Args:
+        settings: its kind and constants.
+        trained: makes those of runs, which need more than their settings.
 
     Raises:
         InputError: an unknown policy, an unknown constant, or one out of range.
     """
-    if settings["kind"] == Mixture.kind:
-        return Mixture(tuple((w, make_policy(part)) for w, part in settings["parts"]))
+    if settings["kind"] == TRAINED:
+        return trained(settings)
+    if settings["kind"] == MIXTURE:
+        return Mixture(tuple((w, make_policy(part, trained)) for w, part in settings["parts"]))
     constants = {name: value for name, value in settings.items() if name != "kind"}
     return _make(settings["kind"], constants)
 

@@ -1,10 +1,11 @@
 """Repairing a data set: damaged or missing files are restored as they were."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from jbrep.collect.policies import Policy, make_policy
 from jbrep.collect.shards import LANES, simulate_shard
@@ -33,7 +34,7 @@ def repair(
     folder: Path,
     lanes: int = LANES,
     num_threads: int | None = None,
-    policy: Policy | None = None,
+    make: Callable[[Mapping[str, Any]], Policy] = make_policy,
 ) -> Iterator[str]:
     """Simulate damaged and missing shards again, and restore the manifest from its backup.
 
@@ -44,7 +45,7 @@ def repair(
         folder: of the data set.
         lanes: robots stepped at once.
         num_threads: threads to step them on; None takes one for each core.
-        policy: in place of the one that the manifest names.
+        make: makes the policy from what the manifest says of it.
 
     Yields:
         A line for each file restored or renamed.
@@ -63,7 +64,7 @@ def repair(
         for shard in range(len(manifest.shards)):
             if _is_intact(folder, manifest, shard):
                 continue
-            entry = _restore(folder, manifest, shard, lanes, num_threads, policy)
+            entry = _restore(folder, manifest, shard, lanes, num_threads, make)
             shards = (*manifest.shards[:shard], entry, *manifest.shards[shard + 1 :])
             manifest = replace(manifest, shards=shards)
             yield f"{folder / shard_name(shard)} restored"
@@ -116,7 +117,7 @@ def _restore(
     shard: int,
     lanes: int,
     num_threads: int | None,
-    policy: Policy | None,
+    make: Callable[[Mapping[str, Any]], Policy],
 ) -> Entry:
     settings, entry, path = manifest.settings, manifest.shards[shard], folder / shard_name(shard)
     if settings.is_imported:
@@ -132,7 +133,7 @@ def _restore(
     with Progress(total=entry.rows, unit="step", unit_scale=True, desc=path.name) as progress:
         columns = simulate_shard(
             settings,
-            policy or make_policy(settings.policy),
+            make(settings.policy),
             shard,
             progress.update,
             lanes,

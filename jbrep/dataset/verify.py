@@ -1,6 +1,8 @@
 """Verifying a data set: hashes, shapes, numbers and ranges."""
 
+import hashlib
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from jbrep.dataset.manifest import (
     read_manifest,
     shard_name,
 )
+from jbrep.dataset.policy import TRAINED, parts_of
 from jbrep.dataset.schema import (
     EPISODES,
     UNKNOWN_SEED,
@@ -30,7 +33,10 @@ from jbrep.dataset.schema import (
 from jbrep.dataset.shard import REPAIR, column_hash
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError
+from jbrep.files.storage import read_regular
 from jbrep.progress import Progress
+
+_MAX_POLICY_BYTES = 1 << 28
 
 
 def find_problems(folder: Path) -> Iterator[str]:
@@ -50,6 +56,7 @@ def find_problems(folder: Path) -> Iterator[str]:
         return
     yield from file_problems(folder, manifest, files)
     yield from _backup_problems(folder, manifest)
+    yield from _policy_problems(folder, manifest)
     for shard in Progress(range(len(manifest.shards)), unit="shard", desc="verify", leave=False):
         path = folder / shard_name(shard)
         try:
@@ -73,6 +80,21 @@ def _backup_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
         return
     if not manifest.is_next(backup):
         yield f"{folder / BACKUP} is of another data set: {REPAIR}"
+
+
+def _policy_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
+    """The files of trained policies are there, as they were when they acted."""
+    for policy in parts_of(manifest.settings.policy):
+        if policy["kind"] != TRAINED:
+            continue
+        path, raw = folder / policy["file"], b""
+        with suppress(OSError):
+            raw = read_regular(path, _MAX_POLICY_BYTES)
+        if hashlib.sha256(raw).hexdigest() != policy["sha256"]:
+            yield (
+                f"{path} is damaged or missing: it is the policy of {policy['run']} at step "
+                f"{policy['step']:,}, which only a copy can restore"
+            )
 
 
 def _hash_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:

@@ -18,7 +18,7 @@ from jbrep.inspection.recording import SUFFIX, check_out
 from jbrep.inspection.traversal import record_traversal
 from jbrep.rl.files import ENCODER, is_run
 from jbrep.rollouts.rollout import Rollout
-from jbrep.rollouts.sources import find_episode, run_folder
+from jbrep.rollouts.sources import find_episode, is_trained, run_folder
 from jbrep.study.results import has_runs, read_runs
 
 FOLDER = Path("inspect")  # of recordings without an --out
@@ -100,7 +100,7 @@ def _find(
     source: str | None, episode: int, task: Task | None, encoder: str | None
 ) -> tuple[Rollout, BaseEncoder | None]:
     """The episode, and the encoder to show with it."""
-    if source is None or source.endswith(ENCODER_SUFFIX):
+    if source is None or (source.endswith(ENCODER_SUFFIX) and not is_trained(source)):
         if (source is None) == (encoder is None):
             raise InputError("give a SOURCE to inspect, or one encoder with its --task")
         shown = find_alone(source or encoder or "", task)
@@ -114,13 +114,17 @@ def _find(
     rollout = find_episode(source, episode, task)
     if encoder:
         return rollout, find(encoder, rollout.task)
-    folder = run_folder(source)
-    return rollout, _own(folder) if folder else None
+    return rollout, _own(source) if is_trained(source) else None
 
 
-def _own(folder: Path) -> BaseEncoder | None:
-    """A run's encoder; None if the run observes the full state."""
-    encoder = load(folder / ENCODER)
+def _own(source: str) -> BaseEncoder | None:
+    """The encoder of a run, or of a policy's file; None if it observes the full state."""
+    if folder := run_folder(source):
+        encoder = load(folder / ENCODER)
+    else:
+        from jbrep.rl.policy_weights import load_encoder  # imports torch
+
+        encoder = load_encoder(Path(source))
     return None if encoder.header["kind"] == "identity" else encoder
 
 

@@ -44,6 +44,7 @@ class Trained(NamedTuple):
     encoder: BaseEncoder
     evaluation_episodes: int = 1  # that the run's evaluations play at once
     step: int | None = None  # of training, if it is not over
+    settings: Mapping[str, Any] = {}  # of the run; none of a file from elsewhere
 
     @property
     def representation(self) -> str:
@@ -180,17 +181,23 @@ def _build(
     folder: Path, settings: Mapping[str, Any], encoder: BaseEncoder | None = None
 ) -> Trained:
     """What a run trains, as it begins."""
+    return build(folder, settings, encoder or run_encoder(folder, settings))
+
+
+def build(path: Path, settings: Mapping[str, Any], encoder: BaseEncoder) -> Trained:
+    """What a run of these settings trains, as it begins; the path is for messages.
+
+    Raises:
+        InputError: an unknown algorithm, or an encoder that isn't the run's.
+    """
     task, algorithm = read_task(settings["environment"]), settings["algorithm"]
     choose(algorithm, ALGORITHMS, "algorithm")
-    encoder = encoder or run_encoder(folder, settings)
     if encoder.fingerprint != settings["encoder"]:
-        raise InputError(
-            f"{encoder.name} is not the encoder that the run in {folder} was made with"
-        )
+        raise InputError(f"{encoder.name} is not the encoder that the run in {path} was made with")
     encoder.check_task(task)
     preset = Preset(tuple(settings["hidden"]), {})
     agent = make_agent(algorithm, preset, Spaces(task, encoder), settings["seed"])
-    return Trained(agent.policy, task, encoder, settings["evaluation_episodes"])
+    return Trained(agent.policy, task, encoder, settings["evaluation_episodes"], settings=settings)
 
 
 def run_encoder(folder: Path, settings: Mapping[str, Any]) -> BaseEncoder:
