@@ -103,6 +103,13 @@ _SETTINGS = {
     "from": Kind(lambda v: v is None or _SHA256.allows(v), f"null or {_SHA256.words}"),
 }
 ADDED = {"encoder_code": None, "encoder_seed": None}  # what early runs of this version lack
+_POLICY = {
+    "settings": _OBJECT,
+    "encoder": _OBJECT,
+    "run": _LINE,
+    "step": whole_number(0, MAX_STEPS),
+    "finished": Kind(lambda v: isinstance(v, bool), "true or false"),
+}
 _VERSION_1 = {"task": _TASK, "episode_steps": whole_number(1, MAX_EPISODE_STEPS)}
 
 
@@ -130,6 +137,15 @@ def check_settings(path: Path, settings: Mapping[str, Any]) -> None:
         raise _damaged(path, f"settings.environment is invalid: {error}") from None
     if task.name != settings["task"]:
         raise _damaged(path, f"settings.environment is of {task.name}")
+
+
+def check_policy(path: Path, header: Mapping[str, Any]) -> None:
+    """The same for the header of a policy's file, but for its settings.
+
+    Raises:
+        DamageError: as `check_run`.
+    """
+    _check(path, header, _POLICY)
 
 
 def from_version_1(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:

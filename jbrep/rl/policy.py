@@ -46,6 +46,7 @@ class Trained(NamedTuple):
     representation: str  # what the policy observes, as tables call it
     evaluation_episodes: int = 1  # that the run's evaluations play at once
     step: int | None = None  # of training, if it is not over
+    settings: Mapping[str, Any] = {}  # of the run; none of a file from elsewhere
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Act deterministically; nothing is drawn.
@@ -188,18 +189,26 @@ def _load_checkpoint(folder: Path, encoder: Any) -> Trained:
 
 def _build(folder: Path, settings: Mapping[str, Any], given: Any = None) -> Trained:
     """What a run trains, as it begins."""
+    task = read_task(settings["environment"])
+    encoder = run_encoder(folder, settings) if given is None else find(given, task)
+    return build(folder, settings, encoder)
+
+
+def build(path: Path, settings: Mapping[str, Any], encoder: BaseEncoder) -> Trained:
+    """What a run of these settings trains, as it begins; the path is for messages.
+
+    Raises:
+        InputError: an unknown algorithm, or an encoder that isn't the run's.
+    """
     task, algorithm = read_task(settings["environment"]), settings["algorithm"]
     choose(algorithm, ALGORITHMS, "algorithm")
-    encoder = run_encoder(folder, settings) if given is None else find(given, task)
     if encoder.fingerprint != settings["encoder"]:
-        raise InputError(
-            f"{encoder.name} is not the encoder that the run in {folder} was made with"
-        )
+        raise InputError(f"{encoder.name} is not the encoder that the run in {path} was made with")
     encoder.check_task(task)
     preset = Preset(tuple(settings["hidden"]), {})
     agent = make_agent(algorithm, preset, Spaces(task, encoder), settings["seed"])
     name, episodes = settings["representation"], settings["evaluation_episodes"]
-    return Trained(agent.policy, task, encoder, name, episodes)
+    return Trained(agent.policy, task, encoder, name, episodes, settings=settings)
 
 
 def run_encoder(folder: Path, settings: Mapping[str, Any]) -> BaseEncoder:
