@@ -6,6 +6,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -233,8 +234,8 @@ class OwnEncoder(BaseEncoder):
         import torch
 
         module = self._given
-        numbers = (p for p in [*module.parameters(), *module.buffers()] if p.is_floating_point())
-        like = next(numbers, torch.empty(0))
+        weights = chain(module.parameters(), module.buffers())
+        like = next((each for each in weights if each.is_floating_point()), torch.empty(0))
         with _evaluating(module), torch.no_grad():
             return function(torch.from_numpy(rows).to(like.device, like.dtype))
 
