@@ -16,6 +16,7 @@ MAX_EVALUATION_EPISODES = 10_000
 MAX_SEED = (1 << 31) - 1
 MAX_LAYERS, MAX_UNITS = 8, 1024  # of a policy's network
 MAX_ENVS = 4096
+_MAX_LATENT = 1 << 20
 _MAX_SECONDS = 1e12
 MAX_LINE = 1000  # characters
 MAX_NAME = 100  # characters, of a learner
@@ -70,7 +71,7 @@ HIDDEN = Kind(
     "lists",
 )
 _TASK = text(r"[\w./-]{1,200}", "a task's name or id")
-_NAME = text(r"[\w.-]{1,100}", "a name of letters, digits, dots, hyphens and underscores")
+NAME = text(r"[\w.-]{1,100}", "a name of letters, digits, dots, hyphens and underscores")
 LEARNER = text(
     rf"[\w.+=-]{{1,{MAX_NAME}}}", f"at most {MAX_NAME} letters, digits and characters of . _ - + ="
 )
@@ -89,12 +90,16 @@ _RUN = {
     ),
     "cpu": _LINE,
 }
-_OPTIONAL = {"reason": _LINE, "policy_sha256": _SHA256}
+_OPTIONAL = {
+    "reason": _LINE,
+    "policy_sha256": _SHA256,
+    "latent_size": whole_number(1, _MAX_LATENT),  # early runs have it in their encoder alone
+}
 _SETTINGS = {
     "task": _TASK,
     "environment": _OBJECT,
-    "algorithm": _NAME,
-    "preset": _NAME,
+    "algorithm": NAME,
+    "preset": NAME,
     "hidden": HIDDEN,
     "settings": _OBJECT,
     "num_envs": whole_number(1, MAX_ENVS),
@@ -107,7 +112,7 @@ _SETTINGS = {
     "normalize": Kind(lambda v: isinstance(v, bool), "true or false"),
     "overrides": _OBJECT,
     "learner": LEARNER,
-    "representation": _NAME,
+    "representation": NAME,
     "encoder": _SHA256,
     "encoder_code": Kind(lambda v: v is None or _is_line(v), "null or a name of code"),
     "encoder_seed": Kind(
