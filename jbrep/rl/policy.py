@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.encoders import find, load
+from jbrep.encoders.code import make
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.recording import Actor
 from jbrep.envs.task import Array, Task, read_task
@@ -88,7 +89,7 @@ class Trained(NamedTuple):
         return self._replace(statistics=Statistics.read(tensors, size, source))
 
 
-def load_run(folder: Path, encoder: BaseEncoder | None = None) -> Trained:
+def load_run(folder: Path, encoder: Any = None) -> Trained:
     """The policy of a run; nothing that the folder holds is run as code.
 
     A finished run has its final policy, one that is under way or was stopped its checkpoint's. Only
@@ -96,7 +97,9 @@ def load_run(folder: Path, encoder: BaseEncoder | None = None) -> Trained:
 
     Args:
         folder: of the run.
-        encoder: the one that the run was made with, where its folder has none because it is code.
+        encoder: the one that the run was made with, where its folder has none because it is a
+            user's own; whatever `jbrep.encoders.find` takes. Code whose module was imported on
+            request is known without it.
 
     Raises:
         InputError: no run there, a failed one, one without a checkpoint so far, or one whose files
@@ -116,20 +119,31 @@ def load_run(folder: Path, encoder: BaseEncoder | None = None) -> Trained:
     return trained.filled(*read_policy(path, run["policy_sha256"]), path)
 
 
-def load_untrained(folder: Path, encoder: BaseEncoder | None = None) -> Trained:
+def load_untrained(folder: Path, encoder: Any = None) -> Trained:
     """The policy that a run began with.
 
     Raises:
         InputError: as `load_run`.
         DamageError: a file isn't what was written.
     """
-    ended = exists(folder / RUN)
-    settings = read_run(folder)["settings"] if ended else _read_checkpoint(folder).settings
+    settings = run_settings(folder)
     trained = _untrained(folder, settings, encoder)
     if not settings["from"]:
         return trained
     path = folder / BEGINNING
     return trained.filled(*read_policy(path, settings["from"]), path)
+
+
+def run_settings(folder: Path) -> dict[str, Any]:
+    """The settings of a run that has ended or is under way.
+
+    Raises:
+        InputError: as `load_run`.
+        DamageError: a file isn't what was written.
+    """
+    if exists(folder / RUN):
+        return read_run(folder)["settings"]
+    return _read_checkpoint(folder).settings
 
 
 def load_zip(path: Path, task: Task, algorithm: str, encoder: str, trust: bool) -> Trained:
@@ -191,15 +205,17 @@ def _read_checkpoint(folder: Path) -> _Checkpoint:
     return _Checkpoint(settings, step, weights, tensors)
 
 
-def _load_checkpoint(folder: Path, encoder: BaseEncoder | None) -> Trained:
+def _load_checkpoint(folder: Path, encoder: Any) -> Trained:
     checkpoint = _read_checkpoint(folder)
     trained = _untrained(folder, checkpoint.settings, encoder)._replace(step=checkpoint.step)
     return trained.filled(checkpoint.weights, checkpoint.tensors, folder / CHECKPOINT)
 
 
-def _untrained(folder: Path, settings: Mapping[str, Any], encoder: BaseEncoder | None) -> Trained:
+def _untrained(folder: Path, settings: Mapping[str, Any], given: Any) -> Trained:
     """What a run trains, as it begins unless another run's policy comes along."""
-    encoder = encoder or run_encoder(folder, settings)
+    task = read_task(settings["environment"])
+    choose(settings["algorithm"], ALGORITHMS, "algorithm")
+    encoder = run_encoder(folder, settings) if given is None else find(given, task)
     if encoder.fingerprint != settings["encoder"]:
         raise InputError(
             f"{encoder.name} is not the encoder that the run in {folder} was made with"
@@ -233,20 +249,18 @@ def build(settings: Mapping[str, Any], encoder: BaseEncoder) -> Trained:
 
 
 def run_encoder(folder: Path, settings: Mapping[str, Any]) -> BaseEncoder:
-    """The encoder in a run's folder.
+    """The encoder in a run's folder, or what its code makes.
 
     Raises:
-        InputError: there is none, as for one that is code, or it can't be used.
+        InputError: it is code whose module wasn't imported on request, or a user's own object, or
+            it can't be used.
         DamageError: its file isn't what was written.
     """
     if exists(folder / ENCODER):
         return load(folder / ENCODER)
     if code := settings["encoder_code"]:
-        raise InputError(
-            f"the run in {folder} was made with an encoder that is code, {code}: give it with "
-            f"--encoder {code}, which runs it"
-        )
+        return make(code, read_task(settings["environment"]))
     raise InputError(
-        f"no {ENCODER} in {folder}: it is missing, or the run's encoder was given in Python; give "
-        "the same again"
+        f"no {ENCODER} in {folder}: a run on a Python object needs it again, as in "
+        "load_run(folder, encoder)"
     )
