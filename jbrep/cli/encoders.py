@@ -261,7 +261,7 @@ def _labels(names: list[str], sources: list[str]) -> list[str]:
 
 @click.group()
 def encoder() -> None:
-    """Look at encoders, and export them."""
+    """Look at encoders, export them, and import those that were trained elsewhere."""
 
 
 _which = click.argument("encoder")
@@ -307,3 +307,41 @@ def export(encoder: str, out: Path, **options: Any) -> None:
     run(find_alone(encoder, task), out)
     click.echo(f"exported {printable(source_of(encoder, task))}")
     click.echo(f"open it with onnxruntime.InferenceSession({str(out)!r})")
+
+
+@encoder.command(
+    "import",
+    epilog=example(
+        "jbrep encoder import model.onnx --task face_direction --out encoders/mine.safetensors"
+    ),
+)
+@click.argument("model", type=click.Path(path_type=Path))
+@task_options()
+@click.option(
+    "--decoder",
+    type=click.Path(path_type=Path),
+    help="A model from latents back to observations, if MODEL has no reconstruction.",
+)
+@click.option("--name", help="What tables will call it; by default the name of the file.")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="A new encoder file.")
+def import_model(
+    model: Path, decoder: Path | None, name: str | None, out: Path, **options: Any
+) -> None:
+    """Make an encoder file from an ONNX model.
+
+    MODEL takes observations in physical units, (rows, features), and is a chain of dense layers
+    with the usual activations and normalisations. Nothing in it is run.
+    """
+    from jbrep.encoders.card import card
+    from jbrep.encoders.file import SUFFIX, save
+    from jbrep.encoders.from_onnx import convert
+    from jbrep.files.storage import exists
+
+    task = given_task(options)
+    assert task is not None
+    if exists(out):
+        raise InputError(f"{out} exists already: choose another file")
+    made = convert(model, task, decoder, name or out.name.removesuffix(SUFFIX))
+    save(made, out)
+    for line in card(made, str(out), terminal_width()).splitlines():
+        click.echo(printable(line))
