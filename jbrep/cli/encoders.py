@@ -76,11 +76,14 @@ _noise = click.option(
 def _how(command: Callable[..., None]) -> Callable[..., None]:
     """The options of every kind that has a network."""
     options = (
-        click.option("--architecture", help="paper, the default, or deep."),
+        click.option(
+            "--architecture",
+            help="paper, the default; deep; or sizes of your own, such as 64,64.",
+        ),
         click.option(
             "--epochs",
             type=COUNT,
-            help="Passes over the data; by default 200 or, if deep, 12.",
+            help="Passes over the data; by default 200 or, if not paper, 12.",
         ),
         click.option(
             "--batch-size",
@@ -88,7 +91,7 @@ def _how(command: Callable[..., None]) -> Callable[..., None]:
             help="Rows in a batch; by default from the rows, 128 to 8192.",
         ),
         click.option(
-            "--learning-rate", type=float, help="Of Adam; by default 5e-4 or, if deep, 2e-3."
+            "--learning-rate", type=float, help="Of Adam; by default 5e-4 or, if not paper, 2e-3."
         ),
         click.option("--seed", type=COUNT, help="Of weights, order and noise; 0 by default."),
         click.option("--device", default="auto", show_default=True, help="cpu, cuda, or auto."),
