@@ -370,9 +370,18 @@ def test_mistakes_are_named(tmp_path):
         ({"shard_episodes": None}, "episodes in a shard is None: it must be a whole number"),
         ({"store_state": "yes"}, "store_state is 'yes': it must be true or false"),
         ({"policy": "uniform"}, "the policy is 'uniform': it must be a kind and its constants"),
-        ({"policy": {"kind": "constant", "drive": "fast"}}, "it must be a kind and its constants"),
+        ({"policy": {"kind": "constant", "drive": None}}, "it must be a kind and its constants"),
+        ({"policy": {"kind": "imported", "source": "a" * 201}}, "it must be a kind and its const"),
+        ({"policy": {"kind": "imported", "source": [1] * 1001}}, "it must be a kind and its const"),
+        ({"policy": {"kind": "imported", 1: 1}}, "it must be a kind and its constants"),
     ],
 )
 def test_invalid_settings_are_refused_in_words(change, message):
     with pytest.raises(InputError, match=message):
         settings(**change)
+
+
+def test_the_constants_of_a_policy_are_numbers_and_text_in_lists_and_tables():
+    parts = [[0.5, {"kind": "uniform"}], [0.5, {"kind": "trained", "run": "runs/a"}]]
+    policy = {"kind": "mixture", "parts": parts}
+    assert settings(policy=policy).as_json()["policy"] == policy

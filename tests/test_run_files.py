@@ -463,7 +463,7 @@ def test_more_episodes_than_memory_holds_are_not_played(run):
 
 def test_another_encoder_is_not_the_run_s(run):
     save(find("pca-8", TASK), run / ENCODER)
-    assert "pca-8 is not the encoder of the run" in refused(load_run, run)
+    assert "is not the encoder that the run in" in refused(load_run, run)
     settings = json.loads((run / RUN).read_text())["settings"]
     own = find("pca-8", TASK).fingerprint
     pose = {"task": "move_to_pose", "environment": describe("move_to_pose").as_json()}

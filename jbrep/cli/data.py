@@ -110,19 +110,24 @@ def collect(
 def _report(out: Path, written: Any) -> None:
     """Print what the folder holds now, and how fast it was written."""
     manifest, rows, seconds = written
-    size = sum(entry.bytes for entry in manifest.shards) / 1e6
-    plural = "s" if manifest.episodes > 1 else ""
-    what = f"{manifest.episodes:,} episode{plural} of {manifest.task.name}, {manifest.rows:,} rows"
-    click.echo(printable(f"{what}, {size:,.1f} MB in {out}"))
+    _report_size(out, manifest)
     if rows:
         click.echo(f"{rows:,} rows in {seconds:,.0f} s, {rows / seconds:,.0f} a second")
     else:
         click.echo("it was complete already: nothing was done")
 
 
+def _report_size(out: Path, manifest: Any) -> None:
+    """Print what the folder holds."""
+    size = sum(entry.bytes for entry in manifest.shards) / 1e6
+    plural = "s" if manifest.episodes > 1 else ""
+    what = f"{manifest.episodes:,} episode{plural} of {manifest.task.name}, {manifest.rows:,} rows"
+    click.echo(printable(f"{what}, {size:,.1f} MB in {out}"))
+
+
 @click.group()
 def data() -> None:
-    """Inspect, verify, repair, derive and export data sets."""
+    """Inspect, verify, repair, derive, import and export data sets."""
 
 
 @data.command(epilog=example("jbrep data info data/face"))
@@ -231,6 +236,30 @@ def export(data: Path, to: str, out: Path) -> None:
         with _deferred_stop():
             load_format(to)
         click.echo(f"open it with {run(Dataset(data), to, out)}")
+
+
+@data.command("import", epilog=example("jbrep data import D4RL/hopper/expert-v0 --out data/hopper"))
+@click.argument("source")
+@task_options()
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="A new folder.")
+def import_(source: str, out: Path, **options: Any) -> None:
+    """Make a data set of one that was made elsewhere.
+
+    SOURCE is an .npz or .parquet file, the folder of a Minari data set, or its id in
+    MINARI_DATASETS_PATH. Without --task, the task is the one that the source names, or is made from
+    the data alone. See docs/data-format.md for the columns that a file must have.
+    """
+    from jbrep.dataset.importing import open_source, write
+
+    task = given_task(options, required=False)
+    with stoppable("nothing was imported"):
+        with _deferred_stop():
+            opened = open_source(source)
+        manifest = write(opened, out, task)
+    if not (task or opened.task):
+        line = f"{manifest.task.name} is made from the data alone: {opened.why_no_task}"
+        click.echo(printable(line), err=True)
+    _report_size(out, manifest)
 
 
 @contextmanager

@@ -197,7 +197,10 @@ def _report(fitted: "Fitted", data: "ScaledDataset") -> None:
     ),
 )
 @click.option(
-    "--encoder", required=True, multiple=True, help="Files, or names that ship; one or several."
+    "--encoder",
+    required=True,
+    multiple=True,
+    help="Files, names that ship, or code, mymodule:MyEncoder; one or several.",
 )
 @_data
 @click.option(
@@ -212,21 +215,27 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path, as_json: bool) -> 
     """Show what encoders lose and keep, side by side.
 
     Judged on the held-out episodes: reconstruction, corruption, the latent's units and dimensions,
-    linear probes, nearest neighbours, and the prediction of the next latent.
+    linear probes, nearest neighbours, and the prediction of the next latent. An encoder of your own
+    is code such as mymodule:MyEncoder; its module is imported, which runs it.
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders import find
     from jbrep.encoders.card import arguments_of
+    from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import source_of
     from jbrep.evaluate.files import EVALUATION, write
     from jbrep.evaluate.summary import evaluation_text
     from jbrep.figures import encoder_plots
     from jbrep.figures import write as write_plots
 
+    for name in encoder:
+        import_code(name)
     scaled = ScaledDataset(Dataset(data))
     encoders = [find(name, scaled.task) for name in encoder]
     sources = [source_of(name, scaled.task) for name in encoder]
     labels = _labels([each.representation for each in encoders], sources)
+    if twice := {label for label in labels if labels.count(label) > 1}:
+        raise InputError(f"{min(twice)} is given twice: leave one out")
     labelled = dict(zip(labels, encoders, strict=True))
     with stoppable("the same command starts over"):
         evaluation = write(labelled, scaled, out)
@@ -239,8 +248,8 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path, as_json: bool) -> 
         if seen == "maybe":
             click.echo(
                 printable(
-                    f"note: {label} was trained on other data with the same seed, so it may have "
-                    "seen these episodes"
+                    f"note: {label} may have seen these episodes: the data it was trained on has "
+                    "the same seed, or isn't known"
                 ),
                 err=as_json,
             )
@@ -257,7 +266,7 @@ def _labels(names: list[str], sources: list[str]) -> list[str]:
 
     taken = [FULL, *names]
     return [
-        name if taken.count(name) == 1 else source.removesuffix(SUFFIX)
+        name if taken.count(name) == 1 else source.removesuffix(SUFFIX).removesuffix(", code")
         for name, source in zip(names, sources, strict=True)
     ]
 
@@ -277,11 +286,14 @@ _which = click.argument("encoder")
 def info(encoder: str, as_json: bool, **options: Any) -> None:
     """Show what an encoder is and where it comes from.
 
-    ENCODER is a file, or, given its --task, the name of one that ships.
+    ENCODER is a file, or, given its --task, the name of one that ships, or code such as
+    mymodule:MyEncoder, whose module is imported: this runs it.
     """
     from jbrep.encoders.card import card, describe
+    from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import find_alone, source_of
 
+    import_code(encoder)
     task = given_task(options, required=False)
     shown, source = find_alone(encoder, task), source_of(encoder, task)
     if as_json:
@@ -303,11 +315,17 @@ def export(encoder: str, out: Path, **options: Any) -> None:
     The input is `observation`, in physical units; the outputs are `latent` and `reconstruction`.
     ENCODER is as for `info`.
     """
+    from jbrep.encoders import Encoder
+    from jbrep.encoders.code import import_code
     from jbrep.encoders.onnx import export as run
     from jbrep.encoders.shipped import find_alone, source_of
 
+    import_code(encoder)
     task = given_task(options, required=False)
-    run(find_alone(encoder, task), out)
+    exported = find_alone(encoder, task)
+    if not isinstance(exported, Encoder):
+        raise InputError(f"{encoder} is code, which can't be exported: give an encoder's file")
+    run(exported, out)
     click.echo(f"exported {printable(source_of(encoder, task))}")
     click.echo(f"open it with onnxruntime.InferenceSession({str(out)!r})")
 

@@ -22,7 +22,10 @@ _KEEPER = ("sh", "-c", "read -r _; kill 0")
 @click.argument("source", required=False)
 @click.option("--episode", type=COUNT, help="Its number, from 0; 0 if not given.")
 @task_options()
-@click.option("--encoder", help="A file, or a name that ships; a run's own if not given.")
+@click.option(
+    "--encoder",
+    help="A file, a name that ships, or code, mymodule:MyEncoder; a run's own if not given.",
+)
 @click.option("--traverse", is_flag=True, help="Show what each unit of the latent moves.")
 @click.option(
     "--out", type=click.Path(path_type=Path), help="An .rrd file; one in inspect/ if not given."
@@ -53,11 +56,13 @@ def inspect(
     """
     if view and serve:
         raise InputError("--view and --serve exclude each other: choose one")
+    from jbrep.encoders.code import import_code
     from jbrep.inspection import inspect as record
 
     def tell(line: str) -> None:
         click.echo(printable(line))
 
+    import_code(encoder)
     task = given_task(options, required=False)
     path = record(source, episode, task, encoder, traverse, out, tell)
     click.echo(printable(f"{path}" if view or serve else f"{path}; open it with: rerun {path}"))

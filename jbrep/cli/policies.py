@@ -35,8 +35,8 @@ _TASK = "face_direction"
 @click.option("--algorithm", default="sac", show_default=True, help="Of a zip file.")
 @click.option(
     "--encoder",
-    help="What a zip file was trained on, or what a policy by name observes through: a file, or "
-    "the name of one that ships.",
+    help="What a zip file was trained on, or what a policy by name observes through: a file, the "
+    "name of one that ships, or code, mymodule:MyEncoder; of a run that was made with code, that.",
 )
 @as_json
 def evaluate_policy(
@@ -59,8 +59,10 @@ def evaluate_policy(
     """
     import numpy as np
 
+    from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import source_of
 
+    import_code(encoder)
     player = _find(policy, given_task(options, required=False), algorithm, encoder, trust)
     source = None if encoder is None else source_of(encoder, player.task)
     returns = player.returns(episodes)
@@ -117,8 +119,9 @@ def _find(
     from jbrep.rollouts.sources import as_player, find_player, run_folder
 
     path = Path(policy)
-    if run_folder(policy) or (exists(path) and path.is_dir()):
-        if encoder:
+    folder = run_folder(policy)
+    if folder or (exists(path) and path.is_dir()):
+        if encoder and not (folder and encoder == _code_of(folder)):
             raise InputError(f"{policy} is a run, which has its own encoder: leave out --encoder")
         return find_player(policy, task)
     task = task or describe(_TASK)
@@ -134,6 +137,13 @@ def _find(
     from jbrep.rl.policy import load_zip  # imports torch
 
     return as_player(policy, load_zip(path, task, algorithm, encoder or FULL, trust))
+
+
+def _code_of(folder: Path) -> str | None:
+    """The code of the encoder that a run was made with, if it is code."""
+    from jbrep.rl.policy import run_settings  # imports torch
+
+    return run_settings(folder)["encoder_code"]
 
 
 @click.command(epilog=example("jbrep behaviour runs/full runs/dae-4 --out behaviour"))

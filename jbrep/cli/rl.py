@@ -39,7 +39,8 @@ _NOT_REPRODUCIBLE = (
     "--encoder",
     default="full",
     show_default=True,
-    help="A file, or a shipped encoder's name; full is the whole observation, scaled alike.",
+    help="A file, a shipped encoder's name, or code as module:Class, which is run; full is the "
+    "whole observation, scaled alike.",
 )
 @click.option("--steps", default=100_000, show_default=True, type=COUNT, help="Of training.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
@@ -73,11 +74,13 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
     resumes from it, to the same result.
     """
     with _stop_signals() as received:
+        from jbrep.encoders.code import import_code
         from jbrep.encoders.shipped import source_of
         from jbrep.rl import Run, StoppedError, train
         from jbrep.rl.files import EVALUATIONS, RUN, read_evaluations
 
         settings["task"] = given_task(settings)
+        import_code(settings["encoder"])
         run = Run(**settings)
         run.check()
         source = source_of(run.encoder, run.task)

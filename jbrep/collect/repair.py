@@ -45,7 +45,7 @@ def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> 
 
     Raises:
         InputError: there is no data set, or a shard comes out differently here, as it does if
-            another machine or other versions made it.
+            another machine or other versions made it, or the data set was imported.
     """
     check_counts(lanes, num_threads)
     intact = _intact_manifest(folder)
@@ -108,6 +108,11 @@ def _restore(
     folder: Path, manifest: Manifest, shard: int, lanes: int, num_threads: int | None
 ) -> Entry:
     settings, entry, path = manifest.settings, manifest.shards[shard], folder / shard_name(shard)
+    if settings.is_imported:
+        raise InputError(
+            f"{path} can't be restored: the data set was imported; import its source, "
+            f"{settings.policy['source']}, again in another folder"
+        )
     if not settings.task.reproducible:
         raise InputError(
             f"{path} can't be restored: {settings.task.name} is not reproducible, the same seed "

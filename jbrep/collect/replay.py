@@ -31,7 +31,8 @@ def replay_problems(
         A line for each episode that differs.
 
     Raises:
-        InputError: there are fewer episodes, or the environment isn't reproducible.
+        InputError: there are fewer episodes, the environment isn't reproducible, or the data set
+            was imported.
     """
     total = len(dataset.episodes["length"])
     if not 0 <= episodes <= total:
@@ -61,12 +62,21 @@ def check_reproducible(dataset: Dataset, what: str) -> None:
     """Make sure that episodes come out the same again.
 
     Raises:
-        InputError: the environment doesn't do that.
+        InputError: the environment doesn't do that, or the data set was imported.
     """
+    _check_collected(dataset)
     if not dataset.task.reproducible:
         raise InputError(
             f"{what}: {dataset.task.name} is not reproducible, the same seed and actions lead to "
             "other states"
+        )
+
+
+def _check_collected(dataset: Dataset) -> None:
+    if dataset.manifest.settings.is_imported:
+        raise InputError(
+            f"{dataset.folder} was imported, its episodes can't be simulated again: to compare it "
+            "with its source, import that again in another folder"
         )
 
 
@@ -80,8 +90,13 @@ def simulate_again(
         read: what to record besides observations and rewards.
         tick: called after each step.
         num_threads: threads to step a batch on; None takes one for each core.
+
+    Raises:
+        InputError: the data set was imported, or its environment can't be made.
     """
-    task = episodes[0].dataset.task
+    dataset = episodes[0].dataset
+    _check_collected(dataset)
+    task = dataset.task
     lanes = Lanes(task, len(episodes), num_threads)
     lanes.reset(range(len(episodes)), [int(episode.record["seed"]) for episode in episodes])
     middle = (np.array(task.action_low) + np.array(task.action_high)) / 2

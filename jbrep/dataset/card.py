@@ -45,7 +45,7 @@ def card(dataset: Dataset, width: int = 80) -> str:
     named = {
         "task": _task_line(dataset.task),
         "policy": ", ".join([policy["kind"], *constants]),
-        "seed": f"{about['seed']}",
+        "seed": "-" if dataset.manifest.settings.is_imported else f"{about['seed']}",
         "rows": f"{about['rows']:,}",
         "episodes": _episodes_line(about),
         "columns": ", ".join(about["columns"]),
@@ -60,7 +60,9 @@ def card(dataset: Dataset, width: int = 80) -> str:
             f"median {of['median']} [10 % {of['p10']}, 90 % {of['p90']}], mean {of['mean']}, "
             f"from {of['min']} to {of['max']}"
         )
-    if not dataset.task.reproducible:
+    if dataset.manifest.settings.is_imported:
+        named["note"] = "the data were imported: no episode can be simulated again"
+    elif not dataset.task.reproducible:
         named["note"] = "the environment is not reproducible: no episode can be simulated again"
     parts = [f"{dataset.folder}\n{facts(named, width)}"]
     if about["features"]:

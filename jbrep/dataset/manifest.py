@@ -139,7 +139,9 @@ def new_manifest(settings: Settings) -> Manifest:
     from jbrep.envs.names import environment_versions
 
     versions = {name: version(name) for name in _PACKAGES}
-    return Manifest(settings, versions | environment_versions(settings.task.id))
+    if not settings.is_imported:  # or else they come from an environment that may not be here
+        versions |= environment_versions(settings.task.id)
+    return Manifest(settings, versions)
 
 
 def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:

@@ -21,6 +21,7 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.schema import EPISODES, episode_bounds, step_specs
 from jbrep.dataset.shard import FileState, Shard, file_state
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
 
 _OPEN_SHARDS = 256  # memory-mapped at a time: each takes a file descriptor
@@ -75,7 +76,7 @@ class Dataset:
     arrays taken from it before are views of the file, and may change with it.
 
     Args:
-        folder: that `jbrep collect` wrote.
+        folder: that `jbrep collect`, `jbrep data import` or `Dataset.write` wrote.
 
     Attributes:
         manifest: settings, versions and hashes.
@@ -97,6 +98,57 @@ class Dataset:
         self._opened = lru_cache(_OPEN_SHARDS)(self._open)
         self._ends = list(accumulate(entry.rows for entry in self.manifest.shards))
         self._specs = step_specs(self.task, self.manifest.settings.store_state)
+
+    @staticmethod
+    def write(
+        folder: str | Path,
+        observations: Any,
+        actions: Any,
+        rewards: Any,
+        terminations: Any,
+        truncations: Any = None,
+        *,
+        final_observations: Any = None,
+        seeds: Any = None,
+        task: Task | str | None = None,
+        source: str = "arrays",
+    ) -> "Dataset":
+        """Write a data set of arrays, whole or not at all.
+
+        The first five are of all episodes, one after the other: N steps of d features and actions
+        of k numbers. Or each is a list of such arrays, one for each of the n episodes.
+
+        Args:
+            folder: new.
+            observations: before each action, (N, d). In a list, the observations of an episode may
+                have one row more than the rest: the final one.
+            actions: (N, k).
+            rewards: (N,).
+            terminations: whether a state ended the episode at that step, (N,).
+            truncations: whether anything else did, such as a time limit, (N,).
+            final_observations: after the last action of each episode, (n, d). Where they aren't
+                known, the last step of each episode is left out, so that its observation is the
+                final one, and the episode counts as truncated.
+            seeds: that the episodes were started with, (n,); -1 where one isn't known.
+            task: that they are of, or its name; made from the data alone if not given.
+            source: where they come from, a few words; also the id of a task made from the data.
+
+        Returns:
+            The data set.
+
+        Raises:
+            InputError: the folder exists already, or the arrays can't be used.
+        """
+        from jbrep.dataset.importing.arrays import source_of  # imports Gymnasium, as below
+        from jbrep.dataset.importing.writer import write
+        from jbrep.envs.description import as_task
+
+        columns = {"observation": observations, "action": actions, "reward": rewards}
+        columns |= {"terminated": terminations, "truncated": truncations}
+        once = {"final_observation": final_observations, "seed": seeds}
+        opened = source_of(columns, once, source)
+        write(opened, Path(folder), None if task is None else as_task(task))
+        return Dataset(folder)
 
     def _shard(self, shard: int) -> Shard:
         """A shard as it is on disk now: another state of its file is another entry of the cache."""

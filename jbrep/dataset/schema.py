@@ -16,6 +16,7 @@ FORMAT = "jbrep data set"
 FORMAT_VERSION = 2
 EPISODES = "episodes/"  # the HDF5 group of the columns with one row for each episode
 
+UNKNOWN_SEED = -1  # of an imported episode
 MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
 _EPISODE_BITS = {63: 32, 31: 20}  # of a seed, for the number of the episode
 _COLUMNS = {  # of every data set

@@ -20,6 +20,7 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.schema import (
     EPISODES,
+    UNKNOWN_SEED,
     Columns,
     episode_bounds,
     episode_columns,
@@ -87,11 +88,12 @@ def _content_problems(manifest: Manifest, shard: int, columns: Columns) -> Itera
     for name, values in columns.items():
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             yield f"{name} has values that are not finite"
-    yield from _range_problems(manifest.task, columns)
+    yield from range_problems(manifest.task, columns)
     yield from _episode_problems(manifest, shard, columns)
 
 
-def _range_problems(task: Task, columns: Columns) -> Iterator[str]:
+def range_problems(task: Task, columns: Columns) -> Iterator[str]:
+    """A line for each action, reward or feature beyond the task's bounds."""
     names = [f"action {i}" for i in range(task.action_size)]
     bounds = zip(names, columns["action"].T, task.action_low, task.action_high, strict=True)
     ranges: list[tuple[str, NDArray[Any], float, float]] = list(bounds)
@@ -112,15 +114,14 @@ def _range_problems(task: Task, columns: Columns) -> Iterator[str]:
 
 def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
     """Episode columns that are inconsistent with the settings or with each other."""
-    settings, rows = manifest.settings, manifest.shards[shard].rows
+    rows = manifest.shards[shard].rows
     own = version1.with_ends(episode_columns(columns))
     numbers = np.array(manifest.episode_range(shard))
-    seeds = [episode_seed(manifest.task, settings.seed, int(number)) for number in numbers]
     lengths = own["length"]
     first = episode_bounds(lengths)[:-1]
     checks: dict[str, tuple[ArrayLike, ArrayLike]] = {
         "episode numbers": (own["episode"], numbers),
-        "seeds": (own["seed"], np.array(seeds)),
+        "seeds": (own["seed"], _seeds(manifest, numbers, own["seed"])),
         "ends of episodes": (own["terminated"] | own["truncated"], np.ones_like(own["truncated"])),
         "the rows' episode": (columns["episode"], np.repeat(numbers, lengths)),
         "the rows' step": (columns["step"], np.arange(rows) - np.repeat(first, lengths)),
@@ -129,3 +130,11 @@ def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Itera
     for what, (stored, expected) in checks.items():
         if not np.array_equal(stored, expected):
             yield f"{what}: inconsistent with the settings, or with other columns"
+
+
+def _seeds(manifest: Manifest, numbers: NDArray[Any], stored: NDArray[Any]) -> NDArray[Any]:
+    """The seeds that episodes must have; of imported ones, any that is one, or unknown."""
+    if manifest.settings.is_imported:
+        return np.maximum(stored, UNKNOWN_SEED)
+    root = manifest.settings.seed
+    return np.array([episode_seed(manifest.task, root, int(number)) for number in numbers])

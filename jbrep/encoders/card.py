@@ -5,33 +5,39 @@ from collections.abc import Mapping
 from typing import Any
 
 from jbrep.encoders.encoder import Encoder, Layer
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task
 from jbrep.text import facts, table
 
 _RECORDS = ("training", "data", "metrics", "versions")
 
 
-def describe(encoder: Encoder, source: str) -> dict[str, Any]:
-    """An encoder's card as plain JSON.
+def describe(encoder: BaseEncoder, source: str) -> dict[str, Any]:
+    """An encoder's card as plain JSON; of a user's own, what is known.
 
     Args:
         encoder: the encoder.
         source: where it was taken from, as `shipped.source_of` says it.
     """
-    header, scaler, task = encoder.header, encoder.scaler, encoder.task
-    ranges = zip(task.features, scaler.low, scaler.high, strict=True)
-    return {
+    task = encoder.task
+    told = {
         "name": encoder.name,
         "source": source,
         "task": task.name,
         "environment": task.id,
         "arguments": dict(task.arguments),
-        "kind": header["kind"],
+        "kind": encoder.kind,
         "size": encoder.size,
         "latent_size": encoder.latent_size,
+    }
+    if not isinstance(encoder, Encoder):
+        return {**told, "decodes": encoder.can_decode, "sha256": encoder.fingerprint}
+    ranges = zip(task.features, encoder.scaler.low, encoder.scaler.high, strict=True)
+    return {
+        **told,
         "encoder": _layers(encoder.encoder),
         "decoder": _layers(encoder.decoder),
-        **{name: header[name] for name in _RECORDS},
+        **{name: encoder.header[name] for name in _RECORDS},
         "sha256": encoder.fingerprint,
         "features": [
             {"name": feature.name, "unit": feature.unit, "low": float(low), "high": float(high)}
@@ -40,8 +46,8 @@ def describe(encoder: Encoder, source: str) -> dict[str, Any]:
     }
 
 
-def card(encoder: Encoder, source: str, width: int) -> str:
-    """A few lines on an encoder, then its features with the range that is scaled to [-1, 1].
+def card(encoder: BaseEncoder, source: str, width: int) -> str:
+    """A few lines on an encoder; of a file, also the range of each feature, scaled to [-1, 1].
 
     Args:
         encoder: the encoder.
@@ -54,6 +60,11 @@ def card(encoder: Encoder, source: str, width: int) -> str:
         "task": f"{told['task']}, {told['size']} features to {told['latent_size']}",
         "environment": ", ".join(filter(None, (encoder.task.id, arguments_of(encoder.task)))),
         "kind": told["kind"],
+    }
+    if not isinstance(encoder, Encoder):
+        decodes = "yes" if encoder.can_decode else "no"
+        return f"{encoder.name}\n{facts({**lines, 'decodes': decodes}, width)}"
+    lines |= {
         "encoder": _shape(encoder.size, told["encoder"]),
         "decoder": _shape(encoder.latent_size, told["decoder"]),
         **{name: _listed(told[name]) for name in _RECORDS},

@@ -1,5 +1,6 @@
 """Encoders that are code: named as module:Class, once the module has been imported on request."""
 
+import inspect
 import re
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ def import_code(name: str | Path | None) -> None:
 
 
 def make(name: str | Path, task: Task) -> BaseEncoder:
-    """The encoder that code makes: a class or a function is called without arguments.
+    """The encoder that code names: a class, or a function of no arguments, is called to make it.
 
     Raises:
         InputError: its module wasn't imported on request, it has no such name, the call fails, or
@@ -44,9 +45,17 @@ def make(name: str | Path, task: Task) -> BaseEncoder:
     try:
         for part in path.split("."):
             thing = getattr(thing, part)
-        if isinstance(thing, type) or (callable(thing) and hasattr(thing, "__code__")):
+        if _makes(thing):
             thing = thing()
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise InputError(f"can't make the encoder {name}: {reason}") from error
     return as_encoder(thing, task)
+
+
+def _makes(thing: Any) -> bool:
+    """Whether it makes an encoder, rather than being one."""
+    if not inspect.isfunction(thing):
+        return isinstance(thing, type)
+    needed = (p for p in inspect.signature(thing).parameters.values() if p.default is p.empty)
+    return all(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in needed)

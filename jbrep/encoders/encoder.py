@@ -268,6 +268,10 @@ class Encoder(BaseEncoder):
         values, parts = self._prepare(latent, self.latent_size, "latents")
         return run(parts.decoder, values) * parts.half_width + parts.centre
 
+    def scale(self, observation: Float32) -> Float32:
+        """Scale observations (..., d) by the extrema of its training data."""
+        return self.scaler.scale(observation)
+
     def _prepare(self, values: Any, size: int, what: str) -> tuple[Any, _Parts]:
         """Values as float32, and this encoder's arrays on the device that they are on."""
         if type(values).__module__ == "torch":

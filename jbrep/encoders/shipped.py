@@ -59,14 +59,20 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
     return encoder
 
 
-def find_alone(name: str | Path, task: Task | None) -> BaseEncoder:
-    """An encoder by name and task, or by its file alone.
+def find_alone(name: Any, task: Task | None) -> BaseEncoder:
+    """An encoder as `find` takes it, with its task, or by its file alone.
 
     Raises:
         InputError: as `find`; or no task is given and there is no such file.
     """
     if task:
         return find(name, task)
+    if isinstance(name, BaseEncoder):
+        return name
+    if is_code(name) or not isinstance(name, (str, Path)):
+        raise InputError(
+            f"{name} is no file, which would say whose observations it reads: give its --task, too"
+        )
     if not exists(name):
         raise InputError(f"no encoder at {name}: for one that ships, give its --task, too")
     return load(Path(name))

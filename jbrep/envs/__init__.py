@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jbrep.encoders.wrapper import Encoded
     from jbrep.envs.description import describe
     from jbrep.envs.lanes import Lanes
     from jbrep.envs.sb3 import JitterbugVecEnv, TaskVecEnv
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from jbrep.jitterbug.tasks import environment_id
 
 __all__ = [
+    "Encoded",
     "Feature",
     "JitterbugEnv",
     "JitterbugVecEnv",
@@ -27,6 +29,7 @@ __all__ = [
 ]
 
 _MODULES = {
+    "Encoded": "jbrep.encoders.wrapper",
     "Feature": "jbrep.envs.task",
     "JitterbugEnv": "jbrep.jitterbug.gym",
     "JitterbugVecEnv": "jbrep.envs.sb3",

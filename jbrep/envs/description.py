@@ -96,7 +96,7 @@ def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | N
         return Task(
             id=find_spec(env_id).id,
             name=find_spec(env_id).id,
-            features=tuple(_features(env_id, env.observation_space)),
+            features=tuple(features_of(env_id, env.observation_space)),
             action_low=tuple((-_below(-action.low)).tolist()),
             action_high=tuple(_below(action.high).tolist()),
             max_episode_steps=limit,
@@ -133,8 +133,12 @@ def _below(bound: NDArray[Any]) -> NDArray[np.float64]:
     ).astype(np.float64)
 
 
-def _features(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
-    """The features of a flat observation, named by the keys of dictionaries, else numbered."""
+def features_of(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
+    """The features of a flat observation, named by the keys of dictionaries, else numbered.
+
+    Raises:
+        InputError: images, or what doesn't make one flat array; the message has the id.
+    """
     flat = flatten_space(space) if space.is_np_flattenable else None
     if not isinstance(flat, spaces.Box):
         raise InputError(f"{env_id} has observations in {space}, which don't make one flat array")

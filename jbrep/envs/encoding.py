@@ -4,7 +4,8 @@ import hashlib
 import re
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ OWN = "own"  # the kind of a user's own encoder
 _NAME = re.compile(r"[\w.-]{1,100}", re.ASCII)
 _PROBES = 256  # observations by whose latents an own encoder is known
 _SPREAD = 1.0  # of these, in the features' usual ranges
+_SAME = 1e-2  # by which a latent may differ in another batch, of the largest: rounding, TF32
 
 
 class BaseEncoder(ABC):
@@ -59,6 +61,19 @@ class BaseEncoder(ABC):
             InputError: it can't.
         """
 
+    def check_decodes(self, why: str) -> None:
+        """Make sure that it can decode, where that is needed.
+
+        Raises:
+            InputError: it can't; the message says why that matters.
+        """
+        if not self.can_decode:
+            raise InputError(f"{self.name} has no decoder: {why}")
+
+    def scale(self, observation: Any) -> Any:
+        """Scale observations (..., d) to about [-1, 1], so that errors of features compare."""
+        return self.task.scale(observation)
+
     @abstractmethod
     def check_task(self, task: Task) -> None:
         """Make sure that it can read this task's observations.
@@ -86,10 +101,11 @@ def as_encoder(given: Any, task: Task) -> BaseEncoder:
 class OwnEncoder(BaseEncoder):
     """A user's own encoder: an object with `encode`, a function, or a torch module.
 
-    It gets float32 observations (n, d) in physical units and returns latents (n, l). A torch module
-    gets a tensor on its own device, in evaluation mode and without gradients. Where there is no
-    `encode`, it is called. `latent_size`, `decode`, `name` and `check_task` are used if there
-    are any.
+    It gets float32 observations (n, d) in physical units and returns latents (n, l), each of which
+    depends on its own observation alone. Both are copied, so that it may do as it likes with them.
+    A torch module gets a tensor on its own device, in evaluation mode and without gradients. Where
+    there is no `encode`, it is called. `latent_size`, `decode`, `name` and `check_task` are used if
+    there are any.
 
     Args:
         given: the user's object.
@@ -97,7 +113,8 @@ class OwnEncoder(BaseEncoder):
 
     Raises:
         InputError: it can't be called, fails, or returns something else than finite latents of one
-            size, which is its `latent_size` if it has one.
+            size, which is its `latent_size` if it has one; or other latents for the same
+            observation, the next time or in another batch.
     """
 
     kind = OWN
@@ -105,19 +122,20 @@ class OwnEncoder(BaseEncoder):
     def __init__(self, given: Any, task: Task):
         self.task, self.size = task, task.size
         self.name = _name(given)
+        if isinstance(given, type):
+            raise InputError(f"{self.name} is a class: give an object, such as {self.name}()")
         self._given = given
-        self._encode = getattr(given, "encode", given)
-        self._decode = getattr(given, "decode", None)
-        if isinstance(given, type) or not callable(self._encode):
+        self._encode, self._decode = self._has("encode", given), self._has("decode")
+        if not callable(self._encode):
             raise InputError(f"{self.name} has no `encode` and can't be called: it is no encoder")
         latents = self._apply(self._encode, self._probes, None)
-        declared = getattr(given, "latent_size", latents.shape[1])
-        if declared != latents.shape[1]:
+        self.latent_size = latents.shape[1]
+        if (declared := self._has("latent_size", self.latent_size)) != self.latent_size:
             raise InputError(
-                f"{self.name} returned latents of {latents.shape[1]} numbers, but its latent_size "
+                f"{self.name} returned latents of {self.latent_size} numbers, but its latent_size "
                 f"is {declared}"
             )
-        self.latent_size = latents.shape[1]
+        self._check_repeats(latents)
         self.fingerprint = hashlib.sha256(latents.tobytes()).hexdigest()
 
     def __repr__(self) -> str:
@@ -126,13 +144,31 @@ class OwnEncoder(BaseEncoder):
     @property
     def can_decode(self) -> bool:
         """Whether the user's object has `decode`."""
-        return self._decode is not None
+        return callable(self._decode)
 
     @property
     def _probes(self) -> Float32:
         """Observations to try it on, (n, d)."""
         scaled = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, (_PROBES, self.size))
         return self.task.unscale(scaled).astype(np.float32)
+
+    def _has(self, name: str, default: Any = None) -> Any:
+        """An attribute of the user's object, which may be a property that fails."""
+        try:
+            return getattr(self._given, name, default)
+        except Exception as error:
+            raise InputError(f"{self.name} failed at its {name}: {_reason(error)}") from error
+
+    def _check_repeats(self, latents: Float32) -> None:
+        """Make sure that the probes' latents (n, l) come again, in this batch and in another."""
+        near = _SAME * np.abs(latents).max()
+        for count, when in ((_PROBES, "the next time"), (1, "in a batch of one")):
+            again = self._apply(self._encode, self._probes[:count], self.latent_size)
+            if not np.allclose(again, latents[:count], rtol=_SAME, atol=near):
+                raise InputError(
+                    f"{self.name} returned other latents for the same observations {when}: an "
+                    "encoder must keep no state, draw nothing, and take each row by itself"
+                )
 
     def encode(self, observation: Any) -> Float32:
         """As for `BaseEncoder`, with NumPy arrays.
@@ -144,14 +180,18 @@ class OwnEncoder(BaseEncoder):
 
     def decode(self, latent: Any) -> Float32:
         """As for `BaseEncoder`, with NumPy arrays."""
-        if self._decode is None:
-            raise InputError(f"{self.name} has no `decode`: it can't reconstruct observations")
+        self.check_decodes("it can't reconstruct observations")
         return self._in_rows(self._decode, latent, self.latent_size, self.size)
 
     def check_task(self, task: Task) -> None:
         """Ask its own `check_task`, if it has one, else compare the number of features."""
-        if check := getattr(self._given, "check_task", None):
-            check(task)
+        if check := self._has("check_task"):
+            try:
+                check(task)
+            except InputError:
+                raise
+            except Exception as error:
+                raise InputError(f"{self.name} refuses {task.name}: {_reason(error)}") from error
         elif task.size != self.size:
             raise InputError(
                 f"{self.name} takes observations of {self.size} numbers, but {task.name} has "
@@ -165,13 +205,15 @@ class OwnEncoder(BaseEncoder):
             raise InputError(
                 f"{self.name} takes {size} numbers, but got an array of shape {values.shape}"
             )
+        if not values.size:
+            return np.empty((*values.shape[:-1], width), np.float32)
         result = self._apply(function, values.reshape(-1, size), width)
         return result.reshape(*values.shape[:-1], width)
 
     def _apply(self, function: Callable[..., Any], rows: Float32, width: int | None) -> Float32:
         """What the user's function makes of rows, (n, width), checked; of any width if None."""
         try:
-            result = np.asarray(self._call(function, rows), np.float32)
+            result = _as_array(self._call(function, rows.copy()))
         except Exception as error:
             raise InputError(f"{self.name} failed: {_reason(error)}") from error
         if result.ndim != 2 or result.shape != (len(rows), width or result.shape[1]):
@@ -179,32 +221,44 @@ class OwnEncoder(BaseEncoder):
                 f"{self.name} returned shape {result.shape} for {len(rows)} rows of "
                 f"{self.task.name}: expected ({len(rows)}, {width or 'its latent size'})"
             )
+        if not result.shape[1]:
+            raise InputError(f"{self.name} returned latents of no numbers: expected at least one")
         if not np.isfinite(result).all():
             raise InputError(f"{self.name} returned numbers that are not finite")
         return result
 
     def _call(self, function: Callable[..., Any], rows: Float32) -> Any:
         if not _is_module(self._given):
-            return _as_array(function(rows))
+            return function(rows)
         import torch
 
-        module, training = self._given, self._given.training
+        module = self._given
         numbers = (p for p in [*module.parameters(), *module.buffers()] if p.is_floating_point())
         like = next(numbers, torch.empty(0))
-        tensor = torch.from_numpy(rows.copy()).to(like.device, like.dtype)
-        module.eval()
-        try:
-            with torch.no_grad():
-                return _as_array(function(tensor))
-        finally:
-            module.train(training)
+        with _evaluating(module), torch.no_grad():
+            return function(torch.from_numpy(rows).to(like.device, like.dtype))
+
+
+@contextmanager
+def _evaluating(module: Any) -> Iterator[None]:
+    """A torch module in evaluation mode; afterwards each of its parts is as it was."""
+    training = [part for part in module.modules() if part.training]
+    for part in training:
+        part.training = False
+    try:
+        yield
+    finally:
+        for part in training:
+            part.training = True
 
 
 def _name(given: Any) -> str:
     """What tables call a user's object: its name, if that is a word, else its class's."""
-    for name in (getattr(given, "name", None), getattr(given, "__name__", None)):
-        if isinstance(name, str) and _NAME.fullmatch(name):
-            return name
+    for attribute in ("name", "__name__"):
+        with suppress(Exception):  # of a property that fails
+            name = getattr(given, attribute)
+            if isinstance(name, str) and _NAME.fullmatch(name):
+                return name
     return type(given).__name__
 
 
@@ -213,9 +267,18 @@ def _is_module(given: Any) -> bool:
     return torch is not None and isinstance(given, torch.nn.Module)
 
 
-def _as_array(result: Any) -> Any:
-    """A tensor as an array; anything else as it is."""
-    return result.detach().cpu().numpy() if hasattr(result, "detach") else result
+def _as_array(result: Any) -> Float32:
+    """What an encoder returned as an array of its own.
+
+    Raises:
+        TypeError: it isn't one array.
+    """
+    if isinstance(result, (tuple, dict)):
+        raise TypeError(f"it returned a {type(result).__name__} instead of one array")
+    if hasattr(result, "detach"):
+        result = result.detach().cpu().float().numpy()
+    with np.errstate(over="ignore"):  # infinite numbers are refused
+        return np.array(result, np.float32)
 
 
 def _reason(error: Exception) -> str:

@@ -7,8 +7,10 @@ import numpy as np
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
-from jbrep.encoders import FULL, Encoder
+from jbrep.dataset.settings import IMPORTED
+from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.encoder import IDENTITY
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.errors import InputError
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import latent
@@ -19,7 +21,7 @@ from jbrep.stats.bootstrap import RESAMPLES
 
 FORMAT = "jbrep evaluation"
 FORMAT_VERSION = 1
-_DIAGNOSTICS: dict[str, Callable[[Encoder, HeldOut], Any]] = {
+_DIAGNOSTICS: dict[str, Callable[[BaseEncoder, HeldOut], Any]] = {
     "reconstruction": reconstruction,
     "corruption": corruption,
     "latent_units": latent,
@@ -28,64 +30,72 @@ _DIAGNOSTICS: dict[str, Callable[[Encoder, HeldOut], Any]] = {
     "correlation": correlation,
     "dynamics": dynamics,
 }
+_DECODING = ("reconstruction", "corruption")  # None of an encoder that doesn't decode
 
 
-def diagnose(encoders: Mapping[str, Encoder], data: ScaledDataset) -> dict[str, Any]:
+def diagnose(encoders: Mapping[str, Any], data: ScaledDataset) -> dict[str, Any]:
     """Every diagnostic of every encoder, as plain JSON; docs/encoders.md describes each.
 
     The full observation comes first, as the upper limit of what can be kept. A value with an
     interval is [value, low, high], a 95 % bootstrap interval over episodes. Errors are those of
-    features scaled by this data set's extrema, whatever the encoder's own scaling.
+    features scaled by this data set's extrema, whatever the encoder's own scaling. What needs
+    decoding is None for an encoder that can't decode.
 
     Args:
-        encoders: by the label to show.
+        encoders: by the label to show; whatever `jbrep.encoders.find` takes, such as a torch
+            module.
         data: to judge them on; encoders that were trained on this data set haven't seen its test
             part.
 
     Raises:
-        InputError: an encoder made for other features, or whose numbers overflow.
+        InputError: an encoder made for other features, or whose numbers overflow; or as `find`.
     """
     held_out = HeldOut(data)
-    for label, encoder in encoders.items():
+    judged = {label: find(each, data.task) for label, each in encoders.items()}
+    for label, encoder in judged.items():
         _check(label, encoder, data)
     full = Encoder({"kind": IDENTITY, "name": FULL}, data.scaler, (), ())
-    everything = {FULL: full, **encoders}
+    everything: dict[str, BaseEncoder] = {FULL: full, **judged}
     results: dict[str, Any] = {}
     with Progress(total=len(everything) * len(_DIAGNOSTICS), unit="diagnostic") as progress:
         for label, encoder in everything.items():
-            results[label] = {"kind": encoder.header["kind"], "latent": encoder.latent_size}
+            results[label] = {"kind": encoder.kind, "latent": encoder.latent_size}
             for name, diagnostic in _DIAGNOSTICS.items():
                 progress.set_description_str(f"{label} {name}", refresh=False)
-                results[label][name] = diagnostic(encoder, held_out)
+                possible = encoder.can_decode or name not in _DECODING
+                results[label][name] = diagnostic(encoder, held_out) if possible else None
                 progress.update()
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "data": _describe(held_out),
         "resamples": RESAMPLES,
-        "seen": {label: seen(encoder, data) for label, encoder in encoders.items()},
+        "seen": {label: seen(encoder, data) for label, encoder in judged.items()},
         "encoders": results,
     }
 
 
-def _check(label: str, encoder: Encoder, data: ScaledDataset) -> None:
+def _check(label: str, encoder: BaseEncoder, data: ScaledDataset) -> None:
     if label == FULL:
         raise InputError(f"the label {FULL} is reserved for the observation itself: choose another")
-    encoder.check_task(data.task)
     rows = data.dataset["observation"][sample(data.test, 1000)]
     with np.errstate(over="ignore", invalid="ignore"):
-        back = encoder.decode(encoder.encode(rows))
+        latent = encoder.encode(rows)
+        back = encoder.decode(latent) if encoder.can_decode else latent
     if not np.isfinite(back).all():
         raise InputError(f"{label} gives numbers that are not finite: train it again")
 
 
-def seen(encoder: Encoder, data: ScaledDataset) -> str:
+def seen(encoder: BaseEncoder, data: ScaledDataset) -> str:
     """Which of these rows an encoder saw in training: "no test row", "none" or "maybe"."""
-    source, manifest = encoder.header["data"], data.dataset.manifest
+    source = encoder.header["data"] if isinstance(encoder, Encoder) else {}
+    manifest = data.dataset.manifest
     if source.get("fingerprint") == manifest.fingerprint:
         return "no test row"
-    differs = "seed" in source and source["seed"] != manifest.settings.seed
-    return "none" if differs else "maybe"
+    kinds = {source.get("policy", {}).get("kind"), manifest.settings.policy["kind"]}
+    if "seed" not in source or IMPORTED in kinds:
+        return "maybe"
+    return "none" if source["seed"] != manifest.settings.seed else "maybe"
 
 
 def _describe(held_out: HeldOut) -> dict[str, Any]:

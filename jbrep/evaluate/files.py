@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.dataset import ScaledDataset
-from jbrep.encoders import Encoder
+from jbrep.encoders import find
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import diagnose
 from jbrep.files.storage import exists, make_folder, write_whole
@@ -16,11 +16,11 @@ EVALUATION = "evaluation.json"
 _DIGITS = 6
 
 
-def write(encoders: Mapping[str, Encoder], data: ScaledDataset, folder: Path) -> dict[str, Any]:
+def write(encoders: Mapping[str, Any], data: ScaledDataset, folder: Path) -> dict[str, Any]:
     """Evaluate encoders, and write evaluation.json.
 
     Args:
-        encoders: by the label to show.
+        encoders: by the label to show; whatever `jbrep.encoders.find` takes.
         data: to judge them on.
         folder: created if it doesn't exist.
 
@@ -32,11 +32,12 @@ def write(encoders: Mapping[str, Encoder], data: ScaledDataset, folder: Path) ->
             other encoders or data.
     """
     path = folder / EVALUATION
-    hashes = {label: encoder.fingerprint for label, encoder in encoders.items()}
+    judged = {label: find(each, data.task) for label, each in encoders.items()}
+    hashes = {label: encoder.fingerprint for label, encoder in judged.items()}
     if exists(path):
         _check_same(path, {"data": data.dataset.manifest.fingerprint, "encoders": hashes})
     make_folder(folder)
-    evaluation = diagnose(encoders, data)
+    evaluation = diagnose(judged, data)
     for label, digest in hashes.items():
         evaluation["encoders"][label]["sha256"] = digest
     write_whole(path, _text(evaluation).encode())

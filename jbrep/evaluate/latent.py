@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.evaluate.held_out import HeldOut, sample_rows
 from jbrep.stats.bootstrap import without_nan
 
@@ -18,7 +19,7 @@ _ROUNDING = 1e-6  # standard deviation that rounding alone can cause
 _NEIGHBOURS = 20  # of the maximum-likelihood estimator
 
 
-def latent(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
+def latent(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
     """Units, their correlations, and dimensions of the latent, over a sample of held-out rows.
 
     At most 200,000 rows, fewer where the latent has more than 41 units; for the intrinsic dimension
@@ -40,7 +41,7 @@ def latent(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
     }
 
 
-def encode(encoder: Encoder, held_out: HeldOut, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+def encode(encoder: BaseEncoder, held_out: HeldOut, rows: NDArray[np.int64]) -> NDArray[np.float32]:
     """Latents of those rows, (n, l)."""
     return np.concatenate([encoder.encode(chunk) for chunk in held_out.data.observations(rows)])
 
@@ -50,9 +51,10 @@ def _participation(values: NDArray[np.float64]) -> float:
     return float(spectrum.sum() ** 2 / np.square(spectrum).sum())
 
 
-def _saturation(encoder: Encoder, values: NDArray[np.float64]) -> list[float] | None:
-    """The share of rows in which each tanh unit is saturated; None for a linear latent."""
-    if not encoder.encoder or encoder.encoder[-1].activation != "tanh":
+def _saturation(encoder: BaseEncoder, values: NDArray[np.float64]) -> list[float] | None:
+    """The share of rows in which each tanh unit is saturated; None for another latent."""
+    layers = encoder.encoder if isinstance(encoder, Encoder) else ()
+    if not layers or layers[-1].activation != "tanh":
         return None
     return (np.abs(values) > _SATURATED).mean(axis=0).tolist()
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.scaled import sample
-from jbrep.encoders import Encoder
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.evaluate.held_out import MAX_GROUPS, MAX_NUMBERS, HeldOut, Rows, sample_rows
 from jbrep.evaluate.truth import quantities, state
 from jbrep.stats.bootstrap import Array, Interval, bootstrap, r_squared, variation
@@ -26,7 +26,7 @@ _ROUNDING = 1e-12  # variance that rounding alone can cause
 _PENALTY = 1.0  # of the ridge, on standardised latents
 
 
-def probes(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
+def probes(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
     """R^2 of a ridge regression of each quantity on the latent, fitted on training rows.
 
     The cosine and sine of an angle count together. At most 100,000 rows are fitted to, and as many
@@ -58,7 +58,7 @@ class _Steps(NamedTuple):
     change: NDArray[Any]  # of the observation to the next one, (n, d)
 
 
-def dynamics(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
+def dynamics(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
     """How well latent and action foretell, by a ridge regression, what comes next.
 
     R^2 of the next latent, predicted from latent and action, and predicted as unchanged; and R^2 of
@@ -91,7 +91,7 @@ def dynamics(encoder: Encoder, held_out: HeldOut) -> dict[str, list[Any]]:
     }
 
 
-def _steps(encoder: Encoder, held_out: HeldOut, rows: Rows) -> _Steps:
+def _steps(encoder: BaseEncoder, held_out: HeldOut, rows: Rows) -> _Steps:
     dataset = held_out.data.dataset
     chosen = held_out.followed(sample_rows(rows, _ROWS, held_out.data.task.size))
     now, then = (dataset["observation"][r] for r in (chosen, chosen + 1))
@@ -123,7 +123,7 @@ def _fit(values: NDArray[Any], wanted: NDArray[Any]) -> Callable[[NDArray[Any]],
     return lambda others: model.predict(others.astype(np.float64)).reshape(len(others), -1)
 
 
-def neighbours(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
+def neighbours(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
     """How similar the states of nearest neighbours in the latent are (KNN-MSE).
 
     The mean squared difference between a held-out row's state and those of its 5 nearest
@@ -160,7 +160,7 @@ def neighbours(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
     }
 
 
-def correlation(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
+def correlation(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
     """How directly single units show the state: the ground-truth correlation (GTC).
 
     For each dimension of the state, the largest absolute correlation with a unit of the latent; as

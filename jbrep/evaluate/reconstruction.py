@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.evaluate.held_out import HeldOut, Rows
 from jbrep.methods.controls import Layers, linear_denoiser, pca
 from jbrep.stats.bootstrap import Array, bootstrap, by_episode, r_squared, variation
@@ -32,7 +33,7 @@ class _Losses(NamedTuple):
         return self.sums.mean(axis=1, keepdims=True)
 
 
-def reconstruction(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
+def reconstruction(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
     """Errors over all held-out rows, of features scaled to [-1, 1] and in physical units.
 
     They come with the error of PCA with as many components, fitted on the training part.
@@ -48,7 +49,7 @@ def reconstruction(encoder: Encoder, held_out: HeldOut) -> dict[str, Any]:
     }
 
 
-def corruption(encoder: Encoder, held_out: HeldOut) -> list[dict[str, Any]]:
+def corruption(encoder: BaseEncoder, held_out: HeldOut) -> list[dict[str, Any]]:
     """Errors of reconstructing clean rows from corrupted ones, at each noise level.
 
     They come with the error of the corrupted rows themselves, and with that of the best linear
@@ -76,7 +77,7 @@ def _mean(total: Array, rows: Array) -> Array:
     return (total / rows)[..., 0]
 
 
-def _losses(encoder: Encoder, held_out: HeldOut, rows: Rows, noise: float = 0) -> _Losses:
+def _losses(encoder: BaseEncoder, held_out: HeldOut, rows: Rows, noise: float = 0) -> _Losses:
     """What is lost of those rows, corrupted by the same noise for every encoder."""
     by_row: list[NDArray[np.float32]] = []
 
@@ -90,7 +91,7 @@ def _losses(encoder: Encoder, held_out: HeldOut, rows: Rows, noise: float = 0) -
 
 
 def _errors(
-    encoder: Encoder, data: ScaledDataset, rows: Rows, noise: float
+    encoder: BaseEncoder, data: ScaledDataset, rows: Rows, noise: float
 ) -> Iterator[NDArray[np.float32]]:
     """Squared errors of each scaled feature, (n, d), some rows at a time."""
     width = data.scaler.half_width

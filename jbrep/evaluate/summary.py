@@ -42,6 +42,9 @@ def _losses(encoders: Mapping[str, Any], width: int | None) -> str:
         if label == FULL:
             continue
         lost = diagnostics["reconstruction"]
+        if lost is None:
+            rows.append((label, str(diagnostics["latent"]), *["-"] * (len(header) - 1)))
+            continue
         ratio = lost["ratio_to_pca"]
         noisy = next(c for c in diagnostics["corruption"] if c["noise"] == _NOISE)
         worst = min(lost["features"], key=lambda f: (f["r2"][0] is None, f["r2"][0]))

@@ -33,7 +33,8 @@ class Settings(TypedDict):
     algorithm: str
     preset: str
     representation: str
-    encoder: str  # SHA-256 of its file
+    encoder: str  # its SHA-256, or that each run has an encoder of its own
+    encoder_code: NotRequired[str | None]  # module:Class, if it is code
     hidden: list[int]  # units of the agent's layers
     steps: int
     evaluate_every: int
@@ -65,6 +66,7 @@ class EncoderRecord(TypedDict):
     name: str
     kind: str
     size: int  # of the observation
+    latent_size: NotRequired[int]
     encoder: list[tuple[int, str]]
     decoder: list[tuple[int, str]]
     training: Training
@@ -94,8 +96,8 @@ def diagrams(labels: Mapping[str, LabelRecord], looks: Looks) -> list[Plot]:
 def autoencoders(task: str, encoders: Mapping[str, EncoderRecord], looks: Looks) -> Plot:
     """The encoders of a task with their decoders, unit by unit; by representation."""
     rows = [
-        (encoder["name"], part, i, *layer)
-        for encoder in encoders.values()
+        (name, part, i, *layer)
+        for name, encoder in encoders.items()
         for part, layers in (("encoder", encoder["encoder"]), ("decoder", encoder["decoder"]))
         for i, layer in enumerate(layers)
     ]
@@ -122,7 +124,7 @@ def _draw_autoencoders(encoders: Mapping[str, EncoderRecord], looks: Looks) -> F
         _draw_layers(axes, encoder, look[representation]["color"])
         noise = encoder["training"].get("noise")
         corrupted = f", trained with noise N(0, {noise:g}²)" if noise else ""
-        axes.set_title(plain(f"{encoder['name']}{corrupted}"), loc="center")
+        axes.set_title(plain(f"{representation}{corrupted}"), loc="center")
     return figure
 
 
@@ -138,7 +140,7 @@ def _draw_layers(axes: Axes, encoder: EncoderRecord, colour: str) -> None:
         shade = colour if x == latent else ink()
         axes.plot(np.full(len(heights), x), heights, "o", ms=3.6, color=shade, zorder=3)
         axes.text(x, -0.08, plain(f"{units} {words}"), ha="center", va="top", size=6.5)
-    names = {0: "observation", latent: "latent", len(sizes) - 1: "reconstruction"}
+    names = {0: "observation", len(sizes) - 1: "reconstruction"} | {latent: "latent"}
     for x, name in names.items():
         shade = colour if x == latent else ink()
         axes.text(x, -0.17, name, ha="center", va="top", size=6, color=shade, weight="bold")
@@ -162,7 +164,7 @@ def system(shared: LabelRecord, looks: Looks) -> Plot:
     boxes = [
         ("robot", settings["task"] + (f"\nsteps{step}" if step else "")),
         ("observation", f"{encoder['size']} features\nscaled to [-1, 1]"),
-        ("encoder", f"{encoder['name']}\n{encoder['size']} to {latent}"),
+        ("encoder", f"{settings['representation']}\n{encoder['size']} to {latent}"),
         ("latent", f"{latent} numbers"),
         ("agent", f"{settings['algorithm'].upper()}\nhidden {hidden}"),
     ]

@@ -25,17 +25,18 @@ _MOST = 40  # features in a picture, and names on an axis
 def encoder_plots(evaluation: Mapping[str, Any]) -> list[Plot]:
     """What encoders lose, how they cope with noise, and how their latent units correlate.
 
-    Errors against latent size and against noise are drawn if a latent is smaller than the
-    observation.
+    What encoders lose is drawn of those that decode; errors against latent size and against noise
+    are drawn if one of their latents is smaller than the observation.
 
     Args:
         evaluation: what jbrep.evaluate.diagnose returned, or its JSON.
     """
     task = evaluation["data"]["task"]
     encoders = {label: e for label, e in evaluation["encoders"].items() if label != FULL}
-    plots = [_error_by_feature(task, encoders)]
-    if _sizes(encoders):
-        plots += [_error_by_latent(task, encoders), _error_by_corruption(task, encoders)]
+    decoding = {label: e for label, e in encoders.items() if e["reconstruction"]}
+    plots = [_error_by_feature(task, decoding)] if decoding else []
+    if decoding and _sizes(decoding):
+        plots += [_error_by_latent(task, decoding), _error_by_corruption(task, decoding)]
     return [*plots, _latent_correlation(task, encoders)]
 
 

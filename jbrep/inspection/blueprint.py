@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from jbrep.encoders import Encoder
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Array, Task
 from jbrep.inspection.ghost import ALIGNED
 from jbrep.inspection.latent import PATH
@@ -36,20 +36,18 @@ _EYE = (1.3, -2.5, 1.2)  # in sizes of the robot, from its root
 _NEAR_EYE = (0.9, -1.3, 0.65)  # likewise
 
 
-def episode_layout(task: Task, robot: Robot | None, encoder: Encoder | None) -> rrb.Blueprint:
+def episode_layout(task: Task, robot: Robot | None, encoder: BaseEncoder | None) -> rrb.Blueprint:
     """The robot on the left, its signals on the right; the signals alone if there is no robot."""
     near = _window(task, _NEAR, _NEAR)
     about = rrb.TextDocumentView(origin=PROVENANCE, name="provenance")
     acting = [_series(name, [name], time_ranges=near) for name, _ in action_panels(task)]
     motor = rrb.Horizontal(*_pages("action", acting), _series("reward", ["reward/**"]))
+    observed = _features("observation", task, ["observation"])
     if encoder is None:
-        observed = _features("observation", task, ["observation"])
         scene = [_world("robot", robot, task)] if robot else []
         return _episode(task, scene, [rrb.Tabs(*observed, about), motor])
-    both = _features("observation (thick) and decoded", task, ["observation", "reconstruction"])
-    has_ghost = robot is not None and jitterbug_task(task) is not None
-    others = ("error/bodies", "error/total") if has_ghost else ("error/total",)
-    errors = _features("error", task, ["error"], "scaled", others)
+    has_ghost = robot is not None and jitterbug_task(task) is not None and encoder.can_decode
+    observed = _decoded(task, has_ghost) if encoder.can_decode else observed
     units = [
         _series(
             _title("latent", panel, encoder.latent_size),
@@ -58,8 +56,8 @@ def episode_layout(task: Task, robot: Robot | None, encoder: Encoder | None) -> 
         )
         for panel in latent_panels(encoder.latent_size)
     ]
-    numbers = [rrb.Tabs(*both, *errors, about), _tabs(_pages("latent", units)), motor]
-    return _episode(task, _decoded_scene(task, robot, has_ghost), numbers)
+    numbers = [rrb.Tabs(*observed, about), _tabs(_pages("latent", units)), motor]
+    return _episode(task, _encoded_scene(task, robot, has_ghost), numbers)
 
 
 def traversal_layout(units: int, robot: Robot | None, places: Array) -> rrb.Blueprint:
@@ -117,7 +115,14 @@ def _episode(
     return _blueprint(rrb.Horizontal(*scene, column) if scene else column, timeline)
 
 
-def _decoded_scene(
+def _decoded(task: Task, has_ghost: bool) -> list[rrb.Grid]:
+    """Pages of features beside what is decoded, then of their errors."""
+    both = _features("observation (thick) and decoded", task, ["observation", "reconstruction"])
+    others = ("error/bodies", "error/total") if has_ghost else ("error/total",)
+    return [*both, *_features("error", task, ["error"], "scaled", others)]
+
+
+def _encoded_scene(
     task: Task, robot: Robot | None, has_ghost: bool
 ) -> list[rrb.Container | rrb.View]:
     """The robot, with its ghost where there is one, and the path of the latent."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jbrep.encoders import Encoder
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.inspection.blueprint import episode_layout
 from jbrep.inspection.ghost import send_ghost
 from jbrep.inspection.latent import send_encoding
@@ -17,13 +17,13 @@ from jbrep.rollouts.jitterbug import jitterbug_task
 from jbrep.rollouts.rollout import Rollout
 
 
-def record_episode(rollout: Rollout, path: Path, encoder: Encoder | None = None) -> None:
+def record_episode(rollout: Rollout, path: Path, encoder: BaseEncoder | None = None) -> None:
     """Write an episode's recording.
 
     Args:
         rollout: the episode.
         path: the .rrd file.
-        encoder: for the episode's task; its reconstruction is shown beside the episode.
+        encoder: for the episode's task; its latent is shown, and its reconstruction if it decodes.
 
     Raises:
         InputError: the file can't be written.
@@ -39,14 +39,14 @@ def record_episode(rollout: Rollout, path: Path, encoder: Encoder | None = None)
         send_terms(recording, task, motion)
     if encoder:
         latent = encoder.encode(rollout.observation)
-        decoded = encoder.decode(latent).astype(np.float64)
+        decoded = encoder.decode(latent).astype(np.float64) if encoder.can_decode else None
         send_encoding(recording, times, rollout, encoder, latent, decoded)
-        if robot and motion and jitterbug_task(task):
+        if decoded is not None and robot and motion and jitterbug_task(task):
             send_ghost(recording, robot, times, task, motion, decoded)
     recording.write(path, episode_layout(task, robot, encoder))
 
 
-def provenance(rollout: Rollout, encoder: Encoder | None) -> str:
+def provenance(rollout: Rollout, encoder: BaseEncoder | None) -> str:
     """The origin of an episode and its encoder, as Markdown."""
     facts = {"task": rollout.task.name}
     if rollout.task.arguments:
@@ -61,7 +61,7 @@ def provenance(rollout: Rollout, encoder: Encoder | None) -> str:
         facts["note"] = rollout.note
     if encoder:
         facts |= {
-            "encoder": f"{encoder.name} ({encoder.header['kind']})",
+            "encoder": f"{encoder.name} ({encoder.kind})",
             "sizes": f"{encoder.size} features, {encoder.latent_size} units",
             "SHA-256": f"`{encoder.fingerprint}`",
         }

@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.encoders import Encoder
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Array
 from jbrep.inspection.recording import SKY, YELLOW, Recording
 from jbrep.inspection.signals import latent_panels, send_decoded, send_features
@@ -21,21 +21,32 @@ def send_encoding(
     recording: Recording,
     times: Sequence[rr.TimeColumn],
     rollout: Rollout,
-    encoder: Encoder,
+    encoder: BaseEncoder,
     latent: NDArray[np.float32],
-    decoded: Array,
+    decoded: Array | None,
 ) -> None:
-    """Send decoded features (n, d), their errors in scaled units, and the latent (n, l)."""
-    task = rollout.task
-    send_decoded(recording, times, task, decoded)
-    errors = (decoded - rollout.observation) / encoder.scaler.half_width
-    send_features(recording, "error", times, task, errors.astype(np.float32), "scaled")
-    total = np.sqrt(np.square(errors).mean(axis=1, keepdims=True))
-    recording.send_series("error/total", times, total, ["root mean square [scaled]"])
+    """Send the latent (n, l), and decoded features (n, d), if any, with errors in scaled units."""
+    if decoded is not None:
+        send_decoded(recording, times, rollout.task, decoded)
+        _send_errors(recording, times, rollout, encoder.scale(decoded), encoder)
     names = [f"unit {i}" for i in range(encoder.latent_size)]
     for name, place in latent_panels(encoder.latent_size):
         recording.send_series(f"latent/{name}", times, latent[:, place], names[place])
     _send_path(recording, times, latent.astype(np.float64))
+
+
+def _send_errors(
+    recording: Recording,
+    times: Sequence[rr.TimeColumn],
+    rollout: Rollout,
+    scaled: Array,
+    encoder: BaseEncoder,
+) -> None:
+    """Send the errors of decoded features, scaled, (n, d), and their root mean square."""
+    errors = scaled - encoder.scale(rollout.observation.astype(np.float64))
+    send_features(recording, "error", times, rollout.task, errors.astype(np.float32), "scaled")
+    total = np.sqrt(np.square(errors).mean(axis=1, keepdims=True))
+    recording.send_series("error/total", times, total, ["root mean square [scaled]"])
 
 
 def principal_components(latent: Array) -> Array:

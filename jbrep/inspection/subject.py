@@ -3,11 +3,14 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.encoders import Encoder, find, load
+from jbrep.encoders import find
+from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import SUFFIX as ENCODER_SUFFIX
 from jbrep.encoders.shipped import find_alone, source_of
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
@@ -28,7 +31,7 @@ def inspect(
     source: str | None = None,
     episode: int | None = None,
     task: Task | None = None,
-    encoder: str | None = None,
+    encoder: Any = None,
     traverse: bool = False,
     out: Path | None = None,
     tell: Callable[[str], object] = lambda line: None,
@@ -41,7 +44,8 @@ def inspect(
             A run that is not over plays its last checkpoint.
         episode: its number, from 0; the first if not given.
         task: of a policy or encoder by its name; a run plays it instead of its own.
-        encoder: a file, or the name of one that ships; a run's own if not given.
+        encoder: a file, the name of one that ships, code, or an object that encodes, as
+            `jbrep.encoders.find` takes it; a run's own if not given.
         traverse: whether to show what each unit of the latent moves, instead of the episode.
         out: the .rrd file; one in inspect/, named after its content, if not given.
         tell: called with a line on where an encoder is from, and on a robot that can't be shown.
@@ -56,7 +60,7 @@ def inspect(
     if out:
         check_out(out)
     if source and _is_study(Path(source)):
-        if encoder or traverse or task or episode is not None:
+        if encoder is not None or traverse or task or episode is not None:
             raise InputError(
                 f"{source} holds several runs, whose training curves are shown without --episode, "
                 "--task, --encoder and --traverse: give one run's folder to see an episode"
@@ -65,7 +69,7 @@ def inspect(
         record_curves(read_runs(Path(source)), source, out)
         return out
     rollout, shown = _find(source, episode or 0, task, encoder)
-    if encoder:
+    if isinstance(encoder, (str, Path)):
         tell(f"encoder: {source_of(encoder, rollout.task)}")
     if rollout.note:
         tell(rollout.note)
@@ -96,13 +100,13 @@ def _is_other_folder(path: Path) -> bool:
 
 
 def _find(
-    source: str | None, episode: int, task: Task | None, encoder: str | None
-) -> tuple[Rollout, Encoder | None]:
+    source: str | None, episode: int, task: Task | None, encoder: Any
+) -> tuple[Rollout, BaseEncoder | None]:
     """The episode, and the encoder to show with it."""
     if source is None or source.endswith(ENCODER_SUFFIX):
         if (source is None) == (encoder is None):
             raise InputError("give a SOURCE to inspect, or one encoder with its --task")
-        shown = find_alone(source or encoder or "", task)
+        shown = find_alone(encoder if source is None else source, task)
         shown.check_task(task or shown.task)
         return find_episode(_POLICY, episode, task or shown.task), shown
     if _is_other_folder(Path(source)):
@@ -110,17 +114,25 @@ def _find(
             f"{source} is no data set, no run with a policy or checkpoint, and holds no finished "
             "run: jbrep collect makes a data set, jbrep rl a run"
         )
-    rollout = find_episode(source, episode, task)
-    if encoder:
-        return rollout, find(encoder, rollout.task)
     folder = run_folder(source)
+    rollout = find_episode(source, episode, task, _acting(folder, encoder))
+    if encoder is not None:
+        return rollout, find(encoder, rollout.task)
     return rollout, _own(folder) if folder else None
 
 
-def _own(folder: Path) -> Encoder | None:
+def _acting(folder: Path | None, encoder: Any) -> Any:
+    """The given encoder, if a run needs it to act: an object, where the run's folder has none."""
+    is_object = encoder is not None and not isinstance(encoder, (str, Path))
+    return encoder if is_object and folder and not exists(folder / ENCODER) else None
+
+
+def _own(folder: Path) -> BaseEncoder | None:
     """A run's encoder; None if the run observes the full state."""
-    encoder = load(folder / ENCODER)
-    return None if encoder.header["kind"] == "identity" else encoder
+    from jbrep.rl.policy import run_encoder, run_settings  # imports torch
+
+    encoder = run_encoder(folder, run_settings(folder))
+    return None if encoder.kind == IDENTITY else encoder
 
 
 def _words(source: str | None) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.encoders import Encoder
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.physics import Motion
 from jbrep.envs.task import Array
 from jbrep.inspection.blueprint import TRAVERSE, traversal_layout
@@ -39,7 +39,7 @@ def sweep(latent: NDArray[np.float32]) -> NDArray[np.float32]:
     return swept.astype(np.float32)
 
 
-def record_traversal(rollout: Rollout, path: Path, encoder: Encoder) -> None:
+def record_traversal(rollout: Rollout, path: Path, encoder: BaseEncoder) -> None:
     """Write a recording of what is decoded while one unit after the other varies.
 
     There is a robot for each unit where the episode has the motion of a Jitterbug.
@@ -50,8 +50,9 @@ def record_traversal(rollout: Rollout, path: Path, encoder: Encoder) -> None:
         encoder: for the episode's task.
 
     Raises:
-        InputError: the file can't be written.
+        InputError: the encoder can't decode, or the file can't be written.
     """
+    encoder.check_decodes("--traverse shows what each unit is decoded to")
     swept = sweep(encoder.encode(rollout.observation))
     about = provenance(rollout, encoder)
     name = f"{encoder.name} on {rollout.name}: each unit of the latent"
@@ -67,9 +68,9 @@ def record_traversal(rollout: Rollout, path: Path, encoder: Encoder) -> None:
         decoded = encoder.decode(latent).astype(np.float64)
         if robot:
             _send_robot(recording, robot, times, as_qpos(rollout.task, decoded), unit, place)
-        scaled = encoder.scaler.scale(decoded)
+        scaled = encoder.scale(decoded)
         moved.append(np.argsort(-np.ptp(scaled, axis=0))[:_MOST])
-        _send_features(recording, times, scaled, unit, moved[-1], encoder.feature_names)
+        _send_features(recording, times, scaled, unit, moved[-1], rollout.task.feature_names)
     recording.send_text(f"{TRAVERSE}/summary", _summary(encoder, rollout, swept, moved))
     recording.write(path, traversal_layout(len(swept), robot, places))
 
@@ -117,7 +118,10 @@ def _send_features(
 
 
 def _summary(
-    encoder: Encoder, rollout: Rollout, swept: NDArray[np.float32], moved: list[NDArray[np.int64]]
+    encoder: BaseEncoder,
+    rollout: Rollout,
+    swept: NDArray[np.float32],
+    moved: list[NDArray[np.int64]],
 ) -> str:
     """The features that each unit moves most, as a table in Markdown."""
     lines = ["| unit | from | to | moves most |", "|---|---|---|---|"]

@@ -136,6 +136,11 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._data: Any = None
 
     @property
+    def scaled(self) -> bool:
+        """Whether observations are scaled, rather than in physical units."""
+        return self._view.scaled
+
+    @property
     def model(self) -> mujoco.MjModel:
         """The robot's model; a new one once it has another body."""
         return self._simulation.model_of(0)
@@ -255,6 +260,11 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         self.single_action_space = _ACTIONS
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(_ACTIONS, num_envs)
+
+    @property
+    def scaled(self) -> bool:
+        """Whether observations are scaled, rather than in physical units."""
+        return self._view.scaled
 
     def reset(
         self,

@@ -1,22 +1,25 @@
 """Everything in a report but its statistics: what ran, how, and how to run it again."""
 
 import json
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from jbrep.encoders import FULL
 from jbrep.encoders.file import HELD_OUT_MSE
+from jbrep.envs.encoding import OWN
 from jbrep.figures.diagrams import EncoderRecord, LabelRecord
 from jbrep.report.tables import Tables
 from jbrep.rl.files import FAILED
 from jbrep.stats.runs import in_order
 from jbrep.stats.summary import shown_number
-from jbrep.study.record import learner
+from jbrep.study.record import EACH_ITS_OWN, learner
 from jbrep.text import SIGNIFICANT, number, slug
 
 Row = tuple[str, ...]
 Rows = list[Row]
+_BARE = re.compile(r"[\w-]+", re.ASCII)  # a key that TOML needs no quotes for
 
 
 def outline(tables: Tables) -> str:
@@ -29,10 +32,14 @@ def outline(tables: Tables) -> str:
     total = len(runs) + len(tables.record["missing"])
     failed = sum(run["status"] == FAILED for run in runs)
     steps = max(run["steps"] for run in runs)
+    own = in_order(
+        (each["representation"] for each in settings if each["encoder"] == EACH_ITS_OWN), FULL
+    )
     return (
         f"{', '.join(algorithms)} on {', '.join(tasks)} with the representations "
         f"{', '.join(representations)}: {len(runs) - failed} of {total} runs finished, {failed} "
         f"failed; up to {steps:,} steps each."
+        + (f" With {', '.join(own)} {EACH_ITS_OWN}." if own else "")
     )
 
 
@@ -124,7 +131,7 @@ def encoder_rows(tables: Tables) -> Rows:
 
 
 def _encoder_row(label: str, shared: LabelRecord) -> Row:
-    encoder = shared["encoder"]
+    encoder, fingerprint = shared["encoder"], shared["settings"]["encoder"]
     error, rows = encoder["metrics"].get(HELD_OUT_MSE), encoder["data"].get("train_rows")
     return (
         label,
@@ -132,12 +139,14 @@ def _encoder_row(label: str, shared: LabelRecord) -> Row:
         _layers(encoder),
         "-" if error is None else f"{error:.2g}",
         "-" if rows is None else f"{rows:,}",
-        shared["settings"]["encoder"][:12],
+        fingerprint if fingerprint == EACH_ITS_OWN else fingerprint[:12],
     )
 
 
 def _layers(encoder: EncoderRecord) -> str:
-    """Such as 16 - 8 tanh - 16 tanh."""
+    """Such as 16 - 8 tanh - 16 tanh; of a user's own encoder 16 - 8."""
+    if encoder["kind"] == OWN:
+        return f"{encoder['size']} - {encoder.get('latent_size', '?')}"
     layers = [*encoder["encoder"], *encoder["decoder"]]
     return " - ".join([str(encoder["size"]), *(f"{units} {kind}" for units, kind in layers)])
 
@@ -149,7 +158,7 @@ def setting_rows(tables: Tables) -> tuple[Row, Rows]:
         settings = shared["settings"]
         columns.setdefault(f"{settings['task']}/{learner(settings)}", dict(_flat(settings)))
     names = dict.fromkeys(name for settings in columns.values() for name in settings)
-    skipped = ("task", "representation", "encoder")
+    skipped = ("task", "representation", "encoder", "encoder_code")
     rows = [
         (name, *(_shown(settings.get(name)) for settings in columns.values()))
         for name in names
@@ -189,12 +198,20 @@ def reproduce(tables: Tables) -> list[tuple[str, str]]:
     study = tables.record["study"]
     if study:
         toml = ("This file, as study.toml:", _toml(study))
-        return [first, toml, ("All runs:", f"jbrep study study.toml --out {folder}"), report]
+        command = f"jbrep study study.toml --out {folder}{_imports(study)}"
+        return [first, toml, ("All runs:", command), report]
     commands = "\n".join(
         _command(shared, f"{tables.name}/{_folder(shared['settings'])}/seed-0")
         for shared in tables.record["labels"].values()
     )
     return [first, ("Each run, here with one seed:", commands), report]
+
+
+def _imports(study: Mapping[str, Any]) -> str:
+    """The options that import the modules of a study's own encoders."""
+    own = (each for each in study["representations"] if isinstance(each, Mapping))
+    modules = dict.fromkeys(each["code"].partition(":")[0] for each in own if "code" in each)
+    return "".join(f" --import {shlex.quote(module)}" for module in modules)
 
 
 def _toml(study: Mapping[str, Any]) -> str:
@@ -204,11 +221,22 @@ def _toml(study: Mapping[str, Any]) -> str:
         if isinstance(value, Mapping):
             unset = ("", 0) if name == "data" else ()  # either steps or a folder is given there
             given = {key: each for key, each in value.items() if each not in unset}
-            cells = [f"{key} = {json.dumps(each)}" for key, each in given.items()]
+            cells = [f"{key} = {_inline(each)}" for key, each in given.items()]
             below += ["", f"[{name}]", *cells] if cells else []
         elif value is not None:
-            lines.append(f"{name} = {json.dumps(value)}")
+            lines.append(f"{name} = {_inline(value)}")
     return "\n".join(lines + below)
+
+
+def _inline(value: Any) -> str:
+    """A value as TOML on one line."""
+    if isinstance(value, Mapping):
+        keys = (key if _BARE.fullmatch(key) else json.dumps(key) for key in value)
+        cells = map(" = ".join, zip(keys, map(_inline, value.values()), strict=True))
+        return f"{{ {', '.join(cells)} }}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_inline, value))}]"
+    return json.dumps(value)
 
 
 def _folder(settings: Mapping[str, Any]) -> str:
@@ -227,5 +255,6 @@ def _command(shared: LabelRecord, out: str) -> str:
         parts += ["--env", f"{name}={json.dumps(value)}"]
     if steps := environment.get("max_episode_steps"):
         parts += ["--episode-steps", str(steps)]
-    parts += ["--encoder", shared["encoder"]["name"], "--seed", "0", "--out", out]
+    encoder = settings.get("encoder_code") or shared["encoder"]["name"]
+    parts += ["--encoder", encoder, "--seed", "0", "--out", out]
     return shlex.join(parts)

@@ -28,7 +28,7 @@ def policy_to_begin_with(folder: Path, settings: Mapping[str, Any], latent_size:
         DamageError: a file of it isn't what was written.
     """
     run = read_finished(folder)
-    there = _sizes(run["settings"], load(folder / ENCODER).latent_size)
+    there = _sizes(run["settings"], run.get("latent_size") or load(folder / ENCODER).latent_size)
     if differing := differences(there, _sizes(settings, latent_size)):
         raise InputError(
             f"can't begin with the policy in {folder}, whose algorithm, network and sizes must be "

@@ -15,6 +15,7 @@ MAX_EVALUATION_EPISODES = 10_000
 MAX_SEED = (1 << 31) - 1
 _MAX_LAYERS, _MAX_UNITS = 8, 1024  # of a policy's network
 _MAX_ENVS = 4096
+_MAX_LATENT = 1 << 20
 _MAX_SECONDS = 1e12
 MAX_LINE = 1000  # characters
 
@@ -48,7 +49,7 @@ def _is_number(value: Any) -> bool:
 
 
 _TASK = text(r"[\w./-]{1,200}", "a task's name or id")
-_NAME = text(r"[\w.-]{1,100}", "a name of letters, digits, dots, hyphens and underscores")
+NAME = text(r"[\w.-]{1,100}", "a name of letters, digits, dots, hyphens and underscores")
 _SHA256 = text("[0-9a-f]{64}", "64 hexadecimal digits")
 _LINE = Kind(_is_line, f"a line of at most {MAX_LINE:,} characters")
 _OBJECT = Kind(lambda value: isinstance(value, dict), "an object")
@@ -64,12 +65,16 @@ _RUN = {
     ),
     "cpu": _LINE,
 }
-_OPTIONAL = {"reason": _LINE, "policy_sha256": _SHA256}
+_OPTIONAL = {
+    "reason": _LINE,
+    "policy_sha256": _SHA256,
+    "latent_size": whole_number(1, _MAX_LATENT),  # early runs have it in their encoder alone
+}
 _SETTINGS = {
     "task": _TASK,
     "environment": _OBJECT,
-    "algorithm": _NAME,
-    "preset": _NAME,
+    "algorithm": NAME,
+    "preset": NAME,
     "hidden": Kind(
         lambda v: (
             isinstance(v, list)
@@ -85,7 +90,7 @@ _SETTINGS = {
         "null or a list of numbers",
     ),
     "optimizer": _OBJECT,
-    "representation": _NAME,
+    "representation": NAME,
     "encoder": _SHA256,
     "encoder_code": Kind(lambda v: v is None or _is_line(v), "null or a name of code"),
     "encoder_seed": Kind(

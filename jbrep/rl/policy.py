@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.encoders import find, load
+from jbrep.encoders.code import make
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.recording import Actor
 from jbrep.envs.task import Array, Task, read_task
@@ -42,13 +43,9 @@ class Trained(NamedTuple):
     policy: BasePolicy
     task: Task
     encoder: BaseEncoder
+    representation: str  # what the policy observes, as tables call it
     evaluation_episodes: int = 1  # that the run's evaluations play at once
     step: int | None = None  # of training, if it is not over
-
-    @property
-    def representation(self) -> str:
-        """What the policy observes."""
-        return self.encoder.representation
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Act deterministically; nothing is drawn.
@@ -66,7 +63,7 @@ class Trained(NamedTuple):
         return checked
 
 
-def load_run(folder: Path, encoder: BaseEncoder | None = None) -> Trained:
+def load_run(folder: Path, encoder: Any = None) -> Trained:
     """The policy of a run; nothing that the folder holds is run as code.
 
     A finished run has its final policy, one that is under way or was stopped its checkpoint's. Only
@@ -74,7 +71,9 @@ def load_run(folder: Path, encoder: BaseEncoder | None = None) -> Trained:
 
     Args:
         folder: of the run.
-        encoder: the one that the run was made with, where its folder has none because it is code.
+        encoder: the one that the run was made with, where its folder has none because it is a
+            user's own; whatever `jbrep.encoders.find` takes. Code whose module was imported on
+            request is known without it.
 
     Raises:
         InputError: no run there, a failed one, one without a checkpoint so far, or one whose files
@@ -95,20 +94,31 @@ def load_run(folder: Path, encoder: BaseEncoder | None = None) -> Trained:
     return trained
 
 
-def load_untrained(folder: Path, encoder: BaseEncoder | None = None) -> Trained:
+def load_untrained(folder: Path, encoder: Any = None) -> Trained:
     """The policy that a run began with.
 
     Raises:
         InputError: as `load_run`.
         DamageError: a file isn't what was written.
     """
-    ended = exists(folder / RUN)
-    settings = read_run(folder)["settings"] if ended else _read_checkpoint(folder).settings
+    settings = run_settings(folder)
     trained = _build(folder, settings, encoder)
     if settings["from"]:
         path = folder / BEGINNING
         fill(trained.policy, read_weights(path, settings["from"]), path)
     return trained
+
+
+def run_settings(folder: Path) -> dict[str, Any]:
+    """The settings of a run that has ended or is under way.
+
+    Raises:
+        InputError: as `load_run`.
+        DamageError: a file isn't what was written.
+    """
+    if exists(folder / RUN):
+        return read_run(folder)["settings"]
+    return _read_checkpoint(folder).settings
 
 
 def load_zip(path: Path, task: Task, algorithm: str, encoder: str, trust: bool) -> Trained:
@@ -137,7 +147,7 @@ def load_zip(path: Path, task: Task, algorithm: str, encoder: str, trust: bool) 
     except Exception as error:  # whatever its pickled parts do
         reason = one_line(error)
         raise InputError(f"{path} is no {algorithm} policy for {task.name}: {reason}") from None
-    return Trained(agent.policy, task, seen)
+    return Trained(agent.policy, task, seen, seen.representation)
 
 
 class _Checkpoint(NamedTuple):
@@ -169,20 +179,18 @@ def _read_checkpoint(folder: Path) -> _Checkpoint:
     return _Checkpoint(settings, step, weights)
 
 
-def _load_checkpoint(folder: Path, encoder: BaseEncoder | None) -> Trained:
+def _load_checkpoint(folder: Path, encoder: Any) -> Trained:
     checkpoint = _read_checkpoint(folder)
     trained = _build(folder, checkpoint.settings, encoder)._replace(step=checkpoint.step)
     fill(trained.policy, checkpoint.weights, folder / CHECKPOINT)
     return trained
 
 
-def _build(
-    folder: Path, settings: Mapping[str, Any], encoder: BaseEncoder | None = None
-) -> Trained:
+def _build(folder: Path, settings: Mapping[str, Any], given: Any = None) -> Trained:
     """What a run trains, as it begins."""
     task, algorithm = read_task(settings["environment"]), settings["algorithm"]
     choose(algorithm, ALGORITHMS, "algorithm")
-    encoder = encoder or run_encoder(folder, settings)
+    encoder = run_encoder(folder, settings) if given is None else find(given, task)
     if encoder.fingerprint != settings["encoder"]:
         raise InputError(
             f"{encoder.name} is not the encoder that the run in {folder} was made with"
@@ -190,18 +198,23 @@ def _build(
     encoder.check_task(task)
     preset = Preset(tuple(settings["hidden"]), {})
     agent = make_agent(algorithm, preset, Spaces(task, encoder), settings["seed"])
-    return Trained(agent.policy, task, encoder, settings["evaluation_episodes"])
+    name, episodes = settings["representation"], settings["evaluation_episodes"]
+    return Trained(agent.policy, task, encoder, name, episodes)
 
 
 def run_encoder(folder: Path, settings: Mapping[str, Any]) -> BaseEncoder:
-    """The encoder in a run's folder.
+    """The encoder in a run's folder, or what its code makes.
 
     Raises:
-        InputError: there is none, since it is code.
+        InputError: it is code whose module wasn't imported on request, or a user's own object, or
+            it can't be used.
+        DamageError: its file isn't what was written.
     """
-    if not exists(folder / ENCODER) and (code := settings["encoder_code"]):
-        raise InputError(
-            f"the run in {folder} was made with an encoder that is code, {code}: give it with "
-            f"--encoder {code}, which runs it"
-        )
-    return load(folder / ENCODER)
+    if exists(folder / ENCODER):
+        return load(folder / ENCODER)
+    if code := settings["encoder_code"]:
+        return make(code, read_task(settings["environment"]))
+    raise InputError(
+        f"no {ENCODER} in {folder}: a run on a Python object needs it again, as in "
+        "load_run(folder, encoder)"
+    )

@@ -28,7 +28,7 @@ from jbrep.files.storage import exists, make_folder, write_whole
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed, unchecked_distributions
 from jbrep.rl.beginning import begin, policy_to_begin_with
 from jbrep.rl.checkpoint import Checkpointer
-from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_LINE, MAX_SEED, MAX_STEPS
+from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_LINE, MAX_SEED, MAX_STEPS, NAME
 from jbrep.rl.files import (
     CHECKPOINT,
     ENCODER,
@@ -62,7 +62,7 @@ class Run:
     """What to train; together with the versions it decides every number, on one kind of CPU.
 
     Raises:
-        InputError: a number out of range, or a name that is no task's.
+        InputError: a number out of range, or a name that can't be used.
     """
 
     task: Task  # or its name, which is then described
@@ -85,8 +85,13 @@ class Run:
                 raise InputError(
                     f"{words} is {getattr(self, name)}: it must be between 1 and {limit:,}"
                 )
-        if not 0 <= self.seed <= MAX_SEED:
-            raise InputError(f"the seed is {self.seed}: it must be between 0 and {MAX_SEED:,}")
+        for name, seed in (("seed", self.seed), ("encoder seed", self.encoder_seed or 0)):
+            if not 0 <= seed <= MAX_SEED:
+                raise InputError(f"the {name} is {seed}: it must be between 0 and {MAX_SEED:,}")
+        if self.representation and not NAME.allows(self.representation):
+            raise InputError(
+                f"the representation is {self.representation!r}: it must be {NAME.words}"
+            )
 
     def check(self) -> None:
         """Check that the run can start.
@@ -95,7 +100,16 @@ class Run:
             InputError: an unknown algorithm or preset, an unusable encoder, or a policy that this
                 run can't begin with.
         """
-        self.describe(find(self.encoder, self.task))
+        self.describe(self.find_encoder())
+
+    def find_encoder(self) -> BaseEncoder:
+        """The encoder; an own one computes on one thread, as in training.
+
+        Raises:
+            InputError: it can't be used.
+        """
+        with single_torch_thread():
+            return find(self.encoder, self.task)
 
     def describe(self, encoder: BaseEncoder) -> dict[str, Any]:
         """All settings that two equal runs share, as plain JSON.
@@ -150,7 +164,7 @@ def train(
         InputError: as `Run.check`; or the folder holds another run, or is in use.
         StoppedError: `stop` was true.
     """
-    encoder = find(run.encoder, run.task)
+    encoder = run.find_encoder()
     settings = plain(run.describe(encoder))
     if ended := _read_ended(folder, settings):
         return ended
@@ -167,7 +181,7 @@ def read_result(run: Run, folder: Path) -> dict[str, Any] | None:
     Raises:
         InputError: as `Run.check`, or the folder holds another run.
     """
-    encoder = find(run.encoder, run.task)
+    encoder = run.find_encoder()
     return _read_ended(folder, plain(run.describe(encoder)))
 
 
@@ -223,6 +237,7 @@ def _train(
         "status": FAILED if failure else FINISHED,
         **({"reason": failure} if failure else {}),
         "settings": settings,
+        "latent_size": encoder.latent_size,
         "steps": agent.num_timesteps,
         "seconds": history.seconds,
         "versions": versions,

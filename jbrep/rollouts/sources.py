@@ -2,14 +2,15 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from jbrep.collect.policies import POLICIES, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.encoders import FULL, Encoder
+from jbrep.encoders import FULL
+from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Actor, episode_returns
@@ -87,15 +88,16 @@ class Player(NamedTuple):
         """About what an episode of the longest takes in memory."""
         return (16 * self.task.size + 100) * self.task.max_episode_steps
 
-    def with_reconstruction(self, encoder: Encoder) -> "Player":
+    def with_reconstruction(self, encoder: BaseEncoder) -> "Player":
         """The same policy, which now observes what an encoder's latent is decoded to.
 
         The return that it loses measures what the latent lacks for acting.
 
         Raises:
-            InputError: an encoder for other observations.
+            InputError: an encoder for other observations, or one that can't decode.
         """
         encoder.check_task(self.task)
+        encoder.check_decodes("a policy by its name acts on decoded observations")
 
         def begin(task: Task, seeds: Sequence[int]) -> Actor:
             act = self.begin(task, seeds)
@@ -121,7 +123,9 @@ def _batches(count: int, most: int) -> Iterator[range]:
         yield range(start, min(start + most, count))
 
 
-def find_episode(source: str, episode: int = 0, task: Task | None = None) -> Rollout:
+def find_episode(
+    source: str, episode: int = 0, task: Task | None = None, encoder: Any = None
+) -> Rollout:
     """An episode of a data set by its number, or one under a policy that `find_player` knows.
 
     Those under a policy are the episodes of evaluation. A run's come out as they did when it was
@@ -140,7 +144,7 @@ def find_episode(source: str, episode: int = 0, task: Task | None = None) -> Rol
                 f"{source} has its own arguments, time limit and features: leave out --task"
             )
         return replay(dataset, episode)
-    player = find_player(source, task)
+    player = find_player(source, task, encoder)
     if episode < 0:
         raise InputError(f"there is no episode {episode}: they count from 0")
     if episode < player.evaluation_batch:
@@ -148,7 +152,7 @@ def find_episode(source: str, episode: int = 0, task: Task | None = None) -> Rol
     return player.play([episode])[0]
 
 
-def find_player(source: str, task: Task | None = None) -> Player:
+def find_player(source: str, task: Task | None = None, encoder: Any = None) -> Player:
     """The policy of a run, or one by its name, such as heuristic or constant:drive=0.5.
 
     Args:
@@ -156,12 +160,13 @@ def find_player(source: str, task: Task | None = None) -> Player:
             its last checkpoint.
         task: for a policy by its name. A run has its own; if one is given, it must be of the same
             environment, and is played instead: with other arguments or another time limit.
+        encoder: the object that a run was made with, if its encoder is a user's own.
 
     Raises:
         InputError: neither, or no task for a name, or a run of another task.
     """
     if folder := run_folder(source):
-        return _of_run(folder, task)
+        return _of_run(folder, task, encoder)
     if exists(Path(source) / MANIFEST):
         raise InputError(f"{source} is a data set: give the folder of a run or a policy")
     if source.partition(":")[0] not in POLICIES:
@@ -192,10 +197,10 @@ def find_untrained(folder: Path) -> Player:
     return as_player(f"{folder}, before training", load_untrained(folder))
 
 
-def _of_run(folder: Path, task: Task | None) -> Player:
+def _of_run(folder: Path, task: Task | None, encoder: Any) -> Player:
     from jbrep.rl.policy import load_run  # imports torch
 
-    trained = load_run(folder)
+    trained = load_run(folder, encoder)
     _check_task(str(folder), trained.task, task)
     name = str(folder) if trained.step is None else f"{folder} at step {trained.step:,}"
     player = as_player(name, trained)

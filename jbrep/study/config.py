@@ -7,31 +7,26 @@ from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from jbrep.dae.training import Training
 from jbrep.encoders import FULL
-from jbrep.encoders.encoder import IDENTITY
-from jbrep.encoders.names import USUAL_ARCHITECTURE, EncoderName
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import MAX_EPISODE_STEPS
 from jbrep.errors import InputError
 from jbrep.files.storage import read_regular
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.methods.fit import get_kind
 from jbrep.rl.presets import get_preset
 from jbrep.rl.run import Run
+from jbrep.study.representations import Given, name_of, read_representation
 from jbrep.text import slug
 
 _MAX_BYTES = 1 << 20
 _MOST_SEEDS = (1 << 16) - 1
 _RUN_SETTINGS = ("steps", "evaluate_every", "evaluation_episodes")
-_ANY_TASK = TASKS["face_direction"].describe()
-_TRAINING: dict[str, tuple[type, ...]] = {  # settings of encoders, with their types
-    "epochs": (int,),
-    "batch_size": (int,),
-    "learning_rate": (float, int),
-    "noise": (float, int),
-    "seed": (int,),
+_ITEMS: dict[Any, tuple[type, ...]] = {  # of lists, by the type of the field
+    tuple[str, ...]: (str,),
+    tuple[int, ...]: (int,),
+    tuple[Given, ...]: (str, dict),
 }
+_ANY_TASK = TASKS["face_direction"].describe()
 
 
 @dataclass(frozen=True)
@@ -41,49 +36,6 @@ class Data:
     steps: int = 0
     seed: int = 0
     folder: str = ""  # a data set, or a folder with one for each task
-
-
-@dataclass(frozen=True)
-class Representation:
-    """What an agent observes."""
-
-    name: str  # full, or the name of an encoder: dae-8, dae-deep-8, pca-8
-    kind: str
-    training: Training  # of its encoder; only some settings matter to each kind
-
-    @property
-    def encoder(self) -> str:
-        """The name of its encoder."""
-        return self.kind if self.name == FULL else self.name
-
-    @classmethod
-    def of(cls, name: str, training: Mapping[str, Any]) -> "Representation":
-        """The representation of that name.
-
-        Raises:
-            InputError: no such representation, or invalid training settings.
-        """
-        if name == FULL:
-            return cls(name, IDENTITY, _training(None, USUAL_ARCHITECTURE, training))
-        kind, architecture, latent = parts = EncoderName.parse(name)
-        settings = get_kind(kind).settings
-        taken = architecture == USUAL_ARCHITECTURE or "architecture" in settings
-        if latent is None or "latent" not in settings or not taken or str(parts) != name:
-            raise InputError(
-                f"unknown representation {name!r}: it must be {FULL}, or a kind and a latent size, "
-                "such as dae-8, dae-deep-8, pca-8 or random-8"
-            )
-        return cls(name, kind, _training(latent, architecture, training))
-
-
-def _training(latent: int | None, architecture: str, settings: Mapping[str, Any]) -> Training:
-    if unknown := [name for name in settings if name not in _TRAINING]:
-        raise InputError(f"unknown training.{unknown[0]}: it must be one of {', '.join(_TRAINING)}")
-    for name, value in settings.items():
-        if type(value) not in _TRAINING[name]:
-            kind = _TRAINING[name][0].__name__
-            raise InputError(f"training.{name} is {value!r}: it must be of type {kind}")
-    return Training.of(latent, architecture, **settings)
 
 
 @dataclass(frozen=True)
@@ -115,7 +67,7 @@ class Study:
 
     tasks: tuple[str, ...]  # the Jitterbug's by their names, others by their ids
     algorithms: tuple[str, ...]
-    representations: tuple[str, ...]
+    representations: tuple[Given, ...]  # names, and tables of users' own encoders
     seeds: tuple[int, ...]
     steps: int
     evaluate_every: int = 10_000
@@ -127,14 +79,15 @@ class Study:
 
     def __post_init__(self) -> None:
         for name in ("tasks", "algorithms", "representations", "seeds"):
-            values = getattr(self, name)
-            if not values or len(set(values)) < len(values):
-                raise InputError(f"{name} is {list(values)}: it must have one or more, each once")
+            values = list(getattr(self, name))
+            names = map(name_of, values) if name == "representations" else values
+            if not values or len(set(map(repr, names))) < len(values):
+                raise InputError(f"{name} is {values}: it must have one or more, each once")
         self._check_tasks()
         for algorithm in self.algorithms:
             Learner.of(algorithm)
-        for name in self.representations:
-            Representation.of(name, self.training)
+        for given in self.representations:
+            read_representation(given, self.training)
         for seed in self.seeds:
             Run(task=_ANY_TASK, seed=seed, **self.run_settings)  # checks the numbers
         if self.data and bool(self.data.steps) == bool(self.data.folder):
@@ -239,12 +192,13 @@ def _checked(kind: Any, given: Any, where: str) -> dict[str, Any]:
 
 def _typed(kind: Any, value: Any, name: str) -> Any:
     """A list as a tuple; anything else as it is."""
-    inner = {tuple[str, ...]: str, tuple[int, ...]: int}.get(kind)
+    inner = _ITEMS.get(kind)
     if inner:
         items = value if isinstance(value, list) else [None]
-        if not all(type(item) is inner for item in items):
+        if not all(type(item) in inner for item in items):
             number = f", or how many (1 to {_MOST_SEEDS})" if name == "seeds" else ""
-            raise InputError(f"{name} is {value!r}: it must be a list of {inner.__name__}{number}")
+            words = " and ".join(each.__name__ for each in inner)
+            raise InputError(f"{name} is {value!r}: it must be a list of {words}{number}")
         return tuple(items)
     scalar = {int: int, int | None: int, str: str}.get(kind)
     if scalar and type(value) is not scalar:

@@ -6,7 +6,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from jbrep.encoders.file import SUFFIX
 from jbrep.envs.description import describe
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
@@ -14,7 +13,8 @@ from jbrep.files.storage import exists, make_folder, read_regular, write_whole
 from jbrep.rl import Run
 from jbrep.rl.files import RUN
 from jbrep.rl.run import plain
-from jbrep.study.config import Learner, Representation, Study, as_study
+from jbrep.study.config import Learner, Study, as_study
+from jbrep.study.representations import Representation, read_representation
 from jbrep.text import slug
 
 STUDY = "study.json"
@@ -54,7 +54,7 @@ class Plan:
     def representations(self) -> tuple[Representation, ...]:
         """What agents observe."""
         study = self.study
-        return tuple(Representation.of(name, study.training) for name in study.representations)
+        return tuple(read_representation(each, study.training) for each in study.representations)
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
@@ -90,13 +90,19 @@ class Plan:
         return describe(name, self.study.environment, self.study.episode_steps)
 
     def run(self, cell: Cell) -> Run:
-        """What to train."""
+        """What to train.
+
+        Raises:
+            InputError: as `describe`, or its representation has no encoder for its task.
+        """
+        made = self.encoders(cell.task) if self.study.data else None
         return Run(
             task=self.task(cell.task),
             algorithm=cell.learner.algorithm,
             preset=cell.learner.preset,
-            encoder=self._encoder(cell),
+            encoder=cell.representation.encoder(cell.task, cell.seed, made),
             seed=cell.seed,
+            **cell.representation.settings(cell.seed),
             **self.study.run_settings,
         )
 
@@ -107,12 +113,6 @@ class Plan:
     def data(self, task: str) -> Path:
         """The folder of the data set that the study collects for a task."""
         return self.folder / "data" / slug(task)
-
-    def _encoder(self, cell: Cell) -> str:
-        name = cell.representation.encoder
-        if self.study.data is None:
-            return name
-        return str(self.encoders(cell.task) / f"{name}{SUFFIX}")
 
     def write(self) -> None:
         """Make the folder, and write what the study is.

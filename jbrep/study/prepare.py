@@ -8,15 +8,18 @@ from jbrep.collect.collector import usual_shard_episodes
 from jbrep.collect.derive import derive
 from jbrep.dataset import Dataset, ScaledDataset, Settings
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.encoders import FULL
+from jbrep.encoders import FULL, find
+from jbrep.encoders.code import is_code
 from jbrep.encoders.shipped import names
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.fit import Fitter
-from jbrep.study.config import Data, Representation
+from jbrep.rl import Run
+from jbrep.study.config import Data
 from jbrep.study.plan import Plan
+from jbrep.study.representations import ByName, Own
 from jbrep.text import slug
 
 
@@ -25,7 +28,7 @@ def check(plan: Plan) -> None:
 
     Raises:
         InputError: as `describe` for a task; no such shipped encoder, a latent size out of range,
-            or no data set of the task.
+            no data set of the task, or an encoder of the user's that can't be used.
     """
     data = plan.study.data
     for name in plan.study.tasks:
@@ -33,7 +36,7 @@ def check(plan: Plan) -> None:
         if data and data.folder:
             folder = _existing(data, name)
             check_same(task, Dataset(folder).task, f"the data set {folder}")
-        for representation in plan.representations:
+        for representation in _by_name(plan):
             if data is None:
                 _check_shipped(representation, task)
             elif (representation.training.latent or 0) >= task.size:
@@ -41,9 +44,39 @@ def check(plan: Plan) -> None:
                     f"{representation.name} doesn't reduce the {task.size} features of "
                     f"{name}: choose a smaller latent size"
                 )
+    _check_own(plan)
 
 
-def _check_shipped(representation: Representation, task: Task) -> None:
+def _by_name(plan: Plan) -> list[ByName]:
+    return [each for each in plan.representations if isinstance(each, ByName)]
+
+
+def _check_own(plan: Plan) -> None:
+    """Check the user's own encoders, each once for each task."""
+    checked = set()
+    for cell in plan.cells:
+        if not isinstance(cell.representation, Own):
+            continue
+        try:
+            run = plan.run(cell)
+            if (cell.task, run.encoder) not in checked:
+                checked.add((cell.task, run.encoder))
+                _check_encoder(run)
+        except InputError as error:
+            raise InputError(f"run {cell.name} can't start: {error}") from None
+
+
+def _check_encoder(run: Run) -> None:
+    if not is_code(run.encoder) and not exists(run.encoder):
+        raise InputError(f"its encoder {run.encoder} is missing")
+    encoder = find(run.encoder, run.task)
+    if is_code(run.encoder) and find(run.encoder, run.task).fingerprint != encoder.fingerprint:
+        raise InputError(
+            f"{run.encoder} makes another encoder each time: let it load its weights, or seed it"
+        )
+
+
+def _check_shipped(representation: ByName, task: Task) -> None:
     shipped = names(task) or (FULL,)
     if representation.name not in shipped:
         raise InputError(
@@ -64,7 +97,7 @@ def prepare(plan: Plan) -> None:
     for task in plan.study.tasks:
         folder = _existing(data, task) if data.folder else _collect(plan, data, task)
         fitter = Fitter(ScaledDataset(Dataset(folder)), plan.encoders(task))
-        for representation in plan.representations:
+        for representation in _by_name(plan):
             fitter.fit(representation.kind, representation.training)
 
 

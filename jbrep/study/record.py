@@ -1,11 +1,14 @@
 """What was run, in one file: every run, the settings under each label, the unfinished runs."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jbrep.encoders import FULL, Encoder, load
+from jbrep.encoders import FULL, load
+from jbrep.envs.encoding import OWN
+from jbrep.envs.task import read_task
+from jbrep.files.storage import exists
 from jbrep.rl.files import ENCODER, read_run
 from jbrep.stats.runs import in_order
 from jbrep.study.plan import read_plan
@@ -14,6 +17,8 @@ from jbrep.study.work import read_progress
 RECORD = "runs.json"
 FORMAT = "jbrep runs"
 FORMAT_VERSION = 1
+EACH_ITS_OWN = "each run has an encoder of its own"
+_RECORDS = ("training", "data", "metrics")  # of an encoder
 
 
 def record(folder: Path, folders: Sequence[Path], left_out: Sequence[str]) -> dict[str, Any]:
@@ -30,11 +35,9 @@ def record(folder: Path, folders: Sequence[Path], left_out: Sequence[str]) -> di
     runs = {each: read_run(each) for each in folders}
     order = in_order((run["settings"]["representation"] for run in runs.values()), FULL)
     runs = dict(sorted(runs.items(), key=lambda item: _sort_key(item[1]["settings"], order)))
-    labels: dict[str, Any] = {}
+    labels: dict[str, dict[Path, Mapping[str, Any]]] = {}
     for each, run in runs.items():
-        label = run_label(run["settings"])
-        if label not in labels:
-            labels[label] = _shared(run["settings"], load(each / ENCODER))
+        labels.setdefault(run_label(run["settings"]), {})[each] = run
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -42,11 +45,11 @@ def record(folder: Path, folders: Sequence[Path], left_out: Sequence[str]) -> di
         "left_out": list(left_out),
         "versions": _distinct(run["versions"] for run in runs.values()),
         "processors": _distinct(run["cpu"] for run in runs.values()),
-        "labels": labels,
+        "labels": {label: _shared(of_label) for label, of_label in labels.items()},
         "runs": [
             {
                 "label": run_label(run["settings"]),
-                "seed": run["settings"]["seed"],
+                **{name: run["settings"][name] for name in ("seed", "encoder")},
                 **{name: run.get(name) for name in ("status", "reason", "steps", "seconds")},
             }
             for run in runs.values()
@@ -76,20 +79,53 @@ def as_json(contents: Mapping[str, Any]) -> bytes:
     return (json.dumps(contents, indent=1, allow_nan=False) + "\n").encode()
 
 
-def _shared(settings: Mapping[str, Any], encoder: Encoder) -> dict[str, Any]:
-    """What the runs of a label share: everything but the seed."""
+def shared_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that all runs of a label share: without the seed and what depends on it."""
+    shared = {n: value for n, value in settings.items() if n not in ("seed", "encoder_seed")}
+    return shared | ({} if settings["encoder_seed"] is None else {"encoder": EACH_ITS_OWN})
+
+
+def _shared(runs: Mapping[Path, Mapping[str, Any]]) -> dict[str, Any]:
+    """What the runs of a label share, by folder."""
+    settings = shared_settings(next(iter(runs.values()))["settings"])
+    folders = list(runs) if settings["encoder"] == EACH_ITS_OWN else list(runs)[:1]
+    return {"settings": settings, "encoder": _common(_encoder(f, runs[f]) for f in folders)}
+
+
+def _encoder(folder: Path, run: Mapping[str, Any]) -> dict[str, Any]:
+    """What is known of a run's encoder; of a user's own, its sizes alone."""
+    settings: Mapping[str, Any] = run["settings"]
+    if "latent_size" in run and not exists(folder / ENCODER):
+        return {
+            "name": settings["encoder_code"] or "an object in Python",
+            "kind": OWN,
+            "size": read_task(settings["environment"]).size,
+            "latent_size": run["latent_size"],
+            **{part: [] for part in ("encoder", "decoder")},
+            **{name: {} for name in _RECORDS},
+        }
+    encoder = load(folder / ENCODER)
     return {
-        "settings": {name: value for name, value in settings.items() if name != "seed"},
-        "encoder": {
-            "name": encoder.name,
-            "size": encoder.size,
-            **{
-                part: [[len(layer.bias), layer.activation] for layer in getattr(encoder, part)]
-                for part in ("encoder", "decoder")
-            },
-            **{name: encoder.header[name] for name in ("kind", "training", "data", "metrics")},
+        **{name: getattr(encoder, name) for name in ("name", "kind", "size", "latent_size")},
+        **{
+            part: [[len(layer.bias), layer.activation] for layer in getattr(encoder, part)]
+            for part in ("encoder", "decoder")
         },
+        **{name: encoder.header[name] for name in _RECORDS},
     }
+
+
+def _common(encoders: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """What is the same of all encoders; empty where nothing is."""
+    first, *others = encoders
+    common = {
+        name: value if all(each[name] == value for each in others) else type(value)()
+        for name, value in first.items()
+    }
+    for name in _RECORDS:
+        fields = first[name].items()
+        common[name] = {n: v for n, v in fields if all(each[name].get(n) == v for each in others)}
+    return common
 
 
 def _study(folder: Path) -> dict[str, Any]:

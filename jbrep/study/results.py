@@ -18,7 +18,7 @@ from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.study.heuristics import write_heuristics
 from jbrep.study.plan import STUDY, Plan, read_plan
-from jbrep.study.record import RECORD, as_json, learner, record
+from jbrep.study.record import RECORD, as_json, learner, record, shared_settings
 from jbrep.text import rounded, table
 
 RETURNS = "returns.csv"
@@ -116,7 +116,7 @@ def _task(run: Mapping[str, Any]) -> Task:
 def _curve(folder: Path) -> RunCurve:
     run = read_run(folder)
     task = _task(run)
-    settings = {name: value for name, value in run["settings"].items() if name != "seed"}
+    settings = shared_settings(run["settings"])
     evaluations = read_evaluations(folder)
     steps = sorted({each.step for each in evaluations})
     returns = [[e.episode_return for e in evaluations if e.step == step] for step in steps]

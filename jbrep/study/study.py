@@ -6,12 +6,15 @@ from contextlib import closing
 from dataclasses import replace
 
 from jbrep.encoders import FULL
+from jbrep.encoders.code import is_code
 from jbrep.files.lock import exclusive
+from jbrep.rl import Run
 from jbrep.rl.run import read_result
 from jbrep.rl.speed import estimate
 from jbrep.study.plan import Cell, Plan
 from jbrep.study.prepare import check, prepare
 from jbrep.study.progress import Progress, duration
+from jbrep.study.representations import ByCode
 from jbrep.study.runner import Backend
 from jbrep.study.work import CRASHED
 from jbrep.text import table
@@ -62,9 +65,7 @@ def dry_run(plan: Plan, workers: int, width: int | None = None) -> str:
     check(plan)
     unfinished = plan.unfinished
     examples = {_kind(cell): cell for cell in unfinished}
-    seconds = {  # the encoder, which need not exist yet, makes little difference
-        kind: estimate(replace(plan.run(cell), encoder=FULL)) for kind, cell in examples.items()
-    }
+    seconds = {kind: estimate(_example(plan.run(cell))) for kind, cell in examples.items()}
     rows = [(cell.name, duration(seconds[_kind(cell)])) for cell in unfinished]
     total = sum(seconds[_kind(cell)] for cell in unfinished)
     done = len(plan.cells) - len(unfinished)
@@ -76,6 +77,12 @@ def dry_run(plan: Plan, workers: int, width: int | None = None) -> str:
     return f"{table(('run', 'time'), rows, width)}\n\n{told}" if rows else told
 
 
-def _kind(cell: Cell) -> tuple[str, str]:
+def _kind(cell: Cell) -> tuple[str, str, str]:
     """What the duration of a run depends on."""
-    return cell.task, cell.learner.name
+    own = cell.representation.name if isinstance(cell.representation, ByCode) else ""
+    return cell.task, cell.learner.name, own
+
+
+def _example(run: Run) -> Run:
+    """A run that takes as long; an encoder that is no code need not exist yet, and costs little."""
+    return run if is_code(run.encoder) else replace(run, encoder=FULL)

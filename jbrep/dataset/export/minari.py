@@ -17,9 +17,11 @@ from minari.data_collector import EpisodeBuffer
 from minari.namespace import NAMESPACE_METADATA_FILENAME
 
 import jbrep.jitterbug.simulation  # noqa: F401  Minari makes the environment: load MuJoCo before
-from jbrep.dataset import Dataset
+from jbrep.dataset import Dataset, Settings
+from jbrep.dataset.schema import UNKNOWN_SEED
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import Task
+from jbrep.errors import InputError
 from jbrep.files.publish import publish_folder, unfinished
 from jbrep.files.storage import exists, write_whole
 from jbrep.progress import Progress
@@ -50,7 +52,8 @@ def _namespace(task: Task) -> str:
     """Jitterbug's tasks stand together; another's id has no version there."""
     if task.id.startswith("Jitterbug/"):
         return f"jitterbug/{task.slug}"
-    return re.sub(r"[^A-Za-z0-9_/-]+", "-", task.id)
+    name = re.sub(r"[^A-Za-z0-9_/-]+", "-", task.id)
+    return name if len(name) > 1 else f"task-{name}"  # Minari takes no single letter
 
 
 def _create(dataset: Dataset, name: str) -> None:
@@ -58,7 +61,7 @@ def _create(dataset: Dataset, name: str) -> None:
     minari.create_dataset_from_buffers(
         name,
         _episodes(dataset),
-        env=_environment(settings.task),
+        env=_environment(settings),
         observation_space=spaces.Box(-np.inf, np.inf, (settings.task.size,), np.float32),
         action_space=_actions(settings.task),
         algorithm_name=settings.policy["kind"],
@@ -72,12 +75,19 @@ def _actions(task: Task) -> spaces.Box:
     return spaces.Box(low, high, dtype=np.float32)
 
 
-def _environment(task: Task) -> EnvSpec | None:
+def _environment(settings: Settings) -> EnvSpec | None:
     """What Minari recovers the environment from: with the arguments and the time limit.
 
     None for one that was registered with a class or function: only a name can be written down.
+    None, too, for imported data of one that isn't there.
     """
-    spec = copy.deepcopy(find_spec(task.id))
+    task = settings.task
+    try:
+        spec = copy.deepcopy(find_spec(task.id))
+    except (InputError, ModuleNotFoundError):
+        if settings.is_imported:
+            return None
+        raise
     spec.kwargs.update(task.arguments)
     spec.max_episode_steps = task.max_episode_steps
     return None if callable(spec.entry_point) else spec
@@ -101,8 +111,9 @@ def _episodes(dataset: Dataset) -> Iterator[EpisodeBuffer]:
         if not len(episode):
             continue  # it diverged in its first step (format version 1): Minari refuses it
         ends, is_last = episode.record, np.arange(len(episode)) == len(episode) - 1
+        seed = int(ends["seed"])
         yield EpisodeBuffer(
-            seed=int(ends["seed"]),
+            seed=None if seed == UNKNOWN_SEED else seed,
             observations=np.append(episode["observation"], ends["final_observation"][None], axis=0),
             actions=episode["action"],
             rewards=episode["reward"].astype(np.float64),

@@ -1,0 +1,115 @@
+"""Everything that one can bring: an encoder, data, and the policy of a run to collect with.
+
+python examples/own/own.py OUT walks through it on the Jitterbug and on Pendulum, in two minutes.
+"""
+
+import os
+import shlex
+import sys
+from pathlib import Path
+
+import gymnasium
+import minari
+import numpy as np
+import torch
+from net import Net
+from torch import nn
+
+from jbrep.cli import main
+from jbrep.dataset import Dataset
+
+STUDY = """
+tasks = ["face_direction"]
+algorithms = ["a2c-modern"]
+seeds = 2
+steps = 400
+evaluate_every = 200
+evaluation_episodes = 2
+representations = [
+    "full",
+    { name = "mine", code = "net:trained" },
+    { name = "mine-onnx", file = "mine.safetensors" },
+]
+"""
+
+
+def jbrep(command: str) -> None:
+    """Run a command of jbrep's, as a shell would."""
+    print(f"\n$ jbrep {command}", flush=True)
+    main(shlex.split(command), standalone_mode=False)
+
+
+def train_elsewhere(data: Dataset) -> Net:
+    """Train a module in plain PyTorch: its latent is to tell how the robot moves next."""
+    torch.manual_seed(0)
+    before = torch.from_numpy(np.asarray(data["observation"]))
+    goes_on = torch.from_numpy(np.asarray(data["step"][1:]) > 0)
+    now, change = before[:-1][goes_on], (before[1:] - before[:-1])[goes_on]
+    net = Net(before.shape[1], 8)
+    net.mean, net.deviation = before.mean(0), before.std(0)
+    head = nn.Linear(8, before.shape[1])
+    optimizer = torch.optim.Adam([*net.parameters(), *head.parameters()], lr=3e-3)
+    target = change / change.std(0)
+    for _ in range(200):
+        optimizer.zero_grad()
+        nn.functional.mse_loss(head(net(now)), target).backward()
+        optimizer.step()
+    return net.eval()
+
+
+def encoder() -> None:
+    """A module through evaluation, study, report and recording; as a file by way of ONNX, too."""
+    jbrep("collect --task face_direction --steps 4k --out states")
+    net = train_elsewhere(Dataset("states"))
+    torch.save(net.state_dict(), "net.pt")
+    example = torch.zeros(2, len(net.mean))
+    rows = {"observation": {0: torch.export.Dim("rows")}}
+    torch.onnx.export(
+        net, (example,), "net.onnx", input_names=["observation"], dynamic_shapes=rows, verbose=False
+    )
+    jbrep("encoder import net.onnx --task face_direction --name mine-onnx --out mine.safetensors")
+    jbrep("evaluate --encoder net:trained --encoder mine.safetensors --data states")
+    Path("study.toml").write_text(STUDY)
+    jbrep("study study.toml --import net --out study")
+    run = "study/runs/face_direction/a2c-modern/mine/seed-0"
+    jbrep(f"inspect {run} --out mine.rrd")
+
+
+def data() -> None:
+    """A Minari data set comes in, an encoder goes out."""
+    os.environ["MINARI_DATASETS_PATH"] = str(Path("minari").resolve())
+    collector = minari.DataCollector(gymnasium.make("Pendulum-v1"))
+    collector.action_space.seed(0)
+    for episode in range(5):
+        collector.reset(seed=episode)
+        ended = False
+        while not ended:
+            *_, terminated, truncated, _ = collector.step(collector.action_space.sample())
+            ended = terminated or truncated
+    collector.create_dataset("pendulum/mine-v0", algorithm_name="uniform")
+    jbrep("data import pendulum/mine-v0 --out pendulum")
+    jbrep("data verify pendulum")
+    jbrep("train-encoder --kind pca --data pendulum --latent 2 --out pendulum-encoders")
+
+
+def policies() -> None:
+    """What a trained run visits, and an encoder of that; a data set that grows."""
+    jbrep("rl --task Pendulum-v1 --preset modern --set learning_rate=1e-3 --steps 1500 --out run")
+    jbrep("collect --task Pendulum-v1 --policy uniform:0.5+run:0.5 --steps 2k --out mixed")
+    jbrep("train-encoder --kind pca --data mixed --latent 2 --out mixed-encoders")
+    for steps, folder in (("20k", "grown"), ("40k", "grown"), ("40k", "at-once")):
+        jbrep(f"collect --task face_direction --steps {steps} --out {folder}")
+    for file in sorted(Path("at-once").glob("[!.]*")):
+        assert file.read_bytes() == (Path("grown") / file.name).read_bytes(), file
+    print("\nthe data set that has grown equals the one collected at once, to the byte")
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True)
+    here = str(Path(__file__).parent.resolve())
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (here, os.environ.get("PYTHONPATH"))))
+    os.chdir(folder)
+    encoder()
+    data()
+    policies()

@@ -1,0 +1,214 @@
+"""Writing a data set of episodes that were made elsewhere: one pass to see them, one to write."""
+
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from jbrep.dataset.importing.episodes import Incoming, Source
+from jbrep.dataset.manifest import Manifest, commit, new_manifest, write_manifest
+from jbrep.dataset.schema import EPISODES, Columns, episode_returns
+from jbrep.dataset.settings import IMPORTED, Settings
+from jbrep.dataset.verify import range_problems
+from jbrep.envs.description import features_of
+from jbrep.envs.make import one_line
+from jbrep.envs.task import Task
+from jbrep.errors import InputError
+from jbrep.files.publish import publish_folder, unfinished
+from jbrep.files.storage import check_space, make_folder
+from jbrep.progress import Progress
+
+_SHARD_ROWS = 20_000
+_MOST_SHARDS = 5_000
+_MOST_LETTERS = 200  # of the source, in the settings
+
+Array = NDArray[Any]
+
+
+@dataclass
+class _Survey:
+    """What all episodes are like."""
+
+    name: str
+    episodes: int = 0
+    rows: int = 0
+    longest: int = 0
+    size: int = 0
+    low: Array = field(default_factory=lambda: np.empty(0))  # of the actions, (k,)
+    high: Array = field(default_factory=lambda: np.empty(0))
+
+    def add(self, episode: Incoming) -> None:
+        low, high = episode.action.min(axis=0), episode.action.max(axis=0)
+        size = episode.observation.shape[1]
+        if not self.episodes:
+            self.size, self.low, self.high = size, low, high
+        if (size, len(low)) != (self.size, len(self.low)):
+            raise InputError(
+                f"{self.name} has {size} features and {len(low)} numbers in an action in an "
+                f"episode, but {self.size} and {len(self.low)} before: all must be alike"
+            )
+        self.low, self.high = np.minimum(self.low, low), np.maximum(self.high, high)
+        self.episodes += 1
+        self.rows += len(episode.reward)
+        self.longest = max(self.longest, len(episode.reward))
+
+
+def write(source: Source, folder: Path, task: Task | None = None) -> Manifest:
+    """Write a data set, whole or not at all.
+
+    Args:
+        source: the episodes; read twice.
+        folder: new.
+        task: that they are of; by default the one that the source names, or else one that is made
+            from the data alone.
+
+    Raises:
+        InputError: the folder exists already, there are no episodes, they don't fit the task, or
+            they can't be written.
+    """
+    make_folder(folder.parent)
+    try:
+        with unfinished(folder) as partial:
+            survey = _survey(source)
+            settings = _settings(source, survey, _fitting(source, survey, task or source.task))
+            check_space(folder.parent, survey.rows * settings.row_bytes())
+            partial.mkdir()
+            manifest = _fill(source, settings, partial)
+            publish_folder(partial, folder)
+    except OSError as error:
+        raise InputError(f"can't write {folder}: {error.strerror or error}") from error
+    return manifest
+
+
+def _survey(source: Source) -> _Survey:
+    survey = _Survey(source.name)
+    with Progress(total=source.rows, unit="step", unit_scale=True, desc="read") as progress:
+        for episode in source.episodes():
+            survey.add(episode)
+            progress.update(len(episode.reward))
+    if not survey.episodes:
+        raise InputError(
+            f"{source.name} has no episode with a step, the last one's observation being the final "
+            "one where no other is given"
+        )
+    return survey
+
+
+def _fitting(source: Source, survey: _Survey, task: Task | None) -> Task:
+    """The task with nothing of its states, or one made from the data alone."""
+    if task is None:
+        return _from_data(source, survey)
+    sizes = (survey.size, len(survey.low))
+    if sizes != (task.size, task.action_size):
+        raise InputError(
+            f"{source.name} has {sizes[0]} features and {sizes[1]} numbers in an action, but "
+            f"{task.name} has {task.size} and {task.action_size}: give the task that it is of"
+        )
+    if survey.longest > task.max_episode_steps:
+        raise InputError(
+            f"{source.name} has an episode of {survey.longest:,} steps, but {task.name} has at "
+            f"most {task.max_episode_steps:,}: give --episode-steps {survey.longest}"
+        )
+    return replace(task, state={}, constants={})
+
+
+def _from_data(source: Source, survey: _Survey) -> Task:
+    box = spaces.Box(-np.inf, np.inf, (survey.size,))
+    low, high = _action_bounds(source, survey)
+    if source.features and len(source.features) != survey.size:
+        raise InputError(
+            f"{source.name} has {survey.size} features, and names of {len(source.features)}: they "
+            "must be as many"
+        )
+    try:
+        return Task(
+            id=source.label,
+            name=source.label,
+            features=source.features or tuple(features_of(source.label, box)),
+            action_low=tuple(low.tolist()),
+            action_high=tuple(high.tolist()),
+            max_episode_steps=max(survey.longest, source.max_episode_steps or 0),
+            reproducible=False,
+        )
+    except ValueError as error:
+        raise InputError(f"{source.name} makes no task: {one_line(error)}") from None
+
+
+def _action_bounds(source: Source, survey: _Survey) -> tuple[Array, Array]:
+    """Those given; the extrema of the data where there are none, which a constant is amid."""
+    constant = survey.low == survey.high
+    low = np.where(constant, survey.low - 1, survey.low).astype(np.float64)
+    high = np.where(constant, survey.high + 1, survey.high).astype(np.float64)
+    if source.action_bounds is None:
+        return low, high
+    given = [np.asarray(bounds, np.float32).astype(np.float64) for bounds in source.action_bounds]
+    return np.where(np.isfinite(given[0]), given[0], low), np.where(
+        np.isfinite(given[1]), given[1], high
+    )
+
+
+def _settings(source: Source, survey: _Survey, task: Task) -> Settings:
+    rows = max(_SHARD_ROWS, survey.rows // _MOST_SHARDS)
+    name = "".join(c if c.isprintable() else "?" for c in source.name)
+    return Settings(
+        task=task,
+        policy={"kind": IMPORTED, "source": name[-_MOST_LETTERS:]},
+        steps=survey.rows,
+        shard_episodes=max(1, rows * survey.episodes // survey.rows),
+    )
+
+
+def _fill(source: Source, settings: Settings, folder: Path) -> Manifest:
+    manifest = new_manifest(settings)
+    write_manifest(folder, manifest)
+    episodes = source.episodes()
+    with Progress(total=settings.steps, unit="step", unit_scale=True, desc="write") as progress:
+        while some := list(islice(episodes, settings.shard_episodes)):
+            columns = _columns(settings.task, some, manifest.episodes)
+            for problem in range_problems(settings.task, columns):
+                raise InputError(
+                    f"{source.name} doesn't fit {settings.task.name}: {problem}; correct the data, "
+                    "or give the task that they are of"
+                )
+            manifest = commit(folder, manifest, columns)
+            progress.update(len(columns["step"]))
+    if manifest.rows != settings.steps:
+        raise InputError(f"{source.name} changed while it was imported: try again")
+    return manifest
+
+
+def _columns(task: Task, episodes: list[Incoming], first: int) -> Columns:
+    """The columns of a shard, in the order of the schema."""
+    lengths = np.array([len(episode.reward) for episode in episodes], "<i4")
+    numbers = np.arange(first, first + len(episodes), dtype="<i4")
+    terminated = np.array([episode.terminated for episode in episodes], "|u1")
+    reward = np.concatenate([episode.reward for episode in episodes])
+    once = {
+        "episode": numbers,
+        "seed": np.array([episode.seed for episode in episodes], "<i8"),
+        "length": lengths,
+        "return": episode_returns(reward, lengths),
+        "terminated": terminated,
+        "truncated": 1 - terminated,
+        "final_observation": np.stack([episode.final for episode in episodes]),
+    }
+    return {
+        "observation": np.concatenate([episode.observation for episode in episodes]),
+        "action": _bounded(task, np.concatenate([episode.action for episode in episodes])),
+        "reward": reward,
+        "episode": np.repeat(numbers, lengths),
+        "step": np.concatenate([np.arange(length, dtype="<i4") for length in lengths]),
+        **{EPISODES + name: values for name, values in once.items()},
+    }
+
+
+def _bounded(task: Task, action: Array) -> Array:
+    """Actions that only rounding to 32 bits took beyond a bound, on that bound."""
+    low, high = (np.array(ends, np.float32) for ends in (task.action_low, task.action_high))
+    inside = np.clip(action, low, high)
+    rounded = np.abs(action - inside) <= np.spacing(np.abs(action))
+    return np.where(rounded, inside, action)

@@ -1,0 +1,494 @@
+"""Data that were made elsewhere become data sets like any other, or are refused in a line."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import warnings
+import zipfile
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from command import jbrep
+
+from jbrep.collect.repair import repair
+from jbrep.collect.replay import replay_problems
+from jbrep.dataset import Dataset
+from jbrep.dataset.card import card
+from jbrep.dataset.export import export
+from jbrep.dataset.importing import open_source, write
+from jbrep.dataset.manifest import shard_name
+from jbrep.dataset.verify import find_problems
+from jbrep.envs import describe
+from jbrep.envs.task import check_same
+from jbrep.errors import InputError
+from jbrep.evaluate.evaluation import seen
+from jbrep.rollouts.rollout import replay
+
+
+def import_data(given, folder, task=None):
+    """What `jbrep data import` does; why the task is made from the data alone, if it is."""
+    source = open_source(given)
+    write(source, folder, task)
+    return source.why_no_task
+
+
+PENDULUM = "Pendulum-v1"
+LENGTHS = (7, 1, 12)  # the middle one is terminated, the last one still going on
+
+
+def arrays(sizes=(3, 1), lengths=LENGTHS):
+    """Steps of episodes one after the other, and what follows each."""
+    random, rows = np.random.default_rng(0), sum(lengths)
+    ends = np.cumsum(lengths) - 1
+    observation = random.normal(size=(rows + len(lengths), sizes[0])).astype(np.float32)
+    finals = ends + 1 + np.arange(len(lengths))
+    return {
+        "observations": np.delete(observation, finals, axis=0),
+        "actions": random.uniform(-2, 2, (rows, sizes[1])).astype(np.float32),
+        "rewards": random.normal(size=rows).astype(np.float32),
+        "terminations": np.arange(rows) == ends[1],
+        "truncations": np.arange(rows) == ends[0],
+        "final_observations": observation[finals],
+    }
+
+
+def same(dataset, given, lengths=LENGTHS):
+    """Check that a data set holds the arrays, and verifies."""
+    for column, name in (("observation", "observations"), ("action", "actions")):
+        np.testing.assert_array_equal(dataset[column], given[name])
+    np.testing.assert_array_equal(dataset["reward"], given["rewards"])
+    np.testing.assert_array_equal(dataset["episode"], np.repeat(range(len(lengths)), lengths))
+    assert dataset.episodes["length"].tolist() == list(lengths)
+    np.testing.assert_array_equal(
+        dataset.episodes["final_observation"], given["final_observations"]
+    )
+    assert not list(find_problems(dataset.folder))
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("import") / "written"
+    return Dataset.write(folder, **arrays(), seeds=[5, -1, 2**62], source="pushes of a pole, 2019")
+
+
+def test_arrays_become_a_data_set(written):
+    same(written, arrays())
+    assert written.episodes["terminated"].tolist() == [0, 1, 0]
+    assert written.episodes["truncated"].tolist() == [1, 0, 1]
+    assert written.episodes["seed"].tolist() == [5, -1, 2**62]
+    task, settings = written.task, written.manifest.settings
+    assert task.id == task.name == "pushes-of-a-pole--2019"
+    assert task.feature_names == ("obs_0", "obs_1", "obs_2")
+    assert (task.action_low[0], task.action_high[0]) == (
+        arrays()["actions"].min(),
+        arrays()["actions"].max(),
+    )
+    assert (task.max_episode_steps, task.reproducible) == (12, False)
+    assert settings.policy == {"kind": "imported", "source": "pushes of a pole, 2019"}
+    assert "no episode can be simulated again" in card(written)
+
+
+def test_a_list_of_episodes_gives_the_same(written, tmp_path):
+    given, ends = arrays(), np.cumsum(LENGTHS)[:-1]
+    finals = given.pop("final_observations")
+    listed = {name: np.split(values, ends) for name, values in given.items()}
+    listed["observations"] = [
+        np.append(rows, final[None], axis=0)
+        for rows, final in zip(listed["observations"], finals, strict=True)
+    ]
+    again = Dataset.write(tmp_path / "listed", **listed)
+    names = [name for name in again.columns if name != "seed"]
+    for name in names:
+        np.testing.assert_array_equal(again[name], written[name])
+    np.testing.assert_array_equal(again.episodes["terminated"], written.episodes["terminated"])
+
+
+def test_without_the_final_observation_the_last_step_is_left_out(tmp_path):
+    given = arrays()
+    del given["final_observations"]
+    dataset = Dataset.write(tmp_path / "data", **given)
+    assert dataset.episodes["length"].tolist() == [6, 11]  # nothing is left of the one of a step
+    np.testing.assert_array_equal(
+        dataset.episodes["final_observation"], given["observations"][[6, 19]]
+    )
+    assert dataset.episodes["terminated"].tolist() == [0, 0]
+    assert not list(find_problems(dataset.folder))
+
+
+def test_a_described_task_brings_its_names_and_bounds(tmp_path):
+    dataset = Dataset.write(tmp_path / "data", **arrays(), task=PENDULUM)
+    assert dataset.task == describe(PENDULUM)
+    alone = Dataset.write(tmp_path / "alone", **arrays(), source=PENDULUM)
+    check_same(describe(PENDULUM), alone.task, "an encoder")  # so it works there
+
+
+def test_shards_are_of_the_usual_size_and_hold_many_chunks(tmp_path):
+    lengths = (999, 500, 1500) * 20
+    given = arrays(lengths=lengths)
+    ends = np.cumsum(lengths) - 1
+    given["truncations"] = np.isin(np.arange(sum(lengths)), ends)
+    given["terminations"] = np.zeros(sum(lengths), bool)
+    dataset = Dataset.write(tmp_path / "data", **given)
+    same(dataset, given, lengths)
+    assert [entry.episodes for entry in dataset.manifest.shards] == [20, 20, 20]
+
+
+def table(dataset):
+    """Columns, and what is known once for each episode, that an export keeps."""
+    once = ("length", "seed", "return", "terminated", "truncated", "final_observation")
+    columns = {n: np.asarray(dataset[n]) for n in ("observation", "action", "reward", "step")}
+    return columns | {name: dataset.episodes[name] for name in once}
+
+
+@pytest.mark.parametrize("to", ["npz", "parquet", "minari"])
+def test_what_is_exported_comes_back(to, collected, tmp_path):
+    dataset = Dataset(collected)
+    out = tmp_path / (f"data.{to}" if to != "minari" else "minari")
+    export(dataset, to, out)
+    given = out / "jitterbug/face_direction/uniform-v0" if to == "minari" else out
+    task = dataset.task if to == "npz" else None  # the others name their own
+    import_data(str(given), tmp_path / "back", task)
+    back = Dataset(tmp_path / "back")
+    for name, values in table(dataset).items():
+        np.testing.assert_array_equal(table(back)[name], values, err_msg=name)
+    assert back.task == replace(dataset.task, state={}, constants={})
+    assert not list(find_problems(back.folder))
+
+
+def test_seeds_that_are_not_known_stay_so(written, tmp_path):
+    export(written, "minari", tmp_path)
+    import_data(str(tmp_path / written.task.slug / "imported-v0"), tmp_path / "back")
+    back = Dataset(tmp_path / "back")
+    same(back, arrays())
+    assert back.episodes["seed"].tolist() == [5, -1, 2**62]
+
+
+def d4rl(path, **changes):
+    given = arrays()
+    following = np.append(given["observations"][1:], given["observations"][:1], axis=0)
+    following[np.cumsum(LENGTHS) - 1] = given.pop("final_observations")
+    names = {"terminations": "terminals", "truncations": "timeouts"}
+    given = {names.get(name, name): values for name, values in given.items()}
+    given |= {"next_observations": following, "infos/qpos": np.zeros((20, 4))}
+    given["observations"] = np.asfortranarray(given["observations"])
+    np.savez_compressed(path, **{**given, **changes})
+
+
+def test_an_npz_file_as_d4rl_names_its_arrays(tmp_path):
+    d4rl(tmp_path / "hopper.npz")
+    import_data(str(tmp_path / "hopper.npz"), tmp_path / "data")
+    dataset = Dataset(tmp_path / "data")
+    same(dataset, arrays())
+    assert dataset.task.id == "hopper"
+
+
+def plain_table(path, **changes):
+    given = arrays()
+    columns = {f"joint {i}": given["observations"][:, i] for i in range(3)}
+    columns |= {"action_0": given["actions"][:, 0], "reward": given["rewards"].astype(float)}
+    columns |= {"episode": np.repeat([4, 2, 9], LENGTHS)}
+    columns |= {"step": np.concatenate([np.arange(length) for length in LENGTHS])}
+    pq.write_table(pa.table({**columns, **changes}), path)
+
+
+def test_a_table_with_columns_of_features(tmp_path):
+    plain_table(tmp_path / "a.parquet")
+    import_data(str(tmp_path / "a.parquet"), tmp_path / "data")
+    dataset = Dataset(tmp_path / "data")
+    assert dataset.task.feature_names == ("joint_0", "joint_1", "joint_2")
+    np.testing.assert_array_equal(dataset["joint_1"][:6], arrays()["observations"][:6, 1])
+    assert dataset.episodes["length"].tolist() == [6, 11]
+
+
+@pytest.fixture(scope="module")
+def minari_folder(tmp_path_factory):
+    """Two data sets in Minari's folder: one of an environment that is here, one of another."""
+    import minari
+    from gymnasium import spaces
+    from minari.data_collector import EpisodeBuffer
+
+    root = tmp_path_factory.mktemp("minari")
+    given = arrays()
+    rows = np.append(given["observations"], given["final_observations"][-1:], axis=0)
+    position, rest = rows[:, :1], rows[:, 1:]
+    buffers = [
+        EpisodeBuffer(
+            observations={"position": position[8:], "rest": rest[8:]},
+            actions=given["actions"][8:],
+            rewards=list(given["rewards"][8:]),
+            terminations=[False] * 12,
+            truncations=[False] * 11 + [True],
+            infos={},
+        )
+    ]
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on the missing author and address
+        patch.setenv("MINARI_DATASETS_PATH", str(root))
+        minari.create_dataset_from_buffers(
+            "cart/push-v0",
+            buffers,
+            observation_space=spaces.Dict(
+                {
+                    "position": spaces.Box(-np.inf, np.inf, (1,)),
+                    "rest": spaces.Box(-np.inf, np.inf, (2,)),
+                }
+            ),
+            action_space=spaces.Box(-np.inf, 3, (1,)),
+        )
+    return root
+
+
+def test_a_minari_data_set_by_its_id(minari_folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(minari_folder))
+    assert import_data("cart/push-v0", tmp_path / "data") == "it names no environment"
+    dataset, given = Dataset(tmp_path / "data"), arrays()
+    np.testing.assert_array_equal(dataset["observation"], given["observations"][8:])
+    assert dataset.task.feature_names == ("position", "rest_0", "rest_1")
+    assert dataset.task.id == "Minari-cart-push-v0"
+    assert dataset.task.action_low == (given["actions"][8:].min(),)
+    assert dataset.task.action_high == (3,)
+    with pytest.raises(InputError, match=r"no Minari data set: .* where there are cart/push-v0"):
+        import_data("cart/pull-v0", tmp_path / "other")
+
+
+def minari_copy(minari_folder, tmp_path, **changes):
+    """A copy of the data set with other metadata."""
+    folder = shutil.copytree(minari_folder / "cart/push-v0", tmp_path / "copy")
+    path = folder / "data/metadata.json"
+    metadata = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({n: v for n, v in metadata.items() if v is not None}))
+    return str(folder)
+
+
+def test_an_environment_that_is_not_here_gives_the_task_its_id(minari_folder, tmp_path):
+    spec = {"id": "Carts/Cart-v3", "kwargs": {}, "max_episode_steps": 500}
+    folder = minari_copy(minari_folder, tmp_path, env_spec=json.dumps(spec))
+    assert "unknown task 'Carts/Cart-v3'" in import_data(folder, tmp_path / "data")
+    assert Dataset(tmp_path / "data").task.id == "Carts/Cart-v3"
+    assert Dataset(tmp_path / "data").task.max_episode_steps == 500
+
+
+@pytest.mark.parametrize(
+    ("env_id", "expected"),
+    [(PENDULUM, PENDULUM), ("MountainCarContinuous-v0", "Minari-cart-push-v0")],
+)
+def test_an_environment_that_is_here_is_described_if_it_fits(
+    env_id, expected, minari_folder, tmp_path
+):
+    spec = {"id": env_id, "kwargs": {}, "max_episode_steps": 50}
+    folder = minari_copy(minari_folder, tmp_path, env_spec=json.dumps(spec))
+    why_no_task = import_data(folder, tmp_path / "data")
+    task = Dataset(tmp_path / "data").task
+    assert (task.id, task.max_episode_steps) == (expected, 50)
+    if env_id == PENDULUM:
+        assert task == describe(PENDULUM, max_episode_steps=50)
+    else:
+        assert why_no_task == f"{env_id} has other sizes"
+
+
+def test_no_code_that_a_minari_data_set_names_is_run(minari_folder, tmp_path, monkeypatch):
+    """Minari makes the environment from its entry point where a space is missing."""
+    (tmp_path / "evil.py").write_text("open('ran', 'w')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    spec = {"id": "Evil-v0", "entry_point": "evil:Env", "kwargs": {}, "max_episode_steps": 5}
+    changes = {"env_spec": json.dumps(spec), "observation_space": None}
+    with pytest.raises(InputError, match=r"metadata.json can't be read: KeyError"):
+        import_data(minari_copy(minari_folder, tmp_path, **changes), tmp_path / "data")
+    assert not (tmp_path / "ran").exists()
+
+
+def wrong(**changes):
+    return {**arrays(), **changes}
+
+
+def spoiled(name, place, value):
+    values = arrays()[name]
+    values[place] = value
+    return {name: values}
+
+
+BAD_ARRAYS = {
+    "observation that isn't finite, or beyond 32 bits, at step 3": spoiled(
+        "observations", 3, np.nan
+    ),
+    "action that isn't finite": {"actions": arrays()["actions"] + np.inf},
+    "reward that isn't finite": {"rewards": np.full(20, 1e39)},
+    "20 rows of observations, and 19 of actions": {"actions": arrays()["actions"][1:]},
+    "no actions": {"actions": None},
+    "has 4 features and 1 numbers in an action, but Pendulum-v1 has 3 and 1": {
+        "observations": np.zeros((20, 4)),
+        "final_observations": np.zeros((3, 4)),
+    },
+    "action 0 ranges from -1.* to 2.5, beyond [-2, 2]": spoiled("actions", 2, 2.5),
+    "images, observations of shape (64, 64, 3)": {"observations": np.zeros((20, 64, 64, 3))},
+    "observations of type object": {"observations": [{"a": 1}] * 20},
+    "observations of different sizes": {"observations": [[1, 2, 3]] * 19 + [[1, 2]]},
+    "actions of type int64": {"actions": np.zeros((20, 1), int)},
+    "no episode with a step": {n: v[:0] for n, v in arrays().items()},
+    "final_observation for 2 episodes": {"final_observations": arrays()["final_observations"][:2]},
+    "seeds of type float64": {"seeds": [1, 2, np.nan]},
+    "rewards of shape (3,)": {"rewards": np.zeros((20, 3))},
+    "has an episode of 300 steps, but Pendulum-v1 has at most 200": arrays(lengths=(1, 1, 300)),
+}
+
+
+@pytest.mark.parametrize("problem", BAD_ARRAYS)
+def test_bad_arrays_are_refused_and_nothing_is_left(problem, tmp_path):
+    pattern = re.escape(problem).replace(r"\.\*", ".*")
+    with pytest.raises(InputError, match=pattern) as caught:
+        Dataset.write(tmp_path / "data", **wrong(**BAD_ARRAYS[problem]), task=PENDULUM)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def gap(name):
+    values = {"episode": np.repeat([4, 2, 9], LENGTHS)}
+    values["step"] = np.concatenate([np.arange(length) for length in LENGTHS])
+    return values[name]
+
+
+BAD_TABLES = {
+    "episode 9 has step 6 where step 5 was expected": {"step": gap("step") + (np.arange(20) > 12)},
+    "episode 4 goes on after its end, or comes in two parts": {
+        "episode": np.where(np.arange(20) > 14, 4, gap("episode"))
+    },
+    "has string in the column 'joint 0'": {"joint 0": ["a"] * 20},
+    "empty cells in the column 'step'": {"step": [None, *range(19)]},
+    "has no rewards": {"reward": None},
+}
+
+
+@pytest.mark.parametrize("problem", BAD_TABLES)
+def test_bad_tables_are_refused(problem, tmp_path):
+    path, changes = tmp_path / "a.parquet", BAD_TABLES[problem]
+    plain_table(path)
+    given = pq.read_table(path).to_pydict() | changes
+    pq.write_table(pa.table({n: v for n, v in given.items() if v is not None}), path)
+    with pytest.raises(InputError, match=re.escape(problem)):
+        import_data(str(path), tmp_path / "data")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+class Evil:
+    def __reduce__(self):
+        return os.mkdir, ("ran",)
+
+
+def test_nothing_in_an_npz_file_is_unpickled(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    objects = np.array([Evil()] * 20, object)
+    for name in ("rewards", "seeds", "infos"):
+        d4rl("bad.npz", **{name: objects})
+        with pytest.raises(InputError, match=f"objects in {name}, which would have to"):
+            import_data("bad.npz", tmp_path / "data")
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.npz"]
+
+
+def test_a_gap_between_an_observation_and_the_next_is_noticed(tmp_path):
+    d4rl(tmp_path / "a.npz", observations=np.roll(arrays()["observations"], 1, axis=1))
+    with pytest.raises(InputError, match="episode 0 has a gap after step 0: the observation after"):
+        import_data(str(tmp_path / "a.npz"), tmp_path / "data")
+
+
+def test_files_that_are_no_data_are_refused(tmp_path, minari_folder):
+    for name in ("a.npz", "a.parquet", "a.hdf5"):
+        (tmp_path / name).write_bytes(b"nonsense" * 50)
+    with zipfile.ZipFile(tmp_path / "cut.npz", "w") as archive:
+        for name in ("observations", "actions", "rewards", "terminals"):
+            archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00")
+    d4rl(tmp_path / "bits.npz")
+    content = bytearray((tmp_path / "bits.npz").read_bytes())
+    content[200:220] = bytes(20)
+    (tmp_path / "bits.npz").write_bytes(content)
+    d4rl(tmp_path / "names.npz", feature_names=["one"])
+    shutil.copytree(minari_folder / "cart/push-v0", tmp_path / "spoiled")
+    (tmp_path / "spoiled/data/main_data.hdf5").write_bytes(b"nonsense")
+    for name, problem in {
+        "a.npz": "can't be read as an npz file",
+        "a.parquet": "can't be read as a Parquet file",
+        "a.hdf5": "unknown format '.hdf5': choose one of npz, parquet",
+        "no.npz": "there is no file",
+        "cut.npz": "has no array in observations.npy",
+        "bits.npz": "is damaged: observations has other bytes|has no array in observations",
+        "names.npz": "has 3 features, and names of 1",
+        "spoiled": "can't be read as a Minari data set",
+    }.items():
+        with pytest.raises(InputError, match=problem) as caught:
+            import_data(str(tmp_path / name), tmp_path / "data")
+        assert "\n" not in str(caught.value)
+    assert not (tmp_path / "data").exists()
+
+
+def test_it_replaces_nothing(written):
+    before = (written.folder / "manifest.json").read_bytes()
+    with pytest.raises(InputError, match="written exists already: choose another name"):
+        Dataset.write(written.folder, **arrays())
+    assert (written.folder / "manifest.json").read_bytes() == before
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from jbrep.dataset.importing import open_source, writer
+def die(*arguments):
+    os.kill(os.getpid(), 9)
+writer.publish_folder = die
+writer.write(open_source(sys.argv[1]), Path(sys.argv[2]))
+"""
+
+
+def test_a_killed_import_is_done_again_by_the_same_command(tmp_path):
+    d4rl(tmp_path / "a.npz")
+    command = [sys.executable, "-c", KILLED, tmp_path / "a.npz", tmp_path / "data"]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    assert not (tmp_path / "data").exists()
+    import_data(str(tmp_path / "a.npz"), tmp_path / "data")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "data"]
+
+
+def test_damage_is_noticed_and_nothing_is_simulated_again(written, tmp_path):
+    folder = shutil.copytree(written.folder, tmp_path / "copy")
+    with pytest.raises(InputError, match=r"copy was imported.*: .* import that again in another"):
+        list(replay_problems(Dataset(folder), 1))
+    path = folder / shard_name(0)
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    assert len(list(find_problems(folder))) == 1
+    with pytest.raises(InputError, match=r"was imported; import its source, pushes of a"):
+        list(repair(folder))
+
+
+def test_it_is_shown_as_stored(written):
+    rollout = replay(written, 2)
+    assert (len(rollout), rollout.motion) == (12, None)
+    assert "episode 2 is shown without the robot" in rollout.note
+    assert "was imported, its episodes can't be simulated again" in rollout.note
+
+
+def test_whether_an_encoder_saw_imported_rows_is_not_known(written):
+    """The seed, which tells data sets apart that were collected, says nothing of them."""
+    trained = {"fingerprint": "", "policy": {"kind": "uniform"}, "seed": 5}
+    encoder = SimpleNamespace(header={"data": trained})
+    assert seen(encoder, SimpleNamespace(dataset=written)) == "maybe"
+
+
+def test_the_command(tmp_path):
+    d4rl(tmp_path / "pole.npz")
+    out = tmp_path / "data"
+    done = jbrep("data", "import", tmp_path / "pole.npz", "--task", PENDULUM, "--out", out)
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert done.stdout == f"3 episodes of {PENDULUM}, 20 rows, 0.0 MB in {out}\n"
+    done = jbrep("data", "import", tmp_path / "pole.npz", "--out", tmp_path / "alone")
+    assert done.stderr == "pole is made from the data alone: it names no environment\n"
+    done = jbrep("data", "import", tmp_path / "pole.npz", "--out", out)
+    assert done.exit_code == 2
+    assert done.stderr == f"Error: {out} exists already: choose another name\n"

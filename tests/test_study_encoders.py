@@ -1,0 +1,317 @@
+"""Users' own encoders in studies and runs: files, code and objects."""
+
+import dataclasses
+import json
+import shutil
+import tomllib
+
+import pytest
+from command import jbrep
+from my_encoders import LATENT, SIZE, FirstFeatures
+
+from jbrep.encoders import find, load, save
+from jbrep.envs import describe
+from jbrep.envs.names import import_modules
+from jbrep.errors import InputError
+from jbrep.figures.diagrams import autoencoders
+from jbrep.figures.style import styles
+from jbrep.report.facts import encoder_rows, outline, reproduce
+from jbrep.report.tables import read_tables
+from jbrep.rl import Run, StoppedError, train
+from jbrep.rl.files import ENCODER, read_run
+from jbrep.rl.policy import load_run
+from jbrep.study.config import Data, Study, as_study
+from jbrep.study.plan import Plan, read_plan
+from jbrep.study.prepare import prepare
+from jbrep.study.record import EACH_ITS_OWN, RECORD
+from jbrep.study.results import conclude, read_results
+from jbrep.study.study import dry_run, run_study
+from jbrep.study.work import work
+
+TASK = "face_direction"
+NET = "my_encoders:Net"
+SHARED = {
+    "task": describe(TASK, {}, 50),
+    "algorithm": "a2c",
+    "steps": 80,
+    "evaluate_every": 80,
+    "evaluation_episodes": 1,
+}
+TINY = Study(
+    tasks=(TASK,),
+    algorithms=("a2c",),
+    representations=("full",),
+    seeds=(0, 1),
+    steps=80,
+    evaluate_every=80,
+    evaluation_episodes=1,
+    episode_steps=50,
+)
+
+
+def with_own(*own, **changes):
+    """The tiny study with other encoders beside the whole observation."""
+    return dataclasses.replace(TINY, representations=("full", *own), **changes)
+
+
+def in_this_process(plan, cells, workers):
+    """A backend that needs no start."""
+    for cell in cells:
+        yield work(cell.name, plan.run(cell), plan.folder_of(cell))
+
+
+def put(name, path):
+    """Keep a shipped encoder as a file of the user's."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save(find(name, TASK), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """A working directory with the user's encoders."""
+    import_modules(["my_encoders"])
+    folder = tmp_path_factory.mktemp("home")
+    for seed, name in enumerate(("pca-8", "random-8")):
+        put(name, folder / "encoders" / TASK / f"mine-{seed}.safetensors")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def at_home(home, monkeypatch):
+    monkeypatch.chdir(home)
+
+
+PATTERN = {"name": "mine", "file": "encoders/{task}/mine-{seed}.safetensors"}
+CODE = {"name": "net", "code": NET}
+
+
+@pytest.fixture(scope="module")
+def done(home):
+    """A study of a file for each seed and of code, finished, with its report."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(home)
+        patch.setattr("jbrep.study.heuristics._EPISODES", 1)
+        plan = Plan(with_own(PATTERN, CODE), home / "done")
+        assert run_study(plan, in_this_process, 1) == 0
+        conclude(plan.folder)
+    return plan
+
+
+def test_each_run_has_its_encoder(done):
+    for cell in done.cells:
+        folder, name = done.folder_of(cell), cell.representation.name
+        settings = read_run(folder)["settings"]
+        assert settings["representation"] == name
+        assert settings["encoder_seed"] == (cell.seed if name == "mine" else None)
+        assert settings["encoder_code"] == (NET if name == "net" else None)
+        assert (folder / ENCODER).exists() == (name != "net")
+        if name == "mine":
+            assert load(folder / ENCODER).name == ("pca-8", "random-8")[cell.seed]
+            assert load_run(folder).representation == "mine"
+
+
+def test_runs_with_an_encoder_each_stand_under_one_label(done):
+    results = read_results(done.folder)
+    assert not results.left_out
+    (group,) = results.analysis.groups
+    assert [(label.representation, label.seeds) for label in group.labels] == [
+        ("full", (0, 1)),
+        ("mine", (0, 1)),
+        ("net", (0, 1)),
+    ]
+    record = json.loads((done.folder / RECORD).read_text())
+    mine, net = (record["labels"][f"{TASK}/a2c/{name}"] for name in ("mine", "net"))
+    assert mine["settings"]["encoder"] == EACH_ITS_OWN
+    assert (mine["encoder"]["latent_size"], mine["encoder"]["metrics"]) == (8, {})
+    assert (net["encoder"]["name"], net["encoder"]["latent_size"]) == (NET, LATENT)
+    assert len({run["encoder"] for run in record["runs"] if run["label"].endswith("mine")}) == 2
+
+
+def test_different_encoders_under_one_label_are_refused_otherwise(done, tmp_path):
+    shutil.copytree(done.folder / "runs", tmp_path / "runs")
+    for path in tmp_path.rglob("mine/*/run.json"):
+        run = json.loads(path.read_text())
+        del run["settings"]["encoder_seed"]
+        path.write_text(json.dumps(run))
+    results = read_results(tmp_path)
+    assert results.analysis is None
+    assert "mixes the settings" in results.left_out[0]
+
+
+def test_the_report_tells_of_own_encoders(done):
+    tables = read_tables(done.folder)
+    assert outline(tables).endswith(f"With mine {EACH_ITS_OWN}.")
+    rows = {row[0].rpartition("/")[2]: row[1:] for row in encoder_rows(tables)}
+    assert rows["mine"][-1] == EACH_ITS_OWN
+    assert rows["net"][:4] == (NET, f"{SIZE} - {LATENT}", "-", "-")
+    toml, command = (code for _, code in reproduce(tables)[1:3])
+    assert as_study(tomllib.loads(toml)) == done.study
+    assert command == "jbrep study study.toml --out done --import my_encoders"
+    assert read_plan(done.folder).study == done.study
+
+
+def test_a_file_that_changes_is_refused_once_its_run_has_ended(done, home):
+    path = home / "encoders" / TASK / "mine-1.safetensors"
+    before = path.read_bytes()
+    try:
+        put("pca-4", path)
+        with pytest.raises(InputError, match=r"mine/seed-1 holds another run: encoder ") as error:
+            run_study(done, None, 1)
+        assert "\n" not in str(error.value)
+    finally:
+        path.write_bytes(before)
+    assert run_study(done, None, 1) == 0  # nothing is left to run
+
+
+@pytest.mark.parametrize(
+    ("file", "expected"),
+    [
+        ("one.safetensors", "one.safetensors"),
+        ({"Hopper-v5": "no.safetensors", TASK: "one.safetensors"}, "one.safetensors"),
+        ("folder", f"folder/{TASK}/mine.safetensors"),
+        ("for-all", "for-all/mine.safetensors"),
+        (
+            "{task}/{seed}.safetensors",
+            f"{TASK}/1.safetensors",
+        ),
+    ],
+)
+def test_where_a_file_is(file, expected, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    put("pca-8", tmp_path / expected)
+    study = with_own({"name": "mine", "file": file}, seeds=(1,))
+    run = Plan(study, tmp_path / "it").run(Plan(study, tmp_path / "it").cells[1])
+    assert run.encoder == str(tmp_path / expected)
+    assert run.encoder_seed == (1 if "{seed}" in str(file) else None)
+    run.check()
+
+
+def test_own_files_beside_those_that_the_study_trains(tmp_path):
+    study = with_own("pca-4", PATTERN, data=Data(steps=200))
+    plan = Plan(study, tmp_path / "it")
+    prepare(plan)
+    assert {path.stem for path in plan.folder.rglob("*.safetensors")} == {"identity", "pca-4"}
+    names = {find(plan.run(cell).encoder, TASK).name for cell in plan.cells}
+    assert names == {"identity", "pca-4", "pca-8", "random-8"}
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        (
+            {"name": "m", "file": "encoders/{task}/m-{seed}.safetensors"},
+            rf"run {TASK}/a2c/m/seed-0 can't start: its encoder .*/{TASK}/m-0.safetensors is miss",
+        ),
+        ({"name": "m", "file": "my.txt"}, "can't start: .*my.txt is .*encoder"),
+        ({"name": "m", "file": {"Hopper-v5": "a"}}, f"representation m has no file for {TASK}"),
+        ({"name": "m", "file": "pose.safetensors"}, f"made for move_to_pose, not for {TASK}"),
+        ({"name": "m", "code": "other:Net"}, "importing other runs it; .* add --import other"),
+        ({"name": "m", "code": "my_encoders:Nat"}, "can't make the encoder my_encoders:Nat"),
+        ({"name": "m", "code": "my_encoders:Unseeded"}, "makes another encoder each time"),
+    ],
+)
+def test_own_encoders_are_checked_before_the_first_run(own, message, home, tmp_path):
+    (home / "my.txt").write_text("no encoder")
+    save(find("pca-8", "move_to_pose"), home / "pose.safetensors")
+    with pytest.raises(InputError, match=message) as error:
+        run_study(Plan(with_own(own), tmp_path / "it"), None, 1)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "it").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ([{"name": "a", "file": "x"}, "full", {"name": "a", "file": "y"}], "each once"),
+        ([{"name": "dae-8", "file": "x"}, "dae-8"], "each once"),
+        ([7], r"representations is \[7\]: it must be a list of str and dict"),
+        *(([{"name": n, "file": "x"}], "name is") for n in ("full", "..", "a/b", "", 7, [])),
+        ([{"file": "x"}], "name is None: it must be of letters, digits"),
+        *(
+            ([{"name": "a", **rest}], "a must have a name and either file or code, not more")
+            for rest in ({}, {"file": "x", "code": NET}, {"file": "x", "kind": "dae"})
+        ),
+        *(([{"name": "a", "file": file}], "its file is") for file in (7, "", {TASK: 7})),
+        ([{"name": "a", "file": "{sed}"}], r"unknown \{sed\} in its file"),
+        *(([{"name": "a", "code": code}], "its code is") for code in ("Net", 7)),
+    ],
+)
+def test_a_mistaken_representation_is_refused(given, message):
+    with pytest.raises(InputError, match=message) as error:
+        as_study({**dataclasses.asdict(TINY), **TINY_LISTS, "representations": given})
+    assert "\n" not in str(error.value)
+
+
+TINY_LISTS = {
+    "tasks": [TASK],
+    "algorithms": ["a2c"],
+    "seeds": 2,
+    "environment": {},
+    "data": {"steps": 9},
+}
+
+
+def test_a_worker_imports_the_modules_it_is_told_to(done, tmp_path, monkeypatch):
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    run = done.run(done.cells[2])
+    assert run.encoder == NET
+    assert "add --import my_encoders" in work("net", run, tmp_path).message
+    assert work("net", run, tmp_path, modules=["my_encoders"]).status == "finished"
+
+
+def test_a_drawing_of_an_encoder_without_decoder_ends_with_the_latent():
+    encoder = {"size": 3, "encoder": [(2, "tanh")], "decoder": [], "training": {}}
+    (axes,) = autoencoders(TASK, {"mine": encoder}, lambda: styles(["mine"])).draw().axes
+    assert [text.get_text() for text in axes.texts][2:] == ["observation", "latent"]
+    assert axes.get_title("center") == "mine"
+
+
+def test_the_time_of_code_is_estimated_by_itself(done, tmp_path, monkeypatch):
+    monkeypatch.setattr("jbrep.study.study.estimate", lambda run: 60 if run.encoder == NET else 30)
+    told = dry_run(Plan(done.study, tmp_path / "it"), 1).splitlines()
+    assert [line.split()[-2:] for line in told[1:4]] == [["30", "s"], ["30", "s"], ["60", "s"]]
+
+
+def test_a_run_on_code(done, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    options = ("--task", TASK, "--episode-steps", 50, "--algorithm", "a2c", "--steps", 80)
+    options += ("--evaluate-every", 80, "--evaluation-episodes", 1, "--encoder")
+    told = jbrep("rl", *options, NET, "--out", out)
+    assert told.exit_code == 0, told.output
+    assert f"encoder: {NET}, code" in told.stdout
+    with pytest.raises(InputError, match=f"is code, {NET}: give it with --encoder {NET}"):
+        load_run(out)
+    trained = load_run(out, find(NET, TASK))
+    assert (trained.representation, trained.encoder.latent_size) == ("Net", LATENT)
+    told = jbrep("rl", *options, NET, "--from", out, "--out", tmp_path / "next")
+    assert told.exit_code == 0, told.output
+    told = jbrep("rl", *options, "full", "--from", out, "--out", tmp_path / "full")
+    assert told.exit_code == 2
+    assert f"latent {LATENT} (now: {SIZE})" in told.stderr
+
+
+def test_a_run_on_an_object_resumes_with_the_same_object_alone(tmp_path):
+    asked = iter([False, True])
+    run = Run(encoder=FirstFeatures(), **SHARED)
+    with pytest.raises(StoppedError):
+        train(run, tmp_path, stop=lambda: next(asked))
+    with pytest.raises(InputError, match="belongs to another configuration: encoder"):
+        train(Run(encoder=FirstFeatures(-1), **SHARED), tmp_path)
+    result = train(run, tmp_path)
+    assert result["settings"]["representation"] == "FirstFeatures"
+    with pytest.raises(InputError, match="or the run's encoder was given in Python; give the same"):
+        load_run(tmp_path)
+    assert not (tmp_path / ENCODER).exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"representation": "my encoder"}, "the representation is 'my encoder': it must be a name"),
+        ({"encoder_seed": -1}, "the encoder seed is -1: it must be between 0"),
+    ],
+)
+def test_a_run_with_a_name_that_could_not_be_read_again_is_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        Run(task=TASK, **settings)
