@@ -15,7 +15,7 @@ from jbrep.encoders.file import unpack as unpack_encoder
 from jbrep.errors import InputError, check_version
 from jbrep.files import container
 from jbrep.files.storage import write_whole
-from jbrep.rl.fields import ADDED, check_policy, check_settings
+from jbrep.rl.fields import check_policy, check_settings, completed
 from jbrep.rl.files import POLICY_FORMAT
 from jbrep.rl.policy import Trained, build
 from jbrep.rl.weights import fill, read_file
@@ -61,6 +61,8 @@ def pack(trained: Trained, run: str) -> bytes:
     tensors = {f"{_ENCODER}{name}": values for name, values in trained.encoder.tensors().items()}
     for name, values in acting(trained.policy).state_dict().items():
         tensors[f"{_WEIGHTS}{name}"] = values.numpy(force=True)
+    if trained.statistics is not None:
+        tensors |= trained.statistics.tensors
     return container.pack(tensors, header)
 
 
@@ -103,7 +105,7 @@ def unpack(raw: bytes, path: Path) -> tuple[Trained, dict[str, Any]]:
         raise InputError(f"{path} is not a jbrep policy")
     check_version(path, header.get("format_version"), FORMAT_VERSION)
     check_policy(path, header)
-    settings = {**ADDED, **header["settings"]}
+    settings = completed(header["settings"])
     check_settings(path, settings)
     parts: dict[str, container.Tensors] = {
         part: {n.removeprefix(part): t for n, t in tensors.items() if n.startswith(part)}
@@ -113,4 +115,5 @@ def unpack(raw: bytes, path: Path) -> tuple[Trained, dict[str, Any]]:
     trained = build(path, settings, encoder)
     weights = {name: torch.tensor(values) for name, values in parts[_WEIGHTS].items()}
     fill(acting(trained.policy), weights, path)
-    return trained._replace(step=None if header["finished"] else header["step"]), header
+    step = None if header["finished"] else header["step"]
+    return trained.with_statistics(tensors, path)._replace(step=step), header
