@@ -1,4 +1,4 @@
-"""A trained policy in one safe file: its weights, its encoder and the settings that rebuild it.
+"""A trained policy in one safe file: its weights, encoder and the settings that rebuild it.
 
 The file is safetensors with a JSON header and a checksum; reading one runs nothing in it. Of the
 network it has what acts, without critics.
@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.encoders import Encoder
 from jbrep.encoders.file import unpack as unpack_encoder
-from jbrep.errors import InputError, check_version
+from jbrep.errors import DamageError, InputError, check_version
 from jbrep.files import container
 from jbrep.files.storage import write_whole
 from jbrep.rl.fields import check_policy, check_settings, completed
@@ -112,6 +112,8 @@ def unpack(raw: bytes, path: Path) -> tuple[Trained, dict[str, Any]]:
         for part in (_WEIGHTS, _ENCODER)
     }
     encoder = unpack_encoder(path, parts[_ENCODER], dict(header["encoder"]))
+    if encoder.fingerprint != settings["encoder"]:
+        raise DamageError(f"{path} is damaged: its encoder isn't the one of its settings")
     trained = build(path, settings, encoder)
     weights = {name: torch.tensor(values) for name, values in parts[_WEIGHTS].items()}
     fill(acting(trained.policy), weights, path)
