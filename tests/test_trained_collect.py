@@ -29,6 +29,7 @@ import_modules(["environments"])
 SHORT = describe("face_direction", max_episode_steps=40)
 SLEDGE = describe("Sledges/Sledge-v0")
 POLICY = "policy-0.safetensors"
+NORMALIZE = {"normalize": True}
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +53,9 @@ def runs(tmp_path_factory):
             folder / "jb",
             save_every=0,
         )
-    train(Run(task=SLEDGE, algorithm="sac", steps=20, **usual), folder / "sledge")
+    train(
+        Run(task=SLEDGE, algorithm="sac", steps=20, settings=NORMALIZE, **usual), folder / "sledge"
+    )
     return folder
 
 
@@ -96,7 +99,7 @@ def test_neither_lanes_nor_threads_nor_extension_change_a_byte(data, runs, tmp_p
 
 
 def test_a_worker_makes_the_same_shard(runs, tmp_path):
-    """An algorithm whose network gives actions in [-1, 1], which are scaled to the bounds."""
+    """Of a network that gives actions in [-1, 1] for what has been normalised before."""
     chosen, actor = some(runs / "sledge", tmp_path, task=SLEDGE, store_state=False, steps=80)
     gather(runs / "sledge", tmp_path / "data", {"num_threads": 1}, task=SLEDGE, store_state=False)
     sent = pickle.loads(pickle.dumps((("environments",), chosen, actor, 1, 80)))

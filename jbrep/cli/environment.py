@@ -90,8 +90,8 @@ def given_task(options: dict[str, Any], required: bool = True) -> "Task | None":
     return describe(name_given(name), parse_arguments(env), steps, features)
 
 
-def parse_arguments(given: tuple[str, ...]) -> dict[str, Any]:
-    """Arguments of an environment from NAME=VALUE; a value is JSON, or else text.
+def parse_arguments(given: tuple[str, ...], option: str = "--env") -> dict[str, Any]:
+    """Arguments from an option's NAME=VALUE; a value is JSON, or else text.
 
     Raises:
         InputError: something else.
@@ -100,7 +100,7 @@ def parse_arguments(given: tuple[str, ...]) -> dict[str, Any]:
     for pair in given:
         name, equals, value = pair.partition("=")
         if not equals or not name.isidentifier() or name in arguments:
-            raise InputError(f"--env {pair} is no argument, or a second one: write NAME=VALUE")
+            raise InputError(f"{option} {pair} is no argument, or a second one: write NAME=VALUE")
         try:
             arguments[name] = json.loads(value)
         except ValueError:

@@ -3,16 +3,17 @@
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 
 from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, on_stop, printable
-from jbrep.cli.environment import given_task, task_options
+from jbrep.cli.environment import given_task, parse_arguments, task_options
+from jbrep.rl.names import CLASSES
 from jbrep.text import rounded
 
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
@@ -22,19 +23,55 @@ _NOT_REPRODUCIBLE = (
 )
 
 
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+def learner_options(command: _Command) -> _Command:
+    """The options from which `given_settings` makes a preset's name and settings."""
+    options = (
+        click.option(
+            "--preset",
+            default="paper",
+            show_default=True,
+            help="Its settings: paper, modern, or a TOML file with a table for each algorithm.",
+        ),
+        click.option(
+            "--set",
+            "overrides",
+            multiple=True,
+            metavar="NAME=VALUE",
+            help="A setting other than the preset's, by stable-baselines3's name, such as "
+            "learning_rate=3e-4, net_arch=[64,64] or learning_rate=linear:3e-4; may be repeated.",
+        ),
+        click.option(
+            "--normalize",
+            is_flag=True,
+            help="Normalise what the agent sees by its running mean and variance.",
+        ),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def given_settings(options: dict[str, Any]) -> dict[str, Any]:
+    """What --set and --normalize set; they are taken out of the options.
+
+    Raises:
+        InputError: --set isn't NAME=VALUE, or names a setting again.
+    """
+    settings = parse_arguments(options.pop("overrides"), "--set")
+    if options.pop("normalize"):
+        settings["normalize"] = True
+    return settings
+
+
 @click.command(
     epilog=example("jbrep rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a")
 )
 @task_options()
-@click.option(
-    "--algorithm", default="sac", show_default=True, help="ddpg, td3, sac, ppo, a2c or trpo."
-)
-@click.option(
-    "--preset",
-    default="paper",
-    show_default=True,
-    help="Its settings: paper or modern.",
-)
+@click.option("--algorithm", default="sac", show_default=True, help=f"One of {', '.join(CLASSES)}.")
+@learner_options
 @click.option(
     "--encoder",
     default="full",
@@ -79,7 +116,7 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
         from jbrep.rl import Run, StoppedError, train
         from jbrep.rl.files import EVALUATIONS, RUN, read_evaluations
 
-        settings["task"] = given_task(settings)
+        settings |= {"task": given_task(settings), "settings": given_settings(settings)}
         import_code(settings["encoder"])
         run = Run(**settings)
         run.check()

@@ -1,6 +1,6 @@
 """A stable-baselines3 agent from a preset, and the evaluation of its policy."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from operator import attrgetter
 from typing import Any
@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.distributions import Distribution
 
@@ -21,12 +22,26 @@ from jbrep.envs.recording import Actor, episode_returns
 from jbrep.envs.sb3 import TaskVecEnv, agent_spaces
 from jbrep.envs.task import Array, Task
 from jbrep.rl.files import EVALUATION_SEED
-from jbrep.rl.presets import ALGORITHMS, Preset
+from jbrep.rl.normalization import Statistics, normalized
+from jbrep.rl.presets import ALGORITHMS, Hidden, Preset
+from jbrep.rl.values import linear_from
+
+ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
+    "relu": torch.nn.ReLU,
+    "tanh": torch.nn.Tanh,
+    "elu": torch.nn.ELU,
+    "gelu": torch.nn.GELU,
+    "silu": torch.nn.SiLU,
+    "leaky_relu": torch.nn.LeakyReLU,
+}
 
 
-def make_env(task: Task, num_envs: int, seed: int, encoder: BaseEncoder) -> VecMonitor:
+def make_env(
+    task: Task, num_envs: int, seed: int, encoder: BaseEncoder, normalize: bool = False
+) -> VecEnv:
     """Lanes of a task seen through an encoder, stepped on one thread."""
-    return VecMonitor(TaskVecEnv(task, num_envs, seed, encoder, num_threads=1))
+    env = VecMonitor(TaskVecEnv(task, num_envs, seed, encoder, num_threads=1))
+    return normalized(env) if normalize else env
 
 
 class Spaces(gymnasium.Env[Any, Any]):
@@ -43,7 +58,7 @@ def training_seed(seed: int) -> int:
 
 def make_agent(algorithm: str, preset: Preset, env: VecEnv | Spaces, seed: int) -> BaseAlgorithm:
     """An untrained agent on the CPU, with its optimisers' state allocated."""
-    settings: dict[str, Any] = {**preset.settings}
+    settings = {name: _argument(value) for name, value in preset.settings.items()}
     if preset.noise:
         size = np.prod(env.action_space.shape or (), dtype=int)
         settings["action_noise"] = preset.noise.make(int(size))
@@ -53,8 +68,9 @@ def make_agent(algorithm: str, preset: Preset, env: VecEnv | Spaces, seed: int) 
         seed=seed,
         device="cpu",
         policy_kwargs={
-            "net_arch": list(preset.hidden),
-            "activation_fn": torch.nn.ReLU,
+            **preset.policy,
+            "net_arch": _layers(preset.hidden),
+            "activation_fn": ACTIVATIONS[preset.policy["activation_fn"]],
             "optimizer_kwargs": {"fused": True, **preset.optimizer},  # same Adam, less overhead
         },
         **settings,
@@ -63,6 +79,19 @@ def make_agent(algorithm: str, preset: Preset, env: VecEnv | Spaces, seed: int) 
         if isinstance(part, torch.optim.Optimizer):
             allocate_adam_state(part)
     return agent
+
+
+def _argument(value: Any) -> Any:
+    """A setting as stable-baselines3 takes it: schedules as functions, a frequency as a tuple."""
+    if isinstance(value, str) and (start := linear_from(value)) is not None:
+        return LinearSchedule(start, 0.0, 1.0)
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _layers(hidden: Hidden) -> list[int] | dict[str, list[int]]:
+    if isinstance(hidden, Mapping):
+        return {name: list(units) for name, units in hidden.items()}
+    return list(hidden)
 
 
 def trained_parts(agent: BaseAlgorithm) -> Iterator[tuple[str, Any]]:
@@ -85,20 +114,39 @@ def unchecked_distributions() -> Iterator[None]:
         Distribution.set_default_validate_args(before)
 
 
-def deterministic(policy: BasePolicy | BaseAlgorithm, encoder: BaseEncoder, task: Task) -> Actor:
+def deterministic(
+    policy: BasePolicy | BaseAlgorithm,
+    encoder: BaseEncoder,
+    task: Task,
+    normalize: Callable[[Any], Any] | None = None,
+) -> Actor:
     """The policy's most likely actions, within their bounds despite rounding.
 
     They are not finite where its weights aren't.
+
+    Args:
+        policy: which to play.
+        encoder: its view of the observation.
+        task: what is played.
+        normalize: what it sees of that view, if that isn't the view itself.
     """
     bounds = agent_spaces(task, encoder)[1]
 
     def act(observation: Array) -> NDArray[np.float32]:
         seen = encoder.encode(observation.astype(np.float32))
+        if normalize:
+            seen = normalize(seen)
         with unchecked_distributions():
             actions = policy.predict(seen, deterministic=True)[0]
         return np.clip(actions, bounds.low, bounds.high)
 
     return act
+
+
+def statistics_of(policy: BasePolicy | BaseAlgorithm) -> Statistics | None:
+    """Those by which an agent normalises what it sees, if it does."""
+    env = policy.get_vec_normalize_env() if isinstance(policy, BaseAlgorithm) else None
+    return Statistics.of(env) if env else None
 
 
 class Evaluator:
@@ -120,9 +168,11 @@ class Evaluator:
     def returns(self, policy: BasePolicy | BaseAlgorithm) -> Array:
         """The return of each episode, (episodes,).
 
+        What an agent normalises, it normalises by its statistics so far, which stay as they are.
+
         Raises:
             NonFiniteActionError: the policy's actions are not finite.
             EnvironmentFailedError: the environment fails in the middle of an episode.
         """
-        act = deterministic(policy, self._encoder, self._lanes.task)
+        act = deterministic(policy, self._encoder, self._lanes.task, statistics_of(policy))
         return episode_returns(self._lanes, act, self._seed)

@@ -4,14 +4,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from jbrep.encoders import load
 from jbrep.envs.task import read_task
 from jbrep.errors import InputError, differences
 from jbrep.files.storage import write_whole
 from jbrep.rl.files import BEGINNING, ENCODER, POLICY, read_finished
-from jbrep.rl.weights import fill, read_file, read_weights
+from jbrep.rl.normalization import Statistics
+from jbrep.rl.settings import shaping
+from jbrep.rl.weights import fill, read_file, read_policy
 
 
 def policy_to_begin_with(folder: Path, settings: Mapping[str, Any], latent_size: int) -> str:
@@ -42,18 +44,21 @@ def _sizes(settings: Mapping[str, Any], latent_size: int) -> dict[str, Any]:
     task = read_task(settings["environment"])
     return {
         "algorithm": settings["algorithm"],
-        "hidden": list(settings["hidden"]),
+        "hidden": settings["hidden"],
+        **settings["policy"],
+        **shaping(settings["settings"]),
+        "normalize": settings["normalize"],
         "features": task.size,
         "latent": latent_size,
         "actions": task.action_size,
     }
 
 
-def begin(policy: BasePolicy, source: Path, sha256: str, folder: Path) -> None:
-    """Give an untrained policy the weights of a finished run's.
+def begin(agent: BaseAlgorithm, source: Path, sha256: str, folder: Path) -> None:
+    """Give an untrained agent the weights of a finished run's policy, and what normalises its view.
 
     Args:
-        policy: untrained.
+        agent: untrained.
         source: the folder of the finished run.
         sha256: of its policy, see `policy_to_begin_with`.
         folder: of the run that begins, where a copy is kept.
@@ -63,5 +68,9 @@ def begin(policy: BasePolicy, source: Path, sha256: str, folder: Path) -> None:
         DamageError: they aren't what was written.
     """
     path = source / POLICY
-    fill(policy, read_weights(path, sha256), path)
+    stored = read_policy(path, sha256)
+    fill(agent.policy, stored.weights, path)
+    if normalizer := agent.get_vec_normalize_env():
+        (size,) = agent.observation_space.shape or ()
+        Statistics.read(stored.tensors, size, path).give(normalizer)
     write_whole(folder / BEGINNING, read_file(path))

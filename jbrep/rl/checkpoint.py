@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
 
@@ -20,8 +21,10 @@ from jbrep.errors import DamageError, InputError
 from jbrep.files import container
 from jbrep.files.container import Tensors
 from jbrep.files.storage import exists
-from jbrep.rl.agent import trained_parts
+from jbrep.rl.agent import statistics_of, trained_parts
+from jbrep.rl.fields import completed
 from jbrep.rl.files import differing
+from jbrep.rl.normalization import Statistics
 from jbrep.rl.recorder import History
 
 MAX_BYTES = 1 << 34
@@ -29,6 +32,8 @@ PARAMETERS = "parameters."  # begins the names of what gradient steps change
 _LANES = "lanes."  # likewise, of what decides how the lanes continue
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 _ROLLOUT = ("_last_obs", "_last_episode_starts")
+_UNSCALED = "_last_original_obs"  # before it was normalised
+_EXPLORATION = ("exploration_mat", "exploration_matrices")
 _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _MALFORMED = (KeyError, TypeError, ValueError, RuntimeError, IndexError, AttributeError)
 
@@ -82,10 +87,12 @@ class Checkpointer(BaseCallback):
         self._path, self._identity, self._history = path, identity, history
         self._save_every, self._stop = save_every, stop
         self._snapshot = self._read() if exists(path) else None
+        self._draws: Tensors = {}  # of the snapshot, until the first rollout
         self._saved = time.monotonic()
 
     def _on_training_start(self) -> None:
         if self._snapshot:
+            self._draws = self._snapshot.tensors
             try:
                 restore(self.model, self._snapshot)
             except EnvironmentFailedError as error:
@@ -97,6 +104,9 @@ class Checkpointer(BaseCallback):
             self._snapshot = None  # a replay buffer can be large
 
     def _on_rollout_start(self) -> None:
+        if self._draws:  # state-dependent noise has just been drawn, for the second time
+            _restore_draws(self.model, self._draws)
+            self._draws = {}
         stopping = self._stop()
         if stopping or time.monotonic() - self._saved >= self._save_every:
             self._write()
@@ -125,7 +135,7 @@ class Checkpointer(BaseCallback):
         """Why a checkpoint of that identity isn't this run's; empty if it is."""
         if "environment" not in identity:
             return "was written by an earlier jbrep, which seeded episodes differently"
-        others = differing(identity, self._identity)
+        others = differing(completed(identity), self._identity)
         return f"belongs to another configuration: {others}" if others else ""
 
     def _write(self) -> None:
@@ -149,8 +159,12 @@ def take(agent: BaseAlgorithm) -> Snapshot:
     tensors |= {f"{_LANES}{name}": values for name, values in env.state.items()}
     tensors |= {f"noise.{i}": n.noise_prev for i, n in enumerate(_drifting_noises(agent))}
     tensors |= {f"rollout.{name}": getattr(agent, name) for name in _ROLLOUT}
+    if statistics := statistics_of(agent):
+        tensors |= {**statistics.tensors, _UNSCALED: getattr(agent, _UNSCALED)}
     tensors |= {"returns": monitor.episode_returns, "lengths": monitor.episode_lengths}
     tensors |= {"torch": torch.get_rng_state().numpy(), "numpy": np.asarray(keys)}
+    if noise := _state_dependent_noise(agent):
+        tensors |= {name: getattr(noise, name).detach().numpy() for name in _EXPLORATION}
     counters = {name: getattr(agent, name) for name in _COUNTERS}
     counters |= {
         "numpy": (kind, position, has_gauss, gauss),
@@ -178,6 +192,10 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
         noise.noise_prev = tensors[f"noise.{i}"]
     for name in _ROLLOUT:
         setattr(agent, name, tensors[f"rollout.{name}"])
+    if normalizer := agent.get_vec_normalize_env():
+        (size,) = agent.observation_space.shape or ()
+        Statistics.read(tensors, size, "the checkpoint").give(normalizer)
+        setattr(agent, _UNSCALED, tensors[_UNSCALED])
     for name in _COUNTERS:
         setattr(agent, name, counters[name])
     agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that TensorBoard shows
@@ -192,13 +210,29 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
     assert agent.ep_info_buffer is not None
     agent.ep_info_buffer.extend(counters["episodes"])
     agent.action_space.np_random.bit_generator.state = counters["action_space"]
-    torch.set_rng_state(torch.from_numpy(tensors["torch"]))
+    _restore_draws(agent, tensors)
     kind, *rest = counters["numpy"]
     np.random.set_state((kind, tensors["numpy"], *rest))  # noqa: NPY002
 
 
+def _restore_draws(agent: BaseAlgorithm, tensors: Tensors) -> None:
+    """Bring torch's generator, and what was drawn from it last, to where they were."""
+    torch.set_rng_state(torch.from_numpy(tensors["torch"]))
+    if noise := _state_dependent_noise(agent):
+        for name in _EXPLORATION:
+            setattr(noise, name, torch.from_numpy(tensors[name]))
+
+
+def _state_dependent_noise(agent: BaseAlgorithm) -> StateDependentNoiseDistribution | None:
+    """The distribution that explores by noise on features, with use_sde."""
+    distribution = getattr(getattr(agent, "actor", agent.policy), "action_dist", None)
+    is_one = isinstance(distribution, StateDependentNoiseDistribution)
+    return distribution if is_one else None
+
+
 def _envs(agent: BaseAlgorithm) -> tuple[VecMonitor, TaskVecEnv]:
-    monitor = agent.env
+    normalizer = agent.get_vec_normalize_env()
+    monitor = normalizer.venv if normalizer else agent.env
     assert isinstance(monitor, VecMonitor)
     env = monitor.unwrapped
     assert isinstance(env, TaskVecEnv)

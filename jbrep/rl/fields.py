@@ -8,16 +8,18 @@ from typing import Any, NamedTuple
 from jbrep.envs.task import MAX_EPISODE_STEPS, read_task
 from jbrep.errors import DamageError
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
+from jbrep.rl.names import base_name
 
 FINISHED, FAILED = "finished", "failed"
 MAX_STEPS = 10**12  # of training
 MAX_EVALUATION_EPISODES = 10_000
 MAX_SEED = (1 << 31) - 1
-_MAX_LAYERS, _MAX_UNITS = 8, 1024  # of a policy's network
-_MAX_ENVS = 4096
+MAX_LAYERS, MAX_UNITS = 8, 1024  # of a policy's network
+MAX_ENVS = 4096
 _MAX_LATENT = 1 << 20
 _MAX_SECONDS = 1e12
 MAX_LINE = 1000  # characters
+MAX_NAME = 100  # characters, of a learner
 
 
 class Kind(NamedTuple):
@@ -48,8 +50,31 @@ def _is_number(value: Any) -> bool:
     return type(value) in (int, float)
 
 
+def is_hidden(value: Any) -> bool:
+    """Whether a value says the units of hidden layers, of a policy or of its parts."""
+    if isinstance(value, dict):
+        return 0 < len(value) <= 2 and all(map(_are_layers, value.values()))
+    return _are_layers(value)
+
+
+def _are_layers(value: Any) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) <= MAX_LAYERS
+        and all(type(units) is int and 1 <= units <= MAX_UNITS for units in value)
+    )
+
+
+HIDDEN = Kind(
+    is_hidden,
+    f"a list of at most {MAX_LAYERS} whole numbers from 1 to {MAX_UNITS:,}, or an object of such "
+    "lists",
+)
 _TASK = text(r"[\w./-]{1,200}", "a task's name or id")
 NAME = text(r"[\w.-]{1,100}", "a name of letters, digits, dots, hyphens and underscores")
+LEARNER = text(
+    rf"[\w.+=-]{{1,{MAX_NAME}}}", f"at most {MAX_NAME} letters, digits and characters of . _ - + ="
+)
 _SHA256 = text("[0-9a-f]{64}", "64 hexadecimal digits")
 _LINE = Kind(_is_line, f"a line of at most {MAX_LINE:,} characters")
 _OBJECT = Kind(lambda value: isinstance(value, dict), "an object")
@@ -75,21 +100,18 @@ _SETTINGS = {
     "environment": _OBJECT,
     "algorithm": NAME,
     "preset": NAME,
-    "hidden": Kind(
-        lambda v: (
-            isinstance(v, list)
-            and len(v) <= _MAX_LAYERS
-            and all(type(units) is int and 1 <= units <= _MAX_UNITS for units in v)
-        ),
-        f"at most {_MAX_LAYERS} whole numbers from 1 to {_MAX_UNITS:,}",
-    ),
+    "hidden": HIDDEN,
     "settings": _OBJECT,
-    "num_envs": whole_number(1, _MAX_ENVS),
+    "num_envs": whole_number(1, MAX_ENVS),
     "noise": Kind(
         lambda v: v is None or (isinstance(v, list) and all(map(_is_number, v))),
         "null or a list of numbers",
     ),
     "optimizer": _OBJECT,
+    "policy": _OBJECT,
+    "normalize": Kind(lambda v: isinstance(v, bool), "true or false"),
+    "overrides": _OBJECT,
+    "learner": LEARNER,
     "representation": NAME,
     "encoder": _SHA256,
     "encoder_code": Kind(lambda v: v is None or _is_line(v), "null or a name of code"),
@@ -102,8 +124,15 @@ _SETTINGS = {
     "evaluation_episodes": whole_number(1, MAX_EVALUATION_EPISODES),
     "from": Kind(lambda v: v is None or _SHA256.allows(v), f"null or {_SHA256.words}"),
 }
-ADDED = {"encoder_code": None, "encoder_seed": None}  # what early runs of this version lack
-_POLICY = {
+POLICY = {"activation_fn": "relu"}  # arguments of every policy unless a run sets others
+_ADDED = {  # what early runs of this version lack
+    "encoder_code": None,
+    "encoder_seed": None,
+    "policy": POLICY,
+    "normalize": False,
+    "overrides": {},
+}
+_POLICY_FILE = {
     "settings": _OBJECT,
     "encoder": _OBJECT,
     "run": _LINE,
@@ -111,6 +140,12 @@ _POLICY = {
     "finished": Kind(lambda v: isinstance(v, bool), "true or false"),
 }
 _VERSION_1 = {"task": _TASK, "episode_steps": whole_number(1, MAX_EPISODE_STEPS)}
+
+
+def completed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a run, with what those of an earlier jbrep leave unsaid."""
+    name = base_name(settings.get("algorithm", ""), settings.get("preset", ""))
+    return {**_ADDED, "learner": name, **settings}
 
 
 def check_run(path: Path, run: Mapping[str, Any]) -> None:
@@ -145,7 +180,7 @@ def check_policy(path: Path, header: Mapping[str, Any]) -> None:
     Raises:
         DamageError: as `check_run`.
     """
-    _check(path, header, _POLICY)
+    _check(path, header, _POLICY_FILE)
 
 
 def from_version_1(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:

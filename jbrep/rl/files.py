@@ -12,15 +12,15 @@ from jbrep.errors import DamageError, InputError, check_version, differences
 from jbrep.files import container
 from jbrep.files.storage import exists, read_regular, write_whole
 from jbrep.files.tables import write_csv
+from jbrep.rl.fields import FAILED as FAILED
+from jbrep.rl.fields import FINISHED as FINISHED
 from jbrep.rl.fields import (
-    ADDED,
     MAX_EVALUATION_EPISODES,
     MAX_STEPS,
     check_run,
+    completed,
     from_version_1,
 )
-from jbrep.rl.fields import FAILED as FAILED
-from jbrep.rl.fields import FINISHED as FINISHED
 
 FORMAT = "jbrep run"
 FORMAT_VERSION = 2
@@ -142,7 +142,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     if version == 1 and isinstance(run.get("settings"), dict):
         run["settings"] = from_version_1(path, run["settings"])
     if isinstance(run.get("settings"), dict):
-        run["settings"] = {**ADDED, **run["settings"]}
+        run["settings"] = completed(run["settings"])
     check_run(path, run)
     return run
 

@@ -67,14 +67,20 @@ def _opened(file: str, content: bytes) -> tuple[Trained, dict[str, Any]]:
 
 
 def _one_by_one(trained: Trained) -> Actor:
-    policy, encoder = trained.policy, trained.encoder
+    policy, encoder, statistics = trained.policy, trained.encoder, trained.statistics
     policy.set_training_mode(False)
     bounds = agent_spaces(trained.task, encoder)[1]
+
+    def choose(row: torch.Tensor) -> torch.Tensor:
+        seen = encoder.encode(row)
+        if statistics:
+            seen = torch.from_numpy(statistics(seen.numpy()))
+        return policy._predict(seen, deterministic=True)
 
     def act(observation: Array) -> NDArray[Any]:
         rows = torch.tensor(observation, dtype=torch.float32).split(1)
         with single_torch_thread(), torch.inference_mode(), unchecked_distributions():
-            chosen = [policy._predict(encoder.encode(row), deterministic=True) for row in rows]
+            chosen = [choose(row) for row in rows]
         actions = torch.cat(chosen).numpy()
         if not np.isfinite(actions).all():
             raise InputError("the policy's actions are not finite: it can't be played")

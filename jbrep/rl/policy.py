@@ -20,7 +20,7 @@ from jbrep.files import container
 from jbrep.files.storage import exists
 from jbrep.rl.agent import Spaces, deterministic, make_agent
 from jbrep.rl.checkpoint import MAX_BYTES, PARAMETERS
-from jbrep.rl.fields import ADDED, MAX_STEPS, check_settings, from_version_1, whole_number
+from jbrep.rl.fields import MAX_STEPS, check_settings, completed, from_version_1, whole_number
 from jbrep.rl.files import (
     BEGINNING,
     CHECKPOINT,
@@ -31,8 +31,10 @@ from jbrep.rl.files import (
     read_finished,
     read_run,
 )
+from jbrep.rl.normalization import Statistics
 from jbrep.rl.presets import ALGORITHMS, Preset
-from jbrep.rl.weights import fill, one_line, read_file, read_weights
+from jbrep.rl.settings import check_shape, shaping
+from jbrep.rl.weights import fill, one_line, read_file, read_policy
 
 _WEIGHTS = f"{PARAMETERS}policy."
 
@@ -47,13 +49,14 @@ class Trained(NamedTuple):
     evaluation_episodes: int = 1  # that the run's evaluations play at once
     step: int | None = None  # of training, if it is not over
     settings: Mapping[str, Any] = {}  # of the run; none of a file from elsewhere
+    statistics: Statistics | None = None  # by which it normalises what it sees, if it does
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Act deterministically; nothing is drawn.
 
         The actor raises an InputError for actions that are not finite.
         """
-        act = deterministic(self.policy, self.encoder, self.task)
+        act = deterministic(self.policy, self.encoder, self.task, self.statistics)
 
         def checked(observation: Array) -> NDArray[Any]:
             actions = act(observation)
@@ -62,6 +65,37 @@ class Trained(NamedTuple):
             return actions
 
         return checked
+
+    def filled(
+        self,
+        weights: Mapping[str, torch.Tensor],
+        tensors: Mapping[str, NDArray[Any]],
+        source: Path,
+    ) -> "Trained":
+        """The policy with these weights, and with statistics from the tensors if it has any.
+
+        Args:
+            weights: by the names of the policy's parameters.
+            tensors: with those of `Statistics` among them.
+            source: the file that they come from, for messages.
+
+        Raises:
+            InputError: the weights don't fit the policy.
+            DamageError: a number that it acts by isn't finite, or the statistics are missing.
+        """
+        fill(self.policy, weights, source)
+        return self.with_statistics(tensors, source)
+
+    def with_statistics(self, tensors: Mapping[str, NDArray[Any]], source: Path) -> "Trained":
+        """The policy with the statistics in the tensors, if it has any.
+
+        Raises:
+            DamageError: they are missing or invalid.
+        """
+        if self.statistics is None:
+            return self
+        size = self.encoder.latent_size
+        return self._replace(statistics=Statistics.read(tensors, size, source))
 
 
 def load_run(folder: Path, encoder: Any = None) -> Trained:
@@ -89,10 +123,9 @@ def load_run(folder: Path, encoder: Any = None) -> Trained:
     if not exists(folder / RUN):
         return _load_checkpoint(folder, encoder)
     run = read_finished(folder)
-    trained = _build(folder, run["settings"], encoder)
     path = folder / POLICY
-    fill(trained.policy, read_weights(path, run["policy_sha256"]), path)
-    return trained
+    trained = _untrained(folder, run["settings"], encoder)
+    return trained.filled(*read_policy(path, run["policy_sha256"]), path)
 
 
 def load_untrained(folder: Path, encoder: Any = None) -> Trained:
@@ -103,11 +136,11 @@ def load_untrained(folder: Path, encoder: Any = None) -> Trained:
         DamageError: a file isn't what was written.
     """
     settings = run_settings(folder)
-    trained = _build(folder, settings, encoder)
-    if settings["from"]:
-        path = folder / BEGINNING
-        fill(trained.policy, read_weights(path, settings["from"]), path)
-    return trained
+    trained = _untrained(folder, settings, encoder)
+    if not settings["from"]:
+        return trained
+    path = folder / BEGINNING
+    return trained.filled(*read_policy(path, settings["from"]), path)
 
 
 def run_settings(folder: Path) -> dict[str, Any]:
@@ -157,6 +190,7 @@ class _Checkpoint(NamedTuple):
     settings: dict[str, Any]
     step: int
     weights: dict[str, torch.Tensor]
+    tensors: container.Tensors
 
 
 def _read_checkpoint(folder: Path) -> _Checkpoint:
@@ -167,7 +201,7 @@ def _read_checkpoint(folder: Path) -> _Checkpoint:
         raise DamageError(f"{path} is not a run's checkpoint")
     if "environment" not in settings:
         settings = from_version_1(path, settings)
-    settings = {**ADDED, **settings}
+    settings = completed(settings)
     check_settings(path, settings)
     step = counters.get("num_timesteps", -1)
     if not whole_number(0, MAX_STEPS).allows(step):
@@ -177,38 +211,51 @@ def _read_checkpoint(folder: Path) -> _Checkpoint:
         for name, values in tensors.items()
         if name.startswith(_WEIGHTS) and not name.startswith(f"{_WEIGHTS}optimizer.")
     }
-    return _Checkpoint(settings, step, weights)
+    return _Checkpoint(settings, step, weights, tensors)
 
 
 def _load_checkpoint(folder: Path, encoder: Any) -> Trained:
     checkpoint = _read_checkpoint(folder)
-    trained = _build(folder, checkpoint.settings, encoder)._replace(step=checkpoint.step)
-    fill(trained.policy, checkpoint.weights, folder / CHECKPOINT)
-    return trained
+    trained = _untrained(folder, checkpoint.settings, encoder)._replace(step=checkpoint.step)
+    return trained.filled(checkpoint.weights, checkpoint.tensors, folder / CHECKPOINT)
 
 
-def _build(folder: Path, settings: Mapping[str, Any], given: Any = None) -> Trained:
-    """What a run trains, as it begins."""
+def _untrained(folder: Path, settings: Mapping[str, Any], given: Any) -> Trained:
+    """What a run trains, as it begins unless another run's policy comes along."""
     task = read_task(settings["environment"])
     encoder = run_encoder(folder, settings) if given is None else find(given, task)
     return build(folder, settings, encoder)
 
 
 def build(path: Path, settings: Mapping[str, Any], encoder: BaseEncoder) -> Trained:
-    """What a run of these settings trains, as it begins; the path is for messages.
+    """The untrained policy of a run; `Trained.filled` gives it weights.
+
+    Args:
+        path: where the settings are from, for messages.
+        settings: of the run, as run.json has them, checked by `check_settings`.
+        encoder: of the run.
 
     Raises:
-        InputError: an unknown algorithm, or an encoder that isn't the run's.
+        InputError: the settings can't be those of a run, or the encoder isn't the run's.
     """
     task, algorithm = read_task(settings["environment"]), settings["algorithm"]
     choose(algorithm, ALGORITHMS, "algorithm")
     if encoder.fingerprint != settings["encoder"]:
         raise InputError(f"{encoder.name} is not the encoder that the run in {path} was made with")
+    check_shape(algorithm, settings["hidden"], settings["policy"])
     encoder.check_task(task)
-    preset = Preset(tuple(settings["hidden"]), {})
-    agent = make_agent(algorithm, preset, Spaces(task, encoder), settings["seed"])
+    preset = Preset(settings["hidden"], shaping(settings["settings"]), policy=settings["policy"])
+    try:
+        agent = make_agent(algorithm, preset, Spaces(task, encoder), settings["seed"])
+    except (AssertionError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"no policy can be made from the settings of the run: {one_line(error)}"
+        ) from None
+    statistics = Statistics.untrained(encoder.latent_size) if settings["normalize"] else None
     name, episodes = settings["representation"], settings["evaluation_episodes"]
-    return Trained(agent.policy, task, encoder, name, episodes, settings=settings)
+    return Trained(
+        agent.policy, task, encoder, name, episodes, settings=settings, statistics=statistics
+    )
 
 
 def run_encoder(folder: Path, settings: Mapping[str, Any]) -> BaseEncoder:

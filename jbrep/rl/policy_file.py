@@ -5,14 +5,19 @@ import json
 import zipfile
 from typing import Any
 
+import safetensors.numpy
 import stable_baselines3
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import data_to_json
 
+from jbrep.rl.agent import statistics_of
+from jbrep.rl.weights import STATISTICS
+
 _OF_THIS_PROCESS = {  # wall times, and where the environment was: `load` starts with defaults
     "_last_episode_starts",
     "_last_obs",
+    "_last_original_obs",
     "_num_timesteps_at_start",
     "ep_info_buffer",
     "ep_success_buffer",
@@ -24,17 +29,20 @@ def policy_zip(agent: BaseAlgorithm) -> bytes:
     """A zip file that the algorithm's `load` takes, as its `save` writes it.
 
     Unlike there, members carry a fixed date, whatever the clock says, and nothing in them depends
-    on the process or the machine.
+    on the process or the machine. Statistics by which the agent normalises what it sees are a
+    member that `load` leaves alone.
     """
     names, variables = agent._get_torch_save_params()
     left_out = {*agent._excluded_save_params(), *_OF_THIS_PROCESS}
     left_out |= {name.partition(".")[0] for name in (*names, *variables)}
     data = {name: value for name, value in vars(agent).items() if name not in left_out}
+    statistics = statistics_of(agent)
     members: dict[str, str | bytes] = {
         "data": _to_json(data),
         "pytorch_variables.pth": _to_bytes({name: getattr(agent, name) for name in variables}),
         **{f"{name}.pth": _to_bytes(state) for name, state in agent.get_parameters().items()},
         "_stable_baselines3_version": stable_baselines3.__version__,
+        **({STATISTICS: safetensors.numpy.save(statistics.tensors)} if statistics else {}),
     }
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as file:

@@ -1,4 +1,4 @@
-"""A trained policy in one safe file: its weights, its encoder and the settings that rebuild it.
+"""A trained policy in one safe file: its weights, encoder and the settings that rebuild it.
 
 The file is safetensors with a JSON header and a checksum; reading one runs nothing in it. Of the
 network it has what acts, without critics.
@@ -12,10 +12,10 @@ from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.encoders import Encoder
 from jbrep.encoders.file import unpack as unpack_encoder
-from jbrep.errors import InputError, check_version
+from jbrep.errors import DamageError, InputError, check_version
 from jbrep.files import container
 from jbrep.files.storage import write_whole
-from jbrep.rl.fields import ADDED, check_policy, check_settings
+from jbrep.rl.fields import check_policy, check_settings, completed
 from jbrep.rl.files import POLICY_FORMAT
 from jbrep.rl.policy import Trained, build
 from jbrep.rl.weights import fill, read_file
@@ -61,6 +61,8 @@ def pack(trained: Trained, run: str) -> bytes:
     tensors = {f"{_ENCODER}{name}": values for name, values in trained.encoder.tensors().items()}
     for name, values in acting(trained.policy).state_dict().items():
         tensors[f"{_WEIGHTS}{name}"] = values.numpy(force=True)
+    if trained.statistics is not None:
+        tensors |= trained.statistics.tensors
     return container.pack(tensors, header)
 
 
@@ -103,14 +105,17 @@ def unpack(raw: bytes, path: Path) -> tuple[Trained, dict[str, Any]]:
         raise InputError(f"{path} is not a jbrep policy")
     check_version(path, header.get("format_version"), FORMAT_VERSION)
     check_policy(path, header)
-    settings = {**ADDED, **header["settings"]}
+    settings = completed(header["settings"])
     check_settings(path, settings)
     parts: dict[str, container.Tensors] = {
         part: {n.removeprefix(part): t for n, t in tensors.items() if n.startswith(part)}
         for part in (_WEIGHTS, _ENCODER)
     }
     encoder = unpack_encoder(path, parts[_ENCODER], dict(header["encoder"]))
+    if encoder.fingerprint != settings["encoder"]:
+        raise DamageError(f"{path} is damaged: its encoder isn't the one of its settings")
     trained = build(path, settings, encoder)
     weights = {name: torch.tensor(values) for name, values in parts[_WEIGHTS].items()}
     fill(acting(trained.policy), weights, path)
-    return trained._replace(step=None if header["finished"] else header["step"]), header
+    step = None if header["finished"] else header["step"]
+    return trained.with_statistics(tensors, path)._replace(step=step), header

@@ -1,12 +1,11 @@
 """The algorithms and their settings, as data."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 import numpy as np
-from sb3_contrib import TRPO
-from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import (
     ActionNoise,
@@ -15,6 +14,10 @@ from stable_baselines3.common.noise import (
 )
 
 from jbrep.errors import choose
+from jbrep.rl.fields import POLICY
+from jbrep.rl.names import CLASSES, MODERN, PAPER
+
+Hidden = Sequence[int] | Mapping[str, Sequence[int]]
 
 
 class NormalNoise(NamedTuple):
@@ -42,22 +45,30 @@ class OrnsteinUhlenbeckNoise(NamedTuple):
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings of an algorithm; those not named keep stable-baselines3's defaults."""
+    """Settings of an algorithm; those not named keep stable-baselines3's defaults.
 
-    hidden: tuple[int, ...]  # units of the hidden layers of actor and critic, with ReLU
-    settings: Mapping[str, Any]  # arguments of the algorithm's class
-    num_envs: int = 1  # lanes stepped together
-    noise: NormalNoise | OrnsteinUhlenbeckNoise | None = None  # on actions scaled to [-1, 1]
-    optimizer: Mapping[str, Any] = field(default_factory=dict)  # arguments of Adam
+    Attributes:
+        hidden: units of the hidden layers of actor and critic, or of each by its name: pi and qf,
+            on policy pi and vf.
+        settings: arguments of the algorithm's class; "linear:0.1" is a schedule from 0.1 to 0.
+        num_envs: lanes stepped together.
+        noise: on actions scaled to [-1, 1].
+        optimizer: arguments of Adam.
+        policy: arguments of the policy's class; activation_fn by its name.
+        normalize: whether the agent sees its input by the running mean and variance.
+    """
+
+    hidden: Hidden
+    settings: Mapping[str, Any]
+    num_envs: int = 1
+    noise: NormalNoise | OrnsteinUhlenbeckNoise | None = None
+    optimizer: Mapping[str, Any] = field(default_factory=dict)
+    policy: Mapping[str, Any] = field(default_factory=lambda: dict(POLICY))
+    normalize: bool = False
 
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
-    "ddpg": DDPG,
-    "td3": TD3,
-    "sac": SAC,
-    "ppo": PPO,
-    "a2c": A2C,
-    "trpo": TRPO,
+    name: resolve_name(path) for name, path in CLASSES.items()
 }
 
 _SHARED = {"learning_rate": 1e-4, "gamma": 0.99}
@@ -81,9 +92,12 @@ _PAPER = {
         {**_SHARED, "learning_starts": 10_000, "gradient_steps": 1000, "train_freq": 1000},
         noise=NormalNoise(0.2),
     ),
-    "sac": Preset(
-        _HIDDEN, {**_SHARED, "batch_size": 256, "ent_coef": "auto"}, noise=NormalNoise(0.2)
-    ),
+    **{
+        name: Preset(
+            _HIDDEN, {**_SHARED, "batch_size": 256, "ent_coef": "auto"}, noise=NormalNoise(0.2)
+        )
+        for name in ("sac", "tqc", "crossq")  # the paper has sac alone
+    },
     "ppo": Preset(
         _HIDDEN,
         {
@@ -110,6 +124,10 @@ _MODERN = {
     "ddpg": Preset((256, 256), _OFF_POLICY, noise=NormalNoise(0.2)),
     "td3": Preset((256, 256), _OFF_POLICY, noise=NormalNoise(0.2)),
     "sac": Preset((256, 256), _OFF_POLICY),
+    "tqc": Preset((256, 256), _OFF_POLICY),
+    "crossq": Preset(  # its own layers and learning rate; it has no target networks
+        {"pi": (256, 256), "qf": (1024, 1024)}, {**_OFF_POLICY, "learning_rate": 1e-3}
+    ),
     "ppo": Preset(
         (64, 64),
         {"learning_rate": 3e-4, "n_steps": 256, "batch_size": 64, "n_epochs": 10},
@@ -129,7 +147,7 @@ _MODERN = {
         optimizer=_ON_POLICY,
     ),
 }
-PRESETS = {"paper": _PAPER, "modern": _MODERN}
+PRESETS = {PAPER: _PAPER, MODERN: _MODERN}
 
 
 def get_preset(preset: str, algorithm: str) -> Preset:

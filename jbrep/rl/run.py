@@ -4,7 +4,7 @@ import hashlib
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -45,9 +45,11 @@ from jbrep.rl.files import (
     write_rows,
     write_run,
 )
+from jbrep.rl.learner import Learner, is_file
 from jbrep.rl.policy_file import policy_zip
-from jbrep.rl.presets import get_preset
+from jbrep.rl.presets import Preset
 from jbrep.rl.recorder import DivergedError, History, Recorder, Scalars, Watch
+from jbrep.rl.settings import used_settings
 
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 _LIMITS = {
@@ -67,7 +69,9 @@ class Run:
 
     task: Task  # or its name, which is then described
     algorithm: str = "sac"
-    preset: str = "paper"
+    preset: str = "paper"  # or a preset file, which is read at once
+    settings: Mapping[str, Any] = field(default_factory=dict)  # set differently from the preset
+    learner: str = ""  # what tables call algorithm and settings; from their names by default
     encoder: Any = FULL  # a name or file, code, or a user's own encoder, as `find` takes it
     seed: int = 0
     steps: int = 100_000
@@ -79,6 +83,9 @@ class Run:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "task", as_task(self.task))
+        if is_file(self.preset):
+            for name, value in self._learner.run_settings.items():
+                object.__setattr__(self, name, value)
         for name, limit in _LIMITS.items():
             if not 1 <= getattr(self, name) <= limit:
                 words = name.replace("_", " ")
@@ -111,6 +118,19 @@ class Run:
         with single_torch_thread():
             return find(self.encoder, self.task)
 
+    @property
+    def _learner(self) -> Learner:
+        return Learner.given(self.algorithm, self.preset, self.settings, self.learner)
+
+    @property
+    def used(self) -> Preset:
+        """All settings of the algorithm.
+
+        Raises:
+            InputError: an unknown algorithm, preset or setting, or a value that it can't have.
+        """
+        return used_settings(self.algorithm, self.preset, self.settings)
+
     def describe(self, encoder: BaseEncoder) -> dict[str, Any]:
         """All settings that two equal runs share, as plain JSON.
 
@@ -122,7 +142,9 @@ class Run:
             "environment": self.task.as_json(),
             "algorithm": self.algorithm,
             "preset": self.preset,
-            **asdict(get_preset(self.preset, self.algorithm)),
+            "overrides": self.settings,
+            "learner": self._learner.name,
+            **asdict(self.used),
             "representation": self.representation or encoder.representation,
             "encoder": encoder.fingerprint,
             "encoder_code": str(self.encoder) if is_code(self.encoder) else None,
@@ -135,7 +157,7 @@ class Run:
         }
         if self.begin_from:
             folder = Path(self.begin_from)
-            settings["from"] = policy_to_begin_with(folder, settings, encoder.latent_size)
+            settings["from"] = policy_to_begin_with(folder, plain(settings), encoder.latent_size)
         return settings
 
 
@@ -220,13 +242,13 @@ def _train(
     if isinstance(encoder, Encoder):  # now that no checkpoint of another run is there
         save(encoder, folder / ENCODER)
 
-    preset = get_preset(run.preset, run.algorithm)
+    preset = run.used
     seed = training_seed(run.seed)
-    env = make_env(run.task, preset.num_envs, seed, encoder)
+    env = make_env(run.task, preset.num_envs, seed, encoder, preset.normalize)
     agent = make_agent(run.algorithm, preset, env, run.seed)
     env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
     if run.begin_from:
-        begin(agent.policy, Path(run.begin_from), settings["from"], folder)
+        begin(agent, Path(run.begin_from), settings["from"], folder)
     agent.set_logger(Logger(None, [Scalars(folder / "tensorboard", history.first_step)]))
 
     evaluator = Evaluator(run.task, encoder, run.evaluation_episodes)

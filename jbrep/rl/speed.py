@@ -9,7 +9,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import find
 from jbrep.rl.agent import Evaluator, make_agent, make_env
-from jbrep.rl.presets import ALGORITHMS, get_preset
+from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.run import Run
 
 _MIN_STEPS = 300
@@ -18,17 +18,16 @@ _MIN_STEPS = 300
 def estimate(run: Run) -> float:
     """Seconds that a run takes on one core of this machine with nothing else running."""
     encoder = find(run.encoder, run.task)
-    preset = get_preset(run.preset, run.algorithm)
+    preset = run.used
     settings: dict[str, Any] = {**preset.settings}
-    rollout = settings.get("train_freq", settings.get("n_steps", 1) * preset.num_envs)
     if issubclass(ALGORITHMS[run.algorithm], OffPolicyAlgorithm):
         settings["learning_starts"] = 0  # gradient steps from the first rollout on
-    env = make_env(run.task, preset.num_envs, 0, encoder)
+    env = make_env(run.task, preset.num_envs, 0, encoder, preset.normalize)
     agent = make_agent(run.algorithm, replace(preset, settings=settings), env, 0)
     evaluator = Evaluator(run.task, encoder, run.evaluation_episodes)
     with single_torch_thread():
         started = time.perf_counter()
-        agent.learn(max(rollout, _MIN_STEPS))
+        agent.learn(_MIN_STEPS)  # whole rollouts, so at least one
         learned = time.perf_counter()
         evaluator.returns(agent)
         evaluated = time.perf_counter()

@@ -7,20 +7,36 @@ import textwrap
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import safetensors.numpy
 import torch
+from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.errors import DamageError, InputError
 from jbrep.files.storage import read_regular
 
 MAX_BYTES = 1 << 28  # of the file
+STATISTICS = "observation_statistics.safetensors"  # by which an agent normalises what it sees
 _MEMBER = "policy.pth"
-_GLOBALS = {"collections OrderedDict", "torch._utils _rebuild_tensor_v2", "torch FloatStorage"}
+_GLOBALS = {
+    "collections OrderedDict",
+    "torch._utils _rebuild_tensor_v2",
+    "torch FloatStorage",
+    "torch LongStorage",  # CrossQ counts the steps of its batch normalisation
+}
 
 
-def read_weights(path: Path, sha256: str) -> dict[str, torch.Tensor]:
-    """The state dictionary of a policy, by the names of its parameters.
+class PolicyFile(NamedTuple):
+    """What is read of a policy's file."""
+
+    weights: dict[str, torch.Tensor]  # by the names of the policy's parameters
+    tensors: dict[str, NDArray[Any]]  # the statistics of what it sees, if it has any
+
+
+def read_policy(path: Path, sha256: str) -> PolicyFile:
+    """The state dictionary of a policy, and the statistics by which it normalises what it sees.
 
     Args:
         path: a zip file that stable-baselines3 wrote.
@@ -34,12 +50,16 @@ def read_weights(path: Path, sha256: str) -> dict[str, torch.Tensor]:
     if hashlib.sha256(raw).hexdigest() != sha256:
         raise DamageError(f"{path} is damaged or another run's: its SHA-256 isn't in run.json")
     try:
-        content = _stored(raw).read(_MEMBER)
+        members = _stored(raw)
+        content = members.read(_MEMBER)
         archive = _stored(content)
         for name in archive.namelist():
             if name.endswith(".pkl"):
                 _check_globals(archive.read(name))
-        return dict(torch.load(io.BytesIO(content), map_location="cpu", weights_only=True))
+        weights = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        has_statistics = STATISTICS in members.namelist()
+        tensors = safetensors.numpy.load(members.read(STATISTICS)) if has_statistics else {}
+        return PolicyFile(dict(weights), tensors)
     except Exception as error:  # zipfile and torch raise many types for a forged file
         raise DamageError(
             f"{path} is damaged, it holds no policy's weights: {one_line(error)}"

@@ -1,0 +1,89 @@
+"""Running normalisation of what an agent sees."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from jbrep.errors import DamageError
+
+CLIP = 10.0  # standard deviations
+_EPSILON = 1e-8  # added to the variance
+_PREFIX = "statistics."  # begins the names of the tensors
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """The running mean and variance of each of the numbers that an agent sees."""
+
+    mean: Array  # (size,)
+    variance: Array  # (size,)
+    count: float  # of observations
+
+    @classmethod
+    def untrained(cls, size: int) -> "Statistics":
+        """Those that a run begins with."""
+        start = RunningMeanStd(shape=(size,))
+        return cls(start.mean, start.var, start.count)
+
+    @classmethod
+    def of(cls, env: VecNormalize) -> "Statistics":
+        """Those of an environment so far."""
+        running = _running(env)
+        return cls(running.mean, running.var, float(running.count))
+
+    @classmethod
+    def read(cls, tensors: Mapping[str, NDArray[Any]], size: int, source: object) -> "Statistics":
+        """Those that `tensors` gave.
+
+        Args:
+            tensors: they may have others beside.
+            size: of what the agent sees.
+            source: where the tensors are from, for messages.
+
+        Raises:
+            DamageError: they aren't there, or of another size, or not statistics.
+        """
+        checked = []
+        for name, shape in {"mean": (size,), "variance": (size,), "count": ()}.items():
+            values = np.asarray(tensors.get(_PREFIX + name))
+            sound = values.shape == shape and values.dtype == np.float64
+            if not sound or not np.isfinite(values).all() or (name != "mean" and values.min() < 0):
+                raise DamageError(
+                    f"{source} is damaged: the {name} of the {size} numbers that the policy sees "
+                    "is missing or invalid"
+                )
+            checked.append(values)
+        mean, variance, count = checked
+        return cls(mean, variance, float(count))
+
+    @property
+    def tensors(self) -> dict[str, NDArray[Any]]:
+        """Themselves by names, for a file."""
+        return {_PREFIX + name: np.asarray(value) for name, value in vars(self).items()}
+
+    def __call__(self, seen: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What an agent sees, (n, size), normalised as in training."""
+        scaled = (seen - self.mean) / np.sqrt(self.variance + _EPSILON)
+        return np.clip(scaled, -CLIP, CLIP).astype(np.float32)
+
+    def give(self, env: VecNormalize) -> None:
+        """Let an environment continue from them."""
+        running = _running(env)
+        running.mean, running.var = self.mean.copy(), self.variance.copy()
+        running.count = self.count
+
+
+def _running(env: VecNormalize) -> RunningMeanStd:
+    return cast(RunningMeanStd, env.obs_rms)  # of one array: observations are no dictionaries
+
+
+def normalized(env: VecEnv) -> VecNormalize:
+    """An environment whose observations are normalised; its rewards are left as they are."""
+    return VecNormalize(env, norm_reward=False, clip_obs=CLIP, epsilon=_EPSILON)

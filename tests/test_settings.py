@@ -1,0 +1,447 @@
+"""Settings other than a preset's: their names and values, networks, and running normalisation."""
+
+import dataclasses
+import hashlib
+import json
+import tomllib
+import zipfile
+
+import numpy as np
+import pytest
+import safetensors.numpy
+import torch
+from command import jbrep
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import VecNormalize
+
+from jbrep.encoders import find
+from jbrep.envs import describe
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.recording import episode_returns
+from jbrep.errors import DamageError, InputError
+from jbrep.report.facts import _toml
+from jbrep.rl import Run, StoppedError, train
+from jbrep.rl.agent import Evaluator, make_agent, make_env, statistics_of
+from jbrep.rl.files import EVALUATION_SEED, POLICY, RUN, read_evaluations, read_run
+from jbrep.rl.learner import Learner, read_preset, usual_name, write_preset
+from jbrep.rl.policy import load_run, load_untrained
+from jbrep.rl.presets import ALGORITHMS
+from jbrep.rl.settings import setting_names, used_settings
+from jbrep.rl.weights import STATISTICS
+from jbrep.study.config import as_study, read_study
+from jbrep.study.plan import read_plan
+from jbrep.study.results import read_results
+
+TASK = describe("Pendulum-v1", max_episode_steps=20)
+SMALL = {"net_arch": [8], "learning_starts": 10, "train_freq": 5, "batch_size": 8}
+QUICK = {"task": TASK, "preset": "modern", "steps": 60, "evaluation_episodes": 2}
+SAC_RUN = Run(**QUICK, settings={**SMALL, "normalize": True})
+
+
+def edited(folder, to, **settings):
+    """A copy of a run with other settings in run.json."""
+    to.mkdir()
+    for file in folder.iterdir():
+        if file.is_file():
+            (to / file.name).write_bytes(file.read_bytes())
+    run = json.loads((to / RUN).read_text())
+    run["settings"] |= settings
+    (to / RUN).write_text(json.dumps(run))
+    return to
+
+
+def agent_of(algorithm, overrides, preset="modern"):
+    used = used_settings(algorithm, preset, overrides)
+    env = make_env(TASK, used.num_envs, 0, find("full", TASK), used.normalize)
+    return make_agent(algorithm, used, env, 0)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("settings") / "run"
+    train(SAC_RUN, folder)
+    return folder
+
+
+def test_settings_reach_the_agent():
+    agent = agent_of(
+        "sac",
+        {
+            "learning_rate": "linear:1e-3",
+            "net_arch": {"pi": [8], "qf": [6, 4]},
+            "activation_fn": "silu",
+            "noise": {"kind": "normal", "sigma": 0.1},
+            "train_freq": [2, "step"],
+            "num_envs": 2,
+            "n_critics": 3,
+            "optimizer_kwargs": {"betas": [0.5, 0.9]},
+        },
+    )
+    assert [agent.lr_schedule(left) for left in (1, 0.5, 0)] == [1e-3, 5e-4, 0]
+    assert agent.actor.latent_pi[0].out_features == 8
+    assert isinstance(agent.actor.latent_pi[1], torch.nn.SiLU)
+    assert [m.out_features for m in agent.critic.q_networks[2] if hasattr(m, "bias")] == [6, 4, 1]
+    assert (agent.n_envs, agent.train_freq.frequency) == (2, 2)
+    assert agent.action_noise._sigma == 0.1
+    assert agent.actor.optimizer.param_groups[0]["betas"] == (0.5, 0.9)
+    assert agent.learning_starts == 1000  # of the preset, as before
+    assert agent_of("sac", {"noise": "none"}, "paper").action_noise is None
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings", "message"),
+    [
+        ("sac", {"learning_rat": 1}, "sac has no setting 'learning_rat': did you mean learning_ra"),
+        ("ppo", {"tau": 0.1}, "ppo has no setting 'tau': it has activation_fn, "),
+        ("sac", {"xyz": 1}, "sac has no setting 'xyz': it has activation_fn, batch_size"),
+        ("sac", {"device": "cuda"}, "device can't be set: runs are on the CPU"),
+        ("a2c", {"use_rms_prop": True}, "use_rms_prop can't be set: the optimiser is always Adam"),
+        ("sac", {"learning_rate": "fast"}, "learning_rate is fast: it must be a number or linear:"),
+        ("sac", {"batch_size": 2.5}, "batch_size is 2.5: it must be a whole number"),
+        ("sac", {"batch_size": True}, "batch_size is true: it must be a whole number"),
+        ("sac", {"gamma": 1.5}, "gamma is 1.5: it must be a number from 0 to 1"),
+        ("sac", {"gamma": float("nan")}, "no finite number"),
+        ("sac", {"net_arch": [10**6]}, "net_arch is .*from 1 to 1,024"),
+        ("ppo", {"net_arch": {"pi": [8], "qf": [8]}}, "net_arch is .* pi and vf"),
+        ("sac", {"activation_fn": "os.system"}, "activation_fn is os.system: it must be one of"),
+        ("sac", {"noise": {"kind": "pink"}}, 'noise is {"kind": "pink"}: it must be none'),
+        ("sac", {"optimizer_kwargs": {"lr": 1}}, "optimizer_kwargs is .*betas"),
+        ("sac", {"ent_coef": "often"}, "stable-baselines3 can't make sac .* 'often'"),
+        ("sac", {"train_freq": [1, "episode"], "num_envs": 2}, "a num_envs of 1"),
+        ("tqc", {"top_quantiles_to_drop_per_net": 25}, "must be below n_quantiles, 25"),
+    ],
+)
+def test_what_a_setting_can_not_be(algorithm, settings, message, tmp_path):
+    with pytest.raises(InputError, match=message) as error:
+        train(Run(**QUICK, algorithm=algorithm, settings=settings), tmp_path / "run")
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_every_setting_of_every_algorithm_takes_stable_baselines3_s_own_value():
+    for algorithm, kind in ALGORITHMS.items():
+        agent = agent_of(algorithm, {})
+        names = {*setting_names(algorithm)} & {*vars(agent)} - {"noise", "target_entropy"}
+        plain = {
+            name: value
+            for name in names
+            if isinstance(value := getattr(kind("MlpPolicy", agent.env), name), (int, float, str))
+        }
+        assert {"gamma", "learning_rate"} <= {*plain}
+        used_settings(algorithm, "modern", plain)
+
+
+def test_the_command_line_sets_them(tmp_path):
+    told = jbrep(
+        *("rl", "--task", "Pendulum-v1", "--preset", "modern", "--steps", 20),
+        *("--evaluation-episodes", 1, "--episode-steps", 20, "--normalize", "--out", tmp_path),
+        *("--set", "learning_rate=linear:3e-4", "--set", "net_arch=[8, 4]"),
+    )
+    assert told.exit_code == 0, told.output
+    settings = read_run(tmp_path)["settings"]
+    overrides = {"learning_rate": "linear:3e-4", "net_arch": [8, 4], "normalize": True}
+    assert (settings["preset"], settings["overrides"]) == ("modern", overrides)
+    assert (settings["hidden"], settings["normalize"]) == ([8, 4], True)
+    assert settings["settings"]["learning_rate"] == "linear:3e-4"
+    assert settings["learner"] == usual_name("sac-modern", overrides)
+    told = jbrep("rl", "--task", "Pendulum-v1", "--set", "gama=1", "--out", tmp_path / "no")
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    assert "did you mean gamma" in told.output
+
+
+def test_a_learner_s_name_says_its_settings_and_is_a_folder_s():
+    assert usual_name("sac", {"learning_rate": 3e-4}) == "sac+learning_rate=0.0003"
+    assert usual_name("sac", {"net_arch": [64, 64]}) == "sac+net_arch=64-64"
+    long = {
+        "noise": {"kind": "normal", "sigma": 0.1},
+        "net_arch": {"pi": [256], "qf": [256, 256, 256]},
+    }
+    assert len(usual_name("sac", long)) == len("sac+12345678")
+    assert usual_name("sac", long) != usual_name("sac", {**long, "gamma": 0.9})
+    assert "/" not in usual_name("sac", {"ent_coef": "../x"})
+
+
+def test_a_preset_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    settings = {"net_arch": {"pi": [8], "qf": [4]}, "noise": "none", "gamma": 0.9}
+    path.write_text(write_preset("sac", "modern", settings) + "[ppo]\ngama = 1\n")
+    assert read_preset(path, "sac") == ("modern", settings)
+    run = Run(task=TASK, algorithm="sac", preset=str(path), settings={"gamma": 0.8})
+    assert (run.preset, run.settings) == ("modern", {**settings, "gamma": 0.8})
+    assert run.learner == "sac-modern+mine+gamma=0.8"
+    for algorithm, message in (
+        ("ppo", r"mine\.toml, \[ppo\]: ppo has no setting 'gama': did you mean gamma"),
+        ("td3", r"mine\.toml has no table \[td3\]: it has sac, ppo"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Run(task=TASK, algorithm=algorithm, preset=str(path))
+    with pytest.raises(InputError, match=r"can't read .*none\.toml"):
+        Run(task=TASK, preset="none.toml")
+
+
+def test_learners_of_tables():
+    assert Learner.of_table("ddpg", {}) == Learner.of("ddpg")
+    mine = Learner.of_table("my-sac", {"base": "sac-modern", "gamma": 0.9})
+    assert (mine.algorithm, mine.preset, mine.overrides) == ("sac", "modern", {"gamma": 0.9})
+    assert Learner.of_table("my-sac", mine.table) == mine
+    for name, table, message in (
+        ("mine", {"gamma": 0.9}, "unknown algorithm 'mine'"),
+        ("sac", {"gamma": 0.9}, 'it is a preset\'s name: give it another and base = "sac"'),
+        ("td3-modern", {"base": "sac"}, "it is a preset's name"),
+        ("mine", {"base": "sac-modern", "preset": "paper"}, None),
+        ("a/b", {"base": "sac"}, "'a/b' can't be a learner's name"),
+        ("mine", {"base": 3}, "base and preset must be text"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Learner.of_table(name, table)
+
+
+def resumed(run, folder, stop_at=40):
+    """The run in a folder, stopped once on the way."""
+    steps = [0]
+    with pytest.raises(StoppedError):
+        train(run, folder, lambda step, _: steps.append(step), stop=lambda: steps[-1] >= stop_at)
+    assert load_run(folder).step
+    train(run, folder)
+    return folder
+
+
+@pytest.mark.filterwarnings("ignore:`n_steps=2` is ignored")  # in stable-baselines3's `load`
+@pytest.mark.parametrize(
+    "run",
+    [
+        Run(**QUICK, algorithm="tqc", settings=SMALL),
+        Run(**QUICK, algorithm="crossq", settings={**SMALL, "renorm_warmup_steps": 2}),
+        Run(**QUICK, algorithm="sac", settings={**SMALL, "use_sde": True, "n_steps": 2}),
+        Run(
+            **QUICK,
+            algorithm="ppo",
+            settings={
+                "n_steps": 10,
+                "batch_size": 20,
+                "num_envs": 2,
+                "use_sde": True,
+                "normalize": True,
+            },
+        ),
+        Run(**QUICK, algorithm="td3", settings={**SMALL, "learning_rate": "linear:0.01"}),
+    ],
+    ids=lambda run: run.algorithm,
+)
+def test_a_stopped_run_resumes_to_the_same_bytes_whatever_its_settings(run, tmp_path):
+    train(run, tmp_path / "whole")
+    resumed(run, tmp_path / "stopped")
+    for name in ("episodes.csv", "evaluations.csv", POLICY):
+        whole, stopped = (tmp_path / each / name for each in ("whole", "stopped"))
+        assert whole.read_bytes() == stopped.read_bytes(), name
+    ALGORITHMS[run.algorithm].load(tmp_path / "whole" / POLICY, device="cpu")
+    check_last_evaluation(tmp_path / "whole")
+
+
+def check_last_evaluation(folder):
+    """The loaded policy plays the run's last evaluation."""
+    trained = load_run(folder)
+    lanes = Lanes(TASK, 2)
+    returns = episode_returns(lanes, trained.begin(TASK, [0, 1]), EVALUATION_SEED)
+    last = [row.episode_return for row in read_evaluations(folder) if row.step > 0][-2:]
+    np.testing.assert_allclose(returns, last, atol=6e-4)
+
+
+def test_normalisation_is_resumed_evaluated_and_read_back(run, tmp_path):
+    resumed(SAC_RUN, tmp_path / "stopped")
+    assert (tmp_path / "stopped" / POLICY).read_bytes() == (run / POLICY).read_bytes()
+    check_last_evaluation(run)
+    without = dataclasses.replace(SAC_RUN, settings=SMALL)
+    train(without, tmp_path / "without")
+    ours, theirs = (load_run(each) for each in (run, tmp_path / "without"))
+    assert ours.statistics is not None
+    assert theirs.statistics is None
+    assert ours.statistics.count == pytest.approx(1 + SAC_RUN.steps, abs=1e-3)
+    name = "actor.mu.weight"
+    assert not ours.policy.state_dict()[name].equal(theirs.policy.state_dict()[name])
+    told = [json.loads(line) for line in evaluated(run, tmp_path / "without")]
+    assert told[0]["returns"] != told[1]["returns"]
+
+
+def evaluated(*folders):
+    for folder in folders:
+        told = jbrep("evaluate-policy", folder, "--episodes", 1, "--json")
+        assert told.exit_code == 0, told.output
+        yield told.output
+
+
+def test_statistics_are_those_of_what_the_agent_saw(run):
+    """stable-baselines3's own environment, with the same statistics, gives the same view."""
+    agent = SAC.load(run / POLICY, device="cpu")
+    statistics = load_run(run).statistics
+    env = make_env(TASK, 1, 0, find("full", TASK), normalize=True)
+    assert isinstance(env, VecNormalize)
+    statistics.give(env)
+    seen = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    np.testing.assert_array_equal(statistics(seen), env.normalize_obs(seen))
+    assert np.all(statistics.mean != 0)
+    assert agent.policy.state_dict()["actor.mu.bias"].equal(
+        load_run(run).policy.state_dict()["actor.mu.bias"]
+    )
+
+
+def test_gradient_steps_and_evaluations_use_the_statistics_without_changing_them():
+    agent = agent_of("sac", {**SMALL, "normalize": True})
+    assert agent._vec_normalize_env is agent.env
+    agent.learn(20)
+    before = statistics_of(agent)
+    stored = agent.replay_buffer.observations[:20]
+    batch = agent.replay_buffer._get_samples(np.arange(20), env=agent._vec_normalize_env)
+    np.testing.assert_array_equal(batch.observations.numpy(), before(stored[:, 0]))
+    Evaluator(TASK, find("full", TASK), 2).returns(agent)
+    after = statistics_of(agent)
+    assert (before.count, *before.mean) == (after.count, *after.mean)
+
+
+def test_a_run_that_begins_with_another_takes_its_statistics_along(run, tmp_path):
+    later = dataclasses.replace(SAC_RUN, seed=1, steps=5, begin_from=str(run))
+    train(later, tmp_path / "later")
+    began = load_untrained(tmp_path / "later").statistics
+    np.testing.assert_array_equal(began.mean, load_run(run).statistics.mean)
+    assert load_run(tmp_path / "later").statistics.count == began.count + 6
+    start = [r.episode_return for r in read_evaluations(tmp_path / "later") if r.step == 0]
+    end = [r.episode_return for r in read_evaluations(run) if r.step == SAC_RUN.steps]
+    assert start == pytest.approx(end, rel=1e-3)  # the first observation counts already
+    for settings, message in (
+        (SMALL, r"normalize True \(now: False\)"),
+        ({**SMALL, "normalize": True, "activation_fn": "tanh"}, r"activation_fn relu \(now: tanh"),
+        ({**SMALL, "normalize": True, "n_critics": 3}, r"n_critics None \(now: 3"),
+    ):
+        other = dataclasses.replace(later, settings=settings)
+        with pytest.raises(InputError, match=message):
+            train(other, tmp_path / "other")
+
+
+def test_a_folder_from_elsewhere_holds_no_other_settings_or_statistics(run, tmp_path):
+    for i, (settings, message) in enumerate(
+        (
+            ({"hidden": [10**9]}, "settings.hidden is invalid"),
+            ({"hidden": {"pi": [8], "vf": [8]}}, "net_arch is"),
+            ({"hidden": {"pi": [[8]], "qf": [8]}}, "settings.hidden is invalid"),
+            ({"policy": {"features_extractor_class": "os.system"}}, "has no argument"),
+            ({"policy": {"activation_fn": "os.system"}}, "activation_fn is os.system"),
+            ({"policy": {}}, "no policy can be made"),
+            ({"policy": {"activation_fn": "relu", "n_critics": 10**9}}, "n_critics is"),
+            ({"settings": {"use_sde": True}}, "doesn't fit the run's settings"),
+            ({"learner": "../x"}, "settings.learner is invalid"),
+            ({"normalize": "yes"}, "settings.normalize is invalid"),
+            ({"overrides": []}, "settings.overrides is invalid"),
+        )
+    ):
+        with pytest.raises(InputError, match=message) as error:
+            load_run(edited(run, tmp_path / str(i), **settings))
+        assert "\n" not in str(error.value)
+
+
+def test_damaged_statistics_are_named(run, tmp_path):
+    folder = edited(run, tmp_path / "copy")
+    with zipfile.ZipFile(run / POLICY) as file:
+        members = {name: file.read(name) for name in file.namelist()}
+    sound = safetensors.numpy.load(members[STATISTICS])
+    for tensors in (
+        {},
+        {**sound, "statistics.mean": np.full(3, np.nan)},
+        {**sound, "statistics.variance": -np.ones(3)},
+        {**sound, "statistics.mean": np.zeros(2)},
+    ):
+        with zipfile.ZipFile(folder / POLICY, "w") as file:
+            for name, content in members.items():
+                packed = safetensors.numpy.save(tensors) if name == STATISTICS else content
+                file.writestr(name, packed)
+        written = json.loads((folder / RUN).read_text())
+        written["policy_sha256"] = hashlib.sha256((folder / POLICY).read_bytes()).hexdigest()
+        (folder / RUN).write_text(json.dumps(written))
+        with pytest.raises(DamageError, match=r"policy\.zip is damaged: the (mean|variance)"):
+            load_run(folder)
+
+
+def test_a_run_of_an_earlier_jbrep_is_the_same_run(tmp_path):
+    """It lacks what every run had in common then."""
+    run = Run(**{**QUICK, "steps": 5}, algorithm="a2c")
+    train(run, tmp_path)
+    written = json.loads((tmp_path / RUN).read_text())
+    for name in ("policy", "normalize", "overrides", "learner"):
+        del written["settings"][name]
+    (tmp_path / RUN).write_text(json.dumps(written))
+    before = (tmp_path / RUN).read_bytes()
+    assert train(run, tmp_path)["settings"]["learner"] == "a2c-modern"
+    assert (tmp_path / RUN).read_bytes() == before
+    assert load_run(tmp_path).statistics is None
+
+
+STUDY = """
+tasks = ["Pendulum-v1"]
+representations = ["full"]
+seeds = 1
+steps = 40
+episode_steps = 20
+evaluation_episodes = 1
+
+[algorithms.a2c-modern]
+
+[algorithms.my-a2c]
+base = "a2c-modern"
+net_arch = [8]
+normalize = true
+
+[algorithms.tuned]
+base = "a2c"
+preset = "{preset}"
+gamma = 0.9
+"""
+
+
+def test_a_study_of_learners(tmp_path):
+    (tmp_path / "mine.toml").write_text(write_preset("a2c", "modern", {"net_arch": [4]}))
+    path, out = tmp_path / "study.toml", tmp_path / "out"
+    path.write_text(STUDY.format(preset=tmp_path / "mine.toml"))
+    told = jbrep("study", path, "--out", out, "--workers", 1)
+    assert told.exit_code == 0, told.output
+    own = {
+        "my-a2c": {"base": "a2c-modern", "net_arch": [8], "normalize": True},
+        "tuned": {"base": "a2c-modern", "net_arch": [4], "gamma": 0.9},
+    }
+    written = json.loads((out / "study.json").read_text())
+    assert (written["algorithms"], written["learners"]) == (["a2c-modern", *own], own)
+    assert read_plan(out).study == read_study(path)
+    labels = json.loads((out / "runs.json").read_text())["labels"]
+    assert [*labels] == [f"Pendulum-v1/{name}/full" for name in ("a2c-modern", *own)]
+    settings = labels["Pendulum-v1/tuned/full"]["settings"]
+    assert (settings["preset"], settings["hidden"]) == ("modern", [4])
+    assert settings["overrides"] == {"net_arch": [4], "gamma": 0.9}
+    assert as_study(tomllib.loads(_toml(written))) == read_study(path)
+    before = (out / "study.json").read_bytes()
+    (tmp_path / "mine.toml").write_text(write_preset("a2c", "modern", {"net_arch": [5]}))
+    told = jbrep("study", path, "--out", out, "--workers", 1)
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    assert "holds another study: learner tuned" in told.output
+    assert (out / "study.json").read_bytes() == before
+
+
+def test_settings_are_not_mixed_under_a_label(tmp_path):
+    quick = {**QUICK, "steps": 5, "algorithm": "a2c", "learner": "mine"}
+    for seed, gamma in enumerate((0.9, 0.9, 0.8)):
+        train(Run(**quick, seed=seed, settings={"gamma": gamma}), tmp_path / str(seed))
+    assert "other settings" in " ".join(read_results(tmp_path).left_out)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("[algorithms.mine]\nbase = 'sac'\ngama = 1", r"\[algorithms.mine\]: sac has no setting"),
+        ("[algorithms.sac]\ngamma = 0.9", r"\[algorithms.sac\]: it is a preset's name"),
+        ("[algorithms]\nsac = 3", "algorithms.sac is 3: it must be a table"),
+        ("[algorithms.mine]\nbase = 'sac'\nday = 2000-01-01", "sac have a value that is no finite"),
+    ],
+)
+def test_what_a_learner_s_table_can_not_be(table, message, tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY.partition("[algorithms")[0] + table)
+    with pytest.raises(InputError, match=message) as error:
+        read_study(path)
+    assert "\n" not in str(error.value)
