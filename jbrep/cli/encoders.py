@@ -324,7 +324,10 @@ def export(encoder: str, out: Path, **options: Any) -> None:
     task = given_task(options, required=False)
     exported = find_alone(encoder, task)
     if not isinstance(exported, Encoder):
-        raise InputError(f"{encoder} is code, which can't be exported: give an encoder's file")
+        raise InputError(
+            f"{encoder} is code, which can't be exported: give an encoder's file, as "
+            "Encoder.from_torch makes it"
+        )
     run(exported, out)
     click.echo(f"exported {printable(source_of(encoder, task))}")
     click.echo(f"open it with onnxruntime.InferenceSession({str(out)!r})")

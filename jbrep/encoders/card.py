@@ -66,7 +66,7 @@ def card(encoder: BaseEncoder, source: str, width: int) -> str:
         return f"{encoder.name}\n{facts({**lines, 'decodes': decodes}, width)}"
     lines |= {
         "encoder": _shape(encoder.size, told["encoder"]),
-        "decoder": _shape(encoder.latent_size, told["decoder"]),
+        "decoder": (_shape(encoder.latent_size, told["decoder"]) if encoder.can_decode else "none"),
         **{name: _listed(told[name]) for name in _RECORDS},
         "sha256": told["sha256"],
     }
