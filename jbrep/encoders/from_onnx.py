@@ -142,7 +142,7 @@ class _Node:
         if self.operation not in _ACTIONS:
             raise InputError("an encoder has no such layer")
         if self._names[0] not in self._values or self._values & set(self._names[1:]):
-            raise InputError("its first input must be a value, the others constants")
+            raise InputError("its first input alone may depend on the observation")
         return _ACTIONS[self.operation](self)
 
     def given(self, place: int) -> Any:
