@@ -46,6 +46,7 @@ class _Method(nn.Module):
         return getattr(self.module, self.method)(values)
 
 
+@np.errstate(all="ignore")  # what isn't finite is refused
 def _layers(module: nn.Module, method: str, rows: Any) -> tuple[tuple[Layer, ...], Any]:
     """A module's layers, and what it makes of rows (n, units).
 
@@ -58,7 +59,7 @@ def _layers(module: nn.Module, method: str, rows: Any) -> tuple[tuple[Layer, ...
     if not isinstance(module, nn.Module):
         raise InputError(f"{said} is no torch module: an Encoder is made of one")
     try:
-        copied = copy.deepcopy(getattr(module, "_orig_mod", module)).cpu().eval()  # if compiled
+        copied = _copy(getattr(module, "_orig_mod", module))  # of a compiled one, the original
         traced = _Method(copied, method if hasattr(copied, method) else "forward")
         with torch.no_grad():
             layers = _fold(traced, _Tracer().trace(traced), rows.shape[1])
@@ -68,8 +69,7 @@ def _layers(module: nn.Module, method: str, rows: Any) -> tuple[tuple[Layer, ...
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise InputError(refusal(said, reason)) from error
-    with np.errstate(all="ignore"):
-        given = run(layers, np.asarray(rows, np.float32))
+    given = run(layers, np.asarray(rows, np.float32))
     most = _PRECISION * (np.abs(expected).max() + _PRECISION)
     if given.shape != expected.shape or not (np.abs(given - expected) <= most).all():
         raise InputError(
@@ -77,6 +77,13 @@ def _layers(module: nn.Module, method: str, rows: Any) -> tuple[tuple[Layer, ...
             "changing a value in place"
         )
     return layers, expected
+
+
+def _copy(module: nn.Module) -> nn.Module:
+    """A copy in evaluation on the CPU, of 32 bits at least."""
+    copied = copy.deepcopy(module).cpu().eval()
+    is_short = any(p.is_floating_point() and p.element_size() < 4 for p in copied.parameters())
+    return copied.float() if is_short else copied
 
 
 def _outputs(module: nn.Module, rows: Any) -> Any:
