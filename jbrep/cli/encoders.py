@@ -310,10 +310,10 @@ def info(encoder: str, as_json: bool, **options: Any) -> None:
 @task_options()
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A new .onnx file.")
 def export(encoder: str, out: Path, **options: Any) -> None:
-    """Write an encoder and its decoder as ONNX.
+    """Write an encoder, with its decoder, as ONNX.
 
-    The input is `observation`, in physical units; the outputs are `latent` and `reconstruction`.
-    ENCODER is as for `info`.
+    The input is `observation`, in physical units; the outputs are `latent` and, if there is a
+    decoder, `reconstruction`. ENCODER is as for `info`.
     """
     from jbrep.encoders import Encoder
     from jbrep.encoders.code import import_code
