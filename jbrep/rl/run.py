@@ -23,6 +23,7 @@ from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.envs.names import environment_versions
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
+from jbrep.files.commit import commits
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder, write_whole
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed, unchecked_distributions
@@ -263,6 +264,7 @@ def _train(
         "steps": agent.num_timesteps,
         "seconds": history.seconds,
         "versions": versions,
+        "commits": dict(commits()),
         "cpu": _cpu(),
     }
     write_rows(folder / EPISODES, history.episodes, Episode)
