@@ -12,6 +12,8 @@ import zipfile
 from dataclasses import replace
 from types import SimpleNamespace
 
+import gymnasium
+import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -165,7 +167,10 @@ def test_what_is_exported_comes_back(to, collected, tmp_path):
 
 def test_seeds_that_are_not_known_stay_so(written, tmp_path):
     export(written, "minari", tmp_path)
-    import_data(str(tmp_path / written.task.slug / "imported-v0"), tmp_path / "back")
+    exported = tmp_path / written.task.slug / "imported-v0"
+    with h5py.File(exported / "data" / "main_data.hdf5") as file:
+        assert ["seed" in file[f"episode_{i}"].attrs for i in range(3)] == [True, False, True]
+    import_data(str(exported), tmp_path / "back")
     back = Dataset(tmp_path / "back")
     same(back, arrays())
     assert back.episodes["seed"].tolist() == [5, -1, 2**62]
@@ -299,8 +304,8 @@ def test_no_code_that_a_minari_data_set_names_is_run(minari_folder, tmp_path, mo
     (tmp_path / "evil.py").write_text("open('ran', 'w')")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    spec = {"id": "Evil-v0", "entry_point": "evil:Env", "kwargs": {}, "max_episode_steps": 5}
-    changes = {"env_spec": json.dumps(spec), "observation_space": None}
+    spec = gymnasium.envs.registration.EnvSpec("Evil-v0", entry_point="evil:Env")
+    changes = {"env_spec": spec.to_json(), "observation_space": None}
     with pytest.raises(InputError, match=r"metadata.json can't be read: KeyError"):
         import_data(minari_copy(minari_folder, tmp_path, **changes), tmp_path / "data")
     assert not (tmp_path / "ran").exists()

@@ -76,11 +76,14 @@ _noise = click.option(
 def _how(command: Callable[..., None]) -> Callable[..., None]:
     """The options of every kind that has a network."""
     options = (
-        click.option("--architecture", help="paper, the default, or deep."),
+        click.option(
+            "--architecture",
+            help="paper, the default; deep; or sizes of your own, such as 64,64.",
+        ),
         click.option(
             "--epochs",
             type=COUNT,
-            help="Passes over the data; by default 200 or, if deep, 12.",
+            help="Passes over the data; by default 200 or, if not paper, 12.",
         ),
         click.option(
             "--batch-size",
@@ -88,7 +91,7 @@ def _how(command: Callable[..., None]) -> Callable[..., None]:
             help="Rows in a batch; by default from the rows, 128 to 8192.",
         ),
         click.option(
-            "--learning-rate", type=float, help="Of Adam; by default 5e-4 or, if deep, 2e-3."
+            "--learning-rate", type=float, help="Of Adam; by default 5e-4 or, if not paper, 2e-3."
         ),
         click.option("--seed", type=COUNT, help="Of weights, order and noise; 0 by default."),
         click.option("--device", default="auto", show_default=True, help="cpu, cuda, or auto."),
@@ -270,7 +273,7 @@ def _labels(names: list[str], sources: list[str]) -> list[str]:
 
 @click.group()
 def encoder() -> None:
-    """Look at encoders, and export them."""
+    """Look at encoders, export them, and import those that were trained elsewhere."""
 
 
 _which = click.argument("encoder")
@@ -325,3 +328,41 @@ def export(encoder: str, out: Path, **options: Any) -> None:
     run(exported, out)
     click.echo(f"exported {printable(source_of(encoder, task))}")
     click.echo(f"open it with onnxruntime.InferenceSession({str(out)!r})")
+
+
+@encoder.command(
+    "import",
+    epilog=example(
+        "jbrep encoder import model.onnx --task face_direction --out encoders/mine.safetensors"
+    ),
+)
+@click.argument("model", type=click.Path(path_type=Path))
+@task_options()
+@click.option(
+    "--decoder",
+    type=click.Path(path_type=Path),
+    help="A model from latents back to observations, if MODEL has no reconstruction.",
+)
+@click.option("--name", help="What tables will call it; by default the name of the file.")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="A new encoder file.")
+def import_model(
+    model: Path, decoder: Path | None, name: str | None, out: Path, **options: Any
+) -> None:
+    """Make an encoder file from an ONNX model.
+
+    MODEL takes observations in physical units, (rows, features), and is a chain of dense layers
+    with the usual activations and normalisations. Nothing in it is run.
+    """
+    from jbrep.encoders.card import card
+    from jbrep.encoders.file import SUFFIX, save
+    from jbrep.encoders.from_onnx import convert
+    from jbrep.files.storage import exists
+
+    task = given_task(options)
+    assert task is not None
+    if exists(out):
+        raise InputError(f"{out} exists already: choose another file")
+    made = convert(model, task, decoder, name or out.name.removesuffix(SUFFIX))
+    save(made, out)
+    for line in card(made, str(out), terminal_width()).splitlines():
+        click.echo(printable(line))

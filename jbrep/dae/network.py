@@ -1,15 +1,20 @@
 """The autoencoder's network."""
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
 from jbrep.encoders import Layer
-from jbrep.errors import choose
+from jbrep.encoders.encoder import MAX_UNITS
+from jbrep.errors import InputError, choose
+from jbrep.files.container import MAX_BYTES
 
 _MODULES = {"relu": nn.ReLU, "tanh": nn.Tanh}
+_SIZES = re.compile(r"[1-9][0-9]{0,8}([x,][1-9][0-9]{0,8})*")
+_BYTES = 4  # of a number in float32
 _NAMES = {module: name for name, module in _MODULES.items()}
 
 
@@ -17,6 +22,7 @@ _NAMES = {module: name for name, module in _MODULES.items()}
 class Architecture:
     """The layers between observation and latent, and the default settings of training."""
 
+    name: str  # paper, deep, or the hidden sizes, as 64x64
     hidden: tuple[int, ...]  # widths from observation to latent, mirrored in the decoder; ReLU
     output: str  # activation of the reconstruction; the latent's is tanh
     epochs: int
@@ -25,18 +31,45 @@ class Architecture:
 
 
 ARCHITECTURES = {
-    "paper": Architecture((), "tanh", epochs=200, learning_rate=5e-4, decay=False),
-    "deep": Architecture((128, 64), "linear", epochs=12, learning_rate=2e-3, decay=True),
+    each.name: each
+    for each in (
+        Architecture("paper", (), "tanh", epochs=200, learning_rate=5e-4, decay=False),
+        Architecture("deep", (128, 64), "linear", epochs=12, learning_rate=2e-3, decay=True),
+    )
 }
 
 
 def get_architecture(name: str) -> Architecture:
     """The architecture of that name.
 
+    One's own hidden sizes, as 64x64 or 64,64, give one that is like `deep` otherwise.
+
     Raises:
-        InputError: the name is unknown; the message lists the architectures.
+        InputError: the name is unknown; the message lists the architectures. Or a size is out of
+            range.
     """
-    return choose(name, ARCHITECTURES, "architecture")
+    if not _SIZES.fullmatch(name):
+        choices = {**ARCHITECTURES, "sizes such as 64x64": ARCHITECTURES["deep"]}
+        return choose(name, ARCHITECTURES if name in ARCHITECTURES else choices, "architecture")
+    hidden = tuple(map(int, re.split("[x,]", name)))
+    if max(hidden) > MAX_UNITS:
+        raise InputError(f"architecture {name} has {max(hidden)} units: the limit is {MAX_UNITS}")
+    return replace(ARCHITECTURES["deep"], name="x".join(map(str, hidden)), hidden=hidden)
+
+
+def check_size(architecture: Architecture, size: int, latent: int) -> None:
+    """Make sure that a network from `size` features to `latent` units fits an encoder's file.
+
+    Raises:
+        InputError: it is too large.
+    """
+    widths = (size, *architecture.hidden, latent)
+    needed = 2 * _BYTES * sum(before * after for before, after in pairwise(widths))
+    if needed > MAX_BYTES:
+        raise InputError(
+            f"architecture {architecture.name} has weights of {needed:,} bytes with {size} "
+            f"features: an encoder's file has at most {MAX_BYTES:,}; choose smaller sizes"
+        )
 
 
 class Autoencoder(nn.Module):

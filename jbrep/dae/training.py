@@ -64,7 +64,7 @@ class Training:
         defaults = get_architecture(architecture)
         training = cls(
             latent=latent,
-            architecture=architecture,
+            architecture=defaults.name,
             epochs=defaults.epochs if epochs is None else epochs,
             batch_size=batch_size,
             learning_rate=defaults.learning_rate if learning_rate is None else learning_rate,

@@ -1,6 +1,7 @@
 """Encoders: from observations to latents and back, their file format, and those that ship."""
 
-from jbrep.encoders.encoder import ACTIVATIONS, FULL, Encoder, Layer
+from jbrep.encoders.activations import ACTIVATIONS
+from jbrep.encoders.encoder import FULL, Encoder, Layer
 from jbrep.encoders.file import load, save
 from jbrep.encoders.shipped import find
 

@@ -1,6 +1,6 @@
 """The encoder: from observations to latents and back, through dense layers."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import zip_longest
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import Scaler
+from jbrep.encoders.activations import ACTIVATIONS, FIRST_ACTIVATIONS, activate
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task, check_same, read_task
 from jbrep.errors import InputError
@@ -21,9 +22,10 @@ Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 
 FULL = "full"  # the representation that is the whole observation
 FORMAT = "jbrep encoder"
-FORMAT_VERSION = 2  # version 1 has no environment: it is the Jitterbug's
+FORMAT_VERSION = 3  # the newest; see `Encoder.format_version`
 IDENTITY = "identity"  # the kind of encoder that leaves the scaled observation as it is
-_MAX_UNITS = 4096  # in a layer
+IMPORTED = "imported"  # the kind of encoder that was trained elsewhere
+MAX_UNITS = 4096  # in a layer
 MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
 
 
@@ -35,17 +37,10 @@ class Layer(NamedTuple):
     activation: str
 
 
-ACTIVATIONS: dict[str, Callable[[Any], Any]] = {  # for NumPy arrays and torch tensors
-    "linear": lambda values: values,
-    "relu": lambda values: values.clip(min=0),
-    "tanh": lambda values: values.tanh() if hasattr(values, "tanh") else np.tanh(values),
-}
-
-
 def run(layers: tuple[Layer, ...], values: Any) -> Any:
     """Pass values (..., in) through the layers, giving (..., out)."""
     for weight, bias, activation in layers:
-        values = ACTIVATIONS[activation](values @ weight.T + bias)
+        values = activate(activation, values @ weight.T + bias)
     return values
 
 
@@ -88,8 +83,8 @@ class Encoder(BaseEncoder):
             self._check(name, tensor, sizes)
         if self.decoder and sizes[-1] != self.size:
             raise InputError(f"the last layer has {sizes[-1]} units, expected {self.size}")
-        if max(sizes) > _MAX_UNITS:
-            raise InputError(f"a layer has {max(sizes)} units: the limit is {_MAX_UNITS}")
+        if max(sizes) > MAX_UNITS:
+            raise InputError(f"a layer has {max(sizes)} units: the limit is {MAX_UNITS}")
         for layer in (*self.encoder, *self.decoder):
             if layer.activation not in ACTIVATIONS:
                 choices = ", ".join(ACTIVATIONS)
@@ -115,6 +110,33 @@ class Encoder(BaseEncoder):
             raise InputError(
                 f"tensor {name} holds a number that is not finite or not below {MAX_MAGNITUDE:g}"
             )
+
+    @staticmethod
+    def from_torch(
+        encoder: Any, task: Task | str, decoder: Any = None, name: str = "own"
+    ) -> "Encoder":
+        """An encoder with the layers of a torch module, which stays as it is.
+
+        The module must be a chain of dense layers and activations of jbrep, as nn.Sequential or in
+        a `forward` that torch.fx can trace, in evaluation: normalisation and any other affine maps
+        become part of the layers.
+
+        Args:
+            encoder: takes observations (n, d) in physical units, gives latents (n, l). Its method
+                `encode` is used if it has one.
+            task: whose observations it reads, or that task's name.
+            decoder: takes latents, gives observations; its method `decode` is used if it has one.
+                None for the `decode` of the encoder, or none.
+            name: what tables will call it: lower-case letters, digits and hyphens.
+
+        Raises:
+            InputError: a module is no such chain; the message names the operation.
+        """
+        from jbrep.encoders.from_torch import convert  # imports torch
+        from jbrep.envs.description import describe  # imports Gymnasium
+
+        known = describe(task) if isinstance(task, str) else task
+        return convert(encoder, known, decoder, name)
 
     def __repr__(self) -> str:
         return f"Encoder({self.name}, {self.header.get('task')}, {self.size} to {self.latent_size})"
@@ -154,10 +176,22 @@ class Encoder(BaseEncoder):
             part: [layer.activation for layer in getattr(self, part)]
             for part in ("encoder", "decoder")
         }
-        version = (
-            FORMAT_VERSION if "environment" in self.header else 1
-        )  # old files keep their bytes
-        return {"format": FORMAT, "format_version": version, **self.header, **activations}
+        start = {"format": FORMAT, "format_version": self.format_version}
+        return {**start, **self.header, **activations}
+
+    @property
+    def format_version(self) -> int:
+        """The oldest version of the file that can hold it, so that old files keep their bytes.
+
+        Version 1 has no environment: it is the Jitterbug's. Version 3 is of encoders that a jbrep
+        of version 2 can't read: imported, with other activations, without a decoder, or with a
+        latent larger than the observation.
+        """
+        if "environment" not in self.header:
+            return 1
+        used = {layer.activation for layer in (*self.encoder, *self.decoder)}
+        known = self.kind != IMPORTED and used <= FIRST_ACTIVATIONS
+        return 2 if known and self.can_decode and self.latent_size <= self.size else 3
 
     @property
     def fingerprint(self) -> str:

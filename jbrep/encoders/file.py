@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from jbrep.dataset import Scaler
-from jbrep.encoders.encoder import FORMAT, FORMAT_VERSION, Encoder, Layer
+from jbrep.encoders.encoder import FORMAT, FORMAT_VERSION, IMPORTED, Encoder, Layer
 from jbrep.errors import InputError, check_version
 from jbrep.files import container
 from jbrep.files.container import Tensors
 from jbrep.files.storage import write_whole
 
 SUFFIX = ".safetensors"
-HELD_OUT_MSE = "held_out_mse"  # the metric that every encoder has
+HELD_OUT_MSE = "held_out_mse"  # the metric that every encoder has, unless it was trained elsewhere
 _TEXTS = ("kind", "name", "task")
 _RECORDS = ("training", "data", "metrics", "versions")
 _RESERVED = ("format", "format_version", "encoder", "decoder", "sha256")
@@ -56,7 +56,20 @@ def load(path: Path) -> Encoder:
             and tensors are inconsistent; the message names the tensor.
         DamageError: it isn't what was written.
     """
-    tensors, header = container.read(path, "encoder")
+    return unpack(path, *container.read(path, "encoder"))
+
+
+def unpack(path: Path, tensors: Tensors, header: dict[str, Any]) -> Encoder:
+    """The encoder with these tensors and this header, both of which are used up.
+
+    Args:
+        path: of the file that they come from, for messages.
+        tensors: as `Encoder.tensors` gives them.
+        header: as `Encoder.file_header` is.
+
+    Raises:
+        InputError: as `load`.
+    """
     if header.get("format") != FORMAT:
         raise InputError(f"{path} is not a jbrep encoder")
     check_version(path, header.get("format_version"), FORMAT_VERSION)
@@ -104,7 +117,8 @@ def _check(header: dict[str, Any]) -> None:
         raise InputError(
             f"invalid encoder name {header['name']!r}: use lower-case letters, digits and hyphens"
         )
-    if not isinstance(header["metrics"].get(HELD_OUT_MSE), float):
+    absent = 0.0 if header["kind"] == IMPORTED else None
+    if not isinstance(header["metrics"].get(HELD_OUT_MSE, absent), float):
         raise InputError(f"the header's metrics have no {HELD_OUT_MSE}, or not as a float")
     for name in ("features", "encoder", "decoder"):
         if not all(isinstance(word, str) for word in header[name]):

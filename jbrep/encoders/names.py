@@ -1,4 +1,4 @@
-"""Names of encoders: kind, architecture, latent size, such as dae-8, dae-deep-8 and pca-8."""
+"""Names of encoders: kind, architecture, latent size, such as dae-8, dae-deep-8, dae-64x64-8."""
 
 from typing import NamedTuple
 
@@ -19,6 +19,7 @@ class EncoderName(NamedTuple):
         if not (words and latent.isascii() and latent.isdecimal() and len(latent) < 10):
             return cls(name)
         kind, _, architecture = words.partition("-")
+        architecture = architecture.replace(",", "x")  # sizes, as a command line takes them
         return cls(kind, architecture or USUAL_ARCHITECTURE, int(latent))
 
     @property

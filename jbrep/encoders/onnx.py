@@ -2,25 +2,37 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from jbrep.encoders.activations import EPSILON, LAYER_NORM
 from jbrep.encoders.encoder import Encoder, Layer
 from jbrep.errors import InputError
 from jbrep.files.storage import exists, write_whole
 
-_OPSET = 17
-_OPERATORS = {"relu": "Relu", "tanh": "Tanh", "linear": "Identity"}
+_OPSET, _IR_VERSION = 17, 8
+_LATER = 20, 9  # the same for models with GELU
+_OPERATORS: dict[str, tuple[str, dict[str, Any]]] = {
+    "linear": ("Identity", {}),
+    "relu": ("Relu", {}),
+    "tanh": ("Tanh", {}),
+    "sigmoid": ("Sigmoid", {}),
+    "gelu": ("Gelu", {"approximate": "none"}),
+    "gelu-tanh": ("Gelu", {"approximate": "tanh"}),
+    "elu": ("Elu", {"alpha": 1.0}),
+    "softplus": ("Softplus", {}),
+}
 
 
 def export(encoder: Encoder, path: Path) -> None:
     """Write encoder and decoder, with the scaling, as one model.
 
     Its input is `observation`, (n, d) float32 in physical units; its outputs are `latent`, (n, l),
-    and `reconstruction`, (n, d) in physical units. Its metadata has the header, which describes the
-    environment.
+    and, if there is a decoder, `reconstruction`, (n, d) in physical units. Its metadata has the
+    header, which describes the environment.
 
     Raises:
         InputError: the file exists already, or can't be written.
@@ -38,10 +50,14 @@ def model(encoder: Encoder) -> onnx.ModelProto:
     graph.node("Sub", ("observation", "centre"), "centred")
     graph.node("Div", ("centred", "half_width"), "scaled")
     graph.layers("encoder", encoder.encoder, "scaled", "latent")
-    graph.layers("decoder", encoder.decoder, "latent", "decoded")
-    graph.node("Mul", ("decoded", "half_width"), "widened")
-    graph.node("Add", ("widened", "centre"), "reconstruction")
-    sizes = {"latent": encoder.latent_size, "reconstruction": encoder.size}
+    sizes = {"latent": encoder.latent_size}
+    if encoder.can_decode:
+        graph.layers("decoder", encoder.decoder, "latent", "decoded")
+        graph.node("Mul", ("decoded", "half_width"), "widened")
+        graph.node("Add", ("widened", "centre"), "reconstruction")
+        sizes["reconstruction"] = encoder.size
+    later = any("gelu" in layer.activation for layer in (*encoder.encoder, *encoder.decoder))
+    opset, ir_version = _LATER if later else (_OPSET, _IR_VERSION)
     made = helper.make_model(
         helper.make_graph(
             graph.nodes,
@@ -50,8 +66,8 @@ def model(encoder: Encoder) -> onnx.ModelProto:
             [_rows(name, size) for name, size in sizes.items()],
             graph.constants,
         ),
-        opset_imports=[helper.make_opsetid("", _OPSET)],
-        ir_version=8,
+        opset_imports=[helper.make_opsetid("", opset)],
+        ir_version=ir_version,
         producer_name="jbrep",
     )
     header = {**encoder.header, "environment": encoder.task.as_json()}
@@ -75,8 +91,8 @@ class _Graph:
         self.constants.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
         return name
 
-    def node(self, operator: str, inputs: tuple[str, ...], output: str) -> str:
-        self.nodes.append(helper.make_node(operator, inputs, [output], output))
+    def node(self, operator: str, inputs: tuple[str, ...], output: str, **attributes: Any) -> str:
+        self.nodes.append(helper.make_node(operator, inputs, [output], output, **attributes))
         return output
 
     def layers(self, part: str, layers: tuple[Layer, ...], value: str, output: str) -> None:
@@ -85,5 +101,16 @@ class _Graph:
             names = f"{part}.{i}.weight", f"{part}.{i}.bias"
             weight, bias = map(self.constant, names, (layer.weight.T, layer.bias))
             dense = self.node("Gemm", (value, weight, bias), f"{part}.{i}.dense")
-            value = self.node(_OPERATORS[layer.activation], (dense,), f"{part}.{i}")
+            value = self.activation(layer, dense, f"{part}.{i}")
         self.node("Identity", (value,), output)
+
+    def activation(self, layer: Layer, value: str, output: str) -> str:
+        """Add a layer's activation, from a value to the output."""
+        if layer.activation == "silu":
+            share = self.node("Sigmoid", (value,), f"{output}.sigmoid")
+            return self.node("Mul", (value, share), output)
+        if layer.activation == LAYER_NORM:
+            ones = self.constant(f"{output}.scale", np.ones_like(layer.bias))
+            return self.node("LayerNormalization", (value, ones), output, epsilon=EPSILON)
+        operator, attributes = _OPERATORS[layer.activation]
+        return self.node(operator, (value,), output, **attributes)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.dae import checkpoint
-from jbrep.dae.network import Autoencoder, get_architecture, layers
+from jbrep.dae.network import Autoencoder, check_size, get_architecture, layers
 from jbrep.dae.training import (
     Epoch,
     Rows,
@@ -249,6 +249,8 @@ def _check(kind: str, settings: Mapping[str, Any], data: ScaledDataset) -> None:
             raise InputError(
                 f"latent size is {latent}: with {size} features it must be from 1 to {size - 1}"
             )
+        if "architecture" in settings:
+            check_size(get_architecture(settings["architecture"]), size, latent)
     if settings.get("noise") == 0:
         raise InputError(f"{kind} without noise is a plain autoencoder: use the kind ae")
 

@@ -1,0 +1,78 @@
+"""The activations of an encoder's layers, for NumPy arrays and torch tensors alike."""
+
+import math
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+LAYER_NORM = "layer-norm"  # the one that reads all units of a layer at once
+EPSILON = 1e-5  # added to the variance in a layer norm
+_SATURATED = 10.0  # from where tanh in the approximate GELU is 1 in float64
+
+
+def activate(name: str, values: Any) -> Any:
+    """Apply an activation to values (..., units), a NumPy array or a torch tensor, in their type.
+
+    `layer-norm` is over the units, without weights of its own: an affine map after it has them.
+    """
+    known = _torch() if type(values).__module__ == "torch" else ACTIVATIONS
+    return known[name](values)
+
+
+def _sigmoid(values: Any) -> Any:
+    small = np.exp(-np.abs(values))  # at most 1, so that nothing overflows
+    return np.where(values >= 0, 1, small) / (1 + small)
+
+
+def _gelu(values: Any) -> Any:
+    from scipy.special import ndtr  # the distribution function of N(0, 1), exact in its tails
+
+    return values * ndtr(values)
+
+
+def _gelu_tanh(values: Any) -> Any:
+    near = np.clip(values, -_SATURATED, _SATURATED)
+    return 0.5 * values * (1 + np.tanh(math.sqrt(2 / math.pi) * (near + 0.044715 * near**3)))
+
+
+def _layer_norm(values: Any) -> Any:
+    wide = np.asarray(values, np.float64)
+    centred = wide - wide.mean(-1, keepdims=True)
+    variance = np.square(centred).mean(-1, keepdims=True)
+    return (centred / np.sqrt(variance + EPSILON)).astype(values.dtype)
+
+
+ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {  # for NumPy arrays
+    "linear": lambda values: values,
+    "relu": lambda values: values.clip(min=0),
+    "tanh": np.tanh,
+    "sigmoid": _sigmoid,
+    "gelu": _gelu,  # Hendrycks and Gimpel 2016
+    "gelu-tanh": _gelu_tanh,  # their approximation of it
+    "silu": lambda values: values * _sigmoid(values),
+    "elu": lambda values: np.where(values > 0, values, np.expm1(np.minimum(values, 0))),
+    "softplus": lambda values: np.logaddexp(values, 0),
+    LAYER_NORM: _layer_norm,
+}
+FIRST_ACTIVATIONS = frozenset(("linear", "relu", "tanh"))  # those of format versions 1 and 2
+
+
+@cache
+def _torch() -> Mapping[str, Callable[[Any], Any]]:
+    """The same for torch tensors."""
+    from torch.nn import functional
+
+    return {
+        "linear": lambda values: values,
+        "relu": lambda values: values.clip(min=0),
+        "tanh": lambda values: values.tanh(),
+        "sigmoid": lambda values: values.sigmoid(),
+        "gelu": functional.gelu,
+        "gelu-tanh": lambda values: functional.gelu(values, approximate="tanh"),
+        "silu": functional.silu,
+        "elu": functional.elu,
+        "softplus": functional.softplus,
+        LAYER_NORM: lambda values: functional.layer_norm(values, values.shape[-1:], eps=EPSILON),
+    }
