@@ -86,7 +86,9 @@ def record(env: gymnasium.Env, seed: int) -> EpisodeBuffer:
         steps.append((before, action, reward, terminated, truncated))
         ended = terminated or truncated
     observations, actions, *others = map(np.array, zip(*steps, strict=True))
-    return EpisodeBuffer(None, seed, None, np.append(observations, [observation], 0), actions, *others)
+    return EpisodeBuffer(
+        None, seed, None, np.append(observations, [observation], 0), actions, *others
+    )
 
 
 def data() -> None:

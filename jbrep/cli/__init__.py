@@ -12,6 +12,7 @@ from jbrep.cli.policies import behaviour, evaluate_policy
 from jbrep.cli.render import render
 from jbrep.cli.rl import rl
 from jbrep.cli.study import report, study
+from jbrep.cli.tune import tune
 
 
 @click.group(cls=Cli, context_settings={"help_option_names": ["-h", "--help"]})
@@ -22,7 +23,7 @@ def main() -> None:
 
 _COMMANDS = (
     *(env, collect, data, train_dae, train_encoder, evaluate, encoder),
-    *(rl, evaluate_policy, behaviour, study, report, inspect),
+    *(rl, tune, evaluate_policy, behaviour, study, report, inspect),
     *(render, doctor),
 )
 for _command in _COMMANDS:

@@ -22,9 +22,11 @@ _EXTRAS = {  # the extra that installs a missing package
     **dict.fromkeys(("tensorboard", "torch"), "learn"),
     **dict.fromkeys(("minari", "onnx", "pyarrow"), "export"),
     **dict.fromkeys(("PIL", "av"), "render"),
+    "optuna": "tune",
     "ray": "cluster",
     "rerun": "view",
     "shimmy": "suite",
+    "wandb": "wandb",
 }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -15,6 +15,11 @@ from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, on_stop, print
 from jbrep.cli.environment import given_task, parse_arguments, task_options
 from jbrep.rl.names import CLASSES
 from jbrep.text import rounded
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.logger import KVWriter
+
+    from jbrep.rl import Run
 
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 _NOT_REPRODUCIBLE = (
@@ -100,17 +105,23 @@ def given_settings(options: dict[str, Any]) -> dict[str, Any]:
     "one on another body; optimisers and SAC's entropy coefficient start anew.",
 )
 @click.option(
+    "--wandb",
+    "project",
+    metavar="PROJECT",
+    help="Log to Weights & Biases, too; WANDB_MODE=offline keeps it in the folder.",
+)
+@click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="A folder for this run."
 )
 @click.pass_context
-def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
+def rl(context: click.Context, /, out: Path, project: str | None, **settings: Any) -> None:
     """Train and evaluate one agent.
 
     It sees the full observation, scaled, or an encoder's latent. A checkpoint is written every
     minute, and on Ctrl-C before the command ends (td3 takes seconds to get there). The same command
     resumes from it, to the same result.
     """
-    with _stop_signals() as received:
+    with stop_signals() as received:
         from jbrep.encoders.code import import_code
         from jbrep.encoders.shipped import source_of
         from jbrep.rl import Run, StoppedError, train
@@ -125,7 +136,8 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
             click.echo(_NOT_REPRODUCIBLE.format(run.task.name), err=True)
         try:
             with closing(_Bar(run.steps, f"{run.algorithm} on {source}")) as bar:
-                result = train(run, out, bar.show, stop=lambda: bool(received))
+                writers = _writers(project, run, out)
+                result = train(run, out, bar.show, stop=lambda: bool(received), writers=writers)
         except StoppedError as error:
             resumes = f"; {RESUMES}" if run.task.reproducible else ""
             click.echo(f"{error}{resumes}", err=True)
@@ -139,6 +151,16 @@ def rl(context: click.Context, /, out: Path, **settings: Any) -> None:
     returns = ", ".join(rounded(*last))
     name = result["settings"]["representation"]
     click.echo(f"returns on {name} at the end: {returns}; all evaluations: {out / EVALUATIONS}")
+
+
+def _writers(project: str | None, run: "Run", out: Path) -> "list[KVWriter]":
+    """What logs to a project of Weights & Biases, if there is one."""
+    if project is None:
+        return []
+    from jbrep.rl.run import plain
+    from jbrep.rl.tracker import Tracker
+
+    return [Tracker(project, out, plain(run.describe(run.find_encoder())))]
 
 
 class _Bar:
@@ -167,7 +189,7 @@ class _Bar:
 
 
 @contextmanager
-def _stop_signals() -> Iterator[list[int]]:
+def stop_signals() -> Iterator[list[int]]:
     """The signals received so far, Ctrl-C or SIGTERM; the second ends the process at once."""
     received: list[int] = []
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import KVWriter, Logger
 
 from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import FULL, Encoder, find, save
@@ -168,6 +168,7 @@ def train(
     watch: Watch = lambda step, mean: None,
     save_every: float = 60,
     stop: Callable[[], bool] = lambda: False,
+    writers: Sequence[KVWriter] = (),
 ) -> dict[str, Any]:
     """Train an agent and write its folder, unless the run has ended already.
 
@@ -179,6 +180,7 @@ def train(
         watch: called with the steps so far and the mean return of the last evaluation.
         save_every: seconds between checkpoints.
         stop: asked before each rollout; once it is true, the run writes a checkpoint and stops.
+        writers: of stable-baselines3's logger, that get what TensorBoard gets.
 
     Returns:
         The contents of run.json.
@@ -194,7 +196,7 @@ def train(
     make_folder(folder)
     with exclusive(folder), single_torch_thread():
         return _read_ended(folder, settings) or _train(
-            run, encoder, settings, folder, watch, save_every, stop
+            run, encoder, settings, folder, watch, save_every, stop, writers
         )
 
 
@@ -233,6 +235,7 @@ def _train(
     watch: Watch,
     save_every: float,
     stop: Callable[[], bool],
+    writers: Sequence[KVWriter],
 ) -> dict[str, Any]:
     """The run, from its start or its checkpoint to its end."""
     versions = environment_versions(run.task.id) | {name: version(name) for name in _PACKAGES}
@@ -250,7 +253,7 @@ def _train(
     env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
     if run.begin_from:
         begin(agent, Path(run.begin_from), settings["from"], folder)
-    agent.set_logger(Logger(None, [Scalars(folder / "tensorboard", history.first_step)]))
+    agent.set_logger(Logger(None, [Scalars(folder / "tensorboard", history.first_step), *writers]))
 
     evaluator = Evaluator(run.task, encoder, run.evaluation_episodes)
     recorder = Recorder(history, evaluator, run.evaluate_every, watch)

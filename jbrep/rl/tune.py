@@ -1,0 +1,146 @@
+"""A search for settings of an algorithm, by Optuna; each trial is a run for each seed."""
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import optuna
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState
+
+from jbrep.errors import InputError, differences
+from jbrep.files.lock import exclusive
+from jbrep.files.storage import make_folder, write_whole
+from jbrep.rl.files import FINISHED, read_evaluations
+from jbrep.rl.learner import write_preset
+from jbrep.rl.run import Run, plain, train
+from jbrep.rl.settings import setting_names
+
+JOURNAL, BEST = "optuna.journal", "best.toml"
+_NETWORKS = [[64, 64], [256, 256], [400, 300]]
+_RANGES: dict[str, tuple[float, float] | list[Any]] = {  # logarithmic, or choices
+    "learning_rate": (1e-5, 1e-2),
+    "batch_size": [64, 128, 256, 512],
+    "gamma": [0.9, 0.95, 0.98, 0.99, 0.995, 0.999],
+    "tau": [0.001, 0.005, 0.01, 0.02, 0.05],
+    "train_freq": [1, 4, 16],
+    "gae_lambda": [0.8, 0.9, 0.95, 0.98, 1.0],
+    "clip_range": [0.1, 0.2, 0.3],
+    "n_epochs": [4, 10, 20],
+    "vf_coef": [0.25, 0.5, 1.0],
+    "target_kl": [0.005, 0.01, 0.02],
+    "net_arch": _NETWORKS,
+}
+
+
+class Trial(NamedTuple):
+    """What a trial came to."""
+
+    number: int  # from 0
+    settings: dict[str, Any]
+    value: float | None  # mean return of the last evaluations; None if a run failed
+
+
+def tune(
+    run: Run,
+    trials: int,
+    seeds: int,
+    folder: Path,
+    watch: Callable[[Trial], object] = lambda trial: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Trial:
+    """Search for the settings with the largest return, and write them as a preset file, `BEST`.
+
+    The same search resumes where it was stopped, to the same trials.
+
+    Args:
+        run: what each trial trains, with other settings; those that it sets itself are kept. Its
+            seed is the search's, too.
+        trials: how many in all.
+        seeds: how many runs each trial has, with the run's seed and those that follow.
+        folder: of this search alone.
+        watch: called with each trial that has ended.
+        stop: asked before each rollout; once it is true, the run writes a checkpoint and stops.
+
+    Returns:
+        The best trial.
+
+    Raises:
+        InputError: as `train`; or the folder holds another search; or each trial failed.
+        StoppedError: `stop` was true.
+    """
+    run.check()
+    make_folder(folder)
+    with exclusive(folder):
+        study = _open(run, seeds, folder)
+        ended = {}
+        for number in range(trials):
+            ended[number] = _trial(study, number, run, seeds, folder, stop)
+            watch(ended[number])
+    sound = [trial for trial in ended.values() if trial.value is not None]
+    if not sound:
+        raise InputError("every trial failed: see the run.json files below the folder")
+    best = max(sound, key=lambda trial: trial.value or 0.0)
+    text = write_preset(run.algorithm, run.preset, {**run.settings, **best.settings})
+    write_whole(folder / BEST, text.encode())
+    return best
+
+
+def _open(run: Run, seeds: int, folder: Path) -> optuna.Study:
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    storage = optuna.storages.JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
+    study = optuna.create_study(
+        storage=storage, study_name="tune", direction="maximize", load_if_exists=True
+    )
+    search = plain(run.describe(run.find_encoder())) | {"seeds": seeds}
+    before = study.user_attrs.get("search", search)
+    if differing := differences(before, search):
+        raise InputError(f"{folder} holds another search: {differing}; choose another folder")
+    study.set_user_attr("search", search)
+    return study
+
+
+def _space(run: Run) -> dict[str, BaseDistribution]:
+    """What is searched: the settings that the algorithm has and the run doesn't set."""
+    names = [n for n in _RANGES if n in setting_names(run.algorithm) and n not in run.settings]
+    return {name: _distribution(_RANGES[name]) for name in names}
+
+
+def _distribution(given: tuple[float, float] | Iterable[Any]) -> BaseDistribution:
+    if isinstance(given, tuple):
+        low, high = given
+        return FloatDistribution(low, high, log=True)
+    return CategoricalDistribution([json.dumps(value) for value in given])  # no lists there
+
+
+def _settings(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    return {n: json.loads(v) if isinstance(v, str) else v for n, v in parameters.items()}
+
+
+def _trial(
+    study: optuna.Study, number: int, run: Run, seeds: int, folder: Path, stop: Callable[[], bool]
+) -> Trial:
+    """A trial, trained unless it has ended."""
+    if number == len(study.get_trials(deepcopy=False)):
+        seed = int(np.random.SeedSequence([run.seed, number]).generate_state(1)[0])
+        study.sampler = optuna.samplers.TPESampler(seed=seed)  # whatever was drawn before
+        study.ask(_space(run))
+    there = study.get_trials(deepcopy=False)[number]
+    settings = _settings(there.params)
+    if there.state.is_finished():
+        return Trial(number, settings, there.value)
+    returns = []
+    for seed in range(run.seed, run.seed + seeds):
+        trained = replace(run, settings={**run.settings, **settings}, seed=seed)
+        of_seed = folder / f"trial-{number}" / f"seed-{seed}"
+        if train(trained, of_seed, stop=stop)["status"] != FINISHED:
+            study.tell(number, state=TrialState.FAIL)
+            return Trial(number, settings, None)
+        rows = read_evaluations(of_seed)
+        returns += [row.episode_return for row in rows if row.step == rows[-1].step]
+    study.tell(number, float(np.mean(returns)))
+    return Trial(number, settings, float(np.mean(returns)))

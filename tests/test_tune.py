@@ -1,0 +1,76 @@
+"""The search for settings, and Weights & Biases as a logger."""
+
+import tomllib
+
+import pytest
+import wandb
+from command import jbrep
+
+from jbrep.envs import describe
+from jbrep.errors import InputError
+from jbrep.rl import Run, StoppedError, train
+from jbrep.rl.files import POLICY
+from jbrep.rl.learner import read_preset
+from jbrep.rl.tracker import Tracker
+from jbrep.rl.tune import BEST, tune
+
+TASK = describe("Pendulum-v1", max_episode_steps=20)
+RUN = Run(
+    task=TASK,
+    algorithm="a2c",
+    preset="modern",
+    steps=128,
+    evaluation_episodes=1,
+    settings={"net_arch": [8]},
+)
+
+
+def test_a_stopped_search_resumes_to_the_same_trials(tmp_path):
+    whole, parts = [], []
+    best = tune(RUN, 3, 1, tmp_path / "whole", whole.append)
+    asked = iter(range(100))
+    with pytest.raises(StoppedError):  # in the second trial
+        tune(RUN, 3, 1, tmp_path / "parts", parts.append, stop=lambda: next(asked) == 3)
+    assert parts == whole[:1]
+    assert tune(RUN, 3, 1, tmp_path / "parts", parts.append) == best
+    assert parts[1:] == whole
+    assert best == max(whole, key=lambda trial: trial.value)
+    assert len({trial.settings["learning_rate"] for trial in whole}) == 3
+    expected = ("modern", {"net_arch": [8], **best.settings})
+    assert read_preset(tmp_path / "whole" / BEST, "a2c") == expected
+    ours, theirs = (tmp_path / each / "trial-1/seed-0" / POLICY for each in ("whole", "parts"))
+    assert ours.read_bytes() == theirs.read_bytes()
+    assert len(set((tmp_path / "whole").glob("trial-*"))) == 3
+    with pytest.raises(InputError, match="holds another search: seeds 1"):
+        tune(RUN, 3, 2, tmp_path / "whole")
+
+
+def test_the_command_writes_a_preset_that_rl_takes(tmp_path):
+    search = ("--task", TASK.id, "--episode-steps", 20, "--algorithm", "a2c", "--steps", 8)
+    quick = (*search, "--evaluation-episodes", 1, "--out", tmp_path / "it")
+    told = jbrep("tune", *quick, "--trials", 1, "--preset", "modern", "--set", "net_arch=[8]")
+    assert told.exit_code == 0, told.output
+    assert "trial 1 of 1: -" in told.output
+    assert tomllib.loads((tmp_path / "it" / BEST).read_text())["a2c"]["net_arch"] == [8]
+    preset = ("--preset", tmp_path / "it" / BEST)
+    told = jbrep("rl", *search, "--evaluation-episodes", 1, *preset, "--out", tmp_path / "run")
+    assert told.exit_code == 0, told.output
+
+
+def test_weights_and_biases_gets_what_tensorboard_gets(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    tracker = Tracker("jbrep", tmp_path / "run", {"algorithm": "a2c"})
+    train(RUN, tmp_path / "run", writers=[tracker])
+    (log,) = (tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb")
+    assert b"evaluation/mean_return" in log.read_bytes()
+
+
+def test_weights_and_biases_ends_no_run(tmp_path, monkeypatch, capsys):
+    def fail(**_):
+        raise wandb.errors.UsageError("no API key\nSecond line")
+
+    monkeypatch.setattr(wandb, "init", fail)
+    tracker = Tracker("jbrep", tmp_path / "run", {})
+    assert train(RUN, tmp_path / "run", writers=[tracker])["status"] == "finished"
+    told = "Weights & Biases: no API key; the run goes on without it\n"
+    assert capsys.readouterr().err == told
