@@ -115,7 +115,6 @@ def test_what_is_there_already_is_left_alone(copied):
     [
         ("task", "move_to_pose"),
         ("policy", {"kind": "heuristic"}),
-        ("steps", 6000),
         ("seed", 4),
         ("shard_episodes", 2),
         ("store_state", False),

@@ -373,6 +373,8 @@ def test_mistakes_are_named(tmp_path):
         ({"policy": {"kind": "constant", "drive": None}}, "it must be a kind and its constants"),
         ({"policy": {"kind": "imported", "source": "a" * 201}}, "it must be a kind and its const"),
         ({"policy": {"kind": "imported", "source": [1] * 1001}}, "it must be a kind and its const"),
+        ({"policy": {"kind": "mixture", "parts": [[1, "uniform"]] * 2}}, "it must be a kind and"),
+        ({"policy": {"kind": "mixture", "parts": [[0, {"kind": "a"}]] * 2}}, "it must be a kind"),
         ({"policy": {"kind": "imported", 1: 1}}, "it must be a kind and its constants"),
     ],
 )
@@ -382,6 +384,6 @@ def test_invalid_settings_are_refused_in_words(change, message):
 
 
 def test_the_constants_of_a_policy_are_numbers_and_text_in_lists_and_tables():
-    parts = [[0.5, {"kind": "uniform"}], [0.5, {"kind": "trained", "run": "runs/a"}]]
+    parts = [[0.5, {"kind": "uniform"}], [0.5, {"kind": "imported", "source": "a"}]]
     policy = {"kind": "mixture", "parts": parts}
     assert settings(policy=policy).as_json()["policy"] == policy

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jbrep.collect.mixture import Mixture
 from jbrep.collect.policies import (
     POLICIES,
     Constant,
@@ -14,9 +15,9 @@ from jbrep.collect.policies import (
     generators,
     make_policy,
     parse_policy,
-    policy_settings,
     within_bounds,
 )
+from jbrep.dataset.schema import episode_part
 from jbrep.envs import Feature, Task, describe
 from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS
@@ -43,7 +44,7 @@ def drives(policy, lanes=50, steps=1000, seed=0, task=TASK):
 def test_actions_are_drives_in_range_that_their_settings_make_again(policy):
     assert drives(policy).shape == (1000, 50, 1)
     assert np.abs(drives(policy)).max() <= 1
-    again = make_policy(policy_settings(policy))
+    again = make_policy(policy.settings())
     assert again == policy
     np.testing.assert_array_equal(drives(policy), drives(again))
 
@@ -88,6 +89,12 @@ def test_episodes_have_streams_of_their_own():
         ("constant:drive=-0.5", Constant(-0.5)),
         ("ornstein-uhlenbeck", OrnsteinUhlenbeck()),
         ("ornstein-uhlenbeck:sigma=1,theta=2", OrnsteinUhlenbeck(theta=2, sigma=1)),
+        ("constant:drive=1e+0", Constant(1)),
+        ("uniform:3+constant:drive=-0.5:1", Mixture(((0.75, Uniform()), (0.25, Constant(-0.5))))),
+        (
+            "uniform:1+heuristic:2+constant:1",
+            Mixture(((0.25, Uniform()), (0.5, Heuristic()), (0.25, Constant()))),
+        ),
     ],
 )
 def test_policies_as_people_write_them(text, policy):
@@ -107,6 +114,11 @@ def test_policies_as_people_write_them(text, policy):
         ("constant:drive=nan", r"must be in \[-1, 1\]"),
         ("ornstein-uhlenbeck:theta=-1", r"theta at least 0"),
         ("ornstein-uhlenbeck:sigma=1e15", r"sigma in \[0, 1e\+06\]"),
+        ("uniform+heuristic", "unknown policy 'uniform\\+heuristic': choose one of uniform"),
+        ("uniform:0.5+heuristic", "weight 'heuristic' must be a positive number"),
+        ("uniform:0+heuristic:1", "weight '0' must be a positive number: each part of a mixture"),
+        ("uniform:0.5+heuristic:nan", "weight 'nan' must be a positive number"),
+        ("uniform:0.5+sprint:0.5", "unknown policy 'sprint'"),
     ],
 )
 def test_mistakes_are_named(text, message):
@@ -155,3 +167,30 @@ def test_noise_needs_a_time_step_that_is_known_and_small_enough():
         noise.begin(TASK, [0])
     with pytest.raises(InputError, match="the time step of Arm-v0 is not known, which ornstein"):
         noise.begin(replace(ARM, timestep=None), [0])
+
+
+MIXTURE = parse_policy("uniform:1+constant:drive=0.5:2+heuristic:1")
+
+
+def test_each_episode_of_a_mixture_has_one_of_its_policies():
+    """Each in its share of the episodes, drawn from the seed alone; its actions are its own."""
+    actions = drives(MIXTURE, lanes=400, steps=3)
+    weights = [weight for weight, _ in MIXTURE.parts]
+    drawn = np.array([episode_part(seed, weights) for seed in range(400)])
+    np.testing.assert_allclose(np.bincount(drawn) / 400, weights, atol=0.06)
+    alone = [drives(policy, lanes=400, steps=3) for _, policy in MIXTURE.parts]
+    for lane, part in enumerate(drawn):
+        np.testing.assert_array_equal(actions[:, lane], alone[part][:, lane])
+    np.testing.assert_array_equal(drives(MIXTURE, lanes=1, seed=7)[:3, 0], actions[:, 7])
+    assert make_policy(MIXTURE.settings()) == MIXTURE
+    assert not MIXTURE.open_loop
+    assert parse_policy("uniform:1+constant:1").open_loop
+
+
+def test_what_chooses_an_episode_s_policy_is_drawn_from_nothing_else():
+    """Not from the environment's numbers, nor from those that the policies draw."""
+    ours = {np.random.default_rng([seed, 0x6D6978]).random() for seed in range(50)}
+    for seed in range(50):
+        others = np.random.default_rng(seed).random(1000)
+        beyond = generators(ARM, [seed])[0].random(1000)
+        assert ours.isdisjoint([*others, *beyond])

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import tomllib
 import zipfile
 
 import numpy as np
@@ -18,6 +19,7 @@ from jbrep.envs import describe
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import episode_returns
 from jbrep.errors import DamageError, InputError
+from jbrep.report.facts import _toml
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, statistics_of
 from jbrep.rl.files import EVALUATION_SEED, POLICY, RUN, read_evaluations, read_run
@@ -26,6 +28,9 @@ from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.settings import setting_names, used_settings
 from jbrep.rl.weights import STATISTICS
+from jbrep.study.config import as_study, read_study
+from jbrep.study.plan import read_plan
+from jbrep.study.results import read_results
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
 SMALL = {"net_arch": [8], "learning_starts": 10, "train_freq": 5, "batch_size": 8}
@@ -246,7 +251,7 @@ def test_normalisation_is_resumed_evaluated_and_read_back(run, tmp_path):
     resumed(SAC_RUN, tmp_path / "stopped")
     assert (tmp_path / "stopped" / POLICY).read_bytes() == (run / POLICY).read_bytes()
     check_last_evaluation(run)
-    without = dataclasses.replace(SAC_RUN, settings=SMALL, learner="")
+    without = dataclasses.replace(SAC_RUN, settings=SMALL)
     train(without, tmp_path / "without")
     ours, theirs = (load_run(each) for each in (run, tmp_path / "without"))
     assert ours.statistics is not None
@@ -307,7 +312,7 @@ def test_a_run_that_begins_with_another_takes_its_statistics_along(run, tmp_path
         ({**SMALL, "normalize": True, "activation_fn": "tanh"}, r"activation_fn relu \(now: tanh"),
         ({**SMALL, "normalize": True, "n_critics": 3}, r"n_critics None \(now: 3"),
     ):
-        other = dataclasses.replace(later, settings=settings, learner="")
+        other = dataclasses.replace(later, settings=settings)
         with pytest.raises(InputError, match=message):
             train(other, tmp_path / "other")
 
@@ -367,3 +372,76 @@ def test_a_run_of_an_earlier_jbrep_is_the_same_run(tmp_path):
     assert train(run, tmp_path)["settings"]["learner"] == "a2c-modern"
     assert (tmp_path / RUN).read_bytes() == before
     assert load_run(tmp_path).statistics is None
+
+
+STUDY = """
+tasks = ["Pendulum-v1"]
+representations = ["full"]
+seeds = 1
+steps = 40
+episode_steps = 20
+evaluation_episodes = 1
+
+[algorithms.a2c-modern]
+
+[algorithms.my-a2c]
+base = "a2c-modern"
+net_arch = [8]
+normalize = true
+
+[algorithms.tuned]
+base = "a2c"
+preset = "{preset}"
+gamma = 0.9
+"""
+
+
+def test_a_study_of_learners(tmp_path):
+    (tmp_path / "mine.toml").write_text(write_preset("a2c", "modern", {"net_arch": [4]}))
+    path, out = tmp_path / "study.toml", tmp_path / "out"
+    path.write_text(STUDY.format(preset=tmp_path / "mine.toml"))
+    told = jbrep("study", path, "--out", out, "--workers", 1)
+    assert told.exit_code == 0, told.output
+    own = {
+        "my-a2c": {"base": "a2c-modern", "net_arch": [8], "normalize": True},
+        "tuned": {"base": "a2c-modern", "net_arch": [4], "gamma": 0.9},
+    }
+    written = json.loads((out / "study.json").read_text())
+    assert (written["algorithms"], written["learners"]) == (["a2c-modern", *own], own)
+    assert read_plan(out).study == read_study(path)
+    labels = json.loads((out / "runs.json").read_text())["labels"]
+    assert [*labels] == [f"Pendulum-v1/{name}/full" for name in ("a2c-modern", *own)]
+    settings = labels["Pendulum-v1/tuned/full"]["settings"]
+    assert (settings["preset"], settings["hidden"]) == ("modern", [4])
+    assert settings["overrides"] == {"net_arch": [4], "gamma": 0.9}
+    assert as_study(tomllib.loads(_toml(written))) == read_study(path)
+    before = (out / "study.json").read_bytes()
+    (tmp_path / "mine.toml").write_text(write_preset("a2c", "modern", {"net_arch": [5]}))
+    told = jbrep("study", path, "--out", out, "--workers", 1)
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    assert "holds another study: learner tuned" in told.output
+    assert (out / "study.json").read_bytes() == before
+
+
+def test_settings_are_not_mixed_under_a_label(tmp_path):
+    quick = {**QUICK, "steps": 5, "algorithm": "a2c", "learner": "mine"}
+    for seed, gamma in enumerate((0.9, 0.9, 0.8)):
+        train(Run(**quick, seed=seed, settings={"gamma": gamma}), tmp_path / str(seed))
+    assert "other settings" in " ".join(read_results(tmp_path).left_out)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("[algorithms.mine]\nbase = 'sac'\ngama = 1", r"\[algorithms.mine\]: sac has no setting"),
+        ("[algorithms.sac]\ngamma = 0.9", r"\[algorithms.sac\]: it is a preset's name"),
+        ("[algorithms]\nsac = 3", "algorithms.sac is 3: it must be a table"),
+        ("[algorithms.mine]\nbase = 'sac'\nday = 2000-01-01", "sac have a value that is no finite"),
+    ],
+)
+def test_what_a_learner_s_table_can_not_be(table, message, tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY.partition("[algorithms")[0] + table)
+    with pytest.raises(InputError, match=message) as error:
+        read_study(path)
+    assert "\n" not in str(error.value)

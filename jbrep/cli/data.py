@@ -1,7 +1,7 @@
 """Collecting data sets, and working with them."""
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -46,8 +46,9 @@ _data = click.argument("data", type=click.Path(path_type=Path))
     "--policy",
     default="uniform",
     show_default=True,
-    help="uniform, constant:drive=0.5, ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3, or, for the "
-    "Jitterbug, heuristic.",
+    help="uniform, constant:drive=0.5, ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3, for the "
+    "Jitterbug heuristic; the folder of a run; or several with weights, of which each episode has "
+    "one: uniform:0.5+runs/a:0.5.",
 )
 @click.option(
     "--store-state",
@@ -78,13 +79,15 @@ def collect(
 ) -> None:
     """Collect the states that a policy visits.
 
-    The same command resumes an unfinished data set and leaves a finished one as it is. The numbers
-    of lanes and threads and the backend don't change the data.
+    The same command resumes an unfinished data set and leaves a finished one as it is; with more
+    --steps it extends it, to the data that one command with as many collects. The numbers of lanes
+    and threads and the backend don't change the data. The policy of a run is kept with the data as
+    it is at the start, also if the run goes on.
     """
     from jbrep.collect import collect as run
     from jbrep.collect.collector import usual_shard_episodes
-    from jbrep.collect.policies import parse_policy, policy_settings
     from jbrep.dataset import Settings
+    from jbrep.rollouts.sources import find_policy
 
     task = given_task(options)
     assert task is not None
@@ -94,17 +97,29 @@ def collect(
             "repair the data set",
             err=True,
         )
+    actor = find_policy(policy, out)
     settings = Settings(
         task=task,
-        policy=policy_settings(parse_policy(policy)),
+        policy=actor.settings(),
         steps=steps,
         seed=seed,
         store_state=store_state,
     )
-    shard_episodes = shard_episodes or usual_shard_episodes(settings, out)
+    shard_episodes = shard_episodes or usual_shard_episodes(settings, out, actor)
     settings = replace(settings, shard_episodes=shard_episodes)
+    _tell_kept(out, settings.policy)
     with stoppable(RESUMES):
-        _report(out, run(settings, out, lanes, threads, backend))
+        _report(out, run(settings, out, lanes, threads, backend, actor))
+
+
+def _tell_kept(out: Path, policy: Mapping[str, Any]) -> None:
+    """Say which policies of runs the data set has already, as they were then."""
+    from jbrep.dataset.policy import TRAINED, parts_of
+
+    for part in parts_of(policy):
+        if part["kind"] == TRAINED and (out / part["file"]).exists():
+            known = f"{part['run']} acts as it did at step {part['step']:,}"
+            click.echo(printable(f"{known}, which {out / part['file']} keeps"), err=True)
 
 
 def _report(out: Path, written: Any) -> None:
@@ -187,10 +202,11 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
 def repair(data: Path, lanes: int, threads: int | None) -> None:
     """Restore damaged and missing files as they were."""
     from jbrep.collect.repair import repair as run
+    from jbrep.rollouts.sources import kept_policy
 
     with stoppable(RESUMES):
         repaired = False
-        for line in run(data, lanes, threads):
+        for line in run(data, lanes, threads, kept_policy(data)):
             click.echo(printable(line))
             repaired = True
     if not repaired:

@@ -116,11 +116,11 @@ def _find(
     from jbrep.encoders import find
     from jbrep.envs.description import describe
     from jbrep.files.storage import exists
-    from jbrep.rollouts.sources import as_player, find_player, run_folder
+    from jbrep.rollouts.sources import as_player, find_player, is_trained, run_folder
 
     path = Path(policy)
     folder = run_folder(policy)
-    if folder or (exists(path) and path.is_dir()):
+    if is_trained(policy) or (exists(path) and path.is_dir()):
         if encoder and not (folder and encoder == _code_of(folder)):
             raise InputError(f"{policy} is a run, which has its own encoder: leave out --encoder")
         return find_player(policy, task)

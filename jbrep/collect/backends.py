@@ -6,7 +6,7 @@ from itertools import count
 from typing import Any
 
 from jbrep.cluster import on_cluster
-from jbrep.collect.policies import make_policy
+from jbrep.collect.policies import Policy
 from jbrep.collect.shards import Missing, Produce, shards_in_turn, simulate_shard
 from jbrep.dataset.schema import Columns
 from jbrep.dataset.settings import Settings
@@ -16,30 +16,30 @@ from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, choose
 from jbrep.pool import ATTEMPTS, Pool, stop_requested
 
-Backend = Callable[[Settings, int, int | None], Produce]
+Backend = Callable[[Settings, Policy, int, int | None], Produce]
 
 
-def local(settings: Settings, lanes: int, num_threads: int | None) -> Produce:
+def local(settings: Settings, policy: Policy, lanes: int, num_threads: int | None) -> Produce:
     """A batch's shards in turn on threads; other environments' side by side in processes."""
     workers = num_threads or os.cpu_count() or 1
     if is_batched(settings.task) or workers == 1:
-        return shards_in_turn(settings, lanes, num_threads)
-    return _in_processes(settings, workers)
+        return shards_in_turn(settings, policy, lanes, num_threads)
+    return _in_processes(settings, policy, workers)
 
 
-def _in_processes(settings: Settings, workers: int) -> Produce:
+def _in_processes(settings: Settings, policy: Policy, workers: int) -> Produce:
     """Shards made side by side, given in order; one whose worker is killed is made again."""
 
     def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
         if not missing.wants(first + 1):  # one shard alone
-            yield from shards_in_turn(settings, 1, 1)(first, missing, tick)
+            yield from shards_in_turn(settings, policy, 1, 1)(first, missing, tick)
             return
         made: dict[int, Columns | str] = {}
         started, attempts = first, dict[int, int]()
         with Pool[int, Columns | str](make_shard, workers, lambda: None) as pool:
 
             def submit(shard: int) -> None:
-                pool.submit(shard, imported_modules(), settings, shard, missing.rows)
+                pool.submit(shard, imported_modules(), settings, policy, shard, missing.rows)
 
             for shard in count(first):
                 while shard not in made:
@@ -66,12 +66,11 @@ def _in_processes(settings: Settings, workers: int) -> Produce:
 
 
 def make_shard(
-    modules: tuple[str, ...], settings: Settings, shard: int, rows: int
+    modules: tuple[str, ...], settings: Settings, policy: Policy, shard: int, rows: int
 ) -> Columns | str:
     """A shard, in a process of its own; the message of an error that a user can mend."""
     try:
         import_modules(modules)
-        policy = make_policy(settings.policy)
         return simulate_shard(settings, policy, shard, _stop_on_request, 1, 1, rows)
     except InputError as error:
         return str(error)
@@ -89,7 +88,7 @@ def _stop_on_request(steps: int) -> None:
         raise SystemExit
 
 
-def on_ray(settings: Settings, lanes: int, num_threads: int | None) -> Produce:
+def on_ray(settings: Settings, policy: Policy, lanes: int, num_threads: int | None) -> Produce:
     """Shards made side by side on the Ray cluster that RAY_ADDRESS names, or else on a local one.
 
     Only this process writes to the data set's folder. The shards of a node that dies are made
@@ -105,7 +104,9 @@ def on_ray(settings: Settings, lanes: int, num_threads: int | None) -> Produce:
             for shard in count(first):
                 ahead = shard + 2 * int(ray.cluster_resources().get("CPU", 1))
                 while started == shard or (started < ahead and missing.wants(started)):
-                    made[started] = make.remote(imported_modules(), settings, started, missing.rows)
+                    made[started] = make.remote(
+                        imported_modules(), settings, policy, started, missing.rows
+                    )
                     started += 1
                 yield _columns(ray.get(made.pop(shard)))
         except ray.exceptions.RayError as error:

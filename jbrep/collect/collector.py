@@ -1,16 +1,17 @@
 """The collector: a policy in many episodes, written to the shards of a data set."""
 
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.collect.backends import get_backend
-from jbrep.collect.policies import make_policy, policy_settings
+from jbrep.collect.policies import Policy, make_policy
 from jbrep.collect.shards import LANES, Produce, simulate_shard
 from jbrep.dataset.manifest import (
     MANIFEST,
@@ -28,7 +29,7 @@ from jbrep.envs.checks import check_counts
 from jbrep.envs.make import is_batched
 from jbrep.errors import InputError, differences
 from jbrep.files.lock import exclusive
-from jbrep.files.storage import check_space, exists, make_folder
+from jbrep.files.storage import check_space, exists, make_folder, read_regular, write_whole
 from jbrep.progress import Progress
 
 _MAX_SHARDS = 10_000
@@ -52,31 +53,40 @@ def collect(
     lanes: int = LANES,
     num_threads: int | None = None,
     backend: str = "local",
+    policy: Policy | None = None,
 ) -> Written:
     """Collect a data set, or what is missing of it.
 
-    Neither lanes, threads nor backend change a byte.
+    Neither lanes, threads nor backend change a byte, nor does it whether a data set is collected at
+    once or extended.
 
     Args:
         settings: what to collect.
-        folder: new, or with an unfinished data set of the same settings.
+        folder: new, or with a data set of the same settings that is unfinished or has fewer steps.
         lanes: environments of a batch, stepped at once.
         num_threads: threads of a batch, or processes of other environments; None takes one for
             each core.
         backend: local, or ray for a cluster.
+        policy: in place of the one that the settings name.
 
     Raises:
-        InputError: invalid settings, a data set of other settings in the folder, a shard that is
-            missing or damaged, too little disk space, or an environment that fails.
+        InputError: invalid settings, a data set of other settings or of more steps in the folder, a
+            shard that is missing or damaged, too little disk space, or an environment that fails.
     """
-    policy = make_policy(settings.policy)
+    policy = policy or make_policy(settings.policy)
     policy.begin(settings.task, [0])  # may refuse the task
-    settings = replace(settings, policy=policy_settings(policy))
+    settings = replace(settings, policy=policy.settings())
     check_counts(lanes, num_threads)
-    return write_shards(settings, folder, get_backend(backend)(settings, lanes, num_threads))
+    produce = get_backend(backend)(settings, policy, lanes, num_threads)
+    return write_shards(settings, folder, produce, policy.files())
 
 
-def write_shards(settings: Settings, folder: Path, produce: Produce) -> Written:
+def write_shards(
+    settings: Settings,
+    folder: Path,
+    produce: Produce,
+    files: Mapping[str, bytes] = MappingProxyType({}),
+) -> Written:
     """Commit the missing shards, until there are as many rows as the settings ask for.
 
     Args:
@@ -84,6 +94,7 @@ def write_shards(settings: Settings, folder: Path, produce: Produce) -> Written:
         folder: of the data set.
         produce: makes shards, one after the other; of the last, only the episodes that are needed
             are kept.
+        files: that the data set needs besides, by name.
 
     Raises:
         InputError: as `collect` does.
@@ -91,21 +102,36 @@ def write_shards(settings: Settings, folder: Path, produce: Produce) -> Written:
     began = time.monotonic()
     make_folder(folder)
     with exclusive(folder):
-        manifest = _begin(settings, folder)
-        before = manifest.rows
+        there = _begin(settings, folder, files)
+        manifest = there.extended(settings.steps)
         if not manifest.complete:
             with Progress(
-                total=settings.steps, initial=before, unit="step", unit_scale=True, desc=folder.name
+                total=settings.steps,
+                initial=manifest.rows,
+                unit="step",
+                unit_scale=True,
+                desc=folder.name,
             ) as progress:
-                manifest = _fill(folder, manifest, produce, progress)
-    return Written(manifest, manifest.rows - before, time.monotonic() - began)
+                manifest = _fill(folder, there, manifest, produce, progress)
+        elif manifest != there:
+            write_manifest(folder, manifest)
+    return Written(manifest, manifest.rows - there.rows, time.monotonic() - began)
 
 
-def _fill(folder: Path, manifest: Manifest, produce: Produce, progress: Any) -> Manifest:
+def _fill(
+    folder: Path, there: Manifest, manifest: Manifest, produce: Produce, progress: Any
+) -> Manifest:
+    """Commit shards until the data set is complete.
+
+    What is there counts until the first shard has been simulated, which may replace its last one.
+    """
     missing = _Missing(manifest)
     shards = produce(len(manifest.shards), missing, progress.update)
     try:
         for columns in shards:
+            if manifest.settings != there.settings:
+                write_manifest(folder, manifest)
+                there = manifest
             manifest = commit(folder, manifest, _cut(columns, missing.rows))
             missing.manifest = manifest
             progress.update(manifest.rows - progress.n)
@@ -153,36 +179,60 @@ def _cut(columns: Columns, rows: int) -> Columns:
     }
 
 
-def _begin(settings: Settings, folder: Path) -> Manifest:
-    """The manifest to resume from, new if there is none."""
-    files = hdf5_files(folder)
-    if (folder / MANIFEST).exists() or files:
+def _begin(settings: Settings, folder: Path, files: Mapping[str, bytes]) -> Manifest:
+    """The manifest to go on from, new if there is none."""
+    shards = hdf5_files(folder)
+    if (folder / MANIFEST).exists() or shards:
         manifest = read_manifest(folder)
         _check_same(manifest, new_manifest(settings), folder)
-        check_files(folder, manifest, files)
+        check_files(folder, manifest, shards)
+        _keep(files, folder)
+        check_space(folder, (settings.steps - manifest.settings.steps) * settings.row_bytes())
     else:
         manifest = new_manifest(settings)
         check_space(folder, settings.steps * settings.row_bytes())
+        _keep(files, folder)
         write_manifest(folder, manifest)
     return manifest
 
 
+def _keep(files: Mapping[str, bytes], folder: Path) -> None:
+    """Write files that aren't there."""
+    for name, content in files.items():
+        path = folder / name
+        if not exists(path):
+            write_whole(path, content)
+        elif read_regular(path, len(content)) != content:
+            raise InputError(f"{path} is another policy's file: choose another folder")
+
+
 def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
-    """Check that resuming gives what an uninterrupted run gives."""
+    """Check that going on gives what an uninterrupted run gives."""
+    steps, own = wanted.settings.steps, there.settings.steps
     differing = differences(_flat(there.settings), _flat(wanted.settings))
-    if differing:
+    if differing and _flat(there.settings) != {**_flat(wanted.settings), "steps": own}:
         raise InputError(
             f"{folder} holds a data set with other settings: {differing}; "
             "choose another folder, or the same settings to resume"
+        )
+    if steps < own:
+        raise InputError(
+            f"{folder} was collected with {own:,} steps and has {there.rows:,} rows so far: it is "
+            f"left as it is; ask for at least as many steps, or choose another folder for {steps:,}"
+        )
+    if steps > own and there.format_version != wanted.format_version:
+        raise InputError(
+            f"{folder} has format version {there.format_version}, which can't be extended: collect "
+            "anew in another folder"
         )
     differing = differences(
         {**there.versions, "format": there.format_version},
         {**wanted.versions, "format": wanted.format_version},
     )
-    if differing and not there.complete:
+    if differing and not (there.complete and steps == own):
         raise InputError(
             f"{folder} was started with other versions: {differing}; "
-            "install those to resume, or choose another folder"
+            "install those to go on, or choose another folder"
         )
 
 
@@ -196,7 +246,7 @@ def _flat(settings: Settings) -> dict[str, Any]:
     return {n: v for n, v in settings.as_json().items() if n != "environment"} | task
 
 
-def usual_shard_episodes(settings: Settings, folder: Path) -> int:
+def usual_shard_episodes(settings: Settings, folder: Path, policy: Policy | None = None) -> int:
     """Episodes in a shard of the usual size, judging by the data set's first few.
 
     A batch's shards have 100,000 steps, each with all threads; other environments' 20,000, since
@@ -210,7 +260,7 @@ def usual_shard_episodes(settings: Settings, folder: Path) -> int:
     task = settings.task
     length = float(task.max_episode_steps)
     if task.terminates is not False:
-        policy = make_policy(settings.policy)
+        policy = policy or make_policy(settings.policy)
         pilot = replace(settings, shard_episodes=_PILOT)
         columns = simulate_shard(pilot, policy, 0, lambda steps: None)
         length = columns[EPISODES + "length"].mean()

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.collect.collector import Written, write_shards
-from jbrep.collect.policies import make_policy
+from jbrep.collect.policies import acts_on_observations
 from jbrep.collect.shards import Missing, Produce
 from jbrep.dataset import Dataset, Settings, version1
 from jbrep.dataset.manifest import new_manifest, open_shard
-from jbrep.dataset.schema import EPISODES, Columns, all_specs, episode_columns, episode_returns
+from jbrep.dataset.schema import EPISODES, Columns, episode_columns, episode_returns
 from jbrep.envs.checks import check_counts
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, differences
@@ -58,7 +58,7 @@ def derive(
         raise InputError(f"{source} has no states: collect it with --store-state")
     if not dataset.manifest.complete:
         raise InputError(f"{source} is unfinished: resume it with the same jbrep collect")
-    if not make_policy(settings.policy).open_loop:
+    if acts_on_observations(settings.policy):
         raise InputError(
             f"{source} was collected by a {settings.policy['kind']} policy, which acts on "
             f"observations: run jbrep collect --task {task_name} instead"
@@ -87,7 +87,7 @@ def _deriving(
     """Make the shards of a data set as another task observes and rewards them."""
 
     def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
-        names = all_specs(settings.task, settings.store_state)
+        names = settings.specs()
         for shard in range(first, len(dataset.manifest.shards)):
             columns = version1.with_ends(open_shard(dataset.folder, dataset.manifest, shard))
             yield _as_task(columns, task, names, settings.task.arguments, tick, num_threads)

@@ -1,12 +1,16 @@
 """Policies to collect with, each determined by its kind and a few constants."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.collect.mixture import Mixture
+from jbrep.dataset.policy import MIXTURE, TRAINED, parts_of
 from jbrep.envs.recording import Actor as Actor
 from jbrep.envs.recording import open_loop
 from jbrep.envs.task import Array, Task
@@ -18,10 +22,13 @@ _BLOCK = 1000  # steps that actions are drawn for at a time
 
 
 class Policy(Protocol):
-    """How actions are chosen; a frozen dataclass of its constants."""
+    """How actions are chosen; it can be pickled, for workers."""
 
-    kind: ClassVar[str]
-    open_loop: ClassVar[bool]  # whether actions don't depend on what is observed
+    def files(self) -> dict[str, bytes]:
+        """The files without which it can't act again, by their names in the data set's folder."""
+
+    def settings(self) -> dict[str, Any]:
+        """What determines it, as plain JSON: its kind and its constants."""
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Act in n new episodes with these seeds; what is drawn depends on each one's alone.
@@ -51,8 +58,23 @@ def within_bounds(task: Task, drives: Array) -> Array:
     return np.clip((low + high) / 2 + drives * (high - low) / 2, low, high)
 
 
+class Constants:
+    """The base of policies that are frozen dataclasses of their constants."""
+
+    kind: ClassVar[str]
+    open_loop: ClassVar[bool]  # whether actions don't depend on what is observed
+
+    def files(self) -> dict[str, bytes]:
+        """None are needed."""
+        return {}
+
+    def settings(self) -> dict[str, Any]:
+        """The settings that `make_policy` takes."""
+        return {"kind": self.kind, **asdict(self)}  # type: ignore[call-overload]
+
+
 @dataclass(frozen=True)
-class Uniform:
+class Uniform(Constants):
     """Uniformly random actions within the bounds, a new one for each step."""
 
     kind: ClassVar[str] = "uniform"
@@ -72,7 +94,7 @@ class Uniform:
 
 
 @dataclass(frozen=True)
-class Constant:
+class Constant(Constants):
     """The same action throughout."""
 
     kind: ClassVar[str] = "constant"
@@ -90,7 +112,7 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class OrnsteinUhlenbeck:
+class OrnsteinUhlenbeck(Constants):
     """An Ornstein-Uhlenbeck process for each action, from its mean on, clipped to [-1, 1].
 
     dx = theta (mu - x) dt + sigma dW, in steps of the task's time step (Uhlenbeck and Ornstein,
@@ -139,7 +161,7 @@ class OrnsteinUhlenbeck:
 
 
 @dataclass(frozen=True)
-class Heuristic:
+class Heuristic(Constants):
     """The task's hand-written policy."""
 
     kind: ClassVar[str] = "heuristic"
@@ -161,25 +183,79 @@ def _one_by_one(blocks: Iterator[NDArray[Any]]) -> Actor:
 
 
 POLICIES = {policy.kind: policy for policy in (Uniform, Heuristic, Constant, OrnsteinUhlenbeck)}
+_WEIGHT = re.compile(r":([\d.]+(?:e-?\d+)?)\+")  # between the parts of a mixture
 
 
-def parse_policy(text: str) -> Policy:
-    """Make a policy from text such as `uniform` or `constant:drive=0.5`.
+def parse_policy(text: str, other: Callable[[str], Policy | None] = lambda text: None) -> Policy:
+    """Make a policy from text such as `constant:drive=0.5` or `uniform:0.8+heuristic:0.2`.
+
+    Args:
+        text: a policy, or parts of a mixture with their weights.
+        other: the policy that text stands for which is none of POLICIES; None if there is none.
 
     Raises:
         InputError: as `make_policy` does.
     """
-    kind, _, constants = text.partition(":")
-    pairs = (pair.partition("=") for pair in constants.split(",") if pair)
-    return _make(kind, {name.strip(): value for name, _, value in pairs})
+    if policy := other(text):
+        return policy
+    if not _WEIGHT.search(text):
+        kind, _, constants = text.partition(":")
+        if kind not in POLICIES:
+            raise InputError(
+                f"unknown policy {kind!r}: choose one of {', '.join(POLICIES)}, the folder of a "
+                "run with a policy or checkpoint, or a mixture: uniform:0.8+heuristic:0.2"
+            )
+        pairs = (pair.partition("=") for pair in constants.split(",") if pair)
+        return _make(kind, {name.strip(): value for name, _, value in pairs})
+    *parts, last = _WEIGHT.split(text)
+    final, _, weight = last.rpartition(":")
+    weights = [_weight(each) for each in (*parts[1::2], weight)]
+    policies = [parse_policy(part, other) for part in (*parts[::2], final)]
+    shares = [weight / math.fsum(weights) for weight in weights]
+    return Mixture(tuple(zip(shares, policies, strict=True)))
 
 
-def make_policy(settings: Mapping[str, Any]) -> Policy:
+def _weight(text: str) -> float:
+    try:
+        weight = float(text)
+    except ValueError:
+        weight = math.nan
+    if not 0 < weight < math.inf:
+        raise InputError(
+            f"the weight {text!r} must be a positive number: each part of a mixture has one, as in "
+            "uniform:0.8+heuristic:0.2"
+        )
+    return weight
+
+
+def acts_on_observations(settings: Mapping[str, Any]) -> bool:
+    """Whether the policy of a manifest may act on what is observed."""
+    kinds = [part["kind"] for part in parts_of(settings)]
+    return not all(kind in POLICIES and POLICIES[kind].open_loop for kind in kinds)
+
+
+def _unreadable(settings: Mapping[str, Any]) -> Policy:
+    raise InputError(
+        f"a {settings['kind']} policy is more than its settings: give the one in its file"
+    )
+
+
+def make_policy(
+    settings: Mapping[str, Any], trained: Callable[[Mapping[str, Any]], Policy] = _unreadable
+) -> Policy:
     """Make a policy from its settings, as in a manifest.
+
+    Args:
+        settings: its kind and constants.
+        trained: makes those of runs, which need more than their settings.
 
     Raises:
         InputError: an unknown policy, an unknown constant, or one out of range.
     """
+    if settings["kind"] == TRAINED:
+        return trained(settings)
+    if settings["kind"] == MIXTURE:
+        return Mixture(tuple((w, make_policy(part, trained)) for w, part in settings["parts"]))
     constants = {name: value for name, value in settings.items() if name != "kind"}
     return _make(settings["kind"], constants)
 
@@ -201,8 +277,3 @@ def _make(kind: str, constants: dict[str, Any]) -> Policy:
                 "constant:drive=0.5"
             ) from None
     return policy(**constants)
-
-
-def policy_settings(policy: Policy) -> dict[str, Any]:
-    """The settings that `make_policy` takes."""
-    return {"kind": policy.kind, **asdict(policy)}  # type: ignore[call-overload]

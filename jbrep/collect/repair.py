@@ -1,12 +1,13 @@
 """Repairing a data set: damaged or missing files are restored as they were."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
-from jbrep.collect.policies import make_policy
+from jbrep.collect.policies import Policy, make_policy
 from jbrep.collect.shards import LANES, simulate_shard
 from jbrep.dataset import version1
 from jbrep.dataset.manifest import (
@@ -29,7 +30,12 @@ from jbrep.files.lock import exclusive
 from jbrep.progress import Progress
 
 
-def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> Iterator[str]:
+def repair(
+    folder: Path,
+    lanes: int = LANES,
+    num_threads: int | None = None,
+    make: Callable[[Mapping[str, Any]], Policy] = make_policy,
+) -> Iterator[str]:
     """Simulate damaged and missing shards again, and restore the manifest from its backup.
 
     A damaged backup is restored from the manifest. A file that isn't part of the data set is
@@ -39,6 +45,7 @@ def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> 
         folder: of the data set.
         lanes: robots stepped at once.
         num_threads: threads to step them on; None takes one for each core.
+        make: makes the policy from what the manifest says of it.
 
     Yields:
         A line for each file restored or renamed.
@@ -57,7 +64,7 @@ def repair(folder: Path, lanes: int = LANES, num_threads: int | None = None) -> 
         for shard in range(len(manifest.shards)):
             if _is_intact(folder, manifest, shard):
                 continue
-            entry = _restore(folder, manifest, shard, lanes, num_threads)
+            entry = _restore(folder, manifest, shard, lanes, num_threads, make)
             shards = (*manifest.shards[:shard], entry, *manifest.shards[shard + 1 :])
             manifest = replace(manifest, shards=shards)
             yield f"{folder / shard_name(shard)} restored"
@@ -105,7 +112,12 @@ def _is_intact(folder: Path, manifest: Manifest, shard: int) -> bool:
 
 
 def _restore(
-    folder: Path, manifest: Manifest, shard: int, lanes: int, num_threads: int | None
+    folder: Path,
+    manifest: Manifest,
+    shard: int,
+    lanes: int,
+    num_threads: int | None,
+    make: Callable[[Mapping[str, Any]], Policy],
 ) -> Entry:
     settings, entry, path = manifest.settings, manifest.shards[shard], folder / shard_name(shard)
     if settings.is_imported:
@@ -121,7 +133,7 @@ def _restore(
     with Progress(total=entry.rows, unit="step", unit_scale=True, desc=path.name) as progress:
         columns = simulate_shard(
             settings,
-            make_policy(settings.policy),
+            make(settings.policy),
             shard,
             progress.update,
             lanes,

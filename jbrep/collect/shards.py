@@ -8,8 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collect.policies import Policy, make_policy
-from jbrep.dataset.schema import EPISODES, Columns, all_specs, episode_returns, episode_seed
+from jbrep.collect.policies import Policy
+from jbrep.dataset.schema import EPISODES, Columns, episode_part, episode_returns, episode_seed
 from jbrep.dataset.settings import Settings
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
@@ -34,9 +34,10 @@ class Missing(Protocol):
 Produce = Callable[[int, Missing, Tick], Iterator[Columns]]  # shards in order, from a number on
 
 
-def shards_in_turn(settings: Settings, lanes: int, num_threads: int | None) -> Produce:
+def shards_in_turn(
+    settings: Settings, policy: Policy, lanes: int, num_threads: int | None
+) -> Produce:
     """Make one shard after the other, each with all threads."""
-    policy = make_policy(settings.policy)
 
     def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
         for shard in count(first):
@@ -74,8 +75,7 @@ def simulate_shard(
     episodes = np.arange(first, first + settings.shard_episodes)[:most_episodes]
     size = _lanes_in_block(settings, lanes)
     blocks = list(_blocks(settings, policy, episodes, size, tick, num_threads, rows))
-    specs = all_specs(settings.task, settings.store_state)
-    return {name: np.concatenate([block[name] for block in blocks]) for name in specs}
+    return {name: np.concatenate([block[name] for block in blocks]) for name in settings.specs()}
 
 
 def _lanes_in_block(settings: Settings, lanes: int) -> int:
@@ -167,3 +167,5 @@ def _ends(
     lanes = np.arange(len(episodes))
     final: dict[str, Array] = {"observation": recording.observation, **recording.arrays}
     yield from ((f"final_{name}", values[length, lanes]) for name, values in final.items())
+    if weights := settings.weights:
+        yield "policy", np.array([episode_part(seed, weights) for seed in seeds], np.int32)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from jbrep.dataset.policy import policy_text
 from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Task
 from jbrep.text import facts, number, table
@@ -41,10 +42,9 @@ def card(dataset: Dataset, width: int = 80) -> str:
     """`describe` as text of at most `width` columns."""
     about = describe(dataset)
     policy, returns = about["policy"], about["return"]
-    constants = (f"{name} {value}" for name, value in policy.items() if name != "kind")
     named = {
         "task": _task_line(dataset.task),
-        "policy": ", ".join([policy["kind"], *constants]),
+        "policy": policy_text(policy),
         "seed": "-" if dataset.manifest.settings.is_imported else f"{about['seed']}",
         "rows": f"{about['rows']:,}",
         "episodes": _episodes_line(about),

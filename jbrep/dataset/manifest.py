@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.dataset import version1
-from jbrep.dataset.schema import EPISODES, FORMAT, FORMAT_VERSION, Columns, Spec, all_specs
+from jbrep.dataset.schema import EPISODES, FORMAT, FORMAT_VERSION, Columns, Spec
 from jbrep.dataset.settings import Settings
 from jbrep.dataset.shard import (
     REPAIR,
@@ -83,7 +83,7 @@ class Manifest:
 
     def specs(self) -> dict[str, Spec]:
         """The columns of each shard."""
-        return all_specs(self.task, self.settings.store_state, self.format_version)
+        return self.settings.specs(self.format_version)
 
     def episode_range(self, shard: int) -> range:
         """Numbers of the episodes in a committed shard."""
@@ -95,6 +95,23 @@ class Manifest:
         entry = self.shards[shard]
         return {n: entry.episodes if n.startswith(EPISODES) else entry.rows for n in self.specs()}
 
+    def extended(self, steps: int) -> "Manifest":
+        """The manifest of more steps, before what it lacks is collected.
+
+        If there aren't enough rows, a last shard that isn't full is left out: it has to be made
+        again, with more episodes.
+        """
+        longer = replace(self, settings=replace(self.settings, steps=steps))
+        full = self.episodes == len(self.shards) * self.settings.shard_episodes
+        return longer if longer.complete or full else replace(longer, shards=self.shards[:-1])
+
+    def is_next(self, other: "Manifest") -> bool:
+        """Whether a collector writes the other manifest after this one."""
+        more = other.settings.steps > self.settings.steps
+        expected = self.extended(other.settings.steps) if more else self
+        begun = other.shards in (expected.shards, (*expected.shards, *other.shards[-1:]))
+        return begun and other == replace(expected, shards=other.shards)
+
     def attributes(self, shard: int, rows: int) -> dict[str, Any]:
         """The HDF5 attributes of a shard's file."""
         settings = self.settings.as_json()
@@ -102,6 +119,7 @@ class Manifest:
             del settings["environment"]
         else:
             settings["environment"] = json.dumps(settings["environment"])
+            del settings["steps"]  # a data set with more of them has the same full shards
         return {
             "format": FORMAT,
             "format_version": self.format_version,

@@ -1,6 +1,6 @@
-"""The columns of a data set, and how an episode's seed follows from the root seed."""
+"""The columns of a data set, and how an episode's seed and policy are determined."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +18,11 @@ EPISODES = "episodes/"  # the HDF5 group of the columns with one row for each ep
 
 UNKNOWN_SEED = -1  # of an imported episode
 MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
+_PART_STREAM = 0x6D6978  # beside an episode's seed: nothing else is drawn from that stream
 _EPISODE_BITS = {63: 32, 31: 20}  # of a seed, for the number of the episode
 _COLUMNS = {  # of every data set
     *("observation", "action", "reward", "episode", "step"),
-    *("seed", "length", "return", "terminated", "truncated", "diverged"),
+    *("seed", "length", "return", "terminated", "truncated", "diverged", "policy"),
 }
 
 
@@ -76,6 +77,9 @@ def episode_specs(task: Task, store_state: bool, version: int = FORMAT_VERSION) 
     return {EPISODES + name: spec for name, spec in specs.items()}
 
 
+MIXTURE_SPECS = {EPISODES + "policy": _spec("<i4")}  # the number of the part of a mixture
+
+
 def check_names(task: Task) -> None:
     """Make sure that no array of the task's states would be stored in the place of a column.
 
@@ -120,6 +124,17 @@ def episode_seed(task: Task, root: int, episode: int) -> int:
             f"most {(1 << (task.seed_bits - bits)) - 2:,}, with at most {1 << bits:,} episodes"
         )
     return seed
+
+
+def episode_part(seed: int, weights: Sequence[float]) -> int:
+    """The number of the policy that acts in an episode, of a mixture with these weights.
+
+    It is drawn from NumPy's default generator with the episode's seed and a constant: a stream that
+    neither the environment nor a policy uses.
+    """
+    ends = np.cumsum(weights)
+    drawn = np.random.default_rng([seed, _PART_STREAM]).random() * ends[-1]
+    return min(int(np.searchsorted(ends, drawn, side="right")), len(ends) - 1)
 
 
 def episode_bounds(lengths: NDArray[Any]) -> NDArray[np.int64]:

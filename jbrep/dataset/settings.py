@@ -2,21 +2,27 @@
 
 import math
 import operator
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from jbrep.dataset.schema import MAX_ROOT_SEED, check_names, episode_seed, step_specs
+from jbrep.dataset.policy import IMPORTED as IMPORTED
+from jbrep.dataset.policy import MAX_LETTERS, MIXTURE, is_policy
+from jbrep.dataset.schema import (
+    FORMAT_VERSION,
+    MAX_ROOT_SEED,
+    MIXTURE_SPECS,
+    Spec,
+    all_specs,
+    check_names,
+    episode_seed,
+    step_specs,
+)
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 
-IMPORTED = "imported"  # the kind of policy of data that were made elsewhere
 _MAX_STEPS = 10**12
 _MAX_SHARD_EPISODES = 1_000_000
-_MAX_LETTERS = 200  # of a text in a policy's constants
-_MAX_CONSTANTS = 1000  # of a policy, at each depth
-_MAX_DEPTH = 6  # of lists and tables in them
 _LIMITS = {  # least, most, and what it is
     "steps": (1, _MAX_STEPS, "the number of steps"),
     "seed": (0, MAX_ROOT_SEED, "the seed"),
@@ -54,9 +60,9 @@ class Settings:
             raise InputError(f"store_state is {self.store_state!r}: it must be true or false")
         if self.store_state and not self.task.state:
             raise InputError(f"{self.task.name} has no states to store: its observations are all")
-        if not _is_policy(self.policy):
+        if not is_policy(self.policy):
             raise InputError(
-                f"the policy is {str(self.policy)[:_MAX_LETTERS]!r}: it must be a kind and its "
+                f"the policy is {str(self.policy)[:MAX_LETTERS]!r}: it must be a kind and its "
                 "constants, such as {'kind': 'constant', 'drive': 0.5}"
             )
 
@@ -71,6 +77,17 @@ class Settings:
             "shard_episodes": self.shard_episodes,
             "store_state": self.store_state,
         }
+
+    @property
+    def weights(self) -> list[float]:
+        """The weights of a mixture's parts; of another policy, none."""
+        parts = self.policy["parts"] if self.policy["kind"] == MIXTURE else ()
+        return [weight for weight, _ in parts]
+
+    def specs(self, version: int = FORMAT_VERSION) -> dict[str, Spec]:
+        """The columns of each shard, by their paths in the file."""
+        mixture = MIXTURE_SPECS if self.weights else {}
+        return all_specs(self.task, self.store_state, version) | mixture
 
     @property
     def is_imported(self) -> bool:
@@ -93,37 +110,3 @@ def _checked_number(name: str, value: Any) -> int:
     if not least <= number <= most:
         raise InputError(f"{what} is {number}: it must be from {least} to {most:,}")
     return number
-
-
-def _is_policy(policy: Any) -> bool:
-    """A kind, which is a word, and constants."""
-    if not isinstance(policy, Mapping) or not isinstance(policy.get("kind"), str):
-        return False
-    return re.fullmatch("[a-z-]+", policy["kind"]) is not None and _is_plain(policy)
-
-
-def _is_plain(value: Any) -> bool:
-    """Numbers and short text in lists and tables, few enough and not nested deeply."""
-    level = [value]
-    for _ in range(_MAX_DEPTH):
-        values = [each for each in level if not _is_scalar(each)]
-        if not all(isinstance(each, list | Mapping) for each in values):
-            return False
-        if sum(map(len, values)) > _MAX_CONSTANTS:
-            return False
-        level = [inner for each in values for inner in _inside(each)]
-    return not level
-
-
-def _inside(value: list[Any] | Mapping[Any, Any]) -> list[Any]:
-    """The items of a list; the names, which must be text, and values of a table."""
-    if isinstance(value, list):
-        return value
-    names = [name if isinstance(name, str) else None for name in value]
-    return [*names, *value.values()]
-
-
-def _is_scalar(value: Any) -> bool:
-    if isinstance(value, str):
-        return len(value) <= _MAX_LETTERS and value.isprintable()
-    return isinstance(value, int | float) and type(value) is not bool and abs(value) < _MAX_STEPS

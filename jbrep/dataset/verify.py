@@ -1,7 +1,8 @@
 """Verifying a data set: hashes, shapes, numbers and ranges."""
 
+import hashlib
 from collections.abc import Iterator
-from dataclasses import replace
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +19,24 @@ from jbrep.dataset.manifest import (
     read_manifest,
     shard_name,
 )
+from jbrep.dataset.policy import TRAINED, parts_of
 from jbrep.dataset.schema import (
     EPISODES,
     UNKNOWN_SEED,
     Columns,
     episode_bounds,
     episode_columns,
+    episode_part,
     episode_returns,
     episode_seed,
 )
 from jbrep.dataset.shard import REPAIR, column_hash
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError
+from jbrep.files.storage import read_regular
 from jbrep.progress import Progress
+
+_MAX_POLICY_BYTES = 1 << 28
 
 
 def find_problems(folder: Path) -> Iterator[str]:
@@ -50,6 +56,7 @@ def find_problems(folder: Path) -> Iterator[str]:
         return
     yield from file_problems(folder, manifest, files)
     yield from _backup_problems(folder, manifest)
+    yield from _policy_problems(folder, manifest)
     for shard in Progress(range(len(manifest.shards)), unit="shard", desc="verify", leave=False):
         path = folder / shard_name(shard)
         try:
@@ -65,16 +72,29 @@ def find_problems(folder: Path) -> Iterator[str]:
 
 
 def _backup_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
-    """The backup equals the manifest, or is one shard ahead while the data set is unfinished."""
+    """The backup equals the manifest, or is the one that the collector writes next."""
     try:
         backup = read_manifest(folder, BACKUP)
     except InputError as error:
         yield str(error)
         return
-    ahead = len(backup.shards) - len(manifest.shards)
-    known = replace(backup, shards=backup.shards[: len(manifest.shards)])
-    if known != manifest or ahead not in (0, 1):
+    if not manifest.is_next(backup):
         yield f"{folder / BACKUP} is of another data set: {REPAIR}"
+
+
+def _policy_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
+    """The files of trained policies are there, as they were when they acted."""
+    for policy in parts_of(manifest.settings.policy):
+        if policy["kind"] != TRAINED:
+            continue
+        path, raw = folder / policy["file"], b""
+        with suppress(OSError):
+            raw = read_regular(path, _MAX_POLICY_BYTES)
+        if hashlib.sha256(raw).hexdigest() != policy["sha256"]:
+            yield (
+                f"{path} is damaged or missing: it is the policy of {policy['run']} at step "
+                f"{policy['step']:,}, which only a copy can restore"
+            )
 
 
 def _hash_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
@@ -119,14 +139,18 @@ def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Itera
     numbers = np.array(manifest.episode_range(shard))
     lengths = own["length"]
     first = episode_bounds(lengths)[:-1]
+    seeds = _seeds(manifest, numbers, own["seed"])
     checks: dict[str, tuple[ArrayLike, ArrayLike]] = {
         "episode numbers": (own["episode"], numbers),
-        "seeds": (own["seed"], _seeds(manifest, numbers, own["seed"])),
+        "seeds": (own["seed"], seeds),
         "ends of episodes": (own["terminated"] | own["truncated"], np.ones_like(own["truncated"])),
         "the rows' episode": (columns["episode"], np.repeat(numbers, lengths)),
         "the rows' step": (columns["step"], np.arange(rows) - np.repeat(first, lengths)),
         "returns": (own["return"], episode_returns(columns["reward"], lengths)),
     }
+    if weights := manifest.settings.weights:
+        parts = [episode_part(int(seed), weights) for seed in seeds]
+        checks["the episodes' policies"] = own["policy"], np.array(parts)
     for what, (stored, expected) in checks.items():
         if not np.array_equal(stored, expected):
             yield f"{what}: inconsistent with the settings, or with other columns"

@@ -56,7 +56,20 @@ def load(path: Path) -> Encoder:
             and tensors are inconsistent; the message names the tensor.
         DamageError: it isn't what was written.
     """
-    tensors, header = container.read(path, "encoder")
+    return unpack(path, *container.read(path, "encoder"))
+
+
+def unpack(path: Path, tensors: Tensors, header: dict[str, Any]) -> Encoder:
+    """The encoder with these tensors and this header, both of which are used up.
+
+    Args:
+        path: of the file that they come from, for messages.
+        tensors: as `Encoder.tensors` gives them.
+        header: as `Encoder.file_header` is.
+
+    Raises:
+        InputError: as `load`.
+    """
     if header.get("format") != FORMAT:
         raise InputError(f"{path} is not a jbrep encoder")
     check_version(path, header.get("format_version"), FORMAT_VERSION)

@@ -35,7 +35,7 @@ class Settings(TypedDict):
     representation: str
     encoder: str  # its SHA-256, or that each run has an encoder of its own
     encoder_code: NotRequired[str | None]  # module:Class, if it is code
-    hidden: list[int]  # units of the agent's layers
+    hidden: list[int] | dict[str, list[int]]  # units of the agent's layers, or of its networks'
     steps: int
     evaluate_every: int
     evaluation_episodes: int
@@ -153,11 +153,18 @@ def _heights(units: int) -> Any:
     return 0.5 + (np.arange(shown) - (shown - 1) / 2) / _MOST
 
 
+def _hidden(layers: list[int] | dict[str, list[int]]) -> str:
+    """Units of hidden layers: 64-64, or pi 64-64, qf 256-256."""
+    if isinstance(layers, dict):
+        return ", ".join(f"{name} {_hidden(units)}" for name, units in layers.items())
+    return "-".join(map(str, layers)) or "none"
+
+
 def system(shared: LabelRecord, looks: Looks) -> Plot:
     """Robot, observation, encoder, agent, action."""
     settings, encoder = shared["settings"], shared["encoder"]
     latent = encoder["encoder"][-1][0]
-    hidden = "-".join(map(str, settings["hidden"]))
+    hidden = _hidden(settings["hidden"])
     task = settings.get("environment")
     action = _action(task) if task else ""
     step = f" of {task['timestep']:g} s" if task and task["timestep"] else ""

@@ -69,6 +69,16 @@ def read(path: Path, what: str, most: int = MAX_BYTES) -> tuple[Tensors, dict[st
         raise InputError(
             f"{path} is not a jbrep {what}: it must be a regular file of 1 to {most:,} bytes"
         )
+    return unpack(raw, path, what)
+
+
+def unpack(raw: bytes, path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
+    """What `pack` made bytes of, as `read` returns it; the path is for messages.
+
+    Raises:
+        InputError: another kind of file.
+        DamageError: it isn't what was written, or has no checksum.
+    """
     try:
         tensors, header = safetensors.numpy.load(raw), _header(raw)
     except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
@@ -82,6 +92,14 @@ def read(path: Path, what: str, most: int = MAX_BYTES) -> tuple[Tensors, dict[st
             f"{path} is damaged (its checksum doesn't match): delete it to start over"
         )
     return tensors, header
+
+
+def format_of(path: Path, most: int = MAX_BYTES) -> str:
+    """The format that the header of such a file names; empty for any other file."""
+    try:
+        return str(_header(read_regular(path, most)).get("format", ""))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return ""
 
 
 def _header(raw: bytes) -> dict[str, Any]:

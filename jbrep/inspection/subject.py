@@ -20,7 +20,7 @@ from jbrep.inspection.recording import SUFFIX, check_out
 from jbrep.inspection.traversal import record_traversal
 from jbrep.rl.files import ENCODER, is_run
 from jbrep.rollouts.rollout import Rollout
-from jbrep.rollouts.sources import find_episode, run_folder
+from jbrep.rollouts.sources import find_episode, is_trained, run_folder
 from jbrep.study.results import has_runs, read_runs
 
 FOLDER = Path("inspect")  # of recordings without an --out
@@ -103,7 +103,7 @@ def _find(
     source: str | None, episode: int, task: Task | None, encoder: Any
 ) -> tuple[Rollout, BaseEncoder | None]:
     """The episode, and the encoder to show with it."""
-    if source is None or source.endswith(ENCODER_SUFFIX):
+    if source is None or (source.endswith(ENCODER_SUFFIX) and not is_trained(source)):
         if (source is None) == (encoder is None):
             raise InputError("give a SOURCE to inspect, or one encoder with its --task")
         shown = find_alone(encoder if source is None else source, task)
@@ -114,11 +114,10 @@ def _find(
             f"{source} is no data set, no run with a policy or checkpoint, and holds no finished "
             "run: jbrep collect makes a data set, jbrep rl a run"
         )
-    folder = run_folder(source)
-    rollout = find_episode(source, episode, task, _acting(folder, encoder))
+    rollout = find_episode(source, episode, task, _acting(run_folder(source), encoder))
     if encoder is not None:
         return rollout, find(encoder, rollout.task)
-    return rollout, _own(folder) if folder else None
+    return rollout, _own(source) if is_trained(source) else None
 
 
 def _acting(folder: Path | None, encoder: Any) -> Any:
@@ -127,11 +126,16 @@ def _acting(folder: Path | None, encoder: Any) -> Any:
     return encoder if is_object and folder and not exists(folder / ENCODER) else None
 
 
-def _own(folder: Path) -> BaseEncoder | None:
-    """A run's encoder; None if the run observes the full state."""
-    from jbrep.rl.policy import run_encoder, run_settings  # imports torch
+def _own(source: str) -> BaseEncoder | None:
+    """The encoder of a run, or of a policy's file; None if it observes the full state."""
+    if folder := run_folder(source):
+        from jbrep.rl.policy import run_encoder, run_settings  # imports torch
 
-    encoder = run_encoder(folder, run_settings(folder))
+        encoder = run_encoder(folder, run_settings(folder))
+    else:
+        from jbrep.rl.policy_weights import load_encoder  # imports torch
+
+        encoder = load_encoder(Path(source))
     return None if encoder.kind == IDENTITY else encoder
 
 

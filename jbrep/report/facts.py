@@ -169,7 +169,9 @@ def setting_rows(tables: Tables) -> tuple[Row, Rows]:
 
 def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     for name, value in settings.items():
-        if isinstance(value, Mapping):
+        if name == "overrides":
+            yield name, ", ".join(f"{each} {_shown(own)}" for each, own in value.items()) or None
+        elif isinstance(value, Mapping):
             yield from _flat(value)
         else:
             yield name, value
@@ -217,7 +219,12 @@ def _imports(study: Mapping[str, Any]) -> str:
 def _toml(study: Mapping[str, Any]) -> str:
     """A study as the file that describes it."""
     lines, below = [], []
+    own = study.get("learners", {})
+    given_algorithms = {name: own.get(name, {}) for name in study["algorithms"]}
+    below += [line for each in given_algorithms.items() if own for line in _learner_table(*each)]
     for name, value in study.items():
+        if name == "learners" or (name == "algorithms" and own):
+            continue
         if isinstance(value, Mapping):
             unset = ("", 0) if name == "data" else ()  # either steps or a folder is given there
             given = {key: each for key, each in value.items() if each not in unset}
@@ -228,11 +235,19 @@ def _toml(study: Mapping[str, Any]) -> str:
     return "\n".join(lines + below)
 
 
+def _learner_table(name: str, table: Mapping[str, Any]) -> list[str]:
+    """The lines of a learner's table."""
+    return ["", f"[algorithms.{_key(name)}]", *(f"{n} = {_inline(v)}" for n, v in table.items())]
+
+
+def _key(name: str) -> str:
+    return name if _BARE.fullmatch(name) else json.dumps(name)
+
+
 def _inline(value: Any) -> str:
     """A value as TOML on one line."""
     if isinstance(value, Mapping):
-        keys = (key if _BARE.fullmatch(key) else json.dumps(key) for key in value)
-        cells = map(" = ".join, zip(keys, map(_inline, value.values()), strict=True))
+        cells = map(" = ".join, zip(map(_key, value), map(_inline, value.values()), strict=True))
         return f"{{ {', '.join(cells)} }}"
     if isinstance(value, list):
         return f"[{', '.join(map(_inline, value))}]"
@@ -250,6 +265,8 @@ def _command(shared: LabelRecord, out: str) -> str:
     parts = ["jbrep", "rl"]
     for name in options:
         parts += [f"--{name.replace('_', '-')}", str(settings[name])]
+    for name, value in settings.get("overrides", {}).items():
+        parts += ["--set", f"{name}={json.dumps(value)}"]
     environment: Mapping[str, Any] = settings.get("environment", {})
     for name, value in environment.get("arguments", {}).items():
         parts += ["--env", f"{name}={json.dumps(value)}"]

@@ -132,6 +132,13 @@ _ADDED = {  # what early runs of this version lack
     "normalize": False,
     "overrides": {},
 }
+_POLICY_FILE = {
+    "settings": _OBJECT,
+    "encoder": _OBJECT,
+    "run": _LINE,
+    "step": whole_number(0, MAX_STEPS),
+    "finished": Kind(lambda v: isinstance(v, bool), "true or false"),
+}
 _VERSION_1 = {"task": _TASK, "episode_steps": whole_number(1, MAX_EPISODE_STEPS)}
 
 
@@ -165,6 +172,15 @@ def check_settings(path: Path, settings: Mapping[str, Any]) -> None:
         raise _damaged(path, f"settings.environment is invalid: {error}") from None
     if task.name != settings["task"]:
         raise _damaged(path, f"settings.environment is of {task.name}")
+
+
+def check_policy(path: Path, header: Mapping[str, Any]) -> None:
+    """The same for the header of a policy's file, but for its settings.
+
+    Raises:
+        DamageError: as `check_run`.
+    """
+    _check(path, header, _POLICY_FILE)
 
 
 def from_version_1(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:

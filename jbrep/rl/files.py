@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jbrep.errors import DamageError, InputError, check_version, differences
+from jbrep.files import container
 from jbrep.files.storage import exists, read_regular, write_whole
 from jbrep.files.tables import write_csv
 from jbrep.rl.fields import FAILED as FAILED
@@ -23,6 +24,8 @@ from jbrep.rl.fields import (
 
 FORMAT = "jbrep run"
 FORMAT_VERSION = 2
+POLICY_FORMAT = "jbrep policy"
+POLICY_SUFFIX = ".safetensors"
 RUN = "run.json"  # written last: its presence means that the run has ended
 POLICY = "policy.zip"
 CHECKPOINT = "checkpoint.safetensors"  # until the run ends
@@ -56,6 +59,11 @@ class Evaluation(NamedTuple):
 def is_run(folder: Path) -> bool:
     """Whether a folder is of a run that has ended or has written a checkpoint."""
     return exists(folder / RUN) or exists(folder / CHECKPOINT)
+
+
+def is_policy_file(path: Path) -> bool:
+    """Whether this is a policy's file as `jbrep.rl.policy_weights` writes it."""
+    return path.suffix == POLICY_SUFFIX and container.format_of(path) == POLICY_FORMAT
 
 
 def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -> None:

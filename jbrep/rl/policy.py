@@ -50,6 +50,7 @@ class Trained(NamedTuple):
     representation: str  # what the policy observes, as tables call it
     evaluation_episodes: int = 1  # that the run's evaluations play at once
     step: int | None = None  # of training, if it is not over
+    settings: Mapping[str, Any] = {}  # of the run; none of a file from elsewhere
     statistics: Statistics | None = None  # by which it normalises what it sees, if it does
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
@@ -85,6 +86,14 @@ class Trained(NamedTuple):
             DamageError: a number that it acts by isn't finite, or the statistics are missing.
         """
         fill(self.policy, weights, source)
+        return self.with_statistics(tensors, source)
+
+    def with_statistics(self, tensors: Mapping[str, NDArray[Any]], source: Path) -> "Trained":
+        """The policy with the statistics in the tensors, if it has any.
+
+        Raises:
+            DamageError: they are missing or invalid.
+        """
         if self.statistics is None:
             return self
         size = self.encoder.latent_size
@@ -216,27 +225,26 @@ def _load_checkpoint(folder: Path, encoder: Any) -> Trained:
 def _untrained(folder: Path, settings: Mapping[str, Any], given: Any) -> Trained:
     """What a run trains, as it begins unless another run's policy comes along."""
     task = read_task(settings["environment"])
-    choose(settings["algorithm"], ALGORITHMS, "algorithm")
     with single_torch_thread():  # as in training, so that a module computes the same bits
         encoder = run_encoder(folder, settings) if given is None else as_file(find(given, task))
-    if encoder.fingerprint != settings["encoder"]:
-        raise InputError(
-            f"{encoder.name} is not the encoder that the run in {folder} was made with"
-        )
-    return build(settings, encoder)
+    return build(folder, settings, encoder)
 
 
-def build(settings: Mapping[str, Any], encoder: BaseEncoder) -> Trained:
+def build(path: Path, settings: Mapping[str, Any], encoder: BaseEncoder) -> Trained:
     """The untrained policy of a run; `Trained.filled` gives it weights.
 
     Args:
+        path: where the settings are from, for messages.
         settings: of the run, as run.json has them, checked by `check_settings`.
         encoder: of the run.
 
     Raises:
-        InputError: the settings can't be those of a run, or the encoder is of another task.
+        InputError: the settings can't be those of a run, or the encoder isn't the run's.
     """
     task, algorithm = read_task(settings["environment"]), settings["algorithm"]
+    choose(algorithm, ALGORITHMS, "algorithm")
+    if encoder.fingerprint != settings["encoder"]:
+        raise InputError(f"{encoder.name} is not the encoder that the run in {path} was made with")
     check_shape(algorithm, settings["hidden"], settings["policy"])
     encoder.check_task(task)
     preset = Preset(settings["hidden"], shaping(settings["settings"]), policy=settings["policy"])
@@ -248,7 +256,9 @@ def build(settings: Mapping[str, Any], encoder: BaseEncoder) -> Trained:
         ) from None
     statistics = Statistics.untrained(encoder.latent_size) if settings["normalize"] else None
     name, episodes = settings["representation"], settings["evaluation_episodes"]
-    return Trained(agent.policy, task, encoder, name, episodes, statistics=statistics)
+    return Trained(
+        agent.policy, task, encoder, name, episodes, settings=settings, statistics=statistics
+    )
 
 
 def run_encoder(folder: Path, settings: Mapping[str, Any]) -> BaseEncoder:

@@ -46,7 +46,7 @@ from jbrep.rl.files import (
     write_rows,
     write_run,
 )
-from jbrep.rl.learner import Learner
+from jbrep.rl.learner import Learner, is_file
 from jbrep.rl.policy_file import policy_zip
 from jbrep.rl.presets import Preset
 from jbrep.rl.recorder import DivergedError, History, Recorder, Scalars, Watch
@@ -84,9 +84,9 @@ class Run:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "task", as_task(self.task))
-        learner = Learner.given(self.algorithm, self.preset, self.settings, self.learner)
-        for name, value in learner.run_settings.items():
-            object.__setattr__(self, name, value)
+        if is_file(self.preset):
+            for name, value in self._learner.run_settings.items():
+                object.__setattr__(self, name, value)
         for name, limit in _LIMITS.items():
             if not 1 <= getattr(self, name) <= limit:
                 words = name.replace("_", " ")
@@ -120,6 +120,10 @@ class Run:
             return as_file(find(self.encoder, self.task))
 
     @property
+    def _learner(self) -> Learner:
+        return Learner.given(self.algorithm, self.preset, self.settings, self.learner)
+
+    @property
     def used(self) -> Preset:
         """All settings of the algorithm.
 
@@ -141,7 +145,7 @@ class Run:
             "algorithm": self.algorithm,
             "preset": self.preset,
             "overrides": self.settings,
-            "learner": self.learner,
+            "learner": self._learner.name,
             **asdict(self.used),
             "representation": self.representation or encoder.representation,
             "encoder": encoder.fingerprint,

@@ -1,12 +1,13 @@
 """Where an episode comes from: a data set, a trained run, or a policy by its name."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from jbrep.collect.policies import POLICIES, parse_policy
+from jbrep.collect.policies import POLICIES, Policy, make_policy, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import FULL
@@ -19,7 +20,7 @@ from jbrep.errors import InputError
 from jbrep.files.storage import exists
 from jbrep.progress import Progress
 from jbrep.rl.fields import MAX_EVALUATION_EPISODES
-from jbrep.rl.files import EVALUATION_SEED, POLICY, is_run
+from jbrep.rl.files import EVALUATION_SEED, POLICY, is_policy_file, is_run
 from jbrep.rollouts.rollout import Begin, Rollout, play, replay
 
 if TYPE_CHECKING:
@@ -152,12 +153,59 @@ def find_episode(
     return player.play([episode])[0]
 
 
+def find_policy(text: str, folder: Path) -> Policy:
+    """The policy that a text names, to collect with: of a run, by its name, or a mixture of them.
+
+    The policy of a run is frozen: it is the one that the data set has already, or else the run's
+    last.
+
+    Args:
+        text: the run's folder or a policy's file, a name such as constant:drive=0.5, or a mixture
+            such as uniform:0.5+runs/a:0.5.
+        folder: of the data set.
+
+    Raises:
+        InputError: it names nothing of these, or what it names can't be used.
+        DamageError: a file isn't what was written.
+    """
+    files = (f"policy-{number}.safetensors" for number in count())
+
+    def frozen(part: str) -> Policy | None:
+        by_name = part.partition(":")[0] in POLICIES
+        if not is_trained(part) and (by_name or not any(folder.glob("policy-*.safetensors"))):
+            return None
+        from jbrep.rl.frozen import freeze, has_kept  # imports torch
+
+        file = next(files)
+        if is_trained(part) or has_kept(part, folder / file):
+            return freeze(str(run_folder(part) or part), folder, file)
+        return None
+
+    return parse_policy(text, frozen)
+
+
+def kept_policy(folder: Path) -> Callable[[Mapping[str, Any]], Policy]:
+    """How to make the policies of a data set in a folder from what its manifest says of them."""
+
+    def trained(settings: Mapping[str, Any]) -> Policy:
+        from jbrep.rl.frozen import read_frozen  # imports torch
+
+        return read_frozen(folder, settings)
+
+    return lambda settings: make_policy(settings, trained)
+
+
+def is_trained(source: str) -> bool:
+    """Whether a source is a run or a policy's file."""
+    return run_folder(source) is not None or is_policy_file(Path(source))
+
+
 def find_player(source: str, task: Task | None = None, encoder: Any = None) -> Player:
     """The policy of a run, or one by its name, such as heuristic or constant:drive=0.5.
 
     Args:
-        source: the run's folder, or the policy.zip in it, or the name. A run that is not over plays
-            its last checkpoint.
+        source: the run's folder, or the policy.zip in it, a policy's file, or the name. A run that
+            is not over plays its last checkpoint.
         task: for a policy by its name. A run has its own; if one is given, it must be of the same
             environment, and is played instead: with other arguments or another time limit.
         encoder: the object that a run was made with, if its encoder is a user's own.
@@ -165,8 +213,8 @@ def find_player(source: str, task: Task | None = None, encoder: Any = None) -> P
     Raises:
         InputError: neither, or no task for a name, or a run of another task.
     """
-    if folder := run_folder(source):
-        return _of_run(folder, task, encoder)
+    if is_trained(source):
+        return _trained(source, task, encoder)
     if exists(Path(source) / MANIFEST):
         raise InputError(f"{source} is a data set: give the folder of a run or a policy")
     if source.partition(":")[0] not in POLICIES:
@@ -197,12 +245,16 @@ def find_untrained(folder: Path) -> Player:
     return as_player(f"{folder}, before training", load_untrained(folder))
 
 
-def _of_run(folder: Path, task: Task | None, encoder: Any) -> Player:
+def _trained(source: str, task: Task | None, encoder: Any) -> Player:
     from jbrep.rl.policy import load_run  # imports torch
+    from jbrep.rl.policy_weights import load
 
-    trained = load_run(folder, encoder)
-    _check_task(str(folder), trained.task, task)
-    name = str(folder) if trained.step is None else f"{folder} at step {trained.step:,}"
+    folder = run_folder(source)
+    trained = load_run(folder, encoder) if folder else load(Path(source))
+    name = str(folder or source)
+    _check_task(name, trained.task, task)
+    if trained.step is not None:
+        name = f"{name} at step {trained.step:,}"
     player = as_player(name, trained)
     return player._replace(task=task) if task else player
 

@@ -3,9 +3,9 @@
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin
 
 from jbrep.encoders import FULL
 from jbrep.envs.names import find_spec
@@ -13,7 +13,7 @@ from jbrep.envs.task import MAX_EPISODE_STEPS
 from jbrep.errors import InputError
 from jbrep.files.storage import read_regular
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.rl.presets import get_preset
+from jbrep.rl.learner import Learner
 from jbrep.rl.run import Run
 from jbrep.study.representations import Given, name_of, read_representation
 from jbrep.text import slug
@@ -38,26 +38,6 @@ class Data:
     folder: str = ""  # a data set, or a folder with one for each task
 
 
-@dataclass(frozen=True)
-class Learner:
-    """An algorithm with a preset."""
-
-    name: str  # ddpg, with the preset paper; sac-modern, with another
-    algorithm: str
-    preset: str
-
-    @classmethod
-    def of(cls, name: str) -> "Learner":
-        """The learner of that name.
-
-        Raises:
-            InputError: unknown algorithm or preset.
-        """
-        algorithm, _, preset = name.partition("-")
-        get_preset(preset or "paper", algorithm)
-        return cls(name, algorithm, preset or "paper")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Study:
     """Tasks x algorithms x representations x seeds, and the settings that all runs share.
@@ -76,6 +56,7 @@ class Study:
     environment: Mapping[str, Any] = field(default_factory=dict)  # arguments of environments
     data: Data | None = None  # None: the shipped encoders
     training: Mapping[str, Any] = field(default_factory=dict)  # of encoders, other than the usual
+    learners: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # with own settings
 
     def __post_init__(self) -> None:
         for name in ("tasks", "algorithms", "representations", "seeds"):
@@ -85,7 +66,7 @@ class Study:
                 raise InputError(f"{name} is {values}: it must have one or more, each once")
         self._check_tasks()
         for algorithm in self.algorithms:
-            Learner.of(algorithm)
+            self.learner(algorithm)
         for given in self.representations:
             read_representation(given, self.training)
         for seed in self.seeds:
@@ -94,6 +75,19 @@ class Study:
             raise InputError("data must have either steps, to collect, or the folder of a data set")
         if self.training and not self.data:
             raise InputError("training is for encoders made by the study: [data] is missing")
+
+    def learner(self, name: str) -> Learner:
+        """The learner of that name: a preset, or one with settings of its own.
+
+        Raises:
+            InputError: a name or setting is unknown, or a value isn't allowed.
+        """
+        if name not in self.learners:
+            return Learner.of(name)
+        try:
+            return Learner.of_table(name, self.learners[name])
+        except InputError as error:
+            raise InputError(f"[algorithms.{name}]: {error}") from None
 
     def _check_tasks(self) -> None:
         """Check what can be checked of tasks without making their environments."""
@@ -166,6 +160,8 @@ def read_study(path: Path) -> Study:
 def as_study(given: Mapping[str, Any]) -> Study:
     """A study from parsed TOML or JSON; a number of seeds n stands for the seeds 0 to n - 1.
 
+    Tables of algorithms become names and learners, which hold what preset files say.
+
     Raises:
         InputError: a name or value is unknown, missing or out of range.
     """
@@ -174,7 +170,11 @@ def as_study(given: Mapping[str, Any]) -> Study:
         given["data"] = Data(**_checked(Data, given["data"], "data."))
     if type(given.get("seeds")) is int and 0 < given["seeds"] <= _MOST_SEEDS:
         given["seeds"] = list(range(given["seeds"]))
-    return Study(**_checked(Study, given, ""))
+    if isinstance(tables := given.get("algorithms"), dict):
+        given |= {"algorithms": list(tables), "learners": tables}
+    study = Study(**_checked(Study, given, ""))
+    named = ((name, study.learner(name).table) for name in study.algorithms)
+    return replace(study, learners={name: table for name, table in named if table})
 
 
 def _checked(kind: Any, given: Any, where: str) -> dict[str, Any]:
@@ -203,6 +203,8 @@ def _typed(kind: Any, value: Any, name: str) -> Any:
     scalar = {int: int, int | None: int, str: str}.get(kind)
     if scalar and type(value) is not scalar:
         raise InputError(f"{name} is {value!r}: it must be of type {scalar.__name__}")
-    if kind == Mapping[str, Any] and not isinstance(value, dict):
+    if get_origin(kind) is Mapping and not isinstance(value, dict):
         raise InputError(f"{name} is {value!r}: it must be a table")
+    if name == "learners" and (bad := [n for n, each in value.items() if type(each) is not dict]):
+        raise InputError(f"algorithms.{bad[0]} is {value[bad[0]]!r}: it must be a table")
     return value

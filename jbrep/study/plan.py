@@ -12,13 +12,14 @@ from jbrep.errors import InputError, differences
 from jbrep.files.storage import exists, make_folder, read_regular, write_whole
 from jbrep.rl import Run
 from jbrep.rl.files import RUN
+from jbrep.rl.learner import Learner
 from jbrep.rl.run import plain
-from jbrep.study.config import Learner, Study, as_study
+from jbrep.study.config import Study, as_study
 from jbrep.study.representations import Representation, read_representation
 from jbrep.text import slug
 
 STUDY = "study.json"
-_GRID = ("tasks", "algorithms", "representations", "seeds")  # may be added to
+_GRID = ("tasks", "algorithms", "representations", "seeds", "learners")  # may be added to
 _MAX_BYTES = 1 << 24
 
 
@@ -61,7 +62,7 @@ class Plan:
         """All runs; those of the first seed come first."""
         study = self.study
         return tuple(
-            Cell(task, Learner.of(algorithm), representation, seed)
+            Cell(task, study.learner(algorithm), representation, seed)
             for seed in study.seeds
             for task in study.tasks
             for algorithm in study.algorithms
@@ -98,8 +99,7 @@ class Plan:
         made = self.encoders(cell.task) if self.study.data else None
         return Run(
             task=self.task(cell.task),
-            algorithm=cell.learner.algorithm,
-            preset=cell.learner.preset,
+            **cell.learner.run_settings,
             encoder=cell.representation.encoder(cell.task, cell.seed, made),
             seed=cell.seed,
             **cell.representation.settings(cell.seed),
@@ -127,7 +127,10 @@ class Plan:
             fixed = {name: value for name, value in settings.items() if name not in _GRID}
             if self._has_limits_of(there):
                 del fixed["episode_steps"]
-            if differing := differences(there.as_json(), fixed):
+            before, now = there.as_json()["learners"], settings["learners"]
+            fixed |= {f"learner {name}": now[name] for name in now if name in before}
+            known = {f"learner {name}": table for name, table in before.items()}
+            if differing := differences({**there.as_json(), **known}, fixed):
                 raise InputError(
                     f"{self.folder} holds another study: {differing}; choose another --out"
                 )

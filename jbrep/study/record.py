@@ -10,6 +10,7 @@ from jbrep.envs.encoding import OWN
 from jbrep.envs.task import read_task
 from jbrep.files.storage import exists
 from jbrep.rl.files import ENCODER, read_run
+from jbrep.rl.names import base_name
 from jbrep.stats.runs import in_order
 from jbrep.study.plan import read_plan
 from jbrep.study.work import read_progress
@@ -64,14 +65,13 @@ def _sort_key(settings: Mapping[str, Any], order: list[str]) -> tuple[Any, ...]:
 
 
 def run_label(settings: Mapping[str, Any]) -> str:
-    """Task, algorithm with its preset, representation: face_direction/sac-modern/dae-8."""
+    """Task, learner, representation: face_direction/sac-modern/dae-8."""
     return f"{settings['task']}/{learner(settings)}/{settings['representation']}"
 
 
 def learner(settings: Mapping[str, Any]) -> str:
-    """The algorithm with its preset, unless that is the paper's: ddpg, sac-modern."""
-    suffix = "" if settings["preset"] == "paper" else f"-{settings['preset']}"
-    return settings["algorithm"] + suffix
+    """What tables call the algorithm with its settings: ddpg, sac-modern, my-sac."""
+    return settings.get("learner") or base_name(settings["algorithm"], settings["preset"])
 
 
 def as_json(contents: Mapping[str, Any]) -> bytes:

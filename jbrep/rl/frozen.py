@@ -1,0 +1,149 @@
+"""Policies of runs to collect data with, frozen as they are at the start."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from jbrep.dae.training import single_torch_thread
+from jbrep.dataset.policy import MAX_LETTERS, TRAINED
+from jbrep.envs.recording import Actor
+from jbrep.envs.sb3 import agent_spaces
+from jbrep.envs.task import Array, Task, check_same
+from jbrep.errors import DamageError, InputError
+from jbrep.files.storage import exists
+from jbrep.rl.agent import unchecked_distributions
+from jbrep.rl.files import ENCODER, is_policy_file
+from jbrep.rl.policy import Trained, load_run
+from jbrep.rl.policy_weights import pack, unpack
+from jbrep.rl.weights import read_file
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """The policy of a run as a data set keeps it: in a file beside the shards.
+
+    It acts deterministically, in one episode at a time: a network rounds differently in batches of
+    other sizes, and on several threads.
+    """
+
+    file: str  # its name in the data set's folder
+    content: bytes  # of the file
+
+    def settings(self) -> dict[str, Any]:
+        """What a manifest says of it."""
+        _, header = _opened(self.file, self.content)
+        digest = hashlib.sha256(self.content).hexdigest()
+        origin = {"run": header["run"], "step": header["step"]}
+        return {"kind": TRAINED, "file": self.file, "sha256": digest, **origin}
+
+    def files(self) -> dict[str, bytes]:
+        """The file that belongs to the data set."""
+        return {self.file: self.content}
+
+    def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
+        """Act deterministically; nothing is drawn.
+
+        Raises:
+            InputError: it was trained in another task; the actor raises one for actions that are
+                not finite.
+        """
+        trained, header = _opened(self.file, self.content)
+        if task.id != trained.task.id:
+            raise InputError(f"{header['run']} is of {trained.task.name}, not of {task.name}")
+        check_same(task, trained.task, header["run"])
+        return _one_by_one(trained)
+
+
+@lru_cache(maxsize=8)
+def _opened(file: str, content: bytes) -> tuple[Trained, dict[str, Any]]:
+    return unpack(content, Path(file))
+
+
+def _one_by_one(trained: Trained) -> Actor:
+    policy, encoder, statistics = trained.policy, trained.encoder, trained.statistics
+    policy.set_training_mode(False)
+    bounds = agent_spaces(trained.task, encoder)[1]
+
+    def choose(row: torch.Tensor) -> torch.Tensor:
+        seen = encoder.encode(row)
+        if statistics:
+            seen = torch.from_numpy(statistics(seen.numpy()))
+        return policy._predict(seen, deterministic=True)
+
+    def act(observation: Array) -> NDArray[Any]:
+        rows = torch.tensor(observation, dtype=torch.float32).split(1)
+        with single_torch_thread(), torch.inference_mode(), unchecked_distributions():
+            chosen = [choose(row) for row in rows]
+        actions = torch.cat(chosen).numpy()
+        if not np.isfinite(actions).all():
+            raise InputError("the policy's actions are not finite: it can't be played")
+        scaled = policy.unscale_action(actions) if policy.squash_output else actions
+        return np.clip(scaled, bounds.low, bounds.high)
+
+    return act
+
+
+def freeze(source: str, folder: Path, file: str) -> Frozen:
+    """The policy of a run, or of a policy's file, for a data set.
+
+    One that the data set has already stays, even if the run has gone on since.
+
+    Args:
+        source: the run's folder, or the file.
+        folder: of the data set.
+        file: name of the policy's file in it.
+
+    Raises:
+        InputError: the run has no policy so far, or an encoder that is code.
+        DamageError: a file isn't what was written.
+    """
+    name = _line(source)
+    if kept := _kept(folder / file, name):
+        return kept
+    path = Path(source)
+    if is_policy_file(path):
+        return Frozen(file, read_file(path))
+    if not exists(path / ENCODER):
+        raise InputError(
+            f"{source} can't be collected with: its encoder is code, which can't be kept with the "
+            "data"
+        )
+    return Frozen(file, pack(load_run(path), name))
+
+
+def has_kept(source: str, path: Path) -> bool:
+    """Whether a data set has the policy of this run already, in this file."""
+    return _kept(path, _line(source)) is not None
+
+
+def _kept(path: Path, run: str) -> Frozen | None:
+    if not exists(path):
+        return None
+    kept = Frozen(path.name, read_file(path))
+    return kept if kept.settings()["run"] == run else None
+
+
+def _line(source: str) -> str:
+    """A run's folder as manifests name it."""
+    return "".join(c if c.isprintable() else "?" for c in str(Path(source)))[-MAX_LETTERS:]
+
+
+def read_frozen(folder: Path, settings: Mapping[str, Any]) -> Frozen:
+    """The policy that a manifest names.
+
+    Raises:
+        InputError: it is missing or can't be read.
+        DamageError: it isn't the one that the data were collected with.
+    """
+    path = folder / settings["file"]
+    frozen = Frozen(settings["file"], read_file(path))
+    if frozen.settings() != settings:
+        raise DamageError(f"{path} is damaged or another policy: its SHA-256 isn't in the manifest")
+    return frozen

@@ -1,0 +1,137 @@
+"""Extending data sets: to the bytes of those collected at once, whatever happens in between."""
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import jbrep
+from small import contents, settings, write_again
+
+from jbrep.collect import collect
+from jbrep.collect.derive import derive
+from jbrep.collect.repair import repair
+from jbrep.dataset import Dataset
+from jbrep.dataset.manifest import BACKUP, MANIFEST, Manifest, read_manifest, write_manifest
+from jbrep.dataset.verify import find_problems
+from jbrep.envs import describe
+from jbrep.envs.names import import_modules
+from jbrep.errors import InputError
+
+import_modules(["environments"])
+SLEDGE = describe("Sledges/Sledge-v0")
+
+
+def two_by_two(steps, **changes):
+    return settings(steps=steps, shard_episodes=2, **changes)
+
+
+def sledges(steps):
+    return settings(task=SLEDGE, steps=steps, shard_episodes=5, store_state=False)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """A shard of two episodes and one of one."""
+    folder = tmp_path_factory.mktemp("short") / "data"
+    collect(two_by_two(3000), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory):
+    """Two shards of two episodes and one of one, collected at once."""
+    folder = tmp_path_factory.mktemp("long") / "data"
+    collect(two_by_two(5000), folder)
+    return folder
+
+
+def test_an_extended_data_set_is_the_one_collected_at_once(short, long, tmp_path):
+    folder = shutil.copytree(short, tmp_path / "data")
+    assert collect(two_by_two(3500), folder).rows == 1000  # the last shard becomes a full one
+    assert collect(two_by_two(4000), folder).rows == 0
+    assert collect(two_by_two(5000), folder, lanes=1, num_threads=1).rows == 1000
+    assert contents(folder) == contents(long)
+    assert not list(find_problems(folder))
+
+
+def test_episodes_of_any_length_in_turn_and_in_processes(tmp_path):
+    for steps, workers in ((60, 1), (61, 1), (150, 1), (400, 2)):
+        collect(sledges(steps), tmp_path / "data", num_threads=workers)
+    collect(sledges(400), tmp_path / "at once", num_threads=1)
+    assert contents(tmp_path / "data") == contents(tmp_path / "at once")
+
+
+def test_a_derived_data_set_is_extended_with_its_source(short, long, tmp_path):
+    derive(short, "move_to_pose", tmp_path / "data")
+    derive(long, "move_to_pose", tmp_path / "data")
+    derive(long, "move_to_pose", tmp_path / "at once")
+    assert contents(tmp_path / "data") == contents(tmp_path / "at once")
+
+
+class Kill(BaseException):
+    """As sudden as an exception can be."""
+
+
+def test_a_kill_at_any_moment_leaves_what_is_read_and_extended(short, long, tmp_path, monkeypatch):
+    """Until the last shard has been replaced: five files are written, each in four stages."""
+    before, opening, left = Dataset(short), Path.open, 0
+
+    def deadly(call):
+        def wrapped(*arguments, **keywords):
+            nonlocal left
+            left -= call is not opening or arguments[1:] == ("xb",)
+            if left < 0:
+                raise Kill
+            return call(*arguments, **keywords)
+
+        return wrapped
+
+    for stage in range(20):
+        folder, left = shutil.copytree(short, tmp_path / str(stage)), stage
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", deadly(os.fsync))
+            patch.setattr(Path, "replace", deadly(Path.replace))
+            patch.setattr(Path, "open", deadly(opening))
+            with pytest.raises(Kill):
+                write_again(long, folder)
+        assert not list(find_problems(folder)), stage
+        seen = Dataset(folder)["observation"][:2000]
+        np.testing.assert_array_equal(seen, before["observation"][:2000])
+        if stage % 8 == 7:
+            list(repair(folder))  # in between changes nothing
+        write_again(long, folder)
+        assert contents(folder) == contents(long)
+
+
+def test_what_can_t_be_extended_is_left_as_it_is(short, tmp_path):
+    folder = shutil.copytree(short, tmp_path / "data")
+    command = ("collect", "--task", "face_direction", "--seed", 3, "--store-state", "--out", folder)
+    told = jbrep(*command, "--steps", 2000)
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    assert "was collected with 3,000 steps and has 3,000 rows so far: it is left as" in told.output
+    with pytest.raises(InputError, match=r"other settings: steps 3000 \(now: 4000\), seed 3"):
+        collect(two_by_two(4000, seed=4), folder)
+    manifest = read_manifest(folder)
+    for changed, message in (
+        (replace(manifest, versions={**manifest.versions, "mujoco": "3.0"}), "mujoco 3.0"),
+        (as_version_1(manifest), "has format version 1, which can't be extended: collect anew"),
+    ):
+        write_manifest(folder, changed)
+        with pytest.raises(InputError, match=message):
+            collect(two_by_two(4000), folder)
+        assert read_manifest(folder) == changed
+    assert {
+        name for name in contents(folder) if contents(short)[name] != contents(folder)[name]
+    } == {
+        MANIFEST,
+        BACKUP,
+    }
+
+
+def as_version_1(manifest: Manifest) -> Manifest:
+    named = replace(manifest, format_version=1)
+    shards = [replace(e, sha256=dict.fromkeys(named.specs(), "")) for e in manifest.shards]
+    return replace(named, shards=tuple(shards))

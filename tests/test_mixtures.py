@@ -1,0 +1,86 @@
+"""Data sets of mixtures: bytes that depend on nothing else, and a column that says who acted."""
+
+import numpy as np
+import pytest
+from command import jbrep
+from small import contents, settings
+
+from jbrep.collect import collect
+from jbrep.collect.derive import derive
+from jbrep.collect.policies import parse_policy
+from jbrep.collect.repair import repair
+from jbrep.dataset import Dataset
+from jbrep.dataset.export import export
+from jbrep.dataset.manifest import open_shard, read_manifest
+from jbrep.dataset.schema import EPISODES
+from jbrep.dataset.verify import _episode_problems, find_problems
+from jbrep.envs import describe
+from jbrep.envs.names import import_modules
+
+import_modules(["environments"])
+OPEN = "uniform:0.4+ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3:0.3+constant:drive=0.5:0.3"
+
+
+def mixed(task="face_direction"):
+    short = describe(task, max_episode_steps=60)
+    policy = parse_policy(OPEN).settings()
+    return settings(task=short, policy=policy, steps=600, shard_episodes=4)
+
+
+@pytest.fixture(scope="module")
+def mixture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mixture") / "data"
+    collect(mixed(), folder)
+    return folder
+
+
+def test_episodes_say_which_policy_acted_in_them(mixture, tmp_path):
+    dataset = Dataset(mixture)
+    drawn = dataset.episodes["policy"]
+    assert drawn.dtype == np.int32
+    assert set(drawn.tolist()) == {0, 1, 2}
+    assert len(drawn) == 10
+    for number, part in enumerate(drawn):
+        actions = dataset.episode(number)["action"]
+        kind = 2 if (actions == 0.5).all() else int((actions[0] == 0).all())
+        assert kind == part
+    told = jbrep("data", "info", mixture).output
+    assert "0.4 of uniform; 0.3 of ornstein-uhlenbeck, mu 0.0" in told
+    assert jbrep("data", "verify", mixture, "--replay", 2).exit_code == 0
+    export(dataset, "npz", tmp_path / "it.npz")
+    with np.load(tmp_path / "it.npz") as archive:
+        np.testing.assert_array_equal(archive["episodes/policy"], drawn)
+
+
+def test_a_column_that_says_something_else_is_a_problem(mixture):
+    manifest = read_manifest(mixture)
+    columns = dict(open_shard(mixture, manifest, 0))
+    columns[EPISODES + "policy"] = (columns[EPISODES + "policy"] + 1) % 3
+    assert [*_episode_problems(manifest, 0, columns)] == [
+        "the episodes' policies: inconsistent with the settings, or with other columns"
+    ]
+
+
+def test_neither_lanes_nor_threads_nor_repair_change_a_byte(mixture, tmp_path):
+    collect(mixed(), tmp_path / "data", lanes=3, num_threads=2)
+    assert contents(tmp_path / "data") == contents(mixture)
+    (tmp_path / "data" / "shard-00001.h5").unlink()
+    assert len(list(repair(tmp_path / "data"))) == 1
+    assert contents(tmp_path / "data") == contents(mixture)
+
+
+def test_in_processes_and_extended(tmp_path):
+    text = "uniform:1+constant:drive=-1:1"
+    sledges = describe("Sledges/Sledge-v0")
+    policy = {"policy": parse_policy(text).settings(), "task": sledges, "store_state": False}
+    for steps in (60, 200):
+        collect(settings(**policy, steps=steps, shard_episodes=5), tmp_path / "data", num_threads=2)
+    collect(settings(**policy, steps=200, shard_episodes=5), tmp_path / "turn", num_threads=1)
+    assert contents(tmp_path / "data") == contents(tmp_path / "turn")
+    assert not list(find_problems(tmp_path / "data"))
+
+
+def test_other_tasks_are_derived_from_a_mixture(mixture, tmp_path):
+    derive(mixture, "move_to_pose", tmp_path / "derived", store_state=True)
+    collect(mixed("move_to_pose"), tmp_path / "collected")
+    assert contents(tmp_path / "derived") == contents(tmp_path / "collected")

@@ -1,0 +1,483 @@
+"""Users' own encoders wherever an encoder is used: objects, functions, torch modules, code."""
+
+import json
+import re
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from command import jbrep
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from rerun.chunk import RrdReader
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch import nn
+from wide import wide
+
+from jbrep.encoders import find
+from jbrep.encoders.code import import_code
+from jbrep.envs import Encoded, JitterbugEnv, TaskVecEnv, describe
+from jbrep.envs.encoding import as_encoder
+from jbrep.errors import InputError
+from jbrep.evaluate import diagnose
+from jbrep.evaluate.summary import evaluation_text
+from jbrep.figures import encoder_plots
+from jbrep.inspection import inspect
+from jbrep.rl import Run, train
+from jbrep.rl.files import CHECKPOINT, ENCODER, RUN
+from jbrep.rl.policy import load_run
+
+FACE = "Jitterbug/FaceDirection-v0"
+TASK = describe("Pendulum-v1", max_episode_steps=20)
+ROWS = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+
+
+class Half:
+    """Encodes and can't decode."""
+
+    latent_size = 2
+
+    def encode(self, observation):
+        return observation[:, :2] / 2
+
+
+class Whole:
+    """Encodes and decodes."""
+
+    def encode(self, observation):
+        return observation / 2
+
+    def decode(self, latent):
+        return latent * 2
+
+
+def half(observation):
+    """An encoder that is a function."""
+    return Half().encode(observation)
+
+
+def make_half():
+    """A function that makes one."""
+    return Half()
+
+
+class Spoilt(Half):
+    """Does as it is told from the given call on."""
+
+    def __init__(self, what, after=3):
+        self.what, self.left = what, after
+
+    def encode(self, observation):
+        self.left -= 1
+        return self.what(observation) if self.left < 0 else super().encode(observation)
+
+
+def only(**methods):
+    """An object of a class with these alone."""
+    return type("Odd", (), methods)()
+
+
+def like(dtype):
+    """A linear module of that type with weights of one half."""
+    module = nn.Linear(3, 2, bias=False, dtype=dtype)
+    nn.init.constant_(module.weight, 0.5)
+    return module
+
+
+class Unscaled(nn.Module):
+    """A module without parameters; one with whole numbers alone."""
+
+    def __init__(self, *, counts=False):
+        super().__init__()
+        if counts:
+            self.register_buffer("seen", torch.tensor([1]))
+
+    def forward(self, observation):
+        return observation.sum(1, keepdim=True).repeat(1, 2) / 2
+
+
+def read(path):
+    """The entities of a recording."""
+    return {chunk.entity_path for chunk in RrdReader(path).stream()}
+
+
+def refused(use, *given):
+    """The one line that a user gets."""
+    with pytest.raises(InputError) as error:
+        use(*given)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        lambda rows: rows.sum(1, keepdims=True).repeat(2, 1) / 2,
+        lambda rows: (rows.sum(1, keepdims=True).repeat(2, 1) / 2).astype(np.float64).tolist(),
+        *(like(dtype) for dtype in (torch.float32, torch.float64, torch.bfloat16)),
+        Unscaled(),
+        Unscaled(counts=True),
+    ],
+)
+def test_whatever_encodes_is_an_encoder(given):
+    encoder = as_encoder(given, TASK)
+    assert (encoder.latent_size, encoder.kind, encoder.can_decode) == (2, "own", False)
+    expected = np.tile(ROWS.sum(1, keepdims=True) / 2, 2)
+    for rows in (ROWS, ROWS[0], ROWS[None, :, None], ROWS[:0], np.asarray(ROWS, np.float64)):
+        latent = encoder.encode(rows)
+        assert (latent.dtype, latent.shape) == (np.float32, (*rows.shape[:-1], 2))
+    np.testing.assert_allclose(encoder.encode(ROWS), expected, atol=0.03)  # bfloat16
+
+
+def test_a_module_is_used_in_evaluation_mode_and_left_as_it_was():
+    norm, frozen = nn.BatchNorm1d(3), nn.Dropout(0.5).eval()
+    module = nn.Sequential(norm, nn.Dropout(0.9), frozen, nn.Linear(3, 2))
+    before = {name: value.clone() for name, value in module.state_dict().items()}
+    encoder = as_encoder(module, TASK)
+    np.testing.assert_array_equal(encoder.encode(ROWS), encoder.encode(ROWS))
+    assert [part.training for part in module.modules()] == [True, True, True, False, True]
+    assert all((value == before[name]).all() for name, value in module.state_dict().items())
+    assert torch.is_grad_enabled()
+    module(torch.zeros(4, 3)).sum().backward()  # it can still learn
+
+
+def test_what_goes_in_and_out_is_copied():
+    class Careless:
+        """Spoils what it gets, and returns the same array each time."""
+
+        memory = np.zeros((300, 3), np.float32)
+
+        def encode(self, observation):
+            observation *= 2
+            kept = self.memory[: len(observation)]
+            kept[:] = observation
+            return kept
+
+    encoder, rows = as_encoder(Careless(), TASK), ROWS.copy()
+    one = encoder.encode(rows)
+    encoder.encode(rows * 0)
+    np.testing.assert_array_equal(rows, ROWS)
+    np.testing.assert_array_equal(one, 2 * ROWS)
+
+
+class _Failing:
+    """Whose latent_size is abstract."""
+
+    @property
+    def latent_size(self):
+        raise NotImplementedError("say how many")
+
+    encode = Half.encode
+
+
+class _Growing(nn.Module):
+    def forward(self, observation):
+        return torch.autograd.grad(observation.sum(), observation)[0]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (only(), "Odd has no `encode` and can't be called: it is no encoder"),
+        (Half, "Half is a class: give an object, such as Half()"),
+        (7, "int has no `encode`"),
+        (only(encode=7), "Odd has no `encode` and can't be called"),
+        (_Failing(), "_Failing failed at its latent_size: NotImplementedError: say how many"),
+        (
+            nn.Module(),
+            "Module failed: NotImplementedError: Module [Module] is missing the required",
+        ),
+        (_Growing(), "does not require grad and does not have a grad_fn (an encoder runs without"),
+        (
+            only(encode=Half.encode, latent_size=4),
+            "Odd returned latents of 2 numbers, but its latent_size is 4",
+        ),
+        (Spoilt(lambda rows: (rows, rows), 0), "TypeError: it returned a tuple instead of one arr"),
+        (
+            Spoilt(lambda rows: rows[0], 0),
+            "returned shape (3,) for 256 rows of Pendulum-v1: expect",
+        ),
+        (Spoilt(lambda rows: rows[:, :0], 0), "returned latents of no numbers"),
+        (
+            Spoilt(lambda rows: rows.astype(float) * 1e300, 0),
+            "returned numbers that are not finite",
+        ),
+        (Spoilt(lambda rows: None, 0), "Spoilt returned shape () for 256 rows"),
+        (Spoilt(lambda rows: 1 / 0, 0), "Spoilt failed: ZeroDivisionError: division by zero"),
+        (Spoilt(lambda rows: rows[:, 1:], 1), "other latents for the same observations the next"),
+        (lambda rows: rows - rows.mean(0), "for the same observations in a batch of one"),
+        (lambda rows: rows[:, :2].squeeze(), "returned shape (2,) for 1 rows"),
+        (nn.Linear(4, 2), "Linear failed: RuntimeError: mat1 and mat2 shapes cannot be multiplied"),
+    ],
+)
+def test_what_is_no_encoder_is_refused_in_one_line(given, message):
+    assert message in refused(as_encoder, given, TASK)
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        (
+            lambda rows: rows,
+            "Spoilt returned shape (5, 3) for 5 rows of Pendulum-v1: expected (5, 2",
+        ),
+        (lambda rows: rows[:, :2] * np.nan, "Spoilt returned numbers that are not finite"),
+        (lambda rows: 1 / 0, "Spoilt failed: ZeroDivisionError"),
+    ],
+)
+def test_an_encoder_is_checked_at_every_call(what, message):
+    assert message in refused(as_encoder(Spoilt(what), TASK).encode, ROWS)
+
+
+def test_what_an_own_encoder_lacks_or_refuses():
+    assert "Half has no decoder" in refused(as_encoder(Half(), TASK).decode, ROWS[:, :2])
+    face = describe("face_direction")
+    assert "Half takes observations of 3 numbers, but" in refused(
+        as_encoder, as_encoder(Half(), TASK), face
+    )
+
+    def check_task(self, task):
+        raise ValueError("not this one")
+
+    picky = only(encode=Half.encode, check_task=check_task)
+    assert "Odd refuses Pendulum-v1: ValueError: not this one" in refused(as_encoder, picky, TASK)
+
+
+@pytest.mark.parametrize("name", ["test_own:Half", "test_own:half", "test_own:make_half"])
+def test_code_is_a_class_or_a_function_that_makes_an_encoder_or_is_one(name):
+    import_code(name)
+    np.testing.assert_array_equal(find(name, TASK).encode(ROWS), ROWS[:, :2] / 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("no_such_module:Net", "can't import no_such_module: ModuleNotFoundError"),
+        ("test_own:Net", "can't make the encoder test_own:Net: AttributeError"),
+        ("test_own:Spoilt", "can't make the encoder test_own:Spoilt: TypeError"),
+        ("test_own:ROWS", "ndarray has no `encode` and can't be called"),
+        ("abc:ABC", "ABC has no `encode` and can't be called"),
+    ],
+)
+def test_code_that_makes_no_encoder(name, message):
+    told = jbrep("encoder", "info", name, "--task", "Pendulum-v1")
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    assert message in told.output
+
+
+def test_code_is_shown_as_far_as_it_is_known_and_not_exported(tmp_path):
+    told = jbrep("encoder", "info", "test_own:Whole", "--task", "Pendulum-v1").output
+    assert told.startswith("Whole\n")
+    assert "test_own:Whole, code" in told
+    assert re.search(r"decodes +yes", told)
+    card = json.loads(
+        jbrep("encoder", "info", "test_own:Half", "--task", "Pendulum-v1", "--json").output
+    )
+    assert (card["kind"], card["latent_size"], card["decodes"]) == ("own", 2, False)
+    out = tmp_path / "it.onnx"
+    told = jbrep("encoder", "export", "test_own:Half", "--task", "Pendulum-v1", "--out", out)
+    assert (told.exit_code, out.exists()) == (2, False)
+    told = jbrep("encoder", "info", "test_own:Half")
+    assert "give its --task" in told.output
+
+
+def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
+    data = wide([300, 250, 99, 180], features=4)
+    evaluation = diagnose({"half": Half(), "whole": Whole(), "module": nn.Linear(4, 6)}, data)
+    json.dumps(evaluation, allow_nan=False)
+    assert evaluation["seen"] == dict.fromkeys(("half", "whole", "module"), "maybe")
+    own = evaluation["encoders"]
+    assert [own["half"][name] for name in ("reconstruction", "corruption")] == [None, None]
+    assert all(own["half"][n] for n in ("latent_units", "probes", "neighbours", "dynamics"))
+    assert own["whole"]["reconstruction"]["mse"][0] < 1e-9
+    probe = own["whole"]["probes"]["obs_1"][0]
+    assert probe == pytest.approx(own["full"]["probes"]["obs_1"][0], rel=1e-6)
+    assert (own["module"]["kind"], own["module"]["latent"]) == ("own", 6)
+    shown = evaluation_text(evaluation)
+    assert re.search(r"^half +2( +-){5} *$", shown.partition("\n\n")[2], re.MULTILINE)
+    plots = {plot.name: plot for plot in encoder_plots(evaluation)}
+    assert {row[0] for row in plots["error_by_feature"].rows} == {"whole"}
+    assert {row[0] for row in plots["latent_correlation"].rows} == {"half", "whole", "module"}
+    for plot in plots.values():
+        plot.draw()
+    alone = {**evaluation, "encoders": {n: own[n] for n in ("full", "half")}}
+    assert [plot.name for plot in encoder_plots(alone)] == ["latent_correlation"]
+
+
+def test_evaluate_takes_code(tmp_path, monkeypatch):
+    monkeypatch.setattr("jbrep.evaluate.evaluation._DIAGNOSTICS", {})
+    monkeypatch.setattr("jbrep.evaluate.summary.evaluation_text", lambda *given: "")
+    monkeypatch.setattr("jbrep.figures.encoder_plots", lambda evaluation: [])
+    chosen = ("--encoder", "test_own:Half", "test_own:make_half", "dae-8")
+    command = ("evaluate", "--data", "data/sample/face_direction", "--out", tmp_path, *chosen)
+    told = jbrep(*command)
+    assert told.exit_code == 0, told.output
+    assert "test_own:Half, code\ntest_own:make_half, code\ndae-8, shipped\n" in told.output
+    assert "note: test_own:Half may have seen these episodes" in told.output
+    told = jbrep(*command, "dae-8")
+    assert (told.exit_code, told.output) == (
+        2,
+        "Error: dae-8, shipped is given twice: leave one out\n",
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A short run on code, and one on an object."""
+    folder = tmp_path_factory.mktemp("own")
+    import_code("test_own:Half")
+    for name, encoder in (("code", "test_own:Half"), ("object", Whole())):
+        run = Run(task=TASK, algorithm="a2c", encoder=encoder, steps=20, evaluation_episodes=1)
+        train(run, folder / name)
+    return folder
+
+
+def test_a_run_on_code_is_played_once_its_module_may_run(trained, monkeypatch):
+    run, played = trained / "code", ("evaluate-policy", trained / "code", "--episodes", 1)
+    assert not (run / ENCODER).exists()
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    told = jbrep(*played)
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    assert "importing test_own runs it; if you trust it, add --import test_own" in told.output
+    told = jbrep(*played, "--encoder", "test_own:Whole")
+    assert "which has its own encoder: leave out --encoder" in told.output
+    told = jbrep(*played, "--encoder", "test_own:Half")
+    assert "encoder: test_own:Half, code\nPendulum-v1 on Half: median return" in told.output
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    assert "on Half: median" in jbrep(*played, "--import", "test_own").output
+    monkeypatch.setattr(Half, "encode", lambda self, rows: rows[:, :2] / 3)
+    assert "is not the encoder that the run in" in refused(load_run, run)
+
+
+def test_recordings_with_own_encoders(trained, tmp_path):
+    out = tmp_path / "it.rrd"
+    assert jbrep("inspect", trained / "code", "--out", out).exit_code == 0
+    shown = read(out)
+    assert {"/latent/units", "/latent/path", "/observation/obs"} <= shown
+    assert not {path for path in shown if path.startswith(("/reconstruction", "/error"))}
+    swept = jbrep("inspect", trained / "code", "--traverse", "--out", tmp_path / "no.rrd")
+    assert (swept.exit_code, swept.output.count("\n")) == (2, 1)
+    assert "Half has no decoder: --traverse" in swept.output
+    assert {"/error/total", "/reconstruction/obs"} <= read(
+        inspect(str(trained / "object"), encoder=Whole(), out=out)
+    )
+    inspect(encoder=Whole(), task=TASK, traverse=True, out=out)
+    assert "/traverse/unit_2/decoded" in read(out)
+    told = []
+    inspect("uniform", task=TASK, encoder="test_own:Half", out=out, tell=told.append)
+    assert told == ["encoder: test_own:Half, code"]
+
+
+def test_a_run_on_an_object_needs_it_again(trained):
+    folder = trained / "object"
+    assert load_run(folder, Whole()).representation == "Whole"
+    assert "encoder" in refused(load_run, folder)
+    assert "Half is not the encoder that the run in" in refused(load_run, folder, Half())
+
+
+def test_a_policy_by_name_needs_an_encoder_that_decodes():
+    played = ("evaluate-policy", "heuristic", "--episodes", 1, "--episode-steps", 20)
+    played += ("--task", "face_direction", "--encoder")
+    assert "heuristic on Whole, decoded" in jbrep(*played, "test_own:Whole").output
+    told = jbrep(*played, "test_own:Half")
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    assert "Half has no decoder: a policy by its name acts on decoded" in told.output
+
+
+def test_a_run_whose_encoder_fails_keeps_its_checkpoint(tmp_path):
+    spoilt = Spoilt(lambda rows: rows[:, :2] * np.nan, after=26)
+    run = Run(task=TASK, algorithm="a2c", encoder=spoilt, steps=80, evaluation_episodes=1)
+    with pytest.raises(InputError, match="Spoilt returned numbers that are not finite"):
+        train(run, tmp_path, save_every=0)
+    assert (tmp_path / CHECKPOINT).exists()
+    assert not (tmp_path / RUN).exists()
+    spoilt.left = 1000
+    assert train(run, tmp_path)["status"] == "finished"
+
+
+def one(**options):
+    """A Jitterbug with short episodes."""
+    return gymnasium.make(FACE, max_episode_steps=10, **options)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of unbounded observations, of the wrapper
+def test_an_encoded_environment_shows_latents():
+    env = Encoded(one(), "dae-8")
+    assert isinstance(env, gymnasium.Wrapper)
+    assert env.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (8,), np.float32)
+    assert env.task == describe("face_direction", max_episode_steps=10)
+    check_env(env)
+    again = gymnasium.make(env.spec)
+    np.testing.assert_array_equal(again.reset(seed=3)[0], env.reset(seed=3)[0])
+
+
+@pytest.mark.parametrize("lanes", [1, 3])
+def test_latents_are_those_of_the_vec_env_to_the_bit(lanes):
+    ours = TaskVecEnv("face_direction", lanes, 3, find("dae-8", "face_direction"), 1, 10)
+    if lanes == 1:
+        theirs = DummyVecEnv([lambda: Encoded(one(form="dict"), "dae-8")])
+        theirs.seed(3)
+        first = theirs.reset()
+    else:
+        theirs = Encoded(gymnasium.make_vec(FACE, num_envs=3, max_episode_steps=10), "dae-8")
+        assert isinstance(theirs, gymnasium.vector.VectorWrapper)
+        first, _ = theirs.reset(seed=3)
+    np.testing.assert_array_equal(first, ours.reset())
+    assert first in theirs.observation_space if lanes > 1 else first[0] in theirs.observation_space
+    action = np.full((lanes, 1), 0.3, np.float32)
+    for step in range(10):
+        seen, (latent, _, _, infos) = theirs.step(action), ours.step(action)
+        if step < 9:
+            np.testing.assert_array_equal(seen[0], latent)
+    for lane, info in enumerate(infos):
+        final = seen[3][0]["terminal_observation"] if lanes == 1 else seen[4]["final_obs"][lane]
+        np.testing.assert_array_equal(final, info["terminal_observation"])
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_the_way_of_resetting_is_kept(mode):
+    lanes = {"num_envs": 2, "vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
+    many = gymnasium.make_vec("Pendulum-v1", max_episode_steps=3, **lanes)
+    plain = gymnasium.make_vec("Pendulum-v1", max_episode_steps=3, **lanes)
+    many = Encoded(many, Whole())
+    np.testing.assert_array_equal(many.reset(seed=1)[0], plain.reset(seed=1)[0] / 2)
+    for _ in range(3 if mode is AutoresetMode.DISABLED else 5):
+        ours, theirs = (each.step(np.ones((2, 1), np.float32)) for each in (many, plain))
+        np.testing.assert_array_equal(ours[0], theirs[0] / 2)
+        assert ("final_obs" in ours[4]) == ("final_obs" in theirs[4])
+        if "final_obs" in ours[4]:
+            np.testing.assert_array_equal(ours[4]["final_obs"][1], theirs[4]["final_obs"][1] / 2)
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (lambda: one(scaled=True), "observations are scaled already, but encoders take physical"),
+        (lambda: JitterbugEnv("face_direction"), "without a spec doesn't say its task: give task="),
+        (lambda: gymnasium.make("Jitterbug/MoveToPose-v0"), "dae-8 was made for face_direction"),
+        (lambda: gymnasium.wrappers.NormalizeObservation(one()), "NormalizeObservation changes"),
+        (lambda: Encoded(one(), "dae-8"), "EncodedEnv changes the environment's observations"),
+        (
+            lambda: gymnasium.make_vec(
+                "Pendulum-v1",
+                num_envs=1,
+                vectorization_mode="sync",
+                wrappers=[gymnasium.wrappers.TimeAwareObservation],
+            ),
+            "TimeAwareObservation changes",
+        ),
+    ],
+)
+def test_environments_that_an_encoder_can_t_read(env, message):
+    file = Path("jbrep/encoders/shipped/face_direction/dae-8.safetensors")
+    assert message in refused(Encoded, env(), file)
+
+
+def test_a_task_that_is_given_must_have_as_many_features():
+    bare = JitterbugEnv("face_direction", form="dict")
+    assert Encoded(bare, "dae-8", "face_direction").reset(seed=0)[0].shape == (8,)
+    assert "have 16 numbers, where move_to_pose has 19" in refused(
+        Encoded, bare, "dae-8", "move_to_pose"
+    )
