@@ -273,7 +273,7 @@ def _labels(names: list[str], sources: list[str]) -> list[str]:
 
 @click.group()
 def encoder() -> None:
-    """Look at encoders, export them, and import those that were trained elsewhere."""
+    """Look at encoders, export and import them."""
 
 
 _which = click.argument("encoder")
