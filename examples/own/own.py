@@ -1,8 +1,9 @@
 """Everything that one can bring: an encoder, data, and the policy of a run to collect with.
 
-python examples/own/own.py OUT walks through it on the Jitterbug and on Pendulum, in two minutes.
+python examples/own/own.py OUT walks through it on the Jitterbug and on Pendulum, in a minute.
 """
 
+import csv
 import os
 import shlex
 import sys
@@ -26,6 +27,7 @@ seeds = 2
 steps = 400
 evaluate_every = 200
 evaluation_episodes = 2
+episode_steps = 200
 representations = [
     "full",
     { name = "mine", code = "net:trained" },
@@ -60,7 +62,7 @@ def train_elsewhere(data: Dataset) -> Net:
 
 def encoder() -> None:
     """A module through evaluation, study, report and recording; as a file by way of ONNX, too."""
-    jbrep("collect --task face_direction --steps 4k --out states")
+    jbrep("collect --task face_direction --episode-steps 200 --steps 4k --out states")
     net = train_elsewhere(Dataset("states"))
     torch.save(net.state_dict(), "net.pt")
     example = torch.zeros(2, len(net.mean))
@@ -72,6 +74,15 @@ def encoder() -> None:
     jbrep("evaluate --encoder net:trained --encoder mine.safetensors --data states")
     Path("study.toml").write_text(STUDY)
     jbrep("study study.toml --import net --out study")
+    header, *table = csv.reader(Path("study/returns.csv").read_text().splitlines())
+    which = header.index("representation")
+    mine, onnx = (
+        [row[:which] + row[which + 1 :] for row in table if row[which] == name]
+        for name in ("mine", "mine-onnx")
+    )
+    assert len(mine) == 12
+    assert mine == onnx
+    print("\nthe module and the file from ONNX give equal tables")
     run = "study/runs/face_direction/a2c-modern/mine/seed-0"
     jbrep(f"inspect {run} --out mine.rrd")
 
@@ -108,7 +119,7 @@ def policies() -> None:
     jbrep("rl --task Pendulum-v1 --preset modern --set learning_rate=1e-3 --steps 1500 --out run")
     jbrep("collect --task Pendulum-v1 --policy uniform:0.5+run:0.5 --steps 2k --out mixed")
     jbrep("train-encoder --kind pca --data mixed --latent 2 --out mixed-encoders")
-    for steps, folder in (("20k", "grown"), ("40k", "grown"), ("40k", "at-once")):
+    for steps, folder in (("2k", "grown"), ("4k", "grown"), ("4k", "at-once")):
         jbrep(f"collect --task face_direction --steps {steps} --out {folder}")
     for file in sorted(Path("at-once").glob("[!.]*")):
         assert file.read_bytes() == (Path("grown") / file.name).read_bytes(), file
