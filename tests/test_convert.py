@@ -177,7 +177,8 @@ def test_affine_maps_in_a_row_are_one_layer_and_a_decoder_may_be_a_module_of_its
         ((5, 16), "tanh")
     ]
     assert encoder.can_decode
-    assert not Encoder.from_torch(nn.Linear(16, 20), TASK).can_decode  # and a larger latent
+    short = nn.Linear(16, 20).bfloat16()  # to a larger latent
+    assert not Encoder.from_torch(short, TASK).can_decode
     with pytest.raises(InputError, match=r"Linear: .* it takes 4 numbers, but gets 5"):
         Encoder.from_torch(nn.Sequential(*parts), TASK, decoder=nn.Linear(4, 16))
     with pytest.raises(InputError, match="the last layer has 15 units, expected 16"):
