@@ -20,6 +20,14 @@ class Net(torch.nn.Module):
         return self.out(observation + torch.tanh(self.hidden(observation)))
 
 
+def dense():
+    """A chain of layers."""
+    with torch.random.fork_rng():
+        torch.manual_seed(8)
+        layers = torch.nn.Linear(SIZE, 6), torch.nn.Tanh(), torch.nn.Linear(6, LATENT)
+    return torch.nn.Sequential(*layers)
+
+
 class Unseeded(torch.nn.Linear):
     """Another one each time."""
 

@@ -279,7 +279,7 @@ def nested(levels):
             {"header": {"features": [*TASK.feature_names[:15], "angle"]}},
             "dae-3 has angle as feature 15, where face_direction has angle_to_target",
         ),
-        ({"header": {"format_version": 3}}, "has format version 3"),
+        ({"header": {"format_version": 4}}, "has format version 4"),
         ({"header": {"format_version": 0}}, "its format version is 0"),
         ({"header": {"format_version": -1}}, "its format version is -1"),
         ({"header": {"format": "other"}}, "is not a jbrep encoder"),

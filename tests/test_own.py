@@ -16,7 +16,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 from wide import wide
 
-from jbrep.encoders import find
+from jbrep.encoders import Encoder, find
+from jbrep.encoders.card import card as describe_encoder
 from jbrep.encoders.code import import_code
 from jbrep.envs import Encoded, JitterbugEnv, TaskVecEnv, describe
 from jbrep.envs.encoding import as_encoder
@@ -276,6 +277,8 @@ def test_code_is_shown_as_far_as_it_is_known_and_not_exported(tmp_path):
         jbrep("encoder", "info", "test_own:Half", "--task", "Pendulum-v1", "--json").output
     )
     assert (card["kind"], card["latent_size"], card["decodes"]) == ("own", 2, False)
+    file = Encoder.from_torch(nn.Sequential(nn.Linear(3, 2)), TASK)
+    assert re.search(r"decoder +none", describe_encoder(file, "here", 80))
     out = tmp_path / "it.onnx"
     told = jbrep("encoder", "export", "test_own:Half", "--task", "Pendulum-v1", "--out", out)
     assert (told.exit_code, out.exists()) == (2, False)

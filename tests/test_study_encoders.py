@@ -4,10 +4,15 @@ import dataclasses
 import json
 import shutil
 import tomllib
+from pathlib import Path
 
+import numpy as np
+import onnx
 import pytest
+import torch
 from command import jbrep
-from my_encoders import LATENT, SIZE, FirstFeatures
+from my_encoders import LATENT, SIZE, FirstFeatures, dense
+from onnx import helper, numpy_helper
 
 from jbrep.encoders import find, load, save
 from jbrep.envs import describe
@@ -24,7 +29,7 @@ from jbrep.study.config import Data, Study, as_study
 from jbrep.study.plan import Plan, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.record import EACH_ITS_OWN, RECORD
-from jbrep.study.results import conclude, read_results
+from jbrep.study.results import RETURNS, conclude, read_results
 from jbrep.study.study import dry_run, run_study
 from jbrep.study.work import work
 
@@ -74,6 +79,10 @@ def home(tmp_path_factory):
     folder = tmp_path_factory.mktemp("home")
     for seed, name in enumerate(("pca-8", "random-8")):
         put(name, folder / "encoders" / TASK / f"mine-{seed}.safetensors")
+    write_onnx(dense(), folder / "net.onnx")
+    options = ("--task", TASK, "--out", folder / "from-onnx.safetensors")
+    told = jbrep("encoder", "import", folder / "net.onnx", *options)
+    assert told.exit_code == 0, told.output
     return folder
 
 
@@ -82,17 +91,39 @@ def at_home(home, monkeypatch):
     monkeypatch.chdir(home)
 
 
+def write_onnx(net, path):
+    """Write a chain of layers as an ONNX model."""
+    nodes, weights, value = [], [], "observation"
+    for i, layer in enumerate(net):
+        inputs = [value, *(f"{i}.{name}" for name in layer.state_dict())]
+        value = f"value-{i}"
+        if isinstance(layer, torch.nn.Linear):
+            arrays = [each.detach().numpy() for each in layer.parameters()]
+            weights += map(numpy_helper.from_array, arrays, inputs[1:])
+            nodes.append(helper.make_node("Gemm", inputs, [value], transB=1))
+        else:
+            nodes.append(helper.make_node(type(layer).__name__, inputs, [value]))
+    ends = [
+        helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["rows", size])
+        for name, size in (("observation", SIZE), (value, LATENT))
+    ]
+    graph = helper.make_graph(nodes, "net", ends[:1], ends[1:], weights)
+    onnx.save(helper.make_model(graph), path)
+
+
 PATTERN = {"name": "mine", "file": "encoders/{task}/mine-{seed}.safetensors"}
 CODE = {"name": "net", "code": NET}
+DENSE = {"name": "dense", "code": "my_encoders:dense"}
+FROM_ONNX = {"name": "from-onnx", "file": "from-onnx.safetensors"}
 
 
 @pytest.fixture(scope="module")
 def done(home):
-    """A study of a file for each seed and of code, finished, with its report."""
+    """A study of files and code, finished."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(home)
         patch.setattr("jbrep.study.heuristics._EPISODES", 1)
-        plan = Plan(with_own(PATTERN, CODE), home / "done")
+        plan = Plan(with_own(PATTERN, CODE, DENSE, FROM_ONNX), home / "done")
         assert run_study(plan, in_this_process, 1) == 0
         conclude(plan.folder)
     return plan
@@ -111,14 +142,35 @@ def test_each_run_has_its_encoder(done):
             assert load_run(folder).representation == "mine"
 
 
+def test_a_module_and_its_onnx_model_give_equal_tables(done):
+    """The module is kept as a file, too."""
+    rows = (done.folder / RETURNS).read_text().splitlines()
+    of_module, of_file = (
+        [row.replace(name, "it") for row in rows if f",{name}," in row]
+        for name in ("dense", "from-onnx")
+    )
+    assert len(of_module) == 4
+    assert of_module == of_file
+    folder = done.folder_of(next(c for c in done.cells if c.representation.name == "dense"))
+    assert read_run(folder)["settings"]["encoder_code"] is None
+    kept, net = load(folder / ENCODER), dense()
+    for ours, theirs in zip(kept.encoder, load(Path("from-onnx.safetensors")).encoder, strict=True):
+        assert all(map(np.array_equal, ours, theirs))
+    seen = kept.task.unscale(np.random.default_rng(0).uniform(-1, 1, (9, SIZE))).astype("float32")
+    np.testing.assert_allclose(kept.encode(seen), net(torch.tensor(seen)).detach(), atol=1e-5)
+    assert load_run(folder, net).encoder.fingerprint == kept.fingerprint
+    with torch.no_grad():
+        net[0].bias += 1
+    with pytest.raises(InputError, match="is not the encoder that the run"):
+        load_run(folder, net)
+
+
 def test_runs_with_an_encoder_each_stand_under_one_label(done):
     results = read_results(done.folder)
     assert not results.left_out
     (group,) = results.analysis.groups
     assert [(label.representation, label.seeds) for label in group.labels] == [
-        ("full", (0, 1)),
-        ("mine", (0, 1)),
-        ("net", (0, 1)),
+        (name, (0, 1)) for name in ("full", "dense", "from-onnx", "mine", "net")
     ]
     record = json.loads((done.folder / RECORD).read_text())
     mine, net = (record["labels"][f"{TASK}/a2c/{name}"] for name in ("mine", "net"))
@@ -270,7 +322,7 @@ def test_a_drawing_of_an_encoder_without_decoder_ends_with_the_latent():
 def test_the_time_of_code_is_estimated_by_itself(done, tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.study.study.estimate", lambda run: 60 if run.encoder == NET else 30)
     told = dry_run(Plan(done.study, tmp_path / "it"), 1).splitlines()
-    assert [line.split()[-2:] for line in told[1:4]] == [["30", "s"], ["30", "s"], ["60", "s"]]
+    assert [line.split()[1] for line in told[1:6]] == ["30", "30", "60", "30", "30"]
 
 
 def test_a_run_on_code(done, tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ import gymnasium
 import minari
 import numpy as np
 import torch
+from minari.data_collector import EpisodeBuffer
 from net import Net
 from torch import nn
 
@@ -75,18 +76,28 @@ def encoder() -> None:
     jbrep(f"inspect {run} --out mine.rrd")
 
 
+def record(env: gymnasium.Env, seed: int) -> EpisodeBuffer:
+    """An episode of random actions, as Minari keeps it."""
+    observation, _ = env.reset(seed=seed)
+    steps, ended = [], False
+    while not ended:
+        action = env.action_space.sample()
+        before, (observation, reward, terminated, truncated, _) = observation, env.step(action)
+        steps.append((before, action, reward, terminated, truncated))
+        ended = terminated or truncated
+    observations, actions, *others = map(np.array, zip(*steps, strict=True))
+    return EpisodeBuffer(
+        None, seed, None, np.append(observations, [observation], 0), actions, *others
+    )
+
+
 def data() -> None:
     """A Minari data set comes in, an encoder goes out."""
     os.environ["MINARI_DATASETS_PATH"] = str(Path("minari").resolve())
-    collector = minari.DataCollector(gymnasium.make("Pendulum-v1"))
-    collector.action_space.seed(0)
-    for episode in range(5):
-        collector.reset(seed=episode)
-        ended = False
-        while not ended:
-            *_, terminated, truncated, _ = collector.step(collector.action_space.sample())
-            ended = terminated or truncated
-    collector.create_dataset("pendulum/mine-v0", algorithm_name="uniform")
+    env = gymnasium.make("Pendulum-v1")
+    env.action_space.seed(0)
+    episodes = [record(env, seed) for seed in range(5)]
+    minari.create_dataset_from_buffers("pendulum/mine-v0", episodes, env, algorithm_name="uniform")
     jbrep("data import pendulum/mine-v0 --out pendulum")
     jbrep("data verify pendulum")
     jbrep("train-encoder --kind pca --data pendulum --latent 2 --out pendulum-encoders")

@@ -142,7 +142,7 @@ def _report_size(out: Path, manifest: Any) -> None:
 
 @click.group()
 def data() -> None:
-    """Inspect, verify, repair, derive, import and export data sets."""
+    """Inspect, repair, derive, import and export data sets."""
 
 
 @data.command(epilog=example("jbrep data info data/face"))

@@ -273,7 +273,7 @@ def _labels(names: list[str], sources: list[str]) -> list[str]:
 
 @click.group()
 def encoder() -> None:
-    """Look at encoders, export them, and import those that were trained elsewhere."""
+    """Look at encoders, export and import them."""
 
 
 _which = click.argument("encoder")
@@ -310,10 +310,10 @@ def info(encoder: str, as_json: bool, **options: Any) -> None:
 @task_options()
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A new .onnx file.")
 def export(encoder: str, out: Path, **options: Any) -> None:
-    """Write an encoder and its decoder as ONNX.
+    """Write an encoder, with its decoder, as ONNX.
 
-    The input is `observation`, in physical units; the outputs are `latent` and `reconstruction`.
-    ENCODER is as for `info`.
+    The input is `observation`, in physical units; the outputs are `latent` and, if there is a
+    decoder, `reconstruction`. ENCODER is as for `info`.
     """
     from jbrep.encoders import Encoder
     from jbrep.encoders.code import import_code
@@ -324,7 +324,10 @@ def export(encoder: str, out: Path, **options: Any) -> None:
     task = given_task(options, required=False)
     exported = find_alone(encoder, task)
     if not isinstance(exported, Encoder):
-        raise InputError(f"{encoder} is code, which can't be exported: give an encoder's file")
+        raise InputError(
+            f"{encoder} is code, which can't be exported: give an encoder's file, as "
+            "Encoder.from_torch makes it"
+        )
     run(exported, out)
     click.echo(f"exported {printable(source_of(encoder, task))}")
     click.echo(f"open it with onnxruntime.InferenceSession({str(out)!r})")

@@ -5,7 +5,7 @@ import json
 import operator
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from jbrep.dataset.shard import (
 )
 from jbrep.envs.task import Task, read_task
 from jbrep.errors import DamageError, InputError, check_version
+from jbrep.files.commit import are_commits, commits
 from jbrep.files.storage import exists, read_regular, write_whole
 
 MANIFEST = "manifest.json"
@@ -52,6 +53,7 @@ class Manifest:
     versions: Mapping[str, str]  # of the packages that made it
     shards: tuple[Entry, ...] = ()
     format_version: int = FORMAT_VERSION
+    commits: Mapping[str, str] = field(default_factory=dict)  # as `jbrep.files.commit` gives them
 
     @property
     def task(self) -> Task:
@@ -140,6 +142,7 @@ class Manifest:
             "format_version": self.format_version,
             "settings": self.settings.as_json(),
             "versions": dict(self.versions),
+            **({"commits": dict(self.commits)} if self.commits else {}),
             "shards": [asdict(entry) for entry in self.shards],
         }
         return version1.record(record) if self.format_version == 1 else record
@@ -151,7 +154,7 @@ def shard_name(shard: int) -> str:
 
 
 def new_manifest(settings: Settings) -> Manifest:
-    """A manifest without shards, with the installed versions of jbrep's and the environment's."""
+    """A manifest without shards, of the installed versions of jbrep's and the environment's."""
     from importlib.metadata import version  # slow to import, and readers don't need it
 
     from jbrep.envs.names import environment_versions
@@ -159,7 +162,7 @@ def new_manifest(settings: Settings) -> Manifest:
     versions = {name: version(name) for name in _PACKAGES}
     if not settings.is_imported:  # or else they come from an environment that may not be here
         versions |= environment_versions(settings.task.id)
-    return Manifest(settings, versions)
+    return Manifest(settings, versions, commits=dict(commits()))
 
 
 def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
@@ -237,8 +240,10 @@ def _parse(record: dict[str, Any]) -> Manifest:
         re.fullmatch(r"[\w.+!-]+", word, re.ASCII) for each in versions.items() for word in each
     ):
         raise ValueError
-    version = record["format_version"]
-    manifest = Manifest(Settings(task=task, **settings), versions, shards, version)
+    version, known = record["format_version"], record.get("commits", {})
+    if not are_commits(known):
+        raise ValueError
+    manifest = Manifest(Settings(task=task, **settings), versions, shards, version, known)
     _check_shards(manifest)
     return manifest
 

@@ -66,8 +66,8 @@ def card(encoder: BaseEncoder, source: str, width: int) -> str:
         return f"{encoder.name}\n{facts({**lines, 'decodes': decodes}, width)}"
     lines |= {
         "encoder": _shape(encoder.size, told["encoder"]),
-        "decoder": _shape(encoder.latent_size, told["decoder"]),
-        **{name: _listed(told[name]) for name in _RECORDS},
+        "decoder": _shape(encoder.latent_size, told["decoder"]) if encoder.can_decode else "none",
+        **{name: _listed(told[name]) for name in _RECORDS if told[name]},
         "sha256": told["sha256"],
     }
     rows = [

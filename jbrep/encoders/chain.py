@@ -49,12 +49,11 @@ class Chain:
         if outputs > MAX_UNITS:
             raise InputError(f"it has {outputs} units: the limit is {MAX_UNITS}")
         bias = _row(bias, outputs)
-        with np.errstate(all="ignore"):  # what isn't finite is refused with the whole encoder
-            if self._map:
-                before, shift = self._map
-                self._map = weight @ before, weight @ shift + bias
-            else:
-                self._map = weight, bias
+        if self._map:
+            before, shift = self._map
+            self._map = weight @ before, weight @ shift + bias
+        else:
+            self._map = weight, bias
         self.width = outputs
 
     def scale(self, factor: Any, shift: Any = 0) -> None:
@@ -65,14 +64,12 @@ class Chain:
         """
         factor, shift = (_row(np.asarray(v, np.float64), self.width) for v in (factor, shift))
         weight, bias = self._map or (np.eye(self.width), np.zeros(self.width))
-        with np.errstate(all="ignore"):
-            self._map = weight * factor[:, None], bias * factor + shift
+        self._map = weight * factor[:, None], bias * factor + shift
 
     def activate(self, name: str) -> None:
         """Add an activation, which ends a layer."""
         weight, bias = self._map or (np.eye(self.width), np.zeros(self.width))
-        with np.errstate(all="ignore"):
-            single = np.asarray(weight, np.float32, order="C"), np.float32(bias + 0.0)  # no -0.0
+        single = np.asarray(weight, np.float32, order="C"), np.float32(bias + 0.0)  # no -0.0
         self._layers.append(Layer(*single, name))
         self._map = None
 

@@ -195,8 +195,9 @@ class Encoder(BaseEncoder):
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of its header and numbers: it identifies the encoder."""
-        return container.checksum(self.tensors(), self.file_header)
+        """SHA-256 of its header and numbers, but not of commits: it identifies the encoder."""
+        header = {name: value for name, value in self.file_header.items() if name != "commits"}
+        return container.checksum(self.tensors(), header)
 
     @property
     def size(self) -> int:

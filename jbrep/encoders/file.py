@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from jbrep.dataset import Scaler
 from jbrep.encoders.encoder import FORMAT, FORMAT_VERSION, IMPORTED, Encoder, Layer
+from jbrep.encoders.names import check_name
 from jbrep.errors import InputError, check_version
 from jbrep.files import container
 from jbrep.files.container import Tensors
@@ -113,10 +113,7 @@ def _check(header: dict[str, Any]) -> None:
     for name, kind in [*fields, ("features", list), ("encoder", list), ("decoder", list)]:
         if not isinstance(header.get(name), kind):
             raise InputError(f"the header has no {name}, or not as a {kind.__name__}")
-    if not re.fullmatch("[a-z0-9-]+", header["name"]):
-        raise InputError(
-            f"invalid encoder name {header['name']!r}: use lower-case letters, digits and hyphens"
-        )
+    check_name(header["name"])
     absent = 0.0 if header["kind"] == IMPORTED else None
     if not isinstance(header["metrics"].get(HELD_OUT_MSE, absent), float):
         raise InputError(f"the header's metrics have no {HELD_OUT_MSE}, or not as a float")

@@ -109,9 +109,8 @@ def batch_norm(
     mean: Array, variance: Array, epsilon: float, weight: Any = None, bias: Any = None
 ) -> Action:
     """Batch norm in evaluation, all (units,): (values - mean) / sqrt(variance + epsilon), ..."""
-    with np.errstate(all="ignore"):
-        factor = (1 if weight is None else weight) / np.sqrt(variance + epsilon)
-        return rescale(factor, (0 if bias is None else bias) - mean * factor)
+    factor = (1 if weight is None else weight) / np.sqrt(variance + epsilon)
+    return rescale(factor, (0 if bias is None else bias) - mean * factor)
 
 
 def reshape(shape: Sequence[int]) -> Action:
@@ -129,15 +128,14 @@ def binary(name: str, left: Array | None, right: Array | None) -> Action:
     function: Callable[..., Array] = getattr(np, name)
     if left is None and right is None:
         return Action(None, function)
-    with np.errstate(all="ignore"):
-        if name == "add":
-            return rescale(1, right if left is None else left)
-        if name == "multiply":
-            return rescale(right if left is None else left)
-        if name == "subtract":
-            return rescale(-1, left) if right is None else rescale(1, -right)
-        if name == "divide" and right is not None:
-            return rescale(1 / right)
+    if name == "add":
+        return rescale(1, right if left is None else left)
+    if name == "multiply":
+        return rescale(right if left is None else left)
+    if name == "subtract":
+        return rescale(-1, left) if right is None else rescale(1, -right)
+    if name == "divide" and right is not None:
+        return rescale(1 / right)
     constant = np.asarray(left if right is None else right)
     if constant.size != 1:
         raise InputError(f"it has a constant of shape {constant.shape}, expected one number")
@@ -217,8 +215,7 @@ class _Folding:
         if function is None:
             self.settle()
             raise InputError(refusal(step.said, "it stands in a branch of the network"))
-        with np.errstate(all="ignore"):
-            result = np.asarray(function(*(self.live[name] for name in step.inputs)))
+        result = np.asarray(function(*(self.live[name] for name in step.inputs)))
         self.live = {**rest, step.output: result}
         self._open.append(step.said)
         if not rest and _recognise(result, self.chain):

@@ -18,6 +18,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError
 
 LATENT, RECONSTRUCTION = "latent", "reconstruction"  # the outputs of a model that jbrep exported
+_MOST_LETTERS = 100  # of what a message says of a node
 
 
 def convert(path: Path, task: Task, decoder: Path | None, name: str) -> Encoder:
@@ -43,6 +44,7 @@ def convert(path: Path, task: Task, decoder: Path | None, name: str) -> Encoder:
     return imported(task, name, encoder, back, "onnx")
 
 
+@np.errstate(all="ignore")  # what isn't finite is refused with the whole encoder
 def _layers(path: Path, size: int) -> tuple[tuple[Layer, ...], tuple[Layer, ...]]:
     """The layers of a model, and those from its latent to its reconstruction, if it has both."""
     model, constants = read(path)
@@ -87,7 +89,7 @@ def _steps(model: onnx.ModelProto, start: str, constants: Constants) -> list[Ste
     steps: list[Step] = []
     values = {start}
     for node in model.graph.node:
-        said = f"{node.op_type} ({node.name or node.output[0]})"
+        said = f"{node.op_type} ({node.name or node.output[0]})"[:_MOST_LETTERS]
         if node.domain not in ("", "ai.onnx"):
             raise InputError(refusal(f"{node.domain}.{said}", "it is no operation of ONNX itself"))
         inputs = tuple(name for name in node.input if name in values)
@@ -142,7 +144,7 @@ class _Node:
         if self.operation not in _ACTIONS:
             raise InputError("an encoder has no such layer")
         if self._names[0] not in self._values or self._values & set(self._names[1:]):
-            raise InputError("its first input must be a value, the others constants")
+            raise InputError("its first input alone may depend on the observation")
         return _ACTIONS[self.operation](self)
 
     def given(self, place: int) -> Any:

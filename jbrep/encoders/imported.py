@@ -6,6 +6,7 @@ import numpy as np
 
 from jbrep.dataset import Scaler
 from jbrep.encoders.encoder import IMPORTED, Encoder, Layer
+from jbrep.encoders.names import check_name
 from jbrep.envs.task import Task
 
 
@@ -26,8 +27,9 @@ def imported(
         package: that it comes from, such as torch.
 
     Raises:
-        InputError: as `Encoder`.
+        InputError: an invalid name, or as `Encoder`.
     """
+    check_name(name)
     header = {
         "kind": IMPORTED,
         "name": name,

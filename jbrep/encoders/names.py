@@ -1,6 +1,9 @@
 """Names of encoders: kind, architecture, latent size, such as dae-8, dae-deep-8, dae-64x64-8."""
 
+import re
 from typing import NamedTuple
+
+from jbrep.errors import InputError
 
 USUAL_ARCHITECTURE = "paper"  # left out of a name
 
@@ -32,3 +35,15 @@ class EncoderName(NamedTuple):
         usual = self.architecture == USUAL_ARCHITECTURE
         words = (self.kind, "" if usual else self.architecture, str(self.latent or ""))
         return "-".join(word for word in words if word)
+
+
+def check_name(name: str) -> None:
+    """Make sure that an encoder can have a name.
+
+    Raises:
+        InputError: it can't.
+    """
+    if not re.fullmatch("[a-z0-9-]+", name):
+        raise InputError(
+            f"invalid encoder name {name!r}: use lower-case letters, digits and hyphens"
+        )

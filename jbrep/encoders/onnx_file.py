@@ -40,13 +40,7 @@ def read(path: Path) -> tuple[onnx.ModelProto, Constants]:
         return model, {tensor.name: array(tensor) for tensor in model.graph.initializer}
     except InputError:
         raise
-    except (
-        DecodeError,
-        onnx.checker.ValidationError,
-        ValueError,
-        TypeError,
-        RuntimeError,
-    ) as error:
+    except _UNREADABLE as error:
         reason = str(error).strip().partition("\n")[0]
         raise InputError(f"{path} is no ONNX model that can be read: {reason}") from None
 

@@ -6,6 +6,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -111,6 +112,9 @@ class OwnEncoder(BaseEncoder):
         given: the user's object.
         task: whose observations it reads.
 
+    Attributes:
+        given: the user's object.
+
     Raises:
         InputError: it can't be called, fails, or returns something else than finite latents of one
             size, which is its `latent_size` if it has one; or other latents for the same
@@ -124,7 +128,7 @@ class OwnEncoder(BaseEncoder):
         self.name = _name(given)
         if isinstance(given, type):
             raise InputError(f"{self.name} is a class: give an object, such as {self.name}()")
-        self._given = given
+        self.given = given
         self._encode, self._decode = self._has("encode", given), self._has("decode")
         if not callable(self._encode):
             raise InputError(f"{self.name} has no `encode` and can't be called: it is no encoder")
@@ -147,6 +151,12 @@ class OwnEncoder(BaseEncoder):
         return callable(self._decode)
 
     @property
+    def is_module(self) -> bool:
+        """Whether it is a torch module."""
+        torch = sys.modules.get("torch")  # whoever has a module has imported it
+        return torch is not None and isinstance(self.given, torch.nn.Module)
+
+    @property
     def _probes(self) -> Float32:
         """Observations to try it on, (n, d)."""
         scaled = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, (_PROBES, self.size))
@@ -155,7 +165,7 @@ class OwnEncoder(BaseEncoder):
     def _has(self, name: str, default: Any = None) -> Any:
         """An attribute of the user's object, which may be a property that fails."""
         try:
-            return getattr(self._given, name, default)
+            return getattr(self.given, name, default)
         except Exception as error:
             raise InputError(f"{self.name} failed at its {name}: {_reason(error)}") from error
 
@@ -228,13 +238,13 @@ class OwnEncoder(BaseEncoder):
         return result
 
     def _call(self, function: Callable[..., Any], rows: Float32) -> Any:
-        if not _is_module(self._given):
+        if not self.is_module:
             return function(rows)
         import torch
 
-        module = self._given
-        numbers = (p for p in [*module.parameters(), *module.buffers()] if p.is_floating_point())
-        like = next(numbers, torch.empty(0))
+        module = self.given
+        weights = chain(module.parameters(), module.buffers())
+        like = next((each for each in weights if each.is_floating_point()), torch.empty(0))
         with _evaluating(module), torch.no_grad():
             return function(torch.from_numpy(rows).to(like.device, like.dtype))
 
@@ -260,11 +270,6 @@ def _name(given: Any) -> str:
             if isinstance(name, str) and _NAME.fullmatch(name):
                 return name
     return type(given).__name__
-
-
-def _is_module(given: Any) -> bool:
-    torch = sys.modules.get("torch")  # whoever has a module has imported it
-    return torch is not None and isinstance(given, torch.nn.Module)
 
 
 def _as_array(result: Any) -> Float32:

@@ -1,32 +1,44 @@
-"""Which git commit code or work is of, where there is one."""
+"""Which git commits code and work are of, where there are any."""
 
+import re
 import subprocess
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 _SECONDS = 5
 _CHANGES = "+changes"
 
 
-def commits() -> dict[str, str]:
+@cache
+def commits() -> MappingProxyType[str, str]:
     """The commits of jbrep and of the working directory, each where it is in a git repository.
 
-    A commit is 40 hexadecimal digits, with "+changes" after them if files that git tracks differ
-    from it. They are those of the first call.
+    A commit is 40 hexadecimal digits (64 with SHA-256), with "+changes" after them if files that
+    git tracks differ from it. They are those of the first call in a process.
     """
-    known = {"jbrep": _commit(Path(__file__).parent), "work": _commit(Path.cwd())}
-    return {name: commit for name, commit in known.items() if commit}
+    places = {"jbrep": Path(__file__).resolve().parent, "work": Path.cwd()}
+    known = {name: _commit(folder) for name, folder in places.items()}
+    return MappingProxyType({name: commit for name, commit in known.items() if commit})
 
 
-@cache
+def are_commits(value: Any) -> bool:
+    """Whether a value is what `commits` returns, read back from JSON."""
+    form = rf"[0-9a-f]{{40,64}}({re.escape(_CHANGES)})?"
+    return isinstance(value, dict) and all(
+        name in ("jbrep", "work") and isinstance(commit, str) and re.fullmatch(form, commit)
+        for name, commit in value.items()
+    )
+
+
 def _commit(folder: Path) -> str:
     """The commit of the repository that a folder is in; empty if there is none, or no git."""
-    if folder_of := _git(folder, "rev-parse", "--show-toplevel"):
-        own = "site-packages" in folder.relative_to(folder_of).parts
-        commit = "" if own else _git(folder, "rev-parse", "HEAD")
-        changes = _git(folder, "status", "--porcelain", "--untracked-files=no") if commit else ""
-        return f"{commit}{_CHANGES if changes else ''}"
-    return ""
+    if "site-packages" in folder.parts:
+        return ""  # installed in an environment that may lie in another project's repository
+    commit = _git(folder, "rev-parse", "HEAD")
+    changes = commit and _git(folder, "status", "--porcelain", "--untracked-files=no")
+    return f"{commit}{_CHANGES}" if changes else commit
 
 
 def _git(folder: Path, *arguments: str) -> str:

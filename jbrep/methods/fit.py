@@ -26,6 +26,7 @@ from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import HELD_OUT_MSE, SUFFIX
 from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose, differences
+from jbrep.files.commit import commits
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder
 from jbrep.methods.controls import Layers, pca, random_projection
@@ -166,6 +167,7 @@ class Fitter:
                 "test_rows": len(self._data.test),
             },
             "versions": {name: version(name) for name in ("jbrep", "numpy", "torch")},
+            "commits": dict(commits()),
         }
 
     def _train_alone(self, header: dict[str, Any], training: Training, path: Path) -> bool:

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.distributions import Distribution
 
 from jbrep.dae.adam import allocate_adam_state
+from jbrep.dae.training import single_torch_thread
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import Actor, episode_returns
@@ -133,10 +134,10 @@ def deterministic(
     bounds = agent_spaces(task, encoder)[1]
 
     def act(observation: Array) -> NDArray[np.float32]:
-        seen = encoder.encode(observation.astype(np.float32))
-        if normalize:
-            seen = normalize(seen)
-        with unchecked_distributions():
+        with single_torch_thread(), unchecked_distributions():  # as in training
+            seen = encoder.encode(observation.astype(np.float32))
+            if normalize:
+                seen = normalize(seen)
             actions = policy.predict(seen, deterministic=True)[0]
         return np.clip(actions, bounds.low, bounds.high)
 

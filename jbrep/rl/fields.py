@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from jbrep.envs.task import MAX_EPISODE_STEPS, read_task
 from jbrep.errors import DamageError
+from jbrep.files.commit import are_commits
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
 from jbrep.rl.names import base_name
 
@@ -94,6 +95,7 @@ _OPTIONAL = {
     "reason": _LINE,
     "policy_sha256": _SHA256,
     "latent_size": whole_number(1, _MAX_LATENT),  # early runs have it in their encoder alone
+    "commits": Kind(are_commits, "an object of git commits"),
 }
 _SETTINGS = {
     "task": _TASK,

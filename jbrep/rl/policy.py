@@ -10,8 +10,10 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
+from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import find, load
 from jbrep.encoders.code import make
+from jbrep.encoders.own import as_file
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.recording import Actor
 from jbrep.envs.task import Array, Task, read_task
@@ -223,7 +225,8 @@ def _load_checkpoint(folder: Path, encoder: Any) -> Trained:
 def _untrained(folder: Path, settings: Mapping[str, Any], given: Any) -> Trained:
     """What a run trains, as it begins unless another run's policy comes along."""
     task = read_task(settings["environment"])
-    encoder = run_encoder(folder, settings) if given is None else find(given, task)
+    with single_torch_thread():  # as in training, so that a module computes the same bits
+        encoder = run_encoder(folder, settings) if given is None else as_file(find(given, task))
     return build(folder, settings, encoder)
 
 

@@ -16,6 +16,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import FULL, Encoder, find, save
 from jbrep.encoders.code import is_code
+from jbrep.encoders.own import as_file
 from jbrep.envs.checks import NonFiniteActionError
 from jbrep.envs.description import as_task
 from jbrep.envs.encoding import BaseEncoder
@@ -23,6 +24,7 @@ from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.envs.names import environment_versions
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
+from jbrep.files.commit import commits
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder, write_whole
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed, unchecked_distributions
@@ -110,13 +112,13 @@ class Run:
         self.describe(self.find_encoder())
 
     def find_encoder(self) -> BaseEncoder:
-        """The encoder; an own one computes on one thread, as in training.
+        """The encoder; a user's torch module as the file that is kept of it, if it can be.
 
         Raises:
             InputError: it can't be used.
         """
-        with single_torch_thread():
-            return find(self.encoder, self.task)
+        with single_torch_thread():  # as in training, so that a module computes the same bits
+            return as_file(find(self.encoder, self.task))
 
     @property
     def _learner(self) -> Learner:
@@ -137,6 +139,7 @@ class Run:
         Raises:
             InputError: as `check`.
         """
+        is_kept_as_code = is_code(self.encoder) and not isinstance(encoder, Encoder)
         settings = {
             "task": self.task.name,
             "environment": self.task.as_json(),
@@ -147,7 +150,7 @@ class Run:
             **asdict(self.used),
             "representation": self.representation or encoder.representation,
             "encoder": encoder.fingerprint,
-            "encoder_code": str(self.encoder) if is_code(self.encoder) else None,
+            "encoder_code": str(self.encoder) if is_kept_as_code else None,
             "encoder_seed": self.encoder_seed,
             "seed": self.seed,
             "steps": self.steps,
@@ -266,6 +269,7 @@ def _train(
         "steps": agent.num_timesteps,
         "seconds": history.seconds,
         "versions": versions,
+        "commits": dict(commits()),
         "cpu": _cpu(),
     }
     write_rows(folder / EPISODES, history.episodes, Episode)

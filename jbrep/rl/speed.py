@@ -7,7 +7,6 @@ from typing import Any
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from jbrep.dae.training import single_torch_thread
-from jbrep.encoders import find
 from jbrep.rl.agent import Evaluator, make_agent, make_env
 from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.run import Run
@@ -17,7 +16,7 @@ _MIN_STEPS = 300
 
 def estimate(run: Run) -> float:
     """Seconds that a run takes on one core of this machine with nothing else running."""
-    encoder = find(run.encoder, run.task)
+    encoder = run.find_encoder()
     preset = run.used
     settings: dict[str, Any] = {**preset.settings}
     if issubclass(ALGORITHMS[run.algorithm], OffPolicyAlgorithm):

@@ -8,7 +8,7 @@ from jbrep.collect.collector import usual_shard_episodes
 from jbrep.collect.derive import derive
 from jbrep.dataset import Dataset, ScaledDataset, Settings
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.encoders import FULL, find
+from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
 from jbrep.encoders.shipped import names
 from jbrep.envs.task import Task, check_same
@@ -69,8 +69,8 @@ def _check_own(plan: Plan) -> None:
 def _check_encoder(run: Run) -> None:
     if not is_code(run.encoder) and not exists(run.encoder):
         raise InputError(f"its encoder {run.encoder} is missing")
-    encoder = find(run.encoder, run.task)
-    if is_code(run.encoder) and find(run.encoder, run.task).fingerprint != encoder.fingerprint:
+    encoder = run.find_encoder()
+    if is_code(run.encoder) and run.find_encoder().fingerprint != encoder.fingerprint:
         raise InputError(
             f"{run.encoder} makes another encoder each time: let it load its weights, or seed it"
         )
