@@ -14,7 +14,7 @@ help: ## what there is to make
 
 setup: $(READY) ## a virtual environment with everything in it
 $(READY): $(READY_DEMO)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[cluster,export,learn,render,suite,view,dev]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[cluster,export,learn,render,suite,tune,view,wandb,dev]'
 	@touch $@
 
 $(READY_DEMO): pyproject.toml constraints.txt

@@ -29,7 +29,8 @@ from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.settings import setting_names, used_settings
 from jbrep.rl.weights import STATISTICS
 from jbrep.study.config import as_study, read_study
-from jbrep.study.plan import read_plan
+from jbrep.study.plan import Plan, read_plan
+from jbrep.study.record import record
 from jbrep.study.results import read_results
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
@@ -400,8 +401,10 @@ def test_a_study_of_learners(tmp_path):
     (tmp_path / "mine.toml").write_text(write_preset("a2c", "modern", {"net_arch": [4]}))
     path, out = tmp_path / "study.toml", tmp_path / "out"
     path.write_text(STUDY.format(preset=tmp_path / "mine.toml"))
-    told = jbrep("study", path, "--out", out, "--workers", 1)
-    assert told.exit_code == 0, told.output
+    plan = Plan(read_study(path), out)
+    plan.write()
+    for cell in plan.cells:
+        train(plan.run(cell), plan.folder_of(cell))
     own = {
         "my-a2c": {"base": "a2c-modern", "net_arch": [8], "normalize": True},
         "tuned": {"base": "a2c-modern", "net_arch": [4], "gamma": 0.9},
@@ -409,7 +412,7 @@ def test_a_study_of_learners(tmp_path):
     written = json.loads((out / "study.json").read_text())
     assert (written["algorithms"], written["learners"]) == (["a2c-modern", *own], own)
     assert read_plan(out).study == read_study(path)
-    labels = json.loads((out / "runs.json").read_text())["labels"]
+    labels = record(out, read_results(out).folders, [])["labels"]
     assert [*labels] == [f"Pendulum-v1/{name}/full" for name in ("a2c-modern", *own)]
     settings = labels["Pendulum-v1/tuned/full"]["settings"]
     assert (settings["preset"], settings["hidden"]) == ("modern", [4])
@@ -417,9 +420,8 @@ def test_a_study_of_learners(tmp_path):
     assert as_study(tomllib.loads(_toml(written))) == read_study(path)
     before = (out / "study.json").read_bytes()
     (tmp_path / "mine.toml").write_text(write_preset("a2c", "modern", {"net_arch": [5]}))
-    told = jbrep("study", path, "--out", out, "--workers", 1)
-    assert told.exit_code == 2
-    assert "holds another study: learner tuned" in told.output.splitlines()[-1]
+    with pytest.raises(InputError, match="holds another study: learner tuned"):
+        Plan(read_study(path), out).write()
     assert (out / "study.json").read_bytes() == before
 
 

@@ -25,7 +25,8 @@ from jbrep.text import rounded
     "--encoder",
     default="full",
     show_default=True,
-    help="A file, or a shipped encoder's name; full is the whole observation, scaled alike.",
+    help="A file, a shipped encoder's name, or code as module:Class, which is run; full is the "
+    "whole observation, scaled alike.",
 )
 @click.option("--trials", default=20, show_default=True, type=POSITIVE, help="In all.")
 @click.option("--seeds", default=1, show_default=True, type=POSITIVE, help="Runs of each trial.")
@@ -47,6 +48,7 @@ def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **settin
     --trials may grow.
     """
     with stop_signals() as received:
+        from jbrep.encoders.code import import_code
         from jbrep.rl import Run, StoppedError
         from jbrep.rl.tune import BEST, Trial
         from jbrep.rl.tune import tune as search
@@ -56,6 +58,7 @@ def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **settin
             click.echo(f"trial {trial.number + 1} of {trials}: {score}  {_shown(trial.settings)}")
 
         settings |= {"task": given_task(settings), "settings": given_settings(settings)}
+        import_code(settings["encoder"])
         run = Run(**settings, evaluate_every=settings["steps"])
         try:
             best = search(run, trials, seeds, out, show, stop=lambda: bool(received))
