@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import optuna
-from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
+from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
@@ -21,7 +21,6 @@ from jbrep.rl.run import Run, plain, train
 from jbrep.rl.settings import setting_names
 
 JOURNAL, BEST = "optuna.journal", "best.toml"
-_NETWORKS = [[64, 64], [256, 256], [400, 300]]
 _RANGES: dict[str, tuple[float, float] | list[Any]] = {  # logarithmic, or choices
     "learning_rate": (1e-5, 1e-2),
     "batch_size": [64, 128, 256, 512],
@@ -33,7 +32,7 @@ _RANGES: dict[str, tuple[float, float] | list[Any]] = {  # logarithmic, or choic
     "n_epochs": [4, 10, 20],
     "vf_coef": [0.25, 0.5, 1.0],
     "target_kl": [0.005, 0.01, 0.02],
-    "net_arch": _NETWORKS,
+    "net_arch": [[64, 64], [256, 256], [400, 300]],
 }
 
 
@@ -77,11 +76,11 @@ def tune(
     make_folder(folder)
     with exclusive(folder):
         study = _open(run, seeds, folder)
-        ended = {}
+        ended = []
         for number in range(trials):
-            ended[number] = _trial(study, number, run, seeds, folder, stop)
+            ended.append(_trial(study, number, run, seeds, folder, stop))
             watch(ended[number])
-    sound = [trial for trial in ended.values() if trial.value is not None]
+    sound = [trial for trial in ended if trial.value is not None]
     if not sound:
         raise InputError("every trial failed: see the run.json files below the folder")
     best = max(sound, key=lambda trial: trial.value or 0.0)
@@ -104,16 +103,15 @@ def _open(run: Run, seeds: int, folder: Path) -> optuna.Study:
     return study
 
 
-def _space(run: Run) -> dict[str, BaseDistribution]:
+def _space(run: Run) -> dict[str, Any]:
     """What is searched: the settings that the algorithm has and the run doesn't set."""
     names = [n for n in _RANGES if n in setting_names(run.algorithm) and n not in run.settings]
     return {name: _distribution(_RANGES[name]) for name in names}
 
 
-def _distribution(given: tuple[float, float] | Iterable[Any]) -> BaseDistribution:
+def _distribution(given: tuple[float, float] | Iterable[Any]) -> Any:
     if isinstance(given, tuple):
-        low, high = given
-        return FloatDistribution(low, high, log=True)
+        return FloatDistribution(given[0], given[1], log=True)
     return CategoricalDistribution([json.dumps(value) for value in given])  # no lists there
 
 
@@ -142,5 +140,6 @@ def _trial(
             return Trial(number, settings, None)
         rows = read_evaluations(of_seed)
         returns += [row.episode_return for row in rows if row.step == rows[-1].step]
-    study.tell(number, float(np.mean(returns)))
-    return Trial(number, settings, float(np.mean(returns)))
+    value = float(np.mean(returns))
+    study.tell(number, value)
+    return Trial(number, settings, value)
