@@ -15,11 +15,13 @@ from packaging.requirements import Requirement
 EXTRAS = {  # what each extra is for; the empty name stands for the core
     "": "the robot and its environments, collect, data",
     "learn": "train-dae, train-encoder, evaluate, rl, study, report",
-    "export": "data export, encoder export",
+    "export": "data import and export, encoder import and export",
     "cluster": "collect and study --backend ray",
     "render": "render",
     "suite": "--task dm_control/...",
+    "tune": "tune",
     "view": "inspect",
+    "wandb": "rl --wandb",
     "dev": "make check, test and bench",
 }
 _RENDER = """

@@ -6,7 +6,6 @@ python tests/cluster.py study OUT, or python tests/cluster.py data OUT.
 import sys
 import threading
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import ray
@@ -49,7 +48,7 @@ def dying_cluster(is_at_work):
 
 
 def run_a_study(out):
-    from test_study import TINY
+    from test_study import ON_RAY
 
     from jbrep.study.plan import Plan
     from jbrep.study.runner import on_ray
@@ -57,7 +56,7 @@ def run_a_study(out):
     from jbrep.study.work import PROGRESS
 
     with dying_cluster(lambda: len(list(out.rglob(PROGRESS))) >= 2):  # a run on each node
-        return run_study(Plan(replace(TINY, seeds=(0,)), out), on_ray, 2)
+        return run_study(Plan(ON_RAY, out), on_ray, 2)
 
 
 def collect_data(out):

@@ -18,6 +18,16 @@ prepare_opengl()
 needs_egl = pytest.mark.skipif(not HEADLESS, reason="no EGL: install libegl1 and libgl1")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def quick_figures():
+    """Fonts as outlines: embedding them takes half of a report's time."""
+    from jbrep.figures.style import PAPER
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PAPER, "pdf.fonttype", 3)
+        yield
+
+
 @pytest.fixture(scope="session")
 def collected(tmp_path_factory):
     """Five shards of an episode each, with states: to be read, or copied before it is changed."""

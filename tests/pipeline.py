@@ -24,6 +24,7 @@ seeds = 2
 steps = 80
 evaluate_every = 80
 evaluation_episodes = 1
+episode_steps = 100
 data = {{folder = "{data}"}}
 training = {{epochs = 30, batch_size = 50}}
 """

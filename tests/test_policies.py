@@ -12,6 +12,7 @@ from jbrep.collect.policies import (
     Heuristic,
     OrnsteinUhlenbeck,
     Uniform,
+    acts_on_observations,
     generators,
     make_policy,
     parse_policy,
@@ -183,8 +184,8 @@ def test_each_episode_of_a_mixture_has_one_of_its_policies():
         np.testing.assert_array_equal(actions[:, lane], alone[part][:, lane])
     np.testing.assert_array_equal(drives(MIXTURE, lanes=1, seed=7)[:3, 0], actions[:, 7])
     assert make_policy(MIXTURE.settings()) == MIXTURE
-    assert not MIXTURE.open_loop
-    assert parse_policy("uniform:1+constant:1").open_loop
+    assert acts_on_observations(MIXTURE.settings())
+    assert not acts_on_observations(parse_policy("uniform:1+constant:1").settings())
 
 
 def test_what_chooses_an_episode_s_policy_is_drawn_from_nothing_else():
