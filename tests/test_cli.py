@@ -24,6 +24,7 @@ def test_a_run_from_training_to_its_returns(tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
     run = tmp_path / "runs" / "dae-8"
     settings = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 40)
+    settings += ("--episode-steps", 100)
     for _ in range(2):  # the second time it is over
         given = (*settings, "--encoder", "dae-8", "--evaluation-episodes", 1, "--out", run)
         assert "returns on dae-8 at the end: " in jbrep("rl", *given).output
@@ -35,7 +36,7 @@ def test_a_run_from_training_to_its_returns(tmp_path, monkeypatch):
     assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
     assert "runs as code when it is read; add --trust" in refused.output
     zip_file = (
-        *("--trust", "--task", "face_direction"),
+        *("--trust", "--task", "face_direction", "--episode-steps", 100),
         "--algorithm",
         "a2c",
         "--encoder",

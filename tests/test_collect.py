@@ -224,8 +224,8 @@ def test_an_episode_ends_where_its_physics_goes_non_finite(tmp_path, collected):
 
 
 def test_kills_lose_at_most_the_open_shard(tmp_path):
-    """`python tests/kills.py 200` does forty times as many."""
-    assert kill_and_resume(5, tmp_path, seed=0).kills == 5
+    """`python tests/kills.py 200` does many more."""
+    assert kill_and_resume(3, tmp_path, seed=0).kills == 3
 
 
 STAGES = ["write", "sync", "rename", "sync folder"] * 3  # of shard, backup and manifest

@@ -29,7 +29,6 @@ evaluate_every = 200
 evaluation_episodes = 2
 episode_steps = 200
 representations = [
-    "full",
     { name = "mine", code = "net:trained" },
     { name = "mine-onnx", file = "mine.safetensors" },
 ]
