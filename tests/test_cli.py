@@ -30,7 +30,9 @@ def test_a_run_from_training_to_its_returns(tmp_path, monkeypatch):
         assert "returns on dae-8 at the end: " in jbrep("rl", *given).output
     assert A2C.load(run / "policy.zip", device="cpu").observation_space.shape == (8,)
     told = jbrep("evaluate-policy", run, "--episodes", 2).output
-    assert re.fullmatch(r"face_direction on dae-8: median return \d+ \[\d+, \d+\] .*\n", told)
+    assert re.fullmatch(
+        r"face_direction on dae-8: median return [\d.]+ \[[\d.]+, [\d.]+\] .*\n", told
+    )
     policy = shutil.copy(run / "policy.zip", tmp_path / "elsewhere.zip")
     refused = jbrep("evaluate-policy", policy)
     assert (refused.exit_code, refused.output.count("\n")) == (2, 1)

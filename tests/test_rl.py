@@ -239,7 +239,6 @@ def test_a_run_that_another_process_has_just_finished_is_left_alone(short, tmp_p
 KILLED = {
     "ddpg": Run(algorithm="ddpg", encoder="dae-8", steps=300, **QUICK),
     "sac": Run(task="Hopper-v5", preset="modern", steps=1100, evaluation_episodes=1),
-    "ppo": Run(task="Pendulum-v1", algorithm="ppo", steps=4096, evaluation_episodes=1),
 }
 
 

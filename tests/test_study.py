@@ -533,7 +533,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     path.write_text(MIXED)
     with monkeypatch.context() as once:
         once.setattr("jbrep.report.write_report", lambda folder, out: [])
-        told = jbrep("study", path, "--out", out, "--workers", 2, "--import", "robots")
+        told = jbrep("study", path, "--out", out, "--workers", 1, "--import", "robots")
     assert told.exit_code == 0, told.output
     monkeypatch.delitem(gymnasium.registry, robots.ID)
     told = jbrep("report", out)

@@ -72,7 +72,7 @@ def encoder() -> None:
     jbrep("encoder import net.onnx --task face_direction --name mine-onnx --out mine.safetensors")
     jbrep("evaluate --encoder net:trained --encoder mine.safetensors --data states")
     Path("study.toml").write_text(STUDY)
-    jbrep("study study.toml --import net --out study")
+    jbrep("study study.toml --import net --workers 1 --out study")
     header, *table = csv.reader(Path("study/returns.csv").read_text().splitlines())
     which = header.index("representation")
     mine, onnx = (
@@ -115,7 +115,7 @@ def data() -> None:
 
 def policies() -> None:
     """What a trained run visits, and an encoder of that; a data set that grows."""
-    jbrep("rl --task Pendulum-v1 --preset modern --set learning_rate=1e-3 --steps 1500 --out run")
+    jbrep("rl --task Pendulum-v1 --algorithm a2c --set learning_rate=1e-3 --steps 4k --out run")
     jbrep("collect --task Pendulum-v1 --policy uniform:0.5+run:0.5 --steps 2k --out mixed")
     jbrep("train-encoder --kind pca --data mixed --latent 2 --out mixed-encoders")
     for steps, folder in (("2k", "grown"), ("4k", "grown"), ("4k", "at-once")):
