@@ -32,8 +32,11 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 def learner_options(command: _Command) -> _Command:
-    """The options from which `given_settings` makes a preset's name and settings."""
+    """What learns, with which settings, and on what; `given_settings` reads the settings."""
     options = (
+        click.option(
+            "--algorithm", default="sac", show_default=True, help=f"One of {', '.join(CLASSES)}."
+        ),
         click.option(
             "--preset",
             default="paper",
@@ -52,6 +55,13 @@ def learner_options(command: _Command) -> _Command:
             "--normalize",
             is_flag=True,
             help="Normalise what the agent sees by its running mean and variance.",
+        ),
+        click.option(
+            "--encoder",
+            default="full",
+            show_default=True,
+            help="A file, a shipped encoder's name, or code as module:Class, which is run; full is "
+            "the whole observation, scaled alike.",
         ),
     )
     for option in reversed(options):
@@ -75,15 +85,7 @@ def given_settings(options: dict[str, Any]) -> dict[str, Any]:
     epilog=example("jbrep rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a")
 )
 @task_options()
-@click.option("--algorithm", default="sac", show_default=True, help=f"One of {', '.join(CLASSES)}.")
 @learner_options
-@click.option(
-    "--encoder",
-    default="full",
-    show_default=True,
-    help="A file, a shipped encoder's name, or code as module:Class, which is run; full is the "
-    "whole observation, scaled alike.",
-)
 @click.option("--steps", default=100_000, show_default=True, type=COUNT, help="Of training.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
 @click.option(

@@ -8,7 +8,6 @@ import click
 from jbrep.cli.base import COUNT, POSITIVE, RESUMES, example
 from jbrep.cli.environment import given_task, task_options
 from jbrep.cli.rl import given_settings, learner_options, stop_signals
-from jbrep.rl.names import CLASSES
 from jbrep.text import rounded
 
 
@@ -19,15 +18,7 @@ from jbrep.text import rounded
     )
 )
 @task_options()
-@click.option("--algorithm", default="sac", show_default=True, help=f"One of {', '.join(CLASSES)}.")
 @learner_options
-@click.option(
-    "--encoder",
-    default="full",
-    show_default=True,
-    help="A file, a shipped encoder's name, or code as module:Class, which is run; full is the "
-    "whole observation, scaled alike.",
-)
 @click.option("--trials", default=20, show_default=True, type=POSITIVE, help="In all.")
 @click.option("--seeds", default=1, show_default=True, type=POSITIVE, help="Runs of each trial.")
 @click.option("--steps", default=20_000, show_default=True, type=COUNT, help="Of each run.")
