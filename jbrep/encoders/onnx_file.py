@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, numpy_helper
 
 from jbrep.errors import InputError
-from jbrep.files.storage import exists, read_regular
+from jbrep.files.storage import exists, read_file
 
 _MAX_BYTES = 1 << 26  # of a model, and of the file of its numbers
 _MAX_NODES = 1000
@@ -93,10 +93,4 @@ def _bytes(path: Path) -> bytes:
     """
     if not exists(path):
         raise InputError(f"no file {path}")
-    try:
-        content = read_regular(path, _MAX_BYTES)
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from None
-    if not content:
-        raise InputError(f"{path} must be a regular file of 1 to {_MAX_BYTES:,} bytes")
-    return content
+    return read_file(path, _MAX_BYTES)

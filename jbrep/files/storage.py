@@ -89,3 +89,18 @@ def read_regular(path: Path, most: int) -> bytes:
         OSError: it can't be read.
     """
     return path.read_bytes() if 0 < regular_size(path) <= most else b""
+
+
+def read_file(path: Path, most: int) -> bytes:
+    """The bytes of a regular file of 1 to `most` bytes.
+
+    Raises:
+        InputError: it can't be read, or is something else.
+    """
+    try:
+        content = read_regular(path, most)
+    except OSError as error:
+        raise InputError(f"can't read {path}: {error.strerror or error}") from None
+    if not content:
+        raise InputError(f"{path} must be a regular file of 1 to {most:,} bytes")
+    return content

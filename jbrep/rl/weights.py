@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.errors import DamageError, InputError
-from jbrep.files.storage import read_regular
+from jbrep.files import storage
 
 MAX_BYTES = 1 << 28  # of the file
 STATISTICS = "observation_statistics.safetensors"  # by which an agent normalises what it sees
@@ -93,13 +93,7 @@ def read_file(path: Path) -> bytes:
     Raises:
         InputError: it is missing, not a regular file, or larger than a policy.
     """
-    try:
-        raw = read_regular(path, MAX_BYTES)
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from None
-    if not raw:
-        raise InputError(f"{path} must be a regular file of 1 to {MAX_BYTES:,} bytes")
-    return raw
+    return storage.read_file(path, MAX_BYTES)
 
 
 def _stored(raw: bytes) -> zipfile.ZipFile:
