@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from jbrep.dae.training import NOISE, Trainer, Training
 from timing import show, timed
 from torch import nn
 from torch.nn.functional import mse_loss
@@ -15,7 +16,6 @@ from torch.utils.data import DataLoader, TensorDataset
 
 from jbrep.dae.gradient import Gradient
 from jbrep.dae.network import ARCHITECTURES, Autoencoder
-from jbrep.dae.training import NOISE, Trainer, Training
 from jbrep.encoders import find
 from jbrep.encoders.encoder import run
 from jbrep.envs import describe

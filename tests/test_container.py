@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-
-from jbrep.dae import checkpoint
 from jbrep.dae.training import Trainer, Training
+
 from jbrep.errors import DamageError, InputError
 from jbrep.files import container
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT
+from jbrep.training import checkpoint
 
 RANDOM = np.random.default_rng(0)
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from jbrep.methods.controls import linear_code, linear_denoiser, pca, random_projection
 from sklearn.decomposition import PCA
 from torch import nn
 
@@ -10,7 +11,6 @@ from jbrep.dae.gradient import Gradient
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders.encoder import run
-from jbrep.methods.controls import linear_code, linear_denoiser, pca, random_projection
 
 
 @pytest.fixture(scope="module")

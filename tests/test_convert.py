@@ -9,12 +9,12 @@ import onnxruntime
 import pytest
 import torch
 from command import jbrep
+from jbrep.dae.training import Training
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 from torch.nn import functional
 
 from jbrep.dae.network import get_architecture
-from jbrep.dae.training import Training
 from jbrep.encoders import ACTIVATIONS, Encoder, Layer, find, load, save
 from jbrep.encoders.activations import activate
 from jbrep.encoders.card import card

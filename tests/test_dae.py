@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 import torch
-from torch.nn.functional import mse_loss
-
-from jbrep.dae import checkpoint
-from jbrep.dae.gradient import Gradient
-from jbrep.dae.network import ARCHITECTURES, Autoencoder, layers
 from jbrep.dae.order import RUN, shuffled
 from jbrep.dae.training import Trainer, Training, default_batch_size, get_device, prefetch
+from torch.nn.functional import mse_loss
+
+from jbrep.dae.gradient import Gradient
+from jbrep.dae.network import ARCHITECTURES, Autoencoder, layers
 from jbrep.encoders.encoder import run
 from jbrep.errors import InputError
 from jbrep.files import container
+from jbrep.training import checkpoint
 
 
 def rows(count=600, size=16, seed=0):

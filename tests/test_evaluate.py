@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from command import jbrep
+from jbrep.methods.controls import pca, random_projection
 from sklearn.decomposition import PCA
 from sklearn.linear_model import Ridge
 from sklearn.metrics import r2_score
@@ -31,7 +32,6 @@ from jbrep.evaluate.summary import evaluation_text
 from jbrep.evaluate.truth import quantities, state
 from jbrep.figures import encoder_plots
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.methods.controls import pca, random_projection
 from jbrep.stats.bootstrap import bootstrap, by_episode
 
 

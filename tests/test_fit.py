@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 from command import jbrep, start, wait_for
+from jbrep.dae.training import Trainer, Training
+from jbrep.methods.rows import available_memory, training_rows, watched_rows
 from small import settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from wide import wide
 
 from jbrep.collect import write_shards
-from jbrep.dae import checkpoint
-from jbrep.dae.training import Trainer, Training
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.manifest import open_shard, read_manifest
 from jbrep.encoders import load
@@ -25,7 +25,7 @@ from jbrep.files.lock import exclusive
 from jbrep.methods import fit
 from jbrep.methods.fit import KINDS, Fitter
 from jbrep.methods.held_out import ratio_to_pca
-from jbrep.methods.rows import available_memory, training_rows, watched_rows
+from jbrep.training import checkpoint
 
 
 @pytest.fixture(scope="module")

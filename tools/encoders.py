@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.dae.training import NOISE, Training
+
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import FULL
 from jbrep.evaluate.files import write

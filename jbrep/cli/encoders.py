@@ -2,13 +2,13 @@
 
 import re
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from jbrep.cli.base import (
-    COUNT,
     RESUMES,
     as_json,
     echo_json,
@@ -18,14 +18,17 @@ from jbrep.cli.base import (
     stoppable,
 )
 from jbrep.cli.environment import given_task, task_options
-from jbrep.errors import InputError
+from jbrep.errors import InputError, choose
 from jbrep.text import terminal_width
 
 if TYPE_CHECKING:
     from jbrep.dataset import ScaledDataset
     from jbrep.methods.fit import Fitted
+    from jbrep.methods.method import Method
+    from jbrep.methods.settings import Setting
 
-_POOR = 1.5  # times PCA's error, from which a trained encoder deserves a warning
+_POOR = 1.5  # times PCA's error, from which a trained autoencoder deserves a warning
+_RECONSTRUCTING = ("ae", "dae")
 
 
 class _Variadic(click.Command):
@@ -34,7 +37,7 @@ class _Variadic(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         repeatable = {
             name
-            for option in self.params
+            for option in self.get_params(ctx)
             if isinstance(option, click.Option) and option.multiple
             for name in option.opts
         }
@@ -44,6 +47,51 @@ class _Variadic(click.Command):
             name = next((a for a in reversed(args[:i]) if a.startswith("-")), None)
             spread += [name, arg] if follows and name in repeatable else [arg]
         return super().parse_args(ctx, spread)
+
+
+class _Making(_Variadic):
+    """A command with an option for each setting of the methods that it offers."""
+
+    kinds: tuple[str, ...] = ()  # all of them if empty
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        *own, last = super().get_params(ctx)  # the last one is --help
+        return [*own, *self._settings, last]
+
+    @cached_property
+    def _methods(self) -> "list[Method]":
+        from jbrep.methods.registry import METHODS  # imports torch
+
+        return [METHODS[name] for name in self.kinds or METHODS]
+
+    @cached_property
+    def _settings(self) -> list[click.Parameter]:
+        from jbrep.methods.settings import SETTINGS
+
+        taken = {name for method in self._methods for name in method.defaults}
+        return [self._option(name, SETTINGS[name]) for name in SETTINGS if name in taken]
+
+    def _option(self, name: str, setting: "Setting") -> click.Option:
+        taking = [method.name for method in self._methods if name in method.defaults]
+        some = "" if len(taking) == len(self._methods) else f" For {', '.join(taking)}."
+        how: dict[str, Any] = {"help": f"{setting.words}{some}"}
+        if name == "latent":
+            how |= {"type": _Sizes(), "multiple": True}
+        elif setting.is_flag:
+            how |= {"is_flag": True, "default": None}
+        return click.Option([f"--{name.replace('_', '-')}"], **how)
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        super().format_options(ctx, formatter)
+        if len(self._methods) > 1:
+            with formatter.section("Kinds"):
+                formatter.write_dl([(method.name, method.words) for method in self._methods])
+
+
+class _MakingDae(_Making):
+    """For the denoising autoencoder alone."""
+
+    kinds = ("dae",)
 
 
 class _Sizes(click.ParamType[tuple[int, ...]]):
@@ -62,54 +110,31 @@ class _Sizes(click.ParamType[tuple[int, ...]]):
 _data = click.option(
     "--data", required=True, type=click.Path(path_type=Path), help="A folder from jbrep collect."
 )
-_out = click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="A folder for the encoder files."
-)
-_latent = click.option(
-    "--latent", type=_Sizes(), multiple=True, help="Latent sizes l, one or several: 12 8 4."
-)
-_noise = click.option(
-    "--noise", type=float, help="Standard deviation of the corruption; 0.1 by default."
-)
 
 
-def _how(command: Callable[..., None]) -> Callable[..., None]:
-    """The options of every kind that has a network."""
-    options = (
-        click.option(
-            "--architecture",
-            help="paper, the default; deep; or sizes of your own, such as 64,64.",
-        ),
-        click.option(
-            "--epochs",
-            type=COUNT,
-            help="Passes over the data; by default 200 or, if not paper, 12.",
-        ),
-        click.option(
-            "--batch-size",
-            type=COUNT,
-            help="Rows in a batch; by default from the rows, 128 to 8192.",
-        ),
-        click.option(
-            "--learning-rate", type=float, help="Of Adam; by default 5e-4 or, if not paper, 2e-3."
-        ),
-        click.option("--seed", type=COUNT, help="Of weights, order and noise; 0 by default."),
+def _making(command: Callable[..., None]) -> Callable[..., None]:
+    """The options of commands that make encoders, but for the methods' own."""
+    for option in (
+        click.option("--preset", help="Named settings; of dae: authors, its authors' own."),
         click.option("--device", default="auto", show_default=True, help="cpu, cuda, or auto."),
-    )
-    for option in reversed(options):
+        click.option("--name", help="What files and tables call it; by default, what it is."),
+        click.option(
+            "--out",
+            required=True,
+            type=click.Path(path_type=Path),
+            help="A folder for the encoder files.",
+        ),
+        _data,
+    ):
         command = option(command)
     return command
 
 
 @click.command(
-    cls=_Variadic,
+    cls=_MakingDae,
     epilog=example("jbrep train-dae --data data/face --latent 12 8 4 --out encoders/face"),
 )
-@_data
-@_latent
-@_how
-@_noise
-@_out
+@_making
 def train_dae(**options: Any) -> None:
     """Train denoising autoencoders.
 
@@ -120,59 +145,58 @@ def train_dae(**options: Any) -> None:
 
 
 @click.command(
-    cls=_Variadic,
+    cls=_Making,
     epilog=example(
-        "jbrep train-encoder --kind pca --data data/face --latent 8 --out encoders/face"
+        "jbrep train-encoder --kind slow --data data/face --latent 8 --out encoders/face"
     ),
 )
-@click.option("--kind", required=True, help="full, pca, random, untrained, ae (no noise) or dae.")
-@_data
-@_latent
-@_how
-@_noise
-@_out
+@click.option("--kind", required=True, help="One of those below; full is the whole observation.")
+@_making
 def train_encoder(kind: str, **options: Any) -> None:
-    """Make encoders of any kind, to compare with.
+    """Make encoders of any kind.
 
-    The full observation, scaled; principal components; a random projection; an untrained network; a
-    plain autoencoder; or a denoising one.
+    They learn from 80 % of the episodes. Each kind takes only some of the settings.
     """
-    from jbrep.encoders.encoder import FULL, IDENTITY
-
-    _fit(IDENTITY if kind == FULL else kind, **options)
+    _fit(kind, **options)
 
 
 def _fit(
-    kind: str, data: Path, latent: tuple[tuple[int, ...], ...], out: Path, device: str, **how: Any
+    kind: str,
+    data: Path,
+    out: Path,
+    name: str | None,
+    device: str,
+    preset: str | None,
+    latent: tuple[tuple[int, ...], ...] = (),
+    **how: Any,
 ) -> None:
-    from jbrep.dae.training import Training
     from jbrep.dataset import Dataset, ScaledDataset
-    from jbrep.methods.fit import Fitter, get_kind
+    from jbrep.methods.fit import Fitter
+    from jbrep.methods.registry import get_method
 
+    method = get_method(kind)
+    given = {key: value for key, value in how.items() if value is not None}
+    if preset is not None:
+        given = {**choose(preset, method.presets, f"preset of {kind}"), **given}
     sizes = dict.fromkeys(size for each in latent for size in each)
-    given = {name: value for name, value in how.items() if value is not None}
-    settings = get_kind(kind).settings
-    for name in (*given, *(["latent"] if sizes else [])):
-        if name not in settings:
-            raise InputError(f"{kind} takes no --{name.replace('_', '-')}: leave it out")
-    if "latent" in settings and not sizes:
-        raise InputError(f"{kind} needs latent sizes, such as --latent 12 8 4")
-    trainings = [Training.of(size, **given) for size in sizes or (None,)]
+    if name and len(sizes) > 1:
+        raise InputError("one name is for one latent size: give each its own")
+    each: list[dict[str, Any]] = [{"latent": size} for size in sizes] or [{}]
     scaled = ScaledDataset(Dataset(data))
-    for name in scaled.constant_features:
-        click.echo(f"{name} is constant in the training part: it is scaled to 0", err=True)
+    for constant in scaled.constant_features:
+        click.echo(f"{constant} is constant in the training part: it is scaled to 0", err=True)
     fitter = Fitter(scaled, out, device)
-    for training in trainings:  # every mistake is reported before the first training
-        fitter.check(kind, training)
+    settings = [{**given, **one, "name": name} for one in each]
+    for one in settings:  # every mistake is reported before the first training
+        fitter.plan(kind, **one)
     with stoppable(f"{RESUMES}; the best so far is in {out}"):
-        for training in trainings:
-            _report(fitter.fit(kind, training), scaled)
+        for one in settings:
+            _report(fitter.fit(kind, **one), scaled)
 
 
 def _report(fitted: "Fitted", data: "ScaledDataset") -> None:
     """Say how an encoder that was fitted to that data compares with PCA."""
     from jbrep.encoders.file import HELD_OUT_MSE
-    from jbrep.methods.fit import KINDS
     from jbrep.methods.held_out import ratio_to_pca
 
     encoder, path, is_new = fitted
@@ -182,7 +206,7 @@ def _report(fitted: "Fitted", data: "ScaledDataset") -> None:
         f"{encoder.name}: held-out mean squared error {encoder.header['metrics'][HELD_OUT_MSE]:.5f}"
         f"{comparison} (features scaled to [-1, 1]); {path}{'' if is_new else ', already complete'}"
     )
-    if ratio is not None and ratio > _POOR and KINDS[encoder.header["kind"]].make is None:
+    if ratio is not None and ratio > _POOR and encoder.kind in _RECONSTRUCTING:
         click.echo(
             f"warning: {encoder.name} reconstructs worse than PCA with as many components: train "
             "for more --epochs, on more data, or with another --learning-rate or --batch-size",

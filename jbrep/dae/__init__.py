@@ -1,1 +1,1 @@
-"""The denoising autoencoder: network, training, checkpoints."""
+"""The autoencoder: its network, its gradient, what it learns."""

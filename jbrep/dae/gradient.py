@@ -18,9 +18,12 @@ class Gradient:
     Args:
         modules: nn.Linear, each followed by an activation, nn.ReLU or nn.Tanh, or by none.
         rows: the largest batch.
+        weights: of each number in the error, (d,); None for 1.
     """
 
-    def __init__(self, modules: Iterable[nn.Module], rows: int):
+    def __init__(self, modules: Iterable[nn.Module], rows: int, weights: Tensor | None = None):
+        self.rows = rows
+        self._weights = None if weights is None else weights[:, None]
         stack = [*modules, nn.Identity()]
         self._layers = [
             (module, after) for module, after in pairwise(stack) if isinstance(module, nn.Linear)
@@ -47,7 +50,11 @@ class Gradient:
             _activate(activation, after)
         errors = self._cut(self._errors, values.shape[1])
         error = torch.sub(inputs[-1], target, out=errors[-1])
-        loss = torch.dot(error.view(-1), error.view(-1)) / error.numel()
+        if self._weights is None:
+            loss = torch.dot(error.view(-1), error.view(-1)) / error.numel()
+        else:
+            loss = torch.sum(error.square() * self._weights) / error.numel()
+            error.mul_(self._weights)
         error.mul_(2 / error.numel())
         for i, (linear, activation) in reversed(list(enumerate(self._layers))):
             _differentiate(activation, inputs[i + 1], errors[i])

@@ -1,11 +1,12 @@
-"""The autoencoder's network."""
+"""Networks of dense layers: the paper's, and others."""
 
 import re
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from jbrep.encoders import Layer
 from jbrep.encoders.encoder import MAX_UNITS
@@ -22,19 +23,22 @@ _NAMES = {module: name for name, module in _MODULES.items()}
 class Architecture:
     """The layers between observation and latent, and the default settings of training."""
 
-    name: str  # paper, deep, or the hidden sizes, as 64x64
+    name: str  # paper, deep, linear, or the hidden sizes, as 64x64
     hidden: tuple[int, ...]  # widths from observation to latent, mirrored in the decoder; ReLU
-    output: str  # activation of the reconstruction; the latent's is tanh
+    code: str  # activation of the latent
+    output: str  # activation of the reconstruction
     epochs: int
     learning_rate: float
     decay: bool  # whether the learning rate falls to zero along a cosine
 
 
+_DECAYING: dict[str, Any] = {"epochs": 12, "learning_rate": 2e-3, "decay": True}
 ARCHITECTURES = {
     each.name: each
     for each in (
-        Architecture("paper", (), "tanh", epochs=200, learning_rate=5e-4, decay=False),
-        Architecture("deep", (128, 64), "linear", epochs=12, learning_rate=2e-3, decay=True),
+        Architecture("paper", (), "tanh", "tanh", epochs=200, learning_rate=5e-4, decay=False),
+        Architecture("deep", (128, 64), "tanh", "linear", **_DECAYING),
+        Architecture("linear", (), "linear", "linear", **_DECAYING),
     )
 }
 
@@ -72,23 +76,34 @@ def check_size(architecture: Architecture, size: int, latent: int) -> None:
         )
 
 
-class Autoencoder(nn.Module):
-    """Encoder and decoder, from d features to l and back; untrained."""
+def stacks(
+    architecture: Architecture, size: int, latent: int, seed: int, initial: str = "torch"
+) -> tuple[nn.Sequential, nn.Sequential]:
+    """Encoder and decoder, from d numbers to l and back; untrained.
 
-    def __init__(self, architecture: Architecture, size: int, latent: int, seed: int):
-        super().__init__()
-        sizes = (size, *architecture.hidden, latent)
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(seed)
-            self.encoder = _stack(sizes, "tanh")
-            self.decoder = _stack(tuple(reversed(sizes)), architecture.output)
+    Args:
+        architecture: the layers between.
+        size: numbers d.
+        latent: numbers l.
+        seed: of the weights.
+        initial: `torch` for its initial weights, `normal` for N(0, 1) with biases of 0.
+    """
+    sizes = (size, *architecture.hidden, latent)
+    with torch.random.fork_rng(devices=()):
+        torch.manual_seed(seed)
+        encoder = stack(sizes, architecture.code)
+        decoder = stack(tuple(reversed(sizes)), architecture.output)
+        if initial == "normal":
+            for name, parameter in (*encoder.named_parameters(), *decoder.named_parameters()):
+                if name.endswith("weight"):
+                    nn.init.normal_(parameter)
+                else:
+                    nn.init.zeros_(parameter)
+    return encoder, decoder
 
-    def forward(self, values: Tensor) -> Tensor:
-        """Reconstructions of scaled observations (n, d)."""
-        return self.decoder(self.encoder(values))
 
-
-def _stack(sizes: tuple[int, ...], last: str) -> nn.Sequential:
+def stack(sizes: tuple[int, ...], last: str) -> nn.Sequential:
+    """Dense layers of these widths, with ReLU between them and a last activation."""
     modules: list[nn.Module] = []
     for inputs, outputs in pairwise(sizes):
         modules += nn.Linear(inputs, outputs), nn.ReLU()

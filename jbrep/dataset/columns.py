@@ -1,10 +1,8 @@
-"""Columns over all shards of a data set, scaling fitted to them, and shuffled batches."""
+"""Columns over all shards of a data set, and shuffled batches of them."""
 
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -123,44 +121,6 @@ class Column:
             part = self._part(int(shard))
             taken[where] = part[flat[where] - (self._ends[shard] - len(part))]
         return taken.reshape((*rows.shape, *self.shape[1:]))[()]
-
-
-@dataclass(frozen=True)
-class Scaler:
-    """Scales each feature to [-1, 1] over the rows it was fitted to, and a constant one to 0."""
-
-    low: NDArray[np.float32]  # (d,)
-    high: NDArray[np.float32]  # (d,)
-
-    @classmethod
-    def fit(cls, column: Column, rows: NDArray[np.int64]) -> "Scaler":
-        """Fit to the minima and maxima of some rows of a column (N, d)."""
-        low = np.full(column.shape[1:], np.inf, column.dtype)
-        high = -low
-        for values in column.parts(rows):
-            low = np.minimum(low, values.min(axis=0))
-            high = np.maximum(high, values.max(axis=0))
-        return cls(low, high)
-
-    @cached_property
-    def half_width(self) -> Array:
-        """What each feature is divided by, (d,); 1 for a constant one."""
-        half_width = (self.high - self.low) / 2
-        half_width[half_width == 0] = 1
-        return half_width
-
-    @cached_property
-    def centre(self) -> Array:
-        """The value of each feature that is scaled to 0, (d,)."""
-        return (self.high + self.low) / 2
-
-    def scale(self, values: Array) -> Array:
-        """Physical units (n, d) to [-1, 1]; values outside the fitted range go beyond it."""
-        return (values - self.centre) / self.half_width
-
-    def unscale(self, scaled: Array) -> Array:
-        """The inverse of `scale`."""
-        return scaled * self.half_width + self.centre
 
 
 class Batches:

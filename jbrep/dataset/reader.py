@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import version1
-from jbrep.dataset.columns import Batches, Column, Scaler
+from jbrep.dataset.columns import Batches, Column
 from jbrep.dataset.manifest import (
     check_files,
     hdf5_files,
@@ -19,6 +19,7 @@ from jbrep.dataset.manifest import (
     read_manifest,
     shard_name,
 )
+from jbrep.dataset.scaling import EXTREMA, Scaler, fit_scaler
 from jbrep.dataset.schema import EPISODES, episode_bounds, step_specs
 from jbrep.dataset.shard import FileState, Shard, file_state
 from jbrep.envs.task import Task
@@ -248,7 +249,7 @@ class Dataset:
 
     def fit_scaler(self, rows: NDArray[np.int64]) -> Scaler:
         """The scaling of observations to [-1, 1] over some rows, such as the training part."""
-        return Scaler.fit(self["observation"], rows)
+        return fit_scaler(EXTREMA, self.task, self["observation"], rows)
 
     def batches(
         self,

@@ -1,6 +1,7 @@
 """A data set prepared for learning representations: split by episode, scaled to [-1, 1]."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from copy import copy
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.reader import Dataset
+from jbrep.dataset.scaling import EXTREMA, fit_scaler
 from jbrep.errors import InputError
 
 
@@ -26,7 +28,7 @@ class Moments(NamedTuple):
 
 
 class ScaledDataset:
-    """Observations scaled to [-1, 1] by the extrema of the training part.
+    """Observations scaled to [-1, 1] by the extrema of the training part, or as `rescaled` says.
 
     Attributes:
         dataset: the data set itself.
@@ -34,6 +36,7 @@ class ScaledDataset:
         train: sorted rows of 80 % of the episodes.
         test: sorted rows of the others.
         scaler: fitted to the training rows only.
+        used: places of the scaled numbers that a row has; all of them unless some are left out.
 
     Raises:
         InputError: fewer than two episodes, or numbers that aren't finite.
@@ -44,6 +47,7 @@ class ScaledDataset:
         self.task = dataset.task
         self.train, self.test = dataset.split()
         self.scaler = dataset.fit_scaler(self.train)
+        self.used = np.arange(self.scaler.size)
         unseen = dataset.fit_scaler(self.test)
         extrema = (self.scaler.low, self.scaler.high, unseen.low, unseen.high)
         not_finite = np.asarray(~np.isfinite(extrema).all(axis=0))
@@ -53,8 +57,54 @@ class ScaledDataset:
                 f"{dataset.folder} has values that aren't finite in {bad}: run jbrep data verify"
             )
 
+    def rescaled(
+        self,
+        scaling: str = EXTREMA,
+        angles: bool = False,
+        clip: float | None = None,
+        without: Collection[str] = (),
+    ) -> "ScaledDataset":
+        """The same rows and split, scaled otherwise.
+
+        Args:
+            scaling: a key of jbrep.dataset.scaling.SCALINGS.
+            angles: whether angles become sine and cosine.
+            clip: scaled values stay within [-clip, clip]; None for no limit.
+            without: features that rows don't have.
+
+        Raises:
+            InputError: the task has no usual ranges, or no such feature.
+        """
+        names = self.task.feature_names
+        if unknown := [name for name in without if name not in names]:
+            raise InputError(f"no feature {unknown[0]!r}: {self.task.name} has {', '.join(names)}")
+        other = copy(self)
+        other.__dict__.pop("moments", None)
+        column = self.dataset["observation"]
+        other.scaler = fit_scaler(scaling, self.task, column, self.train, angles, clip)
+        other.used = np.array(
+            [i for i, name in enumerate(other.scaled_names) if name not in without], int
+        )
+        return other
+
     def __repr__(self) -> str:
         return f"ScaledDataset({self.dataset!r}, {len(self.train):,} rows to train on)"
+
+    @property
+    def size(self) -> int:
+        """Length of a scaled row."""
+        return len(self.used)
+
+    @property
+    def scaled_names(self) -> tuple[str, ...]:
+        """The feature that each scaled number is of; an angle comes twice."""
+        names = self.task.feature_names
+        return names + tuple(names[i] for i in self.scaler.angles)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The feature that each number of a scaled row is of."""
+        return tuple(self.scaled_names[i] for i in self.used)
 
     @property
     def constant_features(self) -> tuple[str, ...]:
@@ -68,13 +118,18 @@ class ScaledDataset:
         """Observations of the rows in physical units, in order, in chunks (n, d)."""
         return self.dataset["observation"].parts(rows)
 
+    def scale(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Observations (n, d) in physical units as scaled rows (n, size)."""
+        scaled: NDArray[np.float32] = self.scaler.scale(observations)
+        return scaled if self.size == self.scaler.size else scaled[:, self.used]
+
     def chunks(self, rows: NDArray[np.int64]) -> Iterator[NDArray[np.float32]]:
-        """The same, scaled."""
-        return map(self.scaler.scale, self.observations(rows))
+        """Scaled rows, in order, in chunks (n, size)."""
+        return map(self.scale, self.observations(rows))
 
     def load(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Scaled observations of the rows, (n, d)."""
-        loaded = np.empty((len(rows), self.task.size), np.float32)
+        """Scaled rows, (n, size)."""
+        loaded = np.empty((len(rows), self.size), np.float32)
         start = 0
         for chunk in self.chunks(rows):
             loaded[start : start + len(chunk)] = chunk
@@ -83,8 +138,8 @@ class ScaledDataset:
 
     @cached_property
     def moments(self) -> Moments:
-        """Mean and covariance of the training rows."""
-        total, products = np.zeros(self.task.size), np.zeros((self.task.size, self.task.size))
+        """Mean and covariance of the scaled training rows."""
+        total, products = np.zeros(self.size), np.zeros((self.size, self.size))
         for chunk in self.chunks(self.train):
             rows = chunk.astype(np.float64)
             total += rows.sum(axis=0)

@@ -7,7 +7,10 @@ from typing import Any
 
 import numpy as np
 
-LAYER_NORM = "layer-norm"  # the one that reads all units of a layer at once
+LAYER_NORM = "layer-norm"
+AVG_L1_NORM = "avg-l1-norm"
+WHOLE = frozenset((LAYER_NORM, AVG_L1_NORM))  # those that read all units of a layer at once
+LEAST_NORM = 1e-8  # that an average magnitude counts as
 EPSILON = 1e-5  # added to the variance in a layer norm
 _SATURATED = 10.0  # from where tanh in the approximate GELU is 1 in float64
 
@@ -16,6 +19,7 @@ def activate(name: str, values: Any) -> Any:
     """Apply an activation to values (..., units), a NumPy array or a torch tensor, in their type.
 
     `layer-norm` is over the units, without weights of its own: an affine map after it has them.
+    `avg-l1-norm` divides them by their average magnitude (Fujimoto et al. 2023).
     """
     known = _torch() if type(values).__module__ == "torch" else ACTIVATIONS
     return known[name](values)
@@ -44,6 +48,10 @@ def _layer_norm(values: Any) -> Any:
     return (centred / np.sqrt(variance + EPSILON)).astype(values.dtype)
 
 
+def _avg_l1_norm(values: Any) -> Any:
+    return values / np.abs(values).mean(-1, keepdims=True).clip(min=LEAST_NORM)
+
+
 ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {  # for NumPy arrays
     "linear": lambda values: values,
     "relu": lambda values: values.clip(min=0),
@@ -54,7 +62,9 @@ ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {  # for NumPy arrays
     "silu": lambda values: values * _sigmoid(values),
     "elu": lambda values: np.where(values > 0, values, np.expm1(np.minimum(values, 0))),
     "softplus": lambda values: np.logaddexp(values, 0),
+    "sin": np.sin,
     LAYER_NORM: _layer_norm,
+    AVG_L1_NORM: _avg_l1_norm,
 }
 FIRST_ACTIVATIONS = frozenset(("linear", "relu", "tanh"))  # those of format versions 1 and 2
 
@@ -74,5 +84,7 @@ def _torch() -> Mapping[str, Callable[[Any], Any]]:
         "silu": functional.silu,
         "elu": functional.elu,
         "softplus": functional.softplus,
+        "sin": lambda values: values.sin(),
         LAYER_NORM: lambda values: functional.layer_norm(values, values.shape[-1:], eps=EPSILON),
+        AVG_L1_NORM: lambda v: v / v.abs().mean(-1, keepdim=True).clip(min=LEAST_NORM),
     }

@@ -1,7 +1,7 @@
 """The encoder: from observations to latents and back, through dense layers."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import zip_longest
 from typing import Any, NamedTuple, TypeVar
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import Scaler
+from jbrep.dataset.scaling import library_of
 from jbrep.encoders.activations import ACTIVATIONS, FIRST_ACTIVATIONS, activate
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task, check_same, read_task
@@ -27,6 +28,7 @@ IDENTITY = "identity"  # the kind of encoder that leaves the scaled observation 
 IMPORTED = "imported"  # the kind of encoder that was trained elsewhere
 MAX_UNITS = 4096  # in a layer
 MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
+_SCALING = ("low", "high")  # tensors
 
 
 class Layer(NamedTuple):
@@ -47,8 +49,7 @@ def run(layers: tuple[Layer, ...], values: Any) -> Any:
 class _Parts(NamedTuple):
     """An encoder's arrays, all NumPy's, or torch tensors on one device."""
 
-    centre: Any
-    half_width: Any
+    scaler: Scaler
     encoder: tuple[Layer, ...]
     decoder: tuple[Layer, ...]
 
@@ -58,13 +59,15 @@ class Encoder(BaseEncoder):
     """An encoder with its decoder and the scaling that both expect.
 
     It takes observations in physical units, as data sets and environments give them, and applies
-    its own scaling: the extrema of its training data become -1 and 1. All arithmetic is float32.
+    its own scaling. All arithmetic is float32.
 
     Attributes:
         header: its kind, name and origin as plain JSON, see docs/encoders.md.
         scaler: fitted on the training part of its data.
-        encoder: layers from d scaled features to l latent units; empty for the identity.
-        decoder: layers from l latent units to d scaled features; empty where there is no decoder.
+        encoder: layers from the scaled numbers of an observation to the code; empty for the
+            identity.
+        decoder: layers from the code back to the scaled numbers; empty where there is no decoder.
+        keep: features that pass around the layers: scaled, they follow the code in the latent.
 
     Raises:
         InputError: tensors whose shapes are inconsistent, whose type is not float32, or that hold
@@ -75,14 +78,17 @@ class Encoder(BaseEncoder):
     scaler: Scaler
     encoder: tuple[Layer, ...]
     decoder: tuple[Layer, ...]
+    keep: tuple[str, ...] = ()
     _on: dict[Any, _Parts] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        sizes = [self.size]
+        self._check_scaling()
+        sizes = [self.scaler.size]
         for name, tensor in self.tensors().items():
-            self._check(name, tensor, sizes)
-        if self.decoder and sizes[-1] != self.size:
-            raise InputError(f"the last layer has {sizes[-1]} units, expected {self.size}")
+            if name not in _SCALING:
+                self._check(name, tensor, sizes)
+        if self.decoder and sizes[-1] != self.scaler.size:
+            raise InputError(f"the last layer has {sizes[-1]} units, expected {self.scaler.size}")
         if max(sizes) > MAX_UNITS:
             raise InputError(f"a layer has {max(sizes)} units: the limit is {MAX_UNITS}")
         for layer in (*self.encoder, *self.decoder):
@@ -91,8 +97,21 @@ class Encoder(BaseEncoder):
                 raise InputError(
                     f"unknown activation {layer.activation!r}: choose one of {choices}"
                 )
-        scaling = self.scaler.centre, self.scaler.half_width
-        self._on[None] = _Parts(*scaling, self.encoder, self.decoder)
+        self._on[None] = _Parts(self.scaler, self.encoder, self.decoder)
+
+    def _check_scaling(self) -> None:
+        """Check the scaling, and what passes around the layers."""
+        for name in _SCALING:
+            _check_tensor(name, getattr(self.scaler, name), (self.size,))
+        angles, clip = self.scaler.angles, self.scaler.clip
+        if len(set(angles)) < len(angles) or not all(0 <= i < self.size for i in angles):
+            raise InputError("its angles must be different features")
+        if clip is not None and not 1 <= clip < MAX_MAGNITUDE:
+            raise InputError(f"its clip is {clip}: it must be at least 1")
+        if self.keep and not (self.encoder and set(self.keep) <= set(self.feature_names)):
+            raise InputError(
+                "only features of its observations can pass around an encoder's layers"
+            )
 
     def _check(self, name: str, tensor: Any, sizes: list[int]) -> None:
         """Check one tensor; `sizes` holds the widths of the layers so far, and grows."""
@@ -102,14 +121,7 @@ class Encoder(BaseEncoder):
             sizes.append(rows)
         else:
             expected = (sizes[-1],)
-        if tensor.shape != expected:
-            raise InputError(f"tensor {name} has shape {tensor.shape}, expected {expected}")
-        if tensor.dtype != np.float32:
-            raise InputError(f"tensor {name} has type {tensor.dtype}, expected float32")
-        if not (np.abs(tensor) < MAX_MAGNITUDE).all():
-            raise InputError(
-                f"tensor {name} holds a number that is not finite or not below {MAX_MAGNITUDE:g}"
-            )
+        _check_tensor(name, tensor, expected)
 
     @staticmethod
     def from_torch(
@@ -162,33 +174,46 @@ class Encoder(BaseEncoder):
     @property
     def representation(self) -> str:
         """What an agent that sees its latent sees: `full` for the identity, else its name."""
-        return FULL if self.kind == IDENTITY else self.name
+        return FULL if self.name == IDENTITY else self.name
 
     @property
     def can_decode(self) -> bool:
         """Whether there is a decoder."""
         return bool(self.decoder) or not self.encoder
 
+    @cached_property
+    def kept(self) -> list[int]:
+        """Places of the scaled numbers that pass around the layers."""
+        angles = (self.feature_names[i] for i in self.scaler.angles)
+        scaled = (*self.feature_names, *angles) if self.keep else ()
+        return [i for i, name in enumerate(scaled) if name in self.keep]
+
     @property
     def file_header(self) -> dict[str, Any]:
         """The header with the fields that its file needs."""
+        angles = [self.feature_names[i] for i in self.scaler.angles]
+        inputs = {"angles": angles, "clip": self.scaler.clip, "keep": list(self.keep)}
         activations = {
             part: [layer.activation for layer in getattr(self, part)]
             for part in ("encoder", "decoder")
         }
         start = {"format": FORMAT, "format_version": self.format_version}
-        return {**start, **self.header, **activations}
+        used = {name: value for name, value in inputs.items() if value}
+        return {**start, **self.header, **used, **activations}
 
     @property
     def format_version(self) -> int:
         """The oldest version of the file that can hold it, so that old files keep their bytes.
 
         Version 1 has no environment: it is the Jitterbug's. Version 3 is of encoders that a jbrep
-        of version 2 can't read: imported, with other activations, without a decoder, or with a
-        latent larger than the observation.
+        of version 2 can't read: imported, with other activations, without a decoder, with a
+        latent larger than the observation, with angles as sine and cosine, with a limit of scaled
+        values, or with some that pass around the layers.
         """
         if "environment" not in self.header:
             return 1
+        if self.scaler.angles or self.scaler.clip is not None or self.keep:
+            return 3
         used = {layer.activation for layer in (*self.encoder, *self.decoder)}
         known = self.kind != IMPORTED and used <= FIRST_ACTIVATIONS
         return 2 if known and self.can_decode and self.latent_size <= self.size else 3
@@ -207,7 +232,8 @@ class Encoder(BaseEncoder):
     @property
     def latent_size(self) -> int:
         """Length l of a latent."""
-        return len(self.encoder[-1].bias) if self.encoder else self.size
+        code = len(self.encoder[-1].bias) if self.encoder else self.scaler.size
+        return code + len(self.kept)
 
     @cached_property
     def task(self) -> Task:
@@ -254,7 +280,11 @@ class Encoder(BaseEncoder):
             InputError: observations of another length.
         """
         values, parts = self._prepare(observation, self.size, "observations")
-        return run(parts.encoder, (values - parts.centre) / parts.half_width)
+        scaled = parts.scaler.scale(values)
+        code = run(parts.encoder, scaled)
+        if not self.keep:
+            return code
+        return library_of(code).concatenate((code, scaled[..., self.kept]), -1)
 
     __call__ = encode
 
@@ -267,11 +297,15 @@ class Encoder(BaseEncoder):
         if not self.can_decode:
             raise InputError(f"{self.name} has no decoder: it can't reconstruct observations")
         values, parts = self._prepare(latent, self.latent_size, "latents")
-        return run(parts.decoder, values) * parts.half_width + parts.centre
+        coded = self.latent_size - len(self.kept)
+        scaled = run(parts.decoder, values[..., :coded])
+        if self.keep:
+            scaled[..., self.kept] = values[..., coded:]
+        return parts.scaler.unscale(scaled)
 
     def scale(self, observation: Float32) -> Float32:
-        """Scale observations (..., d) by the extrema of its training data."""
-        return self.scaler.scale(observation)
+        """Scale observations (..., d) linearly, as its training data were."""
+        return (observation - self.scaler.centre) / self.scaler.half_width
 
     def _prepare(self, values: Any, size: int, what: str) -> tuple[Any, _Parts]:
         """Values as float32, and this encoder's arrays on the device that they are on."""
@@ -296,13 +330,9 @@ class Encoder(BaseEncoder):
             def move_all(layers: tuple[Layer, ...]) -> tuple[Layer, ...]:
                 return tuple(Layer(move(w), move(b), activation) for w, b, activation in layers)
 
-            parts = self._on[None]
-            self._on[device] = _Parts(
-                move(parts.centre),
-                move(parts.half_width),
-                move_all(parts.encoder),
-                move_all(parts.decoder),
-            )
+            scaler, encoder, decoder = self._on[None]
+            moved = replace(scaler, low=move(scaler.low), high=move(scaler.high))
+            self._on[device] = _Parts(moved, move_all(encoder), move_all(decoder))
         return self._on[device]
 
     def check_task(self, task: Task) -> None:
@@ -314,3 +344,19 @@ class Encoder(BaseEncoder):
             InputError: it was made for another environment or other features.
         """
         check_same(task, self.task, self.name)
+
+
+def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...]) -> None:
+    """Make sure that a tensor is of that shape, of float32, and finite.
+
+    Raises:
+        InputError: it isn't.
+    """
+    if tensor.shape != shape:
+        raise InputError(f"tensor {name} has shape {tensor.shape}, expected {shape}")
+    if tensor.dtype != np.float32:
+        raise InputError(f"tensor {name} has type {tensor.dtype}, expected float32")
+    if not (np.abs(tensor) < MAX_MAGNITUDE).all():
+        raise InputError(
+            f"tensor {name} holds a number that is not finite or not below {MAX_MAGNITUDE:g}"
+        )

@@ -20,7 +20,7 @@ SUFFIX = ".safetensors"
 HELD_OUT_MSE = "held_out_mse"  # the metric that every encoder has, unless it was trained elsewhere
 _TEXTS = ("kind", "name", "task")
 _RECORDS = ("training", "data", "metrics", "versions")
-_RESERVED = ("format", "format_version", "encoder", "decoder", "sha256")
+_RESERVED = ("format", "format_version", "encoder", "decoder", "angles", "clip", "keep", "sha256")
 
 
 def save(encoder: Encoder, path: Path) -> None:
@@ -88,19 +88,25 @@ def _encoder(header: dict[str, Any], tensors: Tensors) -> Encoder:
     _check(header)
     parts = {}
     for part in ("encoder", "decoder"):
-        names = [(f"{part}.{i}.weight", f"{part}.{i}.bias") for i in range(len(header[part]))]
+        tensor_names = [
+            (f"{part}.{i}.weight", f"{part}.{i}.bias") for i in range(len(header[part]))
+        ]
         parts[part] = [
             Layer(_take(tensors, weight), _take(tensors, bias), activation)
-            for (weight, bias), activation in zip(names, header.pop(part), strict=True)
+            for (weight, bias), activation in zip(tensor_names, header.pop(part), strict=True)
         ]
-    scaler = Scaler(_take(tensors, "low"), _take(tensors, "high"))
+    names = {name: header.pop(name, []) for name in ("angles", "keep")}
+    places = tuple(_place(header["features"], name) for name in names["angles"])
+    clip = header.pop("clip", None)
+    scaler = Scaler(_take(tensors, "low"), _take(tensors, "high"), places, clip)
     if tensors:
         raise InputError(f"unexpected tensor {min(tensors)}")
     expected = (len(header["features"]),)
     if scaler.low.shape != expected:
         raise InputError(f"tensor low has shape {scaler.low.shape}, expected {expected}")
     del header["format"], header["format_version"]
-    encoder = Encoder(header, scaler, tuple(parts["encoder"]), tuple(parts["decoder"]))
+    layers = tuple(parts["encoder"]), tuple(parts["decoder"])
+    encoder = Encoder(header, scaler, *layers, tuple(names["keep"]))
     encoder.task  # noqa: B018  checked before it is needed
     return encoder
 
@@ -118,10 +124,18 @@ def _check(header: dict[str, Any]) -> None:
     if not isinstance(header["metrics"].get(HELD_OUT_MSE, absent), float):
         raise InputError(f"the header's metrics have no {HELD_OUT_MSE}, or not as a float")
     for name in ("features", "encoder", "decoder"):
-        if not all(isinstance(word, str) for word in header[name]):
-            raise InputError(f"the header's {name} must be strings")
+        _check_words(name, header[name])
+    for name in ("angles", "keep"):
+        _check_words(name, header.get(name, []))
+    if type(header.get("clip", 0)) not in (int, float):
+        raise InputError("the header's clip must be a number")
     if not all(map(math.isfinite, _floats(header))):
         raise InputError("the header holds a number that is not finite")
+
+
+def _check_words(name: str, words: Any) -> None:
+    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+        raise InputError(f"the header's {name} must be strings")
 
 
 def _floats(value: Any) -> Iterator[float]:
@@ -131,6 +145,12 @@ def _floats(value: Any) -> Iterator[float]:
     elif isinstance(value, Mapping | list):
         for item in value.values() if isinstance(value, Mapping) else value:
             yield from _floats(item)
+
+
+def _place(features: list[str], name: str) -> int:
+    if name not in features:
+        raise InputError(f"the header's angle {name} is no feature")
+    return features.index(name)
 
 
 def _take(tensors: Tensors, name: str) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jbrep.encoders.activations import ACTIVATIONS, LAYER_NORM
+from jbrep.encoders.activations import ACTIVATIONS, WHOLE
 from jbrep.encoders.chain import Array, Chain
 from jbrep.encoders.encoder import Layer
 from jbrep.errors import InputError
@@ -247,7 +247,7 @@ def _recognise(results: Array, chain: Chain) -> bool:
     if results.shape != _PROBES.shape or not np.isfinite(results).all():
         return False
     for name in ACTIVATIONS:
-        if name == LAYER_NORM:
+        if name in WHOLE:
             continue
         values = ACTIVATIONS[name](_PROBES)
         factor = _plain((results[-1] - results[0]) / (values[-1] - values[0]))

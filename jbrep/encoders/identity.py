@@ -3,9 +3,10 @@
 import numpy as np
 
 from jbrep.dataset import Scaler
-from jbrep.encoders.encoder import IDENTITY, MAX_MAGNITUDE, Encoder
+from jbrep.dataset.scaling import usual_range
+from jbrep.encoders.encoder import IDENTITY, Encoder
 from jbrep.encoders.file import HELD_OUT_MSE
-from jbrep.envs.task import Feature, Task
+from jbrep.envs.task import Task
 
 SCALINGS = {  # by the word for it in the header
     "ranges": "scaled by the usual ranges",
@@ -19,7 +20,7 @@ def identity(task: Task) -> Encoder:
 
     The usual range of a feature becomes [-1, 1]; a feature without one keeps its physical units.
     """
-    ranges = [_range(feature) for feature in task.features]
+    ranges = [usual_range(feature) for feature in task.features]
     known = sum(each is not None for each in ranges)
     low, high = np.array([each or (-1, 1) for each in ranges], np.float32).T
     header = {
@@ -36,11 +37,3 @@ def identity(task: Task) -> Encoder:
         "versions": {},
     }
     return Encoder(header, Scaler(low, high), (), ())
-
-
-def _range(feature: Feature) -> tuple[float, float] | None:
-    """The usual range, unless it is too wide for scaling to leave anything."""
-    if feature.low is None or feature.high is None:
-        return None
-    low, high = np.float32(feature.low), np.float32(feature.high)
-    return (feature.low, feature.high) if -MAX_MAGNITUDE < low < high < MAX_MAGNITUDE else None

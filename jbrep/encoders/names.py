@@ -1,40 +1,37 @@
-"""Names of encoders: kind, architecture, latent size, such as dae-8, dae-deep-8, dae-64x64-8."""
+"""Names of encoders: method, variant, latent size and seed, such as dae-8, dae-deep-8, pca-8-s2."""
 
 import re
 from typing import NamedTuple
 
 from jbrep.errors import InputError
 
-USUAL_ARCHITECTURE = "paper"  # left out of a name
+_NAME = re.compile(r"(?P<stem>.+?)(-(?P<latent>[0-9]{1,9}))?(-s(?P<seed>[0-9]{1,9}))?", re.ASCII)
 
 
 class EncoderName(NamedTuple):
     """What a name says; `str` makes the name."""
 
-    kind: str
-    architecture: str = USUAL_ARCHITECTURE
+    stem: str  # the method, with what is unusual about it
     latent: int | None = None
+    seed: int | None = None  # of one of several trainings
 
     @classmethod
     def parse(cls, name: str) -> "EncoderName":
-        """The parts of any name; without a latent size at its end, all of it is the kind."""
-        words, _, latent = name.rpartition("-")
-        if not (words and latent.isascii() and latent.isdecimal() and len(latent) < 10):
+        """The parts of any name."""
+        match = _NAME.fullmatch(name)
+        if not match:
             return cls(name)
-        kind, _, architecture = words.partition("-")
-        architecture = architecture.replace(",", "x")  # sizes, as a command line takes them
-        return cls(kind, architecture or USUAL_ARCHITECTURE, int(latent))
+        latent, seed = (int(match[part]) if match[part] else None for part in ("latent", "seed"))
+        return cls(match["stem"], latent, seed)
 
     @property
-    def order(self) -> tuple[str, str, int]:
-        """Sorts names by kind, then by architecture, the largest latent first."""
-        usual = self.architecture == USUAL_ARCHITECTURE
-        return self.kind, "" if usual else self.architecture, -(self.latent or 0)
+    def order(self) -> tuple[str, int, int]:
+        """Sorts names by stem, the largest latent first, then by seed."""
+        return self.stem, -(self.latent or 0), self.seed or 0
 
     def __str__(self) -> str:
-        usual = self.architecture == USUAL_ARCHITECTURE
-        words = (self.kind, "" if usual else self.architecture, str(self.latent or ""))
-        return "-".join(word for word in words if word)
+        latent = "" if self.latent is None else f"-{self.latent}"
+        return f"{self.stem}{latent}" + ("" if self.seed is None else f"-s{self.seed}")
 
 
 def check_name(name: str) -> None:

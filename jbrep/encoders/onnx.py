@@ -24,6 +24,7 @@ _OPERATORS: dict[str, tuple[str, dict[str, Any]]] = {
     "gelu-tanh": ("Gelu", {"approximate": "tanh"}),
     "elu": ("Elu", {"alpha": 1.0}),
     "softplus": ("Softplus", {}),
+    "sin": ("Sin", {}),
 }
 
 

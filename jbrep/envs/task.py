@@ -41,6 +41,13 @@ class Feature:
     def __str__(self) -> str:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
+    @property
+    def is_angle(self) -> bool:
+        """Whether it jumps from one end of its range to the other, a full turn apart."""
+        if self.unit != "rad" or not self.bounded or self.low is None or self.high is None:
+            return False
+        return math.isclose(self.high - self.low, 2 * math.pi, rel_tol=0.01)
+
 
 @dataclass(frozen=True)
 class Task:

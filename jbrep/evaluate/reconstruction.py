@@ -12,7 +12,9 @@ from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.evaluate.held_out import HeldOut, Rows
-from jbrep.methods.controls import Layers, linear_denoiser, pca
+from jbrep.methods.held_out import lost
+from jbrep.methods.linear import linear_denoiser, principal_code
+from jbrep.methods.method import Layers
 from jbrep.stats.bootstrap import Array, bootstrap, by_episode, r_squared, variation
 
 NOISES = (0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # of features scaled to [-1, 1]
@@ -98,8 +100,7 @@ def _errors(
     random = np.random.default_rng(0)
     for observation in data.observations(rows):
         drawn = random.standard_normal(observation.shape, np.float32) if noise else 0
-        back = encoder.decode(encoder.encode(observation + noise * drawn * width))
-        yield np.square((back - observation) / width)
+        yield np.square(lost(encoder, observation, data, observation + noise * drawn * width))
 
 
 @lru_cache(1024)  # since encoders of one size share it
@@ -114,7 +115,7 @@ def _best_linear(held_out: HeldOut, latent: int, noise: float) -> Array:
 def _pca(held_out: HeldOut, latent: int) -> Array:
     """The sums over each group of PCA's errors, (groups, 1)."""
     data = held_out.data
-    return _losses(_linear(data, pca(data, latent)), held_out, data.test).means
+    return _losses(_linear(data, principal_code(data, latent)), held_out, data.test).means
 
 
 def _linear(data: ScaledDataset, layers: tuple[Layers, Layers]) -> Encoder:

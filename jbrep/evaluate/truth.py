@@ -1,19 +1,17 @@
 """The ground truth of a robot, computed from its observations: what a latent is searched for."""
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jbrep.envs.task import Feature, Task
+from jbrep.envs.task import Task
 from jbrep.jitterbug.tasks import TASKS
 
 Array = NDArray[np.float64]
 Columns = dict[str, Array]
 
-_TURN = 2 * math.pi  # [rad]
 _ROTATION = ("orientation_w", "orientation_x", "orientation_y", "orientation_z")
 
 
@@ -56,18 +54,9 @@ def _truth(task: Task) -> _Truth:
     """A task's own ground truth, or every feature."""
     if task.name in _TRUTHS:
         return _TRUTHS[task.name]
-    angles = frozenset(f.name for f in task.features if _is_angle(f))
+    angles = frozenset(f.name for f in task.features if f.is_angle)
     everything = frozenset(f.name for f in task.features)
     return _Truth(lambda features: _every(features, angles), everything)
-
-
-def _is_angle(feature: Feature) -> bool:
-    """Whether a feature jumps from one end of its range to the other."""
-    if feature.unit != "rad" or not feature.bounded:
-        return False
-    if feature.low is None or feature.high is None:
-        return False
-    return math.isclose(feature.high - feature.low, _TURN, rel_tol=0.01)
 
 
 def _features(task: Task, observation: ArrayLike) -> Columns:

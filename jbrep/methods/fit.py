@@ -1,77 +1,39 @@
-"""Making encoders of every kind from a data set, each in its file."""
+"""Making encoders by every method from a data set, each in its file."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torch import Tensor
+import torch
 from torch.utils.tensorboard import SummaryWriter
 
-from jbrep.dae import checkpoint
-from jbrep.dae.network import Autoencoder, check_size, get_architecture, layers
-from jbrep.dae.training import (
-    Epoch,
-    Rows,
-    Trainer,
-    Training,
-    default_batch_size,
-    get_device,
-)
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import FULL, Encoder, load, save
-from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import HELD_OUT_MSE, SUFFIX
-from jbrep.encoders.names import EncoderName
-from jbrep.errors import InputError, choose, differences
+from jbrep.errors import InputError, differences
 from jbrep.files.commit import commits
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import exists, make_folder
-from jbrep.methods.controls import Layers, pca, random_projection
 from jbrep.methods.held_out import held_out_error
-from jbrep.methods.rows import training_rows, watched_rows
+from jbrep.methods.method import ClosedForm, Learned, Made, Method
+from jbrep.methods.registry import get_method, name_of
+from jbrep.methods.settings import CODED, SCALED
+from jbrep.methods.shape import complete
 from jbrep.progress import Progress
+from jbrep.training import checkpoint
+from jbrep.training.objective import Objective
+from jbrep.training.trainer import (
+    Epoch,
+    Schedule,
+    Trainer,
+    default_batch_size,
+    get_device,
+)
+from jbrep.training.windows import Windows, count_windows, watched_windows
 
-_TRAINED = ("latent", "architecture", "epochs", "batch_size", "learning_rate", "seed")
-
-
-def _identity(data: ScaledDataset) -> tuple[Layers, Layers]:
-    return (), ()
-
-
-def _untrained(
-    data: ScaledDataset, latent: int, architecture: str, seed: int
-) -> tuple[Layers, Layers]:
-    network = Autoencoder(get_architecture(architecture), data.task.size, latent, seed)
-    return layers(network.encoder), layers(network.decoder)
-
-
-class Kind(NamedTuple):
-    """A kind of encoder: the settings of a Training that it takes, and how it is made."""
-
-    settings: tuple[str, ...]
-    make: Callable[..., tuple[Layers, Layers]] | None  # from data and settings; None: by training
-
-
-KINDS = {
-    IDENTITY: Kind((), _identity),
-    "pca": Kind(("latent",), pca),
-    "random": Kind(("latent", "seed"), random_projection),
-    "untrained": Kind(("latent", "architecture", "seed"), _untrained),
-    "ae": Kind(_TRAINED, None),
-    "dae": Kind((*_TRAINED, "noise"), None),
-}
-
-
-def get_kind(name: str) -> Kind:
-    """The kind of encoder of that name.
-
-    Raises:
-        InputError: the name is unknown; the message lists the kinds.
-    """
-    return choose(name, KINDS, "kind")
+_USUAL = {**SCALED, **CODED}  # not in a header unless they are set otherwise
 
 
 class Fitted(NamedTuple):
@@ -80,6 +42,33 @@ class Fitted(NamedTuple):
     encoder: Encoder
     path: Path
     is_new: bool  # False if the file was complete already
+
+
+class Plan(NamedTuple):
+    """An encoder that can be made: its settings have been checked."""
+
+    method: Method
+    settings: dict[str, Any]
+    data: ScaledDataset  # scaled as the settings say
+    header: dict[str, Any]  # without metrics
+    path: Path
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the file holds this encoder, trained to the end; False if there is no file.
+
+        Raises:
+            InputError: the file was made with other settings or from other data.
+        """
+        if not exists(self.path):
+            return False
+        there, wanted = load(self.path).header, self.header
+        if differing := differences(_origin(there), _origin(wanted)):
+            raise InputError(
+                f"{self.path} was made with other settings: {differing}; choose another folder or "
+                "another name, or delete it"
+            )
+        return there["metrics"].get("epochs") == self.settings.get("epochs")
 
 
 class Fitter:
@@ -107,83 +96,91 @@ class Fitter:
         self._folder = folder
         self._device = get_device(device)
         self._memory = memory
+        self._scaled: dict[Any, ScaledDataset] = {}
+        self._windows: dict[Any, tuple[Windows, Windows]] = {}
 
-    def fit(self, kind: str, training: Training) -> Fitted:
+    def fit(self, kind: str, *, name: str | None = None, **settings: Any) -> Fitted:
         """Make an encoder, unless its file is complete already.
 
         An interrupted training leaves its best parameters so far in the file, and its checkpoint,
         from which the same call resumes.
 
+        Args:
+            kind: a key of METHODS.
+            name: of the encoder; made from the method and its settings if not given.
+            settings: of the method, as text or values.
+
         Raises:
-            InputError: as `check`, or the files can't be written.
+            InputError: as `plan`, or the files can't be written.
         """
-        header, path = self._plan(kind, training)
-        complete = _is_complete(path, header)
-        if not complete:
+        plan = self.plan(kind, name=name, **settings)
+        is_complete = plan.is_complete
+        if not is_complete:
             make_folder(self._folder)
-            if make := KINDS[kind].make:
-                self._save(header, make(self._data, **header["training"]), path, {})
-            else:
-                complete = self._train_alone(header, training, path)
-        return Fitted(load(path), path, not complete)
+            match plan.method:
+                case ClosedForm(make=make):
+                    self._save(plan, make(plan.data, plan.settings))
+                case Learned(objective=objective):
+                    is_complete = self._train_alone(plan, objective(plan.data, plan.settings))
+        return Fitted(load(plan.path), plan.path, not is_complete)
 
-    def check(self, kind: str, training: Training) -> bool:
-        """Make sure that an encoder can be made, and say whether its file is complete already.
+    def plan(self, kind: str, *, name: str | None = None, **settings: Any) -> Plan:
+        """What `fit` would make.
 
         Raises:
-            InputError: an unknown kind, a latent size out of range, or a file that was made with
-                other settings or from other data.
+            InputError: an unknown kind; a setting that it doesn't take, that is out of range or
+                can't be used with the data; or a file that was made with other settings or from
+                other data.
         """
-        header, path = self._plan(kind, training)
-        return _is_complete(path, header)
-
-    def _plan(self, kind: str, training: Training) -> tuple[dict[str, Any], Path]:
-        """The header and the file of an encoder, once its settings have been checked."""
-        settings = {name: getattr(training, name) for name in get_kind(kind).settings}
-        if "batch_size" in settings:
-            settings["batch_size"] = training.batch_size or default_batch_size(
-                len(self._data.train)
+        method = get_method(kind)
+        used = method.settings(settings)
+        name = name or name_of(method, used)
+        data = self._scaled_data(method, used)
+        method.check(data, used)
+        if "batch_size" in used:
+            used["batch_size"] = used["batch_size"] or default_batch_size(
+                count_windows(data, method.objective(data, used).horizon)
+                if isinstance(method, Learned)
+                else 0
             )
-        _check(kind, settings, self._data)
-        header = self._header(kind, settings)
-        return header, self._folder / f"{header['name']}{SUFFIX}"
+        plan = Plan(
+            method,
+            used,
+            data,
+            _header(method, name, used, data),
+            self._folder / f"{name}{SUFFIX}",
+        )
+        plan.is_complete  # noqa: B018  may find another encoder there
+        return plan
 
-    def _header(self, kind: str, settings: dict[str, Any]) -> dict[str, Any]:
-        """The header of an encoder, without its metrics."""
-        manifest = self._data.dataset.manifest
-        parts = {name: settings[name] for name in ("architecture", "latent") if name in settings}
-        return {
-            "kind": kind,
-            "name": str(EncoderName(kind, **parts)),
-            "task": self._data.task.name,
-            "environment": self._data.task.as_json(),
-            "features": list(self._data.task.feature_names),
-            "training": settings,
-            "data": {
-                "fingerprint": manifest.fingerprint,
-                "policy": dict(manifest.settings.policy),
-                "seed": manifest.settings.seed,
-                "train_rows": len(self._data.train),
-                "test_rows": len(self._data.test),
-            },
-            "versions": {name: version(name) for name in ("jbrep", "numpy", "torch")},
-            "commits": dict(commits()),
-        }
+    def _scaled_data(self, method: Method, settings: Mapping[str, Any]) -> ScaledDataset:
+        """The data as a method sees them."""
+        keep = settings.get("keep", ())
+        key = settings["scaling"], settings["angles"], settings["clip"], keep
+        if key not in self._scaled:
+            usual = {**SCALED, "keep": ()}
+            same = dict(zip(usual, key, strict=True)) == usual
+            self._scaled[key] = self._data if same else self._data.rescaled(*key)
+        data = self._scaled[key]
+        _check(method, settings, data)
+        return data
 
-    def _train_alone(self, header: dict[str, Any], training: Training, path: Path) -> bool:
+    def _train_alone(self, plan: Plan, objective: Objective) -> bool:
         """Train while no other process does, unless one has finished it; whether one has."""
-        work = path.with_suffix(".training")
+        work = plan.path.with_suffix(".training")
         make_folder(work)
         with exclusive(work):
-            complete = _is_complete(path, header)
-            if not complete:
-                settings = {"noise": 0, **header["training"]}
-                self._train(header, replace(training, **settings), path, work)
-        return complete
+            is_complete = plan.is_complete
+            if not is_complete:
+                self._train(plan, objective.to(self._device), work)
+        return is_complete
 
-    def _train(self, header: dict[str, Any], training: Training, path: Path, work: Path) -> None:
+    def _train(self, plan: Plan, objective: Objective, work: Path) -> None:
         """Train from the checkpoint, if there is one, or from the start."""
-        trainer = Trainer(training, *self._rows)
+        header = plan.header
+        windows, watched = self._windows_of(plan.data, objective.horizon)
+        schedule = Schedule(**{name: plan.settings[name] for name in Schedule.__dataclass_fields__})
+        trainer = Trainer(objective, schedule, windows, watched)
         versions = {"device": self._device.type, "torch": header["versions"]["torch"]}
         identity = {**_origin(header), **versions}
         saved = work / "checkpoint.safetensors"
@@ -197,92 +194,109 @@ class Fitter:
                         scalars.add_scalar(name, value, len(trainer.history))
         finally:
             if trainer.history:
-                self._save_best(header, trainer, path)
+                self._save_best(plan, trainer, watched)
         saved.unlink()
 
-    def _save_best(self, header: dict[str, Any], trainer: Trainer, path: Path) -> None:
-        trainer.network.load_state_dict(trainer.best)
-        parts = layers(trainer.network.encoder), layers(trainer.network.decoder)
+    def _windows_of(self, data: ScaledDataset, horizon: int) -> tuple[Windows, Windows]:
+        """Windows to train on, and to watch the loss on; those of the last encoder, if they fit."""
+        key = id(data), horizon
+        if key not in self._windows:
+            train = Windows(data, data.train, horizon, self._device, self._memory)
+            self._windows = {key: (train, watched_windows(data, horizon, self._device))}
+        return self._windows[key]
+
+    def _save_best(self, plan: Plan, trainer: Trainer, watched: Windows) -> None:
+        objective = trainer.objective
+        objective.load_state_dict(trainer.best)
         best = trainer.best_epoch
         metrics = {
             "epochs": len(trainer.history),
             "best_epoch": best,
             "train_loss": trainer.history[best - 1].train_loss,
+            "test_loss": trainer.history[best - 1].test_loss,
         }
-        self._save(header, parts, path, metrics)
+        objective.eval()
+        with torch.no_grad():
+            metrics |= objective.report(watched)
+            self._save(plan, Made(*objective.layers(), metrics))
 
-    def _save(
-        self, header: dict[str, Any], parts: tuple[Layers, Layers], path: Path, metrics: Any
-    ) -> None:
+    def _save(self, plan: Plan, made: Made) -> None:
         """Write the file, with the error on all held-out rows among its metrics."""
-        encoder = Encoder(header, self._data.scaler, *parts)
-        error = held_out_error(encoder, self._data)
-        save(replace(encoder, header={**header, "metrics": {**metrics, HELD_OUT_MSE: error}}), path)
-
-    @cached_property
-    def _rows(self) -> tuple[Rows, Tensor]:
-        """Training rows, and a sample of the held-out ones, on the device."""
-        train = training_rows(self._data, self._device, self._memory)
-        return train, watched_rows(self._data, self._device)
+        data, settings = plan.data, plan.settings
+        parts, keep = complete(made, data, settings)
+        encoder = Encoder(plan.header, data.scaler, *parts, keep)
+        metrics = {**made.metrics, HELD_OUT_MSE: held_out_error(encoder, self._data)}
+        save(replace(encoder, header={**plan.header, "metrics": metrics}), plan.path)
 
 
-def _check(kind: str, settings: Mapping[str, Any], data: ScaledDataset) -> None:
-    """Make sure that an encoder of that kind, with those settings, can be made from the data.
+def _header(
+    method: Method, name: str, settings: Mapping[str, Any], data: ScaledDataset
+) -> dict[str, Any]:
+    """The header of an encoder, without its metrics."""
+    manifest = data.dataset.manifest
+    shown = {key: value for key, value in settings.items() if value != _USUAL.get(key, value)}
+    own = {key: settings[key] for key in method.own}
+    return {
+        "kind": method.name,
+        "name": name,
+        "task": data.task.name,
+        "environment": data.task.as_json(),
+        "features": list(data.task.feature_names),
+        "training": _plain({**own, **shown}),
+        "data": {
+            "fingerprint": manifest.fingerprint,
+            "policy": dict(manifest.settings.policy),
+            "seed": manifest.settings.seed,
+            "train_rows": len(data.train),
+            "test_rows": len(data.test),
+        },
+        "versions": {each: version(each) for each in ("jbrep", "numpy", "torch")},
+        "commits": dict(commits()),
+    }
+
+
+def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as plain JSON."""
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in settings.items()}
+
+
+def _check(method: Method, settings: Mapping[str, Any], data: ScaledDataset) -> None:
+    """Make sure that an encoder of that kind and size can be made from the data.
 
     Raises:
         InputError: it can't.
     """
-    size = data.task.size
+    size = data.size
     try:
-        Encoder({"name": kind}, data.scaler, (), ())
+        Encoder({"name": method.name, "features": []}, data.scaler, (), ())
     except InputError as error:
         raise InputError(
             f"the observations in {data.dataset.folder} are too large to be encoded: {error}"
         ) from None
-    if "latent" in settings:
-        latent = settings["latent"]
-        if size == 1:
-            raise InputError(
-                f"{data.task.name} has one feature, which can't be reduced: use {FULL}"
-            )
-        if latent is None:
-            raise InputError(f"{kind} needs a latent size, from 1 to {size - 1}")
-        if not 1 <= latent < size:
-            raise InputError(
-                f"latent size is {latent}: with {size} features it must be from 1 to {size - 1}"
-            )
-        if "architecture" in settings:
-            check_size(get_architecture(settings["architecture"]), size, latent)
-    if settings.get("noise") == 0:
-        raise InputError(f"{kind} without noise is a plain autoencoder: use the kind ae")
-
-
-def _is_complete(path: Path, header: Mapping[str, Any]) -> bool:
-    """Whether the file holds that encoder, trained to the end; False if there is no file.
-
-    Raises:
-        InputError: the file was made with other settings or from other data.
-    """
-    if not exists(path):
-        return False
-    there, wanted = load(path).header, _origin(header)
-    if differing := differences(_origin(there), wanted):
+    if "latent" not in settings or not method.reduces:
+        return
+    latent = settings["latent"]
+    if size <= 1:
         raise InputError(
-            f"{path} was trained with other settings: {differing}; choose another folder, or "
-            "delete it"
+            f"{data.task.name} has {size or 'no'} feature to reduce, which can't be: use {FULL}"
         )
-    return there["metrics"].get("epochs") == wanted.get("epochs")
+    if latent >= size:
+        raise InputError(
+            f"latent size is {latent}: with {size} features it must be from 1 to {size - 1}"
+        )
 
 
 def _origin(header: Mapping[str, Any]) -> dict[str, Any]:
     """What must be equal for two encoders of one name to be the same."""
+    method = get_method(header["kind"])
     data = header["data"].get("fingerprint")
-    return {**header["training"], "kind": header["kind"], "task": header["task"], "data": data}
+    training = {**_plain(method.defaults), **header["training"]}
+    return {**training, "kind": header["kind"], "task": header["task"], "data": data}
 
 
 def _with_progress(trainer: Trainer, name: str) -> Iterator[Epoch]:
     """The epochs still to train, with a progress bar."""
-    total, done = trainer.training.epochs, len(trainer.history)
+    total, done = trainer.schedule.epochs, len(trainer.history)
     with Progress(total=total, initial=done, desc=name, unit="epoch") as progress:
         for epoch in trainer.epochs():
             progress.set_postfix(train=f"{epoch.train_loss:.5f}", test=f"{epoch.test_loss:.5f}")

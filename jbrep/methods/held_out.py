@@ -1,11 +1,16 @@
 """How well encoders reconstruct held-out rows, and how they compare with PCA."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import Encoder
 from jbrep.encoders.file import HELD_OUT_MSE
-from jbrep.methods.controls import pca
+from jbrep.envs.encoding import BaseEncoder
+from jbrep.methods.linear import principal_code
 
 
 def held_out_error(encoder: Encoder, data: ScaledDataset) -> float:
@@ -15,9 +20,29 @@ def held_out_error(encoder: Encoder, data: ScaledDataset) -> float:
     """
     total = 0.0
     for rows in data.observations(data.test):
-        error = (encoder.decode(encoder.encode(rows)) - rows) / data.scaler.half_width
+        error = lost(encoder, rows, data)
         total += float(np.square(error, dtype=np.float64).sum())
     return float(f"{total / (len(data.test) * data.task.size):.6g}")
+
+
+def lost(
+    encoder: BaseEncoder, rows: NDArray[np.float32], data: ScaledDataset, given: Any = None
+) -> NDArray[np.float32]:
+    """What a reconstruction of rows (n, d) lacks, in half widths of the features in the data.
+
+    An encoder that takes angles as sine and cosine is judged round the circle.
+
+    Args:
+        encoder: that can decode.
+        rows: in physical units.
+        data: whose scaling counts.
+        given: rows that are encoded in their place, such as corrupted ones.
+    """
+    scaler = data.scaler
+    if isinstance(encoder, Encoder):
+        scaler = replace(scaler, angles=encoder.scaler.angles)
+    back = encoder.decode(encoder.encode(rows if given is None else given))
+    return scaler.error(back, rows)
 
 
 def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
@@ -36,6 +61,8 @@ def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
 
 def _pca_error(data: ScaledDataset, latent: int) -> float:
     """PCA's held-out error with that many components; 0 with as many as there are features."""
-    if latent == data.task.size:
+    if latent >= data.task.size:
         return 0.0
-    return held_out_error(Encoder({"name": "pca"}, data.scaler, *pca(data, latent)), data)
+    return held_out_error(
+        Encoder({"name": "pca"}, data.scaler, *principal_code(data, latent)), data
+    )

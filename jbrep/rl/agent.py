@@ -15,8 +15,6 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.distributions import Distribution
 
-from jbrep.dae.adam import allocate_adam_state
-from jbrep.dae.training import single_torch_thread
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import Actor, episode_returns
@@ -26,6 +24,8 @@ from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rl.normalization import Statistics, normalized
 from jbrep.rl.presets import ALGORITHMS, Hidden, Preset
 from jbrep.rl.values import linear_from
+from jbrep.training.adam import allocate_adam_state
+from jbrep.training.trainer import single_torch_thread
 
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     "relu": torch.nn.ReLU,

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from jbrep.dae.training import single_torch_thread
 from jbrep.dataset.policy import MAX_LETTERS, TRAINED
 from jbrep.envs.recording import Actor
 from jbrep.envs.sb3 import agent_spaces
@@ -23,6 +22,7 @@ from jbrep.rl.files import ENCODER, is_policy_file
 from jbrep.rl.policy import Trained, load_run
 from jbrep.rl.policy_weights import pack, unpack
 from jbrep.rl.weights import read_file
+from jbrep.training.trainer import single_torch_thread
 
 
 @dataclass(frozen=True)

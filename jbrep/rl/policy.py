@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
-from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import find, load
 from jbrep.encoders.code import make
 from jbrep.encoders.own import as_file
@@ -37,6 +36,7 @@ from jbrep.rl.normalization import Statistics
 from jbrep.rl.presets import ALGORITHMS, Preset
 from jbrep.rl.settings import check_shape, shaping
 from jbrep.rl.weights import fill, one_line, read_file, read_policy
+from jbrep.training.trainer import single_torch_thread
 
 _WEIGHTS = f"{PARAMETERS}policy."
 

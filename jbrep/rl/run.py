@@ -13,7 +13,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 
-from jbrep.dae.training import single_torch_thread
 from jbrep.encoders import FULL, Encoder, find, save
 from jbrep.encoders.code import is_code
 from jbrep.encoders.own import as_file
@@ -52,6 +51,7 @@ from jbrep.rl.policy_file import policy_zip
 from jbrep.rl.presets import Preset
 from jbrep.rl.recorder import DivergedError, History, Recorder, Scalars, Watch
 from jbrep.rl.settings import used_settings
+from jbrep.training.trainer import single_torch_thread
 
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 _LIMITS = {

@@ -6,10 +6,10 @@ from typing import Any
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from jbrep.dae.training import single_torch_thread
 from jbrep.rl.agent import Evaluator, make_agent, make_env
 from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.run import Run
+from jbrep.training.trainer import single_torch_thread
 
 _MIN_STEPS = 300
 

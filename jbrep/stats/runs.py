@@ -201,7 +201,7 @@ def _ordered(group: Group, key: tuple[str, str], baseline: str) -> Group:
 def in_order(names: Iterable[str], baseline: str) -> list[str]:
     """Representations as tables and figures order them: the baseline first, dae-12 before dae-8."""
 
-    def key(name: str) -> tuple[bool, tuple[str, str, int], str]:
+    def key(name: str) -> tuple[bool, tuple[str, int, int], str]:
         return name != baseline, EncoderName.parse(name).order, name
 
     return sorted(set(names), key=key)

@@ -39,7 +39,7 @@ def check(plan: Plan) -> None:
         for representation in _by_name(plan):
             if data is None:
                 _check_shipped(representation, task)
-            elif (representation.training.latent or 0) >= task.size:
+            elif representation.training.get("latent", 0) >= task.size:
                 raise InputError(
                     f"{representation.name} doesn't reduce the {task.size} features of "
                     f"{name}: choose a smaller latent size"
@@ -98,7 +98,7 @@ def prepare(plan: Plan) -> None:
         folder = _existing(data, task) if data.folder else _collect(plan, data, task)
         fitter = Fitter(ScaledDataset(Dataset(folder)), plan.encoders(task))
         for representation in _by_name(plan):
-            fitter.fit(representation.kind, representation.training)
+            fitter.fit(representation.kind, name=representation.stem, **representation.training)
 
 
 def _collect(plan: Plan, data: Data, task: str) -> Path:

@@ -7,27 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jbrep.dae.training import Training
 from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
 from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import SUFFIX
-from jbrep.encoders.names import USUAL_ARCHITECTURE, EncoderName
 from jbrep.errors import InputError
-from jbrep.methods.fit import get_kind
+from jbrep.methods.registry import read_name
+from jbrep.methods.settings import read_setting
 from jbrep.text import slug
 
 Given = str | Mapping[str, Any]  # a representation in a study's file: a name or a table
 
 _NAME = re.compile(r"[\w.-]{1,100}", re.ASCII)
+_TRAINING = ("epochs", "batch_size", "learning_rate", "noise", "seed")  # settings of encoders
 _TASK, _SEED = "{task}", "{seed}"  # in a file's path: the task's name as in folders, a run's seed
-_TRAINING: dict[str, tuple[type, ...]] = {  # settings of encoders, with their types
-    "epochs": (int,),
-    "batch_size": (int,),
-    "learning_rate": (float, int),
-    "noise": (float, int),
-    "seed": (int,),
-}
 
 
 @dataclass(frozen=True)
@@ -64,11 +57,11 @@ class ByName(Representation):
 
     Attributes:
         kind: of the encoder.
-        training: of the encoder; only some settings matter to each kind.
+        training: settings of the encoder.
     """
 
     kind: str
-    training: Training
+    training: Mapping[str, Any]
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
         """As for `Representation`."""
@@ -77,7 +70,7 @@ class ByName(Representation):
     @property
     def stem(self) -> str:
         """The name of its encoder."""
-        return self.kind if self.name == FULL else self.name
+        return IDENTITY if self.name == FULL else self.name
 
 
 @dataclass(frozen=True)
@@ -160,27 +153,16 @@ def name_of(given: Given) -> Any:
 
 
 def _by_name(name: str, training: Mapping[str, Any]) -> ByName:
-    if name == FULL:
-        return ByName(name, IDENTITY, _training(None, USUAL_ARCHITECTURE, training))
-    kind, architecture, latent = parts = EncoderName.parse(name)
-    settings = get_kind(kind).settings
-    taken = architecture == USUAL_ARCHITECTURE or "architecture" in settings
-    if latent is None or "latent" not in settings or not taken or str(parts) != name:
-        raise InputError(
-            f"unknown representation {name!r}: it must be {FULL}, or a kind and a latent size, "
-            "such as dae-8, dae-deep-8, pca-8 or random-8"
-        )
-    return ByName(name, kind, _training(latent, architecture, training))
-
-
-def _training(latent: int | None, architecture: str, settings: Mapping[str, Any]) -> Training:
-    if unknown := [name for name in settings if name not in _TRAINING]:
-        raise InputError(f"unknown training.{unknown[0]}: it must be one of {', '.join(_TRAINING)}")
-    for name, value in settings.items():
-        if type(value) not in _TRAINING[name]:
-            kind = _TRAINING[name][0].__name__
-            raise InputError(f"training.{name} is {value!r}: it must be of type {kind}")
-    return Training.of(latent, architecture, **settings)
+    method, given = read_name(name)
+    for key, value in training.items():
+        if key not in _TRAINING:
+            raise InputError(f"unknown training.{key}: it must be one of {', '.join(_TRAINING)}")
+        try:
+            read_setting(key, value)
+        except InputError as error:
+            raise InputError(f"training.{error}") from None
+    taken = {key: value for key, value in training.items() if key in method.defaults}
+    return ByName(name, method.name, {**taken, **given})
 
 
 def _own(given: Mapping[str, Any]) -> Own:

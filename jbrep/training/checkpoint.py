@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from jbrep.dae.training import Epoch, Trainer
 from jbrep.errors import DamageError, InputError, differences
 from jbrep.files import container
+from jbrep.training.trainer import Epoch, Trainer
 
 
 def save(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
@@ -55,9 +55,9 @@ def restore(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
 
 def _state(trainer: Trainer) -> dict[str, Tensor]:
     """Everything that an epoch changes, by name; the tensors are the trainer's own."""
-    named = {f"network.{name}": p for name, p in trainer.network.state_dict().items()}
+    named = {f"network.{name}": p for name, p in trainer.objective.state_dict().items()}
     named |= {f"best.{name}": p for name, p in trainer.best.items()}
-    for name, parameter in trainer.network.named_parameters():
+    for name, parameter in trainer.objective.named_parameters():
         named |= {
             f"adam.{name}.{key}": value for key, value in trainer.optimiser.state[parameter].items()
         }

@@ -1,0 +1,1 @@
+"""Training networks by gradient: windows of steps, batches, epochs, checkpoints."""

@@ -1,0 +1,80 @@
+"""What a network learns."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from jbrep.encoders.encoder import Layer
+from jbrep.training.windows import Windows
+
+Layers = tuple[Layer, ...]
+
+
+class Objective(nn.Module, ABC):
+    """A network with its loss, and how an encoder is taken from it.
+
+    Attributes:
+        horizon: steps that a window reaches ahead.
+        moves: whether the loss is against a target that learns as well, so that losses of different
+            epochs can't be compared: the last epoch is kept then, not the one of least loss.
+    """
+
+    horizon: int = 0
+    moves: bool = False
+
+    def prepare(self, windows: Windows) -> None:
+        """Fit what is constant in training, such as scales of targets, to training windows."""
+
+    @abstractmethod
+    def batch(self, windows: Windows, numbers: Tensor) -> Any:
+        """What the loss is of: those windows, as a tuple of tensors (n, ...)."""
+
+    def draws(
+        self, windows: Windows, numbers: Tensor, size: int, generator: torch.Generator
+    ) -> Iterator[Any]:
+        """Batches of at most `size` windows, in order; runs beside the training, a little ahead.
+
+        Args:
+            windows: to train on.
+            numbers: of the windows.
+            size: of a batch.
+            generator: to draw noise from.
+        """
+        parts = (part.split(size) for part in self.batch(windows, numbers))
+        yield from zip(*parts, strict=True)
+
+    @abstractmethod
+    def loss(self, batch: Any) -> Tensor:
+        """The mean loss of a batch, differentiable; in evaluation without noise."""
+
+    def gradient(self, batch: Any) -> Tensor:
+        """Set every parameter's gradient, and return the mean loss."""
+        for parameter in self.parameters():
+            parameter.grad = None
+        loss = self.loss(batch)
+        loss.backward()
+        return loss.detach()
+
+    def rate(self, progress: float, step: int) -> float:
+        """What the learning rate is multiplied by: by default falling to 0 along a cosine.
+
+        Args:
+            progress: share of the training that is done.
+            step: gradient steps so far.
+        """
+        return (1 + math.cos(math.pi * progress)) / 2
+
+    def after_step(self) -> None:
+        """What follows a step of the optimiser, such as moving a target network."""
+
+    @abstractmethod
+    def layers(self) -> tuple[Layers, Layers | None]:
+        """The layers of encoder and decoder; None where no decoder is learned."""
+
+    def report(self, windows: Windows) -> dict[str, Any]:
+        """What it says of itself on some held-out windows, as plain JSON for the file's header."""
+        return {}

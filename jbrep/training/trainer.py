@@ -1,0 +1,197 @@
+"""Training any objective: batches, epochs, and what an epoch changes."""
+
+import math
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.optim import Adam
+
+from jbrep.errors import InputError
+from jbrep.training.adam import allocate_adam_state
+from jbrep.training.objective import Objective
+from jbrep.training.order import POOL, shuffled
+from jbrep.training.windows import Windows
+
+_MIN_BATCH, _MAX_BATCH = 128, 8192
+_BATCHES = 400  # that an epoch should have
+_DRAWN_AT_ONCE = 4  # batches
+_Item = TypeVar("_Item")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """How long and how fast to train."""
+
+    epochs: int
+    batch_size: int | None = None  # None: `default_batch_size` of the training rows
+    learning_rate: float
+    seed: int = 0  # of order and noise
+
+
+def default_batch_size(rows: int) -> int:
+    """Rows in a batch where the settings leave it open, for that many training rows.
+
+    The largest power of two that leaves at least 400 batches in an epoch, but at least 128 and at
+    most 8192: the paper's size, and what its 4 million training rows get.
+    """
+    largest = 1 << max(1, rows // _BATCHES).bit_length() - 1
+    return min(max(largest, _MIN_BATCH), _MAX_BATCH)
+
+
+class Epoch(NamedTuple):
+    """The losses of an epoch, as its objective defines them."""
+
+    train_loss: float  # mean over the epoch, of parameters as they were then, with noise
+    test_loss: float  # after the epoch, from clean held-out rows
+
+
+def get_device(name: str) -> torch.device:
+    """The device cpu or cuda; auto is a GPU if there is one.
+
+    Raises:
+        InputError: another name, or there is no GPU.
+    """
+    gpu = torch.cuda.is_available()
+    if name == "auto":
+        return torch.device("cuda" if gpu else "cpu")
+    if name not in ("cpu", "cuda") or (name == "cuda" and not gpu):
+        choices = "auto, cpu or cuda" if gpu else "auto or cpu"
+        raise InputError(f"no device {name!r} on this machine: choose {choices}")
+    return torch.device(name)
+
+
+class Trainer:
+    """Trains an objective, an epoch at a time.
+
+    An epoch's order and noise depend on the seed and the epoch's number alone, so that a resumed
+    training gives the same weights as one that was never stopped.
+
+    Args:
+        objective: what to train; on the windows' device.
+        schedule: how long and how fast.
+        windows: to train on.
+        watched: to report the loss on.
+        pool: bytes of rows that are shuffled together; see `jbrep.training.order.shuffled`.
+
+    Attributes:
+        objective: after the last epoch.
+        optimiser: after the last epoch.
+        best: parameters after the epoch with the lowest training loss, or the last one where losses
+            can't be compared; held-out rows have no influence on the choice.
+        history: the epochs so far.
+    """
+
+    def __init__(
+        self,
+        objective: Objective,
+        schedule: Schedule,
+        windows: Windows,
+        watched: Windows,
+        pool: int = POOL,
+    ):
+        self.objective, self.schedule = objective, schedule
+        self._windows = windows
+        self._watched = objective.batch(watched, watched.numbers)
+        self._pool = pool // (windows.size * torch.float32.itemsize)  # rows
+        count = len(windows)
+        self._batch_size = min(schedule.batch_size or default_batch_size(count), count)
+        self._batches_per_epoch = -(-count // self._batch_size)
+        objective.prepare(windows)
+        self.best = _copy(objective)
+        self.optimiser = Adam(objective.parameters(), schedule.learning_rate, fused=True)
+        allocate_adam_state(self.optimiser)
+        self.history: list[Epoch] = []
+
+    @property
+    def best_epoch(self) -> int:
+        """The epoch whose parameters are kept, from 1; 0 before the first."""
+        if self.objective.moves or not self.history:
+            return len(self.history)
+        losses = [epoch.train_loss for epoch in self.history]
+        return losses.index(min(losses)) + 1
+
+    def epochs(self) -> Iterator[Epoch]:
+        """Train to the end, yielding each epoch."""
+        with single_torch_thread():
+            while len(self.history) < self.schedule.epochs:
+                self._epoch()
+                yield self.history[-1]
+
+    def _epoch(self) -> None:
+        number = len(self.history) + 1
+        count = len(self._windows)
+        total = torch.zeros((), device=self._windows.device)
+        self.objective.train()
+        for i, batch in enumerate(self._batches(number)):
+            self.optimiser.param_groups[0]["lr"] = self._learning_rate(number, i)
+            rows = min(self._batch_size, count - i * self._batch_size)
+            total += self.objective.gradient(batch) * rows
+            self.optimiser.step()
+            self.objective.after_step()
+        self._record(number, float(total) / count, self._held_out_loss())
+
+    def _held_out_loss(self) -> float:
+        self.objective.eval()
+        with torch.no_grad():
+            return float(self.objective.loss(self._watched))
+
+    def _record(self, number: int, train_loss: float, test_loss: float) -> None:
+        if not math.isfinite(train_loss) or not math.isfinite(test_loss):
+            raise InputError(
+                f"training diverged in epoch {number}, with losses {train_loss} and {test_loss}: "
+                f"use a learning rate below {self.schedule.learning_rate}, or less noise if there "
+                "is some"
+            )
+        self.history.append(Epoch(train_loss, test_loss))
+        if self.best_epoch == number:
+            self.best = _copy(self.objective)
+
+    def _learning_rate(self, number: int, batch: int) -> float:
+        step = (number - 1) * self._batches_per_epoch + batch
+        progress = step / (self._batches_per_epoch * self.schedule.epochs)
+        return self.schedule.learning_rate * self.objective.rate(progress, step)
+
+    def _batches(self, number: int) -> Iterator[Any]:
+        """Every window once."""
+        for drawn in prefetch(self._draws(number)):
+            yield from drawn
+
+    def _draws(self, number: int) -> Iterator[list[Any]]:
+        """The same, several batches at a time."""
+        words = np.random.SeedSequence((self.schedule.seed, number)).generate_state(1, np.uint64)
+        generator = torch.Generator(self._windows.device).manual_seed(int(words[0]))
+        order = shuffled(len(self._windows), self._pool, generator)
+        for numbers in order.split(_DRAWN_AT_ONCE * self._batch_size):
+            drawn = self.objective.draws(self._windows, numbers, self._batch_size, generator)
+            yield list(drawn)
+
+
+def _copy(objective: Objective) -> dict[str, Tensor]:
+    return {name: p.clone() for name, p in objective.state_dict().items()}
+
+
+def prefetch(items: Iterable[_Item]) -> Iterator[_Item]:
+    """The items in order, each produced in another thread while the one before it is used."""
+    iterator = iter(items)
+    with ThreadPoolExecutor(1) as executor:
+        upcoming = executor.submit(next, iterator, None)
+        while (item := upcoming.result()) is not None:
+            upcoming = executor.submit(next, iterator, None)
+            yield item
+
+
+@contextmanager
+def single_torch_thread() -> Iterator[None]:
+    """Limit torch to one thread: more gain little with small networks and change the last bits."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,141 @@
+"""Windows of consecutive steps, which never cross the end of an episode."""
+
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from jbrep.dataset import ScaledDataset
+from jbrep.dataset.scaled import sample
+from jbrep.errors import InputError
+from jbrep.training.rows import Rows, actions_of, available_memory, rows_of
+
+_WATCHED = 100_000  # held-out windows whose loss is reported after each epoch
+_WATCHED_NUMBERS = 1 << 22  # at most in their rows: 16 MiB
+
+
+class Windows:
+    """Windows of consecutive steps: a row, and some number of rows after it in its episode.
+
+    A window is a number: rows, actions and rewards are looked up when they are asked for, so that
+    windows take no more memory than the rows that they share.
+
+    Args:
+        data: scaled.
+        rows: sorted rows of whole episodes, such as `data.train`.
+        horizon: rows after the first one.
+        device: where what is looked up will be.
+        memory: bytes that rows may take: more are read from disk when they are asked for.
+        most: windows, at most; a sample of them if there are more.
+
+    Attributes:
+        device: as given.
+        starts: the first row of each window, among the rows, (n,); None where all are.
+
+    Raises:
+        InputError: no episode is longer than the horizon.
+    """
+
+    def __init__(
+        self,
+        data: ScaledDataset,
+        rows: NDArray[np.int64],
+        horizon: int = 0,
+        device: torch.device | None = None,
+        memory: int | None = None,
+        most: int | None = None,
+    ):
+        self._data, self._rows = data, rows
+        self.device = device or torch.device("cpu")
+        self._memory = available_memory(self.device) if memory is None else memory
+        starts = first_rows(data, rows, horizon)
+        if not len(starts):
+            raise InputError(
+                f"no episode of {data.dataset.folder} is longer than {horizon} steps: look fewer "
+                "steps ahead"
+            )
+        chosen = starts if most is None else sample(starts, most)
+        every = len(chosen) == len(rows)
+        self.starts = None if every else torch.from_numpy(chosen).to(self.device)
+        self._count = len(chosen)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def size(self) -> int:
+        """Length of a scaled row."""
+        return self._data.size
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action."""
+        return self._data.task.action_size
+
+    @property
+    def numbers(self) -> Tensor:
+        """The numbers of all windows, (n,)."""
+        return torch.arange(len(self), device=self.device)
+
+    def _first(self, numbers: Tensor) -> Tensor:
+        return numbers if self.starts is None else self.starts.index_select(0, numbers)
+
+    def rows(self, numbers: Tensor, ahead: int = 0) -> Tensor:
+        """Scaled rows, that many steps after each window's first, (n, size)."""
+        return self._scaled.index_select(0, self._first(numbers) + ahead)
+
+    def actions(self, numbers: Tensor, count: int = 1) -> Tensor:
+        """The first actions of each window, scaled to [-1, 1], (n, count, k)."""
+        steps = torch.arange(count, device=self.device)
+        places = (self._first(numbers)[:, None] + steps).flatten()
+        return self._action.index_select(0, places).view(len(numbers), count, -1)
+
+    def rewards(self, numbers: Tensor, count: int = 1) -> Tensor:
+        """The mean of the first rewards of each window, (n,)."""
+        first = self._first(numbers)
+        total = self._earned.index_select(0, first + count) - self._earned.index_select(0, first)
+        return (total / count).float()
+
+    @cached_property
+    def _scaled(self) -> Rows:
+        return rows_of(self._data, self._rows, self.device, self._memory)
+
+    @cached_property
+    def _action(self) -> Rows:
+        return actions_of(self._data, self._rows, self.device, self._memory)
+
+    @cached_property
+    def _earned(self) -> Tensor:
+        """Sums of the rewards before each row, (rows + 1,)."""
+        column = self._data.dataset["reward"]
+        earned = np.zeros(len(self._rows) + 1)
+        np.cumsum(np.concatenate(list(column.parts(self._rows)), dtype=np.float64), out=earned[1:])
+        return torch.from_numpy(earned).to(self.device)
+
+
+def first_rows(data: ScaledDataset, rows: NDArray[np.int64], horizon: int) -> NDArray[np.int64]:
+    """Places among the rows of those that have so many rows after them in their episode.
+
+    Args:
+        data: the data set.
+        rows: sorted rows of whole episodes.
+        horizon: rows after one.
+    """
+    if not horizon:
+        return np.arange(len(rows))
+    ends = np.cumsum(data.dataset.episodes["length"], dtype=np.int64)
+    end = ends[np.searchsorted(ends, rows, side="right")]
+    return np.flatnonzero(rows + horizon < end)
+
+
+def count_windows(data: ScaledDataset, horizon: int) -> int:
+    """How many windows the training rows have."""
+    return len(first_rows(data, data.train, horizon))
+
+
+def watched_windows(data: ScaledDataset, horizon: int, device: torch.device) -> Windows:
+    """A sample of the held-out windows: at most 100,000, fewer of wide robots."""
+    most = min(_WATCHED, _WATCHED_NUMBERS // data.size)
+    return Windows(data, data.test, horizon, device, memory=0, most=most)
