@@ -134,8 +134,9 @@ class Fitter:
         """
         method = get_method(kind)
         used = method.settings(settings)
-        name = name or name_of(method, used)
         data = self._scaled_data(method, used)
+        used = method.resolve(data, used)
+        name = name or name_of(method, used)
         method.check(data, used)
         if "batch_size" in used:
             used["batch_size"] = used["batch_size"] or default_batch_size(

@@ -11,10 +11,13 @@ from jbrep.methods import (
     forward,
     identity,
     linear_forward,
+    noise,
     pca,
     random,
     slow,
+    subset,
     untrained,
+    vamp,
 )
 from jbrep.methods.method import Method, Settings
 from jbrep.methods.settings import STANDARD, WHITE
@@ -25,10 +28,13 @@ METHODS: dict[str, Method] = {
         identity.METHOD,
         pca.METHOD,
         random.METHOD,
+        subset.METHOD,
+        noise.METHOD,
         untrained.METHOD,
         autoencoder.AE,
         autoencoder.DAE,
         slow.METHOD,
+        vamp.METHOD,
         linear_forward.METHOD,
         forward.METHOD,
     )
@@ -73,7 +79,8 @@ def name_of(method: Method, settings: Settings) -> str:
             words.append(name)
     if len(words) > 1 and method.name == IDENTITY:
         words[0] = FULL
-    return str(EncoderName("-".join(words), settings.get("latent")))
+    size = len(settings["features"]) if "features" in settings else settings.get("latent")
+    return str(EncoderName("-".join(words), size))
 
 
 def read_name(name: str) -> Recipe:
