@@ -8,11 +8,13 @@ from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose
 from jbrep.methods import (
     autoencoder,
+    deepmdp,
     forward,
     identity,
     linear_forward,
     pca,
     random,
+    self_prediction,
     slow,
     untrained,
 )
@@ -31,6 +33,8 @@ METHODS: dict[str, Method] = {
         slow.METHOD,
         linear_forward.METHOD,
         forward.METHOD,
+        self_prediction.METHOD,
+        deepmdp.METHOD,
     )
 }
 _Meanings = dict[str, dict[str, Any]]
