@@ -8,12 +8,14 @@ from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose
 from jbrep.methods import (
     autoencoder,
+    deepmdp,
     forward,
     identity,
     linear_forward,
     noise,
     pca,
     random,
+    self_prediction,
     slow,
     subset,
     untrained,
@@ -37,6 +39,8 @@ METHODS: dict[str, Method] = {
         vamp.METHOD,
         linear_forward.METHOD,
         forward.METHOD,
+        self_prediction.METHOD,
+        deepmdp.METHOD,
     )
 }
 _Meanings = dict[str, dict[str, Any]]
