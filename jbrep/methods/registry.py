@@ -8,13 +8,16 @@ from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose
 from jbrep.methods import (
     autoencoder,
+    ddae,
     forward,
     identity,
     linear_forward,
+    lld_vae,
     pca,
     random,
     slow,
     untrained,
+    vae,
 )
 from jbrep.methods.method import Method, Settings
 from jbrep.methods.settings import STANDARD, WHITE
@@ -28,6 +31,9 @@ METHODS: dict[str, Method] = {
         untrained.METHOD,
         autoencoder.AE,
         autoencoder.DAE,
+        ddae.METHOD,
+        vae.METHOD,
+        lld_vae.METHOD,
         slow.METHOD,
         linear_forward.METHOD,
         forward.METHOD,
