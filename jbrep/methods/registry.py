@@ -8,10 +8,12 @@ from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose
 from jbrep.methods import (
     autoencoder,
+    ddae,
     deepmdp,
     forward,
     identity,
     linear_forward,
+    lld_vae,
     noise,
     pca,
     random,
@@ -19,6 +21,7 @@ from jbrep.methods import (
     slow,
     subset,
     untrained,
+    vae,
     vamp,
 )
 from jbrep.methods.method import Method, Settings
@@ -35,6 +38,9 @@ METHODS: dict[str, Method] = {
         untrained.METHOD,
         autoencoder.AE,
         autoencoder.DAE,
+        ddae.METHOD,
+        vae.METHOD,
+        lld_vae.METHOD,
         slow.METHOD,
         vamp.METHOD,
         linear_forward.METHOD,

@@ -159,6 +159,7 @@ SETTINGS = {
     "ahead": Setting("Steps ahead of the row that is reconstructed.", _whole(0, MAX_HORIZON)),
     "beta": Setting("Weight of the divergence from the prior.", _number(0, _MAX_WEIGHT)),
     "transition": Setting("Weight of the error of the next code.", _number(0, _MAX_WEIGHT)),
+    "weight_decay": Setting("Weight of half the squared weights.", _number(0, _MAX_WEIGHT)),
     "features": Setting("Names of features, or patterns such as velocity_*.", _words),
     "scaling": Setting(
         f"What becomes -1 and 1: {', '.join(SCALINGS)}; extrema by default.", _choice(SCALINGS)
