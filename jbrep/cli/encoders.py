@@ -10,6 +10,7 @@ import click
 
 from jbrep.cli.base import (
     RESUMES,
+    Variadic,
     as_json,
     echo_json,
     echo_paths,
@@ -31,25 +32,7 @@ _POOR = 1.5  # times PCA's error, from which a trained autoencoder deserves a wa
 _RECONSTRUCTING = ("ae", "dae")
 
 
-class _Variadic(click.Command):
-    """An option that may be repeated also takes several values at once: --latent 12 8 4."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        repeatable = {
-            name
-            for option in self.get_params(ctx)
-            if isinstance(option, click.Option) and option.multiple
-            for name in option.opts
-        }
-        spread: list[str] = []
-        for i, arg in enumerate(args):
-            follows = i > 1 and not arg.startswith("-") and not args[i - 1].startswith("-")
-            name = next((a for a in reversed(args[:i]) if a.startswith("-")), None)
-            spread += [name, arg] if follows and name in repeatable else [arg]
-        return super().parse_args(ctx, spread)
-
-
-class _Making(_Variadic):
+class _Making(Variadic):
     """A command with an option for each setting of the methods that it offers."""
 
     kinds: tuple[str, ...] = ()  # all of them if empty
@@ -215,7 +198,7 @@ def _report(fitted: "Fitted", data: "ScaledDataset") -> None:
 
 
 @click.command(
-    cls=_Variadic,
+    cls=Variadic,
     epilog=example(
         "jbrep evaluate --encoder dae-8 encoders/face/pca-8.safetensors --data data/face"
     ),
