@@ -7,6 +7,7 @@ from typing import Any
 
 from jbrep.dae.network import get_architecture
 from jbrep.dataset.scaling import EXTREMA, SCALINGS
+from jbrep.encoders.encoder import MAX_UNITS
 from jbrep.errors import InputError
 
 REQUIRED = object()  # stands for the default of a setting that has to be given
@@ -133,7 +134,7 @@ def _architecture(value: Any) -> str:
 
 
 SETTINGS = {
-    "latent": Setting("Latent units l.", _whole(1)),
+    "latent": Setting("Latent units l.", _whole(1, MAX_UNITS)),
     "architecture": Setting(
         "Layers of the network: paper, deep, linear, or sizes of your own, such as 64,64.",
         _architecture,
