@@ -38,11 +38,17 @@ class Ddae(Objective):
             torch.manual_seed(settings["seed"])
             self.encoder = nn.Sequential(nn.Linear(size, latent), nn.ReLU())
             self.decoder = stack((latent, size), "linear")
-            for linear in (self.encoder[0], self.decoder[0]):
-                nn.init.kaiming_normal_(linear.weight)  # He et al. 2015
-                nn.init.zeros_(linear.bias)
+            for parameter in self.parameters():
+                nn.init.zeros_(parameter)
+            for weight in self._matrices:
+                nn.init.kaiming_normal_(weight)  # He et al. 2015
         weights = feature_weights(data, settings["weights"])
         self.register_buffer("_weights", weights, persistent=False)
+
+    @property
+    def _matrices(self) -> list[Tensor]:
+        """The weights without the biases."""
+        return [parameter for parameter in self.parameters() if parameter.ndim > 1]
 
     def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, Tensor]:
         """Rows, and those to be given."""
@@ -53,8 +59,8 @@ class Ddae(Objective):
         """As for `Objective`."""
         now, target = batch
         error = cross_entropy(self.decoder(self.encoder(now)), target, self._weights).mean()
-        squares = self.encoder[0].weight.square().sum() + self.decoder[0].weight.square().sum()
-        return error + self._decay * squares / 2
+        squares = torch.stack([weight.square().sum() for weight in self._matrices])
+        return error + self._decay * squares.sum() / 2
 
     def rate(self, progress: float, step: int) -> float:
         """As for `Objective`: the authors' steps."""

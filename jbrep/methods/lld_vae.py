@@ -134,7 +134,7 @@ METHOD = Learned(
         "transition": 0.1,
         "epochs": 12,
         "batch_size": 1000,
-        "learning_rate": 1e-4,
+        "learning_rate": 1e-3,
         "seed": 0,
         "weights": {},
     },

@@ -131,7 +131,7 @@ METHOD = Learned(
     own={
         "latent": REQUIRED,
         "architecture": "deep",
-        "beta": 0.01,
+        "beta": 0.001,
         "epochs": 5,
         "batch_size": 256,
         "learning_rate": 1e-3,
