@@ -154,6 +154,9 @@ def example(text: str) -> str:
     return f"Example: {text}"
 
 
+data_option = click.option(
+    "--data", required=True, type=click.Path(path_type=Path), help="A folder from jbrep collect."
+)
 as_json = click.option("--json", "as_json", is_flag=True, help="As JSON, for programs.")
 
 

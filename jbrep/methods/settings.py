@@ -34,6 +34,11 @@ class Setting:
     read: Callable[[Any], Any]
     is_flag: bool = False
 
+    @property
+    def is_list(self) -> bool:
+        """Whether it takes several values: in a list, as text with commas, or one after another."""
+        return self.read in (_steps, _words, _weights)
+
 
 def _whole(least: int, most: int = _MAX_NUMBER) -> Callable[[Any], int]:
     """A whole number in a range, both ends included."""
@@ -162,9 +167,7 @@ SETTINGS = {
     "transition": Setting("Weight of the error of the next code.", _number(0, _MAX_WEIGHT)),
     "weight_decay": Setting("Weight of half the squared weights.", _number(0, _MAX_WEIGHT)),
     "features": Setting("Names of features, or patterns such as velocity_*.", _words),
-    "scaling": Setting(
-        f"What becomes -1 and 1: {', '.join(SCALINGS)}; extrema by default.", _choice(SCALINGS)
-    ),
+    "scaling": Setting(f"What becomes -1 and 1: {', '.join(SCALINGS)}.", _choice(SCALINGS)),
     "angles": Setting("Take angles as sine and cosine.", _flag, is_flag=True),
     "clip": Setting("Limit of scaled values, at least 1; none by default.", _number(1, 1e6)),
     "keep": Setting("Features that pass around the encoder.", _words),
