@@ -130,7 +130,7 @@ def test_a_sigmoid_has_targets_within_its_range():
     torch.testing.assert_close(weighted, 3 * lost)
 
 
-def test_ddae_looks_ahead_in_its_episode_and_then_has_a_linear_decoder(data, tmp_path):
+def test_ddae_looks_ahead_in_its_episode_and_then_has_a_linear_decoder(data):
     it = objective(data, "ddae", ahead=20)
     windows = Windows(data, data.train, it.horizon)
     assert len(windows) == 4 * (1000 - 20)

@@ -145,7 +145,10 @@ SETTINGS = {
         _architecture,
     ),
     "epochs": Setting("Passes over the data.", _whole(1)),
-    "batch_size": Setting("Rows in a batch; by default from the rows, 128 to 8192.", _whole(1)),
+    "batch_size": Setting(
+        "Rows in a batch; by default 128 to 8192, from the rows, unless the method has its own.",
+        _whole(1),
+    ),
     "learning_rate": Setting("Of Adam.", _number(0, _MAX_LEARNING_RATE, above=True)),
     "seed": Setting("Of everything random.", _whole(0)),
     "noise": Setting("Standard deviation of the corruption.", _number(0)),
