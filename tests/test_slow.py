@@ -189,10 +189,16 @@ def test_blocks_give_every_window_once_and_only_so_many_where_rows_are_wide(move
     expected = [rows[: len(rows) - 20] for rows, _, _ in episodes(moved)]
     given = np.concatenate([block.later(0) for block in once])
     np.testing.assert_array_equal(given, np.concatenate(expected))
-    assert max(len(block._rows) for block in once) <= 100 + 20
+    assert len(once) > 1
     monkeypatch.setattr(passes, "_MOST_WORK", len(given) // 4)
     some = [len(block) for block in passes.blocks(moved, 20, width=10, work=1)]
     assert 0 < sum(some) <= len(given) / 3
+
+
+def test_a_block_stays_small_where_most_episodes_are_too_short(tmp_path, monkeypatch):
+    monkeypatch.setattr(passes, "_BLOCK", 20)
+    short = system(tmp_path / "short", lengths=(35, *[9] * 60, 35, *[9] * 60, 35, 35))
+    assert max(len(block._rows) for block in passes.blocks(short, 30, 10, 1)) <= 40 + 30
 
 
 @pytest.mark.parametrize(
