@@ -95,20 +95,29 @@ def direction_code(directions: Array, moments: Moments, spectrum: Array, **metri
     return Made((dense(weight, -weight @ mean),), None, {"spectrum": spectrum.tolist(), **metrics})
 
 
-def whitening(covariance: Array, data: ScaledDataset) -> Array:
+def whitening(
+    covariance: Array, data: ScaledDataset, total: Array | None = None, others: str = "each other"
+) -> Array:
     """W with W C W' = I, for a covariance C of the features (size, size).
 
+    Args:
+        covariance: C.
+        data: that it is of.
+        total: variances that show what is negligible, where C is what a regression left of them.
+        others: what features would be linear functions of, if C were singular.
+
     Raises:
-        InputError: the covariance is singular; the message names the features.
+        InputError: it is singular; the message names the features.
     """
-    deviation = np.sqrt(np.maximum(np.diag(covariance), _TINY))
+    deviation = np.sqrt(np.maximum(np.diag(covariance) if total is None else total, _TINY))
     variances, vectors = np.linalg.eigh(covariance / np.outer(deviation, deviation))
     if not variances[0] > _NEGLIGIBLE * variances[-1]:
         share = np.abs(vectors[:, 0])
         named = [data.names[i] for i in np.flatnonzero(share > _NAMED * share.max())]
         raise InputError(
-            f"{', '.join(dict.fromkeys(named))} depend on each other linearly in "
-            f"{data.dataset.folder}: let one of them pass around the encoder, with --keep"
+            f"the covariance of {', '.join(dict.fromkeys(named))} in {data.dataset.folder} is "
+            f"singular, as of linear functions of {others}: let one of them pass around the "
+            "encoder, with --keep"
         )
     whiten: Array = (vectors / np.sqrt(variances)).T / deviation
     return whiten

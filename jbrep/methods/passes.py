@@ -96,5 +96,9 @@ def blocks(data: ScaledDataset, horizon: int, width: int, work: int) -> Iterator
         )
     size = max(1, min(_BLOCK, _NUMBERS // width))
     every = -(-len(starts) * work // _MOST_WORK)
-    for first in range(0, len(starts), size * every):
-        yield Block(data, starts[first : first + size], horizon)
+    first = 0
+    while first < len(starts):
+        reach = np.searchsorted(starts, starts[first] + 2 * size)  # many episodes may be too short
+        last = min(first + size, int(reach))
+        yield Block(data, starts[first:last], horizon)
+        first += (last - first) * every

@@ -55,13 +55,17 @@ def _partial(lagged: Lagged, data: ScaledDataset) -> tuple[Array, Array]:
     shared = now[:size, size:]
     inverse = np.linalg.pinv(now[size:, size:], hermitian=True)
     effect = shared @ inverse
-    whiten = whitening(now[:size, :size] - effect @ shared.T, data)
+    whiten = whitening(
+        now[:size, :size] - effect @ shared.T, data, np.diag(now)[:size], "the actions"
+    )
     correlations = []
     for mean, later, across in zip(lagged.later_mean, lagged.later, lagged.across, strict=True):
         both = across - np.outer(lagged.now_mean, mean)
-        rest = later - np.outer(mean, mean) - both[size:].T @ inverse @ both[size:]
+        whole = later - np.outer(mean, mean)
+        rest = whole - both[size:].T @ inverse @ both[size:]
         joint = both[:size] - effect @ both[size:]
-        correlations.append(whiten @ joint @ whitening(rest, data).T)
+        after = whitening(rest, data, np.diag(whole), "the actions")
+        correlations.append(whiten @ joint @ after.T)
     return whiten, np.array(correlations)
 
 

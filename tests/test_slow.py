@@ -1,0 +1,259 @@
+"""Slow features, VAMP and the linear forward code against other ways of computing them."""
+
+import math
+
+import numpy as np
+import pytest
+from deeptime.decomposition import TICA, VAMP
+from scipy.linalg import eigh, sqrtm
+
+from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.encoders.encoder import run
+from jbrep.errors import InputError
+from jbrep.methods import passes
+from jbrep.methods.fit import Fitter
+from jbrep.methods.registry import get_method
+
+
+def system(folder, actions=None, lengths=(60, 300, 1, 200, 15, 400, 350), extra=None):
+    """A linear system of four features, moved by two actions; split and scaled."""
+    generator = np.random.default_rng(0)
+    dynamics = np.diag([0.98, 0.9, 0.7, 0.3]) + 0.05 * generator.normal(size=(4, 4))
+    parts = [], [], [], []
+    for length in lengths:
+        state = generator.normal(size=4)
+        rows, taken = np.empty((length, 4)), np.zeros((length, 2))
+        for step in range(length):
+            rows[step] = state
+            drawn = generator.uniform(-1, 1, size=2)
+            taken[step] = drawn if actions is None else actions(state)
+            push = np.array([0.0, 0.5 * taken[step, 0], 0.0, 2 * taken[step, 1]])
+            state = dynamics @ state + push + 0.1 * generator.normal(size=4)
+        rows = rows if extra is None else np.column_stack((rows, extra(rows)))
+        reward, ends = rows[:, 0] ** 2, np.zeros(length, bool)
+        for part, values in zip(parts, (rows, taken, reward, ends), strict=True):
+            part.append(values)
+    return ScaledDataset(Dataset.write(folder, *parts))
+
+
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory):
+    return system(tmp_path_factory.mktemp("closed") / "moved")
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    return system(tmp_path_factory.mktemp("closed") / "still", actions=lambda state: 0)
+
+
+@pytest.fixture(scope="module")
+def face(collected):
+    return ScaledDataset(Dataset(collected))
+
+
+def made(data, kind, **settings):
+    method = get_method(kind)
+    full = method.settings({"latent": data.size, **settings})
+    method.check(data, full)
+    return method.make(data, full)
+
+
+def episodes(data):
+    """Scaled rows, actions and rewards of each training episode."""
+    kept = set(data.train.tolist())
+    for number in range(len(data.dataset.episodes["length"])):
+        episode = data.dataset.episode(number)
+        if episode.rows.start in kept:
+            rows = data.scale(episode["observation"][:]).astype(float)
+            yield rows, episode["action"][:].reshape(len(rows), -1), episode["reward"][:]
+
+
+def same_space(some, others):
+    """Whether the rows of both span the same space."""
+    (a, _), (b, _) = np.linalg.qr(some.T.astype(float)), np.linalg.qr(others.T)
+    return np.linalg.svd(a.T @ b)[1].min() > 1 - 1e-6
+
+
+@pytest.mark.parametrize(("kind", "theirs"), [("slow", TICA), ("vamp", VAMP)])
+@pytest.mark.parametrize("lag", [1, 10])
+def test_one_lag_is_deeptimes(still, kind, theirs, lag):
+    ours = made(still, kind, lags=lag, latent=2)
+    rows = [each for each, _, _ in episodes(still) if len(each) > lag]
+    model = theirs(lagtime=lag, epsilon=1e-12, scaling=None).fit_from_timeseries(rows).fetch_model()
+    spectrum = ours.metrics["spectrum"]
+    theirs = sorted(model.singular_values, reverse=True)  # by magnitude, there
+    np.testing.assert_allclose(spectrum, theirs, atol=1e-9)
+    assert same_space(ours.encoder[0].weight, model.singular_vectors_left[:, :2].T)
+    assert ours.metrics["spectra"][str(lag)] == pytest.approx(spectrum, abs=1e-9)
+
+
+def test_slow_features_of_a_robot_are_deeptimes(face):
+    ours = made(face, "slow", latent=6)
+    estimator = TICA(lagtime=10, epsilon=1e-12, scaling=None)
+    model = estimator.fit_from_timeseries([rows for rows, _, _ in episodes(face)]).fetch_model()
+    np.testing.assert_allclose(ours.metrics["spectrum"][:6], model.singular_values[:6], atol=1e-9)
+    assert same_space(ours.encoder[0].weight, model.singular_vectors_left[:, :6].T)
+    assert all(max(spectrum) <= 1 for spectrum in ours.metrics["spectra"].values())
+
+
+def test_slow_features_of_several_lags_are_those_of_all_their_pairs(moved):
+    first, second = [], []
+    for rows, _, _ in episodes(moved):
+        for start in range(len(rows) - 20):
+            for lag in (2, 20):
+                first += [rows[start], rows[start + lag]]
+                second += [rows[start + lag], rows[start]]
+    first, second = np.array(first), np.array(second)
+    mean = first.mean(axis=0)
+    covariance = (first - mean).T @ (first - mean)
+    values, vectors = eigh((first - mean).T @ (second - mean), covariance)
+    ours = made(moved, "slow", lags=(2, 20), latent=2)
+    assert ours.metrics["spectrum"] == pytest.approx(values[::-1], abs=1e-9)
+    assert same_space(ours.encoder[0].weight, vectors[:, ::-1][:, :2].T)
+    assert list(ours.metrics["spectra"]) == ["1", "2", "5", "10", "20"]
+    code = run(ours.encoder, first.astype(np.float32))
+    np.testing.assert_allclose(code.T @ code / len(code), np.eye(2) / 9, atol=1e-5)
+
+
+def without(values, actions):
+    """What a regression on the actions leaves of values."""
+    wide = np.column_stack((actions, np.ones(len(actions))))
+    return values - wide @ np.linalg.lstsq(wide, values, rcond=None)[0]
+
+
+def test_vamp_is_the_canonical_correlation_that_the_actions_leave(moved):
+    now, later, actions = [], [], []
+    for rows, taken, _ in episodes(moved):
+        for start in range(len(rows) - 5):
+            now.append(rows[start])
+            later.append(rows[start + 5])
+            actions.append(taken[start : start + 5].ravel())
+    sides = [np.linalg.qr(without(np.array(each), np.array(actions))) for each in (now, later)]
+    left, correlations, _ = np.linalg.svd(sides[0][0].T @ sides[1][0])  # Bjorck and Golub 1973
+    directions = np.linalg.solve(sides[0][1], left)
+    ours = made(moved, "vamp", lags=5, latent=2)
+    assert ours.metrics["spectrum"] == pytest.approx(correlations, abs=1e-6)
+    assert same_space(ours.encoder[0].weight, directions[:, :2].T)
+    code = run(ours.encoder, np.array(now, np.float32))
+    np.testing.assert_allclose(code.std(axis=0), 1 / 3, atol=1e-5)
+
+
+def test_vamp_of_several_lags_has_the_mean_of_squares(moved):
+    both = made(moved, "vamp", lags=(2, 10)).metrics
+    squares = [np.square(both["spectra"][lag]).sum() for lag in ("2", "10")]
+    assert np.square(both["spectrum"]).sum() == pytest.approx(np.mean(squares))
+
+
+@pytest.mark.parametrize("weights", [{"values": 0}, {"changes": 2, "reward": 0.5}])
+def test_the_linear_forward_code_is_reduced_rank_regression(face, weights):
+    horizons, regressors, targets = (1, 4), [], []
+    turn = 2 * math.pi / face.scaler.half_width
+    angles = np.array([feature.is_angle for feature in face.task.features])
+    scale = np.tile(
+        np.repeat([weights.get(w, 1) for w in ("changes", "values", "reward")], (16, 16, 1)), 2
+    )
+    for rows, taken, reward in episodes(face):
+        for start in range(0, len(rows) - 4):
+            regressors.append(np.concatenate((rows[start], taken[start : start + 4].ravel())))
+            parts = []
+            for k in horizons:
+                change = rows[start + k] - rows[start]
+                change[angles] -= np.round(change / turn)[angles] * turn[angles]
+                parts += [change, rows[start + k], [reward[start : start + k].mean()]]
+            targets.append(np.concatenate(parts))
+    regressors, targets = np.array(regressors), np.array(targets)
+    regressors -= regressors.mean(axis=0)
+    standard = scale * (targets - targets.mean(axis=0)) / targets.std(axis=0)
+    block = np.linalg.lstsq(regressors, standard, rcond=None)[0][:16]
+    root = sqrtm(np.cov(regressors[:, :16].T, bias=True)).real
+    left, singular, _ = np.linalg.svd(root @ block)
+    ours = made(face, "linear-forward", horizons=horizons, latent=5, **weights)
+    assert ours.metrics["spectrum"] == pytest.approx(singular, rel=1e-4, abs=1e-4)
+    assert same_space(ours.encoder[0].weight, np.linalg.solve(root, left[:, :5]).T)
+
+
+@pytest.mark.parametrize("kind", ["slow", "vamp", "linear-forward"])
+def test_the_file_has_the_spectrum(face, kind, tmp_path):
+    encoder = Fitter(face, tmp_path).fit(kind, latent=4, angles=True).encoder
+    spectrum = encoder.header["metrics"]["spectrum"]
+    assert encoder.name == f"{kind}-angles-4"
+    assert len(spectrum) == 18
+    assert spectrum == sorted(spectrum, reverse=True)
+    code = encoder.encode(face.dataset["observation"][face.train])
+    np.testing.assert_allclose(code.std(axis=0), 1 / 3, rtol=0.05)
+
+
+def test_blocks_give_every_window_once_and_only_so_many_where_rows_are_wide(moved, monkeypatch):
+    monkeypatch.setattr(passes, "_BLOCK", 50)
+    once = list(passes.blocks(moved, 20, width=10, work=1))
+    expected = [rows[: len(rows) - 20] for rows, _, _ in episodes(moved)]
+    given = np.concatenate([block.later(0) for block in once])
+    np.testing.assert_array_equal(given, np.concatenate(expected))
+    assert len(once) > 1
+    monkeypatch.setattr(passes, "_MOST_WORK", len(given) // 4)
+    some = [len(block) for block in passes.blocks(moved, 20, width=10, work=1)]
+    assert 0 < sum(some) <= len(given) / 3
+
+
+def test_a_block_stays_small_where_most_episodes_are_too_short(tmp_path, monkeypatch):
+    monkeypatch.setattr(passes, "_BLOCK", 20)
+    short = system(tmp_path / "short", lengths=(35, *[9] * 60, 35, *[9] * 60, 35, 35))
+    assert max(len(block._rows) for block in passes.blocks(short, 30, 10, 1)) <= 40 + 30
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"kind": "slow", "lags": 500}, "no episode of .* is longer than 500 steps"),
+        ({"kind": "vamp", "lags": 500}, "no episode of .* is longer than 500 steps"),
+        ({"kind": "linear-forward", "horizons": 500}, "no episode of .* is longer than 500 steps"),
+        ({"kind": "slow", "latent": 5}, "latent size is 5: with 4 features it must be from 1 to 4"),
+        ({"kind": "vamp", "latent": 5}, "latent size is 5: with 4 features it must be from 1 to 4"),
+        ({"kind": "linear-forward", "latent": 5}, "latent size is 5: with 4 features"),
+        (
+            {"kind": "linear-forward", "latent": 2, "changes": 0, "values": 0, "horizons": 5},
+            "has rank 1 in .*, so it must be from 1 to 1",
+        ),
+        (
+            {"kind": "linear-forward", "changes": 0, "values": 0, "reward": 0},
+            "nothing to predict: all its weights are 0",
+        ),
+    ],
+)
+def test_a_mistake_is_one_line(moved, settings, said):
+    with pytest.raises(InputError, match=said) as caught:
+        made(moved, **settings)
+    assert "\n" not in str(caught.value)
+
+
+def test_features_that_depend_on_others_are_named(tmp_path):
+    extra = system(tmp_path / "sum", extra=lambda rows: rows[:, :1] - 2 * rows[:, 2:3])
+    names = extra.task.feature_names
+    for kind in ("slow", "vamp", "linear-forward"):
+        with pytest.raises(InputError, match=f"{names[0]}, {names[2]}, {names[4]} in .*singular"):
+            made(extra, kind, latent=2)
+    assert made(extra.rescaled(without=names[4:]), "slow", latent=2)
+
+
+def test_a_constant_feature_passes_around_or_is_refused(tmp_path):
+    constant = system(tmp_path / "constant", extra=np.ones_like)
+    for kind in ("slow", "vamp", "linear-forward"):
+        with pytest.raises(InputError, match=r"is constant in .*: let it pass around"):
+            made(constant, kind, latent=2)
+
+
+def test_actions_that_follow_from_the_state_leave_vamp_nothing(tmp_path):
+    driven = system(tmp_path / "driven", actions=lambda state: 0.05 * state[:2])
+    with pytest.raises(InputError, match="as of linear functions of the actions"):
+        made(driven, "vamp", latent=2)
+
+
+def test_rewards_that_never_vary_say_nothing(tmp_path, still):
+    source = still.dataset
+    columns = [source["observation"][:], source["action"][:], np.ones(len(source))]
+    ends = np.zeros(len(source), bool)
+    ends[np.cumsum(source.episodes["length"]) - 1] = True
+    same = ScaledDataset(Dataset.write(tmp_path / "same", *columns, ends))
+    with pytest.raises(InputError, match="nothing that linear-forward is to predict varies"):
+        made(same, "linear-forward", changes=0, values=0, latent=2)
+    assert made(same, "linear-forward", horizons=(1, 5), latent=4).metrics["spectrum"][3] > 0

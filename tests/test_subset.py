@@ -1,0 +1,109 @@
+"""Controls: some features, noise beside all of them, random directions, scalings of the whole."""
+
+import numpy as np
+import pytest
+import torch
+
+from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.errors import InputError
+from jbrep.methods.fit import Fitter
+
+
+@pytest.fixture(scope="module")
+def data(collected):
+    return ScaledDataset(Dataset(collected))
+
+
+@pytest.fixture(scope="module")
+def fit(data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("controls")
+    return lambda kind, **settings: Fitter(data, folder).fit(kind, **settings).encoder
+
+
+@pytest.fixture(scope="module")
+def observations(data):
+    return data.dataset["observation"][:]
+
+
+def test_a_subset_is_the_scaled_features_in_order(data, fit, observations):
+    encoder = fit("subset", features="motor_angle, velocity_*")
+    names = ("velocity_x", "velocity_y", "velocity_z", "motor_angle")
+    places = [data.task.feature_names.index(name) for name in names]
+    assert encoder.name == "subset-4"
+    assert encoder.header["training"]["features"] == list(names)
+    scaled = data.scale(observations)
+    np.testing.assert_array_equal(encoder.encode(observations), scaled[:, places])
+    back = data.scale(encoder.decode(scaled[:, places]))
+    np.testing.assert_allclose(back[:, places], scaled[:, places], atol=1e-5)
+    wide = np.column_stack((scaled[data.train][:, places], np.ones(len(data.train)))).astype(float)
+    best = wide @ np.linalg.lstsq(wide, scaled[data.train].astype(float), rcond=None)[0]
+    np.testing.assert_allclose(back[data.train], best, atol=1e-4)
+
+
+def test_a_subset_of_an_angle_is_its_sine_and_cosine(fit, observations):
+    code = fit("subset", features="motor_angle", angles=True).encode(observations)
+    angle = observations[:, 13]
+    np.testing.assert_allclose(code, np.column_stack((np.sin(angle), np.cos(angle))), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "said"),
+    [
+        ("subset", {}, "subset needs features"),
+        ("subset", {"features": "speed"}, "no feature 'speed': face_direction has position_x, "),
+        ("subset", {"features": "position_x,speed_*"}, r"no feature 'speed_\*'"),
+        ("subset", {"features": "position_*", "latent": 3}, "subset takes no latent"),
+        ("noise", {"latent": 16}, "latent size is 16: with 16 features .* at least 17"),
+        ("noise", {"latent": 18, "angles": True}, "with 18 features .* at least 19"),
+        ("noise", {"latent": 20, "keep": "position_x"}, "leave keep out"),
+    ],
+)
+def test_a_mistake_is_one_line(data, kind, settings, said, tmp_path):
+    with pytest.raises(InputError, match=said) as caught:
+        Fitter(data, tmp_path).fit(kind, **settings)
+    assert "\n" not in str(caught.value)
+
+
+def test_noise_is_beside_all_features_and_unrelated_to_them_and_to_itself(data, fit, observations):
+    encoder = fit("noise", latent=24)
+    latent = encoder.encode(observations)
+    assert encoder.name == "noise-24"
+    assert latent.shape[1] == encoder.latent_size == 24
+    noise, features = latent[:, :8], latent[:, 8:]
+    np.testing.assert_array_equal(features, data.scale(observations))
+    np.testing.assert_allclose(encoder.decode(latent), observations, atol=2e-4)
+    assert encoder.header["metrics"]["held_out_mse"] < 1e-12
+    related = np.abs(np.corrcoef(latent.T) - np.eye(24))[:8]
+    assert related.max() < 0.08  # 5 deviations of 5000 unrelated values are 0.07
+    steps = np.corrcoef(np.hstack((noise[1:], noise[:-1])).T)[:8, 8:]
+    assert np.abs(steps).max() < 0.08
+    np.testing.assert_allclose(noise.std(axis=0), np.sqrt(0.5), atol=0.02)
+    in_torch = encoder.encode(torch.from_numpy(observations)).numpy()
+    np.testing.assert_allclose(in_torch, latent, atol=2e-3)
+
+
+def test_seeds_give_different_controls(fit, observations):
+    for kind, latent in (("random", 4), ("noise", 20)):
+        codes = [
+            fit(kind, latent=latent, seed=seed, name=f"{kind}-s{seed}").encode(observations[:9])
+            for seed in (1, 2)
+        ]
+        again = fit(kind, latent=latent, seed=1, name=f"{kind}-again").encode(observations[:9])
+        assert np.abs(codes[0] - codes[1]).max() > 0.1
+        np.testing.assert_array_equal(codes[0], again)
+
+
+@pytest.mark.parametrize("scaling", ["extrema", "nominal", "standard"])
+def test_the_whole_is_scaled_as_its_name_says(data, fit, observations, scaling):
+    encoder = fit("full", scaling=scaling)
+    assert encoder.name == ("identity" if scaling == "extrema" else f"full-{scaling}")
+    rows = observations[data.train].astype(float)
+    features = data.task.features
+    low, high = {
+        "extrema": (rows.min(axis=0), rows.max(axis=0)),
+        "nominal": np.array([(each.low, each.high) for each in features]).T,
+        "standard": rows.mean(axis=0) + np.outer((-3, 3), rows.std(axis=0)),
+    }[scaling]
+    expected = 2 * (observations - low) / (high - low) - 1
+    np.testing.assert_allclose(encoder.encode(observations), expected, atol=1e-4)
+    np.testing.assert_allclose(encoder.decode(expected), observations, atol=1e-4)
