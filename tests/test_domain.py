@@ -84,7 +84,7 @@ def test_time_steps_keep_to_the_specs(task):
 
 def test_an_episode_ends_by_time_alone_after_1000_steps(task):
     environment = load(task)
-    with mock.patch.object(environment.physics, "step"):  # time counts steps, not motion
+    with mock.patch.object(environment.physics, "step"):  # the limit counts steps
         steps = list(episodes(environment, count=1, steps=2000))
     assert len(steps) == 1001
     assert steps[-1].last()

@@ -64,7 +64,7 @@ def episodes_of(folder):
     ids=lambda given: getattr(given, "slug", given),
 )
 def test_every_algorithm_learns_on_any_task(algorithm, task, short_rollouts, tmp_path):
-    run = Run(task=task, algorithm=algorithm, steps=100, evaluation_episodes=1)
+    run = Run(task=task, algorithm=algorithm, steps=150, evaluation_episodes=1)
     result = train(run, tmp_path)
     assert result["status"] == "finished", result["reason"]
     assert result["settings"]["task"] == task.name
