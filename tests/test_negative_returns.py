@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jbrep.errors import InputError
-from jbrep.figures import study_plots
+from jbrep.figures import study_plots, write
 from jbrep.figures.curves import Return
 from jbrep.figures.limits import limits
 from jbrep.figures.style import PAPER
@@ -303,7 +303,7 @@ def folder(analysis, runs, returns, tmp_path_factory):
     }
     (folder / "runs.json").write_text(json.dumps(record))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jbrep.report.report.study_plots", lambda *tables: study_plots(*tables)[:1])
+        patch.setattr("jbrep.report.report.write", lambda plots, path: write(plots[:1], path))
         write_report(folder)
     return folder
 

@@ -422,7 +422,8 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     plan.write()
     finished, begun, *_ = plan.cells
     shutil.copytree(done.folder_of(finished), plan.folder_of(finished))
-    assert work(begun.name, plan.run(begun), plan.folder_of(begun), lambda: True) is None
+    stop = iter((False, True)).__next__  # after its first rollout
+    assert work(begun.name, plan.run(begun), plan.folder_of(begun), stop) is None
     assert (plan.folder_of(begun) / CHECKPOINT).exists()
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
     reported = jbrep("report", out, "--json")
