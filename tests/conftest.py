@@ -28,6 +28,15 @@ def quick_figures():
         yield
 
 
+@pytest.fixture
+def one_figure(monkeypatch):
+    """Reports with their first figure alone: drawing all takes most of their time."""
+    from jbrep.report import report
+
+    draw = report.study_plots
+    monkeypatch.setattr(report, "study_plots", lambda *tables: draw(*tables)[:1])
+
+
 @pytest.fixture(scope="session")
 def collected(tmp_path_factory):
     """Five shards of an episode each, with states: to be read, or copied before it is changed."""
@@ -40,6 +49,18 @@ def collected(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="session")
+def brief(tmp_path_factory):
+    """The same with episodes of 100 steps."""
+    import small
+
+    from jbrep.collect import collect
+
+    folder = tmp_path_factory.mktemp("brief") / "face_direction"
+    collect(small.brief(), folder)
+    return folder
+
+
 @pytest.fixture
 def copied(collected, tmp_path):
     """A copy of it to spoil."""
@@ -47,21 +68,21 @@ def copied(collected, tmp_path):
 
 
 @pytest.fixture
-def diverging(collected, monkeypatch, tmp_path):
-    """Of the episodes in `collected`, 1 goes non-finite in its 301st step and 2 in its first."""
+def diverging(brief, monkeypatch, tmp_path):
+    """Of the episodes in `brief`, 1 goes non-finite in its 31st step and 2 in its first."""
     from jbrep.dataset import Dataset
     from jbrep.jitterbug.simulation import Simulation
     from jbrep.jitterbug.tasks import QUATERNION
 
     monkeypatch.chdir(tmp_path)  # MuJoCo logs there
-    starts = Dataset(collected).episodes["initial_qpos"][:, QUATERNION]
+    starts = Dataset(brief).episodes["initial_qpos"][:, QUATERNION]
     reset, step, remaining = Simulation.reset, Simulation.step, {}
 
     def begin(simulation, lanes, randoms):
         reset(simulation, lanes, randoms)
         for lane in lanes:
             remaining.pop((simulation, lane), None)
-            for episode, steps in ((1, 300), (2, 0)):
+            for episode, steps in ((1, 30), (2, 0)):
                 if (simulation.readings.qpos[lane, QUATERNION] == starts[episode]).all():
                     remaining[simulation, lane] = steps
 

@@ -14,11 +14,15 @@ from small import contents, settings
 from jbrep.collect import collect
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
+from jbrep.envs import describe
 
-SETTINGS = settings(steps=8_000, store_state=False)
+STEPS = 500  # of each episode
+TASK = describe("face_direction", max_episode_steps=STEPS)
+SETTINGS = settings(task=TASK, steps=4_000, store_state=False)
 COMMAND = [
     *(sys.executable, "-c", "from jbrep.cli import main; main()", "collect"),
     *("--task", "face_direction", "--seed", "3", "--shard-episodes", "1", "--lanes", "1"),
+    *("--episode-steps", str(STEPS)),
 ]
 
 
@@ -74,7 +78,7 @@ def _check_prefix(data: Path, peace: dict[str, bytes]) -> int:
         assert now[name] == peace[name], name
     others = {name for name in now if name.endswith(".h5")}
     assert len(others) <= shards + 1
-    assert len(Dataset(data)["observation"][:]) == 1000 * shards
+    assert len(Dataset(data)["observation"][:]) == STEPS * shards
     return shards
 
 

@@ -26,7 +26,7 @@ evaluate_every = 80
 evaluation_episodes = 1
 episode_steps = 100
 data = {{folder = "{data}"}}
-training = {{epochs = 30, batch_size = 50}}
+training = {{epochs = 30, batch_size = 25}}
 """
 POINTS = {  # at which each stage may be killed: so many such files are there
     "collect": [("data/.lock", 1), ("data/shard-*.h5", 1), ("data/shard-*.h5", 2)],
@@ -40,8 +40,9 @@ def stages(folder, workers=1):
     """The commands, each of which needs those before."""
     data, study = folder / "data", folder / "tiny.toml"
     study.write_text(STUDY.format(data=data))
-    states = ("--task", "face_direction", "--steps", "4k", "--shard-episodes", 1, "--lanes", 1)
-    training = ("--data", data, "--latent", 4, "--epochs", 30, "--batch-size", 50)
+    states = ("--task", "face_direction", "--episode-steps", 500, "--steps", "2k")
+    states = (*states, "--shard-episodes", 1, "--lanes", 1)
+    training = ("--data", data, "--latent", 4, "--epochs", 30, "--batch-size", 25)
     return {
         "collect": ("collect", *states, "--out", data),
         "train-dae": ("train-dae", *training, "--out", folder / "encoders"),
@@ -69,7 +70,7 @@ def killed(folder, seed, peace):
         delay = random.uniform(0, _LONGEST)
         told.append(f"seed {seed}: {stage} killed {delay:.3f} s after {point[1]} of {point[0]}")
         _kill(given, folder, *point, delay, told[-1])
-        again = jbrep(*given)
+        again = jbrep(*stages(folder)[stage])
         assert again.exit_code == 0, f"{told}\n{again.output[-2000:]}"
     return "; ".join(told)
 

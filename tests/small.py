@@ -3,6 +3,7 @@
 from jbrep.collect import write_shards
 from jbrep.dataset import Settings
 from jbrep.dataset.manifest import open_shard, read_manifest
+from jbrep.envs import describe
 
 
 def settings(**changes):
@@ -15,6 +16,12 @@ def settings(**changes):
         "store_state": True,
     }
     return Settings(**{**small, **changes})
+
+
+def brief(**changes):
+    """Five episodes of 100 steps, each in a shard."""
+    task = describe(changes.pop("task", "face_direction"), max_episode_steps=100)
+    return settings(**{"task": task, "steps": 500, **changes})
 
 
 def write_again(source, folder):

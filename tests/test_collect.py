@@ -12,6 +12,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+import small
 from kills import COMMAND, kill_and_resume
 from small import contents, settings, write_again
 
@@ -61,7 +62,7 @@ def test_an_episode_s_seed_starts_it_in_the_environments_too(collected):
 def uneven(tmp_path_factory):
     """A shard of two episodes and one of one."""
     folder = tmp_path_factory.mktemp("uneven") / "data"
-    collect(settings(steps=3000, shard_episodes=2), folder)
+    collect(small.brief(steps=300, shard_episodes=2), folder)
     return folder
 
 
@@ -71,18 +72,18 @@ def uneven(tmp_path_factory):
     ids=str,
 )
 def test_neither_lanes_nor_threads_change_a_byte(how, uneven, tmp_path):
-    collect(settings(steps=3000, shard_episodes=2), tmp_path / "other", **how)
+    collect(small.brief(steps=300, shard_episodes=2), tmp_path / "other", **how)
     assert contents(tmp_path / "other") == contents(uneven)
 
 
-def test_a_number_may_be_one_of_numpys(collected, tmp_path):
-    collect(settings(steps=np.int64(5000), seed=np.int32(3)), tmp_path / "it")
-    assert contents(tmp_path / "it") == contents(collected)
+def test_a_number_may_be_one_of_numpys(brief, tmp_path):
+    collect(small.brief(steps=np.int64(500), seed=np.int32(3)), tmp_path / "it")
+    assert contents(tmp_path / "it") == contents(brief)
 
 
-def test_shards_cut_the_same_rows(collected, tmp_path):
-    collect(settings(shard_episodes=3, store_state=False), tmp_path / "wide")
-    wide, narrow = Dataset(tmp_path / "wide"), Dataset(collected)
+def test_shards_cut_the_same_rows(brief, tmp_path):
+    collect(small.brief(shard_episodes=3, store_state=False), tmp_path / "wide")
+    wide, narrow = Dataset(tmp_path / "wide"), Dataset(brief)
     for name in wide.columns:
         np.testing.assert_array_equal(wide[name], narrow[name])
     for name in wide.episodes:
@@ -178,28 +179,28 @@ def test_no_two_episodes_share_a_seed():
     assert max(seeds) < 2**63
 
 
-def test_seeds_are_distinct_across_shards_and_data_sets(collected, tmp_path):
-    collect(settings(seed=4, steps=3000), tmp_path / "other")
-    seeds = np.concatenate([Dataset(f).episodes["seed"] for f in (collected, tmp_path / "other")])
+def test_seeds_are_distinct_across_shards_and_data_sets(brief, tmp_path):
+    collect(small.brief(seed=4, steps=300), tmp_path / "other")
+    seeds = np.concatenate([Dataset(f).episodes["seed"] for f in (brief, tmp_path / "other")])
     assert len(np.unique(seeds)) == 8
     starts = np.concatenate(
-        [Dataset(f).episodes["initial_qpos"] for f in (collected, tmp_path / "other")]
+        [Dataset(f).episodes["initial_qpos"] for f in (brief, tmp_path / "other")]
     )
     assert len(np.unique(starts, axis=0)) == 8
 
 
 @pytest.mark.usefixtures("diverging")
-def test_an_episode_ends_where_its_physics_goes_non_finite(tmp_path, collected):
+def test_an_episode_ends_where_its_physics_goes_non_finite(tmp_path, brief):
     """That step keeps its row, with reward 0; the last finite observation stands for the new one.
 
     The rows that are missing then are made up for by another episode.
     """
-    collect(settings(steps=3000, shard_episodes=4), tmp_path / "data")
+    collect(small.brief(steps=300, shard_episodes=4), tmp_path / "data")
     dataset = Dataset(tmp_path / "data")
-    np.testing.assert_array_equal(dataset.episodes["length"], [1000, 301, 1, 1000, 1000])
+    np.testing.assert_array_equal(dataset.episodes["length"], [100, 31, 1, 100, 100])
     np.testing.assert_array_equal(dataset.episodes["truncated"], 1)
     np.testing.assert_array_equal(dataset.episodes["terminated"], 0)
-    whole = Dataset(collected)
+    whole = Dataset(brief)
     length = dataset.episodes["length"][whole["episode"][:]]
     kept = whole["step"][:] < length
     last = np.cumsum(dataset.episodes["length"])[1:3] - 1
@@ -210,8 +211,8 @@ def test_an_episode_ends_where_its_physics_goes_non_finite(tmp_path, collected):
             expected[last] = 0
         np.testing.assert_array_equal(dataset[name], expected)
     final = dataset.episodes["final_observation"]
-    np.testing.assert_array_equal(final[1], whole["observation"][1300])
-    np.testing.assert_array_equal(final[2], whole["observation"][2000])
+    np.testing.assert_array_equal(final[1], whole["observation"][130])
+    np.testing.assert_array_equal(final[2], whole["observation"][200])
     assert not list(find_problems(dataset.folder))
     assert not list(replay_problems(dataset, 5))
     with pytest.raises(InputError, match=r"the physics diverged in .*: run jbrep collect --task"):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import small
 from small import contents, settings
 
 from jbrep.collect import collect
@@ -36,10 +37,10 @@ def test_replayed_episodes_are_equal_bit_for_bit(collected):
 @pytest.mark.parametrize(
     ("name", "row"),
     [
-        ("observation", 400),
+        ("observation", 40),
         ("action", 10),
-        ("reward", 999),
-        ("qvel", 500),
+        ("reward", 99),
+        ("qvel", 50),
         ("episodes/initial_qpos", 0),
         ("episodes/initial_qvel", 0),
         ("episodes/target_position", 0),
@@ -48,13 +49,13 @@ def test_replayed_episodes_are_equal_bit_for_bit(collected):
         ("episodes/final_qpos", 0),
     ],
 )
-def test_replay_finds_one_bit_of_difference(name, row, collected, tmp_path):
+def test_replay_finds_one_bit_of_difference(name, row, brief, tmp_path):
     """As another machine's rounding would make it: all hashes hold."""
-    manifest = read_manifest(collected)
+    manifest = read_manifest(brief)
     spoiled = replace(manifest, shards=())
     write_manifest(tmp_path, spoiled)
     for shard in range(2):
-        columns = dict(open_shard(collected, manifest, shard))
+        columns = dict(open_shard(brief, manifest, shard))
         if shard == 1:
             values = columns[name].copy()
             values.reshape(len(values), -1)[row].view(np.uint8)[0] ^= 1
@@ -64,31 +65,22 @@ def test_replay_finds_one_bit_of_difference(name, row, collected, tmp_path):
     assert "episode 1 simulated again differs" in problem
 
 
-@pytest.fixture(scope="module")
-def two(tmp_path_factory):
-    """Two shards with states."""
-    folder = tmp_path_factory.mktemp("two") / "data"
-    collect(settings(steps=2000), folder)
-    return folder
-
-
 @pytest.mark.parametrize("task", TASKS)
-def test_a_derived_data_set_is_the_collected_one(task, two, tmp_path):
+def test_a_derived_data_set_is_the_collected_one(task, brief, tmp_path):
     """All files, to the last bit, as if it had been collected."""
-    wanted = settings(task=task, steps=2000, store_state=task == "move_to_pose")
+    wanted = small.brief(task=task, store_state=task == "move_to_pose")
     collect(wanted, tmp_path / "collected")
-    written = derive(two, task, tmp_path / "derived", wanted.store_state)
-    assert written.rows == 2000
+    written = derive(brief, task, tmp_path / "derived", wanted.store_state)
+    assert written.rows == 500
     assert contents(tmp_path / "derived") == contents(tmp_path / "collected")
 
 
 def test_so_it_is_for_other_policies_and_wider_shards(tmp_path):
     policy = {"kind": "ornstein-uhlenbeck", "mu": 0.1, "theta": 1.0, "sigma": 0.5}
-    some = settings(steps=3000, shard_episodes=2, policy=policy)
+    some = small.brief(steps=300, shard_episodes=2, policy=policy)
     collect(some, tmp_path / "source")
-    collect(
-        replace(some, task=describe("move_to_position"), store_state=False), tmp_path / "collected"
-    )
+    position = describe("move_to_position", max_episode_steps=100)
+    collect(replace(some, task=position, store_state=False), tmp_path / "collected")
     derive(tmp_path / "source", "move_to_position", tmp_path / "derived")
     assert contents(tmp_path / "derived") == contents(tmp_path / "collected")
 

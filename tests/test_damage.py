@@ -101,7 +101,8 @@ DAMAGES = (flip, flip, flip, truncate, append, remove, swap, duplicate, rename, 
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_none_of_200_random_damages_is_missed(seed, copied):
+def test_none_of_200_random_damages_is_missed(seed, brief, tmp_path):
+    copied = shutil.copytree(brief, tmp_path / "copied")
     random = np.random.default_rng(seed)
     files = [*sorted(copied.glob("*.h5")), copied / MANIFEST]
     whole = {path: path.read_bytes() for path in files}
@@ -121,8 +122,9 @@ def test_none_of_200_random_damages_is_missed(seed, copied):
     read_all(copied)
 
 
-def test_every_bit_of_the_small_parts_counts(copied):
+def test_every_bit_of_the_small_parts_counts(brief, tmp_path):
     """All bits of the manifest's and a shard's first bytes, where HDF5's own structure is."""
+    copied = shutil.copytree(brief, tmp_path / "copied")
     for path, end in ((copied / MANIFEST, 200), (copied / "shard-00000.h5", 128)):
         whole = path.read_bytes()
         for place in range(8 * end):

@@ -10,6 +10,7 @@ import pytest
 OWN = Path("examples/own/own.py").resolve()
 
 
+@pytest.mark.usefixtures("one_figure")
 @pytest.mark.filterwarnings("ignore")  # a user sees them once, if at all
 def test_everything_that_one_can_bring(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)

@@ -743,11 +743,11 @@ def viewer(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("code", [0, 3])
-def test_the_viewer_is_rerun_itself_and_serves_this_machine_alone(code, viewer, tmp_path):
+def test_the_viewer_is_rerun_itself_and_serves_this_machine_alone(code, viewer, brief, tmp_path):
     told, out = viewer(f"sys.exit({code})"), tmp_path / "it.rrd"
-    shown = jbrep("inspect", FACE, "--out", out, "--view")
+    shown = jbrep("inspect", brief, "--out", out, "--view")
     assert json.loads(told.read_text())[1:] == ["--bind", "127.0.0.1", str(out)]
-    served = jbrep("inspect", FACE, "--out", out, "--serve")
+    served = jbrep("inspect", brief, "--out", out, "--serve")
     arguments = json.loads(told.read_text())[1:]
     assert arguments[:3] == ["--bind", "127.0.0.1", "--serve-web"]
     assert f"http://127.0.0.1:{arguments[4]}/" in served.output
@@ -755,10 +755,10 @@ def test_the_viewer_is_rerun_itself_and_serves_this_machine_alone(code, viewer, 
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_the_viewer_ends_with_jbrep(number, viewer, tmp_path):
+def test_the_viewer_ends_with_jbrep(number, viewer, brief, tmp_path):
     """Also the program that Rerun's script starts, and also where jbrep can't say good-bye."""
     told = viewer("time.sleep(600)")
-    with start("inspect", FACE, "--out", tmp_path / "it.rrd", "--serve") as process:
+    with start("inspect", brief, "--out", tmp_path / "it.rrd", "--serve") as process:
         assert wait_for(told.exists, process)
         process.send_signal(number)
     wait_for_the_end_of([json.loads(told.read_text())[0]], seconds=30)

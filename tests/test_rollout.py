@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +38,8 @@ SHORT = {
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
-    settings = Run(
-        task="face_direction", algorithm="a2c", encoder="dae-8", steps=64, evaluation_episodes=2
-    )
+    task = describe("face_direction", max_episode_steps=200)
+    settings = Run(task=task, algorithm="a2c", encoder="dae-8", steps=64, evaluation_episodes=2)
     train(settings, folder)
     return folder
 
@@ -58,10 +58,15 @@ def stored(dataset, episode):
     return np.concatenate((part["observation"], last)), part["action"], part["reward"]
 
 
+@cache
+def replayed(task):
+    """The second episode of a sample, simulated again."""
+    return replay(Dataset(f"data/sample/{task}"), 1)
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_replay_gives_the_stored_episode(task):
-    dataset = Dataset(f"data/sample/{task}")
-    rollout = replay(dataset, 1)
+    dataset, rollout = Dataset(f"data/sample/{task}"), replayed(task)
     for ours, theirs in zip(
         (rollout.observation, rollout.action, rollout.reward), stored(dataset, 1), strict=True
     ):
@@ -75,7 +80,7 @@ def test_replay_gives_the_stored_episode(task):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_terms_multiply_to_the_reward(task):
-    rollout = replay(Dataset(f"data/sample/{task}"), 0)
+    rollout = replayed(task)
     terms = reward_terms(rollout.task, rollout.motion)
     product = np.prod(list(terms.values()), axis=0)
     np.testing.assert_allclose(product[1:], rollout.reward, rtol=1e-6, atol=1e-37)
@@ -96,7 +101,7 @@ def test_a_policy_before_training_is_the_one_that_was_evaluated_first(run):
 
 
 def test_a_named_policy_plays_alone_as_among_others():
-    task = describe("move_to_pose")
+    task = describe("move_to_pose", max_episode_steps=200)
     alone = find_episode("heuristic", 1, task)
     returns = episode_returns(Lanes(task, 2), HEURISTICS["move_to_pose"], EVALUATION_SEED)
     assert alone.episode_return == pytest.approx(returns[1], rel=1e-6)
@@ -141,8 +146,9 @@ def test_an_episode_that_diverges_ends_and_shows_its_last_finite_state(monkeypat
         return step(simulation, action)
 
     monkeypatch.setattr(Simulation, "step", spoil)
-    whole, short = find_player("heuristic", describe("move_to_pose")).play([0, 1])
-    assert (len(whole), len(short), short.truncated) == (1000, 11, True)
+    task = describe("move_to_pose", max_episode_steps=50)
+    whole, short = find_player("heuristic", task).play([0, 1])
+    assert (len(whole), len(short), short.truncated) == (50, 11, True)
     assert short.reward[-1] == 0
     np.testing.assert_array_equal(short.observation[11], short.observation[10])
     start = TASKS["move_to_pose"].start(np.random.default_rng(EVALUATION_SEED + 1))

@@ -58,7 +58,7 @@ TINY = Study(
     evaluation_episodes=1,
     episode_steps=100,
 )
-ON_RAY = dataclasses.replace(TINY, seeds=(0,), steps=2000, evaluate_every=2000)
+ON_RAY = dataclasses.replace(TINY, seeds=(0,), steps=1000, evaluate_every=1000)
 TOML = """
 tasks = ["face_direction"]
 algorithms = ["a2c"]
@@ -77,11 +77,17 @@ def tables(folder):
     return [(folder / name).read_bytes() for name in (RETURNS, STATISTICS)]
 
 
+def in_this_process(plan, cells, workers):
+    """A backend that starts no process and sees what a test has patched."""
+    for cell in cells:
+        yield work(cell.name, plan.run(cell), plan.folder_of(cell))
+
+
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
-    """The tiny study, finished by one worker."""
+    """The tiny study, finished without workers."""
     plan = Plan(TINY, tmp_path_factory.mktemp("study") / "done")
-    assert run_study(plan, on_this_machine, 1) == 0
+    assert run_study(plan, in_this_process, 1) == 0
     return plan
 
 
@@ -387,12 +393,6 @@ def test_a_data_set_of_another_environment(collected, tmp_path):
         run_study(Plan(study, tmp_path / "it"), None, 1)
 
 
-def in_this_process(plan, cells, workers):
-    """A backend that sees what a test has patched."""
-    for cell in cells:
-        yield work(cell.name, plan.run(cell), plan.folder_of(cell))
-
-
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
 def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     preset = get_preset("paper", "a2c")
@@ -415,21 +415,23 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     assert failed == {"a2c": [0, 0], "a2c-modern": [2, 2]}
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     """And reported before: test_whole resumes killed ones."""
-    path, out = tmp_path / "tiny.toml", tmp_path / "stopped"
-    path.write_text(TOML)
-    process = start("study", path, "--out", out, "--workers", 2)
-    assert wait_for(lambda: list(out.rglob(RUN)), process), process.communicate()[1]
-    stop(process)
-    assert len(list(out.rglob(RUN))) < 4
+    plan, out = Plan(TINY, tmp_path / "stopped"), tmp_path / "stopped"
+    plan.write()
+    finished, begun, *_ = plan.cells
+    shutil.copytree(done.folder_of(finished), plan.folder_of(finished))
+    stop = iter((False, True)).__next__  # after its first rollout
+    assert work(begun.name, plan.run(begun), plan.folder_of(begun), stop) is None
+    assert (plan.folder_of(begun) / CHECKPOINT).exists()
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
     reported = jbrep("report", out, "--json")
     assert reported.exit_code == 0, reported.output
     summary = json.loads(reported.stdout)
     assert summary == json.loads((out / "summary.json").read_text())
-    assert len(summary["missing"]) == 4 - summary["runs"]
-    assert run_study(Plan(TINY, out), on_this_machine, 1) == 0
+    assert (len(summary["missing"]), summary["runs"]) == (3, 1)
+    assert run_study(plan, in_this_process, 1) == 0
     assert tables(out) == tables(done.folder)
 
 
@@ -445,7 +447,8 @@ def stop(process):
     return told
 
 
-def test_a_stopped_study_leaves_checkpoints_and_a_killed_one_no_workers(tmp_path):
+def test_a_stopped_study_leaves_checkpoints_and_no_workers(tmp_path):
+    """Nor does a killed one leave workers: test_whole, and test_pool while they start."""
     path, out = tmp_path / "long.toml", tmp_path / "stopped"
     path.write_text(TOML.replace("steps = 80", "steps = 1_000_000", 1))
     process = start("study", path, "--out", out, "--workers", 2)
@@ -456,13 +459,6 @@ def test_a_stopped_study_leaves_checkpoints_and_a_killed_one_no_workers(tmp_path
     told = jbrep("report", out)
     assert told.exit_code == 2
     assert told.stderr == f"Error: no finished run below {out}: jbrep study resumes it\n"
-    process = start("study", path, "--out", out, "--workers", 2)
-    assert wait_for(lambda: workers_of(process.pid), process), process.communicate()[1]
-    time.sleep(0.2)  # workers need more to start
-    workers = workers_of(process.pid)
-    process.kill()
-    process.communicate()
-    wait_for_the_end_of(workers, seconds=10)
 
 
 def test_on_a_cluster_that_loses_a_node(tmp_path):
@@ -519,13 +515,14 @@ representations = ["full", "dae-2"]
 seeds = 2
 steps = 80
 evaluate_every = 80
-evaluation_episodes = 2
+evaluation_episodes = 1
 episode_steps = 50
 data = {steps = 1000}
 training = {epochs = 2}
 """
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monkeypatch):
     """Its workers import the package; its report is made where that is missing."""
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 2)
@@ -544,7 +541,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     returns = {task: [] for task in (robots.ID, "face_direction")}
     for task, _, _, _, _, _, each in list(csv.reader((out / RETURNS).read_text().splitlines()))[1:]:
         returns[task].append(float(each))
-    assert {len(each) for each in returns.values()} == {2 * 2 * 2 * 2}
+    assert {len(each) for each in returns.values()} == {2 * 2 * 2}
     assert max(returns[robots.ID]) < 0 <= min(returns["face_direction"])
     assert max(returns["face_direction"]) <= 50
     played = [line.split(",")[0] for line in (out / HEURISTIC_RETURNS).read_text().splitlines()]

@@ -25,7 +25,7 @@ def peace(tmp_path_factory):
 
 def test_states_become_encoders_and_diagnostics(peace):
     folder, said = peace
-    assert "4 episodes of face_direction, 4,000 rows" in said["collect"]
+    assert "4 episodes of face_direction, 2,000 rows" in said["collect"]
     assert "dae-4: held-out mean squared error" in said["train-dae"]
     data, encoders = folder / "data", folder / "encoders"
     pca = ("--kind", "pca", "--data", data, "--latent", 8, 4, "--out", encoders)
@@ -46,7 +46,7 @@ def test_states_become_encoders_and_diagnostics(peace):
         assert found["sha256"] == encoder.fingerprint
         error = encoder.header["metrics"]["held_out_mse"]
         assert found["reconstruction"]["mse"][0] == pytest.approx(error, rel=1e-3)
-        assert encoder.header["data"]["train_rows"] == 3000
+        assert encoder.header["data"]["train_rows"] == 1500
 
 
 def test_a_studys_tables_are_those_of_its_runs(peace):
@@ -112,6 +112,7 @@ def test_a_recording_shows_the_agent_that_was_evaluated(peace, tmp_path):
     assert "/world/ghost/jitterbug" in chunks
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_killed_in_every_stage_it_comes_to_the_same_end(peace, tmp_path):
     """`python tests/pipeline.py 20` kills at twenty times as many points."""
     told = killed(tmp_path / "killed", 6, peace[0])  # the study's workers are at work then

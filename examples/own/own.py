@@ -24,10 +24,10 @@ STUDY = """
 tasks = ["face_direction"]
 algorithms = ["a2c-modern"]
 seeds = 2
-steps = 400
-evaluate_every = 200
+steps = 240
+evaluate_every = 120
 evaluation_episodes = 2
-episode_steps = 200
+episode_steps = 100
 representations = [
     { name = "mine", code = "net:trained" },
     { name = "mine-onnx", file = "mine.safetensors" },
@@ -61,7 +61,7 @@ def train_elsewhere(data: Dataset) -> Net:
 
 def encoder() -> None:
     """A module through evaluation, study, report and recording; as a file by way of ONNX, too."""
-    jbrep("collect --task face_direction --episode-steps 200 --steps 4k --out states")
+    jbrep("collect --task face_direction --episode-steps 100 --steps 2k --out states")
     net = train_elsewhere(Dataset("states"))
     torch.save(net.state_dict(), "net.pt")
     example = torch.zeros(2, len(net.mean))
@@ -118,7 +118,7 @@ def policies() -> None:
     jbrep("rl --task Pendulum-v1 --algorithm a2c --set learning_rate=1e-3 --steps 4k --out run")
     jbrep("collect --task Pendulum-v1 --policy uniform:0.5+run:0.5 --steps 2k --out mixed")
     jbrep("train-encoder --kind pca --data mixed --latent 2 --out mixed-encoders")
-    for steps, folder in (("2k", "grown"), ("4k", "grown"), ("4k", "at-once")):
+    for steps, folder in (("1k", "grown"), ("2k", "grown"), ("2k", "at-once")):
         jbrep(f"collect --task face_direction --steps {steps} --out {folder}")
     for file in sorted(Path("at-once").glob("[!.]*")):
         assert file.read_bytes() == (Path("grown") / file.name).read_bytes(), file
