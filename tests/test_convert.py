@@ -37,7 +37,9 @@ TORCH = {
     "silu": functional.silu,
     "elu": functional.elu,
     "softplus": functional.softplus,
+    "sin": torch.sin,
     "layer-norm": lambda values: functional.layer_norm(values, values.shape[-1:]),
+    "avg-l1-norm": lambda values: values / values.abs().mean(-1, keepdim=True),
 }
 
 
@@ -485,7 +487,7 @@ def test_sizes_of_ones_own_are_an_architecture(tmp_path):
     assert [len(layer.bias) for layer in (*made.encoder, *made.decoder)] == [64, 32, 8, 32, 64, 16]
     assert made.header["training"]["architecture"] == "64x32"
     for wrong, message in {
-        "64,,32": "unknown architecture '64,,32': choose one of paper, deep, linear, sizes such as 64x64",
+        "64,,32": "'64,,32': choose one of paper, deep, linear, sizes such as 64x64",
         "0": "unknown architecture '0'",
         "64,5000": "architecture 64,5000 has 5000 units: the limit is 4096",
         "2000,2000": "architecture 2000x2000 has weights of 32,384,000 bytes with 16 features",

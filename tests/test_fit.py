@@ -5,6 +5,8 @@ import shutil
 import signal
 import tracemalloc
 from contextlib import contextmanager
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -17,13 +19,15 @@ from wide import wide
 from jbrep.collect import write_shards
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.manifest import open_shard, read_manifest
-from jbrep.encoders import load
+from jbrep.dataset.scaling import SCALINGS
+from jbrep.encoders import load, save
 from jbrep.errors import InputError
 from jbrep.files.lock import exclusive
 from jbrep.methods import fit
 from jbrep.methods.fit import Fitter
 from jbrep.methods.held_out import ratio_to_pca
-from jbrep.methods.registry import METHODS
+from jbrep.methods.registry import METHODS, name_of, read_name
+from jbrep.methods.settings import REQUIRED
 from jbrep.training import checkpoint
 from jbrep.training.rows import available_memory
 from jbrep.training.trainer import Schedule, Trainer
@@ -61,6 +65,39 @@ def test_every_kind_has_the_error_that_its_file_says(data, kind, tmp_path):
     again = Fitter(data, tmp_path).fit(kind, **how(kind))
     assert not again.is_new
     assert fitted.path.read_bytes() == bytes_before
+
+
+NAMED = [
+    m for m in METHODS.values() if {n for n, v in m.own.items() if v is REQUIRED} <= {"latent"}
+]
+
+
+@pytest.mark.parametrize("method", NAMED, ids=lambda method: method.name)
+def test_a_name_says_the_settings_that_it_was_made_of(method):
+    choices = {
+        "latent": (8,),
+        "architecture": ("paper", "deep", "64x32"),
+        "scaling": SCALINGS,
+        "angles": (False, True),
+        "codes": ("raw", "standard", "white"),
+    }
+    taken = {name: values for name, values in choices.items() if name in method.defaults}
+    for values, preset in product(product(*taken.values()), ({}, *method.presets.values())):
+        settings = method.settings({**dict(zip(taken, values, strict=True)), **preset})
+        recipe = read_name(name_of(method, settings))
+        assert recipe.method is method
+        assert method.settings(recipe.given) == settings
+
+
+def test_names_of_no_encoder_are_refused_and_a_name_of_ones_own_is_free(data, tmp_path):
+    for name in ("wide-8", "dae", "dae-white-angles-8", "dae-authors-authors-8", "pca-deep-8", ""):
+        with pytest.raises(InputError, match="unknown representation"):
+            read_name(name)
+    fitted = Fitter(data, tmp_path).fit("pca", latent=4, name="mine")
+    assert (fitted.path.name, fitted.encoder.name) == ("mine.safetensors", "mine")
+    with pytest.raises(InputError, match="invalid encoder name"):
+        Fitter(data, tmp_path).plan("pca", latent=4, name="../x")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.safetensors"]
 
 
 def test_scaling_is_fitted_on_the_training_part_only(data, tmp_path):
@@ -287,6 +324,17 @@ def test_other_settings_or_data_are_refused_and_nothing_is_lost(data, collected,
     shutil.copy(path, tmp_path / "ae-4.safetensors")
     with pytest.raises(InputError, match=r"made with other settings: kind dae \(now: ae\)"):
         fitter.fit("ae", **how("ae"))
+
+
+def test_a_file_of_before_there_were_more_settings_is_complete(data, tmp_path):
+    fitter = Fitter(data, tmp_path)
+    made = fitter.fit("dae", **how())
+    then = {*how(), "architecture", "learning_rate", "seed", "noise"}
+    training = {n: v for n, v in made.encoder.header["training"].items() if n in then}
+    save(replace(made.encoder, header={**made.encoder.header, "training": training}), made.path)
+    assert not fitter.fit("dae", **how()).is_new
+    with pytest.raises(InputError, match=r"other settings: shared_noise False \(now: True\)"):
+        fitter.fit("dae", name="dae-4", **how(shared_noise=True))
 
 
 def test_mistakes_are_named(data, tmp_path):
