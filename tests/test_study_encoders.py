@@ -217,10 +217,10 @@ def test_diagnostics_are_matched_by_the_encoders(done, tmp_path):
     rows = read_diagnostics(folder / DIAGNOSTICS)
     assert [row.values["forward"] for row in rows] == [0.75, 0.25, 0.125]
     assert len(add_diagnostics(folder)) == 3
-    with pytest.raises(InputError, match="no evaluation in .*none: jbrep evaluate makes one"):
+    with pytest.raises(InputError, match=r"no evaluation in .*none: jbrep evaluate makes one"):
         add_diagnostics(folder, [str(tmp_path / "none")])
     write_evaluation(tmp_path / "bad", {"a": (shas["mine"][0], "many")})
-    with pytest.raises(DamageError, match="bad/evaluation.json is damaged: 'many' is no number"):
+    with pytest.raises(DamageError, match=r"bad/evaluation\.json is damaged: 'many' is no number"):
         add_diagnostics(folder, [str(tmp_path / "bad")])
 
 
