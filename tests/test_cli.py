@@ -1,10 +1,12 @@
 """Every command, as a stranger would type it."""
 
+import json
 import re
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from command import jbrep
@@ -13,7 +15,11 @@ from test_study import TOML
 
 from jbrep.cli import main
 from jbrep.cli.base import COUNT
-from jbrep.encoders import load
+from jbrep.encoders import find, load, save
+from jbrep.encoders.diagnostics import Diagnosed, write_diagnostics
+from jbrep.encoders.identity import identity
+from jbrep.envs import describe
+from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.registry import METHODS
 
 GROUPS = ("data", "encoder")
@@ -189,7 +195,7 @@ def test_every_command_has_help_with_an_example(command):
                 ("slow --latent 8 --lags 5 0", "'--lags': '0' must be steps from 1 to 1000, such"),
                 ("dae --latent 8 --batch-size 0", "'--batch-size': '0' must be a whole number"),
                 ("dae --latent 8 --weights x", "'--weights': 'x' must be weights of features"),
-                ("dae --latent 12 8,x", "'--latent': '8,x' must be a whole number from 1"),
+                ("dae --latent 12 8,x", "'--latent': '8,x' is not a list of sizes: wri"),
                 ("slow --lags 5", "slow needs --latent, such as --latent 12 8 4"),
                 ("slow --latent 8 --preset authors", "slow has no presets: leave out --preset"),
                 ("dae --latent 8 --preset x", "unknown preset of dae 'x': choose one of authors"),
@@ -239,6 +245,39 @@ def test_encoders_of_several_seeds_and_lags(tmp_path, collected):
         assert told.exit_code == 0, told.output
     a, b = (load(tmp_path / f"{name}.safetensors").header["training"] for name in "ab")
     assert (a["lags"], b["lags"]) == ([5, 10, 20], [5, 10, 20])
+
+
+def test_the_encoders_that_ship_are_listed(monkeypatch, tmp_path):
+    monkeypatch.setenv("COLUMNS", "80")
+    text = jbrep("encoder", "list").output
+    assert max(map(len, text.splitlines())) <= 80
+    assert all(task in text for task in TASKS)
+    assert re.search(r"^ +dae +denoising autoencoder: ", text, re.M)
+    monkeypatch.setattr("jbrep.encoders.shipped._FOLDER", tmp_path)
+    folder = tmp_path / "face_direction"
+    folder.mkdir()
+    task = describe("face_direction")
+    save(identity(task), folder / "identity.safetensors")
+    for name in ("pca-8", "pca-4"):
+        shutil.copy(Path("jbrep/encoders/shipped/face_direction", f"{name}.safetensors"), folder)
+    given = {"forward": 0.512, "reward": None}
+    shas = {name: find(name, task).fingerprint for name in ("full", "pca-8")}
+    rows = [Diagnosed(task.name, name, sha, given) for name, sha in shas.items()]
+    write_diagnostics(folder / "diagnostics.csv", [*rows, rows[1]._replace(sha256="another")])
+    lines = jbrep("encoder", "list", "--task", "face_direction").output.splitlines()
+    cells = [line.split()[:5] for line in lines[:5]]
+    assert cells[1:] == [
+        ["encoder", "l", "forward", "reward", "value"],
+        ["full", "16", "0.51", "-", "-"],
+        ["pca-8", "8", "0.51", "-", "-"],
+        ["pca-4", "4", "-", "-", "-"],
+    ]
+    listed = json.loads(jbrep("encoder", "list", "--task", "face_direction", "--json").output)
+    assert [each["latent_size"] for each in listed["face_direction"]] == [16, 8, 4]
+    assert listed["face_direction"][1]["diagnostics"] == given
+    refused = jbrep("encoder", "list", "--task", "Hopper-v5")
+    assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
+    assert "no encoder ships for Hopper-v5: only for move_from_origin" in refused.output
 
 
 def test_help_says_which_kind_takes_which_setting_in_80_columns(monkeypatch):

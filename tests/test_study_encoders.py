@@ -15,9 +15,10 @@ from my_encoders import LATENT, SIZE, FirstFeatures, dense
 from onnx import helper, numpy_helper
 
 from jbrep.encoders import find, load, save
+from jbrep.encoders.diagnostics import DIAGNOSTICS, read_diagnostics
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
-from jbrep.errors import InputError
+from jbrep.errors import DamageError, InputError
 from jbrep.figures.diagrams import autoencoders
 from jbrep.figures.style import styles
 from jbrep.report.facts import encoder_rows, outline, reproduce
@@ -26,6 +27,7 @@ from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.files import ENCODER, read_run
 from jbrep.rl.policy import load_run
 from jbrep.study.config import Data, Study, as_study
+from jbrep.study.diagnostics import add_diagnostics
 from jbrep.study.plan import Plan, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.record import EACH_ITS_OWN, RECORD
@@ -177,7 +179,73 @@ def test_runs_with_an_encoder_each_stand_under_one_label(done):
     assert mine["settings"]["encoder"] == EACH_ITS_OWN
     assert (mine["encoder"]["latent_size"], mine["encoder"]["metrics"]) == (8, {})
     assert (net["encoder"]["name"], net["encoder"]["latent_size"]) == (NET, LATENT)
-    assert len({run["encoder"] for run in record["runs"] if run["label"].endswith("mine")}) == 2
+    own = [run for run in record["runs"] if run["label"].endswith("mine")]
+    assert len({run["encoder"] for run in own}) == 2
+    assert [run["encoder_seed"] for run in own] == [0, 1]
+
+
+def test_diagnostics_are_matched_by_the_encoders(done, tmp_path):
+    shas = {}
+    for cell in done.cells:
+        run = read_run(done.folder_of(cell))["settings"]
+        shas.setdefault(cell.representation.name, []).append(run["encoder"])
+    folder = tmp_path / "tables"
+    folder.mkdir()
+    shutil.copy(done.folder / RECORD, folder)
+    assert add_diagnostics(folder) == []
+    assert not (folder / DIAGNOSTICS).exists()
+    write_evaluation(tmp_path / TASK, {"x": (shas["mine"][1], 0.5), "full": (None, 0.75)})
+    lines = add_diagnostics(folder, [str(tmp_path / "{task}")])
+    assert lines[0] == (
+        f"no diagnostics of dense for {TASK}: evaluate it, then jbrep report --evaluation"
+    )
+    assert [line.split(" for ")[0] for line in lines[1:]] == [
+        "no diagnostics of from-onnx",
+        "no diagnostics of 1 of 2 encoders of mine",
+        "no diagnostics of net",
+    ]
+    rows = read_diagnostics(folder / DIAGNOSTICS)
+    assert [(r.task, r.representation, r.sha256, r.values["forward"]) for r in rows] == [
+        (TASK, "full", shas["full"][0], 0.75),
+        (TASK, "mine", shas["mine"][1], 0.5),
+    ]
+    assert rows[0].values["error"] is None
+    again = {"a": (shas["mine"][0], 0.25), "b": (shas["mine"][1], 0.125)}
+    write_evaluation(tmp_path / "later", again)
+    shutil.rmtree(tmp_path / TASK)  # what is in the table stays there
+    assert len(add_diagnostics(folder, [str(tmp_path / "later")])) == 3
+    rows = read_diagnostics(folder / DIAGNOSTICS)
+    assert [row.values["forward"] for row in rows] == [0.75, 0.25, 0.125]
+    assert len(add_diagnostics(folder)) == 3
+    with pytest.raises(InputError, match=r"no evaluation in .*none: jbrep evaluate makes one"):
+        add_diagnostics(folder, [str(tmp_path / "none")])
+    write_evaluation(tmp_path / "bad", {"a": (shas["mine"][0], "many")})
+    with pytest.raises(DamageError, match=r"bad/evaluation\.json is damaged: 'many' is no number"):
+        add_diagnostics(folder, [str(tmp_path / "bad")])
+
+
+def write_evaluation(folder, forward):
+    """An evaluation of encoders, by label: their SHA-256, and one number."""
+    folder.mkdir()
+    entries = {
+        label: {"prediction": {"10": {"mean": [each, None, None]}}}
+        | ({"sha256": sha} if sha else {})
+        for label, (sha, each) in forward.items()
+    }
+    header = {"format": "jbrep evaluation", "format_version": 1, "data": {"task": TASK}}
+    (folder / "evaluation.json").write_text(json.dumps({**header, "encoders": entries}))
+
+
+def test_a_study_names_evaluations(done, tmp_path):
+    study = with_own(evaluations=("results/{task}", "e"))
+    Plan(study, tmp_path / "study").write()
+    assert read_plan(tmp_path / "study").study == study
+    contents = json.loads((done.folder / RECORD).read_text())
+    contents["study"]["evaluations"] = [str(tmp_path / "{task}"), "nowhere"]
+    (tmp_path / RECORD).write_text(json.dumps(contents))
+    write_evaluation(tmp_path / TASK, {"full": (None, 0.75)})
+    assert len(add_diagnostics(tmp_path)) == 4
+    assert [row.representation for row in read_diagnostics(tmp_path / DIAGNOSTICS)] == ["full"]
 
 
 def test_different_encoders_under_one_label_are_refused_otherwise(done, tmp_path):
@@ -193,7 +261,7 @@ def test_different_encoders_under_one_label_are_refused_otherwise(done, tmp_path
 
 def test_the_report_tells_of_own_encoders(done):
     tables = read_tables(done.folder)
-    assert outline(tables).endswith(f"With mine {EACH_ITS_OWN}.")
+    assert outline(tables).endswith(f"With mine, {EACH_ITS_OWN}.")
     rows = {row[0].rpartition("/")[2]: row[1:] for row in encoder_rows(tables)}
     assert rows["mine"][-1] == EACH_ITS_OWN
     assert rows["net"][:4] == (NET, f"{SIZE} - {LATENT}", "-", "-")

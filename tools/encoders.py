@@ -1,37 +1,114 @@
-"""Train encoders of every kind for some tasks, and compare them.
+"""Make encoders by all methods for some tasks, evaluate them, and put the chosen ones in place.
 
-python tools/encoders.py DATA ENCODERS RESULTS TASK...; existing encoders are kept. Without a task
-it only prints the overview of RESULTS.
+python tools/encoders.py DATA ENCODERS RESULTS TASK...; DATA, ENCODERS and RESULTS have a folder for
+each task. What is there already is kept, and what ships is used as it is, so that the same command
+resumes. Without a task it only prints the overview of RESULTS. See --help.
 """
 
+import argparse
 import json
+import os
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 from jbrep.dataset import Dataset, ScaledDataset
-from jbrep.encoders import FULL
-from jbrep.evaluate.files import write
+from jbrep.encoders import FULL, load
+from jbrep.encoders.diagnostics import DIAGNOSTICS, Diagnosed, write_diagnostics
+from jbrep.encoders.encoder import IDENTITY
+from jbrep.encoders.file import SUFFIX
+from jbrep.envs.task import Task
+from jbrep.evaluate.evaluation import FORMAT_VERSION
+from jbrep.evaluate.files import EVALUATION
 from jbrep.evaluate.summary import evaluation_text
-from jbrep.figures import encoder_plots
-from jbrep.figures import write as write_plots
 from jbrep.methods.autoencoder import NOISE
 from jbrep.methods.fit import Fitter
-from jbrep.methods.registry import read_name
+from jbrep.methods.registry import get_method, name_of
+from jbrep.study.diagnostics import evaluated
 
-LATENTS = (12, 8, 4)
-STEMS = ("dae", "dae-deep", "ae", "pca", "random", "untrained", "untrained-deep")
+SHIPPED = Path(__file__).parent.parent / "jbrep" / "encoders" / "shipped"
+MADE: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("dae", {}),
+    ("dae", {"architecture": "deep"}),
+    ("ae", {}),
+    ("pca", {}),
+    ("random", {}),
+    ("untrained", {}),
+    ("untrained", {"architecture": "deep"}),
+    ("slow", {}),
+    ("vamp", {}),
+    ("linear-forward", {}),
+    ("forward", {}),
+    ("self-prediction", {}),
+    ("deepmdp", {}),
+    ("ddae", {}),
+    ("vae", {}),
+    ("lld-vae", {}),
+)
 
 
-def compare(data: ScaledDataset, encoders: Path, results: Path) -> None:
-    """Make encoders of all kinds for a task; write evaluation.json, tables.txt and the figures."""
-    fitter = Fitter(data, encoders)
-    recipes = [read_name(f"{stem}-{latent}") for stem in STEMS for latent in LATENTS]
-    fitted = [fitter.fit(method.name, **given).encoder for method, given in recipes]
-    evaluation = write({encoder.name: encoder for encoder in fitted}, data, results)
-    (results / "tables.txt").write_text(evaluation_text(evaluation) + "\n")
-    write_plots(encoder_plots(evaluation), results)
-    print(evaluation_text(evaluation))
+def names_and_settings(latents: list[int], kinds: list[str]) -> dict[str, tuple[str, Any]]:
+    """Kind and settings of each encoder, by its name."""
+    made = [
+        (kind, {**settings, "latent": latent})
+        for kind, settings in MADE
+        for latent in latents
+        if not kinds or kind in kinds
+    ]
+    methods = [(get_method(kind), settings) for kind, settings in made]
+    names = [name_of(method, method.settings(settings)) for method, settings in methods]
+    return dict(zip(names, made, strict=True))
+
+
+def make(data: ScaledDataset, folder: Path, wanted: dict[str, tuple[str, Any]]) -> list[Path]:
+    """The files of the encoders: those that ship, and those that are made."""
+    fitter, there = Fitter(data, folder), SHIPPED / data.task.slug
+    ours = {name: there / f"{name}{SUFFIX}" for name in wanted}
+    missing = {name: how for name, how in wanted.items() if not ours[name].exists()}
+    for name, (kind, settings) in missing.items():  # every mistake shows before the first training
+        fitter.plan(kind, name=name, **settings)
+    fitted = {
+        name: fitter.fit(kind, name=name, **how).path for name, (kind, how) in missing.items()
+    }
+    return [fitted.get(name, ours[name]) for name in wanted]
+
+
+def evaluate(files: list[Path], data: Path, results: Path) -> None:
+    """Write evaluation.json, tables.txt and the figures, unless they are of these encoders."""
+    hashes = {load(file).fingerprint for file in files}
+    if not is_current(results / EVALUATION, hashes):
+        (results / EVALUATION).unlink(missing_ok=True)
+        options = ("--encoder", *map(str, files), "--data", str(data), "--out", str(results))
+        subprocess.run([sys.executable, "-m", "jbrep", "evaluate", *options], check=True)
+    text = evaluation_text(json.loads((results / EVALUATION).read_text()))
+    (results / "tables.txt").write_text(text + "\n")
+
+
+def is_current(path: Path, hashes: set[str]) -> bool:
+    """Whether an evaluation is of these encoders, by all diagnostics that there are now."""
+    if not path.exists():
+        return False
+    there = json.loads(path.read_text())
+    judged = {entry.get("sha256") for label, entry in there["encoders"].items() if label != FULL}
+    return there["format_version"] == FORMAT_VERSION and judged == hashes
+
+
+def ship(task: Task, files: list[Path], kinds: list[str], results: Path) -> None:
+    """Copy the encoders of some kinds to those that ship, and write what is known of all there."""
+    folder = SHIPPED / task.slug
+    for file in files:
+        if load(file).kind in kinds and not (folder / file.name).exists():
+            shutil.copy(file, folder)
+    known = evaluated(results / EVALUATION)
+    rows = []
+    for file in sorted(folder.glob(f"*{SUFFIX}")):
+        name = FULL if file.stem == IDENTITY else file.stem
+        sha256 = load(file).fingerprint
+        if values := known.get((task.name, FULL if name == FULL else sha256)):
+            rows.append(Diagnosed(task.name, name, sha256, values))
+    write_diagnostics(folder / DIAGNOSTICS, rows)
 
 
 def overview(results: Path) -> str:
@@ -52,9 +129,25 @@ def _cell(encoder: dict[str, Any]) -> str:
     return f"{clean:.2f}, {noisy['mse'][0] / noisy['linear_mse'][0]:.2f}"
 
 
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    for folder in ("data", "encoders", "results"):
+        parser.add_argument(folder, type=Path)
+    parser.add_argument("tasks", nargs="*")
+    parser.add_argument("--latent", type=int, nargs="+", default=[12, 8, 4])
+    parser.add_argument("--only", nargs="+", default=[], help="kinds to make; all by default")
+    parser.add_argument("--ship", nargs="+", default=[], help="kinds to put among what ships")
+    given = parser.parse_args()
+    os.nice(10)  # it takes hours
+    wanted = names_and_settings(given.latent, given.only)
+    for task in given.tasks:
+        data, results = given.data / task, given.results / task
+        scaled = ScaledDataset(Dataset(data))
+        files = make(scaled, given.encoders / task, wanted)
+        evaluate(files, data, results)
+        ship(scaled.task, files, given.ship, results)
+    print(overview(given.results))
+
+
 if __name__ == "__main__":
-    data, encoders, results, *tasks = sys.argv[1:]
-    for task in tasks:
-        scaled = ScaledDataset(Dataset(Path(data, task)))
-        compare(scaled, Path(encoders, task), Path(results, task))
-    print(overview(Path(results)))
+    main()

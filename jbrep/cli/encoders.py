@@ -106,6 +106,54 @@ def encoder() -> None:
     """Look at encoders, export and import them."""
 
 
+_COLUMNS = {name: name for name in ("forward", "reward", "value", "action")}
+_COLUMNS["times_pca"] = "error"
+
+
+@encoder.command("list", epilog=example("jbrep encoder list --task face_direction"))
+@click.option("--task", help="One of the Jitterbug's; all of them by default.")
+@as_json
+def list_shipped(task: str | None, as_json: bool) -> None:
+    """Show which encoders ship, and how they were judged.
+
+    A dash stands for what isn't known; jbrep evaluate finds out.
+    """
+    from jbrep.encoders.card import listed
+    from jbrep.encoders.encoder import FULL, IDENTITY
+    from jbrep.encoders.shipped import shipped
+    from jbrep.evaluate.headline import SCALARS
+    from jbrep.jitterbug.tasks import TASKS
+    from jbrep.methods.registry import METHODS
+    from jbrep.text import facts
+
+    if task is not None and task not in TASKS:
+        raise InputError(f"no encoder ships for {task}: only for {', '.join(TASKS)}")
+    ships = {name: shipped(TASKS[name].describe()) for name in ([task] if task else TASKS)}
+    if as_json:
+        return echo_json(
+            {
+                name: [
+                    {
+                        "name": called,
+                        **{key: getattr(each, key) for key in ("kind", "size", "latent_size")},
+                        "sha256": each.fingerprint,
+                        "diagnostics": dict(told),
+                    }
+                    for called, each, told in encoders
+                ]
+                for name, encoders in ships.items()
+            }
+        )
+    width = terminal_width()
+    for name, encoders in ships.items():
+        click.echo(f"{name}\n{listed(encoders, _COLUMNS, width)}\n")
+    kinds = dict.fromkeys(each.encoder.kind for encoders in ships.values() for each in encoders)
+    words = {FULL if kind == IDENTITY else kind: METHODS[kind].words for kind in kinds}
+    columns = {title: SCALARS[name].words for name, title in _COLUMNS.items()}
+    columns["error"] = "squared error of the reconstruction, as a multiple of PCA's"
+    return click.echo(facts({"l": "size of the code", **columns, **words}, width))
+
+
 _which = click.argument("encoder")
 
 

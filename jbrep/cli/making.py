@@ -121,6 +121,8 @@ class _Value(click.ParamType[Any]):
         except InputError as error:
             self.fail(str(error))
         except ValueError as error:
+            if self._are_sizes:
+                self.fail(f"{value!r} is not a list of sizes: write 12 8 4 or 12,8,4")
             self.fail(f"{value!r} must be {error}")
 
 

@@ -1,10 +1,12 @@
 """Encoders by name: those that ship with the package, and the whole observation of any task."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jbrep.encoders.code import is_code, make
-from jbrep.encoders.encoder import FULL, IDENTITY
+from jbrep.encoders.diagnostics import DIAGNOSTICS, read_diagnostics
+from jbrep.encoders.encoder import FULL, IDENTITY, Encoder
 from jbrep.encoders.file import SUFFIX, load
 from jbrep.encoders.identity import SCALINGS, identity
 from jbrep.encoders.names import EncoderName
@@ -91,6 +93,28 @@ def source_of(name: str | Path, task: Task | None) -> str:
     return f"{name}, shipped" if task and _shipped(name, task) else str(name)
 
 
+class Shipped(NamedTuple):
+    """An encoder that ships."""
+
+    name: str
+    encoder: Encoder
+    diagnostics: Mapping[str, float | None]  # see `jbrep.encoders.diagnostics`; empty if unknown
+
+
+def shipped(task: Task) -> list[Shipped]:
+    """The encoders that ship for a task, the whole observation first.
+
+    Raises:
+        DamageError: a file is damaged.
+    """
+    table = _FOLDER / task.slug / DIAGNOSTICS
+    rows = read_diagnostics(table) if exists(table) else []
+    known = {row.sha256: row.values for row in rows}
+    ordered = sorted(names(task), key=lambda name: name != FULL)
+    loaded = {name: load(_file(name, task)) for name in ordered}
+    return [Shipped(name, e, known.get(e.fingerprint, {})) for name, e in loaded.items()]
+
+
 def _is_made(name: str | Path, task: Task) -> bool:
     """Whether the name is of the whole observation of a task for which that doesn't ship."""
     return str(name) in (FULL, IDENTITY) and FULL not in names(task)
@@ -98,6 +122,9 @@ def _is_made(name: str | Path, task: Task) -> bool:
 
 def _shipped(name: str | Path, task: Task) -> Path | None:
     """The file that ships for a task under that name, if there is one."""
-    stem = IDENTITY if str(name) == FULL else str(name)
-    ships = (FULL if stem == IDENTITY else stem) in names(task)
-    return _FOLDER / task.slug / f"{stem}{SUFFIX}" if ships else None
+    called = FULL if str(name) == IDENTITY else str(name)
+    return _file(called, task) if called in names(task) else None
+
+
+def _file(name: str, task: Task) -> Path:
+    return _FOLDER / task.slug / f"{IDENTITY if name == FULL else name}{SUFFIX}"

@@ -39,7 +39,7 @@ def outline(tables: Tables) -> str:
         f"{', '.join(algorithms)} on {', '.join(tasks)} with the representations "
         f"{', '.join(representations)}: {len(runs) - failed} of {total} runs finished, {failed} "
         f"failed; up to {steps:,} steps each."
-        + (f" With {', '.join(own)} {EACH_ITS_OWN}." if own else "")
+        + (f" With {', '.join(own)}, {EACH_ITS_OWN}." if own else "")
     )
 
 

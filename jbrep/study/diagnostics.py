@@ -82,7 +82,7 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
         if pattern in given and not files:
             raise InputError(f"no evaluation in {pattern}: jbrep evaluate makes one")
         for file in files:
-            known = _evaluated(file) | known
+            known = evaluated(file) | known
     if exists(path):
         known = {_key(row): row.values for row in read_diagnostics(path)} | known
     rows = [row._replace(values=known[_key(row)]) for row in used if _key(row) in known]
@@ -115,7 +115,7 @@ def _files(pattern: str, tasks: Iterable[str]) -> list[Path]:
     return [file for folder in folders if exists(file := folder / "evaluation.json")]
 
 
-def _evaluated(path: Path) -> dict[_Key, _Values]:
+def evaluated(path: Path) -> dict[_Key, _Values]:
     """The headline numbers in an evaluation."""
     from jbrep.evaluate.evaluation import FORMAT, FORMAT_VERSION  # imports scikit-learn
 
