@@ -54,6 +54,7 @@ bench: $(READY) ## speed as ratios in one run, and what the hand-written policie
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/dataset.py
 	$(BIN)/python benchmarks/encoders.py
+	$(BIN)/python benchmarks/methods.py
 	$(BIN)/python benchmarks/learning.py
 	$(BIN)/python benchmarks/inspection.py
 	$(BIN)/python benchmarks/heuristics.py

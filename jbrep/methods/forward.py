@@ -13,7 +13,7 @@ from jbrep.errors import InputError
 from jbrep.methods.linear_forward import turns
 from jbrep.methods.method import Learned, Settings
 from jbrep.methods.predictors import HIDDEN, Predictors
-from jbrep.methods.settings import REQUIRED
+from jbrep.methods.settings import REQUIRED, STANDARD
 from jbrep.training.objective import Layers, Objective
 from jbrep.training.windows import Windows
 
@@ -39,6 +39,9 @@ class Forward(Objective):
     all standardised. The loss is the sum of their weighted mean squared errors, meant over the
     horizons, and of that of the first action from the codes of now and of the next step.
 
+    Units of the code are linear, whatever the architecture: with tanh, some saturate early in the
+    training and stay constant.
+
     Args:
         data: scaled.
         settings: of the method.
@@ -54,14 +57,14 @@ class Forward(Objective):
         super().__init__()
         self._horizons: tuple[int, ...] = settings["horizons"]
         self.horizon = max(self._horizons)
-        architecture = get_architecture(settings["architecture"])
+        hidden = get_architecture(settings["architecture"]).hidden
         size, latent = data.size, settings["latent"]
         self._action_size, self._sizes = data.task.action_size, (size, size, 1)
         reads = tuple(latent + k * self._action_size for k in self._horizons)
         self._inverse_weight = settings["inverse"]
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(settings["seed"])
-            self.encoder = stack((size, *architecture.hidden, latent), architecture.code)
+            self.encoder = stack((size, *hidden, latent), "linear")
             self.predictors = Predictors(reads, sum(self._sizes))
             if self._inverse_weight:
                 self.inverse = stack((2 * latent, HIDDEN, self._action_size), "linear")
@@ -147,7 +150,15 @@ def _check(data: ScaledDataset, settings: Settings) -> None:
         raise InputError("forward has nothing to predict: all its weights are 0")
 
 
-METHOD = Learned(
+class _Forward(Learned):
+    """The scale of a code says nothing to its predictors, so it is made standard."""
+
+    def fill(self, given: Settings) -> dict[str, Any]:
+        """As for `Method`."""
+        return {**self.defaults, "codes": STANDARD}
+
+
+METHOD = _Forward(
     name="forward",
     words="what a network needs, beside the actions, to predict changes and rewards to come",
     source="S-RL Toolbox, Raffin et al. 2018; OFENet, Ota et al. 2020",

@@ -25,7 +25,7 @@ from jbrep.methods import (
     vamp,
 )
 from jbrep.methods.method import Method, Settings
-from jbrep.methods.settings import STANDARD, WHITE
+from jbrep.methods.settings import RAW, STANDARD, WHITE
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -53,7 +53,7 @@ _Meanings = dict[str, dict[str, Any]]
 _UNUSUAL: _Meanings = {  # settings that a name says where they aren't the usual, by word
     "scaling": {name: name for name in SCALINGS if name != EXTREMA},
     "angles": {"angles": True},
-    "codes": {"unit": STANDARD, "white": WHITE},
+    "codes": {"raw": RAW, "unit": STANDARD, "white": WHITE},
 }
 
 
@@ -75,14 +75,14 @@ class Recipe(NamedTuple):
 
 def name_of(method: Method, settings: Settings) -> str:
     """What an encoder is called: method, what is unusual about it, and latent size."""
-    words = [method.name]
+    words, usual = [method.name], method.fill({})
     if settings.get("architecture") != method.own.get("architecture"):
         words.append(str(settings["architecture"]))
     words += [
         word
         for name, meanings in _UNUSUAL.items()
         for word, value in meanings.items()
-        if settings.get(name) == value
+        if settings.get(name) == value != usual.get(name)
     ]
     for name, preset in method.presets.items():
         if all(settings[key] == value for key, value in preset.items()):

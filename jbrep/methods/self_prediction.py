@@ -1,7 +1,9 @@
 """Latent self-prediction: a code from which, with the action, the next code can be told."""
 
+import math
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from jbrep.dae.network import check_size, get_architecture, layers, stack
 from jbrep.dataset import ScaledDataset
@@ -19,7 +21,9 @@ class SelfPrediction(Objective):
 
     The code z = f(x) / mean |f(x)| is predicted from the one before it and the action:
     |g(z_t, a_t) - z_t+1|^2, where no gradient flows through z_t+1. The normalisation keeps codes
-    from shrinking to 0; nothing in the loss keeps them from becoming constant.
+    from shrinking to 0; nothing in the loss keeps them from becoming constant. What a code begins
+    with it mostly keeps, so its layers begin orthogonal and without biases: from torch's own
+    initial weights, biases outweigh the rows and half of the units repeat the others.
 
     Args:
         data: scaled.
@@ -36,6 +40,11 @@ class SelfPrediction(Objective):
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(settings["seed"])
             self.encoder = stack((size, *hidden, latent), AVG_L1_NORM)
+            for parameter in self.encoder.parameters():
+                if parameter.ndim == 2:
+                    nn.init.orthogonal_(parameter, math.sqrt(2))
+                else:
+                    nn.init.zeros_(parameter)
             self.next_code = stack((latent + actions, HIDDEN, HIDDEN, latent), "linear")
 
     def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:

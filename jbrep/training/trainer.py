@@ -97,12 +97,12 @@ class Trainer:
     ):
         self.objective, self.schedule = objective, schedule
         self._windows = windows
-        self._watched = objective.batch(watched, watched.numbers)
         self._pool = pool // (windows.size * torch.float32.itemsize)  # rows
         count = len(windows)
         self._batch_size = min(schedule.batch_size or default_batch_size(count), count)
         self._batches_per_epoch = -(-count // self._batch_size)
         objective.prepare(windows)
+        self._watched = objective.batch(watched, watched.numbers)
         self.best = _copy(objective)
         self.optimiser = Adam(objective.parameters(), schedule.learning_rate, fused=True)
         allocate_adam_state(self.optimiser)

@@ -1,0 +1,144 @@
+"""Every method that makes encoders: its time for a million rows, and what plain PyTorch takes.
+
+python benchmarks/methods.py; a closed form makes a whole encoder, a learned one trains an epoch.
+Ratios are medians over rounds taken in turn, so that a machine that slows down slows both sides.
+"""
+
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from timing import show, timed
+from torch.utils.data import DataLoader
+from torch.utils.data import Dataset as Mapped
+
+from jbrep.dataset import Dataset, ScaledDataset, Settings
+from jbrep.dataset.manifest import commit, new_manifest
+from jbrep.dataset.schema import EPISODES
+from jbrep.methods.method import ClosedForm, Learned, Method
+from jbrep.methods.registry import METHODS
+from jbrep.methods.settings import REQUIRED
+from jbrep.training.objective import Objective
+from jbrep.training.trainer import Schedule, Trainer, default_batch_size
+from jbrep.training.windows import Windows, watched_windows
+
+TASK = "face_direction"
+EPISODE = 1000  # steps
+ROWS = 250_000  # of which 80 % are trained on; all times are scaled to a million
+MILLION = 1_000_000
+USUAL_ROWS = 20_000  # that plain PyTorch goes through
+REQUIRED_ONES = {"latent": 8, "features": "velocity_*"}
+ROUNDS = 3
+
+
+def make_data(folder: Path) -> ScaledDataset:
+    """Rows in which each number wanders, in the shards that a collector writes."""
+    settings = Settings(task=TASK, steps=ROWS)
+    manifest = new_manifest(settings)
+    folder.mkdir()
+    random = np.random.default_rng(0)
+    episodes = settings.shard_episodes
+    while not manifest.complete:
+        columns = {}
+        for name, spec in manifest.specs().items():
+            rows = episodes if name.startswith(EPISODES) else episodes * EPISODE
+            values = random.uniform(-1, 1, spec.shape(rows))
+            if name == "observation":
+                values = np.cumsum(values, axis=0) % 2 - 1
+            columns[name] = values.astype(spec.dtype)
+        columns[EPISODES + "length"][:] = EPISODE
+        manifest = commit(folder, manifest, columns)
+    return ScaledDataset(Dataset(folder))
+
+
+class UsualWindows(Mapped[Any]):
+    """Windows as tutorials give them to a DataLoader: one at a time."""
+
+    def __init__(self, data: ScaledDataset, horizons: tuple[int, ...], count: int):
+        rows = data.train[: count + EPISODE]
+        self._rows = torch.from_numpy(data.load(rows))
+        self._actions = torch.from_numpy(data.dataset["action"][rows])
+        self._rewards = torch.from_numpy(data.dataset["reward"][rows])
+        self._ahead, self._horizon = torch.tensor(horizons), max(horizons, default=0)
+        starts = np.arange(len(rows))
+        self._starts = starts[starts % EPISODE < EPISODE - self._horizon][:count]
+
+    def __len__(self) -> int:
+        return len(self._starts)
+
+    def __getitem__(self, number: int) -> tuple[torch.Tensor, ...]:
+        start = self._starts[number]
+        if not self._horizon:
+            return (self._rows[start],)
+        end = start + self._horizon
+        later = self._rows[start + self._ahead]
+        return self._rows[start], later, self._actions[start:end], self._rewards[start:end]
+
+
+def usual_epoch(objective: Objective, windows: UsualWindows, ready: Any, size: int) -> None:
+    """A DataLoader's batches, and the same loss by autograd.
+
+    Its targets are those of a batch that is ready: making them would cost it still more.
+    """
+    optimiser = torch.optim.Adam(objective.parameters(), 1e-3)
+    for batch in DataLoader(windows, size, shuffle=True, drop_last=True):
+        assert len(batch[0]) == size
+        optimiser.zero_grad()
+        objective.loss(ready).backward()
+        optimiser.step()
+
+
+def required(method: Method) -> dict[str, Any]:
+    """Its defaults, with what has to be given."""
+    return method.settings(
+        {k: v for k, v in REQUIRED_ONES.items() if method.own.get(k) is REQUIRED}
+    )
+
+
+def compare(name: str, method: Learned, data: ScaledDataset) -> None:
+    """An epoch of ours against the usual one, for a million rows each."""
+    settings = required(method)
+    objective = method.objective(data, settings)
+    horizon = objective.horizon
+    windows = Windows(data, data.train, horizon)
+    size = settings.get("batch_size") or default_batch_size(MILLION)
+    schedule = Schedule(epochs=ROUNDS + 1, batch_size=size, learning_rate=1e-3)
+    watched = watched_windows(data, horizon, torch.device("cpu"))
+    epochs = Trainer(objective, schedule, windows, watched).epochs()
+    next(epochs)  # loads the rows
+    horizons = tuple(settings.get("horizons", (1,))) if horizon else ()
+    usual = UsualWindows(data, horizons, USUAL_ROWS // size * size)
+    ready = objective.batch(windows, windows.numbers[:size])
+    ours, ratios = [], []
+    for _ in range(ROUNDS):
+        ours.append(timed(partial(next, epochs)) / len(windows))
+        theirs = timed(lambda: usual_epoch(objective, usual, ready, size)) / len(usual)
+        ratios.append(theirs / ours[-1])
+    show(f"{name}: an epoch of a million rows [s]", [MILLION * seconds for seconds in ours])
+    show(f"{name}: DataLoader's time / ours", ratios, "aim 15")
+
+
+def measure(name: str, method: ClosedForm, data: ScaledDataset) -> None:
+    """The making of an encoder from a million rows."""
+    settings = required(method)
+    method.check(data, settings)
+    seconds = [timed(lambda: method.make(data, settings)) for _ in range(ROUNDS)]
+    show(f"{name}: made from a million rows [s]", MILLION / len(data.train) * np.array(seconds))
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        data = make_data(Path(folder) / "rows")
+        for name, method in METHODS.items():
+            match method:
+                case ClosedForm():
+                    measure(name, method, data)
+                case Learned():
+                    compare(name, method, data)
+
+
+if __name__ == "__main__":
+    main()

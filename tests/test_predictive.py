@@ -1,0 +1,200 @@
+"""Codes that are learned from what comes next."""
+
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from wide import WideDataset, make_feature, make_task
+
+from jbrep.dae.network import stack
+from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.errors import InputError
+from jbrep.methods.fit import Fitter
+from jbrep.methods.linear import principal_code
+from jbrep.methods.predictors import Predictors
+from jbrep.methods.registry import get_method
+from jbrep.training.trainer import Schedule, Trainer
+from jbrep.training.windows import Windows
+
+KINDS = ("forward", "self-prediction", "deepmdp")
+NOISY = 4  # features that nothing predicts
+TURN = 0.3  # [rad] of the hidden state in a step
+
+
+class HiddenDataset(WideDataset):
+    """A Dataset of two hidden numbers, which turn and which the action pushes, among noise."""
+
+    def __init__(self, episodes, length):
+        count = episodes * length
+        task = make_task([make_feature(f"obs_{i}") for i in range(2 + NOISY)])
+        random = np.random.default_rng(0)
+        actions = random.uniform(-1, 1, (length, episodes))
+        turn = 0.95 * np.array([[np.cos(TURN), -np.sin(TURN)], [np.sin(TURN), np.cos(TURN)]])
+        hidden = np.empty((length, episodes, 2))
+        hidden[0] = random.normal(size=(episodes, 2))
+        for before, after in pairwise(range(length)):
+            hidden[after] = hidden[before] @ turn.T
+            hidden[after, :, 0] += actions[before]
+        rows = hidden.transpose(1, 0, 2).reshape(count, 2)
+        noise = random.uniform(-1, 1, (count, NOISY))
+        self.hidden, self.folder, self.task = rows, "made-up", task
+        task.__dict__.update(action_low=(-1.0,), action_high=(1.0,))
+        self.episodes = {"length": np.full(episodes, length), "seed": np.arange(episodes)}
+        self.manifest = SimpleNamespace(fingerprint="made-up", settings=None)
+        self.arrays = {
+            "observation": np.hstack((rows @ [[1, 0.5], [-0.5, 1]], noise)).astype(np.float32),
+            "action": actions.T.reshape(count, 1).astype(np.float32),
+            "reward": rows[:, 0].astype(np.float32),
+        }
+
+
+@pytest.fixture(scope="module")
+def data(collected):
+    return ScaledDataset(Dataset(collected))
+
+
+@pytest.fixture(scope="module")
+def hidden():
+    return ScaledDataset(HiddenDataset(30, 200))
+
+
+def train(data, kind, epochs, **settings):
+    """A trained objective and the history of its losses."""
+    method = get_method(kind)
+    used = method.settings({"latent": 2, "learning_rate": 5e-3, **settings})
+    objective = method.objective(data, used)
+    windows, watched = (Windows(data, r, objective.horizon) for r in (data.train, data.test))
+    schedule = Schedule(epochs=epochs, batch_size=200, learning_rate=used["learning_rate"])
+    trainer = Trainer(objective, schedule, windows, watched)
+    for _ in trainer.epochs():
+        pass
+    return objective.eval(), trainer.history
+
+
+def explained(code, wanted):
+    """R^2 of wanted (n, k) from codes (n, l), by a linear map."""
+    regressors = np.column_stack((code, np.ones(len(code))))
+    residual = wanted - regressors @ np.linalg.lstsq(regressors, wanted, rcond=None)[0]
+    return 1 - residual.var(axis=0) / wanted.var(axis=0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_parameter_learns_and_the_loss_falls(data, kind):
+    settings = {"inverse": 0.5, "horizons": (1, 5)} if kind == "forward" else {}
+    objective, history = train(data, kind, 4, latent=3, **settings)
+    assert history[-1].train_loss < 0.8 * history[0].train_loss
+    windows = Windows(data, data.train, objective.horizon)
+    objective.gradient(objective.batch(windows, windows.numbers[:500]))
+    still = [name for name, p in objective.named_parameters() if not p.grad.abs().sum() > 0]
+    assert not still
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_same_seed_same_bytes(data, kind, tmp_path):
+    files = [
+        Fitter(data, tmp_path / folder).fit(kind, latent=3, epochs=1, batch_size=500).path
+        for folder in ("first", "second")
+    ]
+    first, second = (path.read_bytes() for path in files)
+    assert first == second
+
+
+def test_targets_of_the_forward_code_stay_within_an_episode(data):
+    method = get_method("forward")
+    objective = method.objective(data, method.settings({"latent": 2, "horizons": (2, 7)}))
+    windows = Windows(data, data.train, 7)
+    batch = objective.batch(windows, windows.numbers)  # not yet standardised
+    length = data.dataset.episodes["length"][0]
+    assert len(windows) == len(data.train) - 7 * len(data.train) // length
+    last, first = length - 8, length - 7  # the last window of an episode, the first of the next
+    angle = data.names.index("angle_to_target")
+    for window, start in ((last, length - 8), (first, length)):
+        places = data.train[start : start + 8]
+        rows, rewards = data.load(places), data.dataset["reward"][places]
+        np.testing.assert_array_equal(batch.now[:, window], rows[0])
+        np.testing.assert_array_equal(batch.after[:, window], rows[1])
+        np.testing.assert_allclose(
+            batch.actions[:, window], data.dataset["action"][places[:-1]][:, 0], rtol=1e-6
+        )
+        for targets, ahead in zip(batch.targets[..., window], (2, 7), strict=True):
+            change = rows[ahead] - rows[0]
+            change[angle] = (change[angle] + 1) % 2 - 1
+            expected = [*change, *rows[ahead], rewards[:ahead].mean()]
+            np.testing.assert_allclose(targets, expected, atol=1e-5)
+
+
+def test_predictors_are_separate_networks():
+    torch.manual_seed(0)
+    reads, inputs = (3, 7), torch.randn(7, 5)
+    predictors = Predictors(reads, 4)
+    for i, read in enumerate(reads):
+        alone = stack((read, 64, 64, 4), "linear")
+        linears = [module for module in alone if isinstance(module, torch.nn.Linear)]
+        for linear, weight, bias in zip(
+            linears, predictors.weights, predictors.biases, strict=True
+        ):
+            linear.weight.data = weight[i, :, : linear.in_features].detach().clone()
+            linear.bias.data = bias[i, :, 0].detach().clone()
+        torch.testing.assert_close(predictors(inputs)[i], alone(inputs[:read].T).T)
+
+
+@pytest.mark.parametrize("weights", [{"reward": 1, "values": 1}, {"inverse": 1}])
+def test_forward_finds_what_the_action_moves_among_noise(hidden, weights):
+    used = {**dict.fromkeys(("changes", "values", "reward", "inverse"), 0), **weights}
+    objective, history = train(
+        hidden, "forward", 15, architecture="linear", horizons=(1, 5), **used
+    )
+    rows, wanted = hidden.load(hidden.test), hidden.dataset.hidden[hidden.test]
+    with torch.no_grad():
+        code = objective.encoder(torch.from_numpy(rows)).numpy()
+        report = objective.report(Windows(hidden, hidden.test, 5))["loss_by_horizon"]
+    assert (explained(code, wanted) > 0.97).all()
+    ((weight, bias, _),), _ = principal_code(hidden, 2)
+    assert (explained(rows @ weight.T + bias, wanted) < 0.5).any()
+    if not used["inverse"]:
+        noise = NOISY / (2 + NOISY)  # the share of the features that can't be predicted
+        assert report["1"]["values"] == pytest.approx(noise, abs=0.1)
+        said = [each["values"] + each["reward"] for each in report.values()]
+        assert history[-1].test_loss == pytest.approx(np.mean(said), rel=1e-4)
+
+
+def test_a_self_predicting_code_has_a_mean_magnitude_of_1(data, tmp_path):
+    encoder = Fitter(data, tmp_path).fit("self-prediction", latent=4, epochs=2).encoder
+    code = encoder.encode(data.dataset["observation"][data.test])
+    np.testing.assert_allclose(np.abs(code).mean(axis=1), 1, rtol=1e-5)
+    assert (code.std(axis=0) > 0.1).all()  # it isn't constant
+    assert encoder.can_decode
+
+
+def test_deepmdp_keeps_its_functions_smooth(data):
+    slopes = []
+    for weight in (0, 10):
+        objective, _ = train(data, "deepmdp", 4, lipschitz=weight, latent=3)
+        with torch.no_grad():
+            bound = float(objective.lipschitz(objective.reward))
+            first, second = 2 * torch.rand(2, 5000, 4) - 1
+            second[:, 3:] = first[:, 3:]  # the same action
+            difference = objective.reward(first) - objective.reward(second)
+            slope = float((difference.norm(dim=1) / (first - second).norm(dim=1)).max())
+        assert slope <= bound
+        slopes.append(bound)
+    assert slopes[0] > 1.5
+    assert slopes[1] < 1.1
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "said"),
+    [
+        ("forward", {"changes": 0, "values": 0, "reward": 0}, "nothing to predict"),
+        ("forward", {"horizons": "1,1000"}, "no episode of .* is longer than 1000 steps"),
+        ("self-prediction", {"latent": 1}, "at least 2"),
+        ("deepmdp", {"reward": 0}, "above 0"),
+    ],
+)
+def test_mistakes_are_said_in_a_line(data, tmp_path, kind, settings, said):
+    with pytest.raises(InputError, match=said) as raised:
+        Fitter(data, tmp_path / "out").fit(kind, **{"latent": 3, **settings})
+    assert "\n" not in str(raised.value)
+    assert not list(tmp_path.glob("out/*.safetensors"))
