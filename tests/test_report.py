@@ -289,7 +289,7 @@ def named_otherwise(folder, out, name):
 def test_markdown_keeps_its_tables_whatever_the_names(whole, tmp_path):
     named_otherwise(whole, tmp_path / "a|b*", "d|a*<b>`e")
     tables = read_tables(tmp_path / "a|b*")
-    text = markdown(tables, answers(tables.analysis), "figure.png")
+    text = markdown(tables, answers(tables.analysis), [], "figure.png")
     assert text.startswith("# a\\|b\\*\n")
     assert r"| d\|a\*\<b>\`e | 4 | 1 |" in text
     lines = [line for line in text.splitlines() if line.startswith("|")]

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from jbrep.figures.style import COLUMN, plain
+from jbrep.figures.style import COLUMN, ink, plain
 from jbrep.stats.bootstrap import Array
 
 MOST = 40  # features in a picture, and names on an axis
@@ -30,7 +30,7 @@ def heat_map(
     axes: Axes = figure.subplots()
     picture = axes.imshow(values, cmap="cividis", vmin=0, vmax=1, aspect="auto")
     for (row, column), value in np.ndenumerate(values):
-        colour = "black" if value > 0.6 else "white"
+        colour = ink() if np.isnan(value) else "black" if value > 0.6 else "white"
         shown = "-" if np.isnan(value) else "<0" if value < 0 else f"{value:.2f}"
         axes.text(column, row, shown, ha="center", va="center", color=colour, size=5)
     axes.set_yticks(range(len(rows)), [plain(name) for name in rows])

@@ -115,8 +115,8 @@ def _timescales(task: str, encoders: Encoders) -> Plot:
         "timescales",
         f"{task}: how slow the slow features are",
         "Time in which the autocorrelation of each unit falls to 1/e, -lag / ln(eigenvalue), "
-        "estimated at each lag; darkest: the slowest. A unit whose line is level moves as simply "
-        "as that; in the grey area, where time is shorter than the lag, nothing can be told.",
+        "estimated at each lag; darkest: the slowest. Where a line is level, the estimate doesn't "
+        "depend on the lag; in the grey area it is shorter than the lag, and can't be trusted.",
         ("encoder", "lag", "unit", "eigenvalue", "steps"),
         [row for label, e in encoders.items() for row in _timescale_rows(label, e)],
         lambda: _draw_timescales(task, encoders),
@@ -156,8 +156,10 @@ def _draw_timescales(task: str, encoders: Encoders) -> Figure:
         for i, line in enumerate(steps.T):
             shade = 0.2 + 0.8 * (1 - i / len(steps.T))
             axes.plot(lags, line, "o-", ms=2.5, lw=0.9, color=ink(), alpha=shade)
-        axes.fill_between(lags, lags, lags.min() / 2, color=ink(), alpha=0.12, lw=0)
+        lowest = lags.min() / 2
+        axes.fill_between(lags, lags, lowest, color=ink(), alpha=0.12, lw=0)
         axes.set(xscale="log", yscale="log", xlabel="lag [steps]", title=plain(name))
+        axes.set_ylim(lowest, None)
         axes.set_xticks(lags, [str(lag) for lag in lags])
         axes.xaxis.set_minor_formatter(NullFormatter())
     panels[0].set_ylabel("timescale [steps]")
@@ -236,5 +238,5 @@ def _draw_losses(task: str, encoders: Encoders) -> Figure:
     axes.set(xscale="log" if (values > 0).all() else "linear", xlabel="loss")
     axes.set_yticks(range(len(encoders)), [plain(label) for label in encoders])
     axes.set_ylim(len(encoders) - 0.4, -0.6)
-    axes.set_title(plain(f"{task}:\nloss in training (open) and on held-out episodes (filled)"))
+    axes.set_title(plain(f"{task}:\ntraining loss (open), held-out loss (filled)"))
     return figure

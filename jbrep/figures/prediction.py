@@ -118,8 +118,10 @@ def _draw_horizons(task: str, encoders: Encoders) -> Figure:
         for label, e in encoders.items():
             values = np.array([_three(s[key]) for s in e["prediction"].values()], float)
             _draw_line(axes, list(e["prediction"]), values, label=plain(label), **look[label])
-        axes.set(xlabel="steps ahead", title=words, ylim=(max(axes.get_ylim()[0], _LOWEST), None))
-    panels[0].set_ylabel("R² on held-out episodes")
+        axes.set(xlabel="steps ahead", title=words)
+    panels[0].set(
+        ylabel="R² on held-out episodes", ylim=(max(panels[0].get_ylim()[0], _LOWEST), None)
+    )
     below(figure, panels)
     figure.suptitle(plain(f"{task}: prediction by steps ahead"), size=8)
     return figure
