@@ -283,6 +283,26 @@ def test_diagrams_have_the_real_sizes(plots):
     assert ("agent", "SAC, hidden 350-250") in plots["system"].rows
 
 
+def test_diagrams_show_what_any_method_does():
+    encoder = {
+        **{"name": "slow", "kind": "slow", "size": 16, "latent_size": 9, "data": {}, "metrics": {}},
+        "encoder": [(8, "linear")],
+        "decoder": [(17, "linear")],
+        "training": {
+            **{"latent": 8, "lags": [10], "scaling": "standard", "angles": True},
+            "keep": ["angle_to_target"],
+        },
+    }
+    settings = {**LABELS["face_direction/sac/dae-8"]["settings"], "representation": "slow"}
+    diagrams = study_plots(None, [], {}, {"x": {"settings": settings, "encoder": encoder}})
+    of_system, of_layers = (plot.rows for plot in diagrams)
+    assert ("observation", "16 features, standard scaling, angles as sine and cosine") in of_system
+    assert ("latent", "9 numbers") in of_system  # eight and the one that passes around
+    assert of_layers[0] == ("slow", "encoder", 0, 8, "linear")
+    (axes,) = drawn(diagrams[1]).axes
+    assert axes.get_title(loc="center") == "slow\nangle_to_target passed around"
+
+
 def test_pages_have_a_light_and_a_dark_style(plots):
     plot = plots["variance_ratio"]
     light, dark = plot.on_paper.picture("svg"), Drawing(plot, DARK).picture("svg")
