@@ -314,7 +314,7 @@ def test_diagnostics_are_set_against_returns_where_they_are_known(whole, tmp_pat
     monkeypatch.setattr(report, "write", lambda *_: [])
     page, _, text, _ = write_report(tmp_path / "study")
     assert "diagnostics" in [plot.name for plot in plots]
-    row = ("forward", SCALARS["forward"].words, "-", "3")  # three codes are too few to correlate
+    row = ("forward", SCALARS["forward"].words, r"\-", "3")  # three codes are too few to correlate
     assert f"| {' | '.join(row)} |" in text.read_text()
     assert "do diagnostics predict learning?" in page.read_text()
     assert "unknown" not in page.read_text()
