@@ -15,10 +15,14 @@ from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.figures import behaviour_plots, encoder_plots, study_plots, write
 from jbrep.figures.curves import Return
+from jbrep.figures.diagnostics import _free
+from jbrep.figures.families import family
+from jbrep.figures.methods import timescales
 from jbrep.figures.plot import Drawing
 from jbrep.figures.style import COLUMN, DARK, PAGE, PAPER, with_runs
 from jbrep.rollouts.behaviour import SPEEDS, observe
 from jbrep.stats import Analysis, RunCurve, analyse
+from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.claims import LESS_VARIANCE
 
@@ -279,6 +283,26 @@ def test_diagrams_have_the_real_sizes(plots):
     assert ("agent", "SAC, hidden 350-250") in plots["system"].rows
 
 
+def test_diagrams_show_what_any_method_does():
+    encoder = {
+        **{"name": "slow", "kind": "slow", "size": 16, "latent_size": 9, "data": {}, "metrics": {}},
+        "encoder": [(8, "linear")],
+        "decoder": [(17, "linear")],
+        "training": {
+            **{"latent": 8, "lags": [10], "scaling": "standard", "angles": True},
+            "keep": ["angle_to_target"],
+        },
+    }
+    settings = {**LABELS["face_direction/sac/dae-8"]["settings"], "representation": "slow"}
+    diagrams = study_plots(None, [], {}, {"x": {"settings": settings, "encoder": encoder}})
+    of_system, of_layers = (plot.rows for plot in diagrams)
+    assert ("observation", "16 features, standard scaling, angles as sine and cosine") in of_system
+    assert ("latent", "9 numbers") in of_system  # eight and the one that passes around
+    assert of_layers[0] == ("slow", "encoder", 0, 8, "linear")
+    (axes,) = drawn(diagrams[1]).axes
+    assert axes.get_title(loc="center") == "slow\nangle_to_target passed around"
+
+
 def test_pages_have_a_light_and_a_dark_style(plots):
     plot = plots["variance_ratio"]
     light, dark = plot.on_paper.picture("svg"), Drawing(plot, DARK).picture("svg")
@@ -341,6 +365,37 @@ def test_of_a_wide_robot_the_worst_features_are_shown():
         assert not any("obs" in label.get_text() for label in axes.get_xticklabels())
 
 
+def test_diagnostics_stand_against_final_returns(analysis, returns):
+    """Of every code that has them; a correlation only where there are enough codes."""
+    known = {
+        ("face_direction", "full"): {"forward": 0.9, "error": 0.0},
+        ("face_direction", "dae-8"): {"forward": 0.5, "error": None},
+        ("face_direction", "pca-4"): {"forward": 0.2, "error": 0.3},
+        ("face_direction", "pca-2"): {"forward": 0.1, "error": 0.4},  # without runs
+    }
+    which = Diagnostic("forward", "of changes", 1), Diagnostic("error", "of the state", -1)
+    found = associations(analysis.groups, known, which)
+    assert [(each.group.algorithm, each.diagnostic.name, len(each.values)) for each in found] == [
+        *(("ddpg", "forward", 3), ("ddpg", "error", 2)),
+        *(("sac", "forward", 3), ("sac", "error", 2)),
+    ]
+    assert np.isnan(found[0].correlation.value)
+    (plot,) = [p for p in study_plots(analysis, [], {}, {}, found) if p.name == "diagnostics"]
+    final = analysis.groups[0].labels[1].numbers["final_return_mean"].value
+    row = ("face_direction", "ddpg", "forward", "dae-8", "0.5", f"{final:.7g}", "", "", "", 3)
+    assert plot.rows[1] == row
+    _, forward, error, *_ = drawn(plot).axes
+    assert forward.lines[1].get_xydata().tolist() == [[0.5, final]]
+    assert error.get_xlim()[0] > error.get_xlim()[1]  # the better ones to the right
+
+
+def test_names_stand_where_they_cover_nothing():
+    places = _free(("a", "b", "c"), np.array([[0.5, 0.5], [0.56, 0.5], [0.53, 0.52]]))
+    assert places[0][0] < 0 < places[1][0]  # a to the left of its point, b to the right
+    crowd = np.full((5, 2), 0.5)
+    assert None in _free(["a-long-name"] * 5, crowd)
+
+
 @pytest.fixture(scope="module")
 def behaviours():
     sources = ("constant:drive=0.5", "heuristic")
@@ -382,3 +437,96 @@ def test_the_task_of_a_policy_is_needed_and_no_data_set():
         observe(("data/sample/face_direction",), None, 1, 0)
     with pytest.raises(InputError, match="policy heuristic needs a --task"):
         observe(("heuristic",), None, 1, 0)
+
+
+def scores(quality):
+    """Diagnostics of an encoder's predictions, as evaluation.json has them."""
+    three = [quality, quality - 0.02, quality + 0.02]
+    nothing = [None, None, None]
+    return {
+        steps: {
+            "features": {"yaw": three, "still": nothing},
+            "mean": three,
+            "reward": [quality / 2, None, None],
+        }
+        for steps in ("1", "5", "20")
+    }
+
+
+@pytest.fixture(scope="module")
+def of_methods():
+    """The figures of an evaluation of methods that say something of themselves, by name."""
+    spectrum = [0.9, 0.8, 0.1, -0.01]
+    spectra = {"10": spectrum, "2": [0.99, 0.95, 0.4, 0.2]}
+    slow = {"spectrum": spectrum, "spectra": spectra}
+    losses = {"train_loss": 0.2, "test_loss": 0.3}
+    parts = {"1": {"changes": 0.4, "reward": 0.1}, "20": {"changes": 0.9, "reward": 0.8}}
+    methods = {
+        "full": ("identity", 4, 0.9, {}),
+        "slow-2": ("slow", 2, 0.8, slow),
+        "slow-1": ("slow", 1, 0.1, slow),
+        "forward-2-s1": ("forward", 2, 0.7, {**losses, "loss_by_horizon": parts}),
+    }
+    encoders = {
+        label: {
+            **{"kind": kind, "latent": latent, "reconstruction": None, "method": method},
+            "latent_units": {"correlation": np.eye(latent).tolist()},
+            "prediction": scores(quality),
+        }
+        for label, (kind, latent, quality, method) in methods.items()
+    }
+    return {p.name: p for p in encoder_plots({"data": {"task": "x"}, "encoders": encoders})}
+
+
+def test_methods_and_predictions_have_figures(of_methods):
+    assert list(of_methods) == [
+        *("prediction_by_feature", "prediction_by_horizon", "latent_correlation"),
+        *("spectrum", "timescales", "loss_by_horizon", "losses"),
+    ]
+
+
+def test_predictions_stand_by_feature_and_encoder(of_methods):
+    plot = of_methods["prediction_by_feature"]
+    assert "5 steps" in plot.caption  # there are none of 10
+    assert ("slow-2", 20, "yaw", 0.8, 0.78, 0.8200000000000001) in plot.rows
+    axes = drawn(plot).axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == [
+        *("yaw", "still", "mean of features", "reward"),
+    ]
+    expected = [[0.9, 0.8, 0.1, 0.7], [np.nan] * 4, [0.9, 0.8, 0.1, 0.7], [0.45, 0.4, 0.05, 0.35]]
+    np.testing.assert_array_equal(axes.images[0].get_array(), expected)
+    by_horizon = drawn(of_methods["prediction_by_horizon"]).axes[0]
+    low, high = by_horizon.get_ylim()
+    assert low < 0.1 < 0.9 < high  # no encoder is cut off
+
+
+def test_a_spectrum_shows_which_units_a_code_keeps(of_methods):
+    axes = drawn(of_methods["spectrum"]).axes[0]
+    line, *rings = axes.lines  # one line of both, as their spectra are the same
+    assert list(line.get_ydata()) == [0.9, 0.8, 0.1, -0.01]
+    assert [tuple(ring.get_xydata()[0]) for ring in rings] == [(2, 0.8), (1, 0.9)]
+
+
+def test_timescales_are_those_of_an_exponential_decay(of_methods):
+    lags = np.array([2, 5, 10])
+    steps = [timescales(np.exp(-lag / np.array([30.0, 4.0])), lag) for lag in lags]
+    np.testing.assert_allclose(steps, [[30, 4]] * 3)
+    assert np.isnan(timescales(np.array([1.01, 0, -0.2]), 5)).all()
+    rows = [row for row in of_methods["timescales"].rows if row[:3] == ("slow-2", 10, 1)]
+    assert float(rows[0][4]) == pytest.approx(-10 / np.log(0.9), rel=1e-5)
+    (axes,) = drawn(of_methods["timescales"]).axes
+    assert list(axes.lines[0].get_xdata()) == [2, 10]  # in order, whatever that of the file
+
+
+def test_losses_of_training_stand_by_horizon_and_part(of_methods):
+    changes, reward = drawn(of_methods["loss_by_horizon"]).axes
+    assert list(changes.lines[1].get_ydata()) == [0.4, 0.9]
+    assert list(reward.lines[1].get_ydata()) == [0.1, 0.8]
+    assert of_methods["losses"].rows == [("forward-2-s1", 0.2, 0.3)]
+    drawn(of_methods["losses"])
+
+
+def test_families_differ_in_size_only():
+    assert [family(*each) for each in (("dae-8", 8), ("dae-8-s2", 8), ("slow-20", 8))] == [
+        *("dae", "dae-s2", "slow-20"),
+    ]

@@ -13,14 +13,17 @@ import numpy as np
 import pytest
 
 from jbrep.encoders import find, save
+from jbrep.encoders.diagnostics import DIAGNOSTICS, Diagnosed, write_diagnostics
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.figures import write
+from jbrep.evaluate.headline import SCALARS
+from jbrep.figures import study_plots, write
 from jbrep.files.tables import write_csv
 from jbrep.report import report, write_report
 from jbrep.report.columns import are_numbers
 from jbrep.report.facts import reproduce, setting_rows
 from jbrep.report.markdown import escape, markdown
+from jbrep.report.page import page as page_of
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, SUMMARY
 from jbrep.report.tables import read_tables
 from jbrep.report.words import answers
@@ -289,12 +292,33 @@ def named_otherwise(folder, out, name):
 def test_markdown_keeps_its_tables_whatever_the_names(whole, tmp_path):
     named_otherwise(whole, tmp_path / "a|b*", "d|a*<b>`e")
     tables = read_tables(tmp_path / "a|b*")
-    text = markdown(tables, answers(tables.analysis), "figure.png")
+    text = markdown(tables, answers(tables.analysis), [], "figure.png")
     assert text.startswith("# a\\|b\\*\n")
     assert r"| d\|a\*\<b>\`e | 4 | 1 |" in text
     lines = [line for line in text.splitlines() if line.startswith("|")]
     assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {5, 10}
     assert not re.search(r"(?<!\\)[<`]", text)
+
+
+def test_diagnostics_are_set_against_returns_where_they_are_known(whole, tmp_path, monkeypatch):
+    """As a table of the page and of the summary, and as a figure."""
+    named_otherwise(whole, tmp_path / "study", "dae-8")
+    rows = [
+        Diagnosed("face_direction", name, "0", {"forward": 0.1 * i, "unknown": 1.0})
+        for i, name in enumerate(FINAL)
+    ]
+    write_diagnostics(tmp_path / "study" / DIAGNOSTICS, rows)
+    plots = []
+    monkeypatch.setattr(report, "study_plots", lambda *parts: plots.extend(study_plots(*parts)))
+    monkeypatch.setattr(report, "page", lambda *parts: page_of(*parts[:2], [], *parts[3:]))
+    monkeypatch.setattr(report, "write", lambda *_: [])
+    page, _, text, _ = write_report(tmp_path / "study")
+    assert "diagnostics" in [plot.name for plot in plots]
+    row = ("forward", SCALARS["forward"].words, r"\-", "3")  # three codes are too few to correlate
+    assert f"| {' | '.join(row)} |" in text.read_text()
+    assert "do diagnostics predict learning?" in page.read_text()
+    assert "unknown" not in page.read_text()
+    assert "do diagnostics predict learning?" not in (whole / PAGE).read_text()
 
 
 def test_names_that_are_not_utf_8_are_written_all_the_same(whole, tmp_path):

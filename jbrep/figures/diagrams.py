@@ -11,10 +11,12 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
+from jbrep.dataset.scaling import EXTREMA
 from jbrep.figures.plot import Plot
 from jbrep.figures.style import COLUMN, PAGE, Looks, ink, plain
 
 _MOST = 20  # units of a layer that are drawn
+_TITLE = 45  # characters on a line above a panel
 _BOX = 19  # characters on a line of a box
 
 
@@ -46,6 +48,9 @@ class Training(TypedDict, total=False):
     """How an encoder was trained."""
 
     noise: float  # standard deviation of the corruption
+    scaling: str  # of the features, if not by their extrema
+    angles: bool  # whether each angle is encoded as its sine and cosine
+    keep: list[str]  # features that pass around the encoder
 
 
 class Data(TypedDict, total=False):
@@ -122,10 +127,16 @@ def _draw_autoencoders(encoders: Mapping[str, EncoderRecord], looks: Looks) -> F
         axes.set_axis_off()
     for axes, (representation, encoder) in zip(panels, encoders.items(), strict=False):
         _draw_layers(axes, encoder, look[representation]["color"])
-        noise = encoder["training"].get("noise")
-        corrupted = f", trained with noise N(0, {noise:g}²)" if noise else ""
-        axes.set_title(plain(f"{representation}{corrupted}"), loc="center")
+        axes.set_title(plain(_title(representation, encoder["training"])), loc="center")
     return figure
+
+
+def _title(representation: str, training: Training) -> str:
+    """The name, what it was trained with, and on a line below, what passes around it."""
+    noise, kept = training.get("noise"), training.get("keep")
+    corrupted = f", trained with noise N(0, {noise:g}²)" if noise else ""
+    beside = f"{', '.join(kept)} passed around" if kept else ""
+    return "\n".join(filter(None, (f"{representation}{corrupted}", fill(beside, _TITLE))))
 
 
 def _draw_layers(axes: Axes, encoder: EncoderRecord, colour: str) -> None:
@@ -163,14 +174,14 @@ def _hidden(layers: list[int] | dict[str, list[int]]) -> str:
 def system(shared: LabelRecord, looks: Looks) -> Plot:
     """Robot, observation, encoder, agent, action."""
     settings, encoder = shared["settings"], shared["encoder"]
-    latent = encoder["encoder"][-1][0]
+    latent = encoder.get("latent_size", encoder["encoder"][-1][0])
     hidden = _hidden(settings["hidden"])
     task = settings.get("environment")
     action = _action(task) if task else ""
     step = f" of {task['timestep']:g} s" if task and task["timestep"] else ""
     boxes = [
         ("robot", settings["task"] + (f"\nsteps{step}" if step else "")),
-        ("observation", f"{encoder['size']} features\nscaled to [-1, 1]"),
+        ("observation", f"{encoder['size']} features\n{_scaled(encoder['training'])}"),
         ("encoder", f"{settings['representation']}\n{encoder['size']} to {latent}"),
         ("latent", f"{latent} numbers"),
         ("agent", f"{settings['algorithm'].upper()}\nhidden {hidden}"),
@@ -183,6 +194,12 @@ def system(shared: LabelRecord, looks: Looks) -> Plot:
         [(name, what.replace("\n", ", ")) for name, what in [*boxes, ("action", action)]],
         lambda: _draw_system(boxes, action, looks()[settings["representation"]]["color"]),
     )
+
+
+def _scaled(training: Training) -> str:
+    scaling = training.get("scaling", EXTREMA)
+    how = "scaled to [-1, 1]" if scaling == EXTREMA else f"{scaling} scaling"
+    return f"{how}, angles as sine and cosine" if training.get("angles") else how
 
 
 def _action(task: TaskRecord) -> str:

@@ -1,43 +1,45 @@
 """Figures of encoders, from their evaluation."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
-from numpy.typing import NDArray
 
 from jbrep.encoders import FULL
 from jbrep.encoders.encoder import IDENTITY
 from jbrep.figures.curves import below
+from jbrep.figures.families import Encoders, family, family_styles
+from jbrep.figures.heat_map import MOST, bare, heat_map, least
+from jbrep.figures.methods import method_plots
 from jbrep.figures.plot import Plot
-from jbrep.figures.style import COLUMN, PAGE, ink, plain, reference, styles
-from jbrep.stats.bootstrap import Array
-
-Encoders = Mapping[str, Any]  # of evaluation.json, by label
+from jbrep.figures.prediction import prediction_plots
+from jbrep.figures.style import COLUMN, PAGE, ink, plain, reference
 
 _ERROR = ("mse", "low", "high")
-_MOST = 40  # features in a picture, and names on an axis
 
 
 def encoder_plots(evaluation: Mapping[str, Any]) -> list[Plot]:
-    """What encoders lose, how they cope with noise, and how their latent units correlate.
+    """What codes predict, what encoders lose, how their latent units correlate, what methods say.
 
     What encoders lose is drawn of those that decode; errors against latent size and against noise
-    are drawn if one of their latents is smaller than the observation.
+    are drawn if one of their latents is smaller than the observation. What an evaluation by an
+    earlier version lacks isn't drawn.
 
     Args:
         evaluation: what jbrep.evaluate.diagnose returned, or its JSON.
     """
     task = evaluation["data"]["task"]
-    encoders = {label: e for label, e in evaluation["encoders"].items() if label != FULL}
+    everything = evaluation["encoders"]
+    encoders = {label: e for label, e in everything.items() if label != FULL}
     decoding = {label: e for label, e in encoders.items() if e["reconstruction"]}
-    plots = [_error_by_feature(task, decoding)] if decoding else []
+    plots = prediction_plots(task, everything)
+    plots += [_error_by_feature(task, decoding)] if decoding else []
     if decoding and _sizes(decoding):
         plots += [_error_by_latent(task, decoding), _error_by_corruption(task, decoding)]
-    return [*plots, _latent_correlation(task, encoders)]
+    return [*plots, _latent_correlation(task, encoders), *method_plots(task, encoders)]
 
 
 def _sizes(encoders: Encoders) -> list[int]:
@@ -49,12 +51,12 @@ def _sizes(encoders: Encoders) -> list[int]:
 def _error_by_feature(task: str, encoders: Encoders) -> Plot:
     """R^2 of each feature (rows) for each encoder (columns)."""
     count = len(next(iter(encoders.values()))["reconstruction"]["features"])
-    part = f" Of {count} features the {_MOST} worst are shown; all are in the table."
+    part = f" Of {count} features the {MOST} worst are shown; all are in the table."
     return Plot(
         "error_by_feature",
         f"{task}: reconstruction of each feature",
         "R² of each feature's reconstruction on held-out episodes."
-        + (part if count > _MOST else ""),
+        + (part if count > MOST else ""),
         ("encoder", "feature", "r2", "low", "high"),
         [
             (label, feature["name"], *feature["r2"])
@@ -70,41 +72,15 @@ def _draw_features(task: str, encoders: Encoders) -> Figure:
     values = np.array(
         [[f["r2"][0] for f in e["reconstruction"]["features"]] for e in encoders.values()], float
     ).T
-    count = len(values)
-    worst = _worst(values)
-    features, values = [features[i] for i in worst], values[worst]
-    width = max(COLUMN, 1.7 + 0.29 * len(encoders))
-    figure = Figure(figsize=(width, 1.0 + 0.16 * len(features)))
-    axes: Axes = figure.subplots()
-    picture = axes.imshow(values, cmap="cividis", vmin=0, vmax=1, aspect="auto")
-    for (row, column), value in np.ndenumerate(values):
-        colour = "black" if value > 0.6 else "white"
-        shown = "-" if np.isnan(value) else "<0" if value < 0 else f"{value:.2f}"
-        axes.text(column, row, shown, ha="center", va="center", color=colour, size=5)
-    axes.set_yticks(range(len(features)), [f["name"] for f in features])
-    axes.set_xticks(range(len(encoders)), [plain(n) for n in encoders], rotation=60, ha="right")
-    _bare(axes)
-    which = "each feature" if count == len(features) else f"the {_MOST} worst of {count} features"
-    axes.set_title(plain(f"{task}:\nreconstruction of {which}"))
-    figure.colorbar(picture, label="R² on held-out episodes")
-    return figure
-
-
-def _worst(r2: Array) -> NDArray[np.int64]:
-    """The features with the least mean R² over encoders, in the order of the observation.
-
-    Args:
-        r2: (features, encoders); NaN, of a feature that doesn't vary, counts as 1.
-    """
-    order = np.argsort(np.nan_to_num(r2, nan=1).mean(axis=1), kind="stable")
-    return np.sort(order[:_MOST])
-
-
-def _bare(axes: Axes) -> None:
-    """Remove what a matrix doesn't need."""
-    axes.grid(visible=False)
-    axes.spines[:].set_visible(False)
-    axes.tick_params(length=0)
+    worst = least(np.nan_to_num(values, nan=1).mean(axis=1))  # what never varies isn't the worst
+    names = [features[i]["name"] for i in worst]
+    which = (
+        "each feature"
+        if len(names) == len(features)
+        else f"the {MOST} worst of {len(features)} features"
+    )
+    title = f"{task}:\nreconstruction of {which}"
+    return heat_map(values[worst], names, list(encoders), title, "R² on held-out episodes")
 
 
 def _error_by_latent(task: str, encoders: Encoders) -> Plot:
@@ -128,7 +104,7 @@ def _draw_sizes(task: str, encoders: Encoders) -> Figure:
     axes: Axes = figure.subplots()
     sizes = _sizes(encoders)
     families = _families(encoders)
-    for name, style in _styles(families).items():
+    for name, style in family_styles(families).items():
         points = {size: e["reconstruction"]["mse"] for size, e in sorted(families[name].items())}
         _draw_errors(axes, points, label=plain(name), **style)
     pca = {e["latent"]: e["reconstruction"]["pca_mse"][0] for e in encoders.values()}
@@ -164,7 +140,7 @@ def _draw_corruption(task: str, encoders: Encoders) -> Figure:
     panels = figure.subplots(1, len(sizes), sharey=True, squeeze=False)[0]
     families = _families(encoders)
     for axes, size in zip(panels, sizes, strict=True):
-        for name, style in _styles(families).items():
+        for name, style in family_styles(families).items():
             if size in families[name]:
                 levels = families[name][size]["corruption"]
                 points = {level["noise"]: level["mse"] for level in levels}
@@ -219,11 +195,11 @@ def _draw_correlation(task: str, encoders: Encoders) -> Figure:
         picture = axes.imshow(values, cmap="RdBu_r", vmin=-1, vmax=1)
         names = _unit_names(e)
         unit, size, angle = ("feature", 5, 90) if e["kind"] == IDENTITY else ("latent unit", 6.5, 0)
-        if len(names) <= _MOST:  # otherwise some numbers
+        if len(names) <= MOST:  # otherwise some numbers
             axes.set_xticks(range(len(names)), names, size=size, rotation=angle)
             axes.set_yticks(range(len(names)), names, size=size)
         axes.set(title=plain(label), xlabel=unit, ylabel=unit)
-        _bare(axes)
+        bare(axes)
     figure.colorbar(picture, ax=panels.tolist(), label="correlation", shrink=0.8, aspect=15 * rows)
     figure.suptitle(f"{task}: correlation between latent units", size=8)
     return figure
@@ -234,15 +210,10 @@ def _families(encoders: Encoders) -> dict[str, dict[int, Mapping[str, Any]]]:
     families: dict[str, dict[int, Mapping[str, Any]]] = {}
     sizes = _sizes(encoders)
     for label, e in encoders.items():
-        family = label.removesuffix(f"-{e['latent']}")
-        if family != "pca" and e["latent"] in sizes:
-            families.setdefault(family, {})[e["latent"]] = e
+        name = family(label, e["latent"])
+        if name != "pca" and e["latent"] in sizes:
+            families.setdefault(name, {})[e["latent"]] = e
     return families
-
-
-def _styles(families: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Colour and marker of each family, denoising autoencoders first."""
-    return styles(sorted(families, key=lambda name: (not name.startswith("dae"), name)))
 
 
 def _draw_errors(axes: Axes, points: dict[Any, list[float]], **style: Any) -> None:

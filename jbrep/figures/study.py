@@ -5,11 +5,13 @@ from functools import partial
 
 from jbrep.encoders import FULL
 from jbrep.figures.curves import Heuristics, Return, curves, every_run
+from jbrep.figures.diagnostics import diagnostics
 from jbrep.figures.diagrams import LabelRecord, diagrams
 from jbrep.figures.plot import Plot
 from jbrep.figures.returns import final_return, learning_rate, profiles, variance_ratio
 from jbrep.figures.style import styles
 from jbrep.stats import Analysis
+from jbrep.stats.association import Association
 from jbrep.stats.runs import in_order
 
 
@@ -18,6 +20,7 @@ def study_plots(
     returns: Sequence[Return],
     heuristics: Heuristics,
     labels: Mapping[str, LabelRecord],
+    associations: Sequence[Association] = (),
 ) -> list[Plot]:
     """The figures that the tables of a study allow; a representation has one colour in all.
 
@@ -26,6 +29,7 @@ def study_plots(
         returns: returns.csv.
         heuristics: returns of the hand-written policy, by task.
         labels: of runs.json.
+        associations: of diagnostics with final returns.
     """
     baseline = analysis.baseline if analysis else FULL
     groups = analysis.groups if analysis else ()
@@ -41,6 +45,8 @@ def study_plots(
         if any(group.comparisons for group in groups):
             plots.append(variance_ratio(analysis, looks))
         plots += [learning_rate(groups, looks), profiles(analysis, looks)]
+    if associations:
+        plots.append(diagnostics(associations, looks))
     if returns:
         plots.append(every_run(returns, looks))
     return [*plots, *diagrams(labels, looks)]

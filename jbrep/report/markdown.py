@@ -10,7 +10,7 @@ from jbrep.report.words import Answer, remark
 from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.claims import CLAIMS
 from jbrep.stats.comparison import Verdict
-from jbrep.stats.summary import label_rows, margin
+from jbrep.stats.summary import Rows, label_rows, margin
 
 # what would be read as markup: an underscore within a word and a bracket without a link are not
 _MARKUP = re.compile(
@@ -18,18 +18,23 @@ _MARKUP = re.compile(
 )
 
 
-def markdown(tables: Tables, answers: Sequence[Answer], picture: str) -> str:
+def markdown(
+    tables: Tables, answers: Sequence[Answer], predictions: Sequence[tuple[str, Rows]], picture: str
+) -> str:
     """The summary, for a README.
 
     Args:
         tables: of the study.
         answers: on each claim.
+        predictions: tables of how well diagnostics predict learning, each with a title.
         picture: the main figure's path.
     """
-    return "\n".join(_lines(tables, answers, picture))
+    return "\n".join(_lines(tables, answers, predictions, picture))
 
 
-def _lines(tables: Tables, answers: Sequence[Answer], picture: str) -> Iterator[str]:
+def _lines(
+    tables: Tables, answers: Sequence[Answer], predictions: Sequence[tuple[str, Rows]], picture: str
+) -> Iterator[str]:
     yield from (f"# {escape(tables.name)}", "", escape(facts.outline(tables)), "")
     for notice in facts.notices(tables):
         yield from (f"> {escape(notice)}", "")
@@ -48,6 +53,8 @@ def _lines(tables: Tables, answers: Sequence[Answer], picture: str) -> Iterator[
     for group in groups:
         yield from (f"{escape(group.name)}, with 95 % intervals over runs:", "")
         yield from (*_table(*label_rows(group)), "")
+    for title, (header, rows) in predictions:
+        yield from (f"{escape(title)}:", "", *_table(header, rows), "")
 
 
 def _verdicts(group: GroupAnalysis) -> list[str]:

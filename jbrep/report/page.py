@@ -25,8 +25,20 @@ _WIDEST = 1000  # of a figure [CSS pixels]
 _PER_INCH = 96  # CSS pixels: on a narrow screen a figure is shown at its size on paper
 
 
-def page(tables: Tables, answers: Sequence[Answer], plots: Sequence[Plot]) -> str:
-    """The page; the content of the tables is shown as text and never runs."""
+def page(
+    tables: Tables,
+    answers: Sequence[Answer],
+    plots: Sequence[Plot],
+    predictions: Sequence[tuple[str, Rows]],
+) -> str:
+    """The page; the content of the tables is shown as text and never runs.
+
+    Args:
+        tables: of the study.
+        answers: on each claim.
+        plots: figures.
+        predictions: tables of how well diagnostics predict learning, each with a title.
+    """
     script = _own("page.js")
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     return template.from_string(_own("page.html.j2")).render(
@@ -41,7 +53,7 @@ def page(tables: Tables, answers: Sequence[Answer], plots: Sequence[Plot]) -> st
         answers=answers,
         are_numbers=are_numbers,
         figures=[_figure(plot) for plot in Progress(plots, unit="figure", delay=1, leave=False)],
-        tables=_tables(tables.analysis) if tables.analysis else [],
+        tables=[*(_tables(tables.analysis) if tables.analysis else ()), *predictions],
         runs=facts.run_rows(tables),
         failed=facts.failed_rows(tables),
         missing=facts.missing_rows(tables),

@@ -7,7 +7,7 @@ from typing import Any
 
 from jbrep.figures import study_plots, write
 from jbrep.files.storage import make_folder, write_whole
-from jbrep.report import facts
+from jbrep.report import diagnostics, facts
 from jbrep.report.markdown import markdown
 from jbrep.report.page import page
 from jbrep.report.tables import Tables, read_tables
@@ -38,11 +38,15 @@ def write_report(folder: Path, out: Path | None = None) -> list[Path]:
     out = out or folder
     make_folder(out)
     verdicts = answers(tables.analysis) if tables.analysis else []
-    plots = study_plots(tables.analysis, tables.returns, tables.heuristics, tables.record["labels"])
+    associated = diagnostics.of_study(tables)
+    plots = study_plots(
+        tables.analysis, tables.returns, tables.heuristics, tables.record["labels"], associated
+    )
+    predictions = diagnostics.diagnostic_tables(associated)
     texts = {
-        PAGE: page(tables, verdicts, plots),
+        PAGE: page(tables, verdicts, plots, predictions),
         SUMMARY: json.dumps(_summary(tables, verdicts), indent=1, allow_nan=False) + "\n",
-        MARKDOWN: markdown(tables, verdicts, f"{FIGURES}/{_MAIN_FIGURE}.png"),
+        MARKDOWN: markdown(tables, verdicts, predictions, f"{FIGURES}/{_MAIN_FIGURE}.png"),
     }
     write(plots, out / FIGURES)
     for name, text in texts.items():

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypedDict
 
+from jbrep.encoders.diagnostics import DIAGNOSTICS, by_label, read_diagnostics
 from jbrep.errors import DamageError, InputError
 from jbrep.figures.curves import Return
 from jbrep.figures.diagrams import LabelRecord, TaskRecord
@@ -58,6 +59,8 @@ class Tables(NamedTuple):
     analysis: Analysis | None  # statistics.json
     returns: list[Return]  # returns.csv
     heuristics: dict[str, list[float]]  # heuristics.csv: returns by task
+    # diagnostics.csv: values by task and representation, then by name
+    diagnostics: dict[tuple[str, str], dict[str, float | None]]
 
 
 def read_tables(folder: Path) -> Tables:
@@ -80,8 +83,10 @@ def read_tables(folder: Path) -> Tables:
             heuristics.setdefault(task, []).append(each)
     columns_of_returns = (str, str, str, _count, _count, _count, _episode_return)
     returns = [Return(*row) for row in _read_csv(folder / RETURNS, columns_of_returns)]
+    rows = read_diagnostics(folder / DIAGNOSTICS) if exists(folder / DIAGNOSTICS) else []
     name = folder.resolve().name.encode(errors="replace").decode()
-    return Tables(name, _read_record(folder / record.RECORD), analysis, returns, heuristics)
+    record_of_runs = _read_record(folder / record.RECORD)
+    return Tables(name, record_of_runs, analysis, returns, heuristics, by_label(rows))
 
 
 def _read_record(path: Path) -> Record:
