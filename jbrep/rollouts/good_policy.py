@@ -11,7 +11,7 @@ from jbrep.evaluate.policy import GoodPolicy, PlayedEpisode
 from jbrep.rollouts.jitterbug import jitterbug_task
 from jbrep.rollouts.sources import find_player
 
-_EPISODES = 60
+_EPISODES = 40
 HEURISTIC = "heuristic"
 
 
