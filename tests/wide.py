@@ -49,6 +49,7 @@ class WideDataset:
         self.arrays = {
             "observation": self._observations(sum(lengths), features, random),
             "action": random.uniform(-1, 1, (sum(lengths), 17)).astype(np.float32),
+            "reward": np.zeros(sum(lengths), np.float32),
         }
 
     def _observations(self, count, features, random):

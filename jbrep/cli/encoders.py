@@ -40,13 +40,21 @@ from jbrep.text import terminal_width
     type=click.Path(path_type=Path),
     help="A folder for evaluation.json and figures.",
 )
+@click.option(
+    "--policy",
+    help="That does the task well: a run's folder, or a policy by name. By default the task's "
+    "hand-written policy, if it has one.",
+)
 @as_json
-def evaluate(encoder: tuple[str, ...], data: Path, out: Path, as_json: bool) -> None:
+def evaluate(
+    encoder: tuple[str, ...], data: Path, out: Path, policy: str | None, as_json: bool
+) -> None:
     """Show what encoders lose and keep, side by side.
 
-    Judged on the held-out episodes: reconstruction, corruption, the latent's units and dimensions,
-    linear probes, nearest neighbours, and the prediction of the next latent. An encoder of your own
-    is code such as mymodule:MyEncoder; its module is imported, which runs it.
+    Judged on the held-out episodes: how well they foretell the state and the reward, what they say
+    of a good policy's value and action, linear and nonlinear probes, reconstruction, corruption,
+    the latent's units and dimensions, nearest neighbours, and the prediction of the next latent. An
+    encoder of your own is code such as mymodule:MyEncoder; its module is imported, which runs it.
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders import find
@@ -57,6 +65,7 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path, as_json: bool) -> 
     from jbrep.evaluate.summary import evaluation_text
     from jbrep.figures import encoder_plots
     from jbrep.figures import write as write_plots
+    from jbrep.rollouts.good_policy import find_good_policy
 
     for name in encoder:
         import_code(name)
@@ -68,7 +77,7 @@ def evaluate(encoder: tuple[str, ...], data: Path, out: Path, as_json: bool) -> 
         raise InputError(f"{min(twice)} is given twice: leave one out")
     labelled = dict(zip(labels, encoders, strict=True))
     with stoppable("the same command starts over"):
-        evaluation = write(labelled, scaled, out)
+        evaluation = write(labelled, scaled, out, find_good_policy(policy, scaled.task))
         pictures = write_plots(encoder_plots(evaluation), out)
     for label, source in zip(labels, sources, strict=True):
         line = source if source.startswith(label) else f"{label}: {source}"

@@ -14,14 +14,20 @@ from jbrep.envs.encoding import BaseEncoder
 from jbrep.errors import InputError
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import latent
-from jbrep.evaluate.readout import correlation, dynamics, neighbours, probes
+from jbrep.evaluate.need import lost, needs
+from jbrep.evaluate.policy import GoodPolicy, action, value
+from jbrep.evaluate.prediction import prediction
+from jbrep.evaluate.readout import correlation, dynamics, neighbours, nonlinear_probes, probes
 from jbrep.evaluate.reconstruction import corruption, reconstruction
 from jbrep.progress import Progress
 from jbrep.stats.bootstrap import RESAMPLES
 
 FORMAT = "jbrep evaluation"
-FORMAT_VERSION = 1
-_DIAGNOSTICS: dict[str, Callable[[BaseEncoder, HeldOut], Any]] = {
+FORMAT_VERSION = 2
+_Diagnostic = Callable[[BaseEncoder, HeldOut], Any]
+_DIAGNOSTICS: dict[str, _Diagnostic] = {
+    "prediction": prediction,
+    "nonlinear_probes": nonlinear_probes,
     "reconstruction": reconstruction,
     "corruption": corruption,
     "latent_units": latent,
@@ -33,7 +39,9 @@ _DIAGNOSTICS: dict[str, Callable[[BaseEncoder, HeldOut], Any]] = {
 _DECODING = ("reconstruction", "corruption")  # None of an encoder that doesn't decode
 
 
-def diagnose(encoders: Mapping[str, Any], data: ScaledDataset) -> dict[str, Any]:
+def diagnose(
+    encoders: Mapping[str, Any], data: ScaledDataset, policy: GoodPolicy | None = None
+) -> dict[str, Any]:
     """Every diagnostic of every encoder, as plain JSON; docs/encoders.md describes each.
 
     The full observation comes first, as the upper limit of what can be kept. A value with an
@@ -46,6 +54,8 @@ def diagnose(encoders: Mapping[str, Any], data: ScaledDataset) -> dict[str, Any]
             module.
         data: to judge them on; encoders that were trained on this data set haven't seen its test
             part.
+        policy: that does the task well; what encoders say of its actions and its value is None
+            without one.
 
     Raises:
         InputError: an encoder made for other features, or whose numbers overflow; or as `find`.
@@ -56,23 +66,47 @@ def diagnose(encoders: Mapping[str, Any], data: ScaledDataset) -> dict[str, Any]
         _check(label, encoder, data)
     full = Encoder({"kind": IDENTITY, "name": FULL}, data.scaler, (), ())
     everything: dict[str, BaseEncoder] = {FULL: full, **judged}
+    diagnostics = _DIAGNOSTICS | _of_policy(policy)
     results: dict[str, Any] = {}
-    with Progress(total=len(everything) * len(_DIAGNOSTICS), unit="diagnostic") as progress:
+    needed: dict[str, float] = {}
+    with Progress(total=len(everything) * len(diagnostics), unit="diagnostic") as progress:
         for label, encoder in everything.items():
-            results[label] = {"kind": encoder.kind, "latent": encoder.latent_size}
-            for name, diagnostic in _DIAGNOSTICS.items():
-                progress.set_description_str(f"{label} {name}", refresh=False)
+            result: dict[str, Any] = {"kind": encoder.kind, "latent": encoder.latent_size}
+            for name, diagnostic in diagnostics.items():
+                progress.set_description_str(f"{label} {name.replace('_', ' ')}", refresh=False)
                 possible = encoder.can_decode or name not in _DECODING
-                results[label][name] = diagnostic(encoder, held_out) if possible else None
+                result[name] = diagnostic(encoder, held_out) if possible else None
                 progress.update()
+            if label == FULL:
+                needed = needs(encoder, held_out, policy)
+            result["loses"] = lost(needed, result["nonlinear_probes"])
+            result["method"] = _made(encoder)
+            results[label] = result
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "data": _describe(held_out),
         "resamples": RESAMPLES,
         "seen": {label: seen(encoder, data) for label, encoder in judged.items()},
+        "policy": policy and policy.name,
+        "needs": needed,
         "encoders": results,
     }
+
+
+def _of_policy(policy: GoodPolicy | None) -> dict[str, _Diagnostic]:
+    """The diagnostics that need a policy."""
+    if policy is None:
+        return dict.fromkeys(("value", "action"), lambda encoder, held_out: None)
+    return {
+        "value": lambda encoder, held_out: value(encoder, policy),
+        "action": lambda encoder, held_out: action(encoder, held_out, policy),
+    }
+
+
+def _made(encoder: BaseEncoder) -> dict[str, Any]:
+    """What the method says of its own fit, such as its spectrum."""
+    return dict(encoder.header.get("metrics", {})) if isinstance(encoder, Encoder) else {}
 
 
 def _check(label: str, encoder: BaseEncoder, data: ScaledDataset) -> None:

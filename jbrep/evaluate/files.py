@@ -10,34 +10,42 @@ from jbrep.dataset import ScaledDataset
 from jbrep.encoders import find
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import diagnose
+from jbrep.evaluate.policy import GoodPolicy
 from jbrep.files.storage import exists, make_folder, write_whole
 
 EVALUATION = "evaluation.json"
 _DIGITS = 6
 
 
-def write(encoders: Mapping[str, Any], data: ScaledDataset, folder: Path) -> dict[str, Any]:
+def write(
+    encoders: Mapping[str, Any],
+    data: ScaledDataset,
+    folder: Path,
+    policy: GoodPolicy | None = None,
+) -> dict[str, Any]:
     """Evaluate encoders, and write evaluation.json.
 
     Args:
         encoders: by the label to show; whatever `jbrep.encoders.find` takes.
         data: to judge them on.
         folder: created if it doesn't exist.
+        policy: that does the task well, if one is known.
 
     Returns:
         The evaluation, as `jbrep.evaluate.diagnose` returns it.
 
     Raises:
         InputError: an encoder was made for other features, or the folder holds the evaluation of
-            other encoders or data.
+            other encoders or data, or with another policy.
     """
     path = folder / EVALUATION
     judged = {label: find(each, data.task) for label, each in encoders.items()}
     hashes = {label: encoder.fingerprint for label, encoder in judged.items()}
     if exists(path):
-        _check_same(path, {"data": data.dataset.manifest.fingerprint, "encoders": hashes})
+        wanted = {"data": data.dataset.manifest.fingerprint, "encoders": hashes}
+        _check_same(path, {**wanted, "policy": policy and policy.name})
     make_folder(folder)
-    evaluation = diagnose(judged, data)
+    evaluation = diagnose(judged, data, policy)
     for label, digest in hashes.items():
         evaluation["encoders"][label]["sha256"] = digest
     write_whole(path, _text(evaluation).encode())
@@ -49,7 +57,9 @@ def _check_same(path: Path, wanted: dict[str, Any]) -> None:
     try:
         there = json.loads(path.read_bytes())
         hashes = {label: e["sha256"] for label, e in there["encoders"].items() if "sha256" in e}
-        same = {"data": there["data"]["fingerprint"], "encoders": hashes} == wanted
+        policy = there.get("policy", wanted["policy"])  # version 1 has none
+        made = {"data": there["data"]["fingerprint"], "encoders": hashes, "policy": policy}
+        same = made == wanted
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         same = False
     if not same:

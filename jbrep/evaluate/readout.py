@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.scaled import sample
 from jbrep.envs.encoding import BaseEncoder
+from jbrep.envs.task import Task
+from jbrep.evaluate.explained import explained
 from jbrep.evaluate.held_out import MAX_GROUPS, MAX_NUMBERS, HeldOut, Rows, sample_rows
-from jbrep.evaluate.truth import quantities, state
-from jbrep.stats.bootstrap import Array, Interval, bootstrap, r_squared, variation
+from jbrep.evaluate.regression import Predictor, Problem, fit
+from jbrep.evaluate.truth import Columns, quantities, quantities_and_features, state
+from jbrep.stats.bootstrap import Array, bootstrap, variation
 
 _ROWS = 100_000  # at most, to fit on and to judge on
 _CORRELATED = 50_000  # held-out rows
@@ -32,14 +35,28 @@ def probes(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
     The cosine and sine of an angle count together. At most 100,000 rows are fitted to, and as many
     judged; of more than 83 features, fewer.
     """
+    return _probes(encoder, held_out, quantities, ridge)
+
+
+def nonlinear_probes(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
+    """The same by nonlinear regression, of each quantity and of every feature."""
+    return _probes(encoder, held_out, quantities_and_features, lambda *p: fit([Problem(*p)])[0])
+
+
+def _probes(
+    encoder: BaseEncoder,
+    held_out: HeldOut,
+    truth: Callable[[Task, NDArray[Any]], Columns],
+    regression: Callable[[NDArray[Any], Array], Predictor],
+) -> dict[str, list[Any]]:
     data = held_out.data
     size = data.task.size
     train, test = (sample_rows(rows, _ROWS, size) for rows in (data.train, data.test))
     seen, unseen = data.dataset["observation"][train], data.dataset["observation"][test]
-    known, true = (quantities(data.task, rows) for rows in (seen, unseen))
-    fitted = _fit(encoder.encode(seen), np.hstack(list(known.values())))
-    scores = _explained(
-        fitted(encoder.encode(unseen)),
+    known, true = (truth(data.task, rows) for rows in (seen, unseen))
+    predict = regression(encoder.encode(seen), np.hstack(list(known.values())))
+    scores = explained(
+        predict(encoder.encode(unseen)),
         np.hstack(list(true.values())),
         test,
         held_out,
@@ -79,14 +96,14 @@ def dynamics(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
     before, now = (np.hstack((whitened(s.latent), s.action)) for s in (seen, unseen))
     after, then = whitened(seen.next_latent), whitened(unseen.next_latent)
     width = after.shape[1]
-    fitted = _fit(before, np.hstack((after, seen.change / spread)))(now)
+    fitted = ridge(before, np.hstack((after, seen.change / spread)))(now)
     results = {
         "linear": (fitted[:, :width], then),
         "persistence": (now[:, :width], then),
         "change": (fitted[:, width:], unseen.change / spread),
     }
     return {
-        name: _explained(predicted, true, unseen.rows, held_out).tolist()[0]
+        name: explained(predicted, true, unseen.rows, held_out).tolist()[0]
         for name, (predicted, true) in results.items()
     }
 
@@ -112,7 +129,7 @@ def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
     return lambda values: (values - mean) @ matrix
 
 
-def _fit(values: NDArray[Any], wanted: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
+def ridge(values: NDArray[Any], wanted: NDArray[Any]) -> Predictor:
     """Ridge regressions of all columns (n, k) on standardised values (n, l), as a map."""
     from sklearn.linear_model import Ridge  # not at the top: it takes seconds
     from sklearn.pipeline import make_pipeline
@@ -194,29 +211,3 @@ def correlation(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
         "dimensions": dict(zip(names, by_name, strict=True)),
         "state_dimensions": len(truth),
     }
-
-
-def _explained(
-    predicted: Array,
-    true: NDArray[Any],
-    rows: Rows,
-    held_out: HeldOut,
-    widths: list[int] | None = None,
-) -> Interval:
-    """R^2 of each part of predicted columns (n, k), (parts,); the columns of a part count together.
-
-    The parts have these widths; None for all columns as one part.
-    """
-    true = np.asarray(true, np.float64)
-    shifted = true - true.mean(axis=0)  # keeps the digits of a small variation
-    sums = held_out.sums(
-        rows, (predicted - true) ** 2, shifted, shifted**2, np.ones((len(rows), 1))
-    )
-    starts = np.cumsum([0, *(widths or [true.shape[1]])])[:-1]
-
-    def statistic(residual: Array, total: Array, squares: Array, n: Array) -> Array:
-        about_mean = variation(total, squares, n)
-        parts = (np.add.reduceat(v, starts, axis=-1) for v in (residual, about_mean))
-        return r_squared(*parts)
-
-    return bootstrap(statistic, *sums)

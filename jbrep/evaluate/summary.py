@@ -1,12 +1,22 @@
 """An evaluation as tables to read on a screen."""
 
+import sys
 import textwrap
 from collections.abc import Mapping
 from typing import Any
 
 from jbrep.encoders import FULL
-from jbrep.text import interval, number, table
+from jbrep.evaluate.headline import headline
+from jbrep.evaluate.truth import in_words
+from jbrep.text import facts, interval, number, table
 
+_SERVES = {  # of the headline
+    "forward": "the features' change over 10 steps, from code and actions",
+    "reward": "the mean reward of these steps",
+    "value": "the discounted return to go",
+    "action": "the action",
+}
+_OF_POLICY = ("value", "action")
 _NOISE = 0.1  # the level of corruption that is shown
 _MANY = 8  # quantities from which probes are summed up
 
@@ -20,6 +30,7 @@ def evaluation_text(evaluation: Mapping[str, Any], width: int | None = None) -> 
     """
     data, encoders = evaluation["data"], evaluation["encoders"]
     parts = (
+        *_headline(evaluation, width),
         f"Error on {data['test_episodes']:,} held-out episodes of {data['task']} "
         f"({data['test_rows']:,} rows), features scaled to [-1, 1], with 95 % intervals over "
         "episodes",
@@ -33,6 +44,44 @@ def evaluation_text(evaluation: Mapping[str, Any], width: int | None = None) -> 
     texts, tables = parts[::2], parts[1::2]
     wrapped = texts if width is None else [textwrap.fill(text, width) for text in texts]
     return "\n\n".join(part for pair in zip(wrapped, tables, strict=True) for part in pair)
+
+
+def _headline(evaluation: Mapping[str, Any], width: int | None) -> tuple[str, ...]:
+    """What tells codes that serve from others, and a line on what each loses; of version 2."""
+    if "needs" not in evaluation:
+        return ()
+    encoders, policy = evaluation["encoders"], evaluation["policy"]
+    shown = {name: words for name, words in _SERVES.items() if policy or name not in _OF_POLICY}
+    scalars = {label: headline(diagnostics) for label, diagnostics in encoders.items()}
+    rows = [
+        (label, str(encoders[label]["latent"]), *(_first(known[name]) for name in shown))
+        for label, known in scalars.items()
+    ]
+    explained = "; ".join(f"{name}: {words}" for name, words in shown.items())
+    return (
+        f"Whether a controller can work with the code: held-out R², nonlinear (1: all, 0: nothing)."
+        f" {explained[0].upper()}{explained[1:]}{f' of {policy}' if policy else ''}",
+        table(("encoder", "l", *shown), rows, width),
+        "What a controller needs and the code loses (R² of reading it below .5), the most needed "
+        "first",
+        _lost(evaluation, width),
+    )
+
+
+def _first(values: list[float | None] | None) -> str:
+    return "-" if values is None else number(values[0], ".2f")
+
+
+def _lost(evaluation: Mapping[str, Any], width: int | None) -> str:
+    task, lines = evaluation["data"]["task"], {}
+    for label, diagnostics in evaluation["encoders"].items():
+        lost: dict[str, float] = {}
+        for each in diagnostics["loses"]:
+            lost.setdefault(in_words(task, each["name"]), each["kept"])
+        more = len(lost) - _MANY
+        some = [f"{words} ({number(kept, '.2f')})" for words, kept in list(lost.items())[:_MANY]]
+        lines[label] = ", ".join(some) + (f" and {more} more" if more > 0 else "") or "nothing"
+    return facts(lines, width or sys.maxsize, indent=0)
 
 
 def _losses(encoders: Mapping[str, Any], width: int | None) -> str:

@@ -1,6 +1,7 @@
 """The ground truth of a robot, computed from its observations: what a latent is searched for."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +9,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from jbrep.envs.task import Task
 from jbrep.jitterbug.tasks import TASKS
+
+_WORDS = {
+    "orientation_w": "yaw",
+    "orientation_x": "tilt",
+    "orientation_y": "tilt",
+    "orientation_z": "yaw",
+    "velocity_z": "vertical speed",
+    "angular_velocity_x": "rate of tilt",
+    "angular_velocity_y": "rate of tilt",
+    "angular_velocity_z": "rate of yaw",
+}
 
 Array = NDArray[np.float64]
 Columns = dict[str, Array]
@@ -39,6 +51,19 @@ def quantities(task: Task, observation: ArrayLike) -> Columns:
     return _truth(task).quantities(_features(task, observation))
 
 
+def quantities_and_features(task: Task, observation: ArrayLike) -> Columns:
+    """The quantities, then the features that aren't among them; all angles as cosine and sine."""
+    known = quantities(task, observation)
+    every = _every(_features(task, observation), _angles(task))
+    return known | {name: every[name] for name in every if name not in known}
+
+
+def in_words(task_name: str, feature: str) -> str:
+    """What to call a feature to a reader; several of the Jitterbug's share their words."""
+    words = _WORDS if task_name in TASKS else {}
+    return words.get(feature, feature.replace("_", " "))
+
+
 def state(task: Task, observation: ArrayLike) -> Columns:
     """The whole state as columns (n,) by name: the quantities above and all other features."""
     features, truth = _features(task, observation), _truth(task)
@@ -52,11 +77,12 @@ def state(task: Task, observation: ArrayLike) -> Columns:
 
 def _truth(task: Task) -> _Truth:
     """A task's own ground truth, or every feature."""
-    if task.name in _TRUTHS:
-        return _TRUTHS[task.name]
-    angles = frozenset(f.name for f in task.features if f.is_angle)
-    everything = frozenset(f.name for f in task.features)
-    return _Truth(lambda features: _every(features, angles), everything)
+    everything = frozenset(task.feature_names)
+    return _TRUTHS.get(task.name, _Truth(partial(_every, angles=_angles(task)), everything))
+
+
+def _angles(task: Task) -> frozenset[str]:
+    return frozenset(feature.name for feature in task.features if feature.is_angle)
 
 
 def _features(task: Task, observation: ArrayLike) -> Columns:

@@ -1,0 +1,107 @@
+"""What a controller needs of the state, and what a code loses of that."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.envs.encoding import BaseEncoder
+from jbrep.evaluate.held_out import HeldOut
+from jbrep.evaluate.policy import GoodPolicy, action_predictor, value_predictor
+from jbrep.evaluate.prediction import following, predictors
+from jbrep.stats.bootstrap import Array
+
+_HORIZON = 10  # steps ahead
+_NEEDED = 0.1  # need from which a feature is needed
+_KEPT = 0.5  # R^2 from which it is kept
+_FORETOLD = 0.1  # R^2 below which nothing can be learnt about what a prediction needs
+_NUMBERS = 1 << 18  # rows times features, at most, in which features are shuffled
+
+
+def needs(full: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None) -> dict[str, float]:
+    """How much each feature is needed, from 0 to 1.
+
+    A feature is needed for a prediction by the share of the explained variance that is lost when
+    its values are shuffled among held-out rows (permutation importance; Breiman 2001). It is needed
+    directly as much as for the mean reward of the next 10 steps or, if there is a policy, its
+    action or value, whichever needs it most. It is needed indirectly for the change over 10 steps
+    of another feature, times how much that one is needed directly.
+
+    Args:
+        full: the observation itself.
+        held_out: to judge on.
+        policy: that does the task well, if one is known.
+
+    Returns:
+        By the feature's name; empty where episodes are too short to look ahead.
+    """
+    forward = predictors(full, held_out)
+    if not forward:
+        return {}
+    ahead = min(forward, key=lambda ahead: abs(ahead - _HORIZON))
+    steps = following(held_out, "test", ahead)
+    size = held_out.data.task.size
+    count = max(2, _NUMBERS // size)
+    shares = _shares(
+        lambda seen: forward[ahead](np.hstack((full.encode(seen), steps.action[:count]))),
+        steps.observation[:count],
+        steps.wanted[:count],
+    )
+    moving, direct = shares[:, :-1], shares[:, -1]
+    if policy is not None:
+        seen = steps.observation[:count]
+        acts = action_predictor(full, held_out, policy)
+        by_action = _shares(lambda seen: acts(full.encode(seen)), seen, policy.act(seen))
+        direct = np.maximum(direct, by_action.max(axis=1))
+        if policy.has_value:
+            states, worth = policy.judged_on, value_predictor(full, policy)
+            by_value = _shares(
+                lambda seen: worth(full.encode(seen)),
+                states.observation[:count],
+                states.value[:count],
+            )
+            direct = np.maximum(direct, by_value[:, 0])
+    need = np.maximum(direct, (moving * direct).max(axis=1))
+    return dict(zip(held_out.data.task.feature_names, need.tolist(), strict=True))
+
+
+def _shares(
+    predict: Callable[[NDArray[Any]], Array], observation: NDArray[Any], wanted: NDArray[Any]
+) -> Array:
+    """The share of what is explained of each target that shuffling each feature loses, (d, q)."""
+    random = np.random.default_rng(0)
+    variance = np.var(wanted, axis=0, dtype=np.float64)
+
+    def lost(seen: NDArray[Any]) -> Array:
+        return np.square(predict(seen) - wanted).mean(axis=0)
+
+    least = lost(observation)
+    explained = variance - least
+    shares = np.zeros((observation.shape[1], wanted.shape[1]))
+    foretold = explained > _FORETOLD * variance
+    for feature, column in enumerate(observation.T):
+        shuffled = observation.copy()
+        shuffled[:, feature] = random.permutation(column)
+        more = lost(shuffled) - least
+        shares[feature, foretold] = more[foretold] / explained[foretold]
+    return shares.clip(0, 1)
+
+
+def lost(
+    needed: Mapping[str, float], probes: Mapping[str, list[float | None]]
+) -> list[dict[str, Any]]:
+    """The features that are needed and can't be read from a code, the most needed first.
+
+    Args:
+        needed: as `needs` returns it.
+        probes: of the code, nonlinear.
+
+    Returns:
+        The name of each, how much of it is `kept` (R^2), and its `need`.
+    """
+    return [
+        {"name": name, "kept": kept, "need": need}
+        for name, need in sorted(needed.items(), key=lambda item: -item[1])
+        if need >= _NEEDED and (kept := probes[name][0]) is not None and kept < _KEPT
+    ]

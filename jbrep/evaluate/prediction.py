@@ -1,0 +1,112 @@
+"""Controlled forward prediction: what a code and the next actions say of what comes next."""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.dataset import ScaledDataset
+from jbrep.dataset.scaling import wrapped
+from jbrep.envs.encoding import BaseEncoder
+from jbrep.envs.task import Task
+from jbrep.evaluate.explained import explained
+from jbrep.evaluate.held_out import HeldOut, Rows, sample_rows
+from jbrep.evaluate.regression import Predictor, Problem, fit
+from jbrep.training.windows import first_rows
+
+HORIZONS = (1, 5, 10, 20)  # steps ahead
+_ROWS = {"train": 100_000, "test": 50_000}  # at most
+_USUAL = 0.5  # the share of rows that must have as many rows after them
+
+
+class Steps(NamedTuple):
+    """Rows with what follows each of them, at some number of steps k.
+
+    Attributes:
+        rows: (n,).
+        observation: now, (n, d).
+        action: the next k actions, (n, k * m).
+        wanted: the change of each feature over k steps, angles the shorter way round, and the mean
+            reward over them, (n, d + 1).
+    """
+
+    rows: Rows
+    observation: NDArray[np.float32]
+    action: NDArray[Any]
+    wanted: NDArray[np.float32]
+
+    def inputs(self, encoder: BaseEncoder) -> NDArray[Any]:
+        """Latents and actions side by side, (n, l + k * m)."""
+        return np.hstack((encoder.encode(self.observation), self.action))
+
+
+def prediction(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
+    """R^2 of each feature's change over k steps, and of the mean reward over them.
+
+    Predicted nonlinearly from the latent and the next k actions, and no later ones; fitted to a
+    sample of at most 100,000 training rows, judged on one of at most 50,000 held-out rows, fewer of
+    wide robots. By the number of steps k, of 1, 5, 10 and 20: those that at least half the rows
+    have after them. `mean` is that over the features that change.
+    """
+    names = held_out.data.task.feature_names
+    results = {}
+    for ahead, predictor in predictors(encoder, held_out).items():
+        steps = following(held_out, "test", ahead)
+        each = explained(
+            predictor(steps.inputs(encoder)),
+            steps.wanted,
+            steps.rows,
+            held_out,
+            widths=[1] * (len(names) + 1),
+            averaged=len(names),
+        ).tolist()
+        results[str(ahead)] = {
+            "features": dict(zip(names, each, strict=False)),
+            "mean": each[-1],
+            "reward": each[-2],
+        }
+    return results
+
+
+@lru_cache(1)  # of the full observation, for what is needed
+def predictors(encoder: BaseEncoder, held_out: HeldOut) -> dict[int, Predictor]:
+    """By the number of steps ahead, what predicts `Steps.wanted` from `Steps.inputs`."""
+    size = held_out.data.task.size
+    weights = np.ones(size + 1)
+    weights[-1] = size / 2  # or else many features would leave little for the reward
+    horizons = usual_horizons(held_out.data)
+    training = [following(held_out, "train", ahead) for ahead in horizons]
+    problems = [Problem(steps.inputs(encoder), steps.wanted, weights) for steps in training]
+    return dict(zip(horizons, fit(problems), strict=True))
+
+
+def usual_horizons(data: ScaledDataset) -> list[int]:
+    """The numbers of steps that at least half the rows, training and held out, have after them."""
+    return [
+        ahead
+        for ahead in HORIZONS
+        if all(len(first_rows(data, r, ahead)) >= _USUAL * len(r) for r in (data.train, data.test))
+    ]
+
+
+@lru_cache(2 * len(HORIZONS))  # since all encoders share them
+def following(held_out: HeldOut, part: str, ahead: int) -> Steps:
+    """A sample of the rows of `train` or `test` that have so many rows after them."""
+    data = held_out.data
+    task, dataset, rows = data.task, data.dataset, getattr(data, part)
+    width = 2 * task.size + ahead * task.action_size
+    chosen = sample_rows(rows[first_rows(data, rows, ahead)], _ROWS[part], width)
+    now, then = (dataset["observation"][r] for r in (chosen, chosen + ahead))
+    steps = chosen[:, None] + np.arange(ahead)
+    reward = dataset["reward"][steps].mean(axis=1, dtype=np.float64)
+    wanted = np.hstack((changes(task, now, then), reward[:, None])).astype(np.float32)
+    return Steps(chosen, now, dataset["action"][steps].reshape(len(chosen), -1), wanted)
+
+
+def changes(task: Task, now: NDArray[Any], then: NDArray[Any]) -> NDArray[np.float64]:
+    """What features change by, (n, d); angles the shorter way round."""
+    change = np.subtract(then, now, dtype=np.float64)
+    angles = np.array([feature.is_angle for feature in task.features])
+    change[:, angles] = wrapped(change[:, angles])
+    return change

@@ -1,0 +1,112 @@
+"""Nonlinear regression of many quantities at once, in the same time however many rows there are."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from jbrep.stats.bootstrap import Array
+from jbrep.training.trainer import single_torch_thread
+
+Predictor = Callable[[NDArray[Any]], Array]  # values (n, p) to what is predicted, (n, q)
+
+_HIDDEN = (64, 64, 64)  # units
+_STEPS = 1500
+_BATCH = 256
+_LEARNING_RATE = 5e-3  # at its highest
+_RISING = 0.1  # the share of the steps in which the learning rate rises to that
+_LIMIT = 5.0  # standard deviations within which the network sees its input
+_NEGLIGIBLE = 1e-9  # standard deviation, as a share of the largest magnitude: rounding
+_BLOCK = 1 << 13  # rows predicted at a time
+
+
+class Problem(NamedTuple):
+    """What is to be predicted from what.
+
+    Attributes:
+        values: to predict from, (n, p).
+        wanted: to predict, (n, q).
+        weights: of the squared errors of what is wanted, (q,); None if all count alike.
+    """
+
+    values: NDArray[Any]
+    wanted: NDArray[Any]
+    weights: NDArray[Any] | None = None
+
+
+def fit(problems: Sequence[Problem]) -> list[Predictor]:
+    """Fit a network to each problem: three hidden layers of 64 ReLU units, 1,500 steps of Adam.
+
+    Values and what is wanted are standardised, and values limited to 5 standard deviations. The
+    networks are fitted side by side, one on each core, and each comes out the same to the last bit
+    however many there are.
+    """
+    with single_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(_fit, problems))
+
+
+def _fit(problem: Problem) -> Predictor:
+    values, wanted, weights = problem
+    enter, _ = _standard(values)
+    leave, scale = _standard(wanted)
+    network = _trained(
+        enter(values).clamp_(-_LIMIT, _LIMIT),
+        leave(wanted),
+        torch.ones(wanted.shape[1]) if weights is None else torch.from_numpy(weights).float(),
+    )
+    mean = wanted.mean(axis=0, dtype=np.float64)
+
+    def predict(others: NDArray[Any]) -> Array:
+        with single_torch_thread(), torch.inference_mode():
+            blocks = enter(others).clamp_(-_LIMIT, _LIMIT).split(_BLOCK)
+            return torch.cat([_apply(network, block) for block in blocks]).numpy() * scale + mean
+
+    return predict
+
+
+def _standard(values: NDArray[Any]) -> tuple[Callable[[NDArray[Any]], Tensor], Array]:
+    """A map to columns of mean 0 and deviation 1, and these deviations; constant ones become 0."""
+    mean, deviation = (getattr(values, name)(axis=0, dtype=np.float64) for name in ("mean", "std"))
+    varies = deviation > _NEGLIGIBLE * np.abs(values).max(axis=0)
+    scale = np.where(varies, deviation, 0)
+    factor = np.where(varies, 1 / np.where(varies, deviation, 1), 0)
+    return lambda others: torch.from_numpy(((others - mean) * factor).astype(np.float32)), scale
+
+
+def _trained(values: Tensor, wanted: Tensor, weights: Tensor) -> list[Tensor]:
+    """Weights and biases of each layer, in turn."""
+    random = torch.Generator().manual_seed(0)
+    sizes = (values.shape[1], *_HIDDEN, wanted.shape[1])
+    network: list[Tensor] = []
+    for inputs, outputs in pairwise(sizes):
+        spread = (2 / inputs) ** 0.5  # He et al. 2015
+        weight = spread * torch.randn(outputs, inputs, generator=random)
+        network += [weight.requires_grad_(), torch.zeros(outputs, requires_grad=True)]
+    with torch.no_grad():
+        network[-2] *= 0.1
+    adam = torch.optim.Adam(network, lr=_LEARNING_RATE, fused=True)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        adam, _LEARNING_RATE, total_steps=_STEPS + 1, pct_start=_RISING, cycle_momentum=False
+    )
+    for _ in range(_STEPS):
+        rows = torch.randint(len(values), (_BATCH,), generator=random)
+        error = _apply(network, values[rows]) - wanted[rows]
+        adam.zero_grad()
+        (error.square() * weights).mean().backward()
+        adam.step()
+        schedule.step()
+    return [each.detach() for each in network]
+
+
+def _apply(network: list[Tensor], values: Tensor) -> Tensor:
+    *layers, last = zip(network[::2], network[1::2], strict=True)
+    for weight, bias in layers:
+        values = functional.linear(values, weight, bias).relu()
+    return functional.linear(values, *last)

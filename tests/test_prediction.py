@@ -1,0 +1,273 @@
+"""Whether codes serve a controller: on a made-up robot of which all is known."""
+
+import json
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from sklearn.metrics import r2_score
+from wide import make_feature, make_task
+
+from jbrep.dataset import Column, Dataset, ScaledDataset
+from jbrep.encoders import Encoder, Layer
+from jbrep.errors import InputError
+from jbrep.evaluate import diagnose, regression
+from jbrep.evaluate.explained import explained
+from jbrep.evaluate.headline import SCALARS, headline
+from jbrep.evaluate.held_out import HeldOut
+from jbrep.evaluate.need import lost, needs
+from jbrep.evaluate.policy import GoodPolicy, PlayedEpisode, returns_to_go, value
+from jbrep.evaluate.prediction import following, prediction, usual_horizons
+from jbrep.evaluate.readout import nonlinear_probes, probes
+from jbrep.evaluate.regression import Problem, fit
+from jbrep.evaluate.summary import evaluation_text
+from jbrep.evaluate.truth import in_words
+from jbrep.rollouts.good_policy import find_good_policy
+
+NAMES = ("place", "speed", "load", "idle")
+STEPS, EPISODES = 60, 100
+
+
+class Cart:
+    """A cart that is pushed and pulled back; each action moves it at once.
+
+    `load` turns the action's direction, so that what comes next can't be said without it; `idle`
+    wanders by itself, and nothing depends on it. The reward is for being at 0.
+    """
+
+    split, fit_scaler = Dataset.split, Dataset.fit_scaler
+    folder = "cart"
+
+    def __init__(self):
+        features = [make_feature(name) for name in NAMES]
+        self.task = make_task(features, "Cart-v0")
+        self.episodes = {"length": np.full(EPISODES, STEPS), "seed": np.arange(EPISODES)}
+        policy = SimpleNamespace(policy={"kind": "uniform"}, seed=0)
+        self.manifest = SimpleNamespace(fingerprint="cart", settings=policy)
+        random = np.random.default_rng(0)
+        actions = random.uniform(-1, 1, (EPISODES, STEPS, 17)).astype(np.float32)
+        seen, reward = self.play(lambda step, seen: actions[:, step, 0], random)
+        self.arrays = {
+            "observation": seen[:, :-1].reshape(-1, 4),
+            "action": actions.reshape(-1, 17),
+            "reward": reward.ravel(),
+        }
+
+    @staticmethod
+    def play(act, random):
+        place, speed, idle = random.uniform(-1, 1, (3, EPISODES))
+        load = random.choice((-1.0, 1.0), EPISODES)
+        observations, rewards = [], []
+        for step in range(STEPS + 1):
+            observations.append(np.stack((place, speed, load, idle), 1).astype(np.float32))
+            speed = (
+                0.9 * speed - 0.1 * place + 0.3 * load * act(min(step, STEPS - 1), observations[-1])
+            )
+            place = place + 0.3 * speed
+            idle = 0.95 * idle + 0.1 * random.normal(size=EPISODES)
+            load = np.where(random.uniform(size=EPISODES) < 0.1, -load, load)
+            rewards.append(np.exp(-np.square(place)).astype(np.float32))
+        return np.stack(observations, 1), np.stack(rewards, 1)[:, :STEPS]
+
+    def __getitem__(self, name):
+        values = self.arrays[name]
+        return Column(lambda shard: values, [len(values)], values.dtype, values.shape[1:])
+
+
+def controller(seen):
+    """Push toward 0: what it does takes place, speed and load."""
+    drive = np.clip(-seen[:, 2] * (seen[:, 0] + 0.5 * seen[:, 1]), -1, 1)
+    return np.pad(drive[:, None], ((0, 0), (0, 16)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    """Fewer steps of training: the cart is simple."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(regression, "_STEPS", 300)
+        yield
+
+
+@pytest.fixture(scope="module")
+def held_out():
+    return HeldOut(ScaledDataset(Cart()))
+
+
+@pytest.fixture(scope="module")
+def policy():
+    seen, reward = Cart.play(lambda step, seen: controller(seen)[:, 0], np.random.default_rng(1))
+    played = [PlayedEpisode(o, r, True) for o, r in zip(seen[:30], reward[:30], strict=True)]
+    return GoodPolicy("mine", controller, played)
+
+
+def code(data, *kept):
+    """A code of these features alone."""
+    weight = np.eye(4, dtype=np.float32)[[NAMES.index(name) for name in kept]]
+    header = {"kind": "subset", "name": "subset", "task": data.task.name, "data": {}}
+    header |= {"environment": data.task.as_json(), "features": list(NAMES)}
+    header["metrics"] = {"spectrum": [3.0, 1.0]}
+    there, back = (
+        (Layer(each, np.zeros(len(each), np.float32), "linear"),)
+        for each in (weight, weight.T.copy())
+    )
+    return Encoder(header, data.scaler, there, back)
+
+
+@pytest.fixture(scope="module")
+def evaluation(held_out, policy):
+    data = held_out.data
+    encoders = {
+        f"without {name}": code(data, *(n for n in NAMES if n != name)) for name in ("load", "idle")
+    }
+    encoders["noise"] = lambda seen: np.random.default_rng(0).normal(size=(1, 2)) + 0 * seen[:, :2]
+    return diagnose(encoders, data, policy)
+
+
+def test_a_code_loses_the_feature_that_it_drops_by_name(evaluation):
+    lost_by = {n: [e["name"] for e in d["loses"]] for n, d in evaluation["encoders"].items()}
+    assert lost_by["full"] == lost_by["without idle"] == []
+    assert lost_by["without load"] == ["load"]
+    assert set(lost_by["noise"]) == set(NAMES[:3])
+    assert evaluation["needs"]["idle"] < 0.1
+
+
+def test_what_is_dropped_shows_where_it_matters(evaluation):
+    everything = {n: headline(d) for n, d in evaluation["encoders"].items()}
+    full = everything.pop("full")
+    for scalars in everything.values():
+        for name in ("forward", "reward", "value", "action"):
+            assert scalars[name][0] < full[name][0] + 0.03
+    for name in ("reward", "value", "action"):
+        assert everything["without idle"][name][0] > full[name][0] - 0.03
+        assert abs(everything["noise"][name][0]) < 0.1
+    assert everything["without load"]["action"][0] < 0.1 < 0.9 < full["action"][0]
+    changes = evaluation["encoders"]["without idle"]["prediction"]["10"]["features"]
+    assert changes["idle"][0] < 0.1 < changes["speed"][0]
+    assert full["times_pca"] is None
+    assert full["value"][1] < full["value"][0] < full["value"][2]
+
+
+def test_an_evaluation_is_told_in_one_screen_and_in_older_files_as_before(evaluation):
+    evaluation = json.loads(json.dumps(evaluation))
+    shown = evaluation_text(evaluation, 80)
+    first = shown.partition("Error on")[0]
+    assert max(map(len, shown.splitlines())) <= 80
+    assert len(first.splitlines()) < 30
+    assert re.search(r"without load +load \(0\.\d\d\)\nwithout idle +nothing", first)
+    assert evaluation["encoders"]["without load"]["method"] == {"spectrum": [3.0, 1.0]}
+    assert evaluation["format_version"] == 2
+    del evaluation["needs"], evaluation["policy"]
+    added = "prediction", "value", "action", "nonlinear_probes", "loses", "method"
+    for diagnostics in evaluation["encoders"].values():
+        for name in added:
+            del diagnostics[name]
+    assert evaluation_text(evaluation, 80) == shown[len(first) :]
+    old = headline(evaluation["encoders"]["without load"])
+    assert old.keys() == SCALARS.keys()
+    assert old["forward"] is None
+    assert old["gtc"][0] > 0
+
+
+def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkeypatch):
+    monkeypatch.setattr(regression, "_STEPS", 2)
+    result = diagnose({"it": code(held_out.data, "place")}, held_out.data)
+    assert result["policy"] is None
+    assert all(d["value"] is d["action"] is None for d in result["encoders"].values())
+    assert "return to go" not in evaluation_text(result)
+    assert find_good_policy(None, held_out.data.task) is None
+    cut = [PlayedEpisode(np.zeros((101, 4), np.float32), np.ones(100), False)] * 5
+    assert value(code(held_out.data, "place"), GoodPolicy("short", controller, cut)) is None
+    with pytest.raises(InputError, match="policy uniform doesn't act on what it observes"):
+        find_good_policy("uniform", held_out.data.task)
+
+
+def test_actions_after_the_horizon_do_not_enter(held_out, monkeypatch):
+    monkeypatch.setattr(regression, "_STEPS", 20)
+    steps, inputs = following(held_out, "train", 5), code(held_out.data, "speed")
+    assert steps.inputs(inputs).shape == (len(steps.rows), 1 + 5 * 17)
+    rows = held_out.data.dataset["action"]
+    np.testing.assert_array_equal(steps.action[7], rows[steps.rows[7] : steps.rows[7] + 5].ravel())
+    before = prediction(inputs, held_out)
+    poisoned = ScaledDataset(Cart())
+    last = np.arange(len(rows)) % STEPS >= STEPS - 1  # no window of 1 begins there
+    poisoned.dataset.arrays["action"][last] = np.nan
+    assert prediction(inputs, HeldOut(poisoned))["1"] == before["1"]
+
+
+def test_what_follows_is_of_the_same_episode(held_out):
+    dataset = held_out.data.dataset
+    steps = following(held_out, "test", 20)
+    assert (steps.rows % STEPS).max() == STEPS - 21
+    assert set(steps.rows // STEPS) == set(held_out.numbers)
+    observation, reward = dataset["observation"], dataset["reward"]
+    row = steps.rows[11]
+    change = observation[row + 20] - observation[row]
+    np.testing.assert_allclose(
+        steps.wanted[11], [*change, reward[row : row + 20].mean()], atol=1e-6
+    )
+    short = ScaledDataset(Cart())
+    short.dataset.episodes = {"length": np.full(600, 10), "seed": np.arange(600)}
+    short.train, short.test = short.dataset.split()
+    assert usual_horizons(short) == [1, 5]
+
+
+def test_r_squared_and_interval_by_episode(held_out):
+    rows = held_out.data.test
+    true = held_out.data.dataset["observation"][rows]
+    predicted = true + np.random.default_rng(0).normal(size=true.shape) * [0.1, 1, 2, 0]
+    *parts, mean = explained(predicted, true, rows, held_out, [1, 1, 2], averaged=2).tolist()
+    expected = [r2_score(true[:, i].astype(float), predicted[:, i]) for i in (0, 1)]
+    assert [part[0] for part in parts[:2]] == pytest.approx(expected)
+    assert mean[0] == pytest.approx(np.mean(expected))
+    by_row = (true - predicted)[:, 1].std() ** 2 / true[:, 1].var() / np.sqrt(len(rows))
+    assert parts[1][2] - parts[1][1] > 3 * by_row
+
+
+def test_regression_finds_what_is_not_linear_and_repeats_to_the_last_bit():
+    random = np.random.default_rng(0)
+    values = random.normal(size=(20_000, 6)) * [1, 1, 1, 1e4, 1, 0] + [0, 0, 0, 0, 1e6, 3]
+    wanted = np.stack(
+        (np.sin(2 * values[:, 0]) * values[:, 1], 1e5 + values[:, 2], 0 * values[:, 5]), 1
+    )
+    problem = Problem(values[:15_000], wanted[:15_000])
+    twice = [each(values[15_000:]) for each in fit([problem, problem])]
+    assert r2_score(wanted[15_000:, 0], twice[0][:, 0]) > 0.95
+    assert r2_score(wanted[15_000:, 1], twice[0][:, 1]) > 0.95
+    assert (twice[0][:, 2] == 0).all()
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    again = fit([problem])[0](values[15_000:])
+    torch.set_num_threads(threads)
+    assert again.tobytes() == twice[0].tobytes() == twice[1].tobytes()
+
+
+def test_returns_to_go_are_discounted():
+    assert returns_to_go(np.array([1.0, 0, 2])) == pytest.approx([1 + 2 * 0.99**2, 2 * 0.99, 2])
+
+
+def test_nonlinear_probes_read_what_linear_ones_cannot(held_out):
+    bent = Layer(
+        np.array([[3, 0, 0, 0], [0, 0, 3, 0]], np.float32), np.zeros(2, np.float32), "tanh"
+    )
+    encoder = code(held_out.data, "place")
+    encoder = Encoder(encoder.header, encoder.scaler, (bent,), ())
+    linear, nonlinear = probes(encoder, held_out), nonlinear_probes(encoder, held_out)
+    assert nonlinear["place"][0] > 0.98 > linear["place"][0] + 0.02
+    assert nonlinear["idle"][0] < 0.1
+
+
+def test_needs_pass_from_what_is_rewarded_to_what_moves_it(held_out):
+    full = code(held_out.data, *NAMES)
+    needed = needs(full, held_out, None)
+    assert needed["place"] > needed["speed"] > 0.1 > needed["idle"]
+    assert lost({"a": 0.5, "b": 0.9, "c": 0.05}, {n: [0.2, 0, 1] for n in "abc"}) == [
+        {"name": "b", "kept": 0.2, "need": 0.9},
+        {"name": "a", "kept": 0.2, "need": 0.5},
+    ]
+
+
+def test_features_have_names_for_readers():
+    assert in_words("face_direction", "angular_velocity_z") == "rate of yaw"
+    assert in_words("Other-v0", "angular_velocity_z") == "angular velocity z"
