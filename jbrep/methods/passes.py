@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
+from jbrep.errors import InputError
 from jbrep.training.windows import first_rows
 
 Array = NDArray[np.float64]
@@ -88,8 +89,6 @@ def blocks(data: ScaledDataset, horizon: int, width: int, work: int) -> Iterator
             "many numbers: look fewer steps ahead"
         )
     starts = first_rows(data, data.train, horizon)
-    task, action, reward = data.task, data.dataset["action"], data.dataset["reward"]
-    low, high = (np.asarray(bound, float) for bound in (task.action_low, task.action_high))
     size = max(1, min(_BLOCK, _NUMBERS // width))
     every = -(-len(starts) * work // _MOST_WORK)
     first = 0

@@ -35,7 +35,7 @@ def make(data: ScaledDataset, settings: Settings) -> Made:
 
     lagged = Lagged(data, lags, size + longest * data.task.action_size, now)
     whiten, correlations = _partial(lagged, data)
-    chosen = np.hstack(correlations[lagged.places(lags)]) / np.sqrt(len(lags))
+    chosen = np.concatenate(correlations[lagged.places(lags)], axis=1) / np.sqrt(len(lags))
     left, singular, _ = np.linalg.svd(chosen, full_matrices=False)
     mean = lagged.now_mean[:size]
     covariance = lagged.now[:size, :size] - np.outer(mean, mean)
