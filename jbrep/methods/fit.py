@@ -136,9 +136,10 @@ class Fitter:
         """
         method = get_method(kind)
         used = method.settings(settings)
+        data = self._scaled_data(method, used)
+        used = method.resolve(data, used)
         name = name or name_of(method, used)
         check_name(name)
-        data = self._scaled_data(method, used)
         method.check(data, used)
         if isinstance(method, Learned) and not used["batch_size"]:
             horizon = method.objective(data, used).horizon

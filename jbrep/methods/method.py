@@ -21,6 +21,7 @@ class Made(NamedTuple):
     encoder: Layers
     decoder: Layers | None = None  # None for the linear one of least squared error
     metrics: Settings = MappingProxyType({})  # plain JSON, for the file's header
+    keep: tuple[str, ...] = ()  # features that pass around the layers, beside those it is told of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +69,14 @@ class Method:
     def fill(self, given: Settings) -> dict[str, Any]:
         """The defaults of all settings, which may depend on those that are given."""
         return self.defaults
+
+    def resolve(self, data: ScaledDataset, settings: Settings) -> dict[str, Any]:
+        """The settings as the data need them, such as names of features in place of a pattern.
+
+        Raises:
+            InputError: they mean nothing there.
+        """
+        return dict(settings)
 
 
 @dataclass(frozen=True, kw_only=True)
