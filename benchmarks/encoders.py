@@ -8,17 +8,19 @@ from functools import partial
 
 import numpy as np
 import torch
-from jbrep.dae.training import NOISE, Trainer, Training
 from timing import show, timed
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 from torch.utils.data import DataLoader, TensorDataset
 
 from jbrep.dae.gradient import Gradient
-from jbrep.dae.network import ARCHITECTURES, Autoencoder
+from jbrep.dae.network import ARCHITECTURES, stacks
+from jbrep.dae.objective import Reconstruction
 from jbrep.encoders import find
 from jbrep.encoders.encoder import run
 from jbrep.envs import describe
+from jbrep.methods.autoencoder import NOISE
+from jbrep.training.trainer import Schedule, Trainer
 
 ROWS = 4_000_000
 SIZE = 16
@@ -29,9 +31,26 @@ STEPS = 50
 CALLS = 5_000
 
 
+class Rows:
+    """Windows of one row each, which are in memory already."""
+
+    size = SIZE
+
+    def __init__(self, rows: Tensor):
+        self._rows, self.device = rows, rows.device
+        self.numbers = torch.arange(len(rows), device=rows.device)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def rows(self, numbers: Tensor) -> Tensor:
+        """Rows by number."""
+        return self._rows.index_select(0, numbers)
+
+
 def usual_epoch(rows: torch.Tensor) -> None:
     """The loop of every tutorial."""
-    network = Autoencoder(ARCHITECTURES["paper"], SIZE, LATENT, seed=0)
+    network = nn.Sequential(*stacks(ARCHITECTURES["paper"], SIZE, LATENT, seed=0)).to(rows.device)
     optimiser = torch.optim.Adam(network.parameters(), 5e-4)
     for (clean,) in DataLoader(TensorDataset(rows), BATCH, shuffle=True):
         optimiser.zero_grad()
@@ -40,7 +59,9 @@ def usual_epoch(rows: torch.Tensor) -> None:
 
 
 def our_epoch(rows: torch.Tensor) -> None:
-    next(Trainer(Training.of(LATENT), rows, rows[:1]).epochs())
+    network = Reconstruction(ARCHITECTURES["paper"], SIZE, LATENT, seed=0, noise=NOISE)
+    how = Schedule(epochs=1, batch_size=BATCH, learning_rate=5e-4)
+    next(Trainer(network.to(rows.device), how, Rows(rows), Rows(rows[:1])).epochs())
 
 
 def compare_epochs() -> None:
@@ -58,8 +79,8 @@ def compare_epochs() -> None:
 
 def compare_gradients() -> None:
     for name, architecture in ARCHITECTURES.items():
-        network = Autoencoder(architecture, SIZE, LATENT, seed=0)
-        gradient = Gradient((*network.encoder, *network.decoder), BATCH)
+        network = nn.Sequential(*stacks(architecture, SIZE, LATENT, seed=0))
+        gradient = Gradient((*network[0], *network[1]), BATCH)
         rows = torch.empty(BATCH, SIZE).uniform_(-1, 1)
         columns = rows.T.contiguous()
 

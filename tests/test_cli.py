@@ -13,6 +13,8 @@ from test_study import TOML
 
 from jbrep.cli import main
 from jbrep.cli.base import COUNT
+from jbrep.encoders import load
+from jbrep.methods.registry import METHODS
 
 GROUPS = ("data", "encoder")
 COMMANDS = sorted({*main.commands} - {*GROUPS}) + [
@@ -155,7 +157,7 @@ def test_every_command_has_help_with_an_example(command):
         (("rl", "--task", "face_direction", "--algorithm", "dqn", "--out", "x"), "ddpg, td3"),
         (
             ("train-dae", "--data", "none", "--out", "x"),
-            "needs latent sizes, such as --latent 12 8 4",
+            "dae needs --latent, such as --latent 12 8 4",
         ),
         (
             (
@@ -171,15 +173,30 @@ def test_every_command_has_help_with_an_example(command):
                 "--out",
                 "x",
             ),
-            "pca takes no --seed: leave it out",
+            "pca takes no --seed: leave it out; it is for random, untrained, ae, dae",
         ),
         (
-            ("train-encoder", "--kind", "vae", "--data", "x", "--out", "x"),
-            "unknown kind 'vae': choose one of identity",
+            ("train-encoder", "--kind", "fly", "--data", "x", "--out", "x"),
+            "unknown kind 'fly': choose one of identity",
         ),
         (
             ("train-dae", "--data", "x", "--latent", "8", "--architecture", "wide", "--out", "x"),
             "unknown architecture 'wide'",
+        ),
+        *(
+            (("train-encoder", "--data", "x", "--out", "x", "--kind", *given.split()), message)
+            for given, message in (
+                ("slow --latent 8 --lags 5 0", "'--lags': '0' must be steps from 1 to 1000, such"),
+                ("dae --latent 8 --batch-size 0", "'--batch-size': '0' must be a whole number"),
+                ("dae --latent 8 --weights x", "'--weights': 'x' must be weights of features"),
+                ("dae --latent 12 8,x", "'--latent': '8,x' must be a whole number from 1"),
+                ("slow --lags 5", "slow needs --latent, such as --latent 12 8 4"),
+                ("slow --latent 8 --preset authors", "slow has no presets: leave out --preset"),
+                ("dae --latent 8 --preset x", "unknown preset of dae 'x': choose one of authors"),
+                ("slow --latent 8 --seeds 2", "slow has no seed, so all its encoders are the s"),
+                ("dae --latent 8 --seeds 2 --seed 1", "--seed is for one encoder: leave it out"),
+                ("dae --latent 8 4 --name x", "one --name is for one latent size"),
+            )
         ),
         (("evaluate", "--encoder", "dae-8", "--data", "none"), "no data set in none"),
         (("encoder", "info", "none"), "no encoder at none"),
@@ -197,6 +214,43 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, tmp_path, mon
     assert result.output.count("\n") == 1
     assert message in result.output
     assert not list(tmp_path.iterdir())
+
+
+def test_encoders_of_several_seeds_and_lags(tmp_path, collected):
+    given = ("--data", collected, "--out", tmp_path)
+    random = ("train-encoder", "--kind", "random", "--latent", "4,8", "--seeds", 2, *given)
+    assert jbrep(*random).output.count("held-out") == 4
+    names = [f"random-{size}-s{seed}" for size in (4, 8) for seed in (0, 1)]
+    assert sorted(path.stem for path in tmp_path.glob("*.safetensors")) == names
+    assert jbrep(*random).output.count("already complete") == 4
+    for name, lags in (("a", ("5", "10", "20")), ("b", ("20,5,10",))):
+        told = jbrep(
+            "train-encoder",
+            "--kind",
+            "slow",
+            "--latent",
+            4,
+            "--name",
+            name,
+            "--lags",
+            *lags,
+            *given,
+        )
+        assert told.exit_code == 0, told.output
+    a, b = (load(tmp_path / f"{name}.safetensors").header["training"] for name in "ab")
+    assert (a["lags"], b["lags"]) == ([5, 10, 20], [5, 10, 20])
+
+
+def test_help_says_which_kind_takes_which_setting_in_80_columns(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    text = jbrep("train-encoder", "--help").output
+    assert max(map(len, text.splitlines())) <= 80
+    said = " ".join(text.split())
+    for name, method in METHODS.items():
+        assert f"{'full' if name == 'identity' else name} {method.words}" in said
+    for line in ("--lags VALUE... Steps from now to later, one or several. [slow", "[all but full"):
+        assert line in said
+    assert "[default: extrema]" in said
 
 
 def test_a_data_set_from_collecting_to_exporting(tmp_path):

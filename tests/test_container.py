@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-from jbrep.dae.training import Trainer, Training
+from tensors import TensorWindows
 
+from jbrep.dae.network import ARCHITECTURES
+from jbrep.dae.objective import Reconstruction
 from jbrep.errors import DamageError, InputError
 from jbrep.files import container
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT
 from jbrep.training import checkpoint
+from jbrep.training.trainer import Schedule, Trainer
 
 RANDOM = np.random.default_rng(0)
 
@@ -48,8 +51,10 @@ def test_what_is_written_is_read_back(tmp_path):
 
 
 def test_a_changed_bit_in_a_checkpoint_of_an_encoder_is_noticed(tmp_path):
-    rows = torch.from_numpy(RANDOM.normal(size=(60, 16)).astype(np.float32))
-    trainer = Trainer(Training.of(4, epochs=2, batch_size=30), rows, rows)
+    rows = TensorWindows(torch.from_numpy(RANDOM.normal(size=(60, 16)).astype(np.float32)))
+    network = Reconstruction(ARCHITECTURES["paper"], 16, 4, seed=0)
+    how = Schedule(epochs=2, batch_size=30, learning_rate=1e-3)
+    trainer = Trainer(network, how, rows, rows)
     next(trainer.epochs())
     path = tmp_path / "at"
     checkpoint.save(trainer, {}, path)

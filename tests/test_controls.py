@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from jbrep.methods.controls import linear_code, linear_denoiser, pca, random_projection
 from sklearn.decomposition import PCA
 from torch import nn
 
@@ -11,11 +10,17 @@ from jbrep.dae.gradient import Gradient
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders.encoder import run
+from jbrep.methods import random
+from jbrep.methods.linear import linear_code, linear_denoiser, principal_code
 
 
 @pytest.fixture(scope="module")
 def data(collected):
     return ScaledDataset(Dataset(collected))
+
+
+def projection(data, latent, seed):
+    return random.make(data, {"latent": latent, "seed": seed})[:2]
 
 
 @pytest.fixture(scope="module")
@@ -50,34 +55,34 @@ def test_moments_are_those_of_the_training_rows(data, rows):
 def test_pca_is_scikit_learns_and_loses_the_smallest_variances(data, rows, latent):
     theirs = PCA(latent).fit(rows.astype(float))
     reference = theirs.inverse_transform(theirs.transform(rows.astype(float)))
-    ours = error(pca(data, latent), rows)
+    ours = error(principal_code(data, latent), rows)
     assert ours == pytest.approx(np.mean((reference - rows) ** 2), rel=1e-4)
     dropped = np.linalg.eigvalsh(data.moments.covariance)[: 16 - latent]
     assert ours == pytest.approx(dropped.sum() / 16, rel=1e-4)
 
 
-def test_no_linear_code_beats_pca(data, rows):
-    best = error(pca(data, 6), rows)
+def test_no_linear_code_beats_principal_code(data, rows):
+    best = error(principal_code(data, 6), rows)
     for seed in range(20):
-        assert error(random_projection(data, 6, seed), rows) > best
+        assert error(projection(data, 6, seed), rows) > best
         weight = np.random.default_rng(seed).normal(size=(6, 16))
         assert error(linear_code(weight, data.moments), rows) > best
 
 
 def test_a_random_projection_is_orthonormal_and_its_decoder_the_best(data, rows):
-    (encoder,), (decoder,) = random_projection(data, 5, seed=1)
+    (encoder,), (decoder,) = projection(data, 5, seed=1)
     np.testing.assert_allclose(encoder.weight @ encoder.weight.T, np.eye(5), atol=1e-6)
     latent = np.column_stack((run((encoder,), rows), np.ones(len(rows)))).astype(float)
     least = np.linalg.lstsq(latent, rows.astype(float), rcond=None)[1].sum() / rows.size
     assert error(((encoder,), (decoder,)), rows) == pytest.approx(least, rel=1e-4)
-    same, other = (random_projection(data, 5, seed)[0][0].weight for seed in (1, 2))
+    same, other = (projection(data, 5, seed)[0][0].weight for seed in (1, 2))
     np.testing.assert_array_equal(encoder.weight, same)
     assert not np.array_equal(encoder.weight, other)
 
 
 def test_without_noise_the_denoiser_is_pca(data, rows):
-    ours, theirs = error(linear_denoiser(7, 0, data.moments), rows), error(pca(data, 7), rows)
-    assert ours == pytest.approx(theirs, rel=1e-4)
+    theirs = error(principal_code(data, 7), rows)
+    assert error(linear_denoiser(7, 0, data.moments), rows) == pytest.approx(theirs, rel=1e-4)
 
 
 def test_at_full_rank_the_denoiser_is_ridge_regression(data):
@@ -90,7 +95,7 @@ def test_at_full_rank_the_denoiser_is_ridge_regression(data):
 @pytest.mark.parametrize("noise", [0.1, 0.5])
 def test_no_linear_code_denoises_better(data, noise):
     bound = expected_error(linear_denoiser(6, noise, data.moments), data.moments, noise)
-    assert bound < expected_error(pca(data, 6), data.moments, noise)
+    assert bound < expected_error(principal_code(data, 6), data.moments, noise)
     generator = np.random.default_rng(0)
     for _ in range(20):
         (encoder,), (decoder,) = linear_denoiser(6, noise, data.moments)

@@ -9,7 +9,6 @@ import onnxruntime
 import pytest
 import torch
 from command import jbrep
-from jbrep.dae.training import Training
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 from torch.nn import functional
@@ -19,10 +18,11 @@ from jbrep.encoders import ACTIVATIONS, Encoder, Layer, find, load, save
 from jbrep.encoders.activations import activate
 from jbrep.encoders.card import card
 from jbrep.encoders.from_onnx import convert
-from jbrep.encoders.names import EncoderName
 from jbrep.encoders.onnx import export
 from jbrep.envs import describe
 from jbrep.errors import InputError
+from jbrep.methods.autoencoder import DAE
+from jbrep.methods.registry import name_of, read_name
 
 TASK = describe("face_direction")
 RANDOM = np.random.default_rng(0)
@@ -37,7 +37,9 @@ TORCH = {
     "silu": functional.silu,
     "elu": functional.elu,
     "softplus": functional.softplus,
+    "sin": torch.sin,
     "layer-norm": lambda values: functional.layer_norm(values, values.shape[-1:]),
+    "avg-l1-norm": lambda values: values / values.abs().mean(-1, keepdim=True),
 }
 
 
@@ -473,11 +475,11 @@ def test_sizes_of_ones_own_are_an_architecture(tmp_path):
     sizes = get_architecture("64,32")
     assert sizes == get_architecture("64x32")
     assert (sizes.name, sizes.hidden, sizes.output) == ("64x32", (64, 32), "linear")
-    training = Training.of(8, "64,32")
+    used = DAE.settings({"latent": 8, "architecture": "64,32"})
     deep = get_architecture("deep")
-    assert (training.architecture, training.epochs) == ("64x32", deep.epochs)
-    assert EncoderName.parse("dae-64x32-8") == ("dae", "64x32", 8)
-    assert str(EncoderName.parse("dae-64,32-8")) == "dae-64x32-8"
+    assert (used["architecture"], used["epochs"]) == ("64x32", deep.epochs)
+    assert name_of(DAE, used) == "dae-64x32-8"
+    assert read_name("dae-64x32-8").given == {"latent": 8, "architecture": "64x32"}
     data = ("--data", "data/sample/face_direction", "--out", tmp_path)
     command = ("train-encoder", "--kind", "untrained", "--latent", "8", *data, "--architecture")
     jbrep(*command, "64,32")
@@ -485,7 +487,7 @@ def test_sizes_of_ones_own_are_an_architecture(tmp_path):
     assert [len(layer.bias) for layer in (*made.encoder, *made.decoder)] == [64, 32, 8, 32, 64, 16]
     assert made.header["training"]["architecture"] == "64x32"
     for wrong, message in {
-        "64,,32": "unknown architecture '64,,32': choose one of paper, deep, sizes such as 64x64",
+        "64,,32": "'64,,32': choose one of paper, deep, linear, sizes such as 64x64",
         "0": "unknown architecture '0'",
         "64,5000": "architecture 64,5000 has 5000 units: the limit is 4096",
         "2000,2000": "architecture 2000x2000 has weights of 32,384,000 bytes with 16 features",

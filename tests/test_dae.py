@@ -3,16 +3,20 @@
 import numpy as np
 import pytest
 import torch
-from jbrep.dae.order import RUN, shuffled
-from jbrep.dae.training import Trainer, Training, default_batch_size, get_device, prefetch
+from tensors import TensorWindows
+from torch import nn
 from torch.nn.functional import mse_loss
 
 from jbrep.dae.gradient import Gradient
-from jbrep.dae.network import ARCHITECTURES, Autoencoder, layers
+from jbrep.dae.network import ARCHITECTURES, layers, stacks
+from jbrep.dae.objective import Reconstruction
 from jbrep.encoders.encoder import run
 from jbrep.errors import InputError
 from jbrep.files import container
+from jbrep.methods.autoencoder import AE, DAE
 from jbrep.training import checkpoint
+from jbrep.training.order import POOL, RUN, shuffled
+from jbrep.training.trainer import Schedule, Trainer, default_batch_size, get_device, prefetch
 
 
 def rows(count=600, size=16, seed=0):
@@ -22,10 +26,16 @@ def rows(count=600, size=16, seed=0):
     return torch.from_numpy((random.normal(size=(count, 4)) @ plane).astype(np.float32))
 
 
-def trainer(train=None, **changes):
-    how = {"latent": 4, "epochs": 3, "batch_size": 100, "learning_rate": 3e-3, **changes}
+def trainer(
+    train=None, latent=4, architecture="paper", noise=0.1, seed=0, pool=POOL, weighed=None, **how
+):
     train = rows() if train is None else train
-    return Trainer(Training.of(**how), train, train[:50])
+    objective = Reconstruction(
+        ARCHITECTURES[architecture], train.shape[1], latent, seed, noise=noise, weights=weighed
+    )
+    schedule = {"epochs": 3, "batch_size": 100, "learning_rate": 3e-3, "seed": seed, **how}
+    windows, watched = TensorWindows(train), TensorWindows(train[:50])
+    return Trainer(objective, Schedule(**schedule), windows, watched, pool)
 
 
 def trained(**changes):
@@ -35,17 +45,17 @@ def trained(**changes):
 
 
 def weights(it):
-    return torch.cat([p.detach().flatten() for p in it.network.parameters()])
+    return torch.cat([p.detach().flatten() for p in it.objective.parameters()])
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 @pytest.mark.parametrize("count", [64, 37])
 def test_the_gradient_is_autograds(architecture, count):
-    network = Autoencoder(ARCHITECTURES[architecture], 16, 5, seed=1)
+    network = nn.Sequential(*stacks(ARCHITECTURES[architecture], 16, 5, seed=1))
     values, target = rows(count, seed=1), rows(count, seed=2)
     loss = mse_loss(network(values), target)
     expected = torch.autograd.grad(loss, list(network.parameters()))
-    gradient = Gradient((*network.encoder, *network.decoder), 64)
+    gradient = Gradient((*network[0], *network[1]), 64)
     for _ in range(2):  # nothing is left over from the first
         assert gradient(values.T, target.T).item() == pytest.approx(loss.item(), rel=1e-5)
         for parameter, wanted in zip(network.parameters(), expected, strict=True):
@@ -53,12 +63,11 @@ def test_the_gradient_is_autograds(architecture, count):
 
 
 def test_the_papers_architecture_has_two_layers_with_tanh():
-    network = Autoencoder(ARCHITECTURES["paper"], 16, 12, seed=0)
-    shapes = [(layer.weight.shape, layer.activation) for layer in layers(network.encoder)]
-    shapes += [(layer.weight.shape, layer.activation) for layer in layers(network.decoder)]
+    parts = stacks(ARCHITECTURES["paper"], 16, 12, seed=0)
+    shapes = [(layer.weight.shape, layer.activation) for part in parts for layer in layers(part)]
     assert shapes == [((12, 16), "tanh"), ((16, 12), "tanh")]
-    usual = Training.of(12)
-    assert (usual.epochs, usual.learning_rate, usual.noise, usual.seed) == (200, 5e-4, 0.1, 0)
+    usual = {"epochs": 200, "learning_rate": 5e-4, "noise": 0.1, "seed": 0}
+    assert DAE.settings({"latent": 12}).items() >= usual.items()
 
 
 @pytest.mark.parametrize(
@@ -78,24 +87,24 @@ def test_the_papers_batch_size_is_chosen_for_its_five_million_states():
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_layers_give_what_the_network_gives(architecture):
-    network, values = Autoencoder(ARCHITECTURES[architecture], 16, 5, seed=0), rows(9)
-    parts = (*layers(network.encoder), *layers(network.decoder))
-    expected = network(values).detach()
+    parts, values = stacks(ARCHITECTURES[architecture], 16, 5, seed=0), rows(9)
+    expected = parts[1](parts[0](values)).detach()
+    parts = (*layers(parts[0]), *layers(parts[1]))
     np.testing.assert_allclose(run(parts, values.numpy()), expected, rtol=1e-4, atol=1e-6)
 
 
 def drawn(it, epoch):
-    """All clean and corrupted rows of an epoch, in its order."""
+    """All corrupted and clean rows of an epoch, in its order."""
     batches = list(it._batches(epoch))
-    assert [clean.shape[1] for clean, _ in batches] == [100] * 20
+    assert [clean.shape[1] for _, clean in batches] == [100] * 20
     return (torch.cat(part, 1).T for part in zip(*batches, strict=True))
 
 
 def test_every_row_comes_once_with_noise_of_its_own():
     data = rows(2000)
     it = trainer(data, noise=0.3)
-    clean, corrupted = drawn(it, 1)
-    again, _ = drawn(it, 2)
+    corrupted, clean = drawn(it, 1)
+    _, again = drawn(it, 2)
     assert not torch.equal(clean, again)
     order = [c.sum(1).sort().values for c in (clean, again, data)]
     torch.testing.assert_close(order[0], order[2])
@@ -134,10 +143,10 @@ def test_pools_have_every_row_once(count):
 
 def test_every_row_comes_once_from_pools_too():
     data = rows(5 * RUN)
-    it = Trainer(Training.of(4, batch_size=100, noise=0), data, data[:50], pool=RUN * 16 * 4)
-    taken = torch.cat([clean for clean, _ in it._batches(1)], 1).T
+    it = trainer(data, noise=0, pool=RUN * 16 * 4)
+    taken = torch.cat([clean for _, clean in it._batches(1)], 1).T
     torch.testing.assert_close(taken.sum(1).sort().values, data.sum(1).sort().values)
-    assert not torch.equal(taken, torch.cat([clean for clean, _ in it._batches(2)], 1).T)
+    assert not torch.equal(taken, torch.cat([clean for _, clean in it._batches(2)], 1).T)
 
 
 def test_latent_sizes_see_the_same_order_and_noise():
@@ -145,7 +154,7 @@ def test_latent_sizes_see_the_same_order_and_noise():
     for ours, theirs in zip(
         trainer(data, latent=2)._batches(1), trainer(data, latent=9)._batches(1), strict=True
     ):
-        assert torch.equal(ours[1], theirs[1])
+        assert torch.equal(ours[0], theirs[0])
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
@@ -173,7 +182,7 @@ def test_the_best_epoch_is_that_of_the_lowest_training_loss():
     it = trainer(learning_rate=0.5, epochs=6)
     states = []
     for _ in it.epochs():
-        states.append({n: p.clone() for n, p in it.network.state_dict().items()})
+        states.append({n: p.clone() for n, p in it.objective.state_dict().items()})
     losses = [epoch.train_loss for epoch in it.history]
     assert it.best_epoch == losses.index(min(losses)) + 1
     for name, value in states[it.best_epoch - 1].items():
@@ -267,24 +276,22 @@ def test_prefetch_keeps_order_and_errors():
 
 
 def test_mistakes_are_named():
-    with pytest.raises(InputError, match="unknown architecture 'wide': choose one of paper, deep"):
-        Training.of(4, "wide")
-    with pytest.raises(InputError, match="batch size is 0: it must be from 1 to"):
-        Training.of(4, batch_size=0)
-    with pytest.raises(InputError, match="epochs is -1: it must be from 1 to"):
-        Training.of(4, epochs=-1)
-    with pytest.raises(
-        InputError, match=r"seed is 1000+: it must be from 0 to 9223372036854775807"
-    ):
-        Training.of(4, seed=10**20)
+    def refused(message, **settings):
+        with pytest.raises(InputError, match=message):
+            DAE.settings({"latent": 4, **settings})
+
+    refused("unknown architecture 'wide': choose one of paper, deep", architecture="wide")
+    refused("batch size is 0: it must be a whole number from 1 to", batch_size=0)
+    refused("epochs is -1: it must be a whole number from 1 to", epochs=-1)
+    refused(r"seed is 1000+: it must be .* from 0 to 9223372036854775807", seed=10**20)
     for rate in (0, np.nan, np.inf, 1e9):
-        with pytest.raises(InputError, match=r"learning rate is .*: it must be above 0 and at"):
-            Training.of(4, learning_rate=rate)
+        refused("learning rate is .*: it must be a number above 0 and at most", learning_rate=rate)
     for noise in (-1, np.nan, np.inf):
-        with pytest.raises(InputError, match=r"noise is .*: it must be at least 0, and finite"):
-            Training.of(4, noise=noise)
-    with pytest.raises(InputError, match="an autoencoder needs a latent size"):
-        trainer(latent=None)
+        refused("noise is .*: it must be a number from 0", noise=noise)
+    with pytest.raises(InputError, match="ae takes no noise: leave it out"):
+        AE.settings({"latent": 4, "noise": 0.1})
+    with pytest.raises(InputError, match="dae needs latent"):
+        DAE.settings({})
     for name in ("quantum", "meta"):
         with pytest.raises(InputError, match=f"no device '{name}' on this machine: choose auto"):
             get_device(name)
@@ -292,7 +299,7 @@ def test_mistakes_are_named():
 
 def test_losses_that_overflow_end_the_training_and_leave_the_best():
     it = trainer(noise=1e38, architecture="deep", batch_size=600)
-    with pytest.raises(InputError, match=r"diverged in epoch 1, .*: use less noise than 1e\+38"):
+    with pytest.raises(InputError, match=r"diverged in epoch 1, .*, or less noise if"):
         list(it.epochs())
     assert all(p.isfinite().all() for p in it.best.values())
 

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 from command import jbrep
-from jbrep.methods.controls import pca, random_projection
 from sklearn.decomposition import PCA
 from sklearn.linear_model import Ridge
 from sklearn.metrics import r2_score
@@ -32,6 +31,8 @@ from jbrep.evaluate.summary import evaluation_text
 from jbrep.evaluate.truth import quantities, state
 from jbrep.figures import encoder_plots
 from jbrep.jitterbug.tasks import TASKS
+from jbrep.methods import random
+from jbrep.methods.linear import principal_code
 from jbrep.stats.bootstrap import bootstrap, by_episode
 
 
@@ -49,6 +50,10 @@ def held_out(data):
     return HeldOut(wide)
 
 
+def projection(data, latent, seed):
+    return random.make(data, {"latent": latent, "seed": seed})[:2]
+
+
 def make(scaled, parts, name="it-4", **changes):
     task = changes.pop("task", scaled.task)
     facts = {"kind": "test", "name": name, "task": task.name, "environment": task.as_json()}
@@ -59,7 +64,7 @@ def make(scaled, parts, name="it-4", **changes):
 @pytest.fixture(scope="module")
 def coder(held_out):
     """A random projection to 4 numbers."""
-    return make(held_out.data, random_projection(held_out.data, 4, seed=0))
+    return make(held_out.data, projection(held_out.data, 4, seed=0))
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +129,7 @@ def test_of_very_many_episodes_groups_are_resampled():
     assert {len(np.unique(episodes)) for episodes in place} == {2, 3}
     np.testing.assert_array_equal(np.concatenate(place), it.place(rows))
     assert it.row_counts.ravel().tolist() == [len(episodes) for episodes in place]
-    worst = reconstruction(make(it.data, pca(it.data, 1)), it)["worst_episodes"]
+    worst = reconstruction(make(it.data, principal_code(it.data, 1)), it)["worst_episodes"]
     errors = [episode["mse"] for episode in worst]
     assert errors == sorted(errors, reverse=True)
     assert all(lengths[episode["episode"]] for episode in worst)
@@ -151,7 +156,7 @@ def test_all_held_out_rows_are_judged_in_little_memory(tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.dataset.columns._CHUNK_NUMBERS", 1 << 16)
     data = wide([500] * 40, features=100, folder=tmp_path)
     data.train, data.test = data.test, data.train
-    it, coder = HeldOut(data), make(data, pca(data, 3))
+    it, coder = HeldOut(data), make(data, principal_code(data, 3))
     tracemalloc.start()
     reconstruction(coder, it)
     peak = tracemalloc.get_traced_memory()[1]
@@ -194,7 +199,7 @@ def test_errors_are_those_of_encode_and_decode(held_out, coder):
 
 
 def test_pca_is_its_own_reference_and_the_identity_loses_nothing(held_out, coder, everything):
-    same = reconstruction(make(held_out.data, pca(held_out.data, 4)), held_out)
+    same = reconstruction(make(held_out.data, principal_code(held_out.data, 4)), held_out)
     np.testing.assert_allclose(same["ratio_to_pca"], 1, rtol=1e-4)
     assert same["mse"] == pytest.approx(same["pca_mse"], rel=1e-4)
     assert reconstruction(coder, held_out)["ratio_to_pca"][0] > 1
@@ -327,7 +332,7 @@ def test_any_other_robots_truth_is_every_feature():
 def test_a_wide_robot_can_be_judged(tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.evaluate.readout.MAX_NUMBERS", 1 << 19)
     data = wide([1, 300, 2, 1, 250, 99, 1, 180], features=70)
-    evaluation = write({"r-20": make(data, random_projection(data, 20, 0))}, data, tmp_path)
+    evaluation = write({"r-20": make(data, projection(data, 20, 0))}, data, tmp_path)
     everything, ours = evaluation["encoders"].values()
     for result in everything, ours:
         gtc = result["correlation"]
@@ -344,7 +349,7 @@ def test_a_wide_robot_can_be_judged(tmp_path, monkeypatch):
 
 def test_episodes_of_one_row_have_no_dynamics(tmp_path):
     data = wide([1] * 20, features=6)
-    result = write({"r-2": make(data, random_projection(data, 2, 0))}, data, tmp_path)
+    result = write({"r-2": make(data, projection(data, 2, 0))}, data, tmp_path)
     for judged in result["encoders"].values():
         assert set(map(tuple, judged["dynamics"].values())) == {(None, None, None)}
         assert judged["reconstruction"]["mse"][0] is not None
@@ -354,7 +359,7 @@ def test_episodes_of_one_row_have_no_dynamics(tmp_path):
 def test_a_feature_that_is_constant_where_it_is_judged_has_no_r2(tmp_path):
     data = wide([50] * 10, features=6)
     data.dataset.arrays["observation"][data.test, 3] = 1.7
-    features = reconstruction(make(data, pca(data, 2)), HeldOut(data))["features"]
+    features = reconstruction(make(data, principal_code(data, 2)), HeldOut(data))["features"]
     assert features[3]["r2"][0] is None
     assert features[4]["r2"][0] is not None
 
@@ -472,7 +477,7 @@ def test_a_constant_feature_can_be_judged(data):
         np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.low),
         np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.high),
     )
-    result = diagnose({"pca-4": make(flat, pca(flat, 4))}, flat)["encoders"]["pca-4"]
+    result = diagnose({"pca-4": make(flat, principal_code(flat, 4))}, flat)["encoders"]["pca-4"]
     assert result["reconstruction"]["features"][2]["r2"] == [None, None, None]
     assert result["corruption"][0]["linear_mse"][0] == pytest.approx(
         result["reconstruction"]["mse"][0], rel=1e-3
@@ -494,7 +499,10 @@ def test_labels_and_numbers_that_cannot_be_judged(data):
 
 
 def test_an_evaluation_is_plain_json_and_repeats(data, tmp_path):
-    encoders = {"pca-4": make(data, pca(data, 4)), "r-4": make(data, random_projection(data, 4, 0))}
+    encoders = {
+        "pca-4": make(data, principal_code(data, 4)),
+        "r-4": make(data, projection(data, 4, 0)),
+    }
     one = write(encoders, data, tmp_path / "it")
     text = (tmp_path / "it" / EVALUATION).read_text()
     assert list(json.loads(text)["encoders"]) == ["full", "pca-4", "r-4"]
@@ -540,7 +548,9 @@ def test_whether_an_encoder_may_have_seen_the_episodes(data):
         "overlaps": {"fingerprint": "other", "seed": 3},
         "apart": {"fingerprint": "other", "seed": 4},
     }
-    encoders = {n: make(data, pca(data, 2), data=source) for n, source in sources.items()}
+    encoders = {
+        n: make(data, principal_code(data, 2), data=source) for n, source in sources.items()
+    }
     result = diagnose(encoders, data)["seen"]
     assert result == {"same": "no test row", "overlaps": "maybe", "apart": "none"}
 

@@ -5,13 +5,13 @@ import shutil
 import signal
 import tracemalloc
 from contextlib import contextmanager
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 import torch
 from command import jbrep, start, wait_for
-from jbrep.dae.training import Trainer, Training
-from jbrep.methods.rows import available_memory, training_rows, watched_rows
 from small import settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from wide import wide
@@ -19,13 +19,19 @@ from wide import wide
 from jbrep.collect import write_shards
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.manifest import open_shard, read_manifest
-from jbrep.encoders import load
+from jbrep.dataset.scaling import SCALINGS
+from jbrep.encoders import load, save
 from jbrep.errors import InputError
 from jbrep.files.lock import exclusive
 from jbrep.methods import fit
-from jbrep.methods.fit import KINDS, Fitter
+from jbrep.methods.fit import Fitter
 from jbrep.methods.held_out import ratio_to_pca
+from jbrep.methods.registry import METHODS, name_of, read_name
+from jbrep.methods.settings import REQUIRED
 from jbrep.training import checkpoint
+from jbrep.training.rows import available_memory
+from jbrep.training.trainer import Schedule, Trainer
+from jbrep.training.windows import Windows, watched_windows
 
 
 @pytest.fixture(scope="module")
@@ -33,31 +39,72 @@ def data(collected):
     return ScaledDataset(Dataset(collected))
 
 
-def how(latent=4, **changes):
-    return Training.of(latent, **{"epochs": 3, "batch_size": 500, **changes})
+RECONSTRUCTING = ("identity", "pca", "random", "untrained", "ae", "dae")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+def how(kind="dae", **changes):
+    """Settings of a short training, as far as that method takes them."""
+    short = {"latent": 4, "epochs": 3, "batch_size": 500, "features": "velocity_*"}
+    short |= {"latent": 20} if kind == "noise" else {}
+    short |= changes
+    return {name: value for name, value in short.items() if name in METHODS[kind].defaults}
+
+
+@pytest.mark.parametrize("kind", METHODS)
 def test_every_kind_has_the_error_that_its_file_says(data, kind, tmp_path):
-    fitted = Fitter(data, tmp_path).fit(kind, how())
+    fitted = Fitter(data, tmp_path).fit(kind, **how(kind))
     encoder = load(fitted.path)
     assert fitted.is_new
-    assert fitted.path.name == ("identity" if kind == "identity" else f"{kind}-4") + ".safetensors"
+    assert fitted.path.name == f"{encoder.name}.safetensors"
+    assert encoder.name.startswith(kind)
     rows = data.dataset["observation"][data.test]
     lost = (encoder.decode(encoder.encode(rows)) - rows) / data.scaler.half_width
     expected = np.mean(lost.astype(float) ** 2)
     assert encoder.header["metrics"]["held_out_mse"] == pytest.approx(expected, rel=1e-5)
     assert encoder.header["data"]["fingerprint"] == data.dataset.manifest.fingerprint
     assert encoder.header["data"]["train_rows"] == 4000
-    assert set(encoder.header["training"]) == set(KINDS[kind].settings)
+    assert set(encoder.header["training"]) == set(METHODS[kind].own)
     bytes_before = fitted.path.read_bytes()
-    again = Fitter(data, tmp_path).fit(kind, how())
+    again = Fitter(data, tmp_path).fit(kind, **how(kind))
     assert not again.is_new
     assert fitted.path.read_bytes() == bytes_before
 
 
+NAMED = [
+    m for m in METHODS.values() if {n for n, v in m.own.items() if v is REQUIRED} <= {"latent"}
+]
+
+
+@pytest.mark.parametrize("method", NAMED, ids=lambda method: method.name)
+def test_a_name_says_the_settings_that_it_was_made_of(method):
+    choices = {
+        "latent": (8,),
+        "architecture": ("paper", "deep", "64x32"),
+        "scaling": SCALINGS,
+        "angles": (False, True),
+        "codes": ("raw", "standard", "white"),
+    }
+    taken = {name: values for name, values in choices.items() if name in method.defaults}
+    for values, preset in product(product(*taken.values()), ({}, *method.presets.values())):
+        settings = method.settings({**dict(zip(taken, values, strict=True)), **preset})
+        recipe = read_name(name_of(method, settings))
+        assert recipe.method is method
+        assert method.settings(recipe.given) == settings
+
+
+def test_names_of_no_encoder_are_refused_and_a_name_of_ones_own_is_free(data, tmp_path):
+    for name in ("wide-8", "dae", "dae-white-angles-8", "dae-authors-authors-8", "pca-deep-8", ""):
+        with pytest.raises(InputError, match="unknown representation"):
+            read_name(name)
+    fitted = Fitter(data, tmp_path).fit("pca", latent=4, name="mine")
+    assert (fitted.path.name, fitted.encoder.name) == ("mine.safetensors", "mine")
+    with pytest.raises(InputError, match="invalid encoder name"):
+        Fitter(data, tmp_path).plan("pca", latent=4, name="../x")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.safetensors"]
+
+
 def test_scaling_is_fitted_on_the_training_part_only(data, tmp_path):
-    encoder = Fitter(data, tmp_path).fit("pca", how()).encoder
+    encoder = Fitter(data, tmp_path).fit("pca", **how("pca")).encoder
     rows = data.dataset["observation"][data.train]
     np.testing.assert_array_equal(encoder.scaler.low, rows.min(axis=0))
     np.testing.assert_array_equal(encoder.scaler.high, rows.max(axis=0))
@@ -68,8 +115,8 @@ def test_scaling_is_fitted_on_the_training_part_only(data, tmp_path):
 def test_a_denoiser_beats_a_plain_autoencoder_from_noise_only(data, tmp_path):
     fitter = Fitter(data, tmp_path)
     training = {"epochs": 60, "batch_size": 100, "learning_rate": 3e-3}
-    plain = fitter.fit("ae", how(8, **training)).encoder
-    denoising = fitter.fit("dae", how(8, noise=0.5, **training)).encoder
+    plain = fitter.fit("ae", **how("ae", latent=8, **training)).encoder
+    denoising = fitter.fit("dae", **how(latent=8, noise=0.5, **training)).encoder
     rows = data.dataset["observation"][data.test]
     noise = np.random.default_rng(0).normal(size=rows.shape).astype(np.float32)
     width = data.scaler.half_width
@@ -83,7 +130,7 @@ def test_a_denoiser_beats_a_plain_autoencoder_from_noise_only(data, tmp_path):
 
 
 def test_tensorboard_has_the_losses(data, tmp_path):
-    Fitter(data, tmp_path).fit("dae", how())
+    Fitter(data, tmp_path).fit("dae", **how())
     events = EventAccumulator(str(tmp_path / "dae-4.training")).Reload()
     for name in ("train_loss", "test_loss"):
         assert [e.step for e in events.Scalars(name)] == [1, 2, 3]
@@ -94,7 +141,7 @@ def test_tensorboard_has_the_losses(data, tmp_path):
 def whole(data, tmp_path_factory):
     """The file of a training that nothing stopped."""
     folder = tmp_path_factory.mktemp("whole")
-    return Fitter(data, folder).fit("dae", how(epochs=30, batch_size=50)).path
+    return Fitter(data, folder).fit("dae", **how(epochs=30, batch_size=50)).path
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -121,8 +168,8 @@ def test_only_one_may_train_it(data, tmp_path):
     work = tmp_path / "dae-4.training"
     work.mkdir()
     with exclusive(work), pytest.raises(InputError, match="is being written by process"):
-        fitter.fit("dae", how())
-    assert fitter.fit("dae", how()).is_new
+        fitter.fit("dae", **how())
+    assert fitter.fit("dae", **how()).is_new
 
 
 def test_what_another_process_finished_before_the_lock_is_left_as_it_is(
@@ -132,28 +179,35 @@ def test_what_another_process_finished_before_the_lock_is_left_as_it_is(
     def after_another(work):
         with monkeypatch.context() as patch:
             patch.setattr(fit, "exclusive", exclusive)
-            Fitter(data, tmp_path).fit("dae", how())
+            Fitter(data, tmp_path).fit("dae", **how())
         with exclusive(work):
             yield
 
     monkeypatch.setattr(fit, "exclusive", after_another)
     fitter = Fitter(data, tmp_path)
-    fitted = fitter.fit("dae", how())
+    fitted = fitter.fit("dae", **how())
     assert not fitted.is_new
     events = EventAccumulator(str(tmp_path / "dae-4.training")).Reload()
     assert [e.step for e in events.Scalars("train_loss")] == [1, 2, 3]  # once
 
 
 def test_rows_that_do_not_fit_in_memory_give_the_same_file(data, tmp_path):
-    one = Fitter(data, tmp_path / "memory").fit("dae", how()).path
-    other = Fitter(data, tmp_path / "disk", memory=1000).fit("dae", how()).path
+    one = Fitter(data, tmp_path / "memory").fit("dae", **how()).path
+    other = Fitter(data, tmp_path / "disk", memory=1000).fit("dae", **how()).path
     assert one.read_bytes() == other.read_bytes()
 
 
-def epochs(data, memory, training, path=None):
-    """Weights after training in pools far smaller than the data, perhaps from a checkpoint."""
-    train = training_rows(data, torch.device("cpu"), memory)
-    trainer = Trainer(training, train, watched_rows(data, torch.device("cpu")), pool=1 << 20)
+def pooled(data, memory, pool, **how):
+    """A trainer of a dae that shuffles the data in pools far smaller than they are."""
+    objective = METHODS["dae"].objective(data, METHODS["dae"].settings({"latent": 4}))
+    windows = Windows(data, data.train, memory=memory)
+    watched = Windows(data, data.test, memory=0, most=9)
+    return Trainer(objective, Schedule(learning_rate=5e-4, **how), windows, watched, pool)
+
+
+def trained(data, memory, epochs, path=None):
+    """A trainer that is done, perhaps from a checkpoint."""
+    trainer = pooled(data, memory, 1 << 20, batch_size=256, epochs=epochs)
     if path:
         checkpoint.restore(trainer, {}, path)
     list(trainer.epochs())
@@ -162,15 +216,14 @@ def epochs(data, memory, training, path=None):
 
 def test_a_training_from_disk_is_that_from_memory_and_resumes_in_either(tmp_path):
     data = wide([700] * 8, features=40, folder=tmp_path)
-    half, whole = (how(batch_size=256, epochs=n) for n in (1, 2))
-    memory, disk = (epochs(data, limit, whole) for limit in (1 << 30, 1 << 18))
+    memory, disk = (trained(data, limit, epochs=2) for limit in (1 << 30, 1 << 18))
     assert memory.history == disk.history
     for limit in (1 << 30, 1 << 18):
-        checkpoint.save(epochs(data, limit, half), {}, tmp_path / "at")
+        checkpoint.save(trained(data, limit, epochs=1), {}, tmp_path / "at")
         for other in (1 << 30, 1 << 18):
-            resumed = epochs(data, other, whole, tmp_path / "at")
-            for name, parameter in memory.network.state_dict().items():
-                assert torch.equal(resumed.network.state_dict()[name], parameter)
+            resumed = trained(data, other, 2, tmp_path / "at")
+            for name, parameter in memory.objective.state_dict().items():
+                assert torch.equal(resumed.objective.state_dict()[name], parameter)
 
 
 def test_training_from_disk_takes_little_memory(tmp_path, monkeypatch):
@@ -180,9 +233,7 @@ def test_training_from_disk_takes_little_memory(tmp_path, monkeypatch):
     peaks = []
     for memory in (1 << 30, 1 << 20):
         tracemalloc.start()
-        train = training_rows(data, torch.device("cpu"), memory)
-        trainer = Trainer(how(batch_size=128, epochs=1), train, torch.zeros(9, 348), pool=1 << 22)
-        list(trainer.epochs())
+        list(pooled(data, memory, 1 << 22, batch_size=128, epochs=1).epochs())
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[0] > size > 10 * peaks[1]
@@ -196,15 +247,15 @@ def test_half_of_the_free_memory_is_taken_but_at_least_a_gibibyte(monkeypatch):
 
 
 def test_fewer_held_out_rows_of_a_wide_robot_are_watched(monkeypatch):
-    monkeypatch.setattr("jbrep.methods.rows._WATCHED_NUMBERS", 348 * 30)
-    assert watched_rows(wide([50] * 10), torch.device("cpu")).shape == (30, 348)
+    monkeypatch.setattr("jbrep.training.windows._WATCHED_NUMBERS", 348 * 30)
+    assert len(watched_windows(wide([50] * 10), 0, torch.device("cpu"))) == 30
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", RECONSTRUCTING)
 def test_constant_huge_and_tiny_features_give_finite_encoders(kind, tmp_path):
     data = wide([1, 300, 2, 120, 77])
     assert data.constant_features == ("obs_0",)
-    encoder = Fitter(data, tmp_path).fit(kind, how(batch_size=100)).encoder
+    encoder = Fitter(data, tmp_path).fit(kind, **how(kind, batch_size=100)).encoder
     rows = data.dataset["observation"][data.test]
     back = (encoder.decode(encoder(rows)) - rows) / data.scaler.half_width
     assert encoder.header["metrics"]["held_out_mse"] == pytest.approx(np.mean(back**2), rel=1e-3)
@@ -215,22 +266,21 @@ def test_constant_huge_and_tiny_features_give_finite_encoders(kind, tmp_path):
 def test_observations_that_cannot_be_reduced_are_refused(tmp_path):
     single = Fitter(wide([20] * 5, features=1), tmp_path)
     with pytest.raises(
-        InputError, match="Humanoid-v5 has one feature, which can't be reduced: use"
+        InputError, match="Humanoid-v5 has 1 feature to reduce, which can't be: use"
     ):
-        single.fit("pca", how(1))
-    assert single.fit("identity", how()).encoder.latent_size == 1
+        single.fit("pca", latent=1)
+    assert single.fit("identity", **how("identity")).encoder.latent_size == 1
     data = wide([20] * 5)
     data.scaler.high[7] = 1e13
     with pytest.raises(
         InputError, match=r"the observations in .* are too large to be encoded: ten"
     ):
-        Fitter(data, tmp_path).check("dae", how())
+        Fitter(data, tmp_path).plan("dae", latent=4)
 
 
 def test_an_encoder_is_compared_with_pca(data, tmp_path):
     fitter = Fitter(data, tmp_path)
-    short, full = fitter.fit("dae", how()).encoder, fitter.fit("identity", how()).encoder
-    theirs = fitter.fit("pca", how()).encoder
+    short, full, theirs = (fitter.fit(k, **how(k)).encoder for k in ("dae", "identity", "pca"))
     assert ratio_to_pca(theirs, data) == pytest.approx(1)
     errors = [encoder.header["metrics"]["held_out_mse"] for encoder in (short, theirs)]
     assert ratio_to_pca(short, data) == pytest.approx(errors[0] / errors[1])
@@ -238,7 +288,7 @@ def test_an_encoder_is_compared_with_pca(data, tmp_path):
 
 
 def test_the_header_has_the_batch_size_that_was_chosen(data, tmp_path):
-    training = Fitter(data, tmp_path).fit("dae", how(batch_size=None)).encoder.header["training"]
+    training = Fitter(data, tmp_path).fit("dae", **how(batch_size=None)).encoder.header["training"]
     assert training["batch_size"] == 128
 
 
@@ -264,39 +314,51 @@ def test_the_command_takes_sizes_in_any_form_and_warns_of_what_is_worse_than_pca
 
 def test_other_settings_or_data_are_refused_and_nothing_is_lost(data, collected, tmp_path):
     fitter = Fitter(data, tmp_path)
-    path = fitter.fit("dae", how()).path
+    path = fitter.fit("dae", **how()).path
     before = path.read_bytes()
     with pytest.raises(
-        InputError, match=r"trained with other settings: noise 0\.1 \(now: 0\.2\); choose anoth"
+        InputError, match=r"made with other settings: noise 0\.1 \(now: 0\.2\); choose anoth"
     ):
-        fitter.fit("dae", how(noise=0.2))
+        fitter.fit("dae", **how(noise=0.2))
     other = changed(collected, tmp_path / "other", lambda rows: rows + 1)
-    with pytest.raises(InputError, match=r"trained with other settings: data [0-9a-f.]+ \(now"):
-        Fitter(ScaledDataset(other), tmp_path).fit("dae", how())
+    with pytest.raises(InputError, match=r"made with other settings: data [0-9a-f.]+ \(now"):
+        Fitter(ScaledDataset(other), tmp_path).fit("dae", **how())
     assert path.read_bytes() == before
     shutil.copy(path, tmp_path / "ae-4.safetensors")
-    with pytest.raises(InputError, match=r"trained with other settings: kind dae \(now: ae\)"):
-        fitter.fit("ae", how())
+    with pytest.raises(InputError, match=r"made with other settings: kind dae \(now: ae\)"):
+        fitter.fit("ae", **how("ae"))
+
+
+def test_a_file_of_before_there_were_more_settings_is_complete(data, tmp_path):
+    fitter = Fitter(data, tmp_path)
+    made = fitter.fit("dae", **how())
+    then = {*how(), "architecture", "learning_rate", "seed", "noise"}
+    training = {n: v for n, v in made.encoder.header["training"].items() if n in then}
+    save(replace(made.encoder, header={**made.encoder.header, "training": training}), made.path)
+    assert not fitter.fit("dae", **how()).is_new
+    with pytest.raises(InputError, match=r"other settings: shared_noise False \(now: True\)"):
+        fitter.fit("dae", name="dae-4", **how(shared_noise=True))
 
 
 def test_mistakes_are_named(data, tmp_path):
     fitter = Fitter(data, tmp_path)
-    with pytest.raises(InputError, match="pca needs a latent size, from 1 to 15"):
-        fitter.fit("pca", how(None))
-    for latent in (0, -1, 16, 17):
-        for kind in ("pca", "dae", "untrained"):
-            with pytest.raises(
-                InputError, match=f"latent size is {latent}: .* it must be from 1 to 15"
-            ):
-                fitter.fit(kind, how(latent))
-    with pytest.raises(InputError, match="unknown kind 'vae': choose one of identity, pca, random"):
-        fitter.fit("vae", how())
+    with pytest.raises(InputError, match="pca needs latent"):
+        fitter.fit("pca")
+    for kind in ("pca", "dae", "untrained"):
+        for latent in (0, -1, "many", 4097):
+            with pytest.raises(InputError, match=f"latent is {latent}: .* from 1 to 4096"):
+                fitter.fit(kind, latent=latent)
+        for latent in (16, 17):
+            with pytest.raises(InputError, match=f"latent size is {latent}: .* from 1 to 15"):
+                fitter.fit(kind, latent=latent)
+    with pytest.raises(InputError, match="unknown kind 'vea': choose one of identity, pca, random"):
+        fitter.fit("vea")
     with pytest.raises(InputError, match="without noise is a plain autoencoder: use the kind ae"):
-        fitter.fit("dae", how(noise=0))
+        fitter.fit("dae", **how(noise=0))
     (tmp_path / "file").write_text("")
     for kind in ("pca", "dae"):
         with pytest.raises(InputError, match="can't make the folder"):
-            Fitter(data, tmp_path / "file").fit(kind, how())
+            Fitter(data, tmp_path / "file").fit(kind, **how(kind))
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
@@ -322,7 +384,7 @@ def test_a_constant_feature_is_scaled_to_zero(collected, tmp_path):
     assert data.constant_features == ("position_z",)
     fitter = Fitter(data, tmp_path)
     for kind in ("dae", "pca", "identity"):
-        encoder = fitter.fit(kind, how()).encoder
+        encoder = fitter.fit(kind, **how(kind)).encoder
         rows = data.dataset["observation"][:9]
         assert np.isfinite(encoder(rows)).all()
     np.testing.assert_array_equal(encoder(rows)[:, 2], 0)

@@ -239,6 +239,50 @@ def test_where_a_file_is(file, expected, tmp_path, monkeypatch):
     run.check()
 
 
+def test_encoders_nested_in_one_representation(tmp_path, collected):
+    nested = {"name": "random-4", "encoders": 2}
+    files = {"name": "mine", "file": "encoders/{task}/mine-{encoder}.safetensors", "encoders": 2}
+    own = {"name": "late-4", "kind": "slow", "latent": 4, "lags": [20]}
+    study = with_own(nested, files, own, seeds=(0, 1, 2), data=Data(folder=str(collected)))
+    assert study.notices == [
+        f"The seeds, 3 in number, share the 2 encoders of {name} unevenly."
+        for name in ("random-4", "mine")
+    ]
+    plan = Plan(study, tmp_path / "it")
+    prepare(plan)
+    made = {path.stem: load(path) for path in plan.encoders(TASK).glob("*.safetensors")}
+    assert sorted(made) == ["identity", "late-4", "random-4-s0", "random-4-s1"]
+    assert made["random-4-s1"].header["training"]["seed"] == 1
+    assert made["late-4"].header["training"]["lags"] == [20]
+    runs = {(cell.representation.name, cell.seed): plan.run(cell) for cell in plan.cells}
+    told = [(Path(r.encoder).stem, r.representation, r.encoder_seed) for r in runs.values()]
+    assert told[1:4] == [
+        ("random-4-s0", "random-4", 0),
+        ("mine-0", "mine", 0),
+        ("late-4", "", None),
+    ]
+    assert told[5:7] == [("random-4-s1", "random-4", 1), ("mine-1", "mine", 1)]
+    assert told[9:11] == told[1:3]
+    assert runs["late-4", 0].find_encoder().representation == "late-4"
+    assert dataclasses.replace(study, seeds=(0, 1)).notices == []
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ({"name": "a", "kind": "slow", "latent": 4, "keep": ["x"]}, "a can't be trained for face"),
+        ({"name": "b", "kind": "pca", "latent": 16}, "b can't be trained for face_direction: lat"),
+    ],
+)
+def test_settings_of_encoders_are_checked_with_the_data(own, message, tmp_path, collected):
+    study = with_own(own, data=Data(folder=str(collected)))
+    with pytest.raises(InputError, match=message):
+        run_study(Plan(study, tmp_path / "it"), None, 1)
+    assert not (tmp_path / "it").exists()
+    with pytest.raises(InputError, match=r"a|b is trained by the study, .* \[data\] is missing"):
+        with_own(own)
+
+
 def test_own_files_beside_those_that_the_study_trains(tmp_path):
     study = with_own("pca-4", PATTERN, data=Data(steps=200))
     plan = Plan(study, tmp_path / "it")
@@ -281,12 +325,36 @@ def test_own_encoders_are_checked_before_the_first_run(own, message, home, tmp_p
         *(([{"name": n, "file": "x"}], "name is") for n in ("full", "..", "a/b", "", 7, [])),
         ([{"file": "x"}], "name is None: it must be of letters, digits"),
         *(
-            ([{"name": "a", **rest}], "a must have a name and either file or code, not more")
-            for rest in ({}, {"file": "x", "code": NET}, {"file": "x", "kind": "dae"})
+            ([{"name": "a", **rest}], "a: it must have a name and one of file, code, kind")
+            for rest in (
+                {},
+                {"file": "x", "code": NET},
+                {"file": "x", "kind": "dae"},
+                {"noise": 0.2, "encoders": 2},
+                {"code": NET, "encoders": 2},
+            )
         ),
         *(([{"name": "a", "file": file}], "its file is") for file in (7, "", {TASK: 7})),
         ([{"name": "a", "file": "{sed}"}], r"unknown \{sed\} in its file"),
         *(([{"name": "a", "code": code}], "its code is") for code in ("Net", 7)),
+        *(
+            ([{"name": "dae-8", "encoders": n}], f"dae-8: encoders is {n}: it must be from 1 to")
+            for n in (0, True, 1.5, 1001)
+        ),
+        ([{"name": "a", "encoders": 2}], "a: unknown representation 'a'"),
+        ([{"name": "slow-8", "encoders": 2}], "slow-8: slow has no seed, so all its encoders"),
+        (
+            [{"name": "a", "kind": "dae", "latent": 8, "seed": 1, "encoders": 2}],
+            "a: its encoders have the seeds 0 to 1: leave out seed",
+        ),
+        ([{"name": "a", "file": "x", "encoders": 2}], r"its file x must contain \{encoder\}"),
+        ([{"name": "a", "file": "{encoder}"}], r"how many files \{encoder\} stands for, such as"),
+        ([{"name": "a", "file": "{seed}{encoder}", "encoders": 2}], r"unknown \{seed\} in its"),
+        ([{"name": "A", "kind": "pca", "latent": 8}], "A: invalid encoder name 'A'"),
+        ([{"name": "a", "kind": "fly"}], "a: unknown kind 'fly'"),
+        ([{"name": "a", "kind": "slow", "latent": 8, "lags": [0]}], r"a: lags is \[0\]: it must"),
+        ([{"name": "a", "kind": "slow", "latent": 8, "noise": 1}], "a: slow takes no noise"),
+        ([{"name": "a", "kind": "slow"}], "a: slow needs latent"),
     ],
 )
 def test_a_mistaken_representation_is_refused(given, message):
@@ -300,6 +368,7 @@ TINY_LISTS = {
     "algorithms": ["a2c"],
     "seeds": 2,
     "environment": {},
+    "evaluations": [],
     "data": {"steps": 9},
 }
 

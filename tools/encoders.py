@@ -9,36 +9,25 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jbrep.dae.training import NOISE, Training
-
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import FULL
 from jbrep.evaluate.files import write
 from jbrep.evaluate.summary import evaluation_text
 from jbrep.figures import encoder_plots
 from jbrep.figures import write as write_plots
+from jbrep.methods.autoencoder import NOISE
 from jbrep.methods.fit import Fitter
+from jbrep.methods.registry import read_name
 
 LATENTS = (12, 8, 4)
-KINDS = (
-    ("dae", "paper"),
-    ("dae", "deep"),
-    ("ae", "paper"),
-    ("pca", "paper"),
-    ("random", "paper"),
-    ("untrained", "paper"),
-    ("untrained", "deep"),
-)
+STEMS = ("dae", "dae-deep", "ae", "pca", "random", "untrained", "untrained-deep")
 
 
 def compare(data: ScaledDataset, encoders: Path, results: Path) -> None:
     """Make encoders of all kinds for a task; write evaluation.json, tables.txt and the figures."""
     fitter = Fitter(data, encoders)
-    fitted = [
-        fitter.fit(kind, Training.of(latent, architecture)).encoder
-        for kind, architecture in KINDS
-        for latent in LATENTS
-    ]
+    recipes = [read_name(f"{stem}-{latent}") for stem in STEMS for latent in LATENTS]
+    fitted = [fitter.fit(method.name, **given).encoder for method, given in recipes]
     evaluation = write({encoder.name: encoder for encoder in fitted}, data, results)
     (results / "tables.txt").write_text(evaluation_text(evaluation) + "\n")
     write_plots(encoder_plots(evaluation), results)

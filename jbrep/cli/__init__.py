@@ -5,13 +5,14 @@ import click
 from jbrep.cli.base import Cli
 from jbrep.cli.data import collect, data
 from jbrep.cli.doctor import doctor
-from jbrep.cli.encoders import encoder, evaluate, train_dae, train_encoder
+from jbrep.cli.encoders import encoder, evaluate
 from jbrep.cli.env import env
 from jbrep.cli.inspect import inspect
 from jbrep.cli.policies import behaviour, evaluate_policy
 from jbrep.cli.render import render
 from jbrep.cli.rl import rl
 from jbrep.cli.study import report, study
+from jbrep.cli.train import train_dae, train_encoder
 from jbrep.cli.tune import tune
 
 

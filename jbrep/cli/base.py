@@ -130,11 +130,33 @@ class Cli(click.Group):
             raise _Mistake(f"this needs {error.name}: pip install 'jbrep[{extra}]'") from None
 
 
+class Variadic(click.Command):
+    """An option that may be repeated also takes several values at once: --latent 12 8 4."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put the option's name before each of its values."""
+        repeatable = {
+            name
+            for option in self.get_params(ctx)
+            if isinstance(option, click.Option) and option.multiple
+            for name in option.opts
+        }
+        spread: list[str] = []
+        for i, arg in enumerate(args):
+            follows = i > 1 and not arg.startswith("-") and not args[i - 1].startswith("-")
+            name = next((a for a in reversed(args[:i]) if a.startswith("-")), None)
+            spread += [name, arg] if follows and name in repeatable else [arg]
+        return super().parse_args(ctx, spread)
+
+
 def example(text: str) -> str:
     """The end of a command's help."""
     return f"Example: {text}"
 
 
+data_option = click.option(
+    "--data", required=True, type=click.Path(path_type=Path), help="A folder from jbrep collect."
+)
 as_json = click.option("--json", "as_json", is_flag=True, help="As JSON, for programs.")
 
 

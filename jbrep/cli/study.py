@@ -6,6 +6,7 @@ import click
 
 from jbrep.cli.base import (
     RESUMES,
+    Variadic,
     as_json,
     echo_json,
     echo_paths,
@@ -74,27 +75,40 @@ def study(
         context.exit(1)
 
 
-@click.command(epilog=example("jbrep report runs/smoke"))
+@click.command(cls=Variadic, epilog=example("jbrep report runs/smoke"))
 @click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "--evaluation",
+    multiple=True,
+    metavar="FOLDER...",
+    help="From jbrep evaluate, of encoders of these runs: its diagnostics go into the tables. "
+    "{task} in it stands for each task.",
+)
 @click.option(
     "--out", type=click.Path(path_type=Path), help="A folder for it.  [default: the study's own]"
 )
 @as_json
-def report(folder: Path, out: Path | None, as_json: bool) -> None:
+def report(folder: Path, evaluation: tuple[str, ...], out: Path | None, as_json: bool) -> None:
     """Show what a study found, as a page, tables and figures.
 
     FOLDER holds a study, finished or not, or any runs. Where there are no runs, as in results/desk,
     the report is made from the tables alone.
     """
-    _conclude(folder, out, as_json)
+    _conclude(folder, evaluation, out, as_json)
 
 
-def _conclude(folder: Path, out: Path | None = None, as_json: bool = False) -> None:
+def _conclude(
+    folder: Path,
+    evaluations: tuple[str, ...] = (),
+    out: Path | None = None,
+    as_json: bool = False,
+) -> None:
     """Write the tables of the runs below a folder, if there are any, and the report; print them."""
     import json
 
     from jbrep.report import write_report
     from jbrep.report.report import SUMMARY
+    from jbrep.study.diagnostics import add_diagnostics
     from jbrep.study.results import as_text, conclude, has_runs
     from jbrep.text import terminal_width
 
@@ -104,6 +118,8 @@ def _conclude(folder: Path, out: Path | None = None, as_json: bool = False) -> N
         if not as_json:
             for line in as_text(results, terminal_width()).splitlines():
                 click.echo(printable(line))
+    for line in add_diagnostics(folder, evaluations):
+        click.echo(printable(line), err=True)
     paths += write_report(folder, out)
     if as_json:
         echo_json(json.loads(((out or folder) / SUMMARY).read_bytes()))

@@ -6,14 +6,25 @@ from itertools import pairwise
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from jbrep.encoders import Layer
+from jbrep.encoders.activations import AVG_L1_NORM, activate
 from jbrep.encoders.encoder import MAX_UNITS
 from jbrep.errors import InputError, choose
 from jbrep.files.container import MAX_BYTES
 
-_MODULES = {"relu": nn.ReLU, "tanh": nn.Tanh}
+
+class AvgL1Norm(nn.Module):
+    """Divides values (..., units) by their average magnitude."""
+
+    def forward(self, values: Tensor) -> Tensor:
+        """The values on a mean magnitude of 1."""
+        normalised: Tensor = activate(AVG_L1_NORM, values)
+        return normalised
+
+
+_MODULES = {"relu": nn.ReLU, "tanh": nn.Tanh, AVG_L1_NORM: AvgL1Norm}
 _SIZES = re.compile(r"[1-9][0-9]{0,8}([x,][1-9][0-9]{0,8})*")
 _BYTES = 4  # of a number in float32
 _NAMES = {module: name for name, module in _MODULES.items()}

@@ -108,10 +108,10 @@ class Encoder(BaseEncoder):
             raise InputError("its angles must be different features")
         if clip is not None and not 1 <= clip < MAX_MAGNITUDE:
             raise InputError(f"its clip is {clip}: it must be at least 1")
-        if self.keep and not (self.encoder and set(self.keep) <= set(self.feature_names)):
-            raise InputError(
-                "only features of its observations can pass around an encoder's layers"
-            )
+        if unknown := [name for name in self.keep if name not in self.feature_names]:
+            raise InputError(f"{unknown[0]} can't pass around its layers: it is no feature")
+        if self.keep and (not self.encoder or len(set(self.keep)) < len(self.keep)):
+            raise InputError("different features can pass around layers, where there are some")
 
     def _check(self, name: str, tensor: Any, sizes: list[int]) -> None:
         """Check one tensor; `sizes` holds the widths of the layers so far, and grows."""
@@ -187,6 +187,14 @@ class Encoder(BaseEncoder):
         angles = (self.feature_names[i] for i in self.scaler.angles)
         scaled = (*self.feature_names, *angles) if self.keep else ()
         return [i for i, name in enumerate(scaled) if name in self.keep]
+
+    @cached_property
+    def restored(self) -> list[int]:
+        """Places of the scaled numbers among decoded ones with those that are kept after them."""
+        places = list(range(self.scaler.size))
+        for i, place in enumerate(self.kept):
+            places[place] = self.scaler.size + i
+        return places
 
     @property
     def file_header(self) -> dict[str, Any]:
@@ -300,7 +308,8 @@ class Encoder(BaseEncoder):
         coded = self.latent_size - len(self.kept)
         scaled = run(parts.decoder, values[..., :coded])
         if self.keep:
-            scaled[..., self.kept] = values[..., coded:]
+            scaled = library_of(scaled).concatenate((scaled, values[..., coded:]), -1)
+            scaled = scaled[..., self.restored]
         return parts.scaler.unscale(scaled)
 
     def scale(self, observation: Float32) -> Float32:

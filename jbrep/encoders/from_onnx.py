@@ -274,6 +274,7 @@ _ACTIONS: dict[str, Callable[[_Node], Action]] = {  # of one value, the first in
     "Swish": lambda node: fold.with_slope("silu", node.number("alpha", 1)),
     "Elu": lambda node: fold.elu(node.number("alpha", 1)),
     "Softplus": _same("softplus"),
+    "Sin": _same("sin"),
 }
 _SHAPES: dict[str, Callable[[Any, tuple[int, ...]], Any]] = {  # of constants
     "Reshape": lambda value, shape: value.reshape(

@@ -34,6 +34,11 @@ class EncoderName(NamedTuple):
         return f"{self.stem}{latent}" + ("" if self.seed is None else f"-s{self.seed}")
 
 
+def of_seed(name: str, seed: int) -> str:
+    """The name of one of several trainings: dae-8-s2."""
+    return str(EncoderName.parse(name)._replace(seed=seed))
+
+
 def check_name(name: str) -> None:
     """Make sure that an encoder can have a name.
 

@@ -105,7 +105,7 @@ BINARY = {
     "pow": "power",
 }
 FUNCTIONS: dict[str, Callable[..., Action]] = {  # of torch, and methods of its tensors
-    **{name: _same(name) for name in ("relu", "tanh", "sigmoid", "silu")},
+    **{name: _same(name) for name in ("relu", "tanh", "sigmoid", "silu", "sin")},
     "gelu": _gelu,
     "elu": _elu,
     "softplus": _softplus,

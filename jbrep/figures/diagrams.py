@@ -33,7 +33,7 @@ class Settings(TypedDict):
     algorithm: str
     preset: str
     representation: str
-    encoder: str  # its SHA-256, or that each run has an encoder of its own
+    encoder: str  # its SHA-256, or that runs have different encoders
     encoder_code: NotRequired[str | None]  # module:Class, if it is code
     hidden: list[int] | dict[str, list[int]]  # units of the agent's layers, or of its networks'
     steps: int

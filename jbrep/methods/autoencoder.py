@@ -31,12 +31,15 @@ def feature_weights(data: ScaledDataset, weights: Settings) -> Tensor | None:
     """A weight for each number of a scaled row, (size,); None where all are 1.
 
     Raises:
-        InputError: a weight of an unknown feature, or none above 0.
+        InputError: a weight of an unknown feature or one that isn't encoded, or none above 0.
     """
     if unknown := [name for name in weights if name not in data.names]:
-        raise InputError(
-            f"a weight of {unknown[0]!r}, which is no feature: there are {', '.join(data.names)}"
-        )
+        if unknown[0] in data.task.feature_names:
+            raise InputError(
+                f"{unknown[0]} passes around the encoder unchanged: it can't have a weight"
+            )
+        known = ", ".join(dict.fromkeys(data.names))  # angles come twice
+        raise InputError(f"a weight of {unknown[0]!r}, which is no feature: there are {known}")
     values = torch.tensor([float(weights.get(name, 1)) for name in data.names])
     if not values.any():
         raise InputError("all weights of features are 0: give at least one above 0")

@@ -12,6 +12,7 @@ from torch.utils.tensorboard import SummaryWriter
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import FULL, Encoder, load, save
 from jbrep.encoders.file import HELD_OUT_MSE, SUFFIX
+from jbrep.encoders.names import check_name
 from jbrep.errors import InputError, differences
 from jbrep.files.commit import commits
 from jbrep.files.lock import exclusive
@@ -30,6 +31,7 @@ from jbrep.training.trainer import (
     Trainer,
     default_batch_size,
     get_device,
+    single_torch_thread,
 )
 from jbrep.training.windows import Windows, count_windows, watched_windows
 
@@ -134,22 +136,16 @@ class Fitter:
         """
         method = get_method(kind)
         used = method.settings(settings)
-        name = name or name_of(method, used)
         data = self._scaled_data(method, used)
+        used = method.resolve(data, used)
+        name = name or name_of(method, used)
+        check_name(name)
         method.check(data, used)
-        if "batch_size" in used:
-            used["batch_size"] = used["batch_size"] or default_batch_size(
-                count_windows(data, method.objective(data, used).horizon)
-                if isinstance(method, Learned)
-                else 0
-            )
-        plan = Plan(
-            method,
-            used,
-            data,
-            _header(method, name, used, data),
-            self._folder / f"{name}{SUFFIX}",
-        )
+        if isinstance(method, Learned) and not used["batch_size"]:
+            horizon = method.objective(data, used).horizon
+            used["batch_size"] = default_batch_size(count_windows(data, horizon))
+        path = self._folder / f"{name}{SUFFIX}"
+        plan = Plan(method, used, data, _header(method, name, used, data), path)
         plan.is_complete  # noqa: B018  may find another encoder there
         return plan
 
@@ -189,9 +185,9 @@ class Fitter:
         try:
             with SummaryWriter(str(work), purge_step=len(trainer.history) + 1) as scalars:
                 for _ in _with_progress(trainer, header["name"]):
-                    checkpoint.save(trainer, identity, saved)
                     for name, value in trainer.history[-1]._asdict().items():
                         scalars.add_scalar(name, value, len(trainer.history))
+                    checkpoint.save(trainer, identity, saved)
         finally:
             if trainer.history:
                 self._save_best(plan, trainer, watched)
@@ -216,7 +212,7 @@ class Fitter:
             "test_loss": trainer.history[best - 1].test_loss,
         }
         objective.eval()
-        with torch.no_grad():
+        with torch.no_grad(), single_torch_thread():
             metrics |= objective.report(watched)
             self._save(plan, Made(*objective.layers(), metrics))
 

@@ -1,23 +1,34 @@
 """The forward code: what a network needs, beside the actions, to predict what comes next."""
 
 import math
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from jbrep.dae.network import check_size, get_architecture, layers, stack
 from jbrep.dataset import ScaledDataset
 from jbrep.errors import InputError
 from jbrep.methods.linear_forward import turns
 from jbrep.methods.method import Learned, Settings
+from jbrep.methods.predictors import HIDDEN, Predictors
 from jbrep.methods.settings import REQUIRED
 from jbrep.training.objective import Layers, Objective
 from jbrep.training.windows import Windows
 
-_HIDDEN = 128  # units of each of the two hidden layers of a predictor
+_PARTS = ("changes", "values", "reward")  # of what is predicted
 _FITTED = 200_000  # windows to which targets are standardised
 _SMALL = 1e-6  # standard deviation of a target that says nothing
+
+
+class _Batch(NamedTuple):
+    """Windows, features first."""
+
+    now: Tensor  # first rows, (size, n)
+    after: Tensor  # the rows of the next step, (size, n)
+    actions: Tensor  # all of a window, step by step, (horizon * k, n)
+    targets: Tensor  # standardised, (horizons, 2 * size + 1, n)
 
 
 class Forward(Objective):
@@ -34,6 +45,7 @@ class Forward(Objective):
     """
 
     _turn: Tensor
+    _turns_per: Tensor
     _weight: Tensor
     _mean: Tensor
     _deviation: Tensor
@@ -43,70 +55,72 @@ class Forward(Objective):
         self._horizons: tuple[int, ...] = settings["horizons"]
         self.horizon = max(self._horizons)
         architecture = get_architecture(settings["architecture"])
-        size, latent, actions = data.size, settings["latent"], data.task.action_size
-        parts = {"changes": size, "values": size, "reward": 1}
-        self._parts = list(parts.values())
+        size, latent = data.size, settings["latent"]
+        self._action_size, self._sizes = data.task.action_size, (size, size, 1)
+        reads = tuple(latent + k * self._action_size for k in self._horizons)
+        self._inverse_weight = settings["inverse"]
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(settings["seed"])
             self.encoder = stack((size, *architecture.hidden, latent), architecture.code)
-            self.predictors = nn.ModuleList(
-                stack((latent + k * actions, _HIDDEN, _HIDDEN, sum(parts.values())), "linear")
-                for k in self._horizons
-            )
-            self._inverse_weight = settings["inverse"]
-            self.inverse = stack((2 * latent, _HIDDEN, actions), "linear")
-        weight = torch.cat([torch.full((n,), settings[name] / n) for name, n in parts.items()])
-        scales = torch.zeros(len(self._horizons), len(weight)), torch.ones(len(self._horizons), 1)
-        self.register_buffer("_turn", torch.from_numpy(turns(data)).float(), persistent=False)
-        self.register_buffer("_weight", weight, persistent=False)
-        self.register_buffer("_mean", scales[0], persistent=False)
-        self.register_buffer("_deviation", scales[1], persistent=False)
+            self.predictors = Predictors(reads, sum(self._sizes))
+            if self._inverse_weight:
+                self.inverse = stack((2 * latent, HIDDEN, self._action_size), "linear")
+        each = [settings[name] / n for name, n in zip(_PARTS, self._sizes, strict=True)]
+        turn = torch.from_numpy(turns(data)).float()[:, None]  # infinite for what is no angle
+        for name, buffer in (
+            ("_turn", turn.nan_to_num(posinf=0)),
+            ("_turns_per", 1 / turn),
+            ("_weight", torch.tensor(each).repeat_interleave(torch.tensor(self._sizes))),
+            ("_mean", torch.zeros(())),
+            ("_deviation", torch.ones(())),
+        ):
+            self.register_buffer(name, buffer, persistent=False)
 
     def prepare(self, windows: Windows) -> None:
         """Fit the standardisation of the targets."""
         step = -(-len(windows) // _FITTED)
-        numbers = windows.numbers[::step]
-        now = windows.rows(numbers)
-        targets = [self._targets(windows, numbers, now, k) for k in self._horizons]
-        self._mean = torch.stack([each.mean(0) for each in targets])
-        deviation = torch.stack([each.std(0) for each in targets])
+        deviation, self._mean = torch.std_mean(
+            self.batch(windows, windows.numbers[::step]).targets, 2, keepdim=True
+        )
         self._deviation = torch.where(deviation > _SMALL, deviation, math.inf)
 
     def _targets(self, windows: Windows, numbers: Tensor, now: Tensor, ahead: int) -> Tensor:
-        """Changes, values and mean reward at a horizon, (n, 2 * size + 1)."""
-        then = windows.rows(numbers, ahead)
+        """Changes, values and mean reward at a horizon, (2 * size + 1, n)."""
+        then = windows.rows(numbers, ahead).T
         change = then - now
-        half = self._turn / 2  # infinite for what is no angle
-        wrapped = torch.remainder(change + half, self._turn) - half
-        change = torch.where(torch.isfinite(half), wrapped, change)
-        return torch.cat((change, then, windows.rewards(numbers, ahead)[:, None]), 1)
+        change -= torch.round(change * self._turns_per) * self._turn  # angles: the shorter way
+        return torch.cat((change, then, windows.rewards(numbers, ahead)[None]))
 
-    def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
-        """Rows, the next ones, all actions, and the standardised targets of each horizon."""
-        now = windows.rows(numbers)
-        targets = [self._targets(windows, numbers, now, k) for k in self._horizons]
-        standard = (torch.stack(targets, 1) - self._mean) / self._deviation
-        actions = windows.actions(numbers, self.horizon).flatten(1)
-        return now, windows.rows(numbers, 1), actions, standard
+    def batch(self, windows: Windows, numbers: Tensor) -> _Batch:
+        """As for `Objective`, but with the windows last."""
+        now = windows.rows(numbers).T.contiguous()
+        targets = torch.stack([self._targets(windows, numbers, now, k) for k in self._horizons])
+        return _Batch(
+            now,
+            windows.rows(numbers, 1).T.contiguous(),
+            windows.actions(numbers, self.horizon).flatten(1).T.contiguous(),
+            targets.sub_(self._mean).div_(self._deviation),
+        )
 
-    def _errors(self, batch: tuple[Tensor, ...]) -> Tensor:
-        """Squared errors, meant over rows, (horizons, targets)."""
-        now, _, actions, targets = batch
-        code = self.encoder(now)
-        width = actions.shape[1] // self.horizon
-        errors = []
-        for i, (ahead, predictor) in enumerate(zip(self._horizons, self.predictors, strict=True)):
-            predicted = predictor(torch.cat((code, actions[:, : ahead * width]), 1))
-            errors.append((predicted - targets[:, i]).square().mean(0))
-        return torch.stack(errors)
-
-    def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
+    def draws(
+        self, windows: Windows, numbers: Tensor, size: int, generator: torch.Generator
+    ) -> Iterator[_Batch]:
         """As for `Objective`."""
-        loss = (self._errors(batch) @ self._weight).mean()
+        parts = (part.split(size, -1) for part in self.batch(windows, numbers))
+        yield from map(_Batch, *parts)
+
+    def _errors(self, batch: _Batch, code: Tensor) -> Tensor:
+        """Squared errors from codes (n, l), meant over rows, (horizons, targets)."""
+        predicted = self.predictors(torch.cat((code.T, batch.actions)))
+        return (predicted - batch.targets).square().mean(2)
+
+    def loss(self, batch: _Batch) -> Tensor:
+        """As for `Objective`."""
+        code = self.encoder(batch.now.T)
+        loss = (self._errors(batch, code) @ self._weight).mean()
         if self._inverse_weight:
-            now, after, actions, _ = batch
-            both = torch.cat((self.encoder(now), self.encoder(after)), 1)
-            error = self.inverse(both) - actions[:, : actions.shape[1] // self.horizon]
+            said = self.inverse(torch.cat((code, self.encoder(batch.after.T)), 1))
+            error = said.T - batch.actions[: self._action_size]
             loss = loss + self._inverse_weight * error.square().mean()
         return loss
 
@@ -116,12 +130,12 @@ class Forward(Objective):
 
     def report(self, windows: Windows) -> dict[str, Any]:
         """The loss by horizon: of changes, values and reward, unweighted; 1 for no prediction."""
-        errors = self._errors(self.batch(windows, windows.numbers))
-        by_part = [part.mean(1).tolist() for part in errors.split(self._parts, 1)]
-        names = ("changes", "values", "reward")
+        batch = self.batch(windows, windows.numbers)
+        errors = self._errors(batch, self.encoder(batch.now.T))
+        by_part = [part.mean(1).tolist() for part in errors.split(self._sizes, 1)]
         return {
             "loss_by_horizon": {
-                str(k): dict(zip(names, losses, strict=True))
+                str(k): dict(zip(_PARTS, losses, strict=True))
                 for k, losses in zip(self._horizons, zip(*by_part, strict=True), strict=True)
             }
         }
@@ -129,7 +143,7 @@ class Forward(Objective):
 
 def _check(data: ScaledDataset, settings: Settings) -> None:
     check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
-    if not any(settings[name] for name in ("changes", "values", "reward")):
+    if not any(settings[name] for name in (*_PARTS, "inverse")):
         raise InputError("forward has nothing to predict: all its weights are 0")
 
 

@@ -1,5 +1,7 @@
 """Linear codes: their layers, and the linear maps of least error between two sets of numbers."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,12 +9,14 @@ from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders.encoder import Layer
 from jbrep.errors import InputError
-from jbrep.methods.method import Layers, Settings
+from jbrep.methods.method import Layers, Made, Settings
 
 Array = NDArray[np.float64]
 
 DEVIATION = 1 / 3  # of a unit of a scaled code, so that most of its values lie in [-1, 1]
 _NEGLIGIBLE = 1e-9  # variance, as a share of the largest
+_TINY = 1e-300  # variance of what is constant, to divide by
+_NAMED = 0.1  # part in a linear dependence from which a feature is named, beside the largest
 
 
 def principal_code(data: ScaledDataset, latent: int) -> tuple[Layers, Layers]:
@@ -76,13 +80,53 @@ def inverse_root(covariance: Array, what: str) -> Array:
     return (vectors / np.sqrt(variances)) @ vectors.T
 
 
-def check_varying(data: ScaledDataset, settings: Settings) -> None:
-    """Make sure that no feature is constant, where a method needs all to vary.
+def direction_code(directions: Array, moments: Moments, spectrum: Array, **metrics: Any) -> Made:
+    """The linear code of some directions (l, d), each unit with standard deviation 1/3.
+
+    Args:
+        directions: of the code, of any length.
+        moments: of the rows.
+        spectrum: what the method says of all directions, the largest first.
+        metrics: more of what it says.
+    """
+    mean, covariance = moments
+    variances = np.einsum("li,ij,lj->l", directions, covariance, directions)
+    weight = DEVIATION * signed(directions / np.sqrt(variances)[:, None])
+    return Made((dense(weight, -weight @ mean),), None, {"spectrum": spectrum.tolist(), **metrics})
+
+
+def whitening(covariance: Array, data: ScaledDataset) -> Array:
+    """W with W C W' = I, for a covariance C of the features (size, size).
 
     Raises:
-        InputError: one is.
+        InputError: the covariance is singular; the message names the features.
+    """
+    deviation = np.sqrt(np.maximum(np.diag(covariance), _TINY))
+    variances, vectors = np.linalg.eigh(covariance / np.outer(deviation, deviation))
+    if not variances[0] > _NEGLIGIBLE * variances[-1]:
+        share = np.abs(vectors[:, 0])
+        named = [data.names[i] for i in np.flatnonzero(share > _NAMED * share.max())]
+        raise InputError(
+            f"{', '.join(dict.fromkeys(named))} depend on each other linearly in "
+            f"{data.dataset.folder}: let one of them pass around the encoder, with --keep"
+        )
+    whiten: Array = (vectors / np.sqrt(variances)).T / deviation
+    return whiten
+
+
+def check_directions(data: ScaledDataset, settings: Settings) -> None:
+    """Make sure that all features vary, and that there are as many directions as units.
+
+    Raises:
+        InputError: they don't, or there aren't.
     """
     if constant := [name for name in data.constant_features if name in data.names]:
         raise InputError(
-            f"{constant[0]} is constant in {data.dataset.folder}: it can't be part of such a code"
+            f"{constant[0]} is constant in {data.dataset.folder}: let it pass around the encoder, "
+            f"with --keep {constant[0]}"
+        )
+    if settings["latent"] > data.size:
+        raise InputError(
+            f"latent size is {settings['latent']}: with {data.size} features it must be from 1 to "
+            f"{data.size}"
         )

@@ -5,14 +5,17 @@ import math
 import numpy as np
 
 from jbrep.dataset import ScaledDataset
+from jbrep.dataset.scaled import Moments
 from jbrep.dataset.scaling import wrapped
 from jbrep.errors import InputError
-from jbrep.methods.linear import DEVIATION, check_varying, dense, inverse_root, signed
+from jbrep.methods.linear import check_directions, direction_code, whitening
 from jbrep.methods.method import ClosedForm, Made, Settings
-from jbrep.methods.passes import Array, Block, blocks
+from jbrep.methods.passes import Array, blocks
 from jbrep.methods.settings import REQUIRED
 
 _NEGLIGIBLE = 1e-12  # variance of a target that says nothing
+_PARTS = ("changes", "values", "reward")
+_NO_RANK = 1e-9  # singular value, as a share of the largest
 
 
 def make(data: ScaledDataset, settings: Settings) -> Made:
@@ -22,46 +25,69 @@ def make(data: ScaledDataset, settings: Settings) -> Made:
     reward until then, each brought to a variance of its squared weight. They are regressed on the
     centred row x and the next actions together; B is the block of coefficients of the row, C its
     covariance. The code is U' C^(-1/2) (x - mean), of the first left singular vectors U of
-    C^(1/2) B; its units have standard deviation 1/3.
+    C^(1/2) B; its units have standard deviation 1/3. The spectrum is that of the singular values.
+
+    It takes one pass over the windows; over a sample of them where rows are wide, see `blocks`.
     """
-    horizons = settings["horizons"]
-    size, actions = data.size, max(horizons) * data.task.action_size
-    wide = _Targets(data, settings)
-    mean, covariance = _moments(data, wide, max(horizons))
-    regressors = slice(0, size + actions)
-    targets = slice(size + actions, None)
-    deviation = np.sqrt(np.diag(covariance)[targets])
-    scale = np.where(deviation > _NEGLIGIBLE, wide.weights / np.maximum(deviation, _NEGLIGIBLE), 0)
-    explained = covariance[regressors, targets] * scale
-    coefficients = np.linalg.lstsq(covariance[regressors, regressors], explained, rcond=None)[0]
-    here = covariance[:size, :size]
-    root = inverse_root(here, f"the features of {data.dataset.folder}")
-    left, singular, _ = np.linalg.svd(here @ root @ coefficients[:size])
-    weight = DEVIATION * signed(left[:, : settings["latent"]].T @ root)
-    metrics = {"spectrum": singular.tolist()}
-    return Made((dense(weight, -weight @ mean[:size]),), None, metrics)
+    size = data.size
+    moments, shared, variances = _moments(data, settings)
+    weights = _weights(data, settings)
+    varies = variances > _NEGLIGIBLE
+    scale = np.where(varies, weights / np.sqrt(np.where(varies, variances, 1)), 0)
+    if not scale.any():
+        raise InputError(
+            f"nothing that linear-forward is to predict varies in {data.dataset.folder}: give "
+            "other targets a weight above 0"
+        )
+    coefficients = np.linalg.lstsq(moments.covariance, shared * scale, rcond=None)[0]
+    here = Moments(moments.mean[:size], moments.covariance[:size, :size])
+    whiten = whitening(here.covariance, data)
+    left, singular, _ = np.linalg.svd(
+        whiten @ here.covariance @ coefficients[:size], full_matrices=False
+    )
+    rank = int((singular > _NO_RANK * singular[0]).sum())
+    if settings["latent"] > rank:
+        raise InputError(
+            f"latent size is {settings['latent']}: what linear-forward is to predict has rank "
+            f"{rank} in {data.dataset.folder}, so it must be from 1 to {rank}"
+        )
+    return direction_code(left[:, : settings["latent"]].T @ whiten, here, singular)
 
 
-class _Targets:
-    """Everything that is regressed, and regressed on, of a block of windows."""
+def _weights(data: ScaledDataset, settings: Settings) -> Array:
+    """The weight of each target, (t,)."""
+    sizes = data.size, data.size, 1
+    once = [np.full(n, settings[name]) for n, name in zip(sizes, _PARTS, strict=True)]
+    return np.tile(np.concatenate(once), len(settings["horizons"]))
 
-    def __init__(self, data: ScaledDataset, settings: Settings):
-        self.horizons = settings["horizons"]
-        self._longest = max(self.horizons)
-        parts = ("changes", data.size), ("values", data.size), ("reward", 1)
-        once = np.concatenate([np.full(n, settings[name]) for name, n in parts])
-        self.weights: Array = np.tile(once, len(self.horizons))
-        self.width = data.size + self._longest * data.task.action_size + len(self.weights)
-        self._turn = turns(data)
 
-    def __call__(self, block: Block) -> Array:
-        """Rows, actions and targets side by side, (m, width)."""
+def _moments(data: ScaledDataset, settings: Settings) -> tuple[Moments, Array, Array]:
+    """Moments of rows with actions (p,), their covariances with targets, (p, t), and variances.
+
+    The variances are those of the targets, (t,).
+    """
+    horizons, size = settings["horizons"], data.size
+    longest, turn = max(horizons), turns(data)
+    actions = longest * data.task.action_size
+    regressors, targets = size + actions, len(horizons) * (2 * size + 1)
+    count, width = 0, regressors + targets
+    total, squares = np.zeros(width), np.zeros(targets)
+    products = np.zeros((regressors, width))
+    for block in blocks(data, longest, width, regressors * width):
         now = block.later(0)
-        columns = [now, block.next_actions(self._longest)]
-        for ahead in self.horizons:
+        columns = [now, block.next_actions(longest)]
+        for ahead in horizons:
             then = block.later(ahead)
-            columns += [change(now, then, self._turn), then, block.mean_reward(ahead)]
-        return np.hstack(columns)
+            columns += [change(now, then, turn), then, block.mean_reward(ahead)]
+        values = np.hstack(columns)
+        count += len(block)
+        total += values.sum(axis=0)
+        products += values[:, :regressors].T @ values
+        squares += np.einsum("mt,mt->t", values[:, regressors:], values[:, regressors:])
+    mean = total / count
+    covariance = products / count - np.outer(mean[:regressors], mean)
+    moments = Moments(mean[:regressors], covariance[:, :regressors])
+    return moments, covariance[:, regressors:], squares / count - mean[regressors:] ** 2
 
 
 def turns(data: ScaledDataset) -> Array:
@@ -85,21 +111,9 @@ def change(now: Array, then: Array, turn: Array) -> Array:
     return difference
 
 
-def _moments(data: ScaledDataset, wide: _Targets, horizon: int) -> tuple[Array, Array]:
-    """Mean and covariance of all columns, over all windows of the training part."""
-    count, total, products = 0, np.zeros(wide.width), np.zeros((wide.width, wide.width))
-    for block in blocks(data, horizon, wide.width):
-        values = wide(block)
-        count += len(values)
-        total += values.sum(axis=0)
-        products += values.T @ values
-    mean = total / count
-    return mean, products / count - np.outer(mean, mean)
-
-
 def _check(data: ScaledDataset, settings: Settings) -> None:
-    check_varying(data, settings)
-    if not any(settings[name] for name in ("changes", "values", "reward")):
+    check_directions(data, settings)
+    if not any(settings[name] for name in _PARTS):
         raise InputError("linear-forward has nothing to predict: all its weights are 0")
 
 

@@ -21,6 +21,7 @@ class Made(NamedTuple):
     encoder: Layers
     decoder: Layers | None = None  # None for the linear one of least squared error
     metrics: Settings = MappingProxyType({})  # plain JSON, for the file's header
+    keep: tuple[str, ...] = ()  # features that pass around the layers, beside those it is told of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +52,7 @@ class Method:
         return {**self.own, **SCALED, **(CODED if "latent" in self.own else {})}
 
     def settings(self, given: Settings) -> dict[str, Any]:
-        """All its settings, with some given as text or as values.
+        """All its settings, with some given as text or as values; None is for the default.
 
         Raises:
             InputError: it doesn't take one, one can't have that value, or one is missing.
@@ -59,15 +60,23 @@ class Method:
         defaults = self.defaults
         if unknown := [name for name in given if name not in defaults]:
             raise InputError(f"{self.name} takes no {unknown[0]}: leave it out")
-        read = {name: read_setting(name, value) for name, value in given.items()}
+        read = {n: read_setting(n, value) for n, value in given.items() if value is not None}
         settings = {**self.fill(read), **read}
         if missing := [name for name, value in settings.items() if value is REQUIRED]:
-            raise InputError(f"{self.name} needs {missing[0].replace('_', ' ')}")
+            raise InputError(f"{self.name} needs {missing[0]}: there is no default")
         return settings
 
     def fill(self, given: Settings) -> dict[str, Any]:
         """The defaults of all settings, which may depend on those that are given."""
         return self.defaults
+
+    def resolve(self, data: ScaledDataset, settings: Settings) -> dict[str, Any]:
+        """The settings as the data need them, such as names of features in place of a pattern.
+
+        Raises:
+            InputError: they mean nothing there.
+        """
+        return dict(settings)
 
 
 @dataclass(frozen=True, kw_only=True)

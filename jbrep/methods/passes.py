@@ -1,7 +1,7 @@
 """One pass over all windows of the training part, in blocks of consecutive rows."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,65 +12,84 @@ from jbrep.training.windows import first_rows
 
 Array = NDArray[np.float64]
 
-_BLOCK = 1 << 16  # windows in a block
-_NUMBERS = 1 << 23  # at most in its wide arrays
+_BLOCK = 1 << 15  # windows in a block
+_NUMBERS = 1 << 22  # at most in its wide arrays: 32 MiB
+_MOST_WORK = 10**12  # multiplications in a pass: a minute or two of one core
+_WIDEST = 1 << 28  # products of a window, which are summed: 2 GiB
 
 
-class Block(NamedTuple):
-    """Consecutive training rows, and which of them begin a window.
+class Block:
+    """Windows that follow each other, with the rows that they share.
 
-    Attributes:
-        rows: scaled, (n, size).
-        actions: scaled to [-1, 1], (n, k).
-        rewards: (n,).
-        starts: places of the windows' first rows, (m,); a window lies within the block.
+    Args:
+        data: scaled.
+        starts: places, among the training rows, of the windows' first rows, (m,).
+        horizon: rows of a window after its first.
     """
 
-    rows: Array
-    actions: Array
-    rewards: Array
-    starts: NDArray[np.int64]
+    def __init__(self, data: ScaledDataset, starts: NDArray[np.int64], horizon: int):
+        self._data = data
+        self._places = data.train[starts[0] : starts[-1] + horizon + 1]
+        self._starts = starts - starts[0]
+
+    def __len__(self) -> int:
+        return len(self._starts)
+
+    @cached_property
+    def _rows(self) -> Array:
+        return self._data.load(self._places).astype(np.float64)
+
+    @cached_property
+    def _actions(self) -> Array:
+        """Scaled to [-1, 1], (n, k)."""
+        task = self._data.task
+        low, high = (np.asarray(bound, float) for bound in (task.action_low, task.action_high))
+        actions = self._data.dataset["action"][self._places].reshape(len(self._places), -1)
+        return (actions - (high + low) / 2) / ((high - low) / 2)
+
+    @cached_property
+    def _earned(self) -> Array:
+        """Sums of the rewards before each row, (n + 1,)."""
+        rewards = self._data.dataset["reward"][self._places]
+        return np.concatenate(([0], np.cumsum(rewards, dtype=float)))
 
     def later(self, ahead: int) -> Array:
-        """The rows that many steps after each window's first, (m, size)."""
-        return self.rows[self.starts + ahead]
+        """The scaled rows that many steps after each window's first, (m, size)."""
+        return self._rows[self._starts + ahead]
 
     def next_actions(self, count: int) -> Array:
-        """The first actions of each window, (m, count * k)."""
-        return self.actions[self.starts[:, None] + np.arange(count)].reshape(len(self.starts), -1)
+        """The first actions of each window, scaled to [-1, 1], (m, count * k)."""
+        return self._actions[self._starts[:, None] + np.arange(count)].reshape(len(self), -1)
 
     def mean_reward(self, count: int) -> Array:
         """The mean of the first rewards of each window, (m, 1)."""
-        earned = np.concatenate(([0], np.cumsum(self.rewards)))
-        return (earned[self.starts + count] - earned[self.starts])[:, None] / count
+        return (self._earned[self._starts + count] - self._earned[self._starts])[:, None] / count
 
 
-def blocks(data: ScaledDataset, horizon: int, width: int) -> Iterator[Block]:
-    """All windows of the training part, in order.
+def blocks(data: ScaledDataset, horizon: int, width: int, work: int) -> Iterator[Block]:
+    """All windows of the training part, in order; of very wide ones, evenly spaced blocks.
+
+    Memory doesn't grow with the number of rows, but for the places of the windows.
 
     Args:
         data: scaled.
         horizon: rows of a window after its first.
         width: numbers that the caller makes of each window, by which blocks are sized.
+        work: products that the caller makes of each window and sums. Where those of all windows
+            would be more than 10^12, as of 5 million rows of some hundreds of features, only so
+            many blocks are given.
 
     Raises:
-        InputError: no episode is longer than the horizon.
+        InputError: no episode is longer than the horizon, or it is too long for so many features
+            and actions.
     """
-    starts = first_rows(data, data.train, horizon)
-    if not len(starts):
+    if work > _WIDEST:
         raise InputError(
-            f"no episode of {data.dataset.folder} is longer than {horizon} steps: look fewer steps "
-            "ahead"
+            f"{horizon} steps of {data.size} features and {data.task.action_size} actions are too "
+            "many numbers: look fewer steps ahead"
         )
-    task, action, reward = data.task, data.dataset["action"], data.dataset["reward"]
-    low, high = (np.asarray(bound, float) for bound in (task.action_low, task.action_high))
+    starts = first_rows(data, data.train, horizon)
     size = max(1, min(_BLOCK, _NUMBERS // width))
-    for first in range(0, len(starts), size):
-        chosen = starts[first : first + size]
-        places = data.train[chosen[0] : chosen[-1] + horizon + 1]
-        yield Block(
-            data.load(places).astype(np.float64),
-            (action[places].reshape(len(places), -1) - (high + low) / 2) / ((high - low) / 2),
-            reward[places].astype(np.float64),
-            chosen - chosen[0],
-        )
+    every = -(-len(starts) * work // _MOST_WORK)
+    for first in range(0, len(starts), size * every):
+        yield Block(data, starts[first : first + size], horizon)

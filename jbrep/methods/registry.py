@@ -8,13 +8,21 @@ from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose
 from jbrep.methods import (
     autoencoder,
+    ddae,
+    deepmdp,
     forward,
     identity,
     linear_forward,
+    lld_vae,
+    noise,
     pca,
     random,
+    self_prediction,
     slow,
+    subset,
     untrained,
+    vae,
+    vamp,
 )
 from jbrep.methods.method import Method, Settings
 from jbrep.methods.settings import STANDARD, WHITE
@@ -25,12 +33,20 @@ METHODS: dict[str, Method] = {
         identity.METHOD,
         pca.METHOD,
         random.METHOD,
+        subset.METHOD,
+        noise.METHOD,
         untrained.METHOD,
         autoencoder.AE,
         autoencoder.DAE,
+        ddae.METHOD,
+        vae.METHOD,
+        lld_vae.METHOD,
         slow.METHOD,
+        vamp.METHOD,
         linear_forward.METHOD,
         forward.METHOD,
+        self_prediction.METHOD,
+        deepmdp.METHOD,
     )
 }
 _Meanings = dict[str, dict[str, Any]]
@@ -73,7 +89,8 @@ def name_of(method: Method, settings: Settings) -> str:
             words.append(name)
     if len(words) > 1 and method.name == IDENTITY:
         words[0] = FULL
-    return str(EncoderName("-".join(words), settings.get("latent")))
+    size = len(settings["features"]) if "features" in settings else settings.get("latent")
+    return str(EncoderName("-".join(words), size))
 
 
 def read_name(name: str) -> Recipe:

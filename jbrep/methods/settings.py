@@ -7,6 +7,7 @@ from typing import Any
 
 from jbrep.dae.network import get_architecture
 from jbrep.dataset.scaling import EXTREMA, SCALINGS
+from jbrep.encoders.encoder import MAX_UNITS
 from jbrep.errors import InputError
 
 REQUIRED = object()  # stands for the default of a setting that has to be given
@@ -32,6 +33,11 @@ class Setting:
     words: str
     read: Callable[[Any], Any]
     is_flag: bool = False
+
+    @property
+    def is_list(self) -> bool:
+        """Whether it takes several values: in a list, as text with commas, or one after another."""
+        return self.read in (_steps, _words, _weights)
 
 
 def _whole(least: int, most: int = _MAX_NUMBER) -> Callable[[Any], int]:
@@ -133,13 +139,16 @@ def _architecture(value: Any) -> str:
 
 
 SETTINGS = {
-    "latent": Setting("Latent units l.", _whole(1)),
+    "latent": Setting("Latent units l.", _whole(1, MAX_UNITS)),
     "architecture": Setting(
         "Layers of the network: paper, deep, linear, or sizes of your own, such as 64,64.",
         _architecture,
     ),
     "epochs": Setting("Passes over the data.", _whole(1)),
-    "batch_size": Setting("Rows in a batch; by default from the rows, 128 to 8192.", _whole(1)),
+    "batch_size": Setting(
+        "Rows in a batch; by default 128 to 8192, from the rows, unless the method has its own.",
+        _whole(1),
+    ),
     "learning_rate": Setting("Of Adam.", _number(0, _MAX_LEARNING_RATE, above=True)),
     "seed": Setting("Of everything random.", _whole(0)),
     "noise": Setting("Standard deviation of the corruption.", _number(0)),
@@ -159,10 +168,9 @@ SETTINGS = {
     "ahead": Setting("Steps ahead of the row that is reconstructed.", _whole(0, MAX_HORIZON)),
     "beta": Setting("Weight of the divergence from the prior.", _number(0, _MAX_WEIGHT)),
     "transition": Setting("Weight of the error of the next code.", _number(0, _MAX_WEIGHT)),
+    "weight_decay": Setting("Weight of half the squared weights.", _number(0, _MAX_WEIGHT)),
     "features": Setting("Names of features, or patterns such as velocity_*.", _words),
-    "scaling": Setting(
-        f"What becomes -1 and 1: {', '.join(SCALINGS)}; extrema by default.", _choice(SCALINGS)
-    ),
+    "scaling": Setting(f"What becomes -1 and 1: {', '.join(SCALINGS)}.", _choice(SCALINGS)),
     "angles": Setting("Take angles as sine and cosine.", _flag, is_flag=True),
     "clip": Setting("Limit of scaled values, at least 1; none by default.", _number(1, 1e6)),
     "keep": Setting("Features that pass around the encoder.", _words),

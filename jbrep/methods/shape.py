@@ -33,7 +33,7 @@ def complete(made: Made, data: ScaledDataset, settings: Settings) -> Complete:
     encoder, decoder = made.encoder, made.decoder
     if not encoder:
         return Complete((encoder, ()), ())
-    codes, keep = settings.get("codes", RAW), tuple(settings.get("keep", ()))
+    codes, keep = settings.get("codes", RAW), made.keep or tuple(settings.get("keep", ()))
     if codes != RAW or decoder is None:
         moments, shared = _code_moments(encoder, data)
         if decoder is None:

@@ -3,62 +3,40 @@
 import numpy as np
 
 from jbrep.dataset import ScaledDataset
-from jbrep.methods.linear import DEVIATION, check_varying, dense, inverse_root, signed
+from jbrep.dataset.scaled import Moments
+from jbrep.methods.lagged import Lagged
+from jbrep.methods.linear import check_directions, direction_code, whitening
 from jbrep.methods.method import ClosedForm, Made, Settings
-from jbrep.methods.passes import Array, blocks
+from jbrep.methods.passes import Array
 from jbrep.methods.settings import REQUIRED
-
-LAGS = (1, 2, 5, 10, 20, 50, 100)  # of the spectra that the file keeps
 
 
 def make(data: ScaledDataset, settings: Settings) -> Made:
     """The generalised eigenvectors of the lagged covariance with the largest eigenvalues.
 
-    With the covariance C of the rows and T, the mean of their symmetrised covariances with the
-    rows `lags` steps later in the same episode: T w = a C w. Units are uncorrelated, with standard
-    deviation 1/3.
+    Over all pairs of a row and the one `lags` steps later in its episode, and the same pairs in
+    reverse, C is the covariance of the rows and T that of the first with the second of a pair:
+    T w = a C w. Of several lags, C and T are those of all their pairs together. Units are
+    uncorrelated, with standard deviation 1/3.
     """
-    lags = settings["lags"]
-    moments = _Lagged(data, lags)
-    root = inverse_root(moments.covariance, f"the features of {data.dataset.folder}")
-    eigenvalues, vectors = np.linalg.eigh(root @ moments.symmetric(lags) @ root)
-    weight = DEVIATION * signed(vectors[:, ::-1].T @ root)[: settings["latent"]]
-    spectra = {
-        str(lag): np.linalg.eigvalsh(root @ moments.symmetric((lag,)) @ root)[::-1].tolist()
-        for lag in moments.lags
-    }
-    metrics = {"spectrum": eigenvalues[::-1].tolist(), "spectra": spectra}
-    return Made((dense(weight, -weight @ moments.mean),), None, metrics)
+    lagged = Lagged(data, settings["lags"], data.size, lambda block: block.later(0))
+    eigenvalues, directions, moments = _slowest(lagged, settings["lags"], data)
+    spectra = {str(lag): _slowest(lagged, (lag,), data)[0].tolist() for lag in lagged.lags}
+    return direction_code(directions[: settings["latent"]], moments, eigenvalues, spectra=spectra)
 
 
-class _Lagged:
-    """Mean and covariances of the rows of all pairs, at each lag."""
-
-    def __init__(self, data: ScaledDataset, lags: tuple[int, ...]):
-        longest = max(lags)
-        self.lags = tuple(sorted({*lags, *(lag for lag in LAGS if lag <= longest)}))
-        size = data.size
-        count, totals = 0, np.zeros((2, len(self.lags), size))
-        now, across, later = np.zeros((3, len(self.lags), size, size))
-        for block in blocks(data, longest, 4 * size):
-            first = block.later(0)
-            count += len(first)
-            for i, lag in enumerate(self.lags):
-                after = block.later(lag)
-                totals[:, i] += first.sum(axis=0), after.sum(axis=0)
-                now[i] += first.T @ first
-                across[i] += first.T @ after
-                later[i] += after.T @ after
-        used = [self.lags.index(lag) for lag in lags]
-        self.mean: Array = totals[:, used].mean(axis=(0, 1)) / count
-        outer = np.outer(self.mean, self.mean)
-        self.covariance: Array = (now + later)[used].mean(axis=0) / (2 * count) - outer
-        self._symmetric = (across + across.transpose(0, 2, 1)) / (2 * count) - outer
-
-    def symmetric(self, lags: tuple[int, ...]) -> Array:
-        """The mean of the symmetrised covariances at some lags, (size, size)."""
-        chosen: Array = self._symmetric[[self.lags.index(lag) for lag in lags]]
-        return chosen.mean(axis=0)
+def _slowest(
+    lagged: Lagged, lags: tuple[int, ...], data: ScaledDataset
+) -> tuple[Array, Array, Moments]:
+    """Eigenvalues, the largest first, and directions (size, size), with the moments of the rows."""
+    places = lagged.places(lags)
+    mean = (lagged.now_mean + lagged.later_mean[places].mean(axis=0)) / 2
+    outer = np.outer(mean, mean)
+    covariance = (lagged.now + lagged.later[places].mean(axis=0)) / 2 - outer
+    across = lagged.across[places].mean(axis=0)
+    whiten = whitening(covariance, data)
+    eigenvalues, vectors = np.linalg.eigh(whiten @ ((across + across.T) / 2 - outer) @ whiten.T)
+    return eigenvalues[::-1], vectors[:, ::-1].T @ whiten, Moments(mean, covariance)
 
 
 METHOD = ClosedForm(
@@ -66,7 +44,7 @@ METHOD = ClosedForm(
     words="slow features: the l linear directions that change least over a lag (TICA)",
     source="Wiskott and Sejnowski 2002; Molgedey and Schuster 1994; Perez-Hernandez et al. 2013",
     own={"latent": REQUIRED, "lags": (10,)},
-    check=check_varying,
+    check=check_directions,
     reduces=False,
     make=make,
 )

@@ -230,7 +230,7 @@ def _toml(study: Mapping[str, Any]) -> str:
             given = {key: each for key, each in value.items() if each not in unset}
             cells = [f"{key} = {_inline(each)}" for key, each in given.items()]
             below += ["", f"[{name}]", *cells] if cells else []
-        elif value is not None:
+        elif value not in (None, []):
             lines.append(f"{name} = {_inline(value)}")
     return "\n".join(lines + below)
 

@@ -15,7 +15,7 @@ from jbrep.files.storage import read_regular
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl.learner import Learner
 from jbrep.rl.run import Run
-from jbrep.study.representations import Given, name_of, read_representation
+from jbrep.study.representations import ByName, Given, name_of, read_representation
 from jbrep.text import slug
 
 _MAX_BYTES = 1 << 20
@@ -57,6 +57,7 @@ class Study:
     data: Data | None = None  # None: the shipped encoders
     training: Mapping[str, Any] = field(default_factory=dict)  # of encoders, other than the usual
     learners: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # with own settings
+    evaluations: tuple[str, ...] = ()  # folders from jbrep evaluate; {task} is each task's name
 
     def __post_init__(self) -> None:
         for name in ("tasks", "algorithms", "representations", "seeds"):
@@ -68,7 +69,12 @@ class Study:
         for algorithm in self.algorithms:
             self.learner(algorithm)
         for given in self.representations:
-            read_representation(given, self.training)
+            representation = read_representation(given, self.training)
+            if isinstance(representation, ByName) and not (isinstance(given, str) or self.data):
+                raise InputError(
+                    f"representation {representation.name} is trained by the study, on the states "
+                    "that [data] gives: [data] is missing"
+                )
         for seed in self.seeds:
             Run(task=_ANY_TASK, seed=seed, **self.run_settings)  # checks the numbers
         if self.data and bool(self.data.steps) == bool(self.data.folder):
@@ -126,11 +132,18 @@ class Study:
     @property
     def notices(self) -> list[str]:
         """What to know before the first run."""
-        if self.comparisons:
-            return []
-        return [
-            f"This study compares nothing: representations must have {FULL} and at least one other."
+        lines = [
+            f"The seeds, {len(self.seeds)} in number, share the {each.encoders} encoders of "
+            f"{each.name} unevenly."
+            for given in self.representations
+            if not (each := read_representation(given, self.training)).is_even(self.seeds)
         ]
+        if not self.comparisons:
+            lines.append(
+                f"This study compares nothing: representations must have {FULL} and at least one "
+                "other."
+            )
+        return lines
 
 
 def read_study(path: Path) -> Study:

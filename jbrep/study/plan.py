@@ -19,7 +19,7 @@ from jbrep.study.representations import Representation, read_representation
 from jbrep.text import slug
 
 STUDY = "study.json"
-_GRID = ("tasks", "algorithms", "representations", "seeds", "learners")  # may be added to
+_GRID = ("tasks", "algorithms", "representations", "seeds", "learners", "evaluations")  # may change
 _MAX_BYTES = 1 << 24
 
 

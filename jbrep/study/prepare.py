@@ -16,6 +16,7 @@ from jbrep.errors import InputError
 from jbrep.files.storage import exists
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.fit import Fitter
+from jbrep.methods.registry import get_method
 from jbrep.rl import Run
 from jbrep.study.config import Data
 from jbrep.study.plan import Plan
@@ -36,10 +37,11 @@ def check(plan: Plan) -> None:
         if data and data.folder:
             folder = _existing(data, name)
             check_same(task, Dataset(folder).task, f"the data set {folder}")
+            _check_fits(plan, name, folder)
         for representation in _by_name(plan):
             if data is None:
                 _check_shipped(representation, task)
-            elif representation.training.get("latent", 0) >= task.size:
+            elif _is_too_large(representation, task):
                 raise InputError(
                     f"{representation.name} doesn't reduce the {task.size} features of "
                     f"{name}: choose a smaller latent size"
@@ -49,6 +51,11 @@ def check(plan: Plan) -> None:
 
 def _by_name(plan: Plan) -> list[ByName]:
     return [each for each in plan.representations if isinstance(each, ByName)]
+
+
+def _is_too_large(representation: ByName, task: Task) -> bool:
+    reduces = get_method(representation.kind).reduces
+    return reduces and int(representation.training.get("latent", 0)) >= task.size
 
 
 def _check_own(plan: Plan) -> None:
@@ -96,9 +103,22 @@ def prepare(plan: Plan) -> None:
         return
     for task in plan.study.tasks:
         folder = _existing(data, task) if data.folder else _collect(plan, data, task)
-        fitter = Fitter(ScaledDataset(Dataset(folder)), plan.encoders(task))
+        fitter = _check_fits(plan, task, folder)
         for representation in _by_name(plan):
-            fitter.fit(representation.kind, name=representation.stem, **representation.training)
+            for name, settings in representation.fits.items():
+                fitter.fit(representation.kind, name=name, **settings)
+
+
+def _check_fits(plan: Plan, task: str, folder: Path) -> Fitter:
+    """Check that the encoders of a task can be made from a data set; what makes them."""
+    fitter = Fitter(ScaledDataset(Dataset(folder)), plan.encoders(task))
+    for representation in _by_name(plan):
+        for name, settings in representation.fits.items():
+            try:
+                fitter.plan(representation.kind, name=name, **settings)
+            except InputError as error:
+                raise InputError(f"{name} can't be trained for {task}: {error}") from None
+    return fitter
 
 
 def _collect(plan: Plan, data: Data, task: str) -> Path:

@@ -18,7 +18,7 @@ from jbrep.study.work import read_progress
 RECORD = "runs.json"
 FORMAT = "jbrep runs"
 FORMAT_VERSION = 1
-EACH_ITS_OWN = "each run has an encoder of its own"
+EACH_ITS_OWN = "runs have different encoders"
 _RECORDS = ("training", "data", "metrics")  # of an encoder
 
 
@@ -50,7 +50,7 @@ def record(folder: Path, folders: Sequence[Path], left_out: Sequence[str]) -> di
         "runs": [
             {
                 "label": run_label(run["settings"]),
-                **{name: run["settings"][name] for name in ("seed", "encoder")},
+                **{name: run["settings"][name] for name in ("seed", "encoder", "encoder_seed")},
                 **{name: run.get(name) for name in ("status", "reason", "steps", "seconds")},
             }
             for run in runs.values()

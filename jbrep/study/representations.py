@@ -2,7 +2,8 @@
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,27 +12,32 @@ from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
 from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import SUFFIX
+from jbrep.encoders.names import check_name, of_seed
 from jbrep.errors import InputError
-from jbrep.methods.registry import read_name
+from jbrep.methods.registry import Recipe, get_method, read_name
 from jbrep.methods.settings import read_setting
 from jbrep.text import slug
 
 Given = str | Mapping[str, Any]  # a representation in a study's file: a name or a table
 
+MAX_ENCODERS = 1000  # of one representation
 _NAME = re.compile(r"[\w.-]{1,100}", re.ASCII)
 _TRAINING = ("epochs", "batch_size", "learning_rate", "noise", "seed")  # settings of encoders
-_TASK, _SEED = "{task}", "{seed}"  # in a file's path: the task's name as in folders, a run's seed
+_TASK, _SEED, _ENCODER = "{task}", "{seed}", "{encoder}"  # in a file's path, see ByFile
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Representation(ABC):
     """What an agent observes.
 
     Attributes:
         name: what tables and folders call it.
+        encoders: how many encoders of several training seeds the runs share: that of seed s has
+            number s modulo this; None for one encoder.
     """
 
     name: str
+    encoders: int | None = None
 
     @abstractmethod
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
@@ -48,10 +54,20 @@ class Representation(ABC):
 
     def settings(self, seed: int) -> dict[str, Any]:
         """What else a Run with that seed is told of its encoder."""
-        return {}
+        number = self.number(seed)
+        return {} if number is None else {"representation": self.name, "encoder_seed": number}
+
+    def number(self, seed: int) -> int | None:
+        """Which of several encoders a run with that seed has; None if there is one."""
+        return None if self.encoders is None else seed % self.encoders
+
+    def is_even(self, seeds: Iterable[int]) -> bool:
+        """Whether each of its encoders serves as many of the runs with these seeds."""
+        counts = Counter(map(self.number, seeds))
+        return self.encoders is None or len({counts[i] for i in range(self.encoders)}) == 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ByName(Representation):
     """The whole observation, or an encoder that ships or that the study trains.
 
@@ -65,29 +81,38 @@ class ByName(Representation):
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
         """As for `Representation`."""
-        return self.name if made is None else str(made / f"{self.stem}{SUFFIX}")
+        stem = self._stem(self.number(seed))
+        return self.name if made is None else str(made / f"{stem}{SUFFIX}")
 
     @property
-    def stem(self) -> str:
-        """The name of its encoder."""
-        return IDENTITY if self.name == FULL else self.name
+    def fits(self) -> dict[str, dict[str, Any]]:
+        """The settings of each encoder that the study trains, by the encoder's name."""
+        if self.encoders is None:
+            return {self._stem(None): dict(self.training)}
+        seeds = range(self.encoders)
+        return {self._stem(seed): {**self.training, "seed": seed} for seed in seeds}
+
+    def _stem(self, number: int | None) -> str:
+        name = IDENTITY if self.name == FULL else self.name
+        return name if number is None else of_seed(name, number)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Own(Representation):
     """An encoder of the user's, which tables call by a name of the user's."""
 
     def settings(self, seed: int) -> dict[str, Any]:
         """As for `Representation`."""
-        return {"representation": self.name}
+        return {"representation": self.name, **super().settings(seed)}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ByFile(Own):
     """An encoder in a file.
 
-    A path may contain {task} and {seed}, or be a folder, which then holds TASK/NAME.safetensors or
-    NAME.safetensors. Relative ones begin at the working directory.
+    A path may contain {task}, the task's name as in folders, and either {seed}, a run's seed, or
+    {encoder}, the number of the run's encoder. It may be a folder, which then holds
+    TASK/NAME.safetensors or NAME.safetensors. Relative ones begin at the working directory.
 
     Attributes:
         paths: pairs of a task's name and its path; a name of None is of any task.
@@ -97,8 +122,8 @@ class ByFile(Own):
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
         """As for `Representation`."""
-        pattern = self._pattern(task)
-        filled = pattern.replace(_TASK, slug(task)).replace(_SEED, str(seed))
+        filled = self._pattern(task).replace(_TASK, slug(task)).replace(_SEED, str(seed))
+        filled = filled.replace(_ENCODER, str(self.number(seed)))
         path = Path(filled).absolute()  # workers may have another working directory
         if not path.is_dir():
             return str(path)
@@ -118,7 +143,7 @@ class ByFile(Own):
         return known.get(task) or known[None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ByCode(Own):
     """An encoder that code makes, named as module:Class.
 
@@ -137,14 +162,24 @@ def read_representation(given: Given, training: Mapping[str, Any]) -> Representa
     """A representation as a study's file gives it.
 
     Args:
-        given: full, the name of an encoder, such as dae-8, or a table with a name and either file
-            or code.
+        given: full, the name of an encoder, such as dae-8, or a table with a name and one of: code;
+            file; kind, with the settings of that method; or for several encoders of one, encoders,
+            which may also stand beside file or kind.
         training: settings of encoders that the study trains, other than the usual.
 
     Raises:
-        InputError: no such representation, or invalid training settings.
+        InputError: no such representation, or invalid settings.
     """
-    return _by_name(given, training) if isinstance(given, str) else _own(given)
+    if isinstance(given, str):
+        method, said = read_name(given)
+        return ByName(
+            name=given, kind=method.name, training=_training(Recipe(method, said), training)
+        )
+    name = _name(given)
+    try:
+        return _of_table(name, {n: value for n, value in given.items() if n != "name"}, training)
+    except InputError as error:
+        raise InputError(f"representation {name}: {error}") from None
 
 
 def name_of(given: Given) -> Any:
@@ -152,8 +187,8 @@ def name_of(given: Given) -> Any:
     return given if isinstance(given, str) else given.get("name")
 
 
-def _by_name(name: str, training: Mapping[str, Any]) -> ByName:
-    method, given = read_name(name)
+def _training(recipe: Recipe, training: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of an encoder: what all encoders of a study share, as far as it takes them."""
     for key, value in training.items():
         if key not in _TRAINING:
             raise InputError(f"unknown training.{key}: it must be one of {', '.join(_TRAINING)}")
@@ -161,11 +196,11 @@ def _by_name(name: str, training: Mapping[str, Any]) -> ByName:
             read_setting(key, value)
         except InputError as error:
             raise InputError(f"training.{error}") from None
-    taken = {key: value for key, value in training.items() if key in method.defaults}
-    return ByName(name, method.name, {**taken, **given})
+    taken = {key: value for key, value in training.items() if key in recipe.method.defaults}
+    return {**taken, **recipe.given}
 
 
-def _own(given: Mapping[str, Any]) -> Own:
+def _name(given: Mapping[str, Any]) -> str:
     name = given.get("name")
     is_name = isinstance(name, str) and _NAME.fullmatch(name) and name.strip(".")
     if not is_name or name == FULL:
@@ -173,31 +208,63 @@ def _own(given: Mapping[str, Any]) -> Own:
             f"a representation's name is {name!r}: it must be of letters, digits, dots, hyphens "
             f"and underscores, and not {FULL}"
         )
-    match {key: value for key, value in given.items() if key != "name"}:
+    return str(name)
+
+
+def _of_table(name: str, given: Mapping[str, Any], training: Mapping[str, Any]) -> Representation:
+    encoders = given.get("encoders")
+    if "encoders" in given and (type(encoders) is not int or not 1 <= encoders <= MAX_ENCODERS):
+        raise InputError(f"encoders is {encoders!r}: it must be from 1 to {MAX_ENCODERS:,}")
+    match {key: value for key, value in given.items() if key != "encoders"}:
         case {"file": file, **others} if not others:
-            return ByFile(str(name), _paths(str(name), file))
-        case {"code": code, **others} if not others:
+            return ByFile(name=name, encoders=encoders, paths=_paths(file, encoders is not None))
+        case {"code": code, **others} if not others and encoders is None:
             if not is_code(code):
                 raise InputError(
-                    f"representation {name}: its code is {code!r}, it must be text such as "
-                    "mymodule:MyEncoder"
+                    f"its code is {code!r}, it must be text such as mymodule:MyEncoder"
                 )
-            return ByCode(str(name), code)
-    raise InputError(f"representation {name} must have a name and either file or code, not more")
+            return ByCode(name=name, code=code)
+        case {"kind": kind, **settings} if "file" not in settings and "code" not in settings:
+            return _trained(name, Recipe(get_method(kind), settings), encoders, training)
+        case {**nothing} if not nothing and encoders is not None:
+            return _trained(name, read_name(name), encoders, training)
+    raise InputError(
+        "it must have a name and one of file, code, kind (with settings) or encoders (a number)"
+    )
 
 
-def _paths(name: str, file: Any) -> tuple[tuple[str | None, str], ...]:
+def _trained(
+    name: str, recipe: Recipe, encoders: int | None, training: Mapping[str, Any]
+) -> ByName:
+    """Encoders that the study trains, with settings of their own."""
+    check_name(name)
+    method, settings = recipe.method, _training(recipe, training)
+    method.settings(settings)
+    if encoders is not None and "seed" not in method.own:
+        raise InputError(
+            f"{method.name} has no seed, so all its encoders are the same: leave out encoders"
+        )
+    if encoders is not None and "seed" in settings:
+        raise InputError(f"its encoders have the seeds 0 to {encoders - 1}: leave out seed")
+    return ByName(name=name, encoders=encoders, kind=method.name, training=settings)
+
+
+def _paths(file: Any, are_several: bool) -> tuple[tuple[str | None, str], ...]:
     """The paths in the file of a representation: one, or a table of one for each task."""
     paths = tuple(file.items()) if isinstance(file, Mapping) else ((None, file),)
     for _, path in paths:
         if not isinstance(path, str) or not path:
             raise InputError(
-                f"representation {name}: its file is {path!r}, it must be a path, or a table of "
-                "paths by task"
+                f"its file is {path!r}, it must be a path, or a table of paths by task"
             )
-        if unknown := [w for w in re.findall(r"\{.*?\}", path) if w not in (_TASK, _SEED)]:
+        known = (_TASK, _ENCODER if are_several else _SEED)
+        words = re.findall(r"\{.*?\}", path)
+        if _ENCODER in words and not are_several:
+            raise InputError(f"say how many files {path} stands for, such as encoders = 5")
+        if unknown := [word for word in words if word not in known]:
             raise InputError(
-                f"representation {name}: unknown {unknown[0]} in its file {path}: only {_TASK} and "
-                f"{_SEED} are known"
+                f"unknown {unknown[0]} in its file {path}: only {' and '.join(known)} are known"
             )
+        if are_several and _ENCODER not in words:
+            raise InputError(f"its file {path} must contain {_ENCODER}, as there are several")
     return paths

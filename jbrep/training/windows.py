@@ -51,11 +51,6 @@ class Windows:
         self.device = device or torch.device("cpu")
         self._memory = available_memory(self.device) if memory is None else memory
         starts = first_rows(data, rows, horizon)
-        if not len(starts):
-            raise InputError(
-                f"no episode of {data.dataset.folder} is longer than {horizon} steps: look fewer "
-                "steps ahead"
-            )
         chosen = starts if most is None else sample(starts, most)
         every = len(chosen) == len(rows)
         self.starts = None if every else torch.from_numpy(chosen).to(self.device)
@@ -122,12 +117,21 @@ def first_rows(data: ScaledDataset, rows: NDArray[np.int64], horizon: int) -> ND
         data: the data set.
         rows: sorted rows of whole episodes.
         horizon: rows after one.
+
+    Raises:
+        InputError: no episode is longer than the horizon.
     """
     if not horizon:
         return np.arange(len(rows))
     ends = np.cumsum(data.dataset.episodes["length"], dtype=np.int64)
     end = ends[np.searchsorted(ends, rows, side="right")]
-    return np.flatnonzero(rows + horizon < end)
+    starts = np.flatnonzero(rows + horizon < end)
+    if not len(starts):
+        raise InputError(
+            f"no episode of {data.dataset.folder} is longer than {horizon} steps: look fewer steps "
+            "ahead"
+        )
+    return starts
 
 
 def count_windows(data: ScaledDataset, horizon: int) -> int:

@@ -1,0 +1,130 @@
+"""DeepMDP: a code that is itself the state of a smooth decision process with the same rewards."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from jbrep.dae.network import check_size, get_architecture, layers, stack
+from jbrep.dataset import ScaledDataset
+from jbrep.errors import InputError
+from jbrep.methods.method import Learned, Settings
+from jbrep.methods.predictors import HIDDEN
+from jbrep.methods.settings import REQUIRED
+from jbrep.training.objective import Layers, Objective
+from jbrep.training.windows import Windows
+
+_SMALL = 1e-6  # standard deviation of a reward that says nothing
+
+
+class DeepMDP(Objective):
+    """Reward and next code from the code and the action, by smooth functions.
+
+    With the code z = f(x), the standardised reward r and the networks R and G (Gelada et al. 2019,
+    with squared errors and deterministic transitions):
+
+        reward |R(z_t, a_t) - r_t|^2 + transition |z_t + G(z_t, a_t) - z_t+1|^2 / l
+        + lipschitz sum over R and G of max(0, L - 1)^2
+
+    L, the product of the spectral norms of a network's weights, the first one's of the code alone,
+    bounds how fast the network varies with the code; so R is kept to a constant of 1, and the
+    transition to 2. A code that shrinks would make the transition easy: as R may not be steep, the
+    reward keeps it wide. Gradients flow through both codes, so losses of epochs can be compared.
+
+    Args:
+        data: scaled.
+        settings: of the method.
+    """
+
+    horizon = 1
+    _mean: Tensor
+    _deviation: Tensor
+
+    def __init__(self, data: ScaledDataset, settings: Settings):
+        super().__init__()
+        architecture = get_architecture(settings["architecture"])
+        size, self._latent = data.size, settings["latent"]
+        inputs = self._latent + data.task.action_size
+        self._weights = {name: settings[name] for name in ("reward", "transition", "lipschitz")}
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(settings["seed"])
+            self.encoder = stack((size, *architecture.hidden, self._latent), architecture.code)
+            self.reward = stack((inputs, HIDDEN, HIDDEN, 1), "linear")
+            self.change = stack((inputs, HIDDEN, HIDDEN, self._latent), "linear")
+        self.register_buffer("_mean", torch.zeros(()), persistent=False)
+        self.register_buffer("_deviation", torch.ones(()), persistent=False)
+
+    def prepare(self, windows: Windows) -> None:
+        """Fit the standardisation of the reward."""
+        deviation, self._mean = torch.std_mean(windows.rewards(windows.numbers))
+        self._deviation = deviation.clamp(min=_SMALL)
+
+    def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
+        """Rows, actions (n, k), the next rows, and the standardised rewards (n, 1)."""
+        rewards = (windows.rewards(numbers) - self._mean) / self._deviation
+        actions = windows.actions(numbers).flatten(1)
+        return windows.rows(numbers), actions, windows.rows(numbers, 1), rewards[:, None]
+
+    def _errors(self, batch: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        """The terms of the loss, by the names of their weights."""
+        now, actions, after, rewards = batch
+        code, following = self.encoder(torch.cat((now, after))).chunk(2)
+        known = torch.cat((code, actions), 1)
+        return {
+            "reward": (self.reward(known) - rewards).square().mean(),
+            "transition": (code + self.change(known) - following).square().mean(),
+            "lipschitz": sum(
+                (self.lipschitz(network) - 1).relu().square()
+                for network in (self.reward, self.change)
+            ),
+        }
+
+    def lipschitz(self, network: nn.Sequential) -> Tensor:
+        """A bound on how fast a network's output varies with the code."""
+        first, *others = (each.weight for each in network if isinstance(each, nn.Linear))
+        weights = first[:, : self._latent], *others
+        squares = (w.T @ w if len(w) > w.shape[1] else w @ w.T for w in weights)
+        return torch.stack([torch.linalg.eigvalsh(each)[-1] for each in squares]).prod().sqrt()
+
+    def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
+        """As for `Objective`."""
+        errors = self._errors(batch)
+        return torch.stack([weight * errors[name] for name, weight in self._weights.items()]).sum()
+
+    def layers(self) -> tuple[Layers, Layers | None]:
+        """As for `Objective`; there is no decoder."""
+        return layers(self.encoder), None
+
+    def report(self, windows: Windows) -> dict[str, Any]:
+        """The terms of the loss, unweighted: `reward` is 1 for no prediction."""
+        errors = self._errors(self.batch(windows, windows.numbers))
+        return {"loss_by_term": {name: float(error) for name, error in errors.items()}}
+
+
+def _check(data: ScaledDataset, settings: Settings) -> None:
+    check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
+    if not settings["reward"]:
+        raise InputError(
+            "deepmdp without reward makes a constant code, which is easy to predict: give the "
+            "reward a weight above 0"
+        )
+
+
+METHOD = Learned(
+    name="deepmdp",
+    words="a code from which reward and next code follow smoothly, with the action",
+    source="Gelada et al. 2019",
+    own={
+        "latent": REQUIRED,
+        "architecture": "deep",
+        "reward": 1.0,
+        "transition": 1.0,
+        "lipschitz": 0.1,
+        "epochs": 12,
+        "batch_size": None,
+        "learning_rate": 2e-3,
+        "seed": 0,
+    },
+    check=_check,
+    objective=DeepMDP,
+)

@@ -1,0 +1,151 @@
+"""What evaluations say of the encoders of a study's runs, in its diagnostics.csv."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypedDict
+
+from jbrep.encoders import FULL
+from jbrep.encoders.diagnostics import DIAGNOSTICS, Diagnosed, read_diagnostics, write_diagnostics
+from jbrep.errors import DamageError, InputError
+from jbrep.evaluate.headline import headline
+from jbrep.files.storage import exists, read_file
+from jbrep.files.typed import read_json, typed
+from jbrep.study import record
+from jbrep.text import slug
+
+_TASK = "{task}"  # in an evaluation's path: the task's name as in folders
+_MAX_BYTES = 1 << 28
+_Values = Mapping[str, float | None]
+_Key = tuple[str, str]  # a task, and an encoder's SHA-256 or `full`
+
+
+class _Settings(TypedDict):
+    task: str
+    representation: str
+    encoder: str  # its SHA-256, or that runs have different encoders
+
+
+class _Shared(TypedDict):
+    settings: _Settings
+
+
+class _Data(TypedDict):
+    task: str
+
+
+class _Evaluation(TypedDict):
+    """What is needed of evaluation.json."""
+
+    data: _Data
+    encoders: dict[str, dict[str, Any]]
+
+
+class _Record(TypedDict):
+    """What is needed of runs.json."""
+
+    study: dict[str, Any] | None
+    labels: dict[str, _Shared]
+    runs: list[dict[str, Any]]
+
+
+def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
+    """Write what evaluations say of the encoders of a study's runs, if any is named.
+
+    Evaluations are matched by the encoders' hashes, the whole observation by the task. What the
+    table says already is kept where they say nothing.
+
+    Args:
+        folder: with the tables of a study.
+        given: folders of evaluations beside those that the study names; {task} stands for each
+            task in turn. The first that knows an encoder counts.
+
+    Returns:
+        A line for each representation that no evaluation knows.
+
+    Raises:
+        InputError: a given folder has no evaluation, or a file is of a newer jbrep.
+        DamageError: a file is damaged.
+    """
+    path, runs = folder / DIAGNOSTICS, folder / record.RECORD
+    if not exists(runs):
+        return []
+    contents = _read(runs, record.FORMAT, record.FORMAT_VERSION, _Record)
+    named = (contents["study"] or {}).get("evaluations", [])
+    if not (given or named or exists(path)):
+        return []
+    used = _encoders(contents)
+    known: dict[_Key, _Values] = {}
+    for pattern in dict.fromkeys((*given, *named)):
+        files = _files(pattern, (row.task for row in used))
+        if pattern in given and not files:
+            raise InputError(f"no evaluation in {pattern}: jbrep evaluate makes one")
+        for file in files:
+            known = _evaluated(file) | known
+    if exists(path):
+        known = {_key(row): row.values for row in read_diagnostics(path)} | known
+    rows = [row._replace(values=known[_key(row)]) for row in used if _key(row) in known]
+    write_diagnostics(path, rows)
+    return list(_unknown(used, known))
+
+
+def _read(path: Path, kind: str, version: int, shape: Any) -> Any:
+    """The contents of a JSON file, checked."""
+    try:
+        text = read_file(path, _MAX_BYTES).decode()
+        return typed(read_json(text, path, kind, version), shape)
+    except ValueError as error:
+        raise DamageError(f"{path} is damaged: {error}") from None
+
+
+def _encoders(contents: _Record) -> list[Diagnosed]:
+    """A row without values for each encoder under each name in each task."""
+    rows: dict[tuple[str, str, str], None] = {}
+    for run in contents["runs"]:
+        settings = contents["labels"][run["label"]]["settings"]
+        encoder = run.get("encoder", settings["encoder"])  # the first release said only the latter
+        rows[settings["task"], settings["representation"], encoder] = None
+    return [Diagnosed(*row, {}) for row in rows]
+
+
+def _files(pattern: str, tasks: Iterable[str]) -> list[Path]:
+    """The evaluations that a folder's path stands for, as far as they are there."""
+    folders = dict.fromkeys(Path(pattern.replace(_TASK, slug(task))) for task in tasks)
+    return [file for folder in folders if exists(file := folder / "evaluation.json")]
+
+
+def _evaluated(path: Path) -> dict[_Key, _Values]:
+    """The headline numbers in an evaluation."""
+    from jbrep.evaluate.evaluation import FORMAT, FORMAT_VERSION  # imports scikit-learn
+
+    contents = _read(path, FORMAT, FORMAT_VERSION, _Evaluation)
+    task = contents["data"]["task"]
+    return {
+        (task, entry.get("sha256", label)): _numbers(entry, path)
+        for label, entry in contents["encoders"].items()
+        if label == FULL or "sha256" in entry
+    }
+
+
+def _numbers(entry: Mapping[str, Any], path: Path) -> _Values:
+    values = {name: each[0] if each else None for name, each in headline(entry).items()}
+    for value in values.values():
+        if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
+            raise DamageError(f"{path} is damaged: {value!r} is no number")
+    return values
+
+
+def _key(row: Diagnosed) -> _Key:
+    return row.task, FULL if row.representation == FULL else row.sha256
+
+
+def _unknown(used: Sequence[Diagnosed], known: Mapping[_Key, _Values]) -> Iterator[str]:
+    """What to do about each representation without numbers."""
+    encoders = Counter(row[:2] for row in used)
+    missing = Counter(row[:2] for row in used if _key(row) not in known)
+    for (task, name), count in missing.items():
+        of = "" if encoders[task, name] == 1 else f"{count} of {encoders[task, name]} encoders of "
+        yield (
+            f"no diagnostics of {of}{name} for {task}: evaluate it, then jbrep report --evaluation"
+        )

@@ -1,0 +1,188 @@
+"""Scalings, angles as sine and cosine, limits and features around the layers, in every library."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from wide import make_feature, make_task
+
+from jbrep.dataset import Column, Scaler
+from jbrep.dataset.scaling import fit_scaler
+from jbrep.encoders import Encoder, Layer, load, save
+from jbrep.encoders.from_onnx import convert
+from jbrep.encoders.onnx import export
+from jbrep.envs import describe
+from jbrep.errors import InputError
+from jbrep.files import container
+
+RANDOM = np.random.default_rng(0)
+TASK = describe("face_direction")
+ANGLES = (13, 15)
+
+
+def column(values):
+    return Column(lambda shard: values, [len(values)], values.dtype, values.shape[1:])
+
+
+ROWS = RANDOM.normal(size=(2001, 3))
+ROWS[:, 1] = 0.03  # constant
+ROWS[:, 2] = 1e6 + 1e-1 * ROWS[:, 2]
+ROWS = ROWS.astype(np.float32)
+ROBOT = make_task(make_feature(f"obs_{i}", low=-i - 1, high=2) for i in range(3))
+
+
+def deviations(rows):
+    mean, reach = rows.mean(axis=0), 3 * rows.std(axis=0)
+    return mean - reach, mean + reach
+
+
+def quantiles(rows):
+    low, median, high = np.quantile(rows, (0.01, 0.5, 0.99), axis=0)
+    return median - (high - low) / 2, median + (high - low) / 2
+
+
+@pytest.mark.parametrize(
+    ("scaling", "formula"),
+    [
+        ("extrema", lambda rows: (rows.min(axis=0), rows.max(axis=0))),
+        ("nominal", lambda rows: ((-1, -2, -3), (2, 2, 2))),
+        ("standard", deviations),
+        ("robust", quantiles),
+    ],
+)
+def test_scalings_are_their_formulas_also_of_constant_and_far_features(scaling, formula):
+    chosen = np.arange(0, 2001, 2)  # the others don't count
+    scaler = fit_scaler(scaling, ROBOT, column(ROWS), chosen)
+    low, high = formula(ROWS[chosen].astype(float))
+    near = (1e-5, 1e-6, 0.07)  # a float32 can't tell more of 1e6
+    assert (np.abs(np.subtract((scaler.low, scaler.high), (low, high))) < near).all()
+    scaled = scaler.scale(ROWS)
+    assert np.isfinite(scaled).all()
+    if scaling != "nominal":
+        np.testing.assert_array_equal(scaled[:, 1], 0)
+        assert 0.9 < np.abs(scaled[:, 2]).max() < 3
+
+
+def test_a_task_without_usual_ranges_has_no_nominal_scaling():
+    some = make_task([make_feature("known", low=0, high=1), make_feature("free")])
+    with pytest.raises(InputError, match="Humanoid-v5 has no usual range of free: choose another"):
+        fit_scaler("nominal", some, column(ROWS[:, :2]), np.arange(9))
+
+
+def layer(inputs, outputs, activation):
+    weight = RANDOM.normal(size=(outputs, inputs)) / np.sqrt(inputs)
+    return Layer(weight.astype(np.float32), np.float32([0.1] * outputs), activation)
+
+
+def encoder(angles=ANGLES, clip=1.5, keep=("angle_to_target", "velocity_x"), layers=True):
+    """From 16 features to a code of 3 and what is kept, and back."""
+    low = np.float32([feature.low for feature in TASK.features])
+    high = np.float32([feature.high for feature in TASK.features])
+    low[15] += 2  # so that the middle of an angle isn't 0
+    scaler = Scaler(low, high, angles, clip)
+    header = {"kind": "dae", "name": "it-3", "task": TASK.name, "environment": TASK.as_json()}
+    header |= {"features": list(TASK.feature_names), "training": {}, "data": {}, "versions": {}}
+    header["metrics"] = {"held_out_mse": 0.1}
+    parts = (layer(scaler.size, 3, "tanh"),), (layer(3, scaler.size, "tanh"),)
+    return Encoder(header, scaler, *(parts if layers else ((), ())), keep if layers else ())
+
+
+VARIANTS = (
+    {},
+    {"keep": ()},
+    {"angles": (), "clip": None},
+    {"angles": (13,), "clip": None, "layers": False},
+)
+
+
+@pytest.mark.parametrize("changes", VARIANTS)
+def test_numpy_torch_and_onnx_agree_beyond_the_ranges_too(changes, tmp_path):
+    it = encoder(**changes)
+    save(it, tmp_path / "it")
+    again = load(tmp_path / "it")
+    assert again.fingerprint == it.fingerprint
+    assert again.file_header["format_version"] == 3
+    rows = (3 * it.scaler.half_width * RANDOM.normal(size=(500, 16))).astype(np.float32)
+    rows[0], rows[1, list(ANGLES)] = 0, (np.pi, -np.pi / 2)
+    code, back = it.encode(rows), it.decode(it.encode(rows))
+    given = torch.from_numpy(rows).requires_grad_()
+    there = again.encode(given)
+    again.decode(there).sum().backward()
+    assert given.grad.isfinite().all()
+    export(again, tmp_path / "it.onnx")
+    session = onnxruntime.InferenceSession(tmp_path / "it.onnx")
+    latent, reconstruction = session.run(None, {"observation": rows})
+    for theirs in (there.detach().numpy(), latent):
+        np.testing.assert_allclose(theirs, code, rtol=1e-5, atol=1e-5)
+    for theirs in (again.decode(there).detach().numpy(), reconstruction):
+        off = np.abs(it.scaler.error(theirs, back))
+        assert off.max() < 1e-4
+    if it.scaler.angles or it.keep:
+        with pytest.raises(InputError, match=r"(Gather|Clip) \(.*\)"):
+            convert(tmp_path / "it.onnx", TASK, None, "mine")
+
+
+def test_atan2_of_onnx_in_every_direction(tmp_path):
+    it = encoder(angles=(13,), clip=None, layers=False)
+    export(it, tmp_path / "it.onnx")
+    session = onnxruntime.InferenceSession(tmp_path / "it.onnx")
+    rows = np.zeros((4001, 16), np.float32)
+    rows[:, 13] = np.linspace(-np.pi, np.pi, 4001)
+    _, back = session.run(None, {"observation": rows})
+    off = np.angle(np.exp(1j * (back[:, 13].astype(float) - rows[:, 13])))
+    assert np.abs(off).max() < 1e-6
+
+
+def test_an_observation_survives_sine_and_cosine_and_what_is_kept_survives_the_layers():
+    rows = (encoder().scaler.half_width * RANDOM.uniform(-1, 1, (200, 16))).astype(np.float32)
+    whole = encoder(clip=None, layers=False)
+    assert whole.latent_size == 18
+    assert np.abs(whole.scaler.error(whole.decode(whole.encode(rows)), rows)).max() < 1e-5
+    it = encoder()
+    assert it.latent_size == 3 + 3  # an angle is two numbers
+    code = it.encode(rows)
+    np.testing.assert_array_equal(code[:, 3:], it.scaler.scale(rows)[:, it.kept])
+    lost = np.abs(it.scaler.error(it.decode(code), rows))
+    assert lost[:, [7, 15]].max() < 1e-5
+    assert lost[:, 0].max() > 0.1
+    many = rows * np.float32(1e4)
+    assert np.abs(it.scaler.scale(many)).max() == np.float32(1.5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"angles": ["wing"]}, "angle wing is no feature"),
+        ({"angles": ["motor_angle", "motor_angle"]}, "angles must be different features"),
+        ({"angles": "motor_angle"}, "angles must be strings"),
+        ({"angles": []}, r"tensor encoder.0.weight has shape \(3, 18\), expected \(3, 16\)"),
+        ({"angles": ["motor_angle"]}, "tensor encoder.0.weight has shape"),
+        ({"clip": 0.5}, "clip is 0.5: it must be at least 1"),
+        ({"clip": True}, "clip must be a number"),
+        ({"clip": "1"}, "clip must be a number"),
+        ({"clip": 10**400}, "it must be at least 1"),
+        ({"keep": ["wing"]}, "wing can't pass around its layers: it is no feature"),
+        ({"keep": ["velocity_x"] * 2}, "different features can pass around layers"),
+        ({"keep": [1]}, "keep must be strings"),
+    ],
+)
+def test_a_header_that_contradicts_its_tensors_is_one_line(changes, message, tmp_path):
+    save(encoder(), tmp_path / "it")
+    tensors, header = container.read(tmp_path / "it", "encoder")
+    container.write(tmp_path / "it", tensors, {**header, **json.loads(json.dumps(changes))})
+    with pytest.raises(InputError, match=message) as refused:
+        load(tmp_path / "it")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_header_says_only_what_is_used():
+    plain = encoder(angles=(), clip=None, keep=())
+    assert not {"angles", "clip", "keep"} & set(plain.file_header)
+    assert plain.file_header["format_version"] == 2
+    for scaler in (replace(plain.scaler, clip=2.0), replace(plain.scaler, clip=1)):
+        limited = replace(plain, scaler=scaler)
+        assert (limited.file_header["clip"], limited.format_version) == (scaler.clip, 3)
+        assert limited.fingerprint != plain.fingerprint

@@ -1,0 +1,97 @@
+"""What every code can have: a linear decoder, a scale, features that pass around it."""
+
+import numpy as np
+import pytest
+
+from jbrep.dae.network import ARCHITECTURES, layers, stacks
+from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.encoders import Encoder
+from jbrep.encoders.encoder import run
+from jbrep.errors import InputError
+from jbrep.methods.fit import Fitter
+from jbrep.methods.linear import dense
+from jbrep.methods.method import Made
+from jbrep.methods.shape import complete
+
+
+@pytest.fixture(scope="module")
+def data(collected):
+    return ScaledDataset(Dataset(collected))
+
+
+@pytest.fixture(scope="module")
+def rows(data):
+    return data.load(data.train)
+
+
+@pytest.fixture(scope="module")
+def made(data):
+    """A nonlinear code of 4 units with its decoder."""
+    return Made(*map(layers, stacks(ARCHITECTURES["paper"], data.size, 4, seed=0)))
+
+
+@pytest.mark.parametrize("codes", ["standard", "white"])
+def test_units_have_the_deviation_that_they_say_and_decode_alike(data, rows, made, codes):
+    encoder, decoder = complete(made, data, {"codes": codes}).layers
+    code = run(encoder, rows).astype(float)
+    np.testing.assert_allclose(code.mean(axis=0), 0, atol=1e-4)
+    covariance = np.cov(code.T, bias=True)
+    np.testing.assert_allclose(np.diag(covariance), 1 / 9, rtol=1e-3)
+    correlated = np.abs(covariance - np.diag(np.diag(covariance))).max() > 1e-3
+    assert correlated == (codes == "standard")
+    before = run(made.decoder, run(made.encoder, rows))
+    np.testing.assert_allclose(run(decoder, code.astype(np.float32)), before, atol=1e-4)
+
+
+def test_the_linear_decoder_is_the_best(data, rows, made):
+    encoder, decoder = complete(Made(made.encoder), data, {}).layers
+    assert encoder is made.encoder
+    code = run(encoder, rows)
+    wide = np.column_stack((code, np.ones(len(rows)))).astype(float)
+    best = np.linalg.lstsq(wide, rows.astype(float), rcond=None)[0]
+    np.testing.assert_allclose(run(decoder, code), wide @ best, atol=1e-4)
+
+
+def test_a_unit_that_says_nothing_can_be_scaled_but_not_whitened(data, rows, made):
+    weight = np.random.default_rng(0).normal(size=(3, data.size))
+    weight[1] = 0
+    dead = Made((dense(weight, np.ones(3)),))
+    encoder, decoder = complete(dead, data, {"codes": "standard"}).layers
+    code = run(encoder, rows)
+    np.testing.assert_allclose(code[:, 1], 0, atol=1e-6)
+    np.testing.assert_allclose(code.std(axis=0)[[0, 2]], 1 / 3, rtol=1e-3)
+    assert np.isfinite(run(decoder, code)).all()
+    with pytest.raises(InputError, match="the covariance of the code is singular") as refused:
+        complete(dead, data, {"codes": "white"})
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("kind", "angles"), [("pca", False), ("slow", True)])
+def test_what_is_kept_passes_exactly_and_the_method_never_saw_it(data, kind, angles, tmp_path):
+    keep = ("angle_to_target", "velocity_x")
+    fitted = Fitter(data, tmp_path).fit(
+        kind, latent=4, keep="velocity_x,angle_to_target", angles=angles
+    )
+    it: Encoder = fitted.encoder
+    assert set(it.keep) == set(keep)
+    assert it.latent_size == 4 + 2 + angles
+    observed = data.dataset["observation"][data.test]
+    code, scaled = it.encode(observed), it.scaler.scale(observed)
+    np.testing.assert_array_equal(code[:, 4:], scaled[:, it.kept])
+    other = observed.copy()
+    other[:, [7, 15]] += 0.5
+    np.testing.assert_array_equal(it.encode(other)[:, :4], code[:, :4])
+    assert not it.encoder[0].weight[:, it.kept].any()
+    lost = it.scaler.error(it.decode(code), observed)
+    assert np.abs(lost[:, [7, 15]]).max() < 1e-5
+    rest = data.rescaled(angles=angles, without=keep)
+    assert len(rest.names) == rest.size == 14 + angles
+    assert not set(rest.names) & set(keep)
+    if kind == "pca":
+        values = np.linalg.eigvalsh(rest.moments.covariance)[::-1]
+        variances = np.linalg.eigvalsh(
+            np.cov(
+                it.encode(data.dataset["observation"][data.train])[:, :4].T.astype(float), bias=True
+            )
+        )[::-1]
+        np.testing.assert_allclose(variances, values[:4], rtol=1e-3)

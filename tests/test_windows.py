@@ -1,0 +1,111 @@
+"""Windows of steps: within episodes, without copies; training on them, from disk and resumed."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from wide import wide
+
+from jbrep.dataset import Dataset, ScaledDataset
+from jbrep.errors import InputError
+from jbrep.methods import fit
+from jbrep.methods.fit import Fitter
+from jbrep.methods.passes import blocks
+from jbrep.training.windows import Windows
+
+LENGTHS = [1, 30, 2, 12, 1, 7, 40, 21, 1, 22]
+
+
+@pytest.fixture(scope="module")
+def data():
+    made = wide(LENGTHS, features=6)
+    rewards = np.random.default_rng(1).normal(size=sum(LENGTHS)).astype(np.float32)
+    made.dataset.arrays["reward"] = rewards
+    return made
+
+
+def within(data, horizon):
+    """Rows of the training part that have so many more in their episode, one by one."""
+    ends = np.cumsum(LENGTHS)
+    return [row for row in data.train if row + horizon < ends[np.sum(ends <= row)]]
+
+
+@pytest.mark.parametrize("memory", [0, 1 << 30])
+@pytest.mark.parametrize("horizon", [0, 1, 6, 20])
+def test_windows_lie_within_episodes_and_have_the_data_sets_numbers(data, horizon, memory):
+    windows = Windows(data, data.train, horizon, memory=memory)
+    first = np.array(within(data, horizon))
+    assert len(windows) == len(first)
+    order = np.random.default_rng(0).permutation(len(first))
+    numbers, rows = torch.from_numpy(order), first[order]
+    arrays = data.dataset.arrays
+    for ahead in {0, horizon}:
+        expected = data.scale(arrays["observation"][rows + ahead])
+        np.testing.assert_array_equal(windows.rows(numbers, ahead), expected)
+    if horizon:
+        steps = rows[:, None] + np.arange(horizon)
+        actions = windows.actions(numbers, horizon)
+        np.testing.assert_allclose(actions, arrays["action"][steps], atol=1e-6)
+        mean = arrays["reward"][steps].mean(axis=1, dtype=float)
+        np.testing.assert_allclose(windows.rewards(numbers, horizon), mean, atol=1e-6)
+
+
+def test_a_pass_in_blocks_has_the_same_windows(data, monkeypatch):
+    monkeypatch.setattr("jbrep.methods.passes._BLOCK", 7)
+    windows = Windows(data, data.train, 6)
+    parts = [(b.later(6), b.next_actions(6), b.mean_reward(6)) for b in blocks(data, 6, 1, 1)]
+    rows, actions, rewards = map(np.concatenate, zip(*parts, strict=True))
+    np.testing.assert_allclose(rows, windows.rows(windows.numbers, 6), rtol=1e-6)
+    np.testing.assert_allclose(actions, windows.actions(windows.numbers, 6).flatten(1), atol=1e-6)
+    np.testing.assert_allclose(rewards[:, 0], windows.rewards(windows.numbers, 6), atol=1e-6)
+
+
+def test_a_horizon_that_no_episode_has_is_refused(data):
+    for look in (lambda: Windows(data, data.train, 40), lambda: next(blocks(data, 40, 1, 1))):
+        with pytest.raises(InputError, match=r"no episode of .* longer than 40 steps: look fewer"):
+            look()
+
+
+def test_windows_cost_no_copy_of_the_rows():
+    data = wide([500] * 10, features=100)
+    data.dataset.arrays["reward"] = np.zeros(5000, np.float32)
+    rows = len(data.train) * (100 + 17) * 4
+    tracemalloc.start()
+    windows = Windows(data, data.train, 20, memory=1 << 30)
+    some = windows.numbers[:10]
+    windows.rows(some, 20), windows.actions(some, 20), windows.rewards(some, 20)
+    taken = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert rows < taken < 1.1 * rows
+
+
+def test_forward_is_the_same_from_disk_stopped_and_on_more_threads(
+    collected, tmp_path, monkeypatch
+):
+    data = ScaledDataset(Dataset(collected))
+    how = {"latent": 4, "architecture": "linear", "horizons": "1,5", "epochs": 3, "batch_size": 500}
+    whole = Fitter(data, tmp_path / "memory").fit("forward", **how).path.read_bytes()
+    save, saved = fit.checkpoint.save, []
+
+    def stopping(*given):
+        save(*given)
+        saved.append(given)
+        if len(saved) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(fit.checkpoint, "save", stopping)
+    fitter, threads = Fitter(data, tmp_path / "disk", memory=0), torch.get_num_threads()
+    with pytest.raises(KeyboardInterrupt):
+        fitter.fit("forward", **how)
+    torch.set_num_threads(2)
+    try:
+        resumed = fitter.fit("forward", **how)
+    finally:
+        torch.set_num_threads(threads)
+    assert resumed.is_new
+    assert resumed.path.read_bytes() == whole
+    events = EventAccumulator(str(resumed.path.with_suffix(".training"))).Reload()
+    for name in ("train_loss", "test_loss"):
+        assert [event.step for event in events.Scalars(name)] == [1, 2, 3]
