@@ -37,6 +37,15 @@ def one_figure(monkeypatch):
     monkeypatch.setattr(report, "study_plots", lambda *tables: draw(*tables)[:1])
 
 
+@pytest.fixture(scope="session", autouse=True)
+def quick_evaluations():
+    """Nonlinear regressions that learn little; test_prediction.py has them learn."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jbrep.evaluate.regression._STEPS", 2)
+        patch.setattr("jbrep.rollouts.good_policy._EPISODES", 2)
+        yield
+
+
 @pytest.fixture(scope="session")
 def collected(tmp_path_factory):
     """Five shards of an episode each, with states: to be read, or copied before it is changed."""

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,7 +28,7 @@ from jbrep.evaluate.truth import in_words
 from jbrep.rollouts.good_policy import find_good_policy
 
 NAMES = ("place", "speed", "load", "idle")
-STEPS, EPISODES = 60, 100
+STEPS, EPISODES = 60, 200
 
 
 class Cart:
@@ -42,16 +43,17 @@ class Cart:
 
     def __init__(self):
         features = [make_feature(name) for name in NAMES]
-        self.task = make_task(features, "Cart-v0")
+        task = make_task(features, "Cart-v0")
+        self.task = replace(task, action_low=(-1.0,), action_high=(1.0,))
         self.episodes = {"length": np.full(EPISODES, STEPS), "seed": np.arange(EPISODES)}
         policy = SimpleNamespace(policy={"kind": "uniform"}, seed=0)
         self.manifest = SimpleNamespace(fingerprint="cart", settings=policy)
         random = np.random.default_rng(0)
-        actions = random.uniform(-1, 1, (EPISODES, STEPS, 17)).astype(np.float32)
+        actions = random.uniform(-1, 1, (EPISODES, STEPS, 1)).astype(np.float32)
         seen, reward = self.play(lambda step, seen: actions[:, step, 0], random)
         self.arrays = {
             "observation": seen[:, :-1].reshape(-1, 4),
-            "action": actions.reshape(-1, 17),
+            "action": actions.reshape(-1, 1),
             "reward": reward.ravel(),
         }
 
@@ -79,14 +81,14 @@ class Cart:
 def controller(seen):
     """Push toward 0: what it does takes place, speed and load."""
     drive = np.clip(-seen[:, 2] * (seen[:, 0] + 0.5 * seen[:, 1]), -1, 1)
-    return np.pad(drive[:, None], ((0, 0), (0, 16)))
+    return drive[:, None]
 
 
 @pytest.fixture(scope="module", autouse=True)
-def quick():
-    """Fewer steps of training: the cart is simple."""
+def learning():
+    """Steps enough for the cart."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(regression, "_STEPS", 300)
+        patch.setattr(regression, "_STEPS", 600)
         yield
 
 
@@ -186,7 +188,7 @@ def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkey
 def test_actions_after_the_horizon_do_not_enter(held_out, monkeypatch):
     monkeypatch.setattr(regression, "_STEPS", 20)
     steps, inputs = following(held_out, "train", 5), code(held_out.data, "speed")
-    assert steps.inputs(inputs).shape == (len(steps.rows), 1 + 5 * 17)
+    assert steps.inputs(inputs).shape == (len(steps.rows), 1 + 5)
     rows = held_out.data.dataset["action"]
     np.testing.assert_array_equal(steps.action[7], rows[steps.rows[7] : steps.rows[7] + 5].ravel())
     before = prediction(inputs, held_out)
@@ -208,7 +210,7 @@ def test_what_follows_is_of_the_same_episode(held_out):
         steps.wanted[11], [*change, reward[row : row + 20].mean()], atol=1e-6
     )
     short = ScaledDataset(Cart())
-    short.dataset.episodes = {"length": np.full(600, 10), "seed": np.arange(600)}
+    short.dataset.episodes = {"length": np.full(1200, 10), "seed": np.arange(1200)}
     short.train, short.test = short.dataset.split()
     assert usual_horizons(short) == [1, 5]
 
@@ -261,7 +263,7 @@ def test_nonlinear_probes_read_what_linear_ones_cannot(held_out):
 def test_needs_pass_from_what_is_rewarded_to_what_moves_it(held_out):
     full = code(held_out.data, *NAMES)
     needed = needs(full, held_out, None)
-    assert needed["place"] > needed["speed"] > 0.1 > needed["idle"]
+    assert min(needed[name] for name in NAMES[:3]) > 0.1 > needed["idle"]
     assert lost({"a": 0.5, "b": 0.9, "c": 0.05}, {n: [0.2, 0, 1] for n in "abc"}) == [
         {"name": "b", "kept": 0.2, "need": 0.9},
         {"name": "a", "kept": 0.2, "need": 0.5},

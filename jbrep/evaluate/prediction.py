@@ -83,11 +83,9 @@ def predictors(encoder: BaseEncoder, held_out: HeldOut) -> dict[int, Predictor]:
 
 def usual_horizons(data: ScaledDataset) -> list[int]:
     """The numbers of steps that at least half the rows, training and held out, have after them."""
-    return [
-        ahead
-        for ahead in HORIZONS
-        if all(len(first_rows(data, r, ahead)) >= _USUAL * len(r) for r in (data.train, data.test))
-    ]
+    ends = np.cumsum(data.dataset.episodes["length"], dtype=np.int64)
+    later = [ends[np.searchsorted(ends, r, side="right")] - 1 - r for r in (data.train, data.test)]
+    return [h for h in HORIZONS if all((after >= h).mean() >= _USUAL for after in later)]
 
 
 @lru_cache(2 * len(HORIZONS))  # since all encoders share them
