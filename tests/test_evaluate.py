@@ -527,7 +527,7 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
     chosen = ("--encoder", "dae-4", "./dae-4", "full")
     command = ("evaluate", *chosen, "--data", collected, "--out", "judged")
     shown = jbrep(*command).stdout
-    assert shown.startswith("dae-4, shipped\n./dae-4\nfull, shipped\n\nError on 1 held-out")
+    assert shown.startswith("dae-4, shipped\n./dae-4\nfull, shipped\n\nWhether a controller")
     assert max(map(len, shown.splitlines())) <= 80
     evaluation = json.loads((tmp_path / "judged" / EVALUATION).read_text())
     whole = evaluation_text(evaluation)
