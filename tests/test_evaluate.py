@@ -533,7 +533,7 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
     whole = evaluation_text(evaluation)
     assert set(whole.split()) < set(shown.split())
     assert max(map(len, whole.splitlines())) > 80
-    monkeypatch.setattr(files, "diagnose", lambda encoders, data: evaluation)
+    monkeypatch.setattr(files, "diagnose", lambda encoders, data, policy: evaluation)
     again = jbrep(*command, "--json")
     assert json.loads(again.stdout) == evaluation
     labels = ["full", "dae-4, shipped", "./dae-4", "full, shipped"]
