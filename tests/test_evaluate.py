@@ -527,13 +527,13 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
     chosen = ("--encoder", "dae-4", "./dae-4", "full")
     command = ("evaluate", *chosen, "--data", collected, "--out", "judged")
     shown = jbrep(*command).stdout
-    assert shown.startswith("dae-4, shipped\n./dae-4\nfull, shipped\n\nError on 1 held-out")
+    assert shown.startswith("dae-4, shipped\n./dae-4\nfull, shipped\n\nWhether a controller")
     assert max(map(len, shown.splitlines())) <= 80
     evaluation = json.loads((tmp_path / "judged" / EVALUATION).read_text())
     whole = evaluation_text(evaluation)
     assert set(whole.split()) < set(shown.split())
     assert max(map(len, whole.splitlines())) > 80
-    monkeypatch.setattr(files, "diagnose", lambda encoders, data: evaluation)
+    monkeypatch.setattr(files, "diagnose", lambda encoders, data, policy: evaluation)
     again = jbrep(*command, "--json")
     assert json.loads(again.stdout) == evaluation
     labels = ["full", "dae-4, shipped", "./dae-4", "full, shipped"]

@@ -19,7 +19,7 @@ from jbrep.training.trainer import single_torch_thread
 Predictor = Callable[[NDArray[Any]], Array]  # values (n, p) to what is predicted, (n, q)
 
 _HIDDEN = (64, 64, 64)  # units
-_STEPS = 1500  # at most
+_STEPS = 1000  # at most
 _PASSES = 20  # over the rows, at most: few rows are soon known by heart
 _BATCH = 256
 _LEARNING_RATE = 5e-3  # at its highest
@@ -46,7 +46,7 @@ class Problem(NamedTuple):
 def fit(problems: Sequence[Problem]) -> list[Predictor]:
     """Fit a network to each problem: three hidden layers of 64 ReLU units, by Adam.
 
-    1,500 steps with 256 rows each, fewer if that is more than 20 times all rows. Values and what is
+    1,000 steps with 256 rows each, fewer if that is more than 20 times all rows. Values and what is
     wanted are standardised, and values limited to 5 standard deviations. The networks are fitted
     side by side, one on each core, and each comes out the same to the last bit however many there
     are.

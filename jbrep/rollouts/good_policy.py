@@ -5,13 +5,17 @@ from typing import Any
 from numpy.typing import NDArray
 
 from jbrep.collect.policies import POLICIES
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.recording import record
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.evaluate.policy import GoodPolicy, PlayedEpisode
+from jbrep.progress import Progress
+from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rollouts.jitterbug import jitterbug_task
-from jbrep.rollouts.sources import find_player
+from jbrep.rollouts.sources import Player, find_player
 
-_EPISODES = 40
+_EPISODES = 30
 HEURISTIC = "heuristic"
 
 
@@ -39,8 +43,22 @@ def find_good_policy(source: str | None, task: Task) -> GoodPolicy | None:
     def act(observation: NDArray[Any]) -> NDArray[Any]:
         return player.begin(task, range(len(observation)))(observation)
 
-    played = (
-        PlayedEpisode(rollout.observation, rollout.reward, rollout.terminated)
-        for rollout in player.play_first(_EPISODES)
-    )
-    return GoodPolicy(source, act, list(played))
+    return GoodPolicy(source, act, _played(player))
+
+
+def _played(player: Player) -> list[PlayedEpisode]:
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + _EPISODES)
+    lanes = Lanes(player.task, _EPISODES)
+    lanes.reset(range(_EPISODES), seeds)
+    total = _EPISODES * player.task.max_episode_steps
+    with Progress(total=total, unit="step", unit_scale=True, leave=False, delay=1) as progress:
+        recording = record(lanes, player.begin(player.task, seeds), progress.update)
+    lanes.close()
+    return [
+        PlayedEpisode(
+            recording.observation[: length + 1, lane],
+            recording.reward[:length, lane],
+            bool(recording.terminated[lane]),
+        )
+        for lane, length in enumerate(recording.length.tolist())
+    ]
