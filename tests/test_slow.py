@@ -149,9 +149,8 @@ def test_the_linear_forward_code_is_reduced_rank_regression(face, weights):
     horizons, regressors, targets = (1, 4), [], []
     turn = 2 * math.pi / face.scaler.half_width
     angles = np.array([feature.is_angle for feature in face.task.features])
-    scale = np.tile(
-        np.repeat([weights.get(w, 1) for w in ("changes", "values", "reward")], (16, 16, 1)), 2
-    )
+    changes, values, reward = (weights.get(w, 1) for w in ("changes", "values", "reward"))
+    scale = np.sqrt(np.tile(np.repeat([changes, values, 16 * reward], (16, 16, 1)), 2))
     for rows, taken, reward in episodes(face):
         for start in range(0, len(rows) - 4):
             regressors.append(np.concatenate((rows[start], taken[start : start + 4].ravel())))

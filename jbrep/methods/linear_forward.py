@@ -22,10 +22,12 @@ def make(data: ScaledDataset, settings: Settings) -> Made:
     """Reduced-rank regression of what comes next on the row and the actions (Izenman 1975).
 
     Targets, at each horizon k: the change of each number over k steps, its value then, and the mean
-    reward until then, each brought to a variance of its squared weight. They are regressed on the
-    centred row x and the next actions together; B is the block of coefficients of the row, C its
-    covariance. The code is U' C^(-1/2) (x - mean), of the first left singular vectors U of
-    C^(1/2) B; its units have standard deviation 1/3. The spectrum is that of the singular values.
+    reward until then. Changes and values are brought to a variance of their weights, the reward to
+    its weight times the numbers in a row: at equal weights it counts as much as all changes
+    together. They are regressed on the centred row x and the next actions together; B is the block
+    of coefficients of the row, C its covariance. The code is U' C^(-1/2) (x - mean), of the first
+    left singular vectors U of C^(1/2) B; its units have standard deviation 1/3. The spectrum is
+    that of the singular values.
 
     It takes one pass over the windows; over a sample of them where rows are wide, see `blocks`.
     """
@@ -55,9 +57,12 @@ def make(data: ScaledDataset, settings: Settings) -> Made:
 
 
 def _weights(data: ScaledDataset, settings: Settings) -> Array:
-    """The weight of each target, (t,)."""
+    """The standard deviation that each target is brought to, (t,)."""
     sizes = data.size, data.size, 1
-    once = [np.full(n, settings[name]) for n, name in zip(sizes, _PARTS, strict=True)]
+    once = [
+        np.full(n, np.sqrt(settings[name] * data.size / n))
+        for n, name in zip(sizes, _PARTS, strict=True)
+    ]
     return np.tile(np.concatenate(once), len(settings["horizons"]))
 
 
