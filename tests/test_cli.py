@@ -179,7 +179,7 @@ def test_every_command_has_help_with_an_example(command):
                 "--out",
                 "x",
             ),
-            "pca takes no --seed: leave it out; it is for random, untrained, ae, dae",
+            "pca takes no --seed: leave it out; it is for random, ",
         ),
         (
             ("train-encoder", "--kind", "fly", "--data", "x", "--out", "x"),

@@ -122,10 +122,14 @@ def test_a_study_from_toml(tmp_path):
         ),
         ('"a2c"', '"dqn"', "unknown algorithm 'dqn'"),
         ('"a2c"', '"a2c-best"', "unknown preset 'best'"),
-        ('"pca-8"', '"fit-8"', "unknown kind 'fit'"),
-        ('"pca-8"', '"dae-wide-8"', "unknown architecture 'wide'"),
+        ('"pca-8"', '"fit-8"', "unknown representation 'fit-8'"),
+        ('"pca-8"', '"dae-wide-8"', "unknown representation 'dae-wide-8'"),
         *(
-            ('"pca-8"', f'"{name}"', f"unknown representation '{name}': it must be full, or a kind")
+            (
+                '"pca-8"',
+                f'"{name}"',
+                f"unknown representation '{name}': it must be full, or a method",
+            )
             for name in ("pca", "pca-08", "pca-0", "pca-deep-8", "dae-paper-8", "identity-8")
         ),
         ('"pca-8"', '"full"', "representations is .*each once"),
@@ -167,7 +171,7 @@ def test_a_study_from_toml(tmp_path):
             for training, message in [
                 ("{depth = 3}", "unknown training.depth: it must be one of epochs, "),
                 ("{latent = 3}", "unknown training.latent"),
-                ("{epochs = 'many'}", "training.epochs is 'many': it must be of type int"),
+                ("{epochs = 'many'}", "training.epochs is many: it must be a whole number"),
                 ("{epochs = 0}", "epochs"),
                 ("7", "training is 7: it must be a table"),
             ]
