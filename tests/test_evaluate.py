@@ -467,7 +467,8 @@ def test_dead_and_single_units_can_be_judged(held_out, parts, tmp_path):
 def test_the_observation_alone_can_be_judged(held_out, everything, tmp_path):
     evaluation = write({"identity": everything}, held_out.data, tmp_path)
     names = [plot.name for plot in encoder_plots(evaluation)]
-    assert names == ["error_by_feature", "latent_correlation"]
+    predictions = ["prediction_by_feature", "prediction_by_horizon"]
+    assert names == [*predictions, "error_by_feature", "latent_correlation"]
 
 
 def test_a_constant_feature_can_be_judged(data):

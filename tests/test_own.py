@@ -306,11 +306,16 @@ def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
     for plot in plots.values():
         plot.draw()
     alone = {**evaluation, "encoders": {n: own[n] for n in ("full", "half")}}
-    assert [plot.name for plot in encoder_plots(alone)] == ["latent_correlation"]
+    assert [plot.name for plot in encoder_plots(alone)] == [
+        "prediction_by_feature",
+        "prediction_by_horizon",
+        "latent_correlation",
+    ]
 
 
 def test_evaluate_takes_code(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.evaluate.evaluation._DIAGNOSTICS", {})
+    probes = {"nonlinear_probes": lambda encoder, held_out: {}}
+    monkeypatch.setattr("jbrep.evaluate.evaluation._DIAGNOSTICS", probes)
     monkeypatch.setattr("jbrep.evaluate.summary.evaluation_text", lambda *given: "")
     monkeypatch.setattr("jbrep.figures.encoder_plots", lambda evaluation: [])
     chosen = ("--encoder", "test_own:Half", "test_own:make_half", "dae-8")

@@ -376,8 +376,8 @@ def test_a_data_set_from_elsewhere(collected, tmp_path):
         prepare(plan)
         assert (plan.encoders("face_direction") / "pca-8.safetensors").exists()
     for name, message in (
-        ("pca-16", "reduce the 16 features of face_direction"),
-        ("pca-99", "reduce"),
+        ("pca-16", "pca-16 can't be trained for face_direction: latent size is 16"),
+        ("pca-99", "latent size is 99"),
     ):
         wrong = dataclasses.replace(study, representations=("full", name))
         with pytest.raises(InputError, match=message):
