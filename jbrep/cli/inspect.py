@@ -77,10 +77,10 @@ def inspect(
     if view:
         _run_viewer(path)
     if serve:
-        page, data = _free_ports(2)
-        click.echo(f"http://{_ADDRESS}:{page}/?url=rerun%2Bhttp://{_ADDRESS}:{data}/proxy")
+        page, recording = _free_ports(2)
+        click.echo(f"http://{_ADDRESS}:{page}/?url=rerun%2Bhttp://{_ADDRESS}:{recording}/proxy")
         click.echo("Ctrl-C stops it")
-        ports = ("--web-viewer-port", str(page), "--port", str(data))
+        ports = ("--web-viewer-port", str(page), "--port", str(recording))
         _run_viewer(path, "--serve-web", *ports)
 
 

@@ -1,6 +1,5 @@
 """A recording of an episode, with an encoder's reconstruction of it."""
 
-from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 
@@ -43,7 +42,7 @@ def record_episode(
     content = (rollout.observation, rollout.action, *([motion.qpos] if motion else []))
     examples = examples or from_rollout(rollout)
     fan = make_fan(rollout, encoder, examples) if encoder else None
-    about = provenance(rollout, encoder, fan.facts if fan else {})
+    about = provenance(rollout, encoder, fan.about if fan else "")
     recording = Recording(rollout.name, about, *content)
     times = times_at(task, np.arange(len(rollout) + 1))
     robot, pages = Robot(motion.model) if motion else None, []
@@ -66,10 +65,8 @@ def record_episode(
     recording.write(path, episode_layout(task, robot, encoder, pages))
 
 
-def provenance(
-    rollout: Rollout, encoder: BaseEncoder | None, more: Mapping[str, str] | None = None
-) -> str:
-    """The origin of an episode and its encoder, and more facts by name, as Markdown."""
+def provenance(rollout: Rollout, encoder: BaseEncoder | None, more: str = "") -> str:
+    """The origin of an episode and its encoder as Markdown, and more of it below."""
     facts = {"task": rollout.task.name}
     if rollout.task.arguments:
         facts["arguments"] = f"`{dict(rollout.task.arguments)}`"
@@ -87,8 +84,6 @@ def provenance(
             "sizes": f"{encoder.size} features, {encoder.latent_size} units",
             "SHA-256": f"`{encoder.fingerprint}`",
         }
-    facts |= more or {}
     facts |= {package: version(package) for package in ("jbrep", "mujoco")}
-    return "\n".join(
-        [f"# {rollout.name}", "", *(f"- {name}: {fact}" for name, fact in facts.items())]
-    )
+    lines = [f"# {rollout.name}", "", *(f"- {name}: {fact}" for name, fact in facts.items())]
+    return "\n".join([*lines, *(("", more) if more else ())])

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Array, Task
@@ -58,7 +59,7 @@ class Fan(NamedTuple):
 
     source: str
     names: list[str]
-    starts: Array
+    starts: NDArray[np.int64]
     steps: list[int]
     lines: dict[str, Array]
     truth: Array
@@ -70,15 +71,21 @@ class Fan(NamedTuple):
         return self.names[:MOST_LINES]
 
     @property
-    def facts(self) -> dict[str, str]:
-        """What a reader should know, for the provenance."""
-        steps = ", ".join(map(str, self.steps[1:]))
-        scores = [
-            f"{name} {' '.join(f'{value:.2f}' for value in values)}"
-            for name, values in zip(self.shown, self.explained.T, strict=False)
+    def about(self) -> str:
+        """What they are worth, as Markdown."""
+        lines = [
+            f"Forecasts are fitted to {self.source}. Grey is what came true; orange is foretold "
+            "for the actions taken; blue, green and pink for all actions held at their lowest, midway "
+            "and highest. R² of each quantity's change over some steps, under the actions taken "
+            "in this episode:",
+            "",
+            f"| {' | '.join(['steps', *map(str, self.steps[1:])])} |",
+            "|---" * len(self.steps) + "|",
         ]
-        words = f"R² of the change over {steps} steps under the actions taken, in this episode"
-        return {"forecasts": f"fitted to {self.source}; {words}: {'; '.join(scores)}"}
+        for name, scores in zip(self.shown, self.explained.T, strict=False):
+            cells = " | ".join("-" if np.isnan(score) else f"{score:.2f}" for score in scores)
+            lines.append(f"| {_words(name)} | {cells} |")
+        return "\n".join(lines)
 
 
 def make_fan(rollout: Rollout, encoder: BaseEncoder, examples: Examples) -> Fan | None:
@@ -127,10 +134,14 @@ def fan_pages(task: Task, fan: Fan) -> list[rrb.Grid]:
     middle = len(fan.steps) // 2
     scores = fan.explained[middle - 1]
     titles = {
-        f"{name}: R² of change over {fan.steps[middle]} steps {score:.2f}": f"{_path(name)}/**"
+        f"{_words(name)}: R² {score:.2f} over {fan.steps[middle]} steps": f"{_path(name)}/**"
         for name, score in zip(fan.shown, scores, strict=False)
     }
     return series_pages("forecasts", task, titles)
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def _path(name: str) -> str:
@@ -140,22 +151,23 @@ def _path(name: str) -> str:
 def _send_series(recording: Recording, rollout: Rollout, fan: Fan) -> None:
     """Send forecasts every 25 steps, with a gap after each, and the truth at all steps."""
     task, apart = rollout.task, slice(None, None, _APART // _EVERY)
-    gap = fan.steps[-1] + 1
-    steps = fan.starts[apart, None] + [*fan.steps, gap]
+    steps = fan.starts[apart, None] + np.array([*fan.steps, fan.steps[-1]])
     times = times_at(task, steps.ravel())
     true = columns(task, rollout.observation)
     for i, name in enumerate(fan.shown):
         lines = [_with_gaps(states[apart, :, i]) for states in fan.lines.values()]
-        labels = [f"{name}, {each.replace('_', ' ')}" for each in fan.lines]
+        labels = [f"{_words(name)}, {_words(each)}" for each in fan.lines]
         colours = [_COLOURS[each] for each in fan.lines]
         every = times_at(task, np.arange(len(rollout) + 1))
-        recording.send_series(f"{_path(name)}/truth", every, true[:, [i]], [name], [GREY], 3.0)
+        recording.send_series(
+            f"{_path(name)}/truth", every, true[:, [i]], [_words(name)], [GREY], 3.0
+        )
         values = np.stack(lines, axis=1)
         recording.send_series(f"{_path(name)}/ahead", times, values, labels, colours, 1.5)
 
 
 def _with_gaps(values: Array) -> Array:
-    """Lines (p, h), each followed by NaN, which ends a line in the viewer: (p * (h + 1),)."""
+    """Lines (p, h), each followed by NaN, which ends it in the viewer: (p * (h + 1),)."""
     return np.column_stack((values, np.full(len(values), np.nan))).ravel()
 
 

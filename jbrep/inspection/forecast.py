@@ -60,14 +60,11 @@ class Forecaster:
             if sum(len(each.change) for each in some) >= _FEWEST:
                 inputs, change = map(np.concatenate, zip(*some, strict=True))
                 self._predictors[ahead] = _nonlinear(inputs, change)
+        self.horizons = list(self._predictors)
         self.read: Callable[[Array], Array] = lambda latent: columns(task, encoder.decode(latent))
         if not encoder.can_decode:
             wanted = [columns(task, rows) for rows in examples.observations]
             self.read = ridge(np.concatenate(latents), np.concatenate(wanted))
-
-    @property
-    def horizons(self) -> list[int]:
-        return list(self._predictors)
 
     def __call__(self, latent: Array, actions: NDArray[Any], ahead: int) -> Array:
         """The states read from the codes (n, columns) that many steps after codes (n, l).
