@@ -76,8 +76,8 @@ class Fan(NamedTuple):
         lines = [
             f"Forecasts are fitted to {self.source}. Grey is what came true; orange is foretold "
             "for the actions taken; blue, green and pink for all actions held at their lowest, "
-            "midway and highest. R² of each quantity's change over some steps, under the actions taken "
-            "in this episode:",
+            "midway and highest. R² of each quantity's change over some steps, under the actions "
+            "taken in this episode:",
             "",
             f"| {' | '.join(['steps', *map(str, self.steps[1:])])} |",
             "|---" * len(self.steps) + "|",
