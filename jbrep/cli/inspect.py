@@ -28,6 +28,12 @@ _KEEPER = ("sh", "-c", "read -r _; kill 0")
 )
 @click.option("--traverse", is_flag=True, help="Show what each unit of the latent moves.")
 @click.option(
+    "--data",
+    type=click.Path(path_type=Path),
+    help="A data set, to fit an encoder's forecasts to; if not given SOURCE where it is one, else "
+    "the episode shown.",
+)
+@click.option(
     "--out", type=click.Path(path_type=Path), help="An .rrd file; one in inspect/ if not given."
 )
 @click.option("--view", is_flag=True, help="Open it in the Rerun viewer.")
@@ -42,6 +48,7 @@ def inspect(
     episode: int | None,
     encoder: str | None,
     traverse: bool,
+    data: Path | None,
     out: Path | None,
     view: bool,
     serve: bool,
@@ -52,7 +59,8 @@ def inspect(
     SOURCE is a data set, a run, a folder with several runs, an encoder's file, or a policy such as
     uniform, which needs a --task, as does an encoder by its name. An unfinished run plays its last
     checkpoint. The robot is shown where MuJoCo simulates it; with an encoder, what is decoded is
-    shown beside what was observed, and for the Jitterbug the decoded robot beside the true one.
+    shown beside what was observed, and for the Jitterbug the decoded robot beside the true one; so
+    are the next 20 steps as its latent foretells them, and the latent's slow and fast directions.
     """
     if view and serve:
         raise InputError("--view and --serve exclude each other: choose one")
@@ -64,15 +72,15 @@ def inspect(
 
     import_code(encoder)
     task = given_task(options, required=False)
-    path = record(source, episode, task, encoder, traverse, out, tell)
+    path = record(source, episode, task, encoder, traverse, out, data, tell)
     click.echo(printable(f"{path}" if view or serve else f"{path}; open it with: rerun {path}"))
     if view:
         _run_viewer(path)
     if serve:
-        page, data = _free_ports(2)
-        click.echo(f"http://{_ADDRESS}:{page}/?url=rerun%2Bhttp://{_ADDRESS}:{data}/proxy")
+        page, recording = _free_ports(2)
+        click.echo(f"http://{_ADDRESS}:{page}/?url=rerun%2Bhttp://{_ADDRESS}:{recording}/proxy")
         click.echo("Ctrl-C stops it")
-        ports = ("--web-viewer-port", str(page), "--port", str(data))
+        ports = ("--web-viewer-port", str(page), "--port", str(recording))
         _run_viewer(path, "--serve-web", *ports)
 
 

@@ -1,7 +1,7 @@
 """The viewer's layout of each recording."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,8 +36,16 @@ _EYE = (1.3, -2.5, 1.2)  # in sizes of the robot, from its root
 _NEAR_EYE = (0.9, -1.3, 0.65)  # likewise
 
 
-def episode_layout(task: Task, robot: Robot | None, encoder: BaseEncoder | None) -> rrb.Blueprint:
-    """The robot on the left, its signals on the right; the signals alone if there is no robot."""
+def episode_layout(
+    task: Task,
+    robot: Robot | None,
+    encoder: BaseEncoder | None,
+    pages: Sequence[rrb.Grid] = (),
+) -> rrb.Blueprint:
+    """The robot on the left, its signals on the right; the signals alone if there is no robot.
+
+    Pages about the encoder are more tabs beside the observation's.
+    """
     near = _window(task, _NEAR, _NEAR)
     about = rrb.TextDocumentView(origin=PROVENANCE, name="provenance")
     acting = [_series(name, [name], time_ranges=near) for name, _ in action_panels(task)]
@@ -56,8 +64,22 @@ def episode_layout(task: Task, robot: Robot | None, encoder: BaseEncoder | None)
         )
         for panel in latent_panels(encoder.latent_size)
     ]
-    numbers = [rrb.Tabs(*observed, about), _tabs(_pages("latent", units)), motor]
+    numbers = [rrb.Tabs(*observed, *pages, about), _tabs(_pages("latent", units)), motor]
     return _episode(task, _encoded_scene(task, robot, has_ghost), numbers)
+
+
+def series_pages(name: str, task: Task, titles: Mapping[str, str]) -> list[rrb.Grid]:
+    """Pages of plots of what is near in time: by their titles, what each shows."""
+    plots = [
+        _series(
+            title,
+            [contents],
+            plot_legend=rrb.PlotLegend(visible=False),
+            time_ranges=_window(task, _NEAR, _NEAR),
+        )
+        for title, contents in titles.items()
+    ]
+    return _pages(name, plots)
 
 
 def traversal_layout(units: int, robot: Robot | None, places: Array) -> rrb.Blueprint:

@@ -7,6 +7,9 @@ import numpy as np
 
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.inspection.blueprint import episode_layout
+from jbrep.inspection.directions import direction_pages, name_directions, send_directions
+from jbrep.inspection.examples import Examples, from_rollout
+from jbrep.inspection.fan import fan_pages, make_fan, send_fan
 from jbrep.inspection.ghost import send_ghost
 from jbrep.inspection.latent import send_encoding
 from jbrep.inspection.recording import Recording
@@ -17,22 +20,32 @@ from jbrep.rollouts.jitterbug import jitterbug_task
 from jbrep.rollouts.rollout import Rollout
 
 
-def record_episode(rollout: Rollout, path: Path, encoder: BaseEncoder | None = None) -> None:
+def record_episode(
+    rollout: Rollout,
+    path: Path,
+    encoder: BaseEncoder | None = None,
+    examples: Examples | None = None,
+) -> None:
     """Write an episode's recording.
 
     Args:
         rollout: the episode.
         path: the .rrd file.
-        encoder: for the episode's task; its latent is shown, and its reconstruction if it decodes.
+        encoder: for the episode's task; its latent is shown with what it foretells, and its
+            reconstruction if it decodes.
+        examples: what forecasts and directions are fitted to; the episode itself if not given.
 
     Raises:
         InputError: the file can't be written.
     """
     task, motion = rollout.task, rollout.motion
     content = (rollout.observation, rollout.action, *([motion.qpos] if motion else []))
-    recording = Recording(rollout.name, provenance(rollout, encoder), *content)
+    examples = examples or from_rollout(rollout)
+    fan = make_fan(rollout, encoder, examples) if encoder else None
+    about = provenance(rollout, encoder, fan.about if fan else "")
+    recording = Recording(rollout.name, about, *content)
     times = times_at(task, np.arange(len(rollout) + 1))
-    robot = Robot(motion.model) if motion else None
+    robot, pages = Robot(motion.model) if motion else None, []
     send_signals(recording, rollout)
     if robot and motion:
         send_scene(recording, robot, times, motion)
@@ -43,11 +56,17 @@ def record_episode(rollout: Rollout, path: Path, encoder: BaseEncoder | None = N
         send_encoding(recording, times, rollout, encoder, latent, decoded)
         if decoded is not None and robot and motion and jitterbug_task(task):
             send_ghost(recording, robot, times, task, motion, decoded)
-    recording.write(path, episode_layout(task, robot, encoder))
+        if fan:
+            send_fan(recording, rollout, fan, robot)
+            pages += fan_pages(task, fan)
+        if named := name_directions(encoder, task, examples):
+            send_directions(recording, times, latent.astype(np.float64), named)
+            pages += direction_pages(task, named)
+    recording.write(path, episode_layout(task, robot, encoder, pages))
 
 
-def provenance(rollout: Rollout, encoder: BaseEncoder | None) -> str:
-    """The origin of an episode and its encoder, as Markdown."""
+def provenance(rollout: Rollout, encoder: BaseEncoder | None, more: str = "") -> str:
+    """The origin of an episode and its encoder as Markdown, and more of it below."""
     facts = {"task": rollout.task.name}
     if rollout.task.arguments:
         facts["arguments"] = f"`{dict(rollout.task.arguments)}`"
@@ -66,6 +85,5 @@ def provenance(rollout: Rollout, encoder: BaseEncoder | None) -> str:
             "SHA-256": f"`{encoder.fingerprint}`",
         }
     facts |= {package: version(package) for package in ("jbrep", "mujoco")}
-    return "\n".join(
-        [f"# {rollout.name}", "", *(f"- {name}: {fact}" for name, fact in facts.items())]
-    )
+    lines = [f"# {rollout.name}", "", *(f"- {name}: {fact}" for name, fact in facts.items())]
+    return "\n".join([*lines, *(("", more) if more else ())])

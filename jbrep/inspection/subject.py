@@ -5,17 +5,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import find
 from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import SUFFIX as ENCODER_SUFFIX
 from jbrep.encoders.shipped import find_alone, source_of
 from jbrep.envs.encoding import BaseEncoder
-from jbrep.envs.task import Task
+from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
 from jbrep.inspection.curves import record_curves
 from jbrep.inspection.episode import record_episode
+from jbrep.inspection.examples import Examples, from_dataset
 from jbrep.inspection.recording import SUFFIX, check_out
 from jbrep.inspection.traversal import record_traversal
 from jbrep.rl.files import ENCODER, is_run
@@ -34,6 +36,7 @@ def inspect(
     encoder: Any = None,
     traverse: bool = False,
     out: Path | None = None,
+    data: Path | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> Path:
     """Write the Rerun recording of an episode, of a latent's units, or of a study's curves.
@@ -48,6 +51,8 @@ def inspect(
             `jbrep.encoders.find` takes it; a run's own if not given.
         traverse: whether to show what each unit of the latent moves, instead of the episode.
         out: the .rrd file; one in inspect/, named after its content, if not given.
+        data: a data set's folder, to fit forecasts to; if not given the source itself where it is a
+            data set, else the episode shown.
         tell: called with a line on where an encoder is from, and on a robot that can't be shown.
 
     Returns:
@@ -60,10 +65,10 @@ def inspect(
     if out:
         check_out(out)
     if source and _is_study(Path(source)):
-        if encoder is not None or traverse or task or episode is not None:
+        if encoder is not None or traverse or task or data or episode is not None:
             raise InputError(
                 f"{source} holds several runs, whose training curves are shown without --episode, "
-                "--task, --encoder and --traverse: give one run's folder to see an episode"
+                "--task, --encoder, --data and --traverse: give one run's folder to see an episode"
             )
         out = out or _default("curves", *_words(source))
         record_curves(read_runs(Path(source)), source, out)
@@ -73,12 +78,15 @@ def inspect(
         tell(f"encoder: {source_of(encoder, rollout.task)}")
     if rollout.note:
         tell(rollout.note)
+    if data and (traverse or not shown):
+        raise InputError("--data is for forecasts from a latent: give an --encoder, no --traverse")
     name = [rollout.task.slug, *_words(source), f"episode-{episode or 0}"]
     if shown:
         name.append(shown.name)
     if not traverse:
         out = out or _default(*name)
-        record_episode(rollout, out, shown)
+        examples = _examples(source, episode or 0, data, rollout.task) if shown else None
+        record_episode(rollout, out, shown, examples)
     elif shown:
         out = out or _default(*name, "traverse")
         record_traversal(rollout, out, shown)
@@ -118,6 +126,25 @@ def _find(
     if encoder is not None:
         return rollout, find(encoder, rollout.task)
     return rollout, _own(source) if is_trained(source) else None
+
+
+def _examples(source: str | None, episode: int, data: Path | None, task: Task) -> Examples | None:
+    """What forecasts are fitted to, if it isn't the episode that is shown.
+
+    Raises:
+        InputError: the data set is of another task, or has too few episodes.
+    """
+    own = Path(source) if source and exists(Path(source) / MANIFEST) else None
+    folder = data or own
+    if folder is None:
+        return None
+    dataset = Dataset(folder)
+    check_same(task, dataset.task, str(folder))
+    is_own = own is not None and own.resolve() == folder.resolve()
+    examples = from_dataset(dataset, episode if is_own else None)
+    if data and not examples:
+        raise InputError(f"{data} has too few episodes to fit forecasts to: collect more")
+    return examples
 
 
 def _acting(folder: Path | None, encoder: Any) -> Any:

@@ -1,0 +1,145 @@
+"""Forecasts of an encoder's code: what it and the next actions say of the next states."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from jbrep.envs.encoding import BaseEncoder
+from jbrep.envs.task import Array, Task
+from jbrep.evaluate.readout import ridge
+from jbrep.evaluate.regression import Predictor
+from jbrep.evaluate.truth import state
+from jbrep.inspection.examples import Examples
+
+HORIZONS = (5, 10, 15, 20)  # steps ahead
+_FEWEST = 50  # windows to fit a horizon to
+_HIDDEN = 200  # random ReLU features
+_LIMIT = 5.0  # standard deviations of an input
+
+
+class Windows(NamedTuple):
+    """States with what is known of them now, and some steps later in the same episode.
+
+    Attributes:
+        inputs: the code now and the actions until then, (n, l + k * m).
+        change: of the code, (n, l).
+    """
+
+    inputs: Array
+    change: Array
+
+
+class Forecaster:
+    """Predicts the code at several horizons, and reads the state from it.
+
+    The change of the code over k steps is a ridge regression on the code, the first k actions, and
+    200 random ReLU features of both (extreme learning machine, Huang et al. 2006): nonlinear, and
+    fitted at once. Windows in which an angle jumps by a turn are left out. The state is read from
+    what the encoder decodes or, where it can't decode, by a ridge regression on the code.
+
+    Args:
+        encoder: of the code.
+        task: of the examples.
+        examples: what is fitted to.
+
+    Attributes:
+        names: of the state's columns.
+        horizons: those that enough of the examples reach.
+    """
+
+    def __init__(self, encoder: BaseEncoder, task: Task, examples: Examples):
+        latents = [encode(encoder, rows) for rows in examples.observations]
+        self.names = list(state(task, examples.observations[0][:1]))
+        self._predictors: dict[int, Predictor] = {}
+        for ahead in HORIZONS:
+            parts = zip(latents, examples.actions, examples.observations, strict=True)
+            some = [windows(*part, task, ahead) for part in parts if len(part[1]) >= ahead]
+            if sum(len(each.change) for each in some) >= _FEWEST:
+                inputs, change = map(np.concatenate, zip(*some, strict=True))
+                self._predictors[ahead] = _nonlinear(inputs, change)
+        self.horizons = list(self._predictors)
+        self.read: Callable[[Array], Array] = lambda latent: columns(task, encoder.decode(latent))
+        if not encoder.can_decode:
+            wanted = [columns(task, rows) for rows in examples.observations]
+            self.read = ridge(np.concatenate(latents), np.concatenate(wanted))
+
+    def __call__(self, latent: Array, actions: NDArray[Any], ahead: int) -> Array:
+        """The states read from the codes (n, columns) that many steps after codes (n, l).
+
+        Args:
+            latent: the codes.
+            actions: from then on, (n, at least as many steps, m); later ones don't count.
+            ahead: one of the horizons.
+        """
+        inputs = np.hstack((latent, actions[:, :ahead].reshape(len(latent), -1)))
+        return self.read(latent + self._predictors[ahead](inputs))
+
+
+def encode(encoder: BaseEncoder, observation: NDArray[np.float32]) -> Array:
+    """Codes (n, l) of observations (n, d)."""
+    return np.asarray(encoder.encode(observation), np.float64)
+
+
+def columns(task: Task, observation: NDArray[Any]) -> Array:
+    """The state (n, columns) of observations (n, d)."""
+    return np.stack(list(state(task, observation).values()), axis=1)
+
+
+def next_actions(action: NDArray[Any], count: int) -> NDArray[Any]:
+    """The actions from each step on (n - count + 1, count, m), of actions (n, m)."""
+    return sliding_window_view(action, count, axis=0).swapaxes(1, 2)
+
+
+def windows(
+    latent: Array, action: NDArray[Any], observation: NDArray[Any], task: Task, ahead: int
+) -> Windows:
+    """All windows of part of an episode but those in which an angle jumps.
+
+    Args:
+        latent: codes, (n + 1, l).
+        action: (n, m), n at least `ahead`.
+        observation: (n + 1, d).
+        task: which says what is an angle.
+        ahead: steps from now to then.
+    """
+    angles = [feature.is_angle for feature in task.features]
+    turned = np.abs(observation[ahead:, angles] - observation[:-ahead, angles])
+    smooth = (turned <= np.pi).all(axis=1)
+    actions = next_actions(action, ahead)[smooth]
+    now = latent[:-ahead][smooth]
+    inputs = np.hstack((now, actions.reshape(len(now), -1)))
+    return Windows(inputs, latent[ahead:][smooth] - now)
+
+
+def _nonlinear(inputs: Array, wanted: Array) -> Predictor:
+    """A ridge regression on inputs (n, p) and random ReLU features of them, as a map."""
+    mean, deviation = inputs.mean(axis=0), inputs.std(axis=0)
+    factor = np.where(deviation > 0, 1 / np.where(deviation > 0, deviation, 1), 0)
+    random = np.random.default_rng(0)
+    weight = random.normal(size=(len(mean), _HIDDEN)) / np.sqrt(len(mean))
+    bias = random.uniform(-1, 1, _HIDDEN)
+
+    def widened(values: Array) -> Array:
+        standard = np.clip((values - mean) * factor, -_LIMIT, _LIMIT)
+        return np.hstack((standard, np.maximum(standard @ weight + bias, 0)))
+
+    predict = ridge(widened(inputs), wanted)
+    return lambda values: predict(widened(values))
+
+
+def explained(predicted: Array, true: Array) -> Array:
+    """R^2 of each column, (columns,); NaN of one that doesn't vary."""
+    residual = np.square(predicted - true).sum(axis=0)
+    variation = np.square(true - true.mean(axis=0)).sum(axis=0)
+    return np.where(variation > 0, 1 - residual / np.where(variation > 0, variation, 1), np.nan)
+
+
+def held(task: Task, steps: int) -> dict[str, Array]:
+    """All actions held at their lowest, midway and highest for so many steps, (steps, m) each."""
+    low, high = (np.asarray(bound, float) for bound in (task.action_low, task.action_high))
+    values: Sequence[Array] = (low, (low + high) / 2, high)
+    names = ("held_low", "held_midway", "held_high")
+    return {name: np.tile(value, (steps, 1)) for name, value in zip(names, values, strict=True)}
