@@ -151,6 +151,16 @@ def test_what_is_dropped_shows_where_it_matters(evaluation):
     assert full["value"][1] < full["value"][0] < full["value"][2]
 
 
+def test_what_the_reward_depends_on_counts_by_how_much_it_does(evaluation, held_out):
+    full = Encoder({"kind": "identity", "name": "full"}, held_out.data.scaler, (), ())
+    weights = dict(zip(NAMES, matters(full, held_out), strict=True))
+    assert max(weights, key=weights.get) == "place"
+    for entry in evaluation["encoders"].values():
+        told = entry["prediction"]["10"]
+        expected = sum(weights[n] * told["features"][n][0] for n in NAMES) / sum(weights.values())
+        assert told["rewarded"][0] == pytest.approx(expected, rel=1e-4)
+
+
 def test_an_evaluation_is_told_in_one_screen_and_in_older_files_as_before(evaluation):
     evaluation = json.loads(json.dumps(evaluation))
     shown = evaluation_text(evaluation, 80)
@@ -219,7 +229,9 @@ def test_r_squared_and_interval_by_episode(held_out):
     rows = held_out.data.test
     true = held_out.data.dataset["observation"][rows]
     predicted = true + np.random.default_rng(0).normal(size=true.shape) * [0.1, 1, 2, 0]
-    *parts, mean = explained(predicted, true, rows, held_out, [1, 1, 2], averaged=2).tolist()
+    *parts, mean = explained(
+        predicted, true, rows, held_out, [1, 1, 2], [np.array([1, 1, 0])]
+    ).tolist()
     expected = [r2_score(true[:, i].astype(float), predicted[:, i]) for i in (0, 1)]
     assert [part[0] for part in parts[:2]] == pytest.approx(expected)
     assert mean[0] == pytest.approx(np.mean(expected))

@@ -14,7 +14,7 @@ from jbrep.envs.encoding import BaseEncoder
 from jbrep.errors import InputError
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import latent
-from jbrep.evaluate.need import lost, needs
+from jbrep.evaluate.need import lost, matters, needs
 from jbrep.evaluate.policy import GoodPolicy, action, value
 from jbrep.evaluate.prediction import prediction
 from jbrep.evaluate.readout import correlation, dynamics, neighbours, nonlinear_probes, probes
@@ -26,7 +26,6 @@ FORMAT = "jbrep evaluation"
 FORMAT_VERSION = 2
 _Diagnostic = Callable[[BaseEncoder, HeldOut], Any]
 _DIAGNOSTICS: dict[str, _Diagnostic] = {
-    "prediction": prediction,
     "nonlinear_probes": nonlinear_probes,
     "reconstruction": reconstruction,
     "corruption": corruption,
@@ -66,9 +65,14 @@ def diagnose(
         _check(label, encoder, data)
     full = Encoder({"kind": IDENTITY, "name": FULL}, data.scaler, (), ())
     everything: dict[str, BaseEncoder] = {FULL: full, **judged}
-    diagnostics = _DIAGNOSTICS | _of_policy(policy)
+    rewarded = matters(full, held_out)
+    needed = needs(full, held_out, policy)
+    diagnostics = {
+        "prediction": lambda encoder, held_out: prediction(encoder, held_out, rewarded),
+        **_DIAGNOSTICS,
+        **_of_policy(policy),
+    }
     results: dict[str, Any] = {}
-    needed: dict[str, float] = {}
     with Progress(total=len(everything) * len(diagnostics), unit="diagnostic") as progress:
         for label, encoder in everything.items():
             result: dict[str, Any] = {"kind": encoder.kind, "latent": encoder.latent_size}
@@ -77,8 +81,6 @@ def diagnose(
                 possible = encoder.can_decode or name not in _DECODING
                 result[name] = diagnostic(encoder, held_out) if possible else None
                 progress.update()
-            if label == FULL:
-                needed = needs(encoder, held_out, policy)
             result["loses"] = lost(needed, result["nonlinear_probes"])
             result["method"] = _made(encoder)
             results[label] = result

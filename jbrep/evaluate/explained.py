@@ -22,7 +22,7 @@ def explained(
     rows: NDArray[np.int64],
     episodes: Episodes,
     widths: Sequence[int] | None = None,
-    averaged: int = 0,
+    means: Sequence[NDArray[Any]] = (),
 ) -> Interval:
     """R^2 of each part of predicted columns (n, k), (parts,); the columns of a part count together.
 
@@ -32,8 +32,8 @@ def explained(
         rows: their rows, (n,).
         episodes: of the rows, to resample.
         widths: of the parts; None for all columns as one part.
-        averaged: how many of the first parts are averaged, those that vary; the mean comes as one
-            more part at the end. 0 for no mean.
+        means: weights of the parts, (parts,), in weighted means of those that vary, which come as
+            further parts at the end.
     """
     true = np.asarray(true, np.float64)
     shifted = true - true.mean(axis=0)  # keeps the digits of a small variation
@@ -45,11 +45,12 @@ def explained(
     def statistic(residual: Array, total: Array, squares: Array, n: Array) -> Array:
         about_mean = variation(total, squares, n)
         parts = r_squared(*(np.add.reduceat(v, starts, axis=-1) for v in (residual, about_mean)))
-        if not averaged:
-            return parts
-        first = parts[..., :averaged]
-        known = np.isfinite(first)
-        mean = np.where(known, first, 0).sum(axis=-1, keepdims=True)
-        return np.append(parts, mean / known.sum(axis=-1, keepdims=True), axis=-1)
+        known = np.isfinite(parts)
+        filled = np.where(known, parts, 0)
+        for weights in means:
+            total = known @ weights
+            mean = np.where(total > 0, filled @ weights / np.where(total > 0, total, 1), np.nan)
+            parts = np.append(parts, mean[..., None], axis=-1)
+        return parts
 
     return bootstrap(statistic, *sums)

@@ -65,6 +65,11 @@ SCALARS = {
     "forward": Scalar(
         "R² of the features' change over 10 steps", 1, _at("prediction", HORIZON, "mean")
     ),
+    "rewarded": Scalar(
+        "R² of the change over 10 steps of what the reward depends on",
+        1,
+        _at("prediction", HORIZON, "rewarded"),
+    ),
     "reward": Scalar("R² of the mean reward of 10 steps", 1, _at("prediction", HORIZON, "reward")),
     "value": Scalar("R² of a good policy's return to go", 1, _at("value")),
     "action": Scalar("R² of a good policy's action", 1, _at("action", "nonlinear")),

@@ -1,6 +1,7 @@
 """What a controller needs of the state, and what a code loses of that."""
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.policy import GoodPolicy, action_predictor, value_predictor
-from jbrep.evaluate.prediction import following, predictors
+from jbrep.evaluate.prediction import Matters, following, predictors
 from jbrep.stats.bootstrap import Array
 
 _HORIZON = 10  # steps ahead
@@ -36,21 +37,13 @@ def needs(full: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None) -> di
     Returns:
         By the feature's name; empty where episodes are too short to look ahead.
     """
-    forward = predictors(full, held_out)
-    if not forward:
+    shares = _of_forward(full, held_out)
+    if shares is None:
         return {}
-    ahead = min(forward, key=lambda ahead: abs(ahead - _HORIZON))
-    steps = following(held_out, "test", ahead)
-    size = held_out.data.task.size
-    count = max(2, _NUMBERS // size)
-    shares = _shares(
-        lambda seen: forward[ahead](np.hstack((full.encode(seen), steps.action[:count]))),
-        steps.observation[:count],
-        steps.wanted[:count],
-    )
+    count = _count(held_out)
     moving, direct = shares[:, :-1], shares[:, -1]
     if policy is not None:
-        seen = steps.observation[:count]
+        seen = following(held_out, "test", _ahead(full, held_out)).observation[:count]
         acts = action_predictor(full, held_out, policy)
         by_action = _shares(lambda seen: acts(full.encode(seen)), seen, policy.act(seen))
         direct = np.maximum(direct, by_action.max(axis=1))
@@ -64,6 +57,42 @@ def needs(full: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None) -> di
             direct = np.maximum(direct, by_value[:, 0])
     need = np.maximum(direct, (moving * direct).max(axis=1))
     return dict(zip(held_out.data.task.feature_names, need.tolist(), strict=True))
+
+
+def matters(full: BaseEncoder, held_out: HeldOut) -> Matters:
+    """How much the mean reward of the next 10 steps depends on each feature, (d,), as `needs`.
+
+    None where episodes are too short, or the reward can't be foretold.
+    """
+    shares = _of_forward(full, held_out)
+    if shares is None or not shares[:, -1].any():
+        return None
+    return shares[:, -1]
+
+
+def _ahead(full: BaseEncoder, held_out: HeldOut) -> int:
+    """The number of steps ahead that is nearest to 10."""
+    return min(predictors(full, held_out), key=lambda ahead: abs(ahead - _HORIZON))
+
+
+def _count(held_out: HeldOut) -> int:
+    """Rows in which features are shuffled."""
+    return max(2, _NUMBERS // held_out.data.task.size)
+
+
+@lru_cache(1)
+def _of_forward(full: BaseEncoder, held_out: HeldOut) -> Array | None:
+    """The share that each feature has in the prediction of each change and of the reward."""
+    forward = predictors(full, held_out)
+    if not forward:
+        return None
+    ahead, count = _ahead(full, held_out), _count(held_out)
+    steps = following(held_out, "test", ahead)
+    return _shares(
+        lambda seen: forward[ahead](np.hstack((full.encode(seen), steps.action[:count]))),
+        steps.observation[:count],
+        steps.wanted[:count],
+    )
 
 
 def _shares(

@@ -15,6 +15,8 @@ from jbrep.evaluate.held_out import HeldOut, Rows, sample_rows
 from jbrep.evaluate.regression import Predictor, Problem, fit
 from jbrep.training.windows import first_rows
 
+Matters = NDArray[np.float64] | None
+
 HORIZONS = (1, 5, 10, 20)  # steps ahead
 _ROWS = {"train": 100_000, "test": 50_000}  # at most
 _USUAL = 0.5  # the share of rows that must have as many rows after them
@@ -41,15 +43,22 @@ class Steps(NamedTuple):
         return np.hstack((encoder.encode(self.observation), self.action))
 
 
-def prediction(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
+def prediction(encoder: BaseEncoder, held_out: HeldOut, matters: Matters = None) -> dict[str, Any]:
     """R^2 of each feature's change over k steps, and of the mean reward over them.
 
     Predicted nonlinearly from the latent and the next k actions, and no later ones; fitted to a
     sample of at most 100,000 training rows, judged on one of at most 50,000 held-out rows, fewer of
     wide robots. By the number of steps k, of 1, 5, 10 and 20: those that at least half the rows
-    have after them. `mean` is that over the features that change.
+    have after them. `mean` is that over the features that change; `rewarded` likewise, but weighted
+    by how much each matters to the reward.
+
+    Args:
+        encoder: to judge.
+        held_out: to judge on.
+        matters: how much the reward depends on each feature, (d,); None if that isn't known.
     """
     names = held_out.data.task.feature_names
+    means = [np.append(each, 0.0) for each in (np.ones(len(names)), matters) if each is not None]
     results = {}
     for ahead, predictor in predictors(encoder, held_out).items():
         steps = following(held_out, "test", ahead)
@@ -59,12 +68,13 @@ def prediction(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
             steps.rows,
             held_out,
             widths=[1] * (len(names) + 1),
-            averaged=len(names),
+            means=means,
         ).tolist()
         results[str(ahead)] = {
             "features": dict(zip(names, each, strict=False)),
-            "mean": each[-1],
-            "reward": each[-2],
+            "reward": each[len(names)],
+            "mean": each[len(names) + 1],
+            "rewarded": None if matters is None else each[-1],
         }
     return results
 

@@ -4,15 +4,15 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
-from torch.nn import functional
+from torch import Tensor, nn
 
+from jbrep.dae.gradient import Gradient
+from jbrep.dae.network import stack
 from jbrep.stats.bootstrap import Array
 from jbrep.training.trainer import single_torch_thread
 
@@ -69,7 +69,7 @@ def _fit(problem: Problem) -> Predictor:
     def predict(others: NDArray[Any]) -> Array:
         with single_torch_thread(), torch.inference_mode():
             blocks = enter(others).clamp_(-_LIMIT, _LIMIT).split(_BLOCK)
-            return torch.cat([_apply(network, block) for block in blocks]).numpy() * scale + mean
+            return torch.cat([network(block) for block in blocks]).numpy() * scale + mean
 
     return predict
 
@@ -83,32 +83,24 @@ def _standard(values: NDArray[Any]) -> tuple[Callable[[NDArray[Any]], Tensor], A
     return lambda others: torch.from_numpy(((others - mean) * factor).astype(np.float32)), scale
 
 
-def _trained(values: Tensor, wanted: Tensor, weights: Tensor) -> list[Tensor]:
-    """Weights and biases of each layer, in turn."""
+def _trained(values: Tensor, wanted: Tensor, weights: Tensor) -> nn.Sequential:
+    """The network after its training."""
     random = torch.Generator().manual_seed(0)
-    sizes = (values.shape[1], *_HIDDEN, wanted.shape[1])
-    network: list[Tensor] = []
-    for inputs, outputs in pairwise(sizes):
-        spread = (2 / inputs) ** 0.5  # He et al. 2015
-        weight = spread * torch.randn(outputs, inputs, generator=random)
-        network += [weight.requires_grad_(), torch.zeros(outputs, requires_grad=True)]
+    network = stack((values.shape[1], *_HIDDEN, wanted.shape[1]), "linear")
+    dense = [module for module in network if isinstance(module, nn.Linear)]
     with torch.no_grad():
-        network[-2] *= 0.1
+        for layer in dense:
+            spread = (2 / layer.in_features) ** 0.5  # He et al. 2015
+            layer.weight.normal_(0, spread, generator=random)
+            layer.bias.zero_()
+        dense[-1].weight.mul_(0.1)
     steps = max(1, min(_STEPS, _PASSES * len(values) // _BATCH))
-    adam = torch.optim.Adam(network, lr=_LEARNING_RATE, fused=True)
+    gradient = Gradient(network, _BATCH, weights)
+    adam = torch.optim.Adam(network.parameters(), lr=_LEARNING_RATE, fused=True)
     for step in range(steps):
         rising, falling = (step + 1) / (_RISING * steps), (1 + math.cos(math.pi * step / steps)) / 2
         adam.param_groups[0]["lr"] = _LEARNING_RATE * min(rising, 1) * falling
         rows = torch.randint(len(values), (_BATCH,), generator=random)
-        error = _apply(network, values[rows]) - wanted[rows]
-        adam.zero_grad()
-        (error.square() * weights).mean().backward()
+        gradient(values[rows].T, wanted[rows].T)
         adam.step()
-    return [each.detach() for each in network]
-
-
-def _apply(network: list[Tensor], values: Tensor) -> Tensor:
-    *layers, last = zip(network[::2], network[1::2], strict=True)
-    for weight, bias in layers:
-        values = functional.linear(values, weight, bias).relu()
-    return functional.linear(values, *last)
+    return network

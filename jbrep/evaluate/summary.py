@@ -12,6 +12,7 @@ from jbrep.text import facts, interval, number, table
 
 _SERVES = {  # of the headline
     "forward": "the features' change over 10 steps, from code and actions",
+    "rewarded": "of that, what the reward depends on",
     "reward": "the mean reward of these steps",
     "value": "the discounted return to go",
     "action": "the action",
