@@ -18,7 +18,7 @@ from jbrep.evaluate import diagnose, regression
 from jbrep.evaluate.explained import explained
 from jbrep.evaluate.headline import SCALARS, headline
 from jbrep.evaluate.held_out import HeldOut
-from jbrep.evaluate.need import lost, needs
+from jbrep.evaluate.need import lost, matters, needs
 from jbrep.evaluate.policy import GoodPolicy, PlayedEpisode, returns_to_go, value
 from jbrep.evaluate.prediction import following, prediction, usual_horizons
 from jbrep.evaluate.readout import nonlinear_probes, probes
