@@ -80,7 +80,6 @@ data: $(READY) ## data sets of five million states in data/: half an hour, 4 GB
 	  $(BIN)/jbrep data derive data/face_direction --task $$task --out data/$$task || exit; done
 
 encoders: data ## results/encoders/ from these: hours; goes on where it was stopped
-	rm -rf $(addprefix results/encoders/,$(TASKS))
 	$(BIN)/python tools/encoders.py data encoders results/encoders $(TASKS)
 
 decoded: $(READY) ## results/decoded.txt anew: hand-written policies on what encoders give back
