@@ -252,9 +252,26 @@ def test_regression_finds_what_is_not_linear_and_repeats_to_the_last_bit():
     assert (twice[0][:, 2] == 0).all()
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
-    again = fit([problem])[0](values[15_000:])
+    again = [each(values[15_000:]) for each in fit([problem, problem])]
     torch.set_num_threads(threads)
-    assert again.tobytes() == twice[0].tobytes() == twice[1].tobytes()
+    assert again[0].tobytes() == twice[0].tobytes()
+    assert again[1].tobytes() == twice[1].tobytes()
+
+
+def test_regressions_side_by_side_are_of_their_own_values():
+    random = np.random.default_rng(0)
+    narrow, wide = random.normal(size=(9_000, 2)), random.normal(size=(12_000, 7))
+    problems = [
+        Problem(narrow, narrow.prod(axis=1, keepdims=True)),
+        Problem(wide, np.abs(wide[:, :3]), np.array([1.0, 1.0, 0.0])),
+    ]
+    first, second = fit(problems)
+    for known, predictor, problem in ((1, first, problems[0]), (2, second, problems[1])):
+        predicted = predictor(problem.values)
+        assert predicted.shape == problem.wanted.shape
+        for i in range(known):
+            assert r2_score(problem.wanted[:, i], predicted[:, i]) > 0.9
+    assert r2_score(problems[1].wanted[:, 2], predicted[:, 2]) < 0.5  # its weight is 0
 
 
 def test_returns_to_go_are_discounted():

@@ -1,18 +1,17 @@
 """Nonlinear regression of many quantities at once, in the same time however many rows there are."""
 
 import math
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
+from torch.nn import functional
 
-from jbrep.dae.gradient import Gradient
-from jbrep.dae.network import stack
 from jbrep.stats.bootstrap import Array
 from jbrep.training.trainer import single_torch_thread
 
@@ -46,61 +45,112 @@ class Problem(NamedTuple):
 def fit(problems: Sequence[Problem]) -> list[Predictor]:
     """Fit a network to each problem: three hidden layers of 64 ReLU units, by Adam.
 
-    1,000 steps with 256 rows each, fewer if that is more than 20 times all rows. Values and what is
-    wanted are standardised, and values limited to 5 standard deviations. The networks are fitted
-    side by side, one on each core, and each comes out the same to the last bit however many there
-    are.
+    1,000 steps with 256 rows each, fewer if that is more than 20 times all rows of a problem.
+    Values and what is wanted are standardised, and values limited to 5 standard deviations. The
+    networks learn independently, but are multiplied at once: with so few units, calls would take
+    most of the time.
     """
-    with single_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(_fit, problems))
+    enter = [_Standard(problem.values) for problem in problems]
+    leave = [_Standard(problem.wanted) for problem in problems]
+    values = [at(p.values).clamp_(-_LIMIT, _LIMIT) for at, p in zip(enter, problems, strict=True)]
+    wanted = [to(p.wanted) for to, p in zip(leave, problems, strict=True)]
+    with single_torch_thread():
+        network = _trained(values, wanted, [_weights(problem) for problem in problems])
+    return [
+        partial(_predict, _one_of(network, i, at, to), at, to)
+        for i, (at, to) in enumerate(zip(enter, leave, strict=True))
+    ]
 
 
-def _fit(problem: Problem) -> Predictor:
-    values, wanted, weights = problem
-    enter, _ = _standard(values)
-    leave, scale = _standard(wanted)
-    network = _trained(
-        enter(values).clamp_(-_LIMIT, _LIMIT),
-        leave(wanted),
-        torch.ones(wanted.shape[1]) if weights is None else torch.from_numpy(weights).float(),
-    )
-    mean = wanted.mean(axis=0, dtype=np.float64)
-
-    def predict(others: NDArray[Any]) -> Array:
-        with single_torch_thread(), torch.inference_mode():
-            blocks = enter(others).clamp_(-_LIMIT, _LIMIT).split(_BLOCK)
-            return torch.cat([network(block) for block in blocks]).numpy() * scale + mean
-
-    return predict
+def _one_of(network: list[Tensor], i: int, enter: "_Standard", leave: "_Standard") -> list[Tensor]:
+    """One of the networks, without what fills it up."""
+    own = [part[i] for part in network]
+    inputs, outputs = len(enter.mean), len(leave.mean)
+    return [own[0][:inputs], *own[1:-2], own[-2][:, :outputs], own[-1][:, :outputs]]
 
 
-def _standard(values: NDArray[Any]) -> tuple[Callable[[NDArray[Any]], Tensor], Array]:
-    """A map to columns of mean 0 and deviation 1, and these deviations; constant ones become 0."""
-    mean, deviation = (getattr(values, name)(axis=0, dtype=np.float64) for name in ("mean", "std"))
-    varies = deviation > _NEGLIGIBLE * np.abs(values).max(axis=0)
-    scale = np.where(varies, deviation, 0)
-    factor = np.where(varies, 1 / np.where(varies, deviation, 1), 0)
-    return lambda others: torch.from_numpy(((others - mean) * factor).astype(np.float32)), scale
+def _predict(
+    network: list[Tensor], enter: "_Standard", leave: "_Standard", values: NDArray[Any]
+) -> Array:
+    with single_torch_thread(), torch.inference_mode():
+        blocks = enter(values).clamp_(-_LIMIT, _LIMIT).split(_BLOCK)
+        given = torch.cat([_apply(network, block) for block in blocks]).numpy()
+    return given * leave.deviation + leave.mean
 
 
-def _trained(values: Tensor, wanted: Tensor, weights: Tensor) -> nn.Sequential:
-    """The network after its training."""
+class _Standard:
+    """Columns brought to mean 0 and deviation 1; constant ones become 0.
+
+    Attributes:
+        mean: of each column, (p,).
+        deviation: of each column, (p,); 0 for constant ones.
+    """
+
+    def __init__(self, values: NDArray[Any]):
+        self.mean, deviation = (
+            getattr(values, name)(axis=0, dtype=np.float64) for name in ("mean", "std")
+        )
+        varies = deviation > _NEGLIGIBLE * np.abs(values).max(axis=0)
+        self.deviation = np.where(varies, deviation, 0)
+        self._factor = np.where(varies, 1 / np.where(varies, deviation, 1), 0)
+
+    def __call__(self, values: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(((values - self.mean) * self._factor).astype(np.float32))
+
+
+def _weights(problem: Problem) -> Tensor:
+    """The weight of each thing wanted in a mean over all, (q,)."""
+    count = problem.wanted.shape[1]
+    given = np.ones(count) if problem.weights is None else problem.weights
+    return torch.from_numpy(given / count).float()
+
+
+def _trained(values: list[Tensor], wanted: list[Tensor], weights: list[Tensor]) -> list[Tensor]:
+    """Weights (m, in, out) and biases (m, 1, out) of each layer of m networks, in turn.
+
+    Values (n, p), what is wanted (n, q) and its weights (q,) are of each network; narrower ones are
+    filled up with zeros, from which nothing is learnt.
+    """
     random = torch.Generator().manual_seed(0)
-    network = stack((values.shape[1], *_HIDDEN, wanted.shape[1]), "linear")
-    dense = [module for module in network if isinstance(module, nn.Linear)]
-    with torch.no_grad():
-        for layer in dense:
-            spread = (2 / layer.in_features) ** 0.5  # He et al. 2015
-            layer.weight.normal_(0, spread, generator=random)
-            layer.bias.zero_()
-        dense[-1].weight.mul_(0.1)
-    steps = max(1, min(_STEPS, _PASSES * len(values) // _BATCH))
-    gradient = Gradient(network, _BATCH, weights)
-    adam = torch.optim.Adam(network.parameters(), lr=_LEARNING_RATE, fused=True)
+    lengths = torch.tensor([len(each) for each in values])
+    first = torch.cumsum(lengths, 0) - lengths  # row of each problem
+    seen, true = (_padded(each) for each in (values, wanted))
+    counted = _padded([each[None] for each in weights])[:, None]
+    network = _begin([each.shape[1] for each in values], true.shape[1], random)
+    steps = max(1, min(_STEPS, _PASSES * int(lengths.min()) // _BATCH))
+    adam = torch.optim.Adam(network, lr=_LEARNING_RATE, fused=True)
     for step in range(steps):
         rising, falling = (step + 1) / (_RISING * steps), (1 + math.cos(math.pi * step / steps)) / 2
         adam.param_groups[0]["lr"] = _LEARNING_RATE * min(rising, 1) * falling
-        rows = torch.randint(len(values), (_BATCH,), generator=random)
-        gradient(values[rows].T, wanted[rows].T)
+        drawn = torch.rand(len(values), _BATCH, generator=random, dtype=torch.float64)
+        rows = (drawn * lengths[:, None]).long() + first[:, None]
+        error = _apply(network, seen[rows]) - true[rows]
+        adam.zero_grad()
+        ((error.square() * counted).sum() / _BATCH).backward()
         adam.step()
+    return [each.detach() for each in network]
+
+
+def _begin(inputs: list[int], outputs: int, random: torch.Generator) -> list[Tensor]:
+    """Initial weights by He et al. 2015, small ones in the last layer, and biases of 0."""
+    count, sizes = len(inputs), (max(inputs), *_HIDDEN, outputs)
+    network = []
+    for i, (before, after) in enumerate(pairwise(sizes)):
+        fan_in = torch.tensor(inputs if i == 0 else [before] * count, dtype=torch.float32)
+        weight = torch.randn(count, before, after, generator=random)
+        weight *= (2 / fan_in).sqrt()[:, None, None] * (0.1 if i == len(_HIDDEN) else 1)
+        network += [weight.requires_grad_(), torch.zeros(count, 1, after, requires_grad=True)]
     return network
+
+
+def _padded(parts: list[Tensor]) -> Tensor:
+    """The rows (n, p) of all parts, one after the other, with zeros up to the widest."""
+    widest = max(part.shape[1] for part in parts)
+    return torch.cat([functional.pad(part, (0, widest - part.shape[1])) for part in parts])
+
+
+def _apply(network: list[Tensor], values: Tensor) -> Tensor:
+    *layers, (weight, bias) = zip(network[::2], network[1::2], strict=True)
+    for inner, shift in layers:
+        values = (values @ inner + shift).relu()
+    return values @ weight + bias
