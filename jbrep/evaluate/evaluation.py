@@ -1,6 +1,8 @@
 """Encoders side by side on the held-out part of a data set."""
 
+import os
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from jbrep.evaluate.readout import correlation, dynamics, neighbours, nonlinear_
 from jbrep.evaluate.reconstruction import corruption, reconstruction
 from jbrep.progress import Progress
 from jbrep.stats.bootstrap import RESAMPLES
+from jbrep.training.trainer import single_torch_thread
 
 FORMAT = "jbrep evaluation"
 FORMAT_VERSION = 2
@@ -72,18 +75,22 @@ def diagnose(
         **_DIAGNOSTICS,
         **_of_policy(policy),
     }
-    results: dict[str, Any] = {}
     with Progress(total=len(everything) * len(diagnostics), unit="diagnostic") as progress:
-        for label, encoder in everything.items():
+
+        def judge(label: str, encoder: BaseEncoder) -> dict[str, Any]:
             result: dict[str, Any] = {"kind": encoder.kind, "latent": encoder.latent_size}
             for name, diagnostic in diagnostics.items():
                 progress.set_description_str(f"{label} {name.replace('_', ' ')}", refresh=False)
                 possible = encoder.can_decode or name not in _DECODING
                 result[name] = diagnostic(encoder, held_out) if possible else None
                 progress.update()
-            result["loses"] = lost(needed, result["nonlinear_probes"])
-            result["method"] = _made(encoder)
-            results[label] = result
+            return {
+                **result,
+                "loses": lost(needed, result["nonlinear_probes"]),
+                "method": _made(encoder),
+            }
+
+        results = _side_by_side(judge, everything)
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -94,6 +101,23 @@ def diagnose(
         "needs": needed,
         "encoders": results,
     }
+
+
+def _side_by_side(
+    judge: Callable[[str, BaseEncoder], dict[str, Any]], encoders: Mapping[str, BaseEncoder]
+) -> dict[str, dict[str, Any]]:
+    """What is said of each encoder, as many at a time as there are cores.
+
+    The first one goes alone, since the others share samples of rows with it.
+    """
+    (first, encoder), *others = encoders.items()
+    with single_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        results = {first: judge(first, encoder)}
+        futures = {label: pool.submit(judge, label, each) for label, each in others}
+        try:
+            return results | {label: future.result() for label, future in futures.items()}
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def _of_policy(policy: GoodPolicy | None) -> dict[str, _Diagnostic]:
