@@ -29,32 +29,33 @@ from jbrep.methods.registry import get_method, name_of
 from jbrep.study.diagnostics import evaluated
 
 SHIPPED = Path(__file__).parent.parent / "jbrep" / "encoders" / "shipped"
-MADE: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("dae", {}),
-    ("dae", {"architecture": "deep"}),
-    ("ae", {}),
-    ("pca", {}),
-    ("random", {}),
-    ("untrained", {}),
-    ("untrained", {"architecture": "deep"}),
-    ("slow", {}),
-    ("vamp", {}),
-    ("linear-forward", {}),
-    ("forward", {}),
-    ("self-prediction", {}),
-    ("deepmdp", {}),
-    ("ddae", {}),
-    ("vae", {}),
-    ("lld-vae", {}),
+SIZES = (12, 8, 4)
+MADE: tuple[tuple[str, dict[str, Any], tuple[int, ...]], ...] = (
+    ("dae", {}, SIZES),
+    ("pca", {}, SIZES),
+    ("random", {}, SIZES),
+    ("slow", {}, SIZES),
+    ("vamp", {}, SIZES),
+    ("linear-forward", {}, SIZES),
+    ("forward", {}, SIZES),
+    ("self-prediction", {}, (8,)),
+    ("deepmdp", {}, (8,)),
+    ("dae", {"architecture": "deep"}, (8,)),
+    ("ae", {}, (8,)),
+    ("ddae", {}, (8,)),
+    ("vae", {}, (8,)),
+    ("lld-vae", {}, (8,)),
+    ("untrained", {}, (8,)),
+    ("untrained", {"architecture": "deep"}, (8,)),
 )
 
 
-def names_and_settings(latents: list[int], kinds: list[str]) -> dict[str, tuple[str, Any]]:
+def names_and_settings(kinds: list[str]) -> dict[str, tuple[str, Any]]:
     """Kind and settings of each encoder, by its name."""
     made = [
         (kind, {**settings, "latent": latent})
-        for kind, settings in MADE
-        for latent in latents
+        for kind, settings, sizes in MADE
+        for latent in sizes
         if not kinds or kind in kinds
     ]
     methods = [(get_method(kind), settings) for kind, settings in made]
@@ -134,12 +135,11 @@ def main() -> None:
     for folder in ("data", "encoders", "results"):
         parser.add_argument(folder, type=Path)
     parser.add_argument("tasks", nargs="*")
-    parser.add_argument("--latent", type=int, nargs="+", default=[12, 8, 4])
     parser.add_argument("--only", nargs="+", default=[], help="kinds to make; all by default")
     parser.add_argument("--ship", nargs="+", default=[], help="kinds to put among what ships")
     given = parser.parse_args()
     os.nice(10)  # it takes hours
-    wanted = names_and_settings(given.latent, given.only)
+    wanted = names_and_settings(given.only)
     for task in given.tasks:
         data, results = given.data / task, given.results / task
         scaled = ScaledDataset(Dataset(data))
