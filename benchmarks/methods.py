@@ -31,6 +31,7 @@ ROWS = 250_000  # of which 80 % are trained on; all times are scaled to a millio
 MILLION = 1_000_000
 USUAL_ROWS = 20_000  # that plain PyTorch goes through
 REQUIRED_ONES = {"latent": 8, "features": "velocity_*"}
+PADDED = 32  # numbers of the method that only adds some
 ROUNDS = 3
 
 
@@ -93,9 +94,8 @@ def usual_epoch(objective: Objective, windows: UsualWindows, ready: Any, size: i
 
 def required(method: Method) -> dict[str, Any]:
     """Its defaults, with what has to be given."""
-    return method.settings(
-        {k: v for k, v in REQUIRED_ONES.items() if method.own.get(k) is REQUIRED}
-    )
+    given = {k: v for k, v in REQUIRED_ONES.items() if method.own.get(k) is REQUIRED}
+    return method.settings(given | ({"latent": PADDED} if method.name == "noise" else {}))
 
 
 def compare(name: str, method: Learned, data: ScaledDataset) -> None:

@@ -260,16 +260,16 @@ def test_the_encoders_that_ship_are_listed(monkeypatch, tmp_path):
     save(identity(task), folder / "identity.safetensors")
     for name in ("pca-8", "pca-4"):
         shutil.copy(Path("jbrep/encoders/shipped/face_direction", f"{name}.safetensors"), folder)
-    given = {"forward": 0.512, "reward": None}
+    given = {"forward": 0.512, "rewarded": 0.25, "reward": None}
     shas = {name: find(name, task).fingerprint for name in ("full", "pca-8")}
     rows = [Diagnosed(task.name, name, sha, given) for name, sha in shas.items()]
     write_diagnostics(folder / "diagnostics.csv", [*rows, rows[1]._replace(sha256="another")])
     lines = jbrep("encoder", "list", "--task", "face_direction").output.splitlines()
     cells = [line.split()[:5] for line in lines[:5]]
     assert cells[1:] == [
-        ["encoder", "l", "forward", "reward", "value"],
-        ["full", "16", "0.51", "-", "-"],
-        ["pca-8", "8", "0.51", "-", "-"],
+        ["encoder", "l", "forward", "rewarded", "reward"],
+        ["full", "16", "0.51", "0.25", "-"],
+        ["pca-8", "8", "0.51", "0.25", "-"],
         ["pca-4", "4", "-", "-", "-"],
     ]
     listed = json.loads(jbrep("encoder", "list", "--task", "face_direction", "--json").output)

@@ -115,7 +115,7 @@ def encoder() -> None:
     """Look at encoders, export and import them."""
 
 
-_COLUMNS = {name: name for name in ("forward", "reward", "value", "action")}
+_COLUMNS = {name: name for name in ("forward", "rewarded", "reward", "value", "action")}
 _COLUMNS["times_pca"] = "error"
 
 

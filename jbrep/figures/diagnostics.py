@@ -15,7 +15,7 @@ from jbrep.figures.style import PAGE, Looks, Styles, ink, plain, reference
 from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.association import Association
 
-_SHOWN = ("forward", "reward", "value", "action", "probes", "error")  # in panels of their own
+_SHOWN = ("rewarded", "forward", "reward", "value", "action", "error")  # in panels of their own
 _ACROSS, _HEIGHT = 3, 1.65  # panels beside each other, and their height [inches]
 _PANEL = (1.05, 0.95)  # of their axes, about [inches]
 _CHARACTER, _LINE, _MARKER = 0.038, 0.08, 0.045  # of a name, and of a point's radius [inches]
