@@ -22,8 +22,8 @@ from jbrep.encoders.file import SUFFIX
 from jbrep.envs.task import Task
 from jbrep.evaluate.evaluation import FORMAT_VERSION
 from jbrep.evaluate.files import EVALUATION
+from jbrep.evaluate.headline import headline
 from jbrep.evaluate.summary import evaluation_text
-from jbrep.methods.autoencoder import NOISE
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method, name_of
 from jbrep.study.diagnostics import evaluated
@@ -113,21 +113,20 @@ def ship(task: Task, files: list[Path], kinds: list[str], results: Path) -> None
 
 
 def overview(results: Path) -> str:
-    """A table by task: error as a multiple of PCA's, and at noise 0.1 of the best linear code's."""
-    files = sorted(results.glob("*/evaluation.json"))
+    """A table by task: R² of the change of what is rewarded, and error over PCA's."""
+    files = sorted(results.glob(f"*/{EVALUATION}"))
     tasks = {file.parent.name: json.loads(file.read_text())["encoders"] for file in files}
-    names = [n for n in dict.fromkeys(n for e in tasks.values() for n in e) if n != FULL]
     lines = [f"| | {' | '.join(tasks)} |", "|---" * (len(tasks) + 1) + "|"]
-    for name in names:
+    for name in dict.fromkeys(name for encoders in tasks.values() for name in encoders):
         cells = [_cell(encoders[name]) if name in encoders else "-" for encoders in tasks.values()]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 def _cell(encoder: dict[str, Any]) -> str:
-    noisy = next(level for level in encoder["corruption"] if level["noise"] == NOISE)
-    clean = encoder["reconstruction"]["ratio_to_pca"][0]
-    return f"{clean:.2f}, {noisy['mse'][0] / noisy['linear_mse'][0]:.2f}"
+    told = headline(encoder)
+    known = [told[name][0] for name in ("rewarded", "times_pca") if told[name]]
+    return ", ".join(f"{value:.2f}" for value in known) or "-"
 
 
 def main() -> None:
