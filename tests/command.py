@@ -1,6 +1,5 @@
 """jbrep's commands, as a stranger would type them."""
 
-import os
 import subprocess
 import sys
 import time
@@ -22,19 +21,6 @@ def start(*arguments):
     """The same in a process of its own, which can be killed."""
     command = [sys.executable, "-c", "from jbrep.cli import main; main()", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def run_on_dying_cluster(what, out):
-    """Run a part of `cluster.py`; Ray writes to a home of its own."""
-    told = subprocess.run(
-        [sys.executable, Path(__file__).with_name("cluster.py"), what, out],
-        capture_output=True,
-        text=True,
-        timeout=600,
-        env={**os.environ, "HOME": str(out.parent)},
-    )
-    assert told.returncode == 0, told.stderr[-3000:]
-    assert "a node died at work" in told.stdout
 
 
 def wait_for(happened, process, seconds=120):

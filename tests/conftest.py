@@ -106,7 +106,7 @@ def diverging(brief, monkeypatch, tmp_path):
     monkeypatch.setattr(Simulation, "step", spoil)
 
 
-LONGEST = ("test_whole", "test_study", "test_rl", "test_cli", "test_report")
+LONGEST = ("test_cluster", "test_whole", "test_study", "test_rl", "test_cli", "test_report")
 
 
 def pytest_collection_modifyitems(items):

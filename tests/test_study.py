@@ -18,7 +18,6 @@ import pytest
 import robots
 from command import (
     jbrep,
-    run_on_dying_cluster,
     start,
     wait_for,
     wait_for_the_end_of,
@@ -58,7 +57,6 @@ TINY = Study(
     evaluation_episodes=1,
     episode_steps=100,
 )
-ON_RAY = dataclasses.replace(TINY, seeds=(0,), steps=1000, evaluate_every=1000)
 TOML = """
 tasks = ["face_direction"]
 algorithms = ["a2c"]
@@ -463,18 +461,6 @@ def test_a_stopped_study_leaves_checkpoints_and_no_workers(tmp_path):
     told = jbrep("report", out)
     assert told.exit_code == 2
     assert told.stderr == f"Error: no finished run below {out}: jbrep study resumes it\n"
-
-
-def test_on_a_cluster_that_loses_a_node(tmp_path):
-    pytest.importorskip("ray")
-    run_on_dying_cluster("study", tmp_path / "ray")
-    plan = Plan(ON_RAY, tmp_path / "here")
-    for cell in plan.cells:
-        assert work(cell.name, plan.run(cell), plan.folder_of(cell)).status == "finished"
-    pairs = zip(read_runs(tmp_path / "ray"), read_runs(plan.folder), strict=True)
-    for ours, theirs in pairs:
-        assert (ours.label, ours.settings) == (theirs.label, theirs.settings)
-        np.testing.assert_array_equal(ours.returns, theirs.returns)
 
 
 def test_progress_is_a_line_for_each_run_where_there_is_no_terminal(done, capsys, monkeypatch):
