@@ -1,4 +1,4 @@
-"""A study and a data set on a Ray cluster that loses a node at each: python tests/cluster.py OUT."""
+"""A study and a data set on a Ray cluster that loses a node: python tests/cluster.py OUT."""
 
 import sys
 import threading
@@ -56,7 +56,7 @@ def dying_node(cluster, is_at_work):
 
 
 def run(study, study_folder, data, data_folder):
-    """Run a study and collect a data set; the study first, for both nodes start its workers then."""
+    """Run the study first: its runs overlap where neither node has a worker yet."""
     with running_cluster() as cluster:
         with dying_node(cluster, lambda: len(list(study_folder.rglob(PROGRESS))) >= 2):
             assert run_study(Plan(study, study_folder), on_ray, 2) == 0

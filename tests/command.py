@@ -8,6 +8,7 @@ from pathlib import Path
 from click.testing import CliRunner
 
 from jbrep.cli import main
+from jbrep.study.work import work
 
 
 def jbrep(*arguments):
@@ -21,6 +22,12 @@ def start(*arguments):
     """The same in a process of its own, which can be killed."""
     command = [sys.executable, "-c", "from jbrep.cli import main; main()", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def in_this_process(plan, cells, workers):
+    """A backend that starts no process and sees what a test has patched."""
+    for cell in cells:
+        yield work(cell.name, plan.run(cell), plan.folder_of(cell))
 
 
 def wait_for(happened, process, seconds=120):
