@@ -8,6 +8,8 @@ DEMO := demo
 DEMO_RUN := $(DEMO)/study/runs/face_direction/sac-modern/dae-8/seed-0
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
+export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
+
 .PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12

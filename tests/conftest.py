@@ -46,16 +46,26 @@ def quick_evaluations():
         yield
 
 
+def collected_once(name, settings, tmp_path_factory):
+    """Collected by the worker that needs it first; the other reads the same files."""
+    from filelock import FileLock
+
+    from jbrep.collect import collect
+
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder = base / name / "face_direction"
+    with FileLock(base / f"{name}.lock"):
+        collect(settings, folder)  # leaves it alone where it is complete
+    return folder
+
+
 @pytest.fixture(scope="session")
 def collected(tmp_path_factory):
     """Five shards of an episode each, with states: to be read, or copied before it is changed."""
     from small import settings
 
-    from jbrep.collect import collect
-
-    folder = tmp_path_factory.mktemp("collected") / "face_direction"
-    collect(settings(), folder)
-    return folder
+    return collected_once("collected", settings(), tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
@@ -63,11 +73,7 @@ def brief(tmp_path_factory):
     """The same with episodes of 100 steps."""
     import small
 
-    from jbrep.collect import collect
-
-    folder = tmp_path_factory.mktemp("brief") / "face_direction"
-    collect(small.brief(), folder)
-    return folder
+    return collected_once("brief", small.brief(), tmp_path_factory)
 
 
 @pytest.fixture
@@ -106,7 +112,7 @@ def diverging(brief, monkeypatch, tmp_path):
     monkeypatch.setattr(Simulation, "step", spoil)
 
 
-LONGEST = ("test_whole", "test_study", "test_rl", "test_cli", "test_report")
+LONGEST = ("test_cluster", "test_whole", "test_study", "test_rl", "test_cli", "test_report")
 
 
 def pytest_collection_modifyitems(items):

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
+from command import in_this_process, jbrep, start, wait_for, wait_for_the_end_of, workers_of
 from small import contents
 
 from jbrep.report.report import SUMMARY
 from jbrep.study.heuristics import HEURISTIC_RETURNS
 from jbrep.study.results import RETURNS, STATISTICS
+from jbrep.study.runner import BACKENDS
 
 STUDY = """
 tasks = ["face_direction"]
@@ -36,7 +37,7 @@ POINTS = {  # at which each stage may be killed: so many such files are there
 _LONGEST = 0.2  # seconds from there to the kill
 
 
-def stages(folder, workers=1):
+def stages(folder, workers=2):
     """The commands, each of which needs those before."""
     data, study = folder / "data", folder / "tiny.toml"
     study.write_text(STUDY.format(data=data))
@@ -54,6 +55,7 @@ def in_peace(folder):
     """Run all, the report by its own command; what each said."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jbrep.study.heuristics._EPISODES", 2)  # they would take as long as the rest
+        patch.setitem(BACKENDS, "local", in_this_process)
         with pytest.MonkeyPatch.context() as once:
             once.setattr("jbrep.report.write_report", lambda folder, out: [])
             said = {stage: jbrep(*given).output for stage, given in stages(folder).items()}
@@ -65,12 +67,14 @@ def killed(folder, seed, peace):
     random, told = np.random.default_rng(seed), []
     (folder / "study").mkdir(parents=True)
     shutil.copy(peace / "study" / HEURISTIC_RETURNS, folder / "study")
-    for stage, given in stages(folder, workers=2).items():
+    for stage, given in stages(folder).items():
         point = POINTS[stage][random.integers(len(POINTS[stage]))]
         delay = random.uniform(0, _LONGEST)
         told.append(f"seed {seed}: {stage} killed {delay:.3f} s after {point[1]} of {point[0]}")
         _kill(given, folder, *point, delay, told[-1])
-        again = jbrep(*stages(folder)[stage])
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setitem(BACKENDS, "local", in_this_process)
+            again = jbrep(*stages(folder)[stage])
         assert again.exit_code == 0, f"{told}\n{again.output[-2000:]}"
     return "; ".join(told)
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from command import (
     jbrep,
-    run_on_dying_cluster,
     start,
     wait_for,
     wait_for_the_end_of,
@@ -169,12 +168,6 @@ def test_a_stopped_and_a_killed_collector_are_resumed(long, tmp_path, monkeypatc
     told = jbrep(*command)
     assert told.exit_code == 0, told.output
     assert contents(data) == contents(long)
-
-
-def test_on_a_cluster_that_loses_a_node(long, tmp_path):
-    pytest.importorskip("ray")
-    run_on_dying_cluster("data", tmp_path / "data")
-    assert contents(tmp_path / "data") == contents(long)
 
 
 def test_repair_restores_the_last_shard_and_others(sledges, tmp_path):

@@ -27,7 +27,11 @@ def found(pattern):
     ]
 
 
-@pytest.mark.parametrize("block", found(r"^```python\n(.*?)^```"))
+PYTHON = found(r"^```python\n(.*?)^```")
+(ENVIRONMENT,) = (block for block in PYTHON if "Env)" in block.values[0])
+
+
+@pytest.mark.parametrize("block", [block for block in PYTHON if block is not ENVIRONMENT])
 def test_the_python_runs(block, monkeypatch, tmp_path):
     for name in ("data", "jbrep"):  # what the blocks read; what they write stays out of here
         (tmp_path / name).symlink_to(ROOT / name)
@@ -53,11 +57,7 @@ def test_the_studies_are_studies(block):
 
 def test_the_features_are_those_of_the_environment_shown(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "environments.md").read_text()
-    environment = next(
-        b for b in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if "Env)" in b
-    )
-    exec(compile(environment, "block", "exec"), {})
+    exec(compile(*ENVIRONMENT.values, "block", "exec"), {})
     (features,) = FEATURES
     (tmp_path / "features.toml").write_text(features.values[0])
     task = describe("Cart-v0", features=tmp_path / "features.toml")

@@ -6,6 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from command import in_this_process
+
+from jbrep.study.runner import BACKENDS
 
 OWN = Path("examples/own/own.py").resolve()
 
@@ -14,6 +17,7 @@ OWN = Path("examples/own/own.py").resolve()
 @pytest.mark.filterwarnings("ignore")  # a user sees them once, if at all
 def test_everything_that_one_can_bring(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
+    monkeypatch.setitem(BACKENDS, "local", in_this_process)
     monkeypatch.setattr("jbrep.envs.names._imported", [])  # it imports net
     monkeypatch.setattr(sys, "argv", [str(OWN), str(tmp_path / "out")])
     monkeypatch.syspath_prepend(OWN.parent)

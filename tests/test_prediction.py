@@ -86,9 +86,10 @@ def controller(seen):
 
 @pytest.fixture(scope="module", autouse=True)
 def learning():
-    """Steps enough for the cart."""
+    """Steps and horizons enough for the cart."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(regression, "_STEPS", 600)
+        patch.setattr("jbrep.evaluate.prediction.HORIZONS", (1, 5, 10))
+        patch.setattr(regression, "_STEPS", 400)
         yield
 
 
@@ -239,7 +240,8 @@ def test_r_squared_and_interval_by_episode(held_out):
     assert parts[1][2] - parts[1][1] > 3 * by_row
 
 
-def test_regression_finds_what_is_not_linear_and_repeats_to_the_last_bit():
+def test_regression_finds_what_is_not_linear_and_repeats_to_the_last_bit(monkeypatch):
+    monkeypatch.setattr(regression, "_STEPS", 600)
     random = np.random.default_rng(0)
     values = random.normal(size=(20_000, 6)) * [1, 1, 1, 1e4, 1, 0] + [0, 0, 0, 0, 1e6, 3]
     wanted = np.stack(

@@ -290,7 +290,8 @@ def test_a_run_that_is_asked_to_stop_writes_a_checkpoint_and_resumes_from_there(
 
 
 def test_ctrl_c_stops_the_command_with_a_checkpoint(tmp_path):
-    settings = ("--task", TASK.name, "--steps", "1M", "--evaluation-episodes", 1, "--out", tmp_path)
+    settings = ("--task", TASK.name, "--episode-steps", STEPS, "--evaluation-episodes", 1)
+    settings += ("--steps", "1M", "--out", tmp_path)
     command = [sys.executable, "-c", "from jbrep.cli import main; main()", "rl"]
     process = subprocess.Popen(
         [*command, *map(str, settings)],

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import robots
 from command import (
+    in_this_process,
     jbrep,
-    run_on_dying_cluster,
     start,
     wait_for,
     wait_for_the_end_of,
@@ -58,7 +58,6 @@ TINY = Study(
     evaluation_episodes=1,
     episode_steps=100,
 )
-ON_RAY = dataclasses.replace(TINY, seeds=(0,), steps=1000, evaluate_every=1000)
 TOML = """
 tasks = ["face_direction"]
 algorithms = ["a2c"]
@@ -75,12 +74,6 @@ def tables(folder):
     """The tables of a study, as bytes."""
     write_results(read_results(folder), folder)
     return [(folder / name).read_bytes() for name in (RETURNS, STATISTICS)]
-
-
-def in_this_process(plan, cells, workers):
-    """A backend that starts no process and sees what a test has patched."""
-    for cell in cells:
-        yield work(cell.name, plan.run(cell), plan.folder_of(cell))
 
 
 @pytest.fixture(scope="module")
@@ -455,26 +448,14 @@ def test_a_stopped_study_leaves_checkpoints_and_no_workers(tmp_path):
     """Nor does a killed one leave workers: test_whole, and test_pool while they start."""
     path, out = tmp_path / "long.toml", tmp_path / "stopped"
     path.write_text(TOML.replace("steps = 80", "steps = 1_000_000", 1))
-    process = start("study", path, "--out", out, "--workers", 2)
-    assert wait_for(lambda: len(list(out.rglob(PROGRESS))) == 2, process), process.communicate()[1]
+    process = start("study", path, "--out", out, "--workers", 1)
+    assert wait_for(lambda: list(out.rglob(PROGRESS)), process), process.communicate()[1]
     told = stop(process)
     assert "stopping: the runs under way write their checkpoints" in told
-    assert len(list(out.rglob(CHECKPOINT))) == 2
+    assert len(list(out.rglob(CHECKPOINT))) == 1
     told = jbrep("report", out)
     assert told.exit_code == 2
     assert told.stderr == f"Error: no finished run below {out}: jbrep study resumes it\n"
-
-
-def test_on_a_cluster_that_loses_a_node(tmp_path):
-    pytest.importorskip("ray")
-    run_on_dying_cluster("study", tmp_path / "ray")
-    plan = Plan(ON_RAY, tmp_path / "here")
-    for cell in plan.cells:
-        assert work(cell.name, plan.run(cell), plan.folder_of(cell)).status == "finished"
-    pairs = zip(read_runs(tmp_path / "ray"), read_runs(plan.folder), strict=True)
-    for ours, theirs in pairs:
-        assert (ours.label, ours.settings) == (theirs.label, theirs.settings)
-        np.testing.assert_array_equal(ours.returns, theirs.returns)
 
 
 def test_progress_is_a_line_for_each_run_where_there_is_no_terminal(done, capsys, monkeypatch):

@@ -1,0 +1,44 @@
+"""Data sets and studies on a Ray cluster: they outlive its nodes."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small import contents
+from test_any_collect import some
+from test_study import TINY
+
+from jbrep.collect import collect
+from jbrep.study.plan import Plan
+from jbrep.study.results import read_runs
+from jbrep.study.work import work
+
+DATA = some(steps=6000, shard_episodes=50)
+STUDY = dataclasses.replace(TINY, seeds=(0,), steps=1000, evaluate_every=1000)
+
+
+def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):
+    """One cluster for both: it takes seconds to start."""
+    pytest.importorskip("ray")
+    told = subprocess.run(
+        [sys.executable, Path(__file__).with_name("cluster.py"), tmp_path],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        env={**os.environ, "HOME": str(tmp_path)},  # where Ray writes
+    )
+    assert told.returncode == 0, told.stderr[-3000:]
+    assert told.stdout.count("a node died at work") == 2
+    collect(DATA, tmp_path / "data-here", num_threads=1)
+    assert contents(tmp_path / "data") == contents(tmp_path / "data-here")
+    plan = Plan(STUDY, tmp_path / "study-here")
+    for cell in plan.cells:
+        assert work(cell.name, plan.run(cell), plan.folder_of(cell)).status == "finished"
+    pairs = zip(read_runs(tmp_path / "study"), read_runs(plan.folder), strict=True)
+    for ours, theirs in pairs:
+        assert (ours.label, ours.settings) == (theirs.label, theirs.settings)
+        np.testing.assert_array_equal(ours.returns, theirs.returns)
