@@ -1,6 +1,8 @@
 """Networks of dense layers: the paper's, and others."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -87,6 +89,14 @@ def check_size(architecture: Architecture, size: int, latent: int) -> None:
         )
 
 
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Within, torch's generator, which initialises weights, starts from a seed."""
+    with torch.random.fork_rng(devices=()):
+        torch.manual_seed(seed)
+        yield
+
+
 def stacks(
     architecture: Architecture, size: int, latent: int, seed: int, initial: str = "torch"
 ) -> tuple[nn.Sequential, nn.Sequential]:
@@ -100,8 +110,7 @@ def stacks(
         initial: `torch` for its initial weights, `normal` for N(0, 1) with biases of 0.
     """
     sizes = (size, *architecture.hidden, latent)
-    with torch.random.fork_rng(devices=()):
-        torch.manual_seed(seed)
+    with seeded(seed):
         encoder = stack(sizes, architecture.code)
         decoder = stack(tuple(reversed(sizes)), architecture.output)
         if initial == "normal":

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from jbrep.dae.network import check_size, get_architecture, layers, stack
+from jbrep.dae.network import check_size, get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
 from jbrep.errors import InputError
 from jbrep.methods.linear_forward import turns
@@ -62,8 +62,7 @@ class Forward(Objective):
         self._action_size, self._sizes = data.task.action_size, (size, size, 1)
         reads = tuple(latent + k * self._action_size for k in self._horizons)
         self._inverse_weight = settings["inverse"]
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(settings["seed"])
+        with seeded(settings["seed"]):
             self.encoder = stack((size, *hidden, latent), "linear")
             self.predictors = Predictors(reads, sum(self._sizes))
             if self._inverse_weight:
