@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import EXTREMA, fit_scaler
@@ -135,6 +135,12 @@ class ScaledDataset:
             loaded[start : start + len(chunk)] = chunk
             start += len(chunk)
         return loaded
+
+    def actions(self, rows: NDArray[np.int64], dtype: DTypeLike = np.float32) -> NDArray[Any]:
+        """Actions of the rows, scaled to [-1, 1] by their bounds in that type, (n, k)."""
+        bounds = self.task.action_low, self.task.action_high
+        low, high = (np.asarray(bound, dtype) for bound in bounds)
+        return (self.dataset["action"][rows] - (high + low) / 2) / ((high - low) / 2)
 
     @cached_property
     def moments(self) -> Moments:

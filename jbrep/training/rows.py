@@ -62,14 +62,7 @@ def actions_of(
     data: ScaledDataset, rows: NDArray[np.int64], device: torch.device, memory: int
 ) -> Rows:
     """The same of the actions (n, k), scaled to [-1, 1] by their bounds."""
-    column, task = data.dataset["action"], data.task
-    low, high = (np.asarray(bound, np.float32) for bound in (task.action_low, task.action_high))
-    middle, reach = (high + low) / 2, (high - low) / 2
-
-    def load(rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        return ((column[rows] - middle) / reach).astype(np.float32, copy=False)
-
-    return _rows(load, rows, task.action_size, device, memory)
+    return _rows(data.actions, rows, data.task.action_size, device, memory)
 
 
 def _rows(
