@@ -111,6 +111,13 @@ class ScaledDataset:
         """Features that are constant over the training rows; they are scaled to 0."""
         return self._names(self.scaler.low == self.scaler.high)
 
+    @cached_property
+    def reward_varies(self) -> bool:
+        """Whether not all training rows have the same reward."""
+        parts = self.dataset["reward"].parts(self.train)
+        first = self.dataset["reward"][self.train[0]]
+        return any((part != first).any() for part in parts)
+
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
         return tuple(np.array(self.task.feature_names)[which].tolist())
 

@@ -107,6 +107,11 @@ def _check(data: ScaledDataset, settings: Settings) -> None:
             "deepmdp without reward makes a constant code, which is easy to predict: give the "
             "reward a weight above 0"
         )
+    if not data.reward_varies:
+        raise InputError(
+            f"the reward is constant in {data.dataset.folder}, with which deepmdp makes a constant "
+            "code: use data in which it varies"
+        )
 
 
 METHOD = Learned(

@@ -9,15 +9,13 @@ from torch import Tensor
 
 from jbrep.dae.network import check_size, get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
-from jbrep.errors import InputError
-from jbrep.methods.linear_forward import turns
 from jbrep.methods.method import Learned, Settings
 from jbrep.methods.predictors import HIDDEN, Predictors
 from jbrep.methods.settings import REQUIRED, STANDARD
+from jbrep.methods.targets import PARTS, check_targets, turns
 from jbrep.training.objective import Layers, Objective
 from jbrep.training.windows import Windows
 
-_PARTS = ("changes", "values", "reward")  # of what is predicted
 _FITTED = 200_000  # windows to which targets are standardised
 _SMALL = 1e-6  # standard deviation of a target that says nothing
 
@@ -67,7 +65,7 @@ class Forward(Objective):
             self.predictors = Predictors(reads, sum(self._sizes))
             if self._inverse_weight:
                 self.inverse = stack((2 * latent, HIDDEN, self._action_size), "linear")
-        each = [settings[name] / n for name, n in zip(_PARTS, self._sizes, strict=True)]
+        each = [settings[name] / n for name, n in zip(PARTS, self._sizes, strict=True)]
         turn = torch.from_numpy(turns(data)).float()[:, None]  # infinite for what is no angle
         for name, buffer in (
             ("_turn", turn.nan_to_num(posinf=0)),
@@ -137,7 +135,7 @@ class Forward(Objective):
         by_part = [part.mean(1).tolist() for part in errors.split(self._sizes, 1)]
         return {
             "loss_by_horizon": {
-                str(k): dict(zip(_PARTS, losses, strict=True))
+                str(k): dict(zip(PARTS, losses, strict=True))
                 for k, losses in zip(self._horizons, zip(*by_part, strict=True), strict=True)
             }
         }
@@ -145,8 +143,7 @@ class Forward(Objective):
 
 def _check(data: ScaledDataset, settings: Settings) -> None:
     check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
-    if not any(settings[name] for name in (*_PARTS, "inverse")):
-        raise InputError("forward has nothing to predict: all its weights are 0")
+    check_targets(data, settings, "forward", ("inverse",))
 
 
 class _Forward(Learned):
