@@ -74,12 +74,18 @@ def get_architecture(name: str) -> Architecture:
     return replace(ARCHITECTURES["deep"], name="x".join(map(str, hidden)), hidden=hidden)
 
 
-def check_size(architecture: Architecture, size: int, latent: int) -> None:
+def check_size(name: str, size: int, latent: int) -> None:
     """Make sure that a network from `size` features to `latent` units fits an encoder's file.
+
+    Args:
+        name: of its architecture.
+        size: features.
+        latent: units.
 
     Raises:
         InputError: it is too large.
     """
+    architecture = get_architecture(name)
     widths = (size, *architecture.hidden, latent)
     needed = 2 * _BYTES * sum(before * after for before, after in pairwise(widths))
     if needed > MAX_BYTES:

@@ -21,7 +21,7 @@ def check(data: ScaledDataset, settings: Settings) -> None:
     Raises:
         InputError: they don't.
     """
-    check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
+    check_size(settings["architecture"], data.size, settings["latent"])
     feature_weights(data, settings.get("weights", {}))
 
 

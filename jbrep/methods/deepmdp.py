@@ -101,7 +101,7 @@ class DeepMDP(Objective):
 
 
 def _check(data: ScaledDataset, settings: Settings) -> None:
-    check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
+    check_size(settings["architecture"], data.size, settings["latent"])
     if not settings["reward"]:
         raise InputError(
             "deepmdp without reward makes a constant code, which is easy to predict: give the "

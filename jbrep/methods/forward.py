@@ -142,7 +142,7 @@ class Forward(Objective):
 
 
 def _check(data: ScaledDataset, settings: Settings) -> None:
-    check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
+    check_size(settings["architecture"], data.size, settings["latent"])
     check_targets(data, settings, "forward", ("inverse",))
 
 

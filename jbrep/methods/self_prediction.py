@@ -65,7 +65,7 @@ class SelfPrediction(Objective):
 
 
 def _check(data: ScaledDataset, settings: Settings) -> None:
-    check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
+    check_size(settings["architecture"], data.size, settings["latent"])
     if settings["latent"] == 1:
         raise InputError(
             "self-prediction divides a code by its average magnitude, which leaves a single unit "
