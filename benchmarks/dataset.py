@@ -18,14 +18,13 @@ import h5py
 import numpy as np
 import torch
 from mujoco.batch import Batch
+from rows import make_rows
 from timing import show, timed
 from torch.utils.data import DataLoader, TensorDataset
 
 from jbrep import jitterbug
 from jbrep.collect import collect
 from jbrep.dataset import Dataset, Settings
-from jbrep.dataset.manifest import commit, new_manifest
-from jbrep.dataset.schema import EPISODES
 from jbrep.jitterbug.model import PHYSICS_STEPS, fast_model, stop_profiling
 from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS
 
@@ -131,27 +130,6 @@ def memory_of(steps: int, folder: Path) -> float:
     return int(done.stdout.split()[-1]) / 1000
 
 
-def make_rows(folder: Path) -> Dataset:
-    """Five million rows of noise, in the shards that a collector writes."""
-    settings = Settings(task=TASK, steps=ROWS)
-    manifest = new_manifest(settings)
-    folder.mkdir()
-    random = np.random.default_rng(0)
-    episodes = settings.shard_episodes
-    while not manifest.complete:
-        columns = {
-            name: random.integers(
-                0,
-                100,
-                spec.shape(episodes if name.startswith(EPISODES) else episodes * EPISODE_STEPS),
-            ).astype(spec.dtype)
-            for name, spec in manifest.specs().items()
-        }
-        columns[EPISODES + "length"][:] = EPISODE_STEPS
-        manifest = commit(folder, manifest, columns)
-    return Dataset(folder)
-
-
 def copy_through(blocks: Iterator[Any], size: int) -> None:
     buffer = np.empty((BATCH, size), np.float32)
     for block in blocks:
@@ -159,7 +137,8 @@ def copy_through(blocks: Iterator[Any], size: int) -> None:
 
 
 def compare_readers(folder: Path) -> None:
-    data = make_rows(folder / "rows")
+    random = np.random.default_rng(0)
+    data = make_rows(folder / "rows", TASK, ROWS, lambda _, shape: random.integers(0, 100, shape))
     flat, size = folder / "flat", data.task.size
     np.asarray(data["observation"]).tofile(flat)
     codes = {

@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from rows import make_rows
 from timing import show, timed
 from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as Mapped
 
-from jbrep.dataset import Dataset, ScaledDataset, Settings
-from jbrep.dataset.manifest import commit, new_manifest
-from jbrep.dataset.schema import EPISODES
+from jbrep.dataset import ScaledDataset
 from jbrep.methods.method import ClosedForm, Learned, Method
 from jbrep.methods.registry import METHODS
 from jbrep.methods.settings import REQUIRED
@@ -37,23 +36,14 @@ ROUNDS = 3
 
 
 def make_data(folder: Path) -> ScaledDataset:
-    """Rows in which each number wanders, in the shards that a collector writes."""
-    settings = Settings(task=TASK, steps=ROWS)
-    manifest = new_manifest(settings)
-    folder.mkdir()
+    """Rows in which each number wanders."""
     random = np.random.default_rng(0)
-    episodes = settings.shard_episodes
-    while not manifest.complete:
-        columns = {}
-        for name, spec in manifest.specs().items():
-            rows = episodes if name.startswith(EPISODES) else episodes * EPISODE
-            values = random.uniform(-1, 1, spec.shape(rows))
-            if name == "observation":
-                values = np.cumsum(values, axis=0) % 2 - 1
-            columns[name] = values.astype(spec.dtype)
-        columns[EPISODES + "length"][:] = EPISODE
-        manifest = commit(folder, manifest, columns)
-    return ScaledDataset(Dataset(folder))
+
+    def draw(name: str, shape: tuple[int, ...]) -> np.ndarray:
+        values = random.uniform(-1, 1, shape)
+        return np.cumsum(values, axis=0) % 2 - 1 if name == "observation" else values
+
+    return ScaledDataset(make_rows(folder, TASK, ROWS, draw))
 
 
 class UsualWindows(Mapped[Any]):

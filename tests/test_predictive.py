@@ -198,3 +198,18 @@ def test_mistakes_are_said_in_a_line(data, tmp_path, kind, settings, said):
         Fitter(data, tmp_path / "out").fit(kind, **{"latent": 3, **settings})
     assert "\n" not in str(raised.value)
     assert not list(tmp_path.glob("out/*.safetensors"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "weights"),
+    [
+        ("deepmdp", {}),
+        ("forward", {"changes": 0, "values": 0}),
+        ("linear-forward", {"changes": 0, "values": 0}),
+    ],
+)
+def test_a_constant_reward_is_no_target(kind, weights, tmp_path):
+    dataset = HiddenDataset(3, 30)
+    dataset.arrays["reward"][:] = 0.1
+    with pytest.raises(InputError, match=f"{kind}.*varies"):
+        Fitter(ScaledDataset(dataset), tmp_path).plan(kind, latent=2, **weights)

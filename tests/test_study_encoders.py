@@ -5,6 +5,7 @@ import json
 import shutil
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import onnx
@@ -19,6 +20,7 @@ from jbrep.encoders.diagnostics import DIAGNOSTICS, read_diagnostics
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
 from jbrep.errors import DamageError, InputError
+from jbrep.evaluate.files import write
 from jbrep.figures.diagrams import autoencoders
 from jbrep.figures.style import styles
 from jbrep.report.facts import encoder_rows, outline, reproduce
@@ -222,6 +224,17 @@ def test_diagnostics_are_matched_by_the_encoders(done, tmp_path):
     write_evaluation(tmp_path / "bad", {"a": (shas["mine"][0], "many")})
     with pytest.raises(DamageError, match=r"bad/evaluation\.json is damaged: 'many' is no number"):
         add_diagnostics(folder, [str(tmp_path / "bad")])
+
+
+def test_an_evaluation_knows_code_by_the_hash_of_its_runs(done, tmp_path, monkeypatch):
+    empty = {"encoders": {"dense": {}, "net": {}}}
+    monkeypatch.setattr("jbrep.evaluate.files.diagnose", lambda *_: empty)
+    own = {"dense": DENSE["code"], "net": CODE["code"]}  # kept as a file, and not
+    evaluation = write(own, SimpleNamespace(task=SHARED["task"]), tmp_path)
+    for cell in done.cells:
+        if (name := cell.representation.name) in own:
+            used = read_run(done.folder_of(cell))["settings"]["encoder"]
+            assert evaluation["encoders"][name]["sha256"] == used
 
 
 def write_evaluation(folder, forward):

@@ -1,6 +1,8 @@
 """Networks of dense layers: the paper's, and others."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -72,12 +74,18 @@ def get_architecture(name: str) -> Architecture:
     return replace(ARCHITECTURES["deep"], name="x".join(map(str, hidden)), hidden=hidden)
 
 
-def check_size(architecture: Architecture, size: int, latent: int) -> None:
+def check_size(name: str, size: int, latent: int) -> None:
     """Make sure that a network from `size` features to `latent` units fits an encoder's file.
+
+    Args:
+        name: of its architecture.
+        size: features.
+        latent: units.
 
     Raises:
         InputError: it is too large.
     """
+    architecture = get_architecture(name)
     widths = (size, *architecture.hidden, latent)
     needed = 2 * _BYTES * sum(before * after for before, after in pairwise(widths))
     if needed > MAX_BYTES:
@@ -85,6 +93,14 @@ def check_size(architecture: Architecture, size: int, latent: int) -> None:
             f"architecture {architecture.name} has weights of {needed:,} bytes with {size} "
             f"features: an encoder's file has at most {MAX_BYTES:,}; choose smaller sizes"
         )
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Within, torch's generator, which initialises weights, starts from a seed."""
+    with torch.random.fork_rng(devices=()):
+        torch.manual_seed(seed)
+        yield
 
 
 def stacks(
@@ -100,8 +116,7 @@ def stacks(
         initial: `torch` for its initial weights, `normal` for N(0, 1) with biases of 0.
     """
     sizes = (size, *architecture.hidden, latent)
-    with torch.random.fork_rng(devices=()):
-        torch.manual_seed(seed)
+    with seeded(seed):
         encoder = stack(sizes, architecture.code)
         decoder = stack(tuple(reversed(sizes)), architecture.output)
         if initial == "normal":

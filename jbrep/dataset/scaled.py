@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import EXTREMA, fit_scaler
@@ -111,6 +111,13 @@ class ScaledDataset:
         """Features that are constant over the training rows; they are scaled to 0."""
         return self._names(self.scaler.low == self.scaler.high)
 
+    @cached_property
+    def reward_varies(self) -> bool:
+        """Whether not all training rows have the same reward."""
+        parts = self.dataset["reward"].parts(self.train)
+        first = self.dataset["reward"][self.train[0]]
+        return any((part != first).any() for part in parts)
+
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
         return tuple(np.array(self.task.feature_names)[which].tolist())
 
@@ -135,6 +142,12 @@ class ScaledDataset:
             loaded[start : start + len(chunk)] = chunk
             start += len(chunk)
         return loaded
+
+    def actions(self, rows: NDArray[np.int64], dtype: DTypeLike = np.float32) -> NDArray[Any]:
+        """Actions of the rows, scaled to [-1, 1] by their bounds in that type, (n, k)."""
+        bounds = self.task.action_low, self.task.action_high
+        low, high = (np.asarray(bound, dtype) for bound in bounds)
+        return (self.dataset["action"][rows] - (high + low) / 2) / ((high - low) / 2)
 
     @cached_property
     def moments(self) -> Moments:

@@ -48,8 +48,8 @@ def explained(
         known = np.isfinite(parts)
         filled = np.where(known, parts, 0)
         for weights in means:
-            total = known @ weights
-            mean = np.where(total > 0, filled @ weights / np.where(total > 0, total, 1), np.nan)
+            weight = known @ weights
+            mean = np.where(weight > 0, filled @ weights / np.where(weight > 0, weight, 1), np.nan)
             parts = np.append(parts, mean[..., None], axis=-1)
         return parts
 

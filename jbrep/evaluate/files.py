@@ -8,10 +8,12 @@ from typing import Any
 
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import find
+from jbrep.encoders.own import as_file
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import diagnose
 from jbrep.evaluate.policy import GoodPolicy
 from jbrep.files.storage import exists, make_folder, write_whole
+from jbrep.training.trainer import single_torch_thread
 
 EVALUATION = "evaluation.json"
 _DIGITS = 6
@@ -40,7 +42,8 @@ def write(
     """
     path = folder / EVALUATION
     judged = {label: find(each, data.task) for label, each in encoders.items()}
-    hashes = {label: encoder.fingerprint for label, encoder in judged.items()}
+    with single_torch_thread():  # as in runs, which know a module by the file that is kept of it
+        hashes = {label: as_file(encoder).fingerprint for label, encoder in judged.items()}
     if exists(path):
         wanted = {"data": data.dataset.manifest.fingerprint, "encoders": hashes}
         _check_same(path, {**wanted, "policy": policy and policy.name})

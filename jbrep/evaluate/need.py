@@ -98,21 +98,27 @@ def _of_forward(full: BaseEncoder, held_out: HeldOut) -> Array | None:
 def _shares(
     predict: Callable[[NDArray[Any]], Array], observation: NDArray[Any], wanted: NDArray[Any]
 ) -> Array:
-    """The share of what is explained of each target that shuffling each feature loses, (d, q)."""
+    """The share of what is explained of each target that shuffling each feature loses, (d, q).
+
+    Args:
+        predict: the targets (n, q) from observations (n, d).
+        observation: to shuffle, (n, d).
+        wanted: the targets, (n, q).
+    """
     random = np.random.default_rng(0)
     variance = np.var(wanted, axis=0, dtype=np.float64)
 
-    def lost(seen: NDArray[Any]) -> Array:
+    def error(seen: NDArray[Any]) -> Array:
         return np.square(predict(seen) - wanted).mean(axis=0)
 
-    least = lost(observation)
+    least = error(observation)
     explained = variance - least
     shares = np.zeros((observation.shape[1], wanted.shape[1]))
     foretold = explained > _FORETOLD * variance
     for feature, column in enumerate(observation.T):
         shuffled = observation.copy()
         shuffled[:, feature] = random.permutation(column)
-        more = lost(shuffled) - least
+        more = error(shuffled) - least
         shares[feature, foretold] = more[foretold] / explained[foretold]
     return shares.clip(0, 1)
 

@@ -14,8 +14,8 @@ from jbrep.envs.encoding import BaseEncoder
 from jbrep.evaluate.held_out import HeldOut, Rows
 from jbrep.methods.held_out import lost
 from jbrep.methods.linear import linear_denoiser, principal_code
-from jbrep.methods.method import Layers
 from jbrep.stats.bootstrap import Array, bootstrap, by_episode, r_squared, variation
+from jbrep.training.objective import Layers
 
 NOISES = (0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # of features scaled to [-1, 1]
 _QUANTILES = (0.5, 0.9, 0.99, 0.999, 1)

@@ -13,7 +13,7 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from jbrep.dataset.scaling import EXTREMA
 from jbrep.figures.plot import Plot
-from jbrep.figures.style import COLUMN, PAGE, Looks, ink, plain
+from jbrep.figures.style import PAGE, Looks, ink, panel_grid, plain
 
 _MOST = 20  # units of a layer that are drawn
 _TITLE = 45  # characters on a line above a panel
@@ -118,14 +118,10 @@ def autoencoders(task: str, encoders: Mapping[str, EncoderRecord], looks: Looks)
 
 
 def _draw_autoencoders(encoders: Mapping[str, EncoderRecord], looks: Looks) -> Figure:
-    count = min(3, len(encoders))
-    rows = -(-len(encoders) // count)
-    figure = Figure(figsize=(COLUMN if count == 1 else PAGE, 2.5 * rows))
-    panels = figure.subplots(rows, count, squeeze=False).ravel()
+    figure, panels = panel_grid(len(encoders), 2.5)
     look = looks()
-    for axes in panels:
+    for axes, (representation, encoder) in zip(panels, encoders.items(), strict=True):
         axes.set_axis_off()
-    for axes, (representation, encoder) in zip(panels, encoders.items(), strict=False):
         _draw_layers(axes, encoder, look[representation]["color"])
         axes.set_title(plain(_title(representation, encoder["training"])), loc="center")
     return figure

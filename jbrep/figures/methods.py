@@ -11,10 +11,10 @@ from matplotlib.ticker import MaxNLocator, NullFormatter
 from jbrep.figures.curves import below
 from jbrep.figures.families import Encoders, family, family_styles, line_styles
 from jbrep.figures.plot import Plot
-from jbrep.figures.style import COLUMN, PAGE, ink, plain, reference
+from jbrep.figures.style import COLUMN, PAGE, ink, panel_grid, plain, reference
 from jbrep.stats.bootstrap import Array
 
-_ACROSS = 3  # panels side by side
+_ABOVE = 0.4  # panels, for a title [inches]
 _PARTS = ("changes", "values", "reward")  # of a loss by horizon
 _LOSSES = ("train_loss", "test_loss")
 
@@ -66,7 +66,7 @@ def _draw_spectra(task: str, encoders: Encoders) -> Figure:
     kinds: dict[str, dict[str, Mapping[str, Any]]] = {}
     for label, e in encoders.items():
         kinds.setdefault(e["kind"], {})[label] = e
-    figure, panels = _panels(len(kinds), 2.1)
+    figure, panels = panel_grid(len(kinds), 2.1, _ABOVE)
     look = family_styles(family(label, e["latent"]) for label, e in encoders.items())
     for axes, (kind, members) in zip(panels, kinds.items(), strict=True):
         sizes: dict[tuple[str, tuple[float, ...]], list[int]] = {}
@@ -96,17 +96,6 @@ def _draw_spectrum(
             at = (size, spectrum[size - 1])
             axes.plot(*at, "o", ms=7, mfc="none", mec=style["color"], mew=0.9)
             axes.annotate(f"l = {size}", at, (4, 5), textcoords="offset points", size=6)
-
-
-def _panels(count: int, height: float) -> tuple[Figure, Any]:
-    """A panel for each of so many, in rows."""
-    across = min(_ACROSS, count)
-    rows = -(-count // across)
-    figure = Figure(figsize=(COLUMN if across == 1 else PAGE, 0.4 + height * rows))
-    panels = figure.subplots(rows, across, squeeze=False).ravel()
-    for axes in panels[count:]:
-        axes.set_axis_off()
-    return figure, panels[:count]
 
 
 def _timescales(task: str, encoders: Encoders) -> Plot:
@@ -148,7 +137,7 @@ def _draw_timescales(task: str, encoders: Encoders) -> Figure:
     for label, e in encoders.items():
         if all(e["method"]["spectra"] != other["method"]["spectra"] for other in distinct.values()):
             distinct[family(label, e["latent"])] = e
-    figure, panels = _panels(len(distinct), 2.4)
+    figure, panels = panel_grid(len(distinct), 2.4, _ABOVE)
     for axes, (name, e) in zip(panels, distinct.items(), strict=True):
         spectra = {int(lag): np.array(each) for lag, each in e["method"]["spectra"].items()}
         lags = np.array(sorted(spectra))

@@ -6,12 +6,14 @@ from typing import Any
 import matplotlib as mpl
 from cycler import cycler
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 Styles = dict[str, dict[str, Any]]  # colour and marker, by name
 Looks = Callable[[], Styles]  # of a study's representations, in the style in use
 
 COLUMN, PAGE = 3.45, 7.1  # widths in a paper of two columns [inches]
 MARKERS = "osD^vPX*"
+_ACROSS = 3  # panels side by side
 
 # Okabe and Ito's colours; on dark paper, lighter ones in the same order of hues
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
@@ -83,6 +85,23 @@ def styles(names: Iterable[str], first: str | None = None) -> Styles:
         for i, name in enumerate(others)
     }
     return {**({first: {"color": ink(), "marker": MARKERS[0]}} if first else {}), **coloured}
+
+
+def panel_grid(count: int, height: float, above: float = 0.0) -> tuple[Figure, Sequence[Axes]]:
+    """A figure with so many panels in rows of up to three, a page wide; of one, a column.
+
+    Args:
+        count: of panels, at least 1.
+        height: of a row [inches].
+        above: room for a title over all of them [inches].
+    """
+    across = min(_ACROSS, count)
+    rows = -(-count // across)
+    figure = Figure(figsize=(COLUMN if across == 1 else PAGE, above + height * rows))
+    every = figure.subplots(rows, across, squeeze=False).ravel()
+    for axes in every[count:]:
+        axes.set_axis_off()
+    return figure, list(every[:count])
 
 
 def plain(text: str) -> str:

@@ -21,10 +21,8 @@ def check(data: ScaledDataset, settings: Settings) -> None:
     Raises:
         InputError: they don't.
     """
-    check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
+    check_size(settings["architecture"], data.size, settings["latent"])
     feature_weights(data, settings.get("weights", {}))
-    if settings.get("noise") == 0:
-        raise InputError("dae without noise is a plain autoencoder: use the kind ae")
 
 
 def feature_weights(data: ScaledDataset, weights: Settings) -> Tensor | None:
@@ -57,6 +55,12 @@ def objective(data: ScaledDataset, settings: Settings) -> Reconstruction:
     )
 
 
+def _check_denoising(data: ScaledDataset, settings: Settings) -> None:
+    check(data, settings)
+    if not settings["noise"]:
+        raise InputError("dae without noise is a plain autoencoder: use the kind ae")
+
+
 class _Autoencoder(Learned):
     """Architectures have their own epochs and learning rate."""
 
@@ -85,6 +89,6 @@ DAE = _Autoencoder(
     words="denoising autoencoder: noise on each feature of each row, the clean row as target",
     own={**_OWN, "noise": NOISE, "shared_noise": False},
     presets={"authors": {"initial": "normal", "shared_noise": True}},
-    check=check,
+    check=_check_denoising,
     objective=objective,
 )

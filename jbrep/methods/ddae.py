@@ -7,7 +7,7 @@ episode; here targets lie in [0, 1] and in the same episode. Theirs saw 128,000 
 import torch
 from torch import Tensor, nn
 
-from jbrep.dae.network import layers, stack
+from jbrep.dae.network import layers, seeded, stack
 from jbrep.dataset import ScaledDataset
 from jbrep.methods.autoencoder import feature_weights
 from jbrep.methods.method import Learned, Settings
@@ -34,8 +34,7 @@ class Ddae(Objective):
         self.horizon = settings["ahead"]
         self._decay = settings["weight_decay"]
         size, latent = data.size, settings["latent"]
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(settings["seed"])
+        with seeded(settings["seed"]):
             self.encoder = nn.Sequential(nn.Linear(size, latent), nn.ReLU())
             self.decoder = stack((latent, size), "linear")
             for parameter in self.parameters():

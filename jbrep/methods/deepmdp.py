@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from jbrep.dae.network import check_size, get_architecture, layers, stack
+from jbrep.dae.network import check_size, get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
 from jbrep.errors import InputError
 from jbrep.methods.method import Learned, Settings
@@ -46,8 +46,7 @@ class DeepMDP(Objective):
         size, self._latent = data.size, settings["latent"]
         inputs = self._latent + data.task.action_size
         self._weights = {name: settings[name] for name in ("reward", "transition", "lipschitz")}
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(settings["seed"])
+        with seeded(settings["seed"]):
             self.encoder = stack((size, *architecture.hidden, self._latent), architecture.code)
             self.reward = stack((inputs, HIDDEN, HIDDEN, 1), "linear")
             self.change = stack((inputs, HIDDEN, HIDDEN, self._latent), "linear")
@@ -102,11 +101,16 @@ class DeepMDP(Objective):
 
 
 def _check(data: ScaledDataset, settings: Settings) -> None:
-    check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
+    check_size(settings["architecture"], data.size, settings["latent"])
     if not settings["reward"]:
         raise InputError(
             "deepmdp without reward makes a constant code, which is easy to predict: give the "
             "reward a weight above 0"
+        )
+    if not data.reward_varies:
+        raise InputError(
+            f"the reward is constant in {data.dataset.folder}, with which deepmdp makes a constant "
+            "code: use data in which it varies"
         )
 
 

@@ -7,17 +7,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from jbrep.dae.network import check_size, get_architecture, layers, stack
+from jbrep.dae.network import check_size, get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
-from jbrep.errors import InputError
-from jbrep.methods.linear_forward import turns
 from jbrep.methods.method import Learned, Settings
 from jbrep.methods.predictors import HIDDEN, Predictors
 from jbrep.methods.settings import REQUIRED, STANDARD
+from jbrep.methods.targets import PARTS, check_targets, turns
 from jbrep.training.objective import Layers, Objective
 from jbrep.training.windows import Windows
 
-_PARTS = ("changes", "values", "reward")  # of what is predicted
 _FITTED = 200_000  # windows to which targets are standardised
 _SMALL = 1e-6  # standard deviation of a target that says nothing
 
@@ -62,13 +60,12 @@ class Forward(Objective):
         self._action_size, self._sizes = data.task.action_size, (size, size, 1)
         reads = tuple(latent + k * self._action_size for k in self._horizons)
         self._inverse_weight = settings["inverse"]
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(settings["seed"])
+        with seeded(settings["seed"]):
             self.encoder = stack((size, *hidden, latent), "linear")
             self.predictors = Predictors(reads, sum(self._sizes))
             if self._inverse_weight:
                 self.inverse = stack((2 * latent, HIDDEN, self._action_size), "linear")
-        each = [settings[name] / n for name, n in zip(_PARTS, self._sizes, strict=True)]
+        each = [settings[name] / n for name, n in zip(PARTS, self._sizes, strict=True)]
         turn = torch.from_numpy(turns(data)).float()[:, None]  # infinite for what is no angle
         for name, buffer in (
             ("_turn", turn.nan_to_num(posinf=0)),
@@ -138,16 +135,15 @@ class Forward(Objective):
         by_part = [part.mean(1).tolist() for part in errors.split(self._sizes, 1)]
         return {
             "loss_by_horizon": {
-                str(k): dict(zip(_PARTS, losses, strict=True))
+                str(k): dict(zip(PARTS, losses, strict=True))
                 for k, losses in zip(self._horizons, zip(*by_part, strict=True), strict=True)
             }
         }
 
 
 def _check(data: ScaledDataset, settings: Settings) -> None:
-    check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
-    if not any(settings[name] for name in (*_PARTS, "inverse")):
-        raise InputError("forward has nothing to predict: all its weights are 0")
+    check_size(settings["architecture"], data.size, settings["latent"])
+    check_targets(data, settings, "forward", ("inverse",))
 
 
 class _Forward(Learned):

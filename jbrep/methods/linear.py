@@ -3,15 +3,14 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders.encoder import Layer
 from jbrep.errors import InputError
-from jbrep.methods.method import Layers, Made, Settings
-
-Array = NDArray[np.float64]
+from jbrep.methods.method import Made, Settings
+from jbrep.methods.passes import Array
+from jbrep.training.objective import Layers
 
 DEVIATION = 1 / 3  # of a unit of a scaled code, so that most of its values lie in [-1, 1]
 _NEGLIGIBLE = 1e-9  # variance, as a share of the largest

@@ -1,20 +1,17 @@
 """The linear forward code: what now says, beyond the actions, of what comes next."""
 
-import math
-
 import numpy as np
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
-from jbrep.dataset.scaling import wrapped
 from jbrep.errors import InputError
 from jbrep.methods.linear import check_directions, direction_code, whitening
 from jbrep.methods.method import ClosedForm, Made, Settings
 from jbrep.methods.passes import Array, blocks
 from jbrep.methods.settings import REQUIRED
+from jbrep.methods.targets import PARTS, change, check_targets, nothing_varies, turns
 
 _NEGLIGIBLE = 1e-12  # variance of a target that says nothing
-_PARTS = ("changes", "values", "reward")
 _NO_RANK = 1e-9  # singular value, as a share of the largest
 
 
@@ -37,10 +34,7 @@ def make(data: ScaledDataset, settings: Settings) -> Made:
     varies = variances > _NEGLIGIBLE
     scale = np.where(varies, weights / np.sqrt(np.where(varies, variances, 1)), 0)
     if not scale.any():
-        raise InputError(
-            f"nothing that linear-forward is to predict varies in {data.dataset.folder}: give "
-            "other targets a weight above 0"
-        )
+        raise nothing_varies(data, "linear-forward")
     coefficients = np.linalg.lstsq(moments.covariance, shared * scale, rcond=None)[0]
     here = Moments(moments.mean[:size], moments.covariance[:size, :size])
     whiten = whitening(here.covariance, data)
@@ -61,7 +55,7 @@ def _weights(data: ScaledDataset, settings: Settings) -> Array:
     sizes = data.size, data.size, 1
     once = [
         np.full(n, np.sqrt(settings[name] * data.size / n))
-        for n, name in zip(sizes, _PARTS, strict=True)
+        for n, name in zip(sizes, PARTS, strict=True)
     ]
     return np.tile(np.concatenate(once), len(settings["horizons"]))
 
@@ -95,31 +89,9 @@ def _moments(data: ScaledDataset, settings: Settings) -> tuple[Moments, Array, A
     return moments, covariance[:, regressors:], squares / count - mean[regressors:] ** 2
 
 
-def turns(data: ScaledDataset) -> Array:
-    """The length of a full turn of each scaled number that is an angle, (size,); else infinite."""
-    coded = set(data.scaler.angles)
-    whole = [
-        2 * math.pi / data.scaler.half_width[i]
-        if i < data.task.size and i not in coded and data.task.features[i].is_angle
-        else math.inf
-        for i in data.used
-    ]
-    return np.array(whole)
-
-
-def change(now: Array, then: Array, turn: Array) -> Array:
-    """What scaled rows change by, (m, size); angles take the shorter way."""
-    difference = then - now
-    angles = np.isfinite(turn)
-    unit = turn[angles] / (2 * math.pi)
-    difference[:, angles] = wrapped(difference[:, angles] / unit) * unit
-    return difference
-
-
 def _check(data: ScaledDataset, settings: Settings) -> None:
     check_directions(data, settings)
-    if not any(settings[name] for name in _PARTS):
-        raise InputError("linear-forward has nothing to predict: all its weights are 0")
+    check_targets(data, settings, "linear-forward")
 
 
 METHOD = ClosedForm(

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from jbrep.dae.network import layers, stack
 from jbrep.dataset import ScaledDataset
+from jbrep.methods.autoencoder import check
 from jbrep.methods.method import Learned, Settings
 from jbrep.methods.settings import REQUIRED
-from jbrep.methods.vae import Variational, check, divergence, first_half, posterior
+from jbrep.methods.vae import Variational, divergence, first_half, posterior
 from jbrep.training.objective import Layers
 from jbrep.training.windows import Windows
 

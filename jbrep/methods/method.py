@@ -6,12 +6,10 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from jbrep.dataset import ScaledDataset
-from jbrep.encoders.encoder import Layer
 from jbrep.errors import InputError
 from jbrep.methods.settings import CODED, REQUIRED, SCALED, read_setting
-from jbrep.training.objective import Objective
+from jbrep.training.objective import Layers, Objective
 
-Layers = tuple[Layer, ...]
 Settings = Mapping[str, Any]
 
 

@@ -42,10 +42,7 @@ class Block:
     @cached_property
     def _actions(self) -> Array:
         """Scaled to [-1, 1], (n, k)."""
-        task = self._data.task
-        low, high = (np.asarray(bound, float) for bound in (task.action_low, task.action_high))
-        actions = self._data.dataset["action"][self._places].reshape(len(self._places), -1)
-        return (actions - (high + low) / 2) / ((high - low) / 2)
+        return self._data.actions(self._places, np.float64)
 
     @cached_property
     def _earned(self) -> Array:

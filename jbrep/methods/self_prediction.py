@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from jbrep.dae.network import check_size, get_architecture, layers, stack
+from jbrep.dae.network import check_size, get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders.activations import AVG_L1_NORM
 from jbrep.errors import InputError
@@ -37,8 +37,7 @@ class SelfPrediction(Objective):
         super().__init__()
         hidden = get_architecture(settings["architecture"]).hidden
         size, latent, actions = data.size, settings["latent"], data.task.action_size
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(settings["seed"])
+        with seeded(settings["seed"]):
             self.encoder = stack((size, *hidden, latent), AVG_L1_NORM)
             for parameter in self.encoder.parameters():
                 if parameter.ndim == 2:
@@ -66,7 +65,7 @@ class SelfPrediction(Objective):
 
 
 def _check(data: ScaledDataset, settings: Settings) -> None:
-    check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
+    check_size(settings["architecture"], data.size, settings["latent"])
     if settings["latent"] == 1:
         raise InputError(
             "self-prediction divides a code by its average magnitude, which leaves a single unit "

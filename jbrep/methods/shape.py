@@ -9,10 +9,10 @@ from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders.encoder import Layer, run
 from jbrep.methods.linear import DEVIATION, dense, inverse_root
-from jbrep.methods.method import Layers, Made, Settings
+from jbrep.methods.method import Made, Settings
+from jbrep.methods.passes import Array
 from jbrep.methods.settings import RAW, WHITE
-
-Array = NDArray[np.float64]
+from jbrep.training.objective import Layers
 
 _NEGLIGIBLE = 1e-12  # variance of a unit that says nothing
 

@@ -12,10 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from jbrep.dae.network import check_size, get_architecture, layers, stack
+from jbrep.dae.network import get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders.encoder import Layer
-from jbrep.methods.autoencoder import feature_weights
+from jbrep.methods.autoencoder import check, feature_weights
 from jbrep.methods.method import Learned, Settings
 from jbrep.methods.settings import REQUIRED
 from jbrep.methods.sigmoid import cross_entropy, sigmoid_layers
@@ -60,8 +60,7 @@ class Variational(Objective):
         self._latent = settings["latent"]
         self._beta = settings["beta"]
         self._hidden = get_architecture(settings["architecture"]).hidden
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(settings["seed"])
+        with seeded(settings["seed"]):
             self.encoder = stack((data.size, *self._hidden, 2 * self._latent), "linear")
             self.build(data)
         weights = feature_weights(data, settings["weights"])
@@ -112,16 +111,6 @@ class Vae(Variational):
     def layers(self) -> tuple[Layers, Layers]:
         """As for `Objective`."""
         return first_half(layers(self.encoder)), sigmoid_layers(layers(self.decoder))
-
-
-def check(data: ScaledDataset, settings: Settings) -> None:
-    """Make sure that the network and the weights fit the data.
-
-    Raises:
-        InputError: they don't.
-    """
-    check_size(get_architecture(settings["architecture"]), data.size, settings["latent"])
-    feature_weights(data, settings["weights"])
 
 
 METHOD = Learned(

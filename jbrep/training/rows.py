@@ -1,7 +1,7 @@
 """The rows that a network is trained on: in memory, or read from the data set when asked for."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -9,21 +9,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from jbrep.dataset import ScaledDataset
+Load = Callable[[NDArray[np.int64]], NDArray[np.float32]]
 
 _LEAST_MEMORY = 1 << 30  # bytes that rows may take on any machine
 
 
 class Rows(Protocol):
     """Rows (n, d): a tensor, or what gives chosen rows as one."""
-
-    @property
-    def shape(self) -> Sequence[int]:
-        """(n, d)."""
-
-    @property
-    def device(self) -> torch.device:
-        """Where the chosen rows will be."""
 
     def index_select(self, dim: int, index: Tensor, /) -> Tensor:
         """The rows with those numbers, in that order; `dim` is 0."""
@@ -42,64 +34,33 @@ def available_memory(device: torch.device) -> int:
 
 
 def rows_of(
-    data: ScaledDataset, rows: NDArray[np.int64], device: torch.device, memory: int
+    load: Load, rows: NDArray[np.int64], width: int, device: torch.device, memory: int
 ) -> Rows:
-    """Scaled rows (n, size) on that device, or on disk if they don't fit in memory.
+    """What is loaded of the rows, (n, width), on that device, or left on disk if it doesn't fit.
 
     Both give the same numbers in the same order, and so the same weights. What is read from disk
     is left to the system's cache of files, which gives it up as soon as memory is needed.
 
     Args:
-        data: the data set.
+        load: from row numbers (n,) to float32, (n, width).
         rows: row numbers.
+        width: numbers of a row.
         device: to train on.
         memory: bytes that they may take.
     """
-    return _rows(data.load, rows, data.size, device, memory)
-
-
-def actions_of(
-    data: ScaledDataset, rows: NDArray[np.int64], device: torch.device, memory: int
-) -> Rows:
-    """The same of the actions (n, k), scaled to [-1, 1] by their bounds."""
-    column, task = data.dataset["action"], data.task
-    low, high = (np.asarray(bound, np.float32) for bound in (task.action_low, task.action_high))
-    middle, reach = (high + low) / 2, (high - low) / 2
-
-    def load(rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        return ((column[rows] - middle) / reach).astype(np.float32, copy=False)
-
-    return _rows(load, rows, task.action_size, device, memory)
-
-
-def _rows(
-    load: Callable[[NDArray[np.int64]], NDArray[np.float32]],
-    rows: NDArray[np.int64],
-    width: int,
-    device: torch.device,
-    memory: int,
-) -> Rows:
     if len(rows) * width * np.dtype(np.float32).itemsize <= memory:
         return torch.from_numpy(load(rows)).to(device)
-    return _StoredRows(load, rows, width, device)
+    return _StoredRows(load, rows, device)
 
 
 class _StoredRows:
     """Rows (n, d) that are read from the data set whenever some are asked for."""
 
-    def __init__(
-        self,
-        load: Callable[[NDArray[np.int64]], NDArray[np.float32]],
-        rows: NDArray[np.int64],
-        width: int,
-        device: torch.device,
-    ):
-        self._load, self._numbers = load, rows
-        self.device = device
-        self.shape = (len(rows), width)
+    def __init__(self, load: Load, rows: NDArray[np.int64], device: torch.device):
+        self._load, self._numbers, self._device = load, rows, device
 
     def index_select(self, dim: int, index: Tensor, /) -> Tensor:
         """The rows with those numbers, in that order; `dim` is 0."""
         numbers, place = index.cpu().sort()  # a disk is faster in ascending order
-        loaded = torch.from_numpy(self._load(self._numbers[numbers.numpy()])).to(self.device)
-        return torch.empty_like(loaded).index_copy_(0, place.to(self.device), loaded)
+        loaded = torch.from_numpy(self._load(self._numbers[numbers.numpy()])).to(self._device)
+        return torch.empty_like(loaded).index_copy_(0, place.to(self._device), loaded)

@@ -10,7 +10,7 @@ from torch import Tensor
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.errors import InputError
-from jbrep.training.rows import Rows, actions_of, available_memory, rows_of
+from jbrep.training.rows import Rows, available_memory, rows_of
 
 _WATCHED = 100_000  # held-out windows whose loss is reported after each epoch
 _WATCHED_NUMBERS = 1 << 22  # at most in their rows: 16 MiB
@@ -32,7 +32,6 @@ class Windows:
 
     Attributes:
         device: as given.
-        starts: the first row of each window, among the rows, (n,); None where all are.
 
     Raises:
         InputError: no episode is longer than the horizon.
@@ -53,7 +52,8 @@ class Windows:
         starts = first_rows(data, rows, horizon)
         chosen = starts if most is None else sample(starts, most)
         every = len(chosen) == len(rows)
-        self.starts = None if every else torch.from_numpy(chosen).to(self.device)
+        # the first row of each window, (n,); None where all rows are
+        self._starts = None if every else torch.from_numpy(chosen).to(self.device)
         self._count = len(chosen)
 
     def __len__(self) -> int:
@@ -65,17 +65,12 @@ class Windows:
         return self._data.size
 
     @property
-    def action_size(self) -> int:
-        """Length of an action."""
-        return self._data.task.action_size
-
-    @property
     def numbers(self) -> Tensor:
         """The numbers of all windows, (n,)."""
         return torch.arange(len(self), device=self.device)
 
     def _first(self, numbers: Tensor) -> Tensor:
-        return numbers if self.starts is None else self.starts.index_select(0, numbers)
+        return numbers if self._starts is None else self._starts.index_select(0, numbers)
 
     def rows(self, numbers: Tensor, ahead: int = 0) -> Tensor:
         """Scaled rows, that many steps after each window's first, (n, size)."""
@@ -95,11 +90,12 @@ class Windows:
 
     @cached_property
     def _scaled(self) -> Rows:
-        return rows_of(self._data, self._rows, self.device, self._memory)
+        return rows_of(self._data.load, self._rows, self.size, self.device, self._memory)
 
     @cached_property
     def _action(self) -> Rows:
-        return actions_of(self._data, self._rows, self.device, self._memory)
+        width = self._data.task.action_size
+        return rows_of(self._data.actions, self._rows, width, self.device, self._memory)
 
     @cached_property
     def _earned(self) -> Tensor:
