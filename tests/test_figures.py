@@ -17,7 +17,7 @@ from jbrep.figures import behaviour_plots, encoder_plots, study_plots, write
 from jbrep.figures.curves import Return
 from jbrep.figures.diagnostics import _free
 from jbrep.figures.families import family
-from jbrep.figures.methods import timescales
+from jbrep.figures.methods import method_plots, timescales
 from jbrep.figures.plot import Drawing
 from jbrep.figures.style import COLUMN, DARK, PAGE, PAPER, with_runs
 from jbrep.rollouts.behaviour import SPEEDS, observe
@@ -524,6 +524,17 @@ def test_losses_of_training_stand_by_horizon_and_part(of_methods):
     assert list(reward.lines[1].get_ydata()) == [0.1, 0.8]
     assert of_methods["losses"].rows == [("forward-2-s1", 0.2, 0.3)]
     drawn(of_methods["losses"])
+
+
+def test_losses_stand_by_term_and_divergences_by_unit():
+    methods = {
+        "deepmdp-8": {"loss_by_term": {"reward": 0.3, "transition": 0.01}},
+        "vae-2": {"divergence": [0.1, 2.0]},
+    }
+    terms, units = method_plots("x", {n: {"latent": 2, "method": m} for n, m in methods.items()})
+    assert terms.rows == [("deepmdp-8", "reward", 0.3), ("deepmdp-8", "transition", 0.01)]
+    assert units.rows == [("vae-2", "1", 2.0), ("vae-2", "2", 0.1)]
+    assert list(drawn(units).axes[0].lines[0].get_ydata()) == [2.0, 0.1]
 
 
 def test_families_differ_in_size_only():
