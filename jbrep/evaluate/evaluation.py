@@ -18,7 +18,7 @@ from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import latent
 from jbrep.evaluate.need import lost, matters, needs
 from jbrep.evaluate.policy import GoodPolicy, action, value
-from jbrep.evaluate.prediction import prediction
+from jbrep.evaluate.prediction import Matters, prediction
 from jbrep.evaluate.readout import correlation, dynamics, neighbours, nonlinear_probes, probes
 from jbrep.evaluate.reconstruction import corruption, reconstruction
 from jbrep.progress import Progress
@@ -68,25 +68,20 @@ def diagnose(
         _check(label, encoder, data)
     full = Encoder({"kind": IDENTITY, "name": FULL}, data.scaler, (), ())
     everything: dict[str, BaseEncoder] = {FULL: full, **judged}
-    rewarded = matters(full, held_out)
     needed = needs(full, held_out, policy)
-    diagnostics = {
-        "prediction": lambda encoder, held_out: prediction(encoder, held_out, rewarded),
-        **_DIAGNOSTICS,
-        **_of_policy(policy),
-    }
+    diagnostics = _diagnostics(matters(full, held_out), policy)
     with Progress(total=len(everything) * len(diagnostics), unit="diagnostic") as progress:
 
         def judge(label: str, encoder: BaseEncoder) -> dict[str, Any]:
-            result: dict[str, Any] = {"kind": encoder.kind, "latent": encoder.latent_size}
+            told: dict[str, Any] = {}
             for name, diagnostic in diagnostics.items():
                 progress.set_description_str(f"{label} {name.replace('_', ' ')}", refresh=False)
                 possible = encoder.can_decode or name not in _DECODING
-                result[name] = diagnostic(encoder, held_out) if possible else None
+                told[name] = diagnostic(encoder, held_out) if possible else None
                 progress.update()
             return {
-                **result,
-                "loses": lost(needed, result["nonlinear_probes"]),
+                **{"kind": encoder.kind, "latent": encoder.latent_size, **told},
+                "loses": lost(needed, told["nonlinear_probes"]),
                 "method": _made(encoder),
             }
 
@@ -120,13 +115,18 @@ def _side_by_side(
             pool.shutdown(cancel_futures=True)
 
 
-def _of_policy(policy: GoodPolicy | None) -> dict[str, _Diagnostic]:
-    """The diagnostics that need a policy."""
-    if policy is None:
-        return dict.fromkeys(("value", "action"), lambda encoder, held_out: None)
+def _diagnostics(rewarded: Matters, policy: GoodPolicy | None) -> dict[str, _Diagnostic]:
+    """All of them by name; those of a policy give None without one."""
+    of_policy: dict[str, _Diagnostic] = dict.fromkeys(("value", "action"), lambda *_: None)
+    if policy is not None:
+        of_policy = {
+            "value": lambda encoder, held_out: value(encoder, policy),
+            "action": lambda encoder, held_out: action(encoder, held_out, policy),
+        }
     return {
-        "value": lambda encoder, held_out: value(encoder, policy),
-        "action": lambda encoder, held_out: action(encoder, held_out, policy),
+        "prediction": lambda encoder, held_out: prediction(encoder, held_out, rewarded),
+        **_DIAGNOSTICS,
+        **of_policy,
     }
 
 
