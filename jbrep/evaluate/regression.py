@@ -50,6 +50,8 @@ def fit(problems: Sequence[Problem]) -> list[Predictor]:
     networks learn independently, but are multiplied at once: with so few units, calls would take
     most of the time.
     """
+    if not problems:
+        return []
     enter = [_Standard(problem.values) for problem in problems]
     leave = [_Standard(problem.wanted) for problem in problems]
     values = [at(p.values).clamp_(-_LIMIT, _LIMIT) for at, p in zip(enter, problems, strict=True)]
