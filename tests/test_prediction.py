@@ -18,8 +18,9 @@ from jbrep.evaluate import diagnose, regression
 from jbrep.evaluate.explained import explained
 from jbrep.evaluate.headline import SCALARS, headline
 from jbrep.evaluate.held_out import HeldOut
-from jbrep.evaluate.need import lost, matters, needs
-from jbrep.evaluate.policy import GoodPolicy, PlayedEpisode, returns_to_go, value
+from jbrep.evaluate.need import lost, needs
+from jbrep.evaluate.networks import networks
+from jbrep.evaluate.policy import GoodPolicy, PlayedEpisode, returns_to_go
 from jbrep.evaluate.prediction import following, prediction, usual_horizons
 from jbrep.evaluate.readout import nonlinear_probes, probes
 from jbrep.evaluate.regression import Problem, fit
@@ -152,9 +153,9 @@ def test_what_is_dropped_shows_where_it_matters(evaluation):
     assert full["value"][1] < full["value"][0] < full["value"][2]
 
 
-def test_what_the_reward_depends_on_counts_by_how_much_it_does(evaluation, held_out):
+def test_what_the_reward_depends_on_counts_by_how_much_it_does(evaluation, held_out, policy):
     full = Encoder({"kind": "identity", "name": "full"}, held_out.data.scaler, (), ())
-    weights = dict(zip(NAMES, matters(full, held_out), strict=True))
+    weights = dict(zip(NAMES, needs(full, held_out, policy).reward, strict=True))
     assert max(weights, key=weights.get) == "place"
     for entry in evaluation["encoders"].values():
         told = entry["prediction"]["10"]
@@ -191,7 +192,8 @@ def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkey
     assert "return to go" not in evaluation_text(result)
     assert find_good_policy(None, held_out.data.task) is None
     cut = [PlayedEpisode(np.zeros((101, 4), np.float32), np.ones(100), False)] * 5
-    assert value(code(held_out.data, "place"), GoodPolicy("short", controller, cut)) is None
+    short = GoodPolicy("short", controller, cut)
+    assert set(networks(code(held_out.data, "place"), held_out, short).of_policy) == {"action"}
     with pytest.raises(InputError, match="policy uniform doesn't act on what it observes"):
         find_good_policy("uniform", held_out.data.task)
 
@@ -202,11 +204,12 @@ def test_actions_after_the_horizon_do_not_enter(held_out, monkeypatch):
     assert steps.inputs(inputs).shape == (len(steps.rows), 1 + 5)
     rows = held_out.data.dataset["action"]
     np.testing.assert_array_equal(steps.action[7], rows[steps.rows[7] : steps.rows[7] + 5].ravel())
-    before = prediction(inputs, held_out)
+    before = prediction(inputs, held_out, networks(inputs, held_out).forward)
     poisoned = ScaledDataset(Cart())
     last = np.arange(len(rows)) % STEPS >= STEPS - 1  # no window of 1 begins there
     poisoned.dataset.arrays["action"][last] = np.nan
-    assert prediction(inputs, HeldOut(poisoned))["1"] == before["1"]
+    again = HeldOut(poisoned)
+    assert prediction(inputs, again, networks(inputs, again).forward)["1"] == before["1"]
 
 
 def test_what_follows_is_of_the_same_episode(held_out):
@@ -257,7 +260,7 @@ def test_regression_finds_what_is_not_linear_and_repeats_to_the_last_bit(monkeyp
     again = [each(values[15_000:]) for each in fit([problem, problem])]
     torch.set_num_threads(threads)
     assert again[0].tobytes() == twice[0].tobytes()
-    assert again[1].tobytes() == twice[1].tobytes()
+    assert again[1].tobytes() == twice[1].tobytes() == twice[0].tobytes()  # as if each were alone
 
 
 def test_regressions_side_by_side_are_of_their_own_values():
@@ -286,14 +289,15 @@ def test_nonlinear_probes_read_what_linear_ones_cannot(held_out):
     )
     encoder = code(held_out.data, "place")
     encoder = Encoder(encoder.header, encoder.scaler, (bent,), ())
-    linear, nonlinear = probes(encoder, held_out), nonlinear_probes(encoder, held_out)
+    linear = probes(encoder, held_out)
+    nonlinear = nonlinear_probes(encoder, held_out, networks(encoder, held_out).probe)
     assert nonlinear["place"][0] > 0.98 > linear["place"][0] + 0.02
     assert nonlinear["idle"][0] < 0.1
 
 
 def test_needs_pass_from_what_is_rewarded_to_what_moves_it(held_out):
     full = code(held_out.data, *NAMES)
-    needed = needs(full, held_out, None)
+    needed = needs(full, held_out, None).controller
     assert min(needed[name] for name in NAMES[:3]) > 0.1 > needed["idle"]
     assert lost({"a": 0.5, "b": 0.9, "c": 0.05}, {n: [0.2, 0, 1] for n in "abc"}) == [
         {"name": "b", "kept": 0.2, "need": 0.9},

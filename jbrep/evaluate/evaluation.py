@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,10 @@ from jbrep.envs.encoding import BaseEncoder
 from jbrep.errors import InputError
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import latent
-from jbrep.evaluate.need import lost, matters, needs
+from jbrep.evaluate.need import Needs, lost, needs
+from jbrep.evaluate.networks import Networks, networks
 from jbrep.evaluate.policy import GoodPolicy, action, value
-from jbrep.evaluate.prediction import Matters, prediction
+from jbrep.evaluate.prediction import prediction
 from jbrep.evaluate.readout import correlation, dynamics, neighbours, nonlinear_probes, probes
 from jbrep.evaluate.reconstruction import corruption, reconstruction
 from jbrep.progress import Progress
@@ -29,7 +30,6 @@ FORMAT = "jbrep evaluation"
 FORMAT_VERSION = 2
 _Diagnostic = Callable[[BaseEncoder, HeldOut], Any]
 _DIAGNOSTICS: dict[str, _Diagnostic] = {
-    "nonlinear_probes": nonlinear_probes,
     "reconstruction": reconstruction,
     "corruption": corruption,
     "latent_units": latent,
@@ -68,24 +68,7 @@ def diagnose(
         _check(label, encoder, data)
     full = Encoder({"kind": IDENTITY, "name": FULL}, data.scaler, (), ())
     everything: dict[str, BaseEncoder] = {FULL: full, **judged}
-    needed = needs(full, held_out, policy)
-    diagnostics = _diagnostics(matters(full, held_out), policy)
-    with Progress(total=len(everything) * len(diagnostics), unit="diagnostic") as progress:
-
-        def judge(label: str, encoder: BaseEncoder) -> dict[str, Any]:
-            told: dict[str, Any] = {}
-            for name, diagnostic in diagnostics.items():
-                progress.set_description_str(f"{label} {name.replace('_', ' ')}", refresh=False)
-                possible = encoder.can_decode or name not in _DECODING
-                told[name] = diagnostic(encoder, held_out) if possible else None
-                progress.update()
-            return {
-                **{"kind": encoder.kind, "latent": encoder.latent_size, **told},
-                "loses": lost(needed, told["nonlinear_probes"]),
-                "method": _made(encoder),
-            }
-
-        results = _side_by_side(judge, everything)
+    results, needed = _side_by_side(everything, full, held_out, policy)
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -99,34 +82,65 @@ def diagnose(
 
 
 def _side_by_side(
-    judge: Callable[[str, BaseEncoder], dict[str, Any]], encoders: Mapping[str, BaseEncoder]
-) -> dict[str, dict[str, Any]]:
-    """What is said of each encoder, as many at a time as there are cores.
+    encoders: Mapping[str, BaseEncoder],
+    full: BaseEncoder,
+    held_out: HeldOut,
+    policy: GoodPolicy | None,
+) -> tuple[dict[str, dict[str, Any]], dict[str, float]]:
+    """What is said of each encoder, as many at a time as there are cores, and what is needed.
 
-    The first one goes alone, since the others share samples of rows with it.
+    What is needed comes first, the full observation last: they share its networks.
     """
-    (first, encoder), *others = encoders.items()
     with single_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        results = {first: judge(first, encoder)}
-        futures = {label: pool.submit(judge, label, each) for label, each in others}
-        try:
-            return results | {label: future.result() for label, future in futures.items()}
-        finally:
-            pool.shutdown(cancel_futures=True)
+        needed = pool.submit(needs, full, held_out, policy)
+        diagnostics = _diagnostics(policy, needed)
+        with Progress(total=len(encoders) * len(diagnostics), unit="diagnostic") as progress:
+
+            def judge(label: str) -> dict[str, Any]:
+                encoder = encoders[label]
+                told: dict[str, Any] = {"kind": encoder.kind, "latent": encoder.latent_size}
+                for name, diagnostic in diagnostics.items():
+                    progress.set_description_str(f"{label} {name.replace('_', ' ')}", refresh=False)
+                    possible = encoder.can_decode or name not in _DECODING
+                    told[name] = diagnostic(encoder, held_out) if possible else None
+                    progress.update()
+                loses = lost(needed.result().controller, told["nonlinear_probes"])
+                return {**told, "loses": loses, "method": _made(encoder)}
+
+            futures = {label: pool.submit(judge, label) for label in reversed([*encoders])}
+            try:
+                results = {label: futures[label].result() for label in encoders}
+                return results, needed.result().controller
+            finally:
+                pool.shutdown(cancel_futures=True)
 
 
-def _diagnostics(rewarded: Matters, policy: GoodPolicy | None) -> dict[str, _Diagnostic]:
-    """All of them by name; those of a policy give None without one."""
-    of_policy: dict[str, _Diagnostic] = dict.fromkeys(("value", "action"), lambda *_: None)
-    if policy is not None:
-        of_policy = {
-            "value": lambda encoder, held_out: value(encoder, policy),
-            "action": lambda encoder, held_out: action(encoder, held_out, policy),
-        }
+def _diagnostics(policy: GoodPolicy | None, needed: Future[Needs]) -> dict[str, _Diagnostic]:
+    """All of them by name; those of a policy give None where nothing was learnt of it.
+
+    What has to wait for what is needed comes last.
+    """
+
+    def learnt(encoder: BaseEncoder, held_out: HeldOut) -> Networks:
+        return networks(encoder, held_out, policy)
+
+    def controlled(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
+        forward = learnt(encoder, held_out).forward
+        return prediction(encoder, held_out, forward, needed.result().reward)
+
+    def of_policy(name: str, judge: Callable[..., Any]) -> _Diagnostic:
+        def judged(encoder: BaseEncoder, held_out: HeldOut) -> Any:
+            predict = learnt(encoder, held_out).of_policy.get(name)
+            return predict and judge(encoder, held_out, policy, predict)
+
+        return judged
+
     return {
-        "prediction": lambda encoder, held_out: prediction(encoder, held_out, rewarded),
+        "nonlinear_probes": lambda e, data: nonlinear_probes(e, data, learnt(e, data).probe),
         **_DIAGNOSTICS,
-        **of_policy,
+        "value": of_policy("value", value),
+        "action": of_policy("action", action),
+        "prediction": controlled,
     }
 
 

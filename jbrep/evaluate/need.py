@@ -1,16 +1,18 @@
 """What a controller needs of the state, and what a code loses of that."""
 
-from collections.abc import Callable, Mapping
-from functools import lru_cache
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.evaluate.held_out import HeldOut
-from jbrep.evaluate.policy import GoodPolicy, action_predictor, value_predictor
-from jbrep.evaluate.prediction import Matters, following, predictors
+from jbrep.evaluate.networks import networks
+from jbrep.evaluate.policy import GoodPolicy
+from jbrep.evaluate.prediction import Matters, following
+from jbrep.evaluate.regression import Predictor
 from jbrep.stats.bootstrap import Array
 
 _HORIZON = 10  # steps ahead
@@ -20,79 +22,81 @@ _FORETOLD = 0.1  # R^2 below which nothing can be learnt about what a prediction
 _NUMBERS = 1 << 18  # rows times features, at most, in which features are shuffled
 
 
-def needs(full: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None) -> dict[str, float]:
+class Needs(NamedTuple):
     """How much each feature is needed, from 0 to 1.
 
+    Attributes:
+        reward: for the mean reward of the next 10 steps, (d,); None where episodes are too short,
+            or it can't be foretold.
+        controller: for that, directly or not, or for what a policy does, by the feature's name;
+            empty where episodes are too short.
+    """
+
+    reward: Matters
+    controller: dict[str, float]
+
+
+def needs(full: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None) -> Needs:
+    """What reward and controller need of the state.
+
     A feature is needed for a prediction by the share of the explained variance that is lost when
-    its values are shuffled among held-out rows (permutation importance; Breiman 2001). It is needed
-    directly as much as for the mean reward of the next 10 steps or, if there is a policy, its
-    action or value, whichever needs it most. It is needed indirectly for the change over 10 steps
+    its values are shuffled among held-out rows (permutation importance; Breiman 2001). A controller
+    needs it directly as much as the mean reward of the next 10 steps or, if there is a policy, its
+    action or value, whichever needs it most. It needs it indirectly for the change over 10 steps
     of another feature, times how much that one is needed directly.
 
     Args:
         full: the observation itself.
         held_out: to judge on.
         policy: that does the task well, if one is known.
-
-    Returns:
-        By the feature's name; empty where episodes are too short to look ahead.
     """
-    shares = _of_forward(full, held_out)
-    if shares is None:
-        return {}
-    count = _count(held_out)
-    moving, direct = shares[:, :-1], shares[:, -1]
-    if policy is not None:
-        seen = following(held_out, "test", _ahead(full, held_out)).observation[:count]
-        acts = action_predictor(full, held_out, policy)
-        by_action = _shares(lambda seen: acts(full.encode(seen)), seen, policy.act(seen))
-        direct = np.maximum(direct, by_action.max(axis=1))
-        if policy.has_value:
-            states, worth = policy.judged_on, value_predictor(full, policy)
-            by_value = _shares(
-                lambda seen: worth(full.encode(seen)),
-                states.observation[:count],
-                states.value[:count],
-            )
-            direct = np.maximum(direct, by_value[:, 0])
-    need = np.maximum(direct, (moving * direct).max(axis=1))
-    return dict(zip(held_out.data.task.feature_names, need.tolist(), strict=True))
+    learnt = networks(full, held_out, policy)
+    if not learnt.forward:
+        return Needs(None, {})
+    ahead, count = _ahead(learnt.forward), _count(held_out)
+    steps = following(held_out, "test", ahead)
+    seen, told = steps.observation[:count], learnt.forward[ahead]
+    inputs = steps.action[:count]
+    shares = _shares(
+        lambda seen: told(np.hstack((full.encode(seen), inputs))), seen, steps.wanted[:count]
+    )
+    moving, reward = shares[:, :-1], shares[:, -1]
+    of_policy = _of_policy(full, policy, learnt.of_policy, seen) if policy else ()
+    direct = np.max([reward, *of_policy], axis=0)
+    need = np.maximum(direct, (moving * direct).max(axis=1)).tolist()
+    names = held_out.data.task.feature_names
+    return Needs(reward if reward.any() else None, dict(zip(names, need, strict=True)))
 
 
-def matters(full: BaseEncoder, held_out: HeldOut) -> Matters:
-    """How much the mean reward of the next 10 steps depends on each feature, (d,), as `needs`.
+def _of_policy(
+    full: BaseEncoder,
+    policy: GoodPolicy,
+    predictors: Mapping[str, Predictor],
+    seen: NDArray[Any],
+) -> Iterator[Array]:
+    """How much each of what predictors say of a policy depends on each feature, (d,)."""
+    count = len(seen)
+    asked = {"action": (seen, policy.act(seen))}
+    if policy.has_value:
+        states = policy.judged_on
+        asked["value"] = states.observation[:count], states.value[:count]
+    for name, (observation, wanted) in asked.items():
+        told = partial(_told, full, predictors[name])
+        yield _shares(told, observation, wanted).max(axis=1)
 
-    None where episodes are too short, or the reward can't be foretold.
-    """
-    shares = _of_forward(full, held_out)
-    if shares is None or not shares[:, -1].any():
-        return None
-    return shares[:, -1]
+
+def _told(full: BaseEncoder, predict: Predictor, observation: NDArray[Any]) -> Array:
+    return predict(full.encode(observation))
 
 
-def _ahead(full: BaseEncoder, held_out: HeldOut) -> int:
+def _ahead(horizons: Iterable[int]) -> int:
     """The number of steps ahead that is nearest to 10."""
-    return min(predictors(full, held_out), key=lambda ahead: abs(ahead - _HORIZON))
+    return min(horizons, key=lambda ahead: abs(ahead - _HORIZON))
 
 
 def _count(held_out: HeldOut) -> int:
     """Rows in which features are shuffled."""
     return max(2, _NUMBERS // held_out.data.task.size)
-
-
-@lru_cache(1)
-def _of_forward(full: BaseEncoder, held_out: HeldOut) -> Array | None:
-    """The share that each feature has in the prediction of each change and of the reward."""
-    forward = predictors(full, held_out)
-    if not forward:
-        return None
-    ahead, count = _ahead(full, held_out), _count(held_out)
-    steps = following(held_out, "test", ahead)
-    return _shares(
-        lambda seen: forward[ahead](np.hstack((full.encode(seen), steps.action[:count]))),
-        steps.observation[:count],
-        steps.wanted[:count],
-    )
 
 
 def _shares(
@@ -129,7 +133,7 @@ def lost(
     """The features that are needed and can't be read from a code, the most needed first.
 
     Args:
-        needed: as `needs` returns it.
+        needed: how much a controller needs each feature.
         probes: of the code, nonlinear.
 
     Returns:

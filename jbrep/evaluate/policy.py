@@ -12,7 +12,7 @@ from jbrep.envs.encoding import BaseEncoder
 from jbrep.evaluate.explained import explained
 from jbrep.evaluate.held_out import HeldOut, Rows, sample_rows
 from jbrep.evaluate.readout import ridge
-from jbrep.evaluate.regression import Predictor, Problem, fit
+from jbrep.evaluate.regression import Predictor, Problem
 from jbrep.stats.bootstrap import Array, by_episode
 
 GAMMA = 0.99
@@ -112,44 +112,43 @@ def returns_to_go(reward: NDArray[Any]) -> Array:
     return values[:-1]
 
 
-def value(encoder: BaseEncoder, policy: GoodPolicy) -> list[float | None] | None:
+def problems(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> dict[str, Problem]:
+    """The policy's `action` and `value`, its return to go, from the latent.
+
+    No value where too few episodes are left to fit to and to judge on.
+    """
+    seen, taken, _ = _acting(held_out, policy, "train")
+    told = {"action": Problem(encoder.encode(seen), taken)}
+    if policy.has_value:
+        states = policy.fitted_on
+        told["value"] = Problem(encoder.encode(states.observation), states.value)
+    return told
+
+
+def value(
+    encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy, predict: Predictor
+) -> list[float | None]:
     """R^2 of the policy's return to go, discounted by .99, from the latent, nonlinearly.
 
     Fitted on two thirds of its episodes, judged on the others. The last 300 steps of an episode
-    are left out unless a state ended it. None where too few episodes are left.
+    are left out unless a state ended it.
     """
-    if not policy.has_value:
-        return None
     states = policy.judged_on
-    predicted = value_predictor(encoder, policy)(encoder.encode(states.observation))
+    predicted = predict(encoder.encode(states.observation))
     return explained(predicted, states.value, states.rows, states).tolist()[0]
 
 
-@lru_cache(1)  # of the full observation, for what is needed
-def value_predictor(encoder: BaseEncoder, policy: GoodPolicy) -> Predictor:
-    """What predicts the policy's return to go from a latent."""
-    states = policy.fitted_on
-    return fit([Problem(encoder.encode(states.observation), states.value)])[0]
-
-
-def action(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> dict[str, Any]:
+def action(
+    encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy, predict: Predictor
+) -> dict[str, Any]:
     """R^2 of what the policy would do in held-out rows, from the latent: linear and nonlinear."""
     (seen, taken, _), (unseen, true, rows) = (_acting(held_out, policy, p) for p in _PARTS)
     latent = encoder.encode(unseen)
-    predicted = {
-        "linear": ridge(encoder.encode(seen), taken)(latent),
-        "nonlinear": action_predictor(encoder, held_out, policy)(latent),
-    }
+    linear = ridge(encoder.encode(seen), taken)
+    predicted = {"linear": linear(latent), "nonlinear": predict(latent)}
     return {
         name: explained(each, true, rows, held_out).tolist()[0] for name, each in predicted.items()
     }
-
-
-@lru_cache(1)
-def action_predictor(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> Predictor:
-    """What predicts the policy's action from a latent."""
-    seen, taken, _ = _acting(held_out, policy, "train")
-    return fit([Problem(encoder.encode(seen), taken)])[0]
 
 
 @lru_cache(2)  # since all encoders share them

@@ -1,5 +1,6 @@
 """Controlled forward prediction: what a code and the next actions say of what comes next."""
 
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task
 from jbrep.evaluate.explained import explained
 from jbrep.evaluate.held_out import HeldOut, Rows, sample_rows
-from jbrep.evaluate.regression import Predictor, Problem, fit
+from jbrep.evaluate.regression import Predictor, Problem
 from jbrep.training.windows import first_rows
 
 Matters = NDArray[np.float64] | None
@@ -43,7 +44,12 @@ class Steps(NamedTuple):
         return np.hstack((encoder.encode(self.observation), self.action))
 
 
-def prediction(encoder: BaseEncoder, held_out: HeldOut, matters: Matters = None) -> dict[str, Any]:
+def prediction(
+    encoder: BaseEncoder,
+    held_out: HeldOut,
+    predictors: Mapping[int, Predictor],
+    matters: Matters = None,
+) -> dict[str, Any]:
     """R^2 of each feature's change over k steps, and of the mean reward over them.
 
     Predicted nonlinearly from the latent and the next k actions, and no later ones; fitted to a
@@ -55,12 +61,13 @@ def prediction(encoder: BaseEncoder, held_out: HeldOut, matters: Matters = None)
     Args:
         encoder: to judge.
         held_out: to judge on.
+        predictors: by the number of steps, fitted to `problems`.
         matters: how much the reward depends on each feature, (d,); None if that isn't known.
     """
     names = held_out.data.task.feature_names
     means = [np.append(each, 0.0) for each in (np.ones(len(names)), matters) if each is not None]
     results = {}
-    for ahead, predictor in predictors(encoder, held_out).items():
+    for ahead, predictor in predictors.items():
         steps = following(held_out, "test", ahead)
         each = explained(
             predictor(steps.inputs(encoder)),
@@ -79,16 +86,13 @@ def prediction(encoder: BaseEncoder, held_out: HeldOut, matters: Matters = None)
     return results
 
 
-@lru_cache(1)  # of the full observation, for what is needed
-def predictors(encoder: BaseEncoder, held_out: HeldOut) -> dict[int, Predictor]:
-    """By the number of steps ahead, what predicts `Steps.wanted` from `Steps.inputs`."""
+def problems(encoder: BaseEncoder, held_out: HeldOut) -> dict[int, Problem]:
+    """By the number of steps ahead: `Steps.wanted`, from `Steps.inputs`."""
     size = held_out.data.task.size
     weights = np.ones(size + 1)
     weights[-1] = size / 2  # or else many features would leave little for the reward
-    horizons = usual_horizons(held_out.data)
-    training = [following(held_out, "train", ahead) for ahead in horizons]
-    problems = [Problem(steps.inputs(encoder), steps.wanted, weights) for steps in training]
-    return dict(zip(horizons, fit(problems), strict=True))
+    training = {k: following(held_out, "train", k) for k in usual_horizons(held_out.data)}
+    return {k: Problem(each.inputs(encoder), each.wanted, weights) for k, each in training.items()}
 
 
 def usual_horizons(data: ScaledDataset) -> list[int]:

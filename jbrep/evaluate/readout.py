@@ -15,7 +15,7 @@ from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task
 from jbrep.evaluate.explained import explained
 from jbrep.evaluate.held_out import MAX_GROUPS, MAX_NUMBERS, HeldOut, Rows, sample_rows
-from jbrep.evaluate.regression import Predictor, Problem, fit
+from jbrep.evaluate.regression import Predictor, Problem
 from jbrep.evaluate.truth import Columns, quantities, quantities_and_features, state
 from jbrep.stats.bootstrap import Array, bootstrap, variation
 
@@ -35,30 +35,46 @@ def probes(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
     The cosine and sine of an angle count together. At most 100,000 rows are fitted to, and as many
     judged; of more than 83 features, fewer.
     """
-    return _probes(encoder, held_out, quantities, ridge)
+    predict = ridge(*_readable(encoder, held_out, quantities))
+    return _probes(encoder, held_out, quantities, predict)
 
 
-def nonlinear_probes(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
-    """The same by nonlinear regression, of each quantity and of every feature."""
-    return _probes(encoder, held_out, quantities_and_features, lambda *p: fit([Problem(*p)])[0])
+def problem(encoder: BaseEncoder, held_out: HeldOut) -> Problem:
+    """Each quantity and every feature, from the latent."""
+    return Problem(*_readable(encoder, held_out, quantities_and_features))
+
+
+def nonlinear_probes(
+    encoder: BaseEncoder, held_out: HeldOut, predict: Predictor
+) -> dict[str, list[Any]]:
+    """R^2 as `probes`, by what was fitted to `problem`."""
+    return _probes(encoder, held_out, quantities_and_features, predict)
+
+
+_Truth = Callable[[Task, NDArray[Any]], Columns]
+
+
+def _readable(
+    encoder: BaseEncoder, held_out: HeldOut, truth: _Truth
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Latents of training rows, and what is true of them."""
+    data = held_out.data
+    rows = sample_rows(data.train, _ROWS, data.task.size)
+    seen = data.dataset["observation"][rows]
+    return encoder.encode(seen), np.hstack(list(truth(data.task, seen).values()))
 
 
 def _probes(
-    encoder: BaseEncoder,
-    held_out: HeldOut,
-    truth: Callable[[Task, NDArray[Any]], Columns],
-    regression: Callable[[NDArray[Any], Array], Predictor],
+    encoder: BaseEncoder, held_out: HeldOut, truth: _Truth, predict: Predictor
 ) -> dict[str, list[Any]]:
     data = held_out.data
-    size = data.task.size
-    train, test = (sample_rows(rows, _ROWS, size) for rows in (data.train, data.test))
-    seen, unseen = data.dataset["observation"][train], data.dataset["observation"][test]
-    known, true = (truth(data.task, rows) for rows in (seen, unseen))
-    predict = regression(encoder.encode(seen), np.hstack(list(known.values())))
+    rows = sample_rows(data.test, _ROWS, data.task.size)
+    unseen = data.dataset["observation"][rows]
+    true = truth(data.task, unseen)
     scores = explained(
         predict(encoder.encode(unseen)),
         np.hstack(list(true.values())),
-        test,
+        rows,
         held_out,
         [values.shape[1] for values in true.values()],
     )

@@ -47,17 +47,25 @@ def fit(problems: Sequence[Problem]) -> list[Predictor]:
 
     1,000 steps with 256 rows each, fewer if that is more than 20 times all rows of a problem.
     Values and what is wanted are standardised, and values limited to 5 standard deviations. The
-    networks learn independently, but are multiplied at once: with so few units, calls would take
-    most of the time.
+    networks learn independently, but those of as many steps are multiplied at once: with so few
+    units, calls would take most of the time.
     """
-    if not problems:
-        return []
+    steps = [max(1, min(_STEPS, _PASSES * len(each.values) // _BATCH)) for each in problems]
+    fitted: dict[int, Predictor] = {}
+    for count in dict.fromkeys(steps):
+        among = [i for i, each in enumerate(steps) if each == count]
+        fitted |= zip(among, _fit([problems[i] for i in among], count), strict=True)
+    return [fitted[i] for i in range(len(problems))]
+
+
+def _fit(problems: list[Problem], steps: int) -> list[Predictor]:
+    """As `fit`, in so many steps."""
     enter = [_Standard(problem.values) for problem in problems]
     leave = [_Standard(problem.wanted) for problem in problems]
     values = [at(p.values).clamp_(-_LIMIT, _LIMIT) for at, p in zip(enter, problems, strict=True)]
     wanted = [to(p.wanted) for to, p in zip(leave, problems, strict=True)]
     with single_torch_thread():
-        network = _trained(values, wanted, [_weights(problem) for problem in problems])
+        network = _trained(values, wanted, [_weights(problem) for problem in problems], steps)
     return [
         partial(_predict, _one_of(network, i, at, to), at, to)
         for i, (at, to) in enumerate(zip(enter, leave, strict=True))
@@ -107,25 +115,28 @@ def _weights(problem: Problem) -> Tensor:
     return torch.from_numpy(given / count).float()
 
 
-def _trained(values: list[Tensor], wanted: list[Tensor], weights: list[Tensor]) -> list[Tensor]:
+def _trained(
+    values: list[Tensor], wanted: list[Tensor], weights: list[Tensor], steps: int
+) -> list[Tensor]:
     """Weights (m, in, out) and biases (m, 1, out) of each layer of m networks, in turn.
 
     Values (n, p), what is wanted (n, q) and its weights (q,) are of each network; narrower ones are
     filled up with zeros, from which nothing is learnt.
     """
-    random = torch.Generator().manual_seed(0)
-    lengths = torch.tensor([len(each) for each in values])
-    first = torch.cumsum(lengths, 0) - lengths  # row of each problem
     seen, true = (_padded(each) for each in (values, wanted))
     counted = _padded([each[None] for each in weights])[:, None]
-    network = _begin([each.shape[1] for each in values], true.shape[1], random)
-    steps = max(1, min(_STEPS, _PASSES * int(lengths.min()) // _BATCH))
+    begun, drawn, first = [], [], 0
+    for now, then in zip(values, wanted, strict=True):  # each as if it were alone
+        random = torch.Generator().manual_seed(0)
+        begun.append(_begin((now.shape[1], *_HIDDEN, then.shape[1]), random))
+        numbers = torch.rand(steps, _BATCH, generator=random, dtype=torch.float64)
+        drawn.append((numbers * len(now)).long() + first)
+        first += len(now)
+    network = [_stacked(parts).requires_grad_() for parts in zip(*begun, strict=True)]
     adam = torch.optim.Adam(network, lr=_LEARNING_RATE, fused=True)
-    for step in range(steps):
+    for step, rows in enumerate(torch.stack(drawn, 1)):
         rising, falling = (step + 1) / (_RISING * steps), (1 + math.cos(math.pi * step / steps)) / 2
         adam.param_groups[0]["lr"] = _LEARNING_RATE * min(rising, 1) * falling
-        drawn = torch.rand(len(values), _BATCH, generator=random, dtype=torch.float64)
-        rows = (drawn * lengths[:, None]).long() + first[:, None]
         error = _apply(network, seen[rows]) - true[rows]
         adam.zero_grad()
         ((error.square() * counted).sum() / _BATCH).backward()
@@ -133,22 +144,27 @@ def _trained(values: list[Tensor], wanted: list[Tensor], weights: list[Tensor]) 
     return [each.detach() for each in network]
 
 
-def _begin(inputs: list[int], outputs: int, random: torch.Generator) -> list[Tensor]:
+def _begin(sizes: Sequence[int], random: torch.Generator) -> list[Tensor]:
     """Initial weights by He et al. 2015, small ones in the last layer, and biases of 0."""
-    count, sizes = len(inputs), (max(inputs), *_HIDDEN, outputs)
     network = []
     for i, (before, after) in enumerate(pairwise(sizes)):
-        fan_in = torch.tensor(inputs if i == 0 else [before] * count, dtype=torch.float32)
-        weight = torch.randn(count, before, after, generator=random)
-        weight *= (2 / fan_in).sqrt()[:, None, None] * (0.1 if i == len(_HIDDEN) else 1)
-        network += [weight.requires_grad_(), torch.zeros(count, 1, after, requires_grad=True)]
+        scale = math.sqrt(2 / before) * (0.1 if i == len(_HIDDEN) else 1)
+        network += [torch.randn(before, after, generator=random) * scale, torch.zeros(1, after)]
     return network
 
 
-def _padded(parts: list[Tensor]) -> Tensor:
+def _padded(parts: Sequence[Tensor]) -> Tensor:
     """The rows (n, p) of all parts, one after the other, with zeros up to the widest."""
     widest = max(part.shape[1] for part in parts)
     return torch.cat([functional.pad(part, (0, widest - part.shape[1])) for part in parts])
+
+
+def _stacked(parts: Sequence[Tensor]) -> Tensor:
+    """Matrices (n, p) side by side, (m, n, p), with zeros up to the largest."""
+    rows, columns = (max(part.shape[axis] for part in parts) for axis in (0, 1))
+    return torch.stack(
+        [functional.pad(p, (0, columns - p.shape[1], 0, rows - p.shape[0])) for p in parts]
+    )
 
 
 def _apply(network: list[Tensor], values: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rollouts.jitterbug import jitterbug_task
 from jbrep.rollouts.sources import Player, find_player
 
-_EPISODES = 18
+_EPISODES = 30
 HEURISTIC = "heuristic"
 
 
