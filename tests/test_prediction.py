@@ -91,6 +91,7 @@ def learning():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jbrep.evaluate.prediction.HORIZONS", (1, 5, 10))
         patch.setattr(regression, "_STEPS", 400)
+        patch.setattr("jbrep.evaluate.policy._SHARE", 1.0)
         yield
 
 

@@ -19,6 +19,7 @@ GAMMA = 0.99
 _PARTS = ("train", "test")
 _UNKNOWN = 300  # last steps of an episode cut short, whose return to go isn't known: .99^300 = .05
 _EVERY = 3  # one of three episodes is judged on
+_SHARE = 0.3  # of the usual steps of training
 _ROWS = 50_000  # at most, to fit on and to judge on
 
 
@@ -121,7 +122,7 @@ def problems(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> dic
     told = {"action": Problem(encoder.encode(seen), taken)}
     if policy.has_value:
         states = policy.fitted_on
-        told["value"] = Problem(encoder.encode(states.observation), states.value)
+        told["value"] = Problem(encoder.encode(states.observation), states.value, share=_SHARE)
     return told
 
 

@@ -35,11 +35,14 @@ class Problem(NamedTuple):
         values: to predict from, (n, p).
         wanted: to predict, (n, q).
         weights: of the squared errors of what is wanted, (q,); None if all count alike.
+        share: of the usual steps that are taken; less where rows are of few episodes, which a
+            network soon knows by heart.
     """
 
     values: NDArray[Any]
     wanted: NDArray[Any]
     weights: NDArray[Any] | None = None
+    share: float = 1.0
 
 
 def fit(problems: Sequence[Problem]) -> list[Predictor]:
@@ -50,12 +53,16 @@ def fit(problems: Sequence[Problem]) -> list[Predictor]:
     networks learn independently, but those of as many steps are multiplied at once: with so few
     units, calls would take most of the time.
     """
-    steps = [max(1, min(_STEPS, _PASSES * len(each.values) // _BATCH)) for each in problems]
+    steps = [_steps(each) for each in problems]
     fitted: dict[int, Predictor] = {}
     for count in dict.fromkeys(steps):
         among = [i for i, each in enumerate(steps) if each == count]
         fitted |= zip(among, _fit([problems[i] for i in among], count), strict=True)
     return [fitted[i] for i in range(len(problems))]
+
+
+def _steps(problem: Problem) -> int:
+    return max(1, min(int(_STEPS * problem.share), _PASSES * len(problem.values) // _BATCH))
 
 
 def _fit(problems: list[Problem], steps: int) -> list[Predictor]:
