@@ -12,7 +12,7 @@ from jbrep.evaluate.held_out import HeldOut, sample_rows
 from jbrep.stats.bootstrap import without_nan
 
 _ROWS = 200_000
-_POINTS = 5_000  # for intrinsic dimensions
+_POINTS = 4_000  # for intrinsic dimensions
 _SATURATED = 0.95  # magnitude of a tanh unit
 _DEAD = 0.01  # standard deviation, as a share of the most variable unit's
 _ROUNDING = 1e-6  # standard deviation that rounding alone can cause
@@ -23,7 +23,7 @@ def latent(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
     """Units, their correlations, and dimensions of the latent, over a sample of held-out rows.
 
     At most 200,000 rows, fewer where the latent has more than 41 units; for the intrinsic dimension
-    5,000. The participation ratio is (sum of the covariance's eigenvalues)^2 / sum of their
+    4,000. The participation ratio is (sum of the covariance's eigenvalues)^2 / sum of their
     squares.
     """
     rows = sample_rows(held_out.data.test, _ROWS, encoder.latent_size)
