@@ -10,7 +10,7 @@ TASKS := move_from_origin face_direction move_in_direction move_to_position move
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw behaviour clean
+.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -76,13 +76,14 @@ samples: $(READY) ## the sample data sets in data/, made anew
 	for task in $(TASKS); do \
 	  rm -rf data/sample/$$task; $(BIN)/jbrep collect --task $$task --steps 4k --out data/sample/$$task; done
 
-data: $(READY) ## data sets of five million states in data/: half an hour, 4 GB
+data: $(READY) ## data sets of five million states in data/, and one of a cheetah: an hour, 4 GB
 	$(BIN)/jbrep collect --task face_direction --steps 5M --store-state --out data/face_direction
 	for task in $(filter-out face_direction,$(TASKS)); do \
 	  $(BIN)/jbrep data derive data/face_direction --task $$task --out data/$$task || exit; done
+	$(BIN)/jbrep collect --task dm_control/cheetah-run-v0 --steps 1M --out data/cheetah
 
 encoders: data ## results/encoders/ from these: hours; goes on where it was stopped
-	$(BIN)/python tools/encoders.py data encoders results/encoders $(TASKS)
+	$(BIN)/python tools/encoders.py data encoders results/encoders $(TASKS) cheetah
 
 decoded: $(READY) ## results/decoded.txt anew: hand-written policies on what encoders give back
 	for task in $(TASKS); do \
@@ -95,7 +96,8 @@ decoded: $(READY) ## results/decoded.txt anew: hand-written policies on what enc
 desk: ## results/desk/ anew: a night or two; goes on where it was stopped
 ddpg: ## results/ddpg/ anew: a night
 yaw: data ## results/yaw/ anew: hours
-desk ddpg yaw: $(READY)
+codes: encoders ## results/codes/ anew: hours
+desk ddpg yaw codes: $(READY)
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
 	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json heuristics.csv) results/$@/
