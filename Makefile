@@ -76,7 +76,7 @@ samples: $(READY) ## the sample data sets in data/, made anew
 	for task in $(TASKS); do \
 	  rm -rf data/sample/$$task; $(BIN)/jbrep collect --task $$task --steps 4k --out data/sample/$$task; done
 
-data: $(READY) ## data sets of five million states in data/, and one of a cheetah: an hour, 4 GB
+data: $(READY) ## data sets of five million states in data/, and one million of a cheetah: half an hour, 4 GB
 	$(BIN)/jbrep collect --task face_direction --steps 5M --store-state --out data/face_direction
 	for task in $(filter-out face_direction,$(TASKS)); do \
 	  $(BIN)/jbrep data derive data/face_direction --task $$task --out data/$$task || exit; done

@@ -97,8 +97,13 @@ def is_current(path: Path, hashes: set[str]) -> bool:
 
 
 def ship(task: Task, files: list[Path], kinds: list[str], results: Path) -> None:
-    """Copy the encoders of some kinds to those that ship, and write what is known of all there."""
+    """Copy the encoders of some kinds to those that ship, and write what is known of all there.
+
+    Nothing ships for a task that has no folder.
+    """
     folder = SHIPPED / task.slug
+    if not folder.is_dir():
+        return
     for file in files:
         if load(file).kind in kinds and not (folder / file.name).exists():
             shutil.copy(file, folder)
