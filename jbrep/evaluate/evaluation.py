@@ -113,6 +113,7 @@ def _side_by_side(
                 return results, needed.result().controller
             finally:
                 pool.shutdown(cancel_futures=True)
+                networks.cache_clear()  # it holds the data set
 
 
 def _diagnostics(policy: GoodPolicy | None, needed: Future[Needs]) -> dict[str, _Diagnostic]:
