@@ -68,7 +68,7 @@ def diagnose(
         _check(label, encoder, data)
     full = Encoder({"kind": IDENTITY, "name": FULL}, data.scaler, (), ())
     everything: dict[str, BaseEncoder] = {FULL: full, **judged}
-    results, needed = _side_by_side(everything, full, held_out, policy)
+    results, needed = _side_by_side(everything, held_out, policy)
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -82,17 +82,14 @@ def diagnose(
 
 
 def _side_by_side(
-    encoders: Mapping[str, BaseEncoder],
-    full: BaseEncoder,
-    held_out: HeldOut,
-    policy: GoodPolicy | None,
+    encoders: Mapping[str, BaseEncoder], held_out: HeldOut, policy: GoodPolicy | None
 ) -> tuple[dict[str, dict[str, Any]], dict[str, float]]:
     """What is said of each encoder, as many at a time as there are cores, and what is needed.
 
     What is needed comes first, the full observation last: they share its networks.
     """
     with single_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        needed = pool.submit(needs, full, held_out, policy)
+        needed = pool.submit(needs, encoders[FULL], held_out, policy)
         diagnostics = _diagnostics(policy, needed)
         with Progress(total=len(encoders) * len(diagnostics), unit="diagnostic") as progress:
 

@@ -13,7 +13,6 @@ from jbrep.figures.plot import Plot
 from jbrep.figures.style import COLUMN, PAGE, Styles, plain, reference
 
 LOSSES = ("train_loss", "test_loss")
-_PARTS = ("changes", "values", "reward")  # of a loss by horizon
 
 
 def loss_by_horizon(task: str, encoders: Encoders) -> Plot:
@@ -35,7 +34,10 @@ def loss_by_horizon(task: str, encoders: Encoders) -> Plot:
 
 
 def _draw_loss_by_horizon(task: str, encoders: Encoders) -> Figure:
-    parts = [part for part in _PARTS if any(_losses_of(e, part) for e in encoders.values())]
+    by_horizon = [e["method"]["loss_by_horizon"] for e in encoders.values()]
+    parts = list(
+        dict.fromkeys(p for each in by_horizon for losses in each.values() for p in losses)
+    )
     figure = Figure(figsize=(PAGE, 2.4))
     panels = figure.subplots(1, len(parts), sharey=True, squeeze=False)[0]
     look = line_styles(encoders)
