@@ -88,7 +88,7 @@ encoders: data ## results/encoders/ from these: hours; goes on where it was stop
 decoded: $(READY) ## results/decoded.txt anew: hand-written policies on what encoders give back
 	for task in $(TASKS); do \
 	  $(BIN)/jbrep evaluate-policy heuristic --task $$task || exit; \
-	  for name in dae pca random; do for latent in 12 8 4; do \
+	  for name in dae pca random linear-forward forward; do for latent in 12 8 4; do \
 	    $(BIN)/jbrep evaluate-policy heuristic --task $$task --encoder $$name-$$latent || exit; \
 	  done; done; \
 	done > results/decoded.txt
