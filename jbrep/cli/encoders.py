@@ -160,7 +160,8 @@ def list_shipped(task: str | None, as_json: bool) -> None:
     words = {FULL if kind == IDENTITY else kind: METHODS[kind].words for kind in kinds}
     columns = {title: SCALARS[name].words for name, title in _COLUMNS.items()}
     columns["error"] = "squared error of the reconstruction, as a multiple of PCA's"
-    return click.echo(facts({"l": "size of the code", **columns, **words}, width))
+    click.echo(f"columns\n{facts({'l': 'size of the code', **columns}, width)}\n")
+    return click.echo(f"kinds of encoders\n{facts(words, width)}")
 
 
 _which = click.argument("encoder")
