@@ -21,9 +21,9 @@ from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.need import lost, needs
 from jbrep.evaluate.networks import networks
 from jbrep.evaluate.policy import GoodPolicy, PlayedEpisode, returns_to_go
-from jbrep.evaluate.prediction import following, prediction, usual_horizons
+from jbrep.evaluate.prediction import Steps, following, prediction, problems, usual_horizons
 from jbrep.evaluate.readout import nonlinear_probes, probes
-from jbrep.evaluate.regression import Problem, fit
+from jbrep.evaluate.regression import Problem, beside, fit
 from jbrep.evaluate.summary import evaluation_text
 from jbrep.evaluate.truth import in_words
 from jbrep.rollouts.good_policy import find_good_policy
@@ -269,15 +269,29 @@ def test_regressions_side_by_side_are_of_their_own_values():
     narrow, wide = random.normal(size=(9_000, 2)), random.normal(size=(12_000, 7))
     problems = [
         Problem(narrow, narrow.prod(axis=1, keepdims=True)),
-        Problem(wide, np.abs(wide[:, :3]), np.array([1.0, 1.0, 0.0])),
+        Problem(wide, np.abs(wide[:, :3])),
     ]
-    first, second = fit(problems)
-    for known, predictor, problem in ((1, first, problems[0]), (2, second, problems[1])):
+    for predictor, problem in zip(fit(problems), problems, strict=True):
         predicted = predictor(problem.values)
         assert predicted.shape == problem.wanted.shape
-        for i in range(known):
-            assert r2_score(problem.wanted[:, i], predicted[:, i]) > 0.9
-    assert r2_score(problems[1].wanted[:, 2], predicted[:, 2]) < 0.5  # its weight is 0
+        assert r2_score(problem.wanted, predicted, multioutput="raw_values").min() > 0.9
+
+
+def test_a_rare_reward_is_learnt_beside_many_features(monkeypatch):
+    random = np.random.default_rng(0)
+    seen = random.normal(size=(20_000, 6)).astype(np.float32)
+    near = np.clip(1 - 3 * np.hypot(seen[:, 0] - 1.5, seen[:, 1]), 0, None)  # in 2 % of rows
+    moved = np.sin(2 * seen @ random.normal(size=(6, 20)))
+    wanted = np.column_stack((moved, near)).astype(np.float32)
+    steps = Steps(np.arange(20_000), seen, np.zeros((20_000, 1)), wanted)
+    monkeypatch.setattr("jbrep.evaluate.prediction.following", lambda *_: steps)
+    monkeypatch.setattr("jbrep.evaluate.prediction.usual_horizons", lambda _: [10])
+    alone = SimpleNamespace(encode=lambda rows: rows)
+    (pair,) = problems(alone, SimpleNamespace(data=None)).values()
+    together = Problem(steps.inputs(alone), wanted)
+    *apart, joint = fit([*pair, together])
+    told = [r2_score(near, each(together.values)[:, -1]) for each in (beside(*apart), joint)]
+    assert told[0] > 0.3 > told[1] + 0.1
 
 
 def test_returns_to_go_are_discounted():

@@ -1,13 +1,14 @@
 """The networks that diagnostics of an encoder need."""
 
 from functools import lru_cache
+from itertools import chain
 from typing import NamedTuple
 
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.evaluate import policy, prediction, readout
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.policy import GoodPolicy
-from jbrep.evaluate.regression import Predictor, fit
+from jbrep.evaluate.regression import Predictor, beside, fit
 
 
 class Networks(NamedTuple):
@@ -30,7 +31,7 @@ def networks(encoder: BaseEncoder, held_out: HeldOut, good: GoodPolicy | None = 
     """All of them, fitted at once: one after the other they would take nearly twice as long."""
     ahead = prediction.problems(encoder, held_out)
     of_policy = policy.problems(encoder, held_out, good) if good else {}
-    problems = *ahead.values(), readout.problem(encoder, held_out), *of_policy.values()
-    fitted = iter(fit(problems))
-    forward = {k: next(fitted) for k in ahead}
+    pairs = chain.from_iterable(ahead.values())
+    fitted = iter(fit([*pairs, readout.problem(encoder, held_out), *of_policy.values()]))
+    forward = {k: beside(next(fitted), next(fitted)) for k in ahead}
     return Networks(forward, next(fitted), dict(zip(of_policy, fitted, strict=True)))

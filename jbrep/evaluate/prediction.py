@@ -20,6 +20,7 @@ Matters = NDArray[np.float64] | None
 
 HORIZONS = (1, 5, 10, 20)  # steps ahead
 _ROWS = {"train": 100_000, "test": 50_000}  # at most
+_SHARE = 0.6  # of a network's usual steps, for the changes: more would gain little
 _USUAL = 0.5  # the share of rows that must have as many rows after them
 
 
@@ -61,7 +62,7 @@ def prediction(
     Args:
         encoder: to judge.
         held_out: to judge on.
-        predictors: by the number of steps, fitted to `problems`.
+        predictors: by the number of steps, of `Steps.wanted`.
         matters: how much the reward depends on each feature, (d,); None if that isn't known.
     """
     names = held_out.data.task.feature_names
@@ -86,13 +87,20 @@ def prediction(
     return results
 
 
-def problems(encoder: BaseEncoder, held_out: HeldOut) -> dict[int, Problem]:
-    """By the number of steps ahead: `Steps.wanted`, from `Steps.inputs`."""
-    size = held_out.data.task.size
-    weights = np.ones(size + 1)
-    weights[-1] = size / 2  # or else many features would leave little for the reward
-    training = {k: following(held_out, "train", k) for k in usual_horizons(held_out.data)}
-    return {k: Problem(each.inputs(encoder), each.wanted, weights) for k, each in training.items()}
+def problems(encoder: BaseEncoder, held_out: HeldOut) -> dict[int, tuple[Problem, Problem]]:
+    """By the number of steps ahead: the features' changes, and the reward.
+
+    The reward has a network of its own: beside many features a rare one would hardly be learnt.
+    """
+    return {
+        ahead: _changes_and_reward(following(held_out, "train", ahead), encoder)
+        for ahead in usual_horizons(held_out.data)
+    }
+
+
+def _changes_and_reward(steps: Steps, encoder: BaseEncoder) -> tuple[Problem, Problem]:
+    inputs, (changed, reward) = steps.inputs(encoder), np.split(steps.wanted, [-1], axis=1)
+    return Problem(inputs, changed, share=_SHARE), Problem(inputs, reward)
 
 
 def usual_horizons(data: ScaledDataset) -> list[int]:

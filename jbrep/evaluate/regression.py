@@ -21,7 +21,7 @@ _HIDDEN = (64, 64, 64)  # units
 _STEPS = 1000  # at most
 _PASSES = 20  # over the rows, at most: few rows are soon known by heart
 _BATCH = 256
-_LEARNING_RATE = 5e-3  # at its highest
+_LEARNING_RATE = 1e-2  # at its highest
 _RISING = 0.1  # the share of the steps in which the learning rate rises to that
 _LIMIT = 5.0  # standard deviations within which the network sees its input
 _NEGLIGIBLE = 1e-9  # standard deviation, as a share of the largest magnitude: rounding
@@ -34,14 +34,12 @@ class Problem(NamedTuple):
     Attributes:
         values: to predict from, (n, p).
         wanted: to predict, (n, q).
-        weights: of the squared errors of what is wanted, (q,); None if all count alike.
-        share: of the usual steps that are taken; less where rows are of few episodes, which a
-            network soon knows by heart.
+        share: of the usual steps that are taken; less where these are enough, or where rows are of
+            few episodes, which a network soon knows by heart.
     """
 
     values: NDArray[Any]
     wanted: NDArray[Any]
-    weights: NDArray[Any] | None = None
     share: float = 1.0
 
 
@@ -61,6 +59,11 @@ def fit(problems: Sequence[Problem]) -> list[Predictor]:
     return [fitted[i] for i in range(len(problems))]
 
 
+def beside(*predictors: Predictor) -> Predictor:
+    """What several predict from the same values, side by side."""
+    return lambda values: np.hstack([predict(values) for predict in predictors])
+
+
 def _steps(problem: Problem) -> int:
     return max(1, min(int(_STEPS * problem.share), _PASSES * len(problem.values) // _BATCH))
 
@@ -72,7 +75,7 @@ def _fit(problems: list[Problem], steps: int) -> list[Predictor]:
     values = [at(p.values).clamp_(-_LIMIT, _LIMIT) for at, p in zip(enter, problems, strict=True)]
     wanted = [to(p.wanted) for to, p in zip(leave, problems, strict=True)]
     with single_torch_thread():
-        network = _trained(values, wanted, [_weights(problem) for problem in problems], steps)
+        network = _trained(values, wanted, steps)
     return [
         partial(_predict, _one_of(network, i, at, to), at, to)
         for i, (at, to) in enumerate(zip(enter, leave, strict=True))
@@ -115,23 +118,14 @@ class _Standard:
         return torch.from_numpy(((values - self.mean) * self._factor).astype(np.float32))
 
 
-def _weights(problem: Problem) -> Tensor:
-    """The weight of each thing wanted in a mean over all, (q,)."""
-    count = problem.wanted.shape[1]
-    given = np.ones(count) if problem.weights is None else problem.weights
-    return torch.from_numpy(given / count).float()
-
-
-def _trained(
-    values: list[Tensor], wanted: list[Tensor], weights: list[Tensor], steps: int
-) -> list[Tensor]:
+def _trained(values: list[Tensor], wanted: list[Tensor], steps: int) -> list[Tensor]:
     """Weights (m, in, out) and biases (m, 1, out) of each layer of m networks, in turn.
 
-    Values (n, p), what is wanted (n, q) and its weights (q,) are of each network; narrower ones are
-    filled up with zeros, from which nothing is learnt.
+    Values (n, p) and what is wanted (n, q) are of each network; narrower ones are filled up with
+    zeros, from which nothing is learnt.
     """
     seen, true = (_padded(each) for each in (values, wanted))
-    counted = _padded([each[None] for each in weights])[:, None]
+    widths = torch.tensor([each.shape[1] for each in wanted])[:, None, None]
     begun, drawn, first = [], [], 0
     for now, then in zip(values, wanted, strict=True):  # each as if it were alone
         random = torch.Generator().manual_seed(0)
@@ -146,7 +140,7 @@ def _trained(
         adam.param_groups[0]["lr"] = _LEARNING_RATE * min(rising, 1) * falling
         error = _apply(network, seen[rows]) - true[rows]
         adam.zero_grad()
-        ((error.square() * counted).sum() / _BATCH).backward()
+        ((error.square() / widths).sum() / _BATCH).backward()
         adam.step()
     return [each.detach() for each in network]
 
