@@ -12,6 +12,7 @@ from sklearn.metrics import r2_score
 from wide import make_feature, make_task
 
 from jbrep.dataset import Column, Dataset, ScaledDataset
+from jbrep.dataset.scaling import wrapped
 from jbrep.encoders import Encoder, Layer
 from jbrep.errors import InputError
 from jbrep.evaluate import diagnose, regression
@@ -21,7 +22,14 @@ from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.need import lost, needs
 from jbrep.evaluate.networks import networks
 from jbrep.evaluate.policy import GoodPolicy, PlayedEpisode, returns_to_go
-from jbrep.evaluate.prediction import Steps, following, prediction, problems, usual_horizons
+from jbrep.evaluate.prediction import (
+    Steps,
+    changes,
+    following,
+    prediction,
+    problems,
+    usual_horizons,
+)
 from jbrep.evaluate.readout import nonlinear_probes, probes
 from jbrep.evaluate.regression import Problem, beside, fit
 from jbrep.evaluate.summary import evaluation_text
@@ -275,6 +283,16 @@ def test_regressions_side_by_side_are_of_their_own_values():
         predicted = predictor(problem.values)
         assert predicted.shape == problem.wanted.shape
         assert r2_score(problem.wanted, predicted, multioutput="raw_values").min() > 0.9
+
+
+def test_angles_change_by_all_that_they_turn():
+    task = make_task(
+        [make_feature("spin", "rad", -np.pi, np.pi, True), make_feature("place")], "Top-v0"
+    )
+    turned = np.array([0, 1, 2.5, 4, 7, 6, 4])
+    rows = np.stack((wrapped(turned + 3), turned), axis=1).astype(np.float32)
+    found = changes(task, rows, np.array([0, 2]), 4)
+    assert found == pytest.approx(np.array([[7, 7], [1.5, 1.5]]), abs=1e-5)
 
 
 def test_a_rare_reward_is_learnt_beside_many_features(monkeypatch):

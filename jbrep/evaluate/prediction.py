@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.dataset import ScaledDataset
+from jbrep.dataset import Column, ScaledDataset
 from jbrep.dataset.scaling import wrapped
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task
@@ -31,8 +32,8 @@ class Steps(NamedTuple):
         rows: (n,).
         observation: now, (n, d).
         action: the next k actions, (n, k * m).
-        wanted: the change of each feature over k steps, angles the shorter way round, and the mean
-            reward over them, (n, d + 1).
+        wanted: the change of each feature over k steps, see `changes`, and the mean reward over
+            them, (n, d + 1).
     """
 
     rows: Rows
@@ -117,16 +118,33 @@ def following(held_out: HeldOut, part: str, ahead: int) -> Steps:
     task, dataset, rows = data.task, data.dataset, getattr(data, part)
     width = 2 * task.size + ahead * task.action_size
     chosen = sample_rows(rows[first_rows(data, rows, ahead)], _ROWS[part], width)
-    now, then = (dataset["observation"][r] for r in (chosen, chosen + ahead))
+    observation = dataset["observation"]
     steps = chosen[:, None] + np.arange(ahead)
     reward = dataset["reward"][steps].mean(axis=1, dtype=np.float64)
-    wanted = np.hstack((changes(task, now, then), reward[:, None])).astype(np.float32)
-    return Steps(chosen, now, dataset["action"][steps].reshape(len(chosen), -1), wanted)
+    changed = changes(task, observation, chosen, ahead)
+    wanted = np.hstack((changed, reward[:, None])).astype(np.float32)
+    action = dataset["action"][steps].reshape(len(chosen), -1)
+    return Steps(chosen, observation[chosen], action, wanted)
 
 
-def changes(task: Task, now: NDArray[Any], then: NDArray[Any]) -> NDArray[np.float64]:
-    """What features change by, (n, d); angles the shorter way round."""
-    change = np.subtract(then, now, dtype=np.float64)
-    angles = np.array([feature.is_angle for feature in task.features])
-    change[:, angles] = wrapped(change[:, angles])
+def changes(
+    task: Task, observation: Column | NDArray[Any], rows: NDArray[np.int64], ahead: int
+) -> NDArray[np.float64]:
+    """What features change by in so many steps after rows, (n, d).
+
+    Angles by all that they turn, each step the shorter way round: the difference of two angles
+    jumps where a joint turns more than half round, and hardly anything could foretell it.
+
+    Args:
+        task: which says what is an angle.
+        observation: all rows.
+        rows: (n,).
+        ahead: steps.
+    """
+    change = np.subtract(observation[rows + ahead], observation[rows], dtype=np.float64)
+    angles = [feature.is_angle for feature in task.features]
+    if any(angles):
+        seen = (observation[rows + step][:, angles] for step in range(ahead + 1))
+        turns = (wrapped(np.subtract(b, a, dtype=np.float64)) for a, b in pairwise(seen))
+        change[:, angles] = sum(turns)
     return change
