@@ -90,6 +90,11 @@ def number(value: float | None, form: str) -> str:
     return format(value, f"z{form}")  # no negative zero
 
 
+def r2_text(value: float | None) -> str:
+    """An R², or a dash for None; less than nothing isn't told apart: <0."""
+    return "<0" if value is not None and round(value, 2) < 0 else number(value, ".2f")
+
+
 def slug(text: str) -> str:
     """A name for a file or folder: a hyphen for each character but letters, digits, '.', '_', '-'.
 

@@ -178,7 +178,7 @@ def test_an_evaluation_is_told_in_one_screen_and_in_older_files_as_before(evalua
     first = shown.partition("Error on")[0]
     assert max(map(len, shown.splitlines())) <= 80
     assert len(first.splitlines()) < 30
-    assert re.search(r"without load +load \(-?0\.\d\d\)\nwithout idle +nothing", first)
+    assert re.search(r"without load +load \((<0|0\.\d\d)\)\nwithout idle +nothing", first)
     assert evaluation["encoders"]["without load"]["method"] == {"spectrum": [3.0, 1.0]}
     assert evaluation["format_version"] == 2
     del evaluation["needs"], evaluation["policy"]

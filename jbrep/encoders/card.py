@@ -8,7 +8,7 @@ from jbrep.encoders.encoder import Encoder, Layer
 from jbrep.encoders.shipped import Shipped
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task
-from jbrep.text import facts, number, table
+from jbrep.text import facts, r2_text, table
 
 _RECORDS = ("training", "data", "metrics", "versions")
 
@@ -87,7 +87,7 @@ def listed(ships: Sequence[Shipped], columns: Mapping[str, str], width: int) -> 
         width: to fit [columns].
     """
     rows = [
-        (name, str(encoder.latent_size), *(number(told.get(each), ".2f") for each in columns))
+        (name, str(encoder.latent_size), *(r2_text(told.get(each)) for each in columns))
         for name, encoder, told in ships
     ]
     return table(("encoder", "l", *columns.values()), rows, width)

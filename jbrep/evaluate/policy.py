@@ -19,7 +19,7 @@ GAMMA = 0.99
 _PARTS = ("train", "test")
 _UNKNOWN = 300  # last steps of an episode cut short, whose return to go isn't known: .99^300 = .05
 _EVERY = 3  # one of three episodes is judged on
-_SHARE = 0.3  # of the usual steps of training
+_SHARE = 0.1  # of the usual steps of training
 _ROWS = 50_000  # at most, to fit on and to judge on
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from jbrep.encoders import FULL
 from jbrep.evaluate.headline import headline
 from jbrep.evaluate.truth import in_words
-from jbrep.text import facts, interval, number, table
+from jbrep.text import facts, interval, number, r2_text, table
 
 _SERVES = {  # of the headline
     "forward": "the features' change over 10 steps, from code and actions",
@@ -70,7 +70,7 @@ def _headline(evaluation: Mapping[str, Any], width: int | None) -> tuple[str, ..
 
 
 def _first(values: list[float | None] | None) -> str:
-    return "-" if values is None else number(values[0], ".2f")
+    return r2_text(None if values is None else values[0])
 
 
 def _lost(evaluation: Mapping[str, Any], width: int | None) -> str:
@@ -80,7 +80,7 @@ def _lost(evaluation: Mapping[str, Any], width: int | None) -> str:
         for each in diagnostics["loses"]:
             lost.setdefault(in_words(task, each["name"]), each["kept"])
         more = len(lost) - _MANY
-        some = [f"{words} ({number(kept, '.2f')})" for words, kept in list(lost.items())[:_MANY]]
+        some = [f"{words} ({r2_text(kept)})" for words, kept in list(lost.items())[:_MANY]]
         lines[label] = ", ".join(some) + (f" and {more} more" if more > 0 else "") or "nothing"
     return facts(lines, width or sys.maxsize, indent=0)
 
@@ -106,7 +106,7 @@ def _losses(encoders: Mapping[str, Any], width: int | None) -> str:
                 interval(ratio, ".3f") if ratio else "-",
                 number(noisy["mse"][0], ".5f"),
                 number(noisy["linear_mse"][0], ".5f"),
-                f"{worst['name']} {number(worst['r2'][0], '.2f')}",
+                f"{worst['name']} {r2_text(worst['r2'][0])}",
             )
         )
     return table((*header, "worst feature, R²"), rows, width)
@@ -128,7 +128,7 @@ def _readings(encoders: Mapping[str, Any], width: int | None) -> str:
             *probes[label].values(),
             number(diagnostics["neighbours"]["mse"][0], ".2f"),
             number(diagnostics["correlation"]["mean"][0], ".2f"),
-            number(diagnostics["dynamics"]["linear"][0], ".2f"),
+            r2_text(diagnostics["dynamics"]["linear"][0]),
         )
         for label, diagnostics in encoders.items()
     ]
@@ -138,14 +138,14 @@ def _readings(encoders: Mapping[str, Any], width: int | None) -> str:
 def _probes(scores: Mapping[str, Any]) -> dict[str, str]:
     """R² of each quantity; of many, of those that vary, the mean and the least."""
     if len(scores) <= _MANY:
-        return {name.replace("_", " "): number(score[0], ".2f") for name, score in scores.items()}
+        return {name.replace("_", " "): r2_text(score[0]) for name, score in scores.items()}
     known = {name: score[0] for name, score in scores.items() if score[0] is not None}
     if not known:
         return {"probes, mean": "-", "worst probe": "-"}
     worst = min(known, key=known.__getitem__)
     return {
-        "probes, mean": number(sum(known.values()) / len(known), ".2f"),
-        "worst probe": f"{worst} {number(known[worst], '.2f')}",
+        "probes, mean": r2_text(sum(known.values()) / len(known)),
+        "worst probe": f"{worst} {r2_text(known[worst])}",
     }
 
 

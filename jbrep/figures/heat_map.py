@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from jbrep.figures.style import COLUMN, ink, plain
 from jbrep.stats.bootstrap import Array
+from jbrep.text import r2_text
 
 MOST = 40  # features in a picture, and names on an axis
 
@@ -31,7 +32,7 @@ def heat_map(
     picture = axes.imshow(values, cmap="cividis", vmin=0, vmax=1, aspect="auto")
     for (row, column), value in np.ndenumerate(values):
         colour = ink() if np.isnan(value) else "black" if value > 0.6 else "white"
-        shown = "-" if np.isnan(value) else "<0" if value < 0 else f"{value:.2f}"
+        shown = r2_text(None if np.isnan(value) else value)
         axes.text(column, row, shown, ha="center", va="center", color=colour, size=5)
     axes.set_yticks(range(len(rows)), [plain(name) for name in rows])
     axes.set_xticks(range(len(columns)), [plain(n) for n in columns], rotation=60, ha="right")
