@@ -534,7 +534,10 @@ def test_losses_stand_by_term_and_divergences_by_unit():
     terms, units = method_plots("x", {n: {"latent": 2, "method": m} for n, m in methods.items()})
     assert terms.rows == [("deepmdp-8", "reward", 0.3), ("deepmdp-8", "transition", 0.01)]
     assert units.rows == [("vae-2", "1", 2.0), ("vae-2", "2", 0.1)]
-    assert list(drawn(units).axes[0].lines[0].get_ydata()) == [2.0, 0.1]
+    (line,) = drawn(units).axes[0].lines
+    assert list(line.get_ydata()) == [2.0, 0.1]
+    (points,) = drawn(terms, DARK).axes[0].lines
+    assert (points.get_linestyle(), points.get_color()) == ("None", "#56B4E9")  # of the style
 
 
 def test_families_differ_in_size_only():

@@ -10,9 +10,10 @@ from matplotlib.figure import Figure
 from jbrep.figures.curves import below
 from jbrep.figures.families import Encoders, line_styles
 from jbrep.figures.plot import Plot
-from jbrep.figures.style import COLUMN, PAGE, Styles, plain, reference
+from jbrep.figures.style import COLUMN, PAGE, Looks, plain, reference
 
 LOSSES = ("train_loss", "test_loss")
+_WORDS = {"lipschitz": "Lipschitz"}  # of terms
 
 
 def loss_by_horizon(task: str, encoders: Encoders) -> Plot:
@@ -68,10 +69,15 @@ def loss_by_term(task: str, encoders: Encoders) -> Plot:
         "Terms of the loss on held-out windows, unweighted: the squared error of the standardised "
         "reward, 1 for no prediction; that of the next code; and by how much the networks are "
         "steeper than they may be.",
-        {label: e["method"]["loss_by_term"] for label, e in encoders.items()},
+        {label: _terms(e["method"]["loss_by_term"]) for label, e in encoders.items()},
         ("term", "loss on held-out windows"),
-        line_styles(encoders),
+        lambda: {name: {**look, "linestyle": ""} for name, look in line_styles(encoders).items()},
     )
+
+
+def _terms(losses: Mapping[str, float]) -> dict[str, float]:
+    """Losses by what the terms are called."""
+    return {_WORDS.get(term, term): loss for term, loss in losses.items()}
 
 
 def divergence(task: str, encoders: Encoders) -> Plot:
@@ -85,7 +91,7 @@ def divergence(task: str, encoders: Encoders) -> Plot:
         "rows, most first: about 0 for a unit that says nothing.",
         {label: {str(i): v for i, v in enumerate(each, 1)} for label, each in units.items()},
         ("unit", "divergence [nat]"),
-        line_styles(encoders),
+        lambda: line_styles(encoders),
     )
 
 
@@ -96,7 +102,7 @@ def _by_name(
     caption: str,
     values: Mapping[str, Mapping[str, float]],
     axis_labels: tuple[str, str],
-    look: Styles,
+    looks: Looks,
 ) -> Plot:
     """A line for each encoder over values that have names."""
     what, quantity = axis_labels
@@ -104,6 +110,7 @@ def _by_name(
     def draw() -> Figure:
         figure = Figure(figsize=(COLUMN, 2.3))
         axes: Axes = figure.subplots()
+        look = looks()
         for label, each in values.items():
             axes.plot(list(each), list(each.values()), ms=3, label=plain(label), **look[label])
         axes.set(xlabel=what, ylabel=quantity, ylim=(0, None))
