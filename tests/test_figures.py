@@ -324,9 +324,12 @@ def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
     few = ("full", "dae-12", "dae-8", "pca-8")
     evaluation["encoders"] = {name: evaluation["encoders"][name] for name in few}
     found = {plot.name: plot for plot in encoder_plots(evaluation)}
-    assert list(found) == [
-        *("error_by_feature", "error_by_latent", "error_by_corruption", "latent_correlation"),
-    ]
+    of_losses = ["error_by_feature", "error_by_latent", "error_by_corruption", "latent_correlation"]
+    assert list(found) == ["prediction_by_feature", "prediction_by_horizon", *of_losses]
+    known = evaluation["encoders"].items()
+    early = {n: {k: v for k, v in e.items() if k != "prediction"} for n, e in known}  # version 1
+    plots = encoder_plots({**evaluation, "encoders": early})
+    assert [plot.name for plot in plots] == of_losses
     error = evaluation["encoders"]["dae-8"]["reconstruction"]["mse"]
     (row,) = [row for row in found["error_by_latent"].rows if row[0] == "dae-8"]
     assert list(row[2:5]) == error
@@ -335,7 +338,7 @@ def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
     matrix = drawn(found["latent_correlation"]).axes[0].images[0].get_array()
     expected = evaluation["encoders"]["dae-12"]["latent_units"]["correlation"]
     np.testing.assert_array_equal(matrix, np.array(expected, float))
-    assert len(write(found.values(), tmp_path)) == 4
+    assert len(write(found.values(), tmp_path)) == 6
 
 
 def test_of_a_wide_robot_the_worst_features_are_shown():
