@@ -92,6 +92,7 @@ decoded: $(READY) ## results/decoded.txt anew: hand-written policies on what enc
 	    $(BIN)/jbrep evaluate-policy heuristic --task $$task --encoder $$name-$$latent || exit; \
 	  done; done; \
 	done > results/decoded.txt
+	sed -i '/^encoder:/d' results/decoded.txt
 
 desk: ## results/desk/ anew: a night or two; goes on where it was stopped
 ddpg: ## results/ddpg/ anew: a night
