@@ -4,22 +4,24 @@ import csv
 import io
 import json
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from PIL import Image
 
 from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.figures import behaviour_plots, encoder_plots, study_plots, write
-from jbrep.figures.curves import Return
+from jbrep.figures.curves import Return, every_run
 from jbrep.figures.diagnostics import _free
 from jbrep.figures.families import family
 from jbrep.figures.methods import method_plots, timescales
 from jbrep.figures.plot import Drawing
-from jbrep.figures.style import COLUMN, DARK, PAGE, PAPER, with_runs
+from jbrep.figures.style import COLUMN, DARK, PAGE, PAPER, styles, with_runs
 from jbrep.rollouts.behaviour import SPEEDS, observe
 from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
@@ -174,6 +176,17 @@ def test_a_representation_has_one_colour_in_all_figures(analysis, returns):
         assert colours == {"#D55E00"}
     latent = drawn(of_all[-1]).axes[0].lines[2]  # observation, hidden layer, latent
     assert latent.get_color() == "#0072B2"
+
+
+def test_titles_of_many_representations_do_not_overlap(returns):
+    names = [f"representation-{number}" for number in range(7)]
+    full = [row for row in returns if row[:3] == (*GROUPS[0], "full")]
+    rows = [row._replace(representation=name) for name in names for row in full]
+    figure = Drawing(every_run(rows, lambda: styles(names)), PAPER)._figure
+    titles = [t for t in figure.findobj(Text) if t.get_text().endswith(" (n = 4)")]
+    assert len(titles) == len(names)
+    boxes = [title.get_window_extent() for title in titles]
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
 
 
 def test_every_run_is_drawn(plots, returns):

@@ -27,6 +27,7 @@ Groups = Sequence[GroupAnalysis]
 Evaluated = tuple[str, str, str, int, int]  # task, algorithm, representation, seed, step
 Heuristics = Mapping[str, Sequence[float]]  # returns of the hand-written policy, by task
 
+_MOST_ACROSS = 5  # panels of runs side by side
 _HANDLE, _CHARACTER = 0.5, 0.05  # widths in a legend [inches]
 _COLUMNS = (
     *("task", "algorithm", "representation", "step"),
@@ -206,15 +207,17 @@ def _draw_runs(means: Mapping[Evaluated, float], looks: Looks) -> Figure:
     look = looks()
     names = [name for name in look if any(key[2] == name for key in means)]
     groups = list(dict.fromkeys(key[:2] for key in means))
-    figure = Figure(figsize=(PAGE, 0.35 + 1.35 * len(groups)))
-    panels = figure.subplots(len(groups), len(names), squeeze=False, sharey="row", sharex="row")
+    across = min(len(names), _MOST_ACROSS)
+    down = -(-len(names) // across)  # rows of a group
+    figure = Figure(figsize=(PAGE, 0.35 + 1.35 * len(groups) * down))
+    panels = figure.subplots(len(groups) * down, across, squeeze=False, sharey="row", sharex="row")
     of_task = defaultdict(list)
     for (task, *_), mean in means.items():
         of_task[task].append(mean)
-    for (i, j), axes in np.ndenumerate(panels):
+    for (i, j), axes in np.ndenumerate(panels.reshape(len(groups), -1)):
         runs: dict[int, dict[int, float]] = defaultdict(dict)
         for (*label, seed, step), mean in means.items():
-            if label == [*groups[i], names[j]]:
+            if label == [*groups[i], *names[j : j + 1]]:
                 runs[seed][step] = mean
         if not runs:
             axes.set_axis_off()
@@ -224,9 +227,10 @@ def _draw_runs(means: Mapping[Evaluated, float], looks: Looks) -> Figure:
         axes.set_title(plain(group) + with_runs(names[j], [len(runs)]))
         last = max(key[4] for key in means if key[:2] == groups[i])
         extent = limits(of_task[groups[i][0]])
-        _training_axes(axes, last, extent, ticks=5 if len(names) < 5 else 3)
-        axes.set_xlabel("training step" if i == len(groups) - 1 else "")
-        axes.set_ylabel("" if j else "return")
+        _training_axes(axes, last, extent, ticks=5 if across < 5 else 3)
+        is_lowest = i == len(groups) - 1 and j >= len(names) - across
+        axes.set_xlabel("training step" if is_lowest else "")
+        axes.set_ylabel("" if j % across else "return")
     return figure
 
 
