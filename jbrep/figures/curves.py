@@ -25,6 +25,7 @@ from jbrep.stats.analysis import GroupAnalysis
 
 Groups = Sequence[GroupAnalysis]
 Evaluated = tuple[str, str, str, int, int]  # task, algorithm, representation, seed, step
+Runs = dict[int, dict[int, float]]  # mean returns of a label, by seed and step
 Heuristics = Mapping[str, Sequence[float]]  # returns of the hand-written policy, by task
 
 _MOST_ACROSS = 5  # panels of runs side by side
@@ -204,27 +205,25 @@ def _is_broken(handle: Any) -> bool:
 
 
 def _draw_runs(means: Mapping[Evaluated, float], looks: Looks) -> Figure:
-    look = looks()
-    names = [name for name in look if any(key[2] == name for key in means)]
-    groups = list(dict.fromkeys(key[:2] for key in means))
+    runs: dict[tuple[str, ...], Runs] = defaultdict(lambda: defaultdict(dict))  # by label
+    of_task = defaultdict(list)
+    for (task, algorithm, name, seed, step), mean in means.items():
+        runs[task, algorithm, name][seed][step] = mean
+        of_task[task].append(mean)
+    look, groups = looks(), list(dict.fromkeys(label[:2] for label in runs))
+    names = [name for name in look if any(label[2] == name for label in runs)]
     across = min(len(names), _MOST_ACROSS)
     down = -(-len(names) // across)  # rows of a group
     figure = Figure(figsize=(PAGE, 0.35 + 1.35 * len(groups) * down))
     panels = figure.subplots(len(groups) * down, across, squeeze=False, sharey="row", sharex="row")
-    of_task = defaultdict(list)
-    for (task, *_), mean in means.items():
-        of_task[task].append(mean)
     for (i, j), axes in np.ndenumerate(panels.reshape(len(groups), -1)):
-        runs: dict[int, dict[int, float]] = defaultdict(dict)
-        for (*label, seed, step), mean in means.items():
-            if label == [*groups[i], *names[j : j + 1]]:
-                runs[seed][step] = mean
-        if not runs:
+        label = (*groups[i], *names[j : j + 1])  # without a name beyond the last
+        if label not in runs:
             axes.set_axis_off()
             continue
-        _draw_label(axes, runs, look[names[j]]["color"])
+        _draw_label(axes, runs[label], look[names[j]]["color"])
         group = f"{', '.join(groups[i])}\n" if j == 0 else ""
-        axes.set_title(plain(group) + with_runs(names[j], [len(runs)]))
+        axes.set_title(plain(group) + with_runs(names[j], [len(runs[label])]))
         last = max(key[4] for key in means if key[:2] == groups[i])
         extent = limits(of_task[groups[i][0]])
         _training_axes(axes, last, extent, ticks=5 if across < 5 else 3)
@@ -234,7 +233,7 @@ def _draw_runs(means: Mapping[Evaluated, float], looks: Looks) -> Figure:
     return figure
 
 
-def _draw_label(axes: Axes, runs: Mapping[int, Mapping[int, float]], colour: str) -> None:
+def _draw_label(axes: Axes, runs: Runs, colour: str) -> None:
     for steps in runs.values():
         axes.plot(list(steps), list(steps.values()), color=colour, linewidth=0.6, alpha=0.55)
     shared = sorted(set.intersection(*(set(steps) for steps in runs.values())))
