@@ -13,15 +13,16 @@ _QUIET: dict[str, Any] = {
 }
 
 
-def on_cluster(function: Callable[..., Any], cpus: int | None) -> Any:
+def on_cluster(function: Callable[..., Any], cpus: int | None, gpus: int = 0) -> Any:
     """A function as Ray's remote function, on a core each, called again if its node dies.
 
     Args:
         function: to run.
         cpus: of the local cluster that is started where RAY_ADDRESS names none; None takes all.
+        gpus: that it needs.
     """
     import ray
 
     if not ray.is_initialized():
         ray.init(num_cpus=None if "RAY_ADDRESS" in os.environ else cpus, **_QUIET)
-    return ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(function)
+    return ray.remote(num_cpus=1, num_gpus=gpus, max_retries=ATTEMPTS - 1)(function)

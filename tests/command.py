@@ -24,10 +24,10 @@ def start(*arguments):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def in_this_process(plan, cells, workers):
+def in_this_process(plan, packs, workers):
     """A backend that starts no process and sees what a test has patched."""
-    for cell in cells:
-        yield work(cell.name, plan.run(cell), plan.folder_of(cell))
+    for pack in packs:
+        yield from work(plan.assigned(pack))
 
 
 def wait_for(happened, process, seconds=120):

@@ -88,6 +88,8 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
         (("studies/none.toml",), "no study at studies/none.toml"),
         (("studies/desk.toml", "--backend", "slurm"), "unknown backend 'slurm'"),
         (("README.md",), "README.md is not valid TOML"),
+        (("studies/paper.toml", "--width", 0), "'--width': 0 is not in the range"),
+        (("studies/paper.toml", "--width", 1000, "--workers", 9), "the width is 1000: 9 cohorts"),
     ):
         refused = jbrep("study", *arguments, "--out", tmp_path / "dry")
         assert (refused.exit_code, refused.output.count("\n")) == (2, 1), refused.output
@@ -208,6 +210,16 @@ def test_every_command_has_help_with_an_example(command):
         (("encoder", "info", "none"), "no encoder at none"),
         (("encoder", "info", "dae-9", "--task", "face_direction"), "no encoder 'dae-9'"),
         (("rl", "--task", "face_direction", "--encoder", "x", "--out", "y"), "no encoder 'x'"),
+        *(
+            (("rl", "--task", "face_direction", "--out", "x", *given.split()), message)
+            for given, message in (
+                ("--trainer both", "unknown trainer 'both': choose one of cohort, sb3"),
+                ("--algorithm ppo --trainer cohort", "not ppo: add --trainer sb3"),
+                ("--algorithm ppo --precision bfloat16", "sb3 has no bfloat16"),
+                ("--precision half", "unknown precision 'half'"),
+                ("--device tpu", "no device 'tpu' on this machine"),
+            )
+        ),
         (("report", "none"), "none is not the folder of a study"),
         (("report",), "Missing argument 'FOLDER'. See jbrep report --help."),
         (("fly",), "No such command 'fly'. See jbrep --help."),

@@ -26,11 +26,12 @@ from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
 from jbrep.errors import InputError
 from jbrep.files import container
-from jbrep.rl import Run, StoppedError, checkpoint, train
+from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, read_evaluations, read_run
 from jbrep.rl.policy import load_run, load_zip
 from jbrep.rl.presets import ALGORITHMS, PRESETS, get_preset
+from jbrep.rl.sb3.checkpointer import restore, take
 
 STEPS = 100  # of an episode: little depends on its length
 TASK = describe("face_direction", max_episode_steps=STEPS)
@@ -231,8 +232,10 @@ def test_a_run_that_another_process_has_just_finished_is_left_alone(short, tmp_p
         shutil.copytree(short, folder, dirs_exist_ok=True)
         yield
 
-    monkeypatch.setattr("jbrep.rl.run.exclusive", wait_for_another_process)
-    monkeypatch.setattr("jbrep.rl.run._train", lambda *_: pytest.fail("it was trained again"))
+    monkeypatch.setattr("jbrep.rl.trainers.exclusive", wait_for_another_process)
+    monkeypatch.setattr(
+        "jbrep.rl.job.Job.keep_encoder", lambda _: pytest.fail("it was trained again")
+    )
     assert train(SHORT, folder) == read_run(short)
 
 
@@ -329,7 +332,7 @@ def test_the_rate_after_resuming_counts_the_steps_since():
         bar.show(600, 1.0)
         assert (bar._progress.n, bar._progress.initial) == (600, 500)
     trained, resumed = agent_of("a2c").learn(80), agent_of("a2c").learn(40)
-    checkpoint.restore(resumed, checkpoint.take(trained))
+    restore(resumed, take(trained))
     assert resumed.num_timesteps == resumed._num_timesteps_at_start == 80
 
 

@@ -150,7 +150,7 @@ def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
     before = (tmp_path / CHECKPOINT).read_bytes()
 
     def fail(*_):
-        raise EnvironmentFailedError("out of order")
+        raise EnvironmentFailedError("out of order", 0)
 
     with monkeypatch.context() as patch:
         patch.setattr("jbrep.envs.lanes.Lanes.restore", fail)

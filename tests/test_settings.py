@@ -213,7 +213,12 @@ def resumed(run, folder, stop_at=40):
     [
         Run(**QUICK, algorithm="tqc", settings=SMALL),
         Run(**QUICK, algorithm="crossq", settings={**SMALL, "renorm_warmup_steps": 2}),
-        Run(**QUICK, algorithm="sac", settings={**SMALL, "use_sde": True, "n_steps": 2}),
+        Run(
+            **QUICK,
+            algorithm="sac",
+            settings={**SMALL, "use_sde": True, "n_steps": 2},
+            trainer="sb3",
+        ),
         Run(
             **QUICK,
             algorithm="ppo",

@@ -33,7 +33,7 @@ from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, read_study
 from jbrep.study.heuristics import HEURISTIC_RETURNS, write_heuristics
-from jbrep.study.plan import STUDY, Plan, read_plan
+from jbrep.study.plan import STUDY, Plan, plan_for, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.progress import Progress, duration
 from jbrep.study.results import (
@@ -86,7 +86,7 @@ def done(tmp_path_factory):
 
 def test_the_presets_are_studies():
     studies = {p.stem: read_study(p) for p in Path("studies").glob("*.toml")}
-    assert set(studies) == {"smoke", "codes", "ddpg", "desk", "paper", "yaw"}
+    assert set(studies) == {"demo", "codes", "ddpg", "desk", "paper", "yaw"}
     paper = studies["paper"]
     assert (paper.steps, len(paper.seeds), paper.data) == (5_000_000, 10, Data(steps=5_000_000))
     assert {"dae-12", "dae-8", "dae-4", "full"} <= set(paper.representations)
@@ -317,11 +317,16 @@ def test_what_the_first_release_finished_is_not_run_again(done, tmp_path):
         run["settings"]["episode_steps"] = TINY.episode_steps
         path.write_text(json.dumps({**run, "format_version": 1}))
     study = json.loads((tmp_path / "old" / STUDY).read_text())
-    del study["environment"]
+    for name in ("environment", "trainer", "precision", "device"):
+        del study[name]
     (tmp_path / "old" / STUDY).write_text(
         json.dumps({**study, "episode_steps": TINY.episode_steps})
     )
-    assert run_study(Plan(TINY, tmp_path / "old"), None, 1) == 0  # nothing is left to run
+    goes_on = plan_for(TINY, tmp_path / "old")
+    assert run_study(goes_on, None, 1) == 0  # nothing is left to run
+    assert goes_on.study.trainer == "sb3"  # the only one that there was
+    assert run_study(plan_for(TINY, tmp_path / "old"), None, 1) == 0
+    assert plan_for(TINY, tmp_path / "new").study == TINY
     assert [run.label for run in read_runs(tmp_path / "old")] == [
         run.label for run in read_runs(done.folder)
     ]
@@ -412,6 +417,21 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     assert failed == {"a2c": [0, 0], "a2c-modern": [2, 2]}
 
 
+def test_runs_of_different_trainers_are_compared_on_request(done, tmp_path):
+    shutil.copytree(done.folder / "runs", tmp_path / "runs")
+    for path in tmp_path.rglob("pca-8/*/run.json"):
+        run = json.loads(path.read_text())
+        run["settings"]["trainer"] = "cohort"
+        path.write_text(json.dumps(run))
+    results = read_results(tmp_path)
+    assert results.analysis is None
+    assert (
+        "trainers: cohort float32 cpu, sb3 float32 cpu; report those of one" in results.left_out[0]
+    )
+    assert read_results(tmp_path, across_trainers=True).analysis.to_json()
+    assert jbrep("report", tmp_path, "--across-trainers", "--json").exit_code == 0
+
+
 @pytest.mark.usefixtures("one_figure")
 def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     """And reported before: test_whole resumes killed ones."""
@@ -420,7 +440,7 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     finished, begun, *_ = plan.cells
     shutil.copytree(done.folder_of(finished), plan.folder_of(finished))
     stop = iter((False, True)).__next__  # after its first rollout
-    assert work(begun.name, plan.run(begun), plan.folder_of(begun), stop) is None
+    assert work(plan.assigned([begun]), stop) is None
     assert (plan.folder_of(begun) / CHECKPOINT).exists()
     monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
     reported = jbrep("report", out, "--json")

@@ -35,7 +35,7 @@ from jbrep.study.prepare import prepare
 from jbrep.study.record import EACH_ITS_OWN, RECORD
 from jbrep.study.results import RETURNS, conclude, read_results
 from jbrep.study.study import dry_run, run_study
-from jbrep.study.work import work
+from jbrep.study.work import Assigned, work
 
 TASK = "face_direction"
 NET = "my_encoders:Net"
@@ -63,10 +63,10 @@ def with_own(*own, **changes):
     return dataclasses.replace(TINY, representations=("full", *own), **changes)
 
 
-def in_this_process(plan, cells, workers):
+def in_this_process(plan, packs, workers):
     """A backend that needs no start."""
-    for cell in cells:
-        yield work(cell.name, plan.run(cell), plan.folder_of(cell))
+    for pack in packs:
+        yield from work(plan.assigned(pack))
 
 
 def put(name, path):
@@ -458,8 +458,11 @@ def test_a_worker_imports_the_modules_it_is_told_to(done, tmp_path, monkeypatch)
     monkeypatch.setattr("jbrep.envs.names._imported", [])
     run = done.run(done.cells[2])
     assert run.encoder == NET
-    assert "add --import my_encoders" in work("net", run, tmp_path).message
-    assert work("net", run, tmp_path, modules=["my_encoders"]).status == "finished"
+    assigned = [Assigned("net", run, tmp_path)]
+    (crashed,) = work(assigned)
+    assert "add --import my_encoders" in crashed.message
+    (ended,) = work(assigned, modules=["my_encoders"])
+    assert ended.status == "finished"
 
 
 def test_a_drawing_of_an_encoder_without_decoder_ends_with_the_latent():
@@ -470,9 +473,11 @@ def test_a_drawing_of_an_encoder_without_decoder_ends_with_the_latent():
 
 
 def test_the_time_of_code_is_estimated_by_itself(done, tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.study.study.estimate", lambda run: 60 if run.encoder == NET else 30)
+    monkeypatch.setattr(
+        "jbrep.study.study.estimate", lambda runs: 60 if runs[0].encoder == NET else 30
+    )
     told = dry_run(Plan(done.study, tmp_path / "it"), 1).splitlines()
-    assert [line.split()[1] for line in told[1:6]] == ["30", "30", "60", "30", "30"]
+    assert [line.split()[2] for line in told[1:6]] == ["30", "30", "60", "30", "30"]
 
 
 def test_a_run_on_code(done, tmp_path, monkeypatch):

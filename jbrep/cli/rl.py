@@ -86,6 +86,22 @@ def given_settings(options: dict[str, Any]) -> dict[str, Any]:
 )
 @task_options()
 @learner_options
+@click.option(
+    "--trainer",
+    default="",
+    help="cohort, which is jbrep's own, or sb3, stable-baselines3 itself.  [default: cohort for "
+    "ddpg, td3 and sac, sb3 for the others]",
+)
+@click.option(
+    "--precision",
+    default="float32",
+    show_default=True,
+    help="Of a cohort's products of matrices: float32, or bfloat16, which some processors compute "
+    "several times as fast.",
+)
+@click.option(
+    "--device", default="cpu", show_default=True, help="That a cohort learns on: cpu or cuda."
+)
 @click.option("--steps", default=100_000, show_default=True, type=COUNT, help="Of training.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
 @click.option(

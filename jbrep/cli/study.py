@@ -17,13 +17,20 @@ from jbrep.cli.base import (
 from jbrep.cli.environment import import_option
 
 
-@click.command(epilog=example("jbrep study studies/smoke.toml --out runs/smoke"))
+@click.command(epilog=example("jbrep study studies/demo.toml --out runs/demo"))
 @click.argument("study", type=click.Path(path_type=Path))
 @click.option(
     "--out", type=click.Path(path_type=Path), help="A folder.  [default: runs/NAME of the STUDY]"
 )
 @click.option(
-    "--workers", type=click.IntRange(1, 1024), help="Runs at a time.  [default: one for each core]"
+    "--workers",
+    type=click.IntRange(1, 1024),
+    help="Processes at a time.  [default: one for each core; one if it learns on a GPU]",
+)
+@click.option(
+    "--width",
+    type=click.IntRange(1, 1024),
+    help="The most agents that learn together in a process.  [default: what keeps all busy]",
 )
 @click.option(
     "--backend",
@@ -40,6 +47,7 @@ def study(
     study: Path,
     out: Path | None,
     workers: int | None,
+    width: int | None,
     backend: str,
     dry_run: bool,
 ) -> None:
@@ -50,24 +58,23 @@ def study(
     Data sets and encoders are made first. Stopped or killed, the same command resumes the study;
     runs that have ended are never run again.
     """
-    from joblib import cpu_count
-
     from jbrep.study.config import read_study
-    from jbrep.study.plan import Plan
+    from jbrep.study.packing import usual_workers
+    from jbrep.study.plan import plan_for
     from jbrep.study.runner import get_backend
     from jbrep.study.study import dry_run as dry_run_text
     from jbrep.study.study import run_study
     from jbrep.text import terminal_width
 
-    plan = Plan(read_study(study), out or Path("runs") / study.stem)
-    run, count = get_backend(backend), workers or cpu_count()
+    plan = plan_for(read_study(study), out or Path("runs") / study.stem)
+    run, count = get_backend(backend), workers or usual_workers(plan)
     for notice in plan.study.notices:
         click.echo(notice, err=True)
     if dry_run:
-        click.echo(dry_run_text(plan, count, terminal_width()))
+        click.echo(dry_run_text(plan, count, width, terminal_width()))
         return
     with stoppable(RESUMES):
-        crashed = run_study(plan, run, count)
+        crashed = run_study(plan, run, count, width)
     if crashed:
         click.echo(f"{crashed} runs crashed: the same command tries them again", err=True)
     _conclude(plan.folder)
@@ -75,7 +82,7 @@ def study(
         context.exit(1)
 
 
-@click.command(cls=Variadic, epilog=example("jbrep report runs/smoke"))
+@click.command(cls=Variadic, epilog=example("jbrep report runs/demo"))
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option(
     "--evaluation",
@@ -85,21 +92,31 @@ def study(
     "{task} in it stands for each task.",
 )
 @click.option(
+    "--across-trainers", is_flag=True, help="Compare runs of different trainers or precisions, too."
+)
+@click.option(
     "--out", type=click.Path(path_type=Path), help="A folder for it.  [default: the study's own]"
 )
 @as_json
-def report(folder: Path, evaluation: tuple[str, ...], out: Path | None, as_json: bool) -> None:
+def report(
+    folder: Path,
+    evaluation: tuple[str, ...],
+    across_trainers: bool,
+    out: Path | None,
+    as_json: bool,
+) -> None:
     """Show what a study found, as a page, tables and figures.
 
     FOLDER holds a study, finished or not, or any runs. Where there are no runs, as in results/desk,
     the report is made from the tables alone.
     """
-    _conclude(folder, evaluation, out, as_json)
+    _conclude(folder, evaluation, across_trainers, out, as_json)
 
 
 def _conclude(
     folder: Path,
     evaluations: tuple[str, ...] = (),
+    across_trainers: bool = False,
     out: Path | None = None,
     as_json: bool = False,
 ) -> None:
@@ -114,7 +131,7 @@ def _conclude(
 
     paths: list[Path] = []
     if has_runs(folder):
-        results, paths = conclude(folder)
+        results, paths = conclude(folder, across_trainers)
         if not as_json:
             for line in as_text(results, terminal_width()).splitlines():
                 click.echo(printable(line))

@@ -19,7 +19,15 @@ State = dict[str, NDArray[Any]]  # everything that decides how lanes continue; (
 
 
 class EnvironmentFailedError(InputError):
-    """An environment raised an error, or gave something else than its task's description says."""
+    """An environment raised an error, or gave something else than its task's description says.
+
+    Attributes:
+        lane: in which it did.
+    """
+
+    def __init__(self, message: str, lane: int):
+        super().__init__(message)
+        self.lane = lane
 
 
 class Step(NamedTuple):
@@ -200,7 +208,8 @@ class Lanes:
         lane = int(np.flatnonzero(~good)[0])
         raise EnvironmentFailedError(
             f"{self.task.name} {did} an observation or reward that is not finite, at step "
-            f"{self._steps[lane]} of the episode with seed {self._seeds[lane]}"
+            f"{self._steps[lane]} of the episode with seed {self._seeds[lane]}",
+            lane,
         )
 
 
@@ -308,7 +317,8 @@ class _Separate:
     def _failure(self, lane: int, error: Exception) -> EnvironmentFailedError:
         return EnvironmentFailedError(
             f"{self._task.name} failed at step {len(self._actions[lane])} of the episode with seed "
-            f"{self._seeds[lane]}: {one_line(error)}"
+            f"{self._seeds[lane]}: {one_line(error)}",
+            lane,
         )
 
     @property

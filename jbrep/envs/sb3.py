@@ -12,7 +12,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from jbrep.envs.checks import check_actions
 from jbrep.envs.description import describe
 from jbrep.envs.encoding import BaseEncoder, as_encoder
-from jbrep.envs.lanes import Lanes, State
+from jbrep.envs.endless import Endless
+from jbrep.envs.lanes import State
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 
@@ -78,24 +79,20 @@ class TaskVecEnv(VecEnv):
             raise InputError(f"{task.name} is described with its time limit: describe it anew")
         self.task = task
         self._encoder = None if encoder is None else as_encoder(encoder, task)
-        self.lanes = Lanes(task, num_envs, num_threads)
+        self._endless = Endless(task, num_envs, num_threads)
+        self.lanes = self._endless.lanes
         observation_space, action_space = agent_spaces(task, self._encoder)
         self._low, self._high = np.array(task.action_low), np.array(task.action_high)
         self._actions = np.zeros((num_envs, task.action_size))
-        self._first_seeds = np.zeros(num_envs, np.int64)
-        self._episodes = np.zeros(num_envs, np.int64)  # k of each lane's episode
         super().__init__(num_envs, observation_space, action_space)
         self.seed(seed)
 
     def reset(self) -> Float32:
         """Start an episode in every lane: the first one if seeds were set since, else the next."""
-        self._episodes += 1
-        for lane, seed in enumerate(self._seeds):
-            if seed is not None:
-                self._first_seeds[lane], self._episodes[lane] = seed, 0
+        observation = self._endless.reset(self._seeds)
         self._reset_seeds()
         self._reset_options()
-        return self._represent(self._start(range(self.num_envs)))
+        return self._represent(observation)
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
         """Keep the actions, (num_envs, k), for `step_wait`.
@@ -108,29 +105,24 @@ class TaskVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Take one step in every lane; where an episode ends, start the next."""
-        step = self.lanes.step(self._actions)
-        observation, done = step.observation, self.lanes.ended
+        moved = self._endless.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        if done.any():
-            ended = np.flatnonzero(done).tolist()
-            told = self.lanes.info.get("non_finite")
-            finals = self._represent(observation[ended])
+        if moved.ended.any():
+            ended = np.flatnonzero(moved.ended).tolist()
+            finals = self._represent(moved.final[ended])
             for lane, final in zip(ended, finals, strict=True):
                 infos[lane] = {
                     "terminal_observation": final,
-                    "TimeLimit.truncated": not step.terminated[lane],
+                    "TimeLimit.truncated": not moved.terminated[lane],
+                    **moved.told(lane),
                 }
-                if told is not None:
-                    infos[lane]["non_finite"] = bool(told[lane])
-            self._episodes[ended] += 1
-            observation = self._start(ended)
-        return self._represent(observation), step.reward.astype(np.float32), done, infos
+        reward = moved.reward.astype(np.float32)
+        return self._represent(moved.observation), reward, moved.ended, infos
 
     @property
     def state(self) -> State:
         """A copy of what `restore` takes: everything that decides how the lanes continue."""
-        own = {"first_seeds": self._first_seeds.copy(), "episodes": self._episodes.copy()}
-        return own | self.lanes.state
+        return self._endless.state
 
     def restore(self, state: State) -> None:
         """Continue from where the state was taken, to the same bits.
@@ -138,15 +130,7 @@ class TaskVecEnv(VecEnv):
         Raises:
             InputError: the environment isn't reproducible.
         """
-        lanes = dict(state)
-        self._first_seeds, self._episodes = lanes.pop("first_seeds"), lanes.pop("episodes")
-        self.lanes.restore(lanes)
-
-    def _start(self, lanes: Sequence[int]) -> Array:
-        """Start the episode in each of the lanes that its counter says."""
-        return self.lanes.reset(
-            lanes, [_episode_seed(int(self._first_seeds[i]), int(self._episodes[i])) for i in lanes]
-        )
+        self._endless.restore(state)
 
     def _represent(self, observation: Array) -> Float32:
         if self._encoder is None:
@@ -186,10 +170,3 @@ class TaskVecEnv(VecEnv):
 
 
 JitterbugVecEnv = TaskVecEnv  # the name of the first release
-
-
-def _episode_seed(first: int, episode: int) -> int:
-    """The seed of a lane's episode, from that of its first and the number of episodes before."""
-    if episode == 0:
-        return first
-    return int(np.random.SeedSequence([first, episode]).generate_state(1)[0]) >> 1

@@ -212,7 +212,7 @@ def reproduce(tables: Tables) -> list[tuple[str, str]]:
 def _imports(study: Mapping[str, Any]) -> str:
     """The options that import the modules of a study's own encoders."""
     own = (each for each in study["representations"] if isinstance(each, Mapping))
-    modules = dict.fromkeys(each["code"].partition(":")[0] for each in own if "code" in each)
+    modules = dict.fromkeys(str(each["code"]).partition(":")[0] for each in own if "code" in each)
     return "".join(f" --import {shlex.quote(module)}" for module in modules)
 
 

@@ -19,6 +19,7 @@ from jbrep.study import record
 from jbrep.study.heuristics import HEURISTIC_RETURNS
 from jbrep.study.results import RETURNS, STATISTICS
 
+_REPRESENTATIONS = list[str | dict[str, Any]]  # names, or what a user's own are made of
 _MOST = 1 << 53  # of a number: a float holds whole ones exactly
 # of the first release, which had no other robot
 _JITTERBUG: TaskRecord = {
@@ -110,6 +111,9 @@ def _check(checked: Record) -> None:
     """
     if not checked["runs"]:
         raise ValueError("it has no finished run")
+    if study := checked["study"]:
+        typed(study.get("algorithms"), list[str], where="study.algorithms")
+        typed(study.get("representations"), _REPRESENTATIONS, where="study.representations")
     if "jbrep" not in (*checked["versions"], {})[0]:
         raise ValueError("the version of jbrep is missing")
     for run in checked["runs"]:

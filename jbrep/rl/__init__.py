@@ -5,11 +5,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jbrep.rl.checkpoint import StoppedError
-    from jbrep.rl.run import Run, train
+    from jbrep.rl.run import Run
+    from jbrep.rl.trainers import train
 
 __all__ = ["Run", "StoppedError", "train"]
 
-_MODULES = {"Run": "run", "StoppedError": "checkpoint", "train": "run"}
+_MODULES = {"Run": "run", "StoppedError": "checkpoint", "train": "trainers"}
 
 
 def __getattr__(name: str) -> Any:

@@ -101,6 +101,24 @@ def trained_parts(agent: BaseAlgorithm) -> Iterator[tuple[str, Any]]:
     return ((name, attrgetter(name)(agent)) for name in names)
 
 
+def parameters(agent: BaseAlgorithm) -> Iterator[tuple[str, torch.Tensor]]:
+    """Everything that gradient steps change: weights, targets, Adam's moments, entropy's weight."""
+    _, variables = agent._get_torch_save_params()
+    yield from ((name, getattr(agent, name).data) for name in variables)
+    for name, part in trained_parts(agent):
+        if isinstance(part, torch.optim.Optimizer):
+            yield from _moments(name, part)
+        else:
+            yield from ((f"{name}.{key}", t) for key, t in part.state_dict().items())
+
+
+def _moments(name: str, optimizer: torch.optim.Optimizer) -> Iterator[tuple[str, torch.Tensor]]:
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    for i, parameter in enumerate(parameters):
+        for key, tensor in optimizer.state[parameter].items():
+            yield f"{name}.{i}.{key}", tensor
+
+
 @contextmanager
 def unchecked_distributions() -> Iterator[None]:
     """Let NaN through torch's distributions, which would raise a bare ValueError.
@@ -158,12 +176,18 @@ class Evaluator:
         encoder: the policy's view of the observation.
         episodes: the number of episodes.
         seed: of the first episode; the others take the numbers that follow.
+        num_threads: as for `Lanes`.
     """
 
     def __init__(
-        self, task: Task, encoder: BaseEncoder, episodes: int, seed: int = EVALUATION_SEED
+        self,
+        task: Task,
+        encoder: BaseEncoder,
+        episodes: int,
+        seed: int = EVALUATION_SEED,
+        num_threads: int | None = 1,
     ):
-        self._lanes = Lanes(task, episodes, num_threads=1)
+        self._lanes = Lanes(task, episodes, num_threads)
         self._encoder, self._seed = encoder, seed
 
     def returns(self, policy: BasePolicy | BaseAlgorithm) -> Array:

@@ -9,7 +9,7 @@ from jbrep.envs.task import MAX_EPISODE_STEPS, read_task
 from jbrep.errors import DamageError
 from jbrep.files.commit import are_commits
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
-from jbrep.rl.names import base_name
+from jbrep.rl.names import FLOAT32, PRECISIONS, SB3, TRAINERS, base_name
 
 FINISHED, FAILED = "finished", "failed"
 MAX_STEPS = 10**12  # of training
@@ -124,6 +124,9 @@ _SETTINGS = {
     "steps": whole_number(1, MAX_STEPS),
     "evaluate_every": whole_number(1, MAX_STEPS),
     "evaluation_episodes": whole_number(1, MAX_EVALUATION_EPISODES),
+    "trainer": text("|".join(TRAINERS), " or ".join(TRAINERS)),
+    "precision": text("|".join(PRECISIONS), " or ".join(PRECISIONS)),
+    "device": text("cpu|cuda", "cpu or cuda"),
     "from": Kind(lambda v: v is None or _SHA256.allows(v), f"null or {_SHA256.words}"),
 }
 POLICY = {"activation_fn": "relu"}  # arguments of every policy unless a run sets others
@@ -133,6 +136,9 @@ _ADDED = {  # what early runs of this version lack
     "policy": POLICY,
     "normalize": False,
     "overrides": {},
+    "trainer": SB3,
+    "precision": FLOAT32,
+    "device": "cpu",
 }
 _POLICY_FILE = {
     "settings": _OBJECT,

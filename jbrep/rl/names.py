@@ -10,9 +10,19 @@ CLASSES = {  # by the names of algorithms
     "tqc": "sb3_contrib.TQC",
     "crossq": "sb3_contrib.CrossQ",
 }
+CPU, CUDA = "cpu", "cuda"
+COHORT, SB3 = "cohort", "sb3"
+TRAINERS = {COHORT: ("ddpg", "td3", "sac"), SB3: tuple(CLASSES)}  # and the algorithms that each has
+FLOAT32, BFLOAT16 = "float32", "bfloat16"
+PRECISIONS = {FLOAT32: (COHORT, SB3), BFLOAT16: (COHORT,)}  # and the trainers that have each
 PAPER, MODERN = "paper", "modern"  # presets; the paper's unless another is named
 
 
 def base_name(algorithm: str, preset: str) -> str:
     """An algorithm with its preset, unless that is the paper's: ddpg, sac-modern."""
     return algorithm if preset == PAPER else f"{algorithm}-{preset}"
+
+
+def usual_trainer(algorithm: str) -> str:
+    """What trains an algorithm unless another trainer is asked for."""
+    return next((name for name, its in TRAINERS.items() if algorithm in its), SB3)

@@ -6,6 +6,7 @@ from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import (
     ActionNoise,
@@ -17,7 +18,11 @@ from jbrep.errors import choose
 from jbrep.rl.fields import POLICY
 from jbrep.rl.names import CLASSES, MODERN, PAPER
 
+Array = NDArray[np.float64]
 Hidden = Sequence[int] | Mapping[str, Sequence[int]]
+
+
+_DT = 1e-2  # stable-baselines3's unit of time for a step
 
 
 class NormalNoise(NamedTuple):
@@ -28,6 +33,10 @@ class NormalNoise(NamedTuple):
     def make(self, size: int) -> ActionNoise:
         """The noise on actions of so many numbers, as a stable-baselines3 object."""
         return NormalActionNoise(np.zeros(size), np.full(size, self.sigma))
+
+    def after(self, previous: Array, generator: np.random.RandomState) -> Array:
+        """The next noise as that object draws it; zeros come before an episode's first."""
+        return generator.normal(0, self.sigma, previous.shape)
 
 
 class OrnsteinUhlenbeckNoise(NamedTuple):
@@ -41,6 +50,11 @@ class OrnsteinUhlenbeckNoise(NamedTuple):
         """As for `NormalNoise`; stable-baselines3 takes a step for 0.01 units of time."""
         mean, sigma = np.full(size, self.mean), np.full(size, self.sigma)
         return OrnsteinUhlenbeckActionNoise(mean, sigma, self.theta)
+
+    def after(self, previous: Array, generator: np.random.RandomState) -> Array:
+        """As for `NormalNoise`."""
+        pull = self.theta * (self.mean - previous) * _DT
+        return previous + pull + self.sigma * np.sqrt(_DT) * generator.normal(size=previous.shape)
 
 
 @dataclass(frozen=True)

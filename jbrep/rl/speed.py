@@ -1,35 +1,68 @@
-"""How long a run takes, estimated from a short trial."""
+"""How long runs take, estimated from a short trial."""
 
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from jbrep.rl.agent import Evaluator, make_agent, make_env
+from jbrep.rl.cohort.cohort import Cohort
+from jbrep.rl.cohort.member import Member
+from jbrep.rl.job import Job
+from jbrep.rl.names import COHORT
 from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.run import Run
 from jbrep.training.trainer import single_torch_thread
 
-_MIN_STEPS = 300
+_MIN_STEPS = 300  # of all runs
 
 
-def estimate(run: Run) -> float:
-    """Seconds that a run takes on one core of this machine with nothing else running."""
-    encoder = run.find_encoder()
-    preset = run.used
-    settings: dict[str, Any] = {**preset.settings}
-    if issubclass(ALGORITHMS[run.algorithm], OffPolicyAlgorithm):
-        settings["learning_starts"] = 0  # gradient steps from the first rollout on
+def estimate(runs: Sequence[Run]) -> float:
+    """Seconds that runs take, together, on one core of this machine with nothing else running.
+
+    Args:
+        runs: that can be in one cohort, or one of another trainer.
+    """
+    first = runs[0]
+    if issubclass(ALGORITHMS[first.algorithm], OffPolicyAlgorithm):
+        at_once = {"learning_starts": 0}  # gradient steps from the first rollout on
+        runs = [replace(run, settings={**run.settings, **at_once}) for run in runs]
+    with TemporaryDirectory() as folder, single_torch_thread():
+        trial = _together if first.trainer == COHORT else _alone
+        per_step, per_evaluation = trial(runs, Path(folder))
+    evaluations = first.steps // first.evaluate_every + 1
+    return first.steps * per_step + evaluations * per_evaluation
+
+
+def _alone(runs: Sequence[Run], folder: Path) -> tuple[float, float]:
+    """Seconds of a step, and of an evaluation."""
+    (run,) = runs
+    encoder, preset = run.find_encoder(), run.used
     env = make_env(run.task, preset.num_envs, 0, encoder, preset.normalize)
-    agent = make_agent(run.algorithm, replace(preset, settings=settings), env, 0)
+    agent = make_agent(run.algorithm, preset, env, 0)
     evaluator = Evaluator(run.task, encoder, run.evaluation_episodes)
-    with single_torch_thread():
-        started = time.perf_counter()
-        agent.learn(_MIN_STEPS)  # whole rollouts, so at least one
-        learned = time.perf_counter()
-        evaluator.returns(agent)
-        evaluated = time.perf_counter()
-    evaluations = run.steps // run.evaluate_every + 1
-    per_step = (learned - started) / agent.num_timesteps
-    return run.steps * per_step + evaluations * (evaluated - learned)
+    learned = _seconds(lambda: agent.learn(_MIN_STEPS))  # whole rollouts, so at least one
+    return learned / agent.num_timesteps, _seconds(lambda: evaluator.returns(agent))
+
+
+def _together(runs: Sequence[Run], folder: Path) -> tuple[float, float]:
+    """The same of a cohort: a step of each run, an evaluation of each."""
+    members = [Member(Job(run, folder / str(i)), []) for i, run in enumerate(runs)]
+    cohort = Cohort(members)
+
+    def learn() -> None:
+        while cohort.step * len(runs) < _MIN_STEPS:
+            for _ in range(cohort.rollout):
+                cohort.act()
+            cohort.learn()
+
+    return _seconds(learn) / cohort.step, _seconds(members[0].evaluate) * len(members)
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    started = time.perf_counter()
+    work()
+    return time.perf_counter() - started

@@ -17,8 +17,9 @@ from jbrep.files.lock import exclusive
 from jbrep.files.storage import make_folder, write_whole
 from jbrep.rl.files import FINISHED, read_evaluations
 from jbrep.rl.learner import write_preset
-from jbrep.rl.run import Run, plain, train
+from jbrep.rl.run import Run, plain
 from jbrep.rl.settings import setting_names
+from jbrep.rl.trainers import train_all
 
 JOURNAL, BEST = "optuna.journal", "best.toml"
 _RANGES: dict[str, tuple[float, float] | list[Any]] = {  # logarithmic, or choices
@@ -131,11 +132,14 @@ def _trial(
     settings = _settings(there.params)
     if there.state.is_finished():
         return Trial(number, settings, there.value)
+    trained = replace(run, settings={**run.settings, **settings})
+    runs = {
+        folder / f"trial-{number}" / f"seed-{seed}": replace(trained, seed=seed)
+        for seed in range(run.seed, run.seed + seeds)
+    }
     returns = []
-    for seed in range(run.seed, run.seed + seeds):
-        trained = replace(run, settings={**run.settings, **settings}, seed=seed)
-        of_seed = folder / f"trial-{number}" / f"seed-{seed}"
-        if train(trained, of_seed, stop=stop)["status"] != FINISHED:
+    for of_seed, result in train_all(runs, stop=stop):
+        if result["status"] != FINISHED:
             study.tell(number, state=TrialState.FAIL)
             return Trial(number, settings, None)
         rows = read_evaluations(of_seed)

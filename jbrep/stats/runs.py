@@ -36,6 +36,7 @@ class RunCurve:
         failed_at: training step at which the run failed; None if it didn't.
         return_floor: the least possible return of an episode of the task; None if unknown.
         solved: the return from which on the task counts as solved; None if unknown.
+        trainer: what trained it, and how exactly; equal for all runs that are compared.
         failure_return: what the run counts as once it has failed; None for the floor.
             `with_failure_returns` sets it for runs that are compared.
 
@@ -54,6 +55,7 @@ class RunCurve:
     failed_at: int | None = None
     return_floor: float | None = None
     solved: float | None = None
+    trainer: str = ""
     failure_return: float | None = None
 
     def __post_init__(self) -> None:
@@ -167,7 +169,7 @@ def groups(runs: Sequence[RunCurve], baseline: str) -> dict[tuple[str, str], Gro
     Raises:
         InputError: there is no run, something else than a run, a group without its baseline,
             without any evaluation, or with different facts of its task, or a label with one run,
-            with a seed twice, or with different settings.
+            with a seed twice, or with different settings; or runs of different trainers.
     """
     by_group: dict[tuple[str, str], Group] = defaultdict(lambda: defaultdict(list))
     for run in runs:
@@ -210,6 +212,11 @@ def in_order(names: Iterable[str], baseline: str) -> list[str]:
 def _check_task(runs: list[RunCurve], name: str) -> None:
     if runs[0].failure_return is None:
         raise InputError(f"{name}: every run failed before its first evaluation: see why they did")
+    if len(trainers := sorted({run.trainer for run in runs})) > 1:
+        raise InputError(
+            f"{name}: its runs are of different trainers: {', '.join(trainers)}; report those of "
+            "one, or all with --across-trainers"
+        )
     for what in ("return_floor", "solved"):
         values = sorted({str(getattr(run, what)) for run in runs})
         if len(values) > 1:

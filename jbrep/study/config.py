@@ -14,13 +14,17 @@ from jbrep.errors import InputError
 from jbrep.files.storage import read_regular
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl.learner import Learner
+from jbrep.rl.names import FLOAT32
 from jbrep.rl.run import Run
 from jbrep.study.representations import ByName, Given, name_of, read_representation
 from jbrep.text import slug
 
 _MAX_BYTES = 1 << 20
 _MOST_SEEDS = (1 << 16) - 1
-_RUN_SETTINGS = ("steps", "evaluate_every", "evaluation_episodes")
+_RUN_SETTINGS = (
+    *("steps", "evaluate_every", "evaluation_episodes"),
+    *("trainer", "precision", "device"),
+)
 _ITEMS: dict[Any, tuple[type, ...]] = {  # of lists, by the type of the field
     tuple[str, ...]: (str,),
     tuple[int, ...]: (int,),
@@ -52,6 +56,9 @@ class Study:
     steps: int
     evaluate_every: int = 10_000
     evaluation_episodes: int = 10
+    trainer: str = ""  # cohort or sb3; by default cohort, for the algorithms that it has
+    precision: str = FLOAT32  # of products of matrices: float32 or bfloat16
+    device: str = "cpu"  # that gradient steps are taken on: cpu or cuda
     episode_steps: int | None = None  # time limit; None: each task's own
     environment: Mapping[str, Any] = field(default_factory=dict)  # arguments of environments
     data: Data | None = None  # None: the shipped encoders
@@ -67,7 +74,8 @@ class Study:
                 raise InputError(f"{name} is {values}: it must have one or more, each once")
         self._check_tasks()
         for algorithm in self.algorithms:
-            self.learner(algorithm)
+            settings = self.learner(algorithm).run_settings
+            Run(task=_ANY_TASK, **settings, **self.run_settings).check_trainer()
         for given in self.representations:
             representation = read_representation(given, self.training)
             if isinstance(representation, ByName) and not (isinstance(given, str) or self.data):
@@ -76,7 +84,7 @@ class Study:
                     "that [data] gives: [data] is missing"
                 )
         for seed in self.seeds:
-            Run(task=_ANY_TASK, seed=seed, **self.run_settings)  # checks the numbers
+            Run(task=_ANY_TASK, seed=seed)  # checks the number
         if self.data and bool(self.data.steps) == bool(self.data.folder):
             raise InputError("data must have either steps, to collect, or the folder of a data set")
         if self.training and not self.data:

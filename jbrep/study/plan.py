@@ -1,7 +1,8 @@
 """A study's folder: where its files are, and which runs it has."""
 
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,17 @@ from jbrep.files.storage import exists, make_folder, read_regular, write_whole
 from jbrep.rl import Run
 from jbrep.rl.files import RUN
 from jbrep.rl.learner import Learner
+from jbrep.rl.names import SB3, usual_trainer
 from jbrep.rl.run import plain
 from jbrep.study.config import Study, as_study
 from jbrep.study.representations import Representation, read_representation
+from jbrep.study.work import Assigned
 from jbrep.text import slug
+from jbrep.training.trainer import get_device
 
 STUDY = "study.json"
 _GRID = ("tasks", "algorithms", "representations", "seeds", "learners", "evaluations")  # may change
+_BEFORE_TRAINERS = {"trainer": SB3}  # what the files of earlier versions leave unsaid
 _MAX_BYTES = 1 << 24
 
 
@@ -69,6 +74,19 @@ class Plan:
             for representation in self.representations
         )
 
+    def trainer(self, cell: Cell) -> str:
+        """What trains a run."""
+        return self.study.trainer or usual_trainer(cell.learner.algorithm)
+
+    @property
+    def device(self) -> str:
+        """What gradient steps are taken on.
+
+        Raises:
+            InputError: there is no such device.
+        """
+        return str(get_device(self.study.device).type)
+
     def folder_of(self, cell: Cell) -> Path:
         """A run's folder."""
         return self.folder / "runs" / cell.name
@@ -105,6 +123,14 @@ class Plan:
             **cell.representation.settings(cell.seed),
             **self.study.run_settings,
         )
+
+    def assigned(self, cells: Iterable[Cell]) -> list[Assigned]:
+        """Runs for a worker.
+
+        Raises:
+            InputError: as `run`.
+        """
+        return [Assigned(cell.name, self.run(cell), self.folder_of(cell)) for cell in cells]
 
     def encoders(self, task: str) -> Path:
         """The folder of the encoders that the study trains for a task."""
@@ -148,6 +174,17 @@ class Plan:
         return dict(plain(asdict(self.study)))
 
 
+def plan_for(study: Study, folder: Path) -> Plan:
+    """A study in its folder; one that names no trainer goes on with that which it began with.
+
+    Raises:
+        InputError: as `read_plan`.
+    """
+    if not study.trainer and (there := read_plan(folder)):
+        study = replace(study, trainer=there.study.trainer)
+    return Plan(study, folder)
+
+
 def read_plan(folder: Path) -> Plan | None:
     """The study in a folder; None if there is none, but at most runs.
 
@@ -158,7 +195,7 @@ def read_plan(folder: Path) -> Plan | None:
     if not exists(path):
         return None
     try:
-        given = json.loads(read_regular(path, _MAX_BYTES))
+        given = _BEFORE_TRAINERS | json.loads(read_regular(path, _MAX_BYTES))
         return Plan(as_study({n: v for n, v in given.items() if v is not None}), folder)
     except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(

@@ -35,8 +35,12 @@ class Results(NamedTuple):
     left_out: list[str]  # what there are no statistics of, and why
 
 
-def conclude(folder: Path) -> tuple[Results, list[Path]]:
+def conclude(folder: Path, across_trainers: bool = False) -> tuple[Results, list[Path]]:
     """Write the tables of the runs below a folder, of a study or not, as far as they have ended.
+
+    Args:
+        folder: with the runs.
+        across_trainers: compare runs of different trainers, too.
 
     Returns:
         The results and the files: every return, what was run, the statistics if there are any, and
@@ -45,21 +49,25 @@ def conclude(folder: Path) -> tuple[Results, list[Path]]:
     Raises:
         InputError: as `read_results` and `write_results`.
     """
-    results = read_results(folder)
+    results = read_results(folder, across_trainers)
     paths = write_results(results, folder)
     heuristics = write_heuristics(map(_task, map(read_run, results.folders)), folder)
     return results, [*paths, heuristics] if heuristics else paths
 
 
-def read_results(folder: Path) -> Results:
+def read_results(folder: Path, across_trainers: bool = False) -> Results:
     """The runs below a folder that have finished or failed, with statistics if they allow any.
+
+    Args:
+        folder: with the runs.
+        across_trainers: compare runs of different trainers, too.
 
     Raises:
         InputError: there is no such run, or a file is damaged.
     """
     plan = read_plan(folder)
     folders = _folders(folder, plan)
-    runs = [_curve(each) for each in folders]
+    runs = [_curve(each, across_trainers) for each in folders]
     compared, left_out = _comparable(runs)
     planned = plan.study.comparisons if plan else 0
     try:
@@ -113,10 +121,11 @@ def _task(run: Mapping[str, Any]) -> Task:
     return read_task(run["settings"]["environment"])
 
 
-def _curve(folder: Path) -> RunCurve:
+def _curve(folder: Path, across_trainers: bool = False) -> RunCurve:
     run = read_run(folder)
     task = _task(run)
     settings = shared_settings(run["settings"])
+    trainer = [settings.pop(name) for name in ("trainer", "precision", "device")]
     evaluations = read_evaluations(folder)
     steps = sorted({each.step for each in evaluations})
     returns = [[e.episode_return for e in evaluations if e.step == step] for step in steps]
@@ -132,6 +141,7 @@ def _curve(folder: Path) -> RunCurve:
         failed_at=run["steps"] if run["status"] == FAILED else None,
         return_floor=task.return_floor,
         solved=task.solved_return,
+        trainer="" if across_trainers else " ".join(trainer),
     )
 
 

@@ -8,35 +8,36 @@ from jbrep.cluster import on_cluster
 from jbrep.envs.names import imported_modules
 from jbrep.errors import choose
 from jbrep.pool import ATTEMPTS, Pool, stop_requested
-from jbrep.study.plan import Cell, Plan
+from jbrep.rl.names import CUDA
+from jbrep.study.packing import Pack
+from jbrep.study.plan import Plan
 from jbrep.study.progress import say
 from jbrep.study.work import CRASHED, Outcome, work
 
-Backend = Callable[[Plan, Iterable[Cell], int], Generator[Outcome]]
+Backend = Callable[[Plan, Iterable[Pack], int], Generator[Outcome]]
 
 
-def on_this_machine(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:
-    """Bring runs to their end in processes of one thread each; yield each outcome as it comes.
+def on_this_machine(plan: Plan, packs: Iterable[Pack], workers: int) -> Generator[Outcome]:
+    """Bring runs to their end in processes of one thread each; yield the outcomes as they come.
 
-    A run whose worker is killed is resumed from its checkpoint by another. One that has lost five
-    workers has crashed. Closed early, this waits until the runs under way have written their
-    checkpoints.
+    Runs whose worker is killed are resumed from their checkpoints by others, in packs of half the
+    size, as memory may have run out. One that has lost five workers has crashed. Closed early, this
+    waits until the runs under way have written their checkpoints.
     """
-    waiting, deaths = deque(cells), Counter[str]()
-    with Pool[Cell, Outcome | None](work, workers, _announce_stop) as pool:
+    waiting, deaths = deque(packs), Counter[str]()
+    with Pool[Pack, list[Outcome] | None](work, workers, _announce_stop) as pool:
         while waiting or not pool.is_idle:
             while waiting and not pool.is_full:
-                cell = waiting.popleft()
-                pool.submit(cell, *_job(plan, cell))
-            cell, outcome = pool.result()
-            if outcome is not None:
-                yield outcome
+                pack = waiting.popleft()
+                pool.submit(pack, *_job(plan, pack))
+            pack, outcomes = pool.result()
+            if outcomes is not None:
+                yield from outcomes
                 continue
-            deaths[cell.name] += 1
-            if deaths[cell.name] == ATTEMPTS:
-                yield _killed(cell.name)
-            else:
-                waiting.append(cell)
+            deaths.update(cell.name for cell in pack)
+            yield from (_killed(cell.name) for cell in pack if deaths[cell.name] == ATTEMPTS)
+            left = [cell for cell in pack if deaths[cell.name] < ATTEMPTS]
+            waiting += [half for half in (tuple(left[::2]), tuple(left[1::2])) if half]
 
 
 def _announce_stop() -> None:
@@ -48,7 +49,7 @@ def _killed(name: str) -> Outcome:
     return Outcome(name, CRASHED, f"{reason}: try fewer --workers")
 
 
-def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome]:
+def on_ray(plan: Plan, packs: Iterable[Pack], workers: int) -> Generator[Outcome]:
     """The same on the Ray cluster that RAY_ADDRESS names, or else on a local one.
 
     All nodes need the study's folder at the same path. The runs of a node that dies are resumed on
@@ -57,19 +58,19 @@ def on_ray(plan: Plan, cells: Iterable[Cell], workers: int) -> Generator[Outcome
     """
     import ray
 
-    task = on_cluster(work, workers)
-    names = {task.remote(*_job(plan, cell)): cell.name for cell in cells}
+    task = on_cluster(work, workers, gpus=int(plan.device == CUDA))
+    under_way = {task.remote(*_job(plan, pack)): pack for pack in packs}
     try:
-        while names:
-            (done,), _ = ray.wait(list(names))
-            name = names.pop(done)
+        while under_way:
+            (done,), _ = ray.wait(list(under_way))
+            pack = under_way.pop(done)
             try:
-                outcome = ray.get(done)
+                outcomes = ray.get(done)
             except ray.exceptions.RayError:
-                outcome = _killed(name)
-            yield outcome
+                outcomes = [_killed(cell.name) for cell in pack]
+            yield from outcomes
     finally:
-        for job in names:
+        for job in under_way:
             ray.cancel(job, force=True)
 
 
@@ -89,7 +90,6 @@ def get_backend(name: str) -> Backend:
     return choose(name, BACKENDS, "backend")
 
 
-def _job(plan: Plan, cell: Cell) -> tuple[Any, ...]:
+def _job(plan: Plan, pack: Pack) -> tuple[Any, ...]:
     """The arguments of `work`."""
-    run, folder = plan.run(cell), plan.folder_of(cell)
-    return cell.name, run, folder, stop_requested, imported_modules()
+    return plan.assigned(pack), stop_requested, imported_modules()

@@ -9,9 +9,10 @@ from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
 from jbrep.files.lock import exclusive
 from jbrep.rl import Run
-from jbrep.rl.run import read_result
+from jbrep.rl.job import Job
 from jbrep.rl.speed import estimate
-from jbrep.study.plan import Cell, Plan
+from jbrep.study.packing import Pack, packed, until_done
+from jbrep.study.plan import Plan
 from jbrep.study.prepare import check, prepare
 from jbrep.study.progress import Progress, duration
 from jbrep.study.representations import ByCode
@@ -20,30 +21,38 @@ from jbrep.study.work import CRASHED
 from jbrep.text import table
 
 
-def run_study(plan: Plan, backend: Backend, workers: int) -> int:
+def run_study(plan: Plan, backend: Backend, workers: int, width: int | None = None) -> int:
     """Collect data, train encoders, and train every agent that hasn't been trained yet.
 
     `jbrep.study.results.conclude` then writes what came of it.
+
+    Args:
+        plan: the study.
+        backend: what runs it.
+        workers: how many processes go on at a time.
+        width: the most agents that learn together in one.
 
     Returns:
         How many runs crashed.
 
     Raises:
-        InputError: the folder holds another study, or the study's settings can't be used.
+        InputError: the folder holds another study, the study's settings can't be used, or memory
+            doesn't hold as many agents.
     """
     check(plan)
+    unfinished = plan.unfinished
+    packs = packed(plan, unfinished, workers, width)
     plan.write()
     with exclusive(plan.folder):
         prepare(plan)
-        unfinished = plan.unfinished
         for cell in plan.cells:  # so that any mistake shows before the first run
-            read_result(plan.run(cell), plan.folder_of(cell))
+            _ = Job(plan.run(cell), plan.folder_of(cell)).result
         if not unfinished:
             return 0
         statuses = Counter[str]()
         with (
             Progress(plan, unfinished) as progress,
-            closing(backend(plan, unfinished, workers)) as outcomes,
+            closing(backend(plan, packs, workers)) as outcomes,
         ):
             for outcome in outcomes:
                 progress.report(outcome)
@@ -51,36 +60,45 @@ def run_study(plan: Plan, backend: Backend, workers: int) -> int:
     return statuses[CRASHED]
 
 
-def dry_run(plan: Plan, workers: int, width: int | None = None) -> str:
+def dry_run(plan: Plan, workers: int, width: int | None = None, columns: int | None = None) -> str:
     """The runs to go, and how long they would take, estimated from a few steps of each learner.
 
     Args:
         plan: the study.
-        workers: how many runs would go on at a time.
-        width: to fit [columns]; None for no limit.
+        workers: how many processes would go on at a time.
+        width: the most agents that would learn together in one.
+        columns: to fit; None for no limit.
 
     Raises:
         InputError: as `run_study`, as far as that is known beforehand.
     """
     check(plan)
     unfinished = plan.unfinished
-    examples = {_kind(cell): cell for cell in unfinished}
-    seconds = {kind: estimate(_example(plan.run(cell))) for kind, cell in examples.items()}
-    rows = [(cell.name, duration(seconds[_kind(cell)])) for cell in unfinished]
-    total = sum(seconds[_kind(cell)] for cell in unfinished)
+    packs = packed(plan, unfinished, workers, width)
+    examples = {_kind(pack): pack for pack in packs}
+    seconds = {
+        kind: estimate([_example(plan.run(cell)) for cell in pack])
+        for kind, pack in examples.items()
+    }
+    each = [seconds[_kind(pack)] for pack in packs]
+    rows = [
+        (cell.name, str(number), duration(each[number - 1]))
+        for number, pack in enumerate(packs, 1)
+        for cell in pack
+    ]
     done = len(plan.cells) - len(unfinished)
     summary = (
-        f"{len(unfinished)} runs to go, {done} done; {duration(total)} on one core, "
-        f"{duration(total / workers)} with {workers} workers, besides data and encoders"
+        f"{len(unfinished)} runs to go, {done} done; {duration(sum(each))} on one core, "
+        f"{duration(until_done(each, workers))} with {workers} workers, besides data and encoders"
     )
-    told = textwrap.fill(summary, width) if width else summary
-    return f"{table(('run', 'time'), rows, width)}\n\n{told}" if rows else told
+    told = textwrap.fill(summary, columns) if columns else summary
+    return f"{table(('run', 'cohort', 'time'), rows, columns)}\n\n{told}" if rows else told
 
 
-def _kind(cell: Cell) -> tuple[str, str, str]:
-    """What the duration of a run depends on."""
-    own = cell.representation.name if isinstance(cell.representation, ByCode) else ""
-    return cell.task, cell.learner.name, own
+def _kind(pack: Pack) -> tuple[object, ...]:
+    """What the duration of a pack depends on."""
+    own = [c.representation.name for c in pack if isinstance(c.representation, ByCode)]
+    return pack[0].task, pack[0].learner.name, len(pack), tuple(own)
 
 
 def _example(run: Run) -> Run:

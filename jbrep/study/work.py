@@ -1,15 +1,16 @@
-"""One run of a study, in a process of its own."""
+"""Runs of a study, in a process of their own."""
 
 import time
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jbrep.envs.names import import_modules
 from jbrep.files.storage import make_folder
-from jbrep.rl import Run, StoppedError, train
+from jbrep.rl import Run, StoppedError
+from jbrep.rl.trainers import train_all
 from jbrep.text import rounded
 
 PROGRESS = "progress"
@@ -26,40 +27,58 @@ class Outcome(NamedTuple):
     message: str  # the reason, or how long it took
 
 
+class Assigned(NamedTuple):
+    """A run for a worker."""
+
+    name: str
+    run: Run
+    folder: Path  # of this run alone
+
+
 def work(
-    name: str,
-    run: Run,
-    folder: Path,
+    assigned: Sequence[Assigned],
     stop: Callable[[], bool] = lambda: False,
     modules: Iterable[str] = (),
-) -> Outcome | None:
-    """Train; an error is reported in the outcome and stops no other run.
+) -> list[Outcome] | None:
+    """Train runs; an error is reported in the outcome of its run and stops no other.
 
     Args:
-        name: of the run.
-        run: what to train.
-        folder: of this run alone.
-        stop: whether to write a checkpoint and stop now.
+        assigned: the runs, which go on together where they can.
+        stop: whether to write checkpoints and stop now.
         modules: to import first, as they register environments.
 
     Returns:
-        How the run ended; None if it was stopped.
+        How each run ended; None if they were stopped.
     """
     try:
-        make_folder(folder)
+        for each in assigned:
+            make_folder(each.folder)
         import_modules(modules)
-        result = train(run, folder, _ProgressFile(folder), stop=stop)
+        runs = {each.folder: each.run for each in assigned}
+        results = dict(train_all(runs, _ProgressFiles(), stop=stop))
     except StoppedError:
         return None
     except Exception as error:
-        with suppress(OSError):
-            (folder / ERROR).write_text(traceback.format_exc())
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        return Outcome(name, CRASHED, f"{reason}; see {folder / ERROR}")
+        if len(assigned) == 1:
+            return [_crashed(assigned[0], error)]
+        alone = [work([each], stop) for each in assigned]  # to see whose error it is
+        return None if None in alone else [outcome for each in alone for outcome in each or ()]
+    return [_ended(each, results[each.folder]) for each in assigned]
+
+
+def _ended(assigned: Assigned, result: Mapping[str, Any]) -> Outcome:
     for leftover in (PROGRESS, ERROR):
-        (folder / leftover).unlink(missing_ok=True)
+        (assigned.folder / leftover).unlink(missing_ok=True)
     message = result.get("reason", f"{result['seconds'] / 60:.1f} min")
-    return Outcome(name, result["status"], message)
+    return Outcome(assigned.name, result["status"], message)
+
+
+def _crashed(assigned: Assigned, error: Exception) -> Outcome:
+    path = assigned.folder / ERROR
+    with suppress(OSError):
+        path.write_text("".join(traceback.format_exception(error)))
+    reason = str(error).partition("\n")[0] or type(error).__name__
+    return Outcome(assigned.name, CRASHED, f"{reason}; see {path}")
 
 
 def read_progress(folder: Path) -> tuple[int, str]:
@@ -70,14 +89,14 @@ def read_progress(folder: Path) -> tuple[int, str]:
     return 0, "-"
 
 
-class _ProgressFile:
-    """Tells the parent process, through a file, how far a run is."""
+class _ProgressFiles:
+    """Tells the parent process, through files, how far runs are."""
 
-    def __init__(self, folder: Path):
-        self._path, self._written = folder / PROGRESS, 0.0
+    def __init__(self) -> None:
+        self._written: dict[Path, float] = {}
 
-    def __call__(self, step: int, mean: float | None) -> None:
+    def __call__(self, folder: Path, step: int, mean: float | None) -> None:
         now = time.monotonic()
-        if now - self._written >= _WRITE_EVERY:
-            self._path.write_text(f"{step} {'-' if mean is None else rounded(mean)[0]}")
-            self._written = now
+        if now - self._written.get(folder, 0.0) >= _WRITE_EVERY:
+            (folder / PROGRESS).write_text(f"{step} {'-' if mean is None else rounded(mean)[0]}")
+            self._written[folder] = now

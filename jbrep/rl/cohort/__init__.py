@@ -1,0 +1,1 @@
+"""Many agents of one algorithm that learn together, each as it would alone."""

@@ -1,0 +1,112 @@
+"""Training runs together, in cohorts."""
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
+from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.errors import InputError
+from jbrep.rl.agent import unchecked_distributions
+from jbrep.rl.checkpoint import MALFORMED, Snapshot, StoppedError
+from jbrep.rl.cohort.cohort import Cohort, filled_up
+from jbrep.rl.cohort.member import Member
+from jbrep.rl.cohort.settings import shared_by
+from jbrep.rl.job import Ended, Job, Session
+from jbrep.rl.policy_file import policy_zip
+
+_Begun = tuple[Job, Snapshot | None]
+
+
+def train_together(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
+    """Bring runs to their end: those together that can be, one cohort after another.
+
+    What can be together are runs that share their settings, and begin anew or have checkpoints of
+    the same step; and that observe no more numbers than their task has, or the same number. A run's
+    result doesn't depend on which others are beside it.
+
+    Yields:
+        Each run, when it ends.
+
+    Raises:
+        InputError: a checkpoint can't be resumed.
+        StoppedError: the session is to stop; the runs' checkpoints are written.
+    """
+    begun = [(job, job.checkpoint.read()) for job in jobs]
+    for job in jobs:  # now that no checkpoint of another run is there
+        job.keep_encoder()
+
+    def kind(each: _Begun) -> tuple[str, int, int]:
+        job, _ = each
+        return shared_by(job.settings), job.history.first_step, filled_up(job)
+
+    for _, alike in groupby(sorted(begun, key=kind), kind):
+        with unchecked_distributions():
+            yield from _train(_cohort([*alike], session), session)
+
+
+def _cohort(begun: Sequence[_Begun], session: Session) -> Cohort:
+    """A cohort at its start, or where its members' snapshots were taken."""
+    cohort = Cohort([Member(job, session.writers) for job, _ in begun])
+    snapshots = [snapshot for _, snapshot in begun if snapshot]
+    if snapshots:
+        checkpoint = begun[0][0].checkpoint
+        try:
+            cohort.restore(snapshots)
+        except EnvironmentFailedError as error:
+            raise InputError(f"{checkpoint.path} can't be resumed: {error}") from None
+        except InputError:
+            raise
+        except MALFORMED:
+            raise checkpoint.damaged() from None
+    return cohort
+
+
+def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
+    everyone = cohort.members
+    try:
+        if not everyone[0].job.history.evaluations:
+            cohort.evaluate()
+        while cohort.goes_on:
+            yield from map(_end, cohort.failed)
+            cohort = cohort.survivors()
+            _tell(cohort, session)
+            _save(cohort, session)
+            for _ in range(cohort.rollout):
+                cohort.act()
+                if cohort.is_evaluation_due:
+                    cohort.evaluate()
+            cohort.learn()
+        cohort.evaluate()
+        _tell(cohort, session)
+        yield from map(_end, cohort.members)
+    except EnvironmentFailedError as error:
+        cohort.member_of(error.lane).fail(str(error))
+        yield from map(_end, cohort.failed)
+        others = [Job(m.job.run, m.job.folder) for m in cohort.members if not m.failure]
+        yield from train_together(others, session)  # from their checkpoints
+    finally:
+        for member in everyone:
+            member.agent.logger.close()
+
+
+def _tell(cohort: Cohort, session: Session) -> None:
+    for member in cohort.members:
+        session.watch(member.job, cohort.step, member.mean)
+
+
+def _save(cohort: Cohort, session: Session) -> None:
+    """Write all checkpoints, if it is time or the session is to stop."""
+    stopping = session.stop()
+    first = cohort.members[0].job.checkpoint
+    if stopping or first.is_due(session.save_every, len(cohort.members)):
+        cohort.give_back()
+        for member in cohort.members:
+            member.job.checkpoint.write(cohort.take(member))
+    if stopping:
+        raise StoppedError(cohort.step)
+
+
+def _end(member: Member) -> Ended:
+    """Write what a member leaves; its agent has its last weights."""
+    policy = b"" if member.failure else policy_zip(member.agent)
+    steps = member.agent.num_timesteps
+    return member.job, member.job.end(steps, member.failure, policy)

@@ -1,0 +1,67 @@
+"""What a run has recorded so far, and what it tells while it goes on."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.logger import TensorBoardOutputFormat
+from torch.utils.tensorboard import SummaryWriter
+
+from jbrep.rl.files import Episode, Evaluation
+
+Watch = Callable[[int, float | None], None]  # steps so far; mean return of the last evaluation
+
+WEIGHTS_NOT_FINITE = "the policy's weights are not finite"  # reasons for a run to fail
+ACTIONS_NOT_FINITE = "the policy's actions are not finite"
+
+
+class DivergedError(ArithmeticError):
+    """A loss or a weight of the policy is NaN or infinite: training can't continue."""
+
+
+@dataclass
+class History:
+    """What a run has recorded so far, over all the processes that worked on it.
+
+    Attributes:
+        episodes: of training.
+        evaluations: of the deterministic policy.
+        first_step: the training step from which this process continues.
+        earlier_seconds: the wall time that earlier processes took.
+    """
+
+    episodes: list[Episode] = field(default_factory=list)
+    evaluations: list[Evaluation] = field(default_factory=list)
+    first_step: int = 0
+    earlier_seconds: float = 0.0
+    _started: float = field(default_factory=time.monotonic)
+
+    @property
+    def seconds(self) -> float:
+        """The wall time so far."""
+        return round(self.earlier_seconds + time.monotonic() - self._started, 1)
+
+    def as_json(self) -> dict[str, Any]:
+        """A record that `resume` takes."""
+        return {
+            "episodes": self.episodes,
+            "evaluations": self.evaluations,
+            "seconds": self.seconds,
+        }
+
+    def resume(self, record: Mapping[str, Any], step: int) -> None:
+        """Continue from an earlier process's record, made at that step."""
+        self.episodes = [Episode(*row) for row in record["episodes"]]
+        self.evaluations = [Evaluation(*row) for row in record["evaluations"]]
+        self.earlier_seconds = float(record["seconds"])
+        self.first_step = step
+
+
+class Scalars(TensorBoardOutputFormat):
+    """TensorBoard's file from a step on; later steps of an earlier process are hidden."""
+
+    def __init__(self, folder: Path, step: int):
+        self.writer = SummaryWriter(str(folder), purge_step=step)
+        self._is_closed = False

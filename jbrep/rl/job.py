@@ -1,0 +1,163 @@
+"""A run in its folder: how it begins, and how it ends."""
+
+import hashlib
+import platform
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from stable_baselines3.common.logger import KVWriter, Logger
+
+from jbrep.encoders import Encoder, save
+from jbrep.envs.names import environment_versions
+from jbrep.errors import InputError
+from jbrep.files.commit import commits
+from jbrep.files.storage import exists, write_whole
+from jbrep.rl.checkpoint import CheckpointFile
+from jbrep.rl.fields import MAX_LINE
+from jbrep.rl.files import (
+    CHECKPOINT,
+    ENCODER,
+    EPISODES,
+    EVALUATIONS,
+    FAILED,
+    FINISHED,
+    POLICY,
+    RUN,
+    Episode,
+    Evaluation,
+    differing,
+    read_run,
+    write_rows,
+    write_run,
+)
+from jbrep.rl.history import History, Scalars
+from jbrep.rl.run import Run, plain
+
+Ended = tuple["Job", dict[str, Any]]  # a run, and the contents of its run.json
+_PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
+
+
+class Session(NamedTuple):
+    """What goes on around training.
+
+    Attributes:
+        watch: called with a run, its steps so far and the mean return of its last evaluation.
+        save_every: seconds between checkpoints, at least.
+        stop: asked before each rollout; once it is true, checkpoints are written and training ends.
+        writers: of stable-baselines3's logger, that get what TensorBoard gets.
+    """
+
+    watch: Callable[["Job", int, float | None], None]
+    save_every: float
+    stop: Callable[[], bool]
+    writers: Sequence[KVWriter]
+
+
+class Job:
+    """A run, and the folder that is its alone.
+
+    Args:
+        run: what to train.
+        folder: it need not exist yet.
+
+    Attributes:
+        run: what to train.
+        folder: where.
+        encoder: that the run sees its task through.
+        settings: of the run, as run.json has them.
+        history: what was recorded so far.
+
+    Raises:
+        InputError: as `Run.check`.
+    """
+
+    def __init__(self, run: Run, folder: Path):
+        self.run, self.folder = run, folder
+        self.encoder = run.find_encoder()
+        self.settings: dict[str, Any] = plain(run.describe(self.encoder))
+        self.history = History()
+
+    @property
+    def result(self) -> dict[str, Any] | None:
+        """The contents of run.json, if the run has ended.
+
+        Raises:
+            InputError: the folder holds another run.
+        """
+        if not exists(self.folder / RUN):
+            return None
+        result = read_run(self.folder)
+        if others := differing(result["settings"], self.settings):
+            raise InputError(f"{self.folder} holds another run: {others}; choose another folder")
+        return result
+
+    @cached_property
+    def versions(self) -> dict[str, str]:
+        """What, with the settings, decides every number."""
+        packages = {name: version(name) for name in _PACKAGES}
+        return environment_versions(self.run.task.id) | packages
+
+    @cached_property
+    def checkpoint(self) -> CheckpointFile:
+        """The run's snapshots."""
+        identity = {**self.settings, **self.versions}
+        return CheckpointFile(self.folder / CHECKPOINT, identity, self.history)
+
+    def keep_encoder(self) -> None:
+        """Write the encoder's file; do it when no checkpoint of another run is there."""
+        if isinstance(self.encoder, Encoder):
+            save(self.encoder, self.folder / ENCODER)
+
+    def logger(self, writers: Sequence[KVWriter] = ()) -> Logger:
+        """What logs to TensorBoard, from the step on at which the run continues."""
+        scalars = Scalars(self.folder / "tensorboard", self.history.first_step)
+        return Logger(None, [scalars, *writers])
+
+    def end(self, steps: int, failure: str, policy: bytes) -> dict[str, Any]:
+        """Write the run's files.
+
+        Args:
+            steps: that it took.
+            failure: why it failed; empty if it didn't.
+            policy: the contents of policy.zip; it isn't kept of a run that failed.
+
+        Returns:
+            The contents of run.json.
+        """
+        result = {
+            "status": FAILED if failure else FINISHED,
+            **({"reason": f"{_one_line(failure)} after {steps:,} steps"} if failure else {}),
+            "settings": self.settings,
+            "latent_size": self.encoder.latent_size,
+            "steps": steps,
+            "seconds": self.history.seconds,
+            "versions": self.versions,
+            "commits": dict(commits()),
+            "cpu": _cpu(),
+        }
+        write_rows(self.folder / EPISODES, self.history.episodes, Episode)
+        write_rows(self.folder / EVALUATIONS, self.history.evaluations, Evaluation)
+        if not failure:
+            write_whole(self.folder / POLICY, policy)
+            result["policy_sha256"] = hashlib.sha256(policy).hexdigest()
+        write_run(self.folder, result)  # last: the run has ended where it exists
+        (self.folder / CHECKPOINT).unlink(missing_ok=True)
+        return result
+
+
+def _one_line(text: str) -> str:
+    """Text as run.json may hold it, whatever an environment says."""
+    return "".join(c if c.isprintable() else "?" for c in text)[: MAX_LINE // 2]
+
+
+def _cpu() -> str:
+    """The processor's name, where the system tells it."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,83 @@
+"""Which runs of a study go on together: cohorts that keep all workers busy to the end."""
+
+import heapq
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+from joblib import cpu_count
+
+from jbrep.errors import InputError
+from jbrep.rl.cohort.replay import memory_of
+from jbrep.rl.names import COHORT, CPU, CUDA
+from jbrep.study.plan import Cell, Plan
+
+Pack = tuple[Cell, ...]
+
+# wider cohorts don't cost each of their agents less on a CPU
+_WIDEST = {CPU: 16, CUDA: 64}  # agents; for a GPU not measured yet
+_OVERHEAD = 0.3  # what a step costs besides its agents, in what it costs for each
+_SHARE = 0.7  # of the machine's memory, that replay memories may take
+_OF_WORKER, _OF_AGENT = 1 << 29, 1 << 25  # bytes that they take besides
+
+
+def usual_workers(plan: Plan) -> int:
+    """How many packs go on at a time: one for each core, or one that has a GPU and all cores."""
+    return cpu_count() if plan.device == CPU else 1
+
+
+def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = None) -> list[Pack]:
+    """Runs in packs, one for a worker at a time, the longest first.
+
+    Runs of one task and learner can be in one pack, whatever they observe, if their trainer is the
+    cohort. Their number is that with which the last worker ends earliest.
+
+    Args:
+        plan: of the study.
+        cells: the runs to go.
+        workers: how many packs go on at a time.
+        width: the most runs in a pack; by default as many as memory holds, and no more than pay.
+
+    Raises:
+        InputError: memory doesn't hold so many runs.
+    """
+    groups, alone = defaultdict[tuple[str, str], list[Cell]](list), []
+    for cell in cells:
+        if plan.trainer(cell) == COHORT:
+            groups[cell.task, cell.learner.name].append(cell)
+        else:
+            alone.append((cell,))
+    first = [group[0] for group in groups.values()]
+    widest = _WIDEST[plan.device]
+    most = min((_most(plan, cell, workers) for cell in first), default=widest)
+    if width and width > most:
+        raise InputError(
+            f"the width is {width}: {workers} cohorts of {most} agents are the most that this "
+            "machine's memory holds"
+        )
+    choices = range(width or min(widest, max(most, 1)), 0, -1)
+    each = [alone + [p for group in groups.values() for p in _split(group, n)] for n in choices]
+    best = min(each, key=lambda packs: until_done([len(p) + _OVERHEAD for p in packs], workers))
+    return sorted(best, key=len, reverse=True)
+
+
+def _most(plan: Plan, cell: Cell, workers: int) -> int:
+    """How many runs like that one memory holds, for each worker."""
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") * _SHARE
+    return int((memory / workers - _OF_WORKER) // (memory_of(plan.run(cell)) + _OF_AGENT))
+
+
+def _split(group: Sequence[Cell], most: int) -> list[Pack]:
+    """Packs of about the same size."""
+    count = -(-len(group) // most)
+    ends = [len(group) * number // count for number in range(count + 1)]
+    return [tuple(group[a:b]) for a, b in pairwise(ends)]
+
+
+def until_done(durations: Iterable[float], workers: int) -> float:
+    """When the last worker ends, if each takes the longest work that is left."""
+    busy = [0.0] * workers
+    for each in sorted(durations, reverse=True):
+        heapq.heapreplace(busy, busy[0] + each)
+    return max(busy)

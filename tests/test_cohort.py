@@ -1,0 +1,281 @@
+"""Runs that learn together do what stable-baselines3 does with each alone."""
+
+import hashlib
+from dataclasses import replace
+from itertools import count
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.logger import Logger
+from torch.nn import functional
+
+from jbrep.encoders import find
+from jbrep.envs import describe
+from jbrep.envs.endless import Endless
+from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.errors import InputError
+from jbrep.rl import Run, StoppedError
+from jbrep.rl.agent import make_agent, make_env, parameters, trained_parts, training_seed
+from jbrep.rl.cohort.cohort import Cohort
+from jbrep.rl.cohort.learner import give_back, stacked
+from jbrep.rl.cohort.member import Member
+from jbrep.rl.cohort.steps import Batch, set_rate
+from jbrep.rl.job import Job
+from jbrep.rl.presets import PRESETS
+from jbrep.rl.settings import used_settings
+from jbrep.rl.trainers import train_all
+from jbrep.training.adam import allocate_adam_state
+
+TASK = describe("face_direction", max_episode_steps=50)
+CODES = ("full", "dae-8", "pca-12")  # of 16, 8 and 12 numbers
+ROWS = 32
+
+
+@pytest.fixture
+def in_float64(monkeypatch):
+    """stable-baselines3 without its casts to float32."""
+    name = "stable_baselines3.common.policies.preprocess_obs"
+    monkeypatch.setattr(name, lambda seen, *_, **__: seen)
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(before)
+
+
+def precise(algorithm, preset, code, seed):
+    """An agent in float64 with some transitions to learn from."""
+    preset = replace(preset, settings={**preset.settings, "buffer_size": 200})
+    agent = make_agent(algorithm, preset, make_env(TASK, 1, 0, find(code, TASK)), seed)
+    agent.set_logger(Logger(None, []))
+    agent.policy.double()
+    for _, part in trained_parts(agent):
+        if isinstance(part, torch.optim.Optimizer):
+            allocate_adam_state(part)
+    random, buffer = np.random.default_rng(seed), agent.replay_buffer
+    for name in ("observations", "next_observations", "actions", "rewards"):
+        setattr(buffer, name, np.tanh(random.normal(size=getattr(buffer, name).shape)))
+    for name in ("dones", "timeouts"):
+        setattr(buffer, name, (random.normal(size=getattr(buffer, name).shape) > 1).astype(float))
+    buffer.full = True
+    return agent
+
+
+def drawn(agent, seed, draws):
+    """What an agent's next gradient step with that seed learns from, filled up to 16 numbers."""
+    np.random.seed(seed)  # noqa: NPY002 - stable-baselines3 draws there
+    torch.manual_seed(seed)
+    rows = agent.replay_buffer.sample(ROWS)
+    wide = [functional.pad(x, (0, 16 - x.shape[1])) for x in (rows[0], rows[2])]
+    normals = [torch.empty(ROWS, 1).normal_() for _ in range(draws)]
+    np.random.seed(seed)  # noqa: NPY002
+    torch.manual_seed(seed)
+    return Batch(wide[0], rows.actions, wide[1], rows.rewards, rows.dones), normals
+
+
+VARIANTS = [
+    *((algorithm, preset, {}) for preset in PRESETS for algorithm in ("ddpg", "td3", "sac")),
+    ("sac", "modern", {"ent_coef": 0.1}),
+    ("sac", "modern", {"ent_coef": "auto_0.2", "target_entropy": -0.5}),
+    ("td3", "modern", {"policy_delay": 3, "activation_fn": "elu", "net_arch": [20, 10]}),
+    ("sac", "modern", {"learning_rate": "linear:1e-3", "optimizer_kwargs": {"weight_decay": 0.1}}),
+]
+
+
+@pytest.mark.parametrize(("algorithm", "preset", "overrides"), VARIANTS)
+def test_gradient_steps_are_those_of_stable_baselines3(in_float64, algorithm, preset, overrides):
+    small = {"net_arch": [30, 20], **overrides}
+    used = used_settings(algorithm, preset, small)
+    alone = [precise(algorithm, used, code, seed) for seed, code in enumerate(CODES)]
+    together = [precise(algorithm, used, code, seed) for seed, code in enumerate(CODES)]
+    learner = stacked(together, 16)
+    for step in range(1, 11):
+        batches, normals = [], []
+        for member, agent in enumerate(alone):
+            batch, normal = drawn(agent, 100 * step + member, learner.draws_to_learn)
+            batches.append(batch)
+            normals.append(normal)
+            agent._current_progress_remaining = 1 - step / 100
+            agent.train(1, ROWS)
+        set_rate(learner.optimizers, alone[0].lr_schedule(1 - step / 100))
+        batch = Batch(*map(torch.stack, zip(*batches, strict=True)))
+        normal = [torch.stack(each) for each in zip(*normals, strict=True)]
+        losses = learner.update(batch, normal, learner.is_due(step, 0))
+    give_back(learner, together, 16)
+    for member, (expected, agent) in enumerate(zip(alone, together, strict=True)):
+        for (name, there), (_, here) in zip(parameters(expected), parameters(agent), strict=True):
+            assert there.numpy() == pytest.approx(here.numpy(), rel=0, abs=1e-10), name
+        for name, values in losses.items():
+            assert expected.logger.name_to_value[f"train/{name}"] == pytest.approx(
+                float(values[member])
+            )
+
+
+def runs(steps, **settings):
+    """Three runs of one learner on different codes."""
+    return [
+        Run(
+            task=TASK,
+            preset="modern",
+            encoder=code,
+            seed=seed,
+            steps=steps,
+            evaluate_every=100,
+            evaluation_episodes=2,
+            **settings,
+        )
+        for seed, code in enumerate(CODES)
+    ]
+
+
+def together(given, folder, stop=lambda: False, save_every=1e9):
+    """What becomes of runs, each in a folder named by its seed."""
+    folders = {folder / str(run.seed): run for run in given}
+    ended = train_all(folders, save_every=save_every, stop=stop)
+    return {int(path.name): result for path, result in ended}
+
+
+def contents(folder):
+    """The bytes of what runs leave, but for times."""
+    names = ("policy.zip", "episodes.csv", "evaluations.csv")
+    return [hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names]
+
+
+SAC = {"algorithm": "sac", "settings": {"learning_starts": 60}}
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """Three runs that were trained together."""
+    folder = tmp_path_factory.mktemp("cohort")
+    results = together(runs(260, **SAC), folder)
+    assert [result["status"] for result in results.values()] == ["finished"] * 3
+    return folder
+
+
+FOLLOWED = [
+    ("ddpg", "paper", {}, 1e-5),
+    ("td3", "modern", {}, 1e-5),
+    ("sac", "modern", {"num_envs": 2, "normalize": True}, 1e-5),
+]
+
+
+@pytest.mark.parametrize(("algorithm", "preset", "overrides", "tolerance"), FOLLOWED)
+def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, tolerance, tmp_path):
+    """The same bits until the first gradient step; ten steps later, the same weights nearly."""
+    settings = {"learning_starts": 100, **overrides}
+    made = [
+        Run(
+            task=TASK,
+            algorithm=algorithm,
+            preset=preset,
+            encoder=c,
+            seed=s,
+            steps=110,
+            settings=settings,
+        )
+        for s, c in enumerate(CODES)
+    ]
+    members = [Member(Job(run, tmp_path / str(run.seed)), []) for run in made]
+    cohort = Cohort(members)
+    while cohort.goes_on:
+        for _ in range(cohort.rollout):
+            cohort.act()
+        cohort.learn()
+    cohort.give_back()
+    for number, run in enumerate(made):
+        agent = alone(run)
+        assert agent._n_updates == members[number].agent._n_updates > 0
+        buffer, rows = agent.replay_buffer, cohort._replay.of(number)
+        steps, size = len(rows), run.find_encoder().latent_size
+        first = slice(0, 100 // run.used.num_envs)
+        np.testing.assert_array_equal(buffer.observations[first], rows[first, :, :size])
+        np.testing.assert_array_equal(buffer.rewards[first], rows[first, :, -2])
+        np.testing.assert_allclose(buffer.rewards[:steps], rows[..., -2], atol=tolerance)
+        for (name, there), (_, here) in zip(
+            parameters(agent), parameters(members[number].agent), strict=True
+        ):
+            np.testing.assert_allclose(here, there, rtol=0, atol=tolerance, err_msg=name)
+
+
+def alone(run):
+    """What stable-baselines3 makes of a run."""
+    preset, seed = run.used, training_seed(run.seed)
+    env = make_env(run.task, preset.num_envs, seed, run.find_encoder(), preset.normalize)
+    agent = make_agent(run.algorithm, preset, env, run.seed)
+    env.seed(seed)
+    agent.set_logger(Logger(None, []))
+    return agent.learn(run.steps)
+
+
+class Huge:
+    """An encoder with which a critic's loss is infinite."""
+
+    latent_size = 2
+
+    def encode(self, observations):
+        return observations[:, :2] + np.float32(1e25)
+
+
+def test_a_member_that_diverges_fails_alone(done, tmp_path):
+    first, second, third = runs(260, **SAC)
+    results = together([first, replace(second, encoder=Huge()), third], tmp_path)
+    assert results[1]["reason"] == "train/critic_loss is inf after 64 steps"
+    for seed in "02":
+        assert contents(tmp_path / seed) == contents(done / seed)
+    assert not (tmp_path / "1" / "policy.zip").exists()
+
+
+def test_an_environment_that_fails_ends_its_run_alone(done, tmp_path, monkeypatch):
+    """The others go back to their last checkpoints."""
+    asked, step = count(), Endless.step
+
+    def fail_once(self, actions):
+        if next(asked) == 130:
+            raise EnvironmentFailedError("the motor is broken", 2)
+        return step(self, actions)
+
+    monkeypatch.setattr(Endless, "step", fail_once)
+    results = together(runs(260, **SAC), tmp_path, save_every=0)
+    assert results[2]["reason"] == "the motor is broken after 130 steps"
+    for seed in "01":
+        assert contents(tmp_path / seed) == contents(done / seed)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"trainer": "both"}, "unknown trainer 'both': choose one of cohort, sb3"),
+        ({"trainer": "cohort", "algorithm": "ppo"}, "cohorts train ddpg, td3, sac, not ppo: add"),
+        ({"settings": {"use_sde": True}}, "can't learn with use_sde = True: add --trainer sb3"),
+        ({"settings": {"train_freq": [1, "episode"]}}, "train_freq in episodes: add --trainer sb3"),
+        ({"trainer": "sb3", "precision": "bfloat16"}, "sb3 has no bfloat16: leave the precision"),
+        ({"precision": "half"}, "unknown precision 'half'"),
+        ({"device": "cuda"}, "no device 'cuda' on this machine: choose auto or cpu"),
+        ({"settings": {"n_steps": 3}}, "n_steps = 3: add --trainer sb3"),
+    ],
+)
+def test_what_no_cohort_can_do_is_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        Run(task=TASK, **settings).check()
+
+
+def test_members_do_not_depend_on_their_companions(done, tmp_path):
+    first, second, third = runs(260, **SAC)
+    together([third, first], tmp_path)
+    together([second], tmp_path)
+    for seed in "012":
+        assert contents(tmp_path / seed) == contents(done / seed)
+
+
+@pytest.mark.parametrize("rollouts", [0, 30])
+def test_a_stopped_cohort_goes_on_to_the_same_bytes(rollouts, done, tmp_path):
+    asked = count()
+    with pytest.raises(StoppedError):
+        together(runs(260, **SAC), tmp_path, stop=lambda: next(asked) == rollouts)
+    first, *others = runs(260, **SAC)
+    together(others, tmp_path)
+    together([first], tmp_path)
+    for seed in "012":
+        assert contents(tmp_path / seed) == contents(done / seed)
+        assert not (tmp_path / seed / "checkpoint.safetensors").exists()

@@ -1,0 +1,74 @@
+"""Which runs of a study learn in one cohort."""
+
+import os
+from dataclasses import replace
+
+import pytest
+from joblib import cpu_count
+
+from jbrep.errors import InputError
+from jbrep.rl.cohort.replay import memory_of
+from jbrep.study.config import Study
+from jbrep.study.packing import packed, until_done, usual_workers
+from jbrep.study.plan import Plan
+
+STUDY = Study(
+    tasks=("face_direction", "move_in_direction"),
+    algorithms=("sac-modern", "ppo"),
+    representations=("full", "dae-8", "dae-4"),
+    seeds=(0, 1, 2, 3),
+    steps=1000,
+)
+
+
+def packs_of(tmp_path, workers, width=None, **changes):
+    """The packs of a study."""
+    plan = Plan(replace(STUDY, **changes), tmp_path)
+    packs = packed(plan, plan.cells, workers, width)
+    assert sorted(c.name for pack in packs for c in pack) == sorted(c.name for c in plan.cells)
+    for pack in packs:
+        assert len({(cell.task, cell.learner.name) for cell in pack}) == 1
+    return packs
+
+
+@pytest.mark.parametrize(
+    ("workers", "seeds", "sizes"),
+    [(2, 4, [12, 12]), (1, 4, [12, 12]), (4, 4, [6] * 4), (3, 4, [4] * 6), (2, 6, [9] * 4)],
+)
+def test_packs_are_even(tmp_path, workers, seeds, sizes):
+    packs = packs_of(tmp_path, workers, algorithms=("sac-modern",), seeds=tuple(range(seeds)))
+    assert [len(pack) for pack in packs] == sizes
+
+
+def test_a_width_is_not_passed_and_what_has_no_cohort_goes_alone(tmp_path):
+    packs = packs_of(tmp_path, 2, width=5)
+    assert [len(pack) for pack in packs] == [4] * 6 + [1] * 24
+    assert {pack[0].learner.name for pack in packs[6:]} == {"ppo"}
+    alone = packs_of(tmp_path, 2, algorithms=("sac-modern",), trainer="sb3")
+    assert [len(pack) for pack in alone] == [1] * 24
+
+
+def test_memory_limits_the_width(tmp_path, monkeypatch):
+    plan = Plan(replace(STUDY, algorithms=("sac-modern",), steps=1_000_000), tmp_path)
+    bytes_of_one = memory_of(plan.run(plan.cells[0]))
+    assert bytes_of_one == 1_000_000 * (16 + 1 + 16 + 1 + 1) * 4
+    gib = 1 << 30
+    monkeypatch.setattr(os, "sysconf", {"SC_PHYS_PAGES": 4, "SC_PAGE_SIZE": gib}.__getitem__)
+    packs = packed(plan, plan.cells, 2)
+    assert max(map(len, packs)) == 4  # of 19 features, 0.9 GiB
+    with pytest.raises(InputError, match="the width is 5: 2 cohorts of 4 agents are the most that"):
+        packed(plan, plan.cells, 2, 5)
+
+
+def test_the_last_worker_decides():
+    assert until_done([3, 1, 1, 1], 2) == 3
+    assert until_done([2, 2, 2], 2) == 4
+    assert until_done([], 2) == 0
+
+
+def test_a_gpu_has_one_wide_cohort_at_a_time(tmp_path, monkeypatch):
+    plan = Plan(replace(STUDY, algorithms=("sac-modern",), seeds=tuple(range(20))), tmp_path)
+    assert usual_workers(plan) == cpu_count()
+    monkeypatch.setattr(Plan, "device", "cuda")
+    assert usual_workers(plan) == 1
+    assert [len(pack) for pack in packed(plan, plan.cells, 1)] == [60, 60]
