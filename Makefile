@@ -5,12 +5,12 @@ VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2
 READY_DEMO := $(VENV)/.ready-$(VERSION)-for-the-demo
 READY := $(VENV)/.ready-$(VERSION)
 DEMO := demo
-DEMO_RUN := $(DEMO)/study/runs/face_direction/sac-modern/dae-8/seed-0
+DEMO_RUN := $(DEMO)/study/runs/face_direction/small-sac/forward-8/seed-0
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes behaviour clean
+.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes trainers behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -26,19 +26,17 @@ $(READY_DEMO): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[learn,view]'
 	@touch $@
 
-demo: $(READY_DEMO) ## the whole job in minutes: collect, train and judge encoders, learn on latent and full state
+demo: $(READY_DEMO) ## the whole job in minutes: collect, train and judge encoders, learn on codes and the full state
 	rm -rf $(DEMO)
 	$(BIN)/jbrep collect --task face_direction --steps 20k --out $(DEMO)/data
 	$(BIN)/jbrep data info $(DEMO)/data
 	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 12 8 4 --out $(DEMO)/encoders
-	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 8 --architecture deep --epochs 40 --out $(DEMO)/encoders
-	$(BIN)/jbrep train-encoder --kind random --data $(DEMO)/data --latent 8 --out $(DEMO)/encoders
-	$(BIN)/jbrep evaluate --encoder $(addprefix $(DEMO)/encoders/,$(addsuffix .safetensors,dae-12 dae-8 dae-4 dae-deep-8 random-8)) --data $(DEMO)/data --out $(DEMO)/evaluation
-	$(BIN)/jbrep study studies/smoke.toml --out $(DEMO)/study
-	$(BIN)/jbrep inspect $(DEMO_RUN) --out $(DEMO)/dae-8.rrd
+	$(BIN)/jbrep evaluate --encoder $(addprefix $(DEMO)/encoders/,$(addsuffix .safetensors,dae-12 dae-8 dae-4)) forward-8 --data $(DEMO)/data --out $(DEMO)/evaluation
+	$(BIN)/jbrep study studies/demo.toml --out $(DEMO)/study
+	$(BIN)/jbrep inspect $(DEMO_RUN) --out $(DEMO)/forward-8.rrd
 	@echo
 	@echo "the report: $(DEMO)/study/report.html"
-	@echo "an agent at work on its latent: $(BIN)/rerun $(DEMO)/dae-8.rrd"
+	@echo "an agent at work on its code: $(BIN)/rerun $(DEMO)/forward-8.rrd"
 
 test: $(READY) ## the test suite
 	$(BIN)/python -m pytest
@@ -58,6 +56,7 @@ bench: $(READY) ## speed as ratios in one run, and what the hand-written policie
 	$(BIN)/python benchmarks/encoders.py
 	$(BIN)/python benchmarks/methods.py
 	$(BIN)/python benchmarks/learning.py
+	$(BIN)/python benchmarks/cohorts.py
 	$(BIN)/python benchmarks/inspection.py
 	$(BIN)/python benchmarks/heuristics.py
 	$(BIN)/python benchmarks/environments.py
@@ -103,6 +102,13 @@ desk ddpg yaw codes: $(READY)
 	mkdir -p results/$@
 	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json heuristics.csv) results/$@/
 	$(BIN)/jbrep report results/$@
+
+trainers: $(READY) ## results/trainers/ anew: eight hours; goes on where it was stopped
+	for study in $(basename $(notdir $(wildcard studies/trainers/*.toml))); do \
+	  $(BIN)/jbrep study studies/trainers/$$study.toml --out runs/trainers/$$study || exit; \
+	  mkdir -p results/trainers/$$study; cp runs/trainers/$$study/returns.csv runs/trainers/$$study/runs.json results/trainers/$$study/; \
+	done
+	$(BIN)/python tools/trainers.py results/trainers
 
 behaviour: $(READY) ## results/behaviour/ anew: half an hour
 	$(BIN)/jbrep rl --task move_in_direction --preset modern --steps 100k --out runs/mid/full
