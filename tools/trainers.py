@@ -1,0 +1,141 @@
+"""Whether cohorts learn as stable-baselines3 does: python tools/trainers.py RESULTS.
+
+RESULTS has returns.csv and runs.json of each study of studies/trainers in a folder of its own. The
+verdicts go by the rule in results/trainers/README.md.
+"""
+
+import sys
+from collections import defaultdict
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jbrep.figures import write
+from jbrep.figures.curves import curves
+from jbrep.figures.style import styles
+from jbrep.files.storage import write_whole
+from jbrep.report.tables import read_tables
+from jbrep.stats import RunCurve, analyse
+from jbrep.stats.bootstrap import Array, Interval
+from jbrep.stats.claims import variance_p
+from jbrep.stats.intervals import difference, variance_ratio
+from jbrep.text import rounded, table
+
+SB3, *COHORTS = ARMS = ("sb3", "float32", "bfloat16")
+LEARNERS = ("sac", "ddpg")
+WIDE, NARROW = 100, 50  # points of return
+SURE, USUAL = 0.99, 0.90  # of intervals: to call arms different, and to call them equal
+HEADER = (
+    "cohort, measure",
+    "mean",
+    "of sb3",
+    "difference, 90 %",
+    "99 %",
+    "ratio of variances, 99 %",
+    "p",
+)
+SUMMARY = "summary.txt"
+
+
+class Compared(NamedTuple):
+    """A measure of the runs of a cohort, against those of stable-baselines3."""
+
+    mean: float
+    of_sb3: float
+    difference: Interval  # of means, at the level that calls them equal
+    surely: Interval  # the same at the level that calls them different
+    ratio: Interval  # of variances
+    p: float  # of equal variances
+
+    @classmethod
+    def of(cls, x: Array, y: Array) -> "Compared":
+        """Of the runs of a cohort (n,) and those of stable-baselines3 (m,)."""
+        differences = (difference(x, y, level) for level in (USUAL, SURE))
+        return cls(x.mean(), y.mean(), *differences, variance_ratio(x, y, SURE), variance_p(x, y))
+
+    @property
+    def differs(self) -> bool:
+        """Whether means or variances differ, at the level for that."""
+        of_means = not self.surely.low <= 0 <= self.surely.high
+        return of_means or (not self.ratio.low <= 1 <= self.ratio.high and self.p < 1 - SURE)
+
+    def is_within(self, margin: float) -> bool:
+        """Whether the means differ by less, as the test of equivalence has it."""
+        return -margin < self.difference.low and self.difference.high < margin
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Below HEADER, from its second name on."""
+        low, high = rounded(self.ratio.low, self.ratio.high)
+        return (
+            *(f"{mean:.0f}" for mean in (self.mean, self.of_sb3)),
+            f"{self.difference.value:.0f} [{self.difference.low:.0f}, {self.difference.high:.0f}]",
+            f"[{self.surely.low:.0f}, {self.surely.high:.0f}]",
+            f"{self.ratio.value:.2f} [{low}, {high}]",
+            f"{self.p:.3f}",
+        )
+
+
+def verdict(measures: Mapping[str, Compared]) -> str:
+    """By the rule that was written down before the first run."""
+    if any(each.differs for each in measures.values()):
+        return "different"
+    for margin in (NARROW, WIDE):
+        if all(each.is_within(margin) for each in measures.values()):
+            return f"equal, within {margin} points"
+    return "undecided"
+
+
+def read_arm(folder: Path, arm: str) -> list[RunCurve]:
+    """The runs of a study, with the arm in the place of what they observe."""
+    returns: dict[int, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for row in read_tables(folder).returns:
+        returns[row.seed][row.step].append(row.episode_return)
+    return [
+        RunCurve(
+            task=row.task,
+            algorithm=row.algorithm,
+            representation=arm,
+            seed=seed,
+            settings="",
+            steps=np.array([*by_step]),
+            returns=np.array([*by_step.values()]),
+            total_steps=max(by_step),
+            return_floor=0,
+            solved=900,
+        )
+        for seed, by_step in returns.items()
+    ]
+
+
+def measured(runs: list[RunCurve]) -> dict[str, Array]:
+    """Of each run, the mean return of its last evaluation, and of all."""
+    means = np.array([run.returns.mean(1) for run in runs])
+    return {"final return": means[:, -1], "mean return": means.mean(1)}
+
+
+def main(results: Path) -> None:
+    texts, runs = [], []
+    for learner in LEARNERS:
+        arms = {arm: read_arm(results / f"{learner}-{arm}", arm) for arm in ARMS}
+        runs += [run for each in arms.values() for run in each]
+        usual, rows, verdicts = measured(arms[SB3]), [], []
+        for arm in COHORTS:
+            its = measured(arms[arm])
+            compared = {name: Compared.of(its[name], usual[name]) for name in usual}
+            rows += [(f"{arm}, {name}", *each.cells) for name, each in compared.items()]
+            verdicts.append(f"{arm}: {verdict(compared)}")
+        counts = ", ".join(f"{len(each)} of {arm}" for arm, each in arms.items())
+        texts.append("\n".join((f"{learner}: runs, {counts}", table(HEADER, rows), *verdicts)))
+    text = "\n\n".join(texts) + "\n"
+    print(text, end="")
+    write_whole(results / SUMMARY, text.encode())
+    groups = analyse(runs, baseline=SB3).groups
+    write([curves(groups, {}, partial(styles, ARMS, SB3))], results / "figures")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
