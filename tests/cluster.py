@@ -1,8 +1,10 @@
 """A study and a data set on a Ray cluster that loses a node: python tests/cluster.py OUT."""
 
 import sys
-import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import ray
@@ -25,8 +27,8 @@ CONFIG = {
 
 @contextmanager
 def running_cluster():
-    """A cluster of a node with one core."""
-    head = {**NODE, "no_monitor": True, "_system_config": CONFIG}
+    """A cluster whose only node has no core for work."""
+    head = {**NODE, "num_cpus": 0, "no_monitor": True, "_system_config": CONFIG}
     cluster = Cluster(initialize_head=True, head_node_args=head)
     ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
     yield cluster
@@ -34,34 +36,29 @@ def running_cluster():
     cluster.shutdown()
 
 
-@contextmanager
-def dying_node(cluster, is_at_work):
-    """A second node, which is killed once both are at work."""
-    node, over = cluster.add_node(**NODE), threading.Event()
-
-    def kill():
+def loses_a_node(cluster, work, is_at_work):
+    """Do work on a node that is killed in the middle of it, and then on another."""
+    node = cluster.add_node(**NODE)
+    with ThreadPoolExecutor() as pool:  # as Ray starts nodes from the main thread alone
+        result = pool.submit(work)
         while not is_at_work():
-            if over.wait(0.02):
-                return
+            assert not result.done()
+            time.sleep(0.02)
         cluster.remove_node(node, allow_graceful=False)
-        print("a node died at work", flush=True)
-
-    killer = threading.Thread(target=kill)
-    killer.start()
-    try:
-        yield
-    finally:
-        over.set()
-        killer.join()
+        assert not result.done()
+        other = cluster.add_node(**NODE)
+    cluster.remove_node(other)
+    return result.result()
 
 
 def run(study, study_folder, data, data_folder):
-    """Run the study first: its runs overlap where neither node has a worker yet."""
+    """Run a study, and collect data."""
+    learn = partial(run_study, Plan(study, study_folder), on_ray, 2)
+    make = partial(collect, data, data_folder, backend="ray")
     with running_cluster() as cluster:
-        with dying_node(cluster, lambda: len(list(study_folder.rglob(PROGRESS))) >= 2):
-            assert run_study(Plan(study, study_folder), on_ray, 2) == 0
-        with dying_node(cluster, (data_folder / "shard-00001.h5").exists):
-            assert collect(data, data_folder, backend="ray").manifest.complete
+        assert loses_a_node(cluster, learn, lambda: any(study_folder.rglob(PROGRESS))) == 0
+        first = data_folder / "shard-00000.h5"
+        assert loses_a_node(cluster, make, first.exists).manifest.complete
 
 
 if __name__ == "__main__":

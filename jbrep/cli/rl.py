@@ -13,7 +13,7 @@ import click
 
 from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, on_stop, printable
 from jbrep.cli.environment import given_task, parse_arguments, task_options
-from jbrep.rl.names import CLASSES
+from jbrep.rl.names import CLASSES, CPU, FLOAT32
 from jbrep.text import rounded
 
 if TYPE_CHECKING:
@@ -94,13 +94,13 @@ def given_settings(options: dict[str, Any]) -> dict[str, Any]:
 )
 @click.option(
     "--precision",
-    default="float32",
+    default=FLOAT32,
     show_default=True,
     help="Of a cohort's products of matrices: float32, or bfloat16, which some processors compute "
     "several times as fast.",
 )
 @click.option(
-    "--device", default="cpu", show_default=True, help="That a cohort learns on: cpu or cuda."
+    "--device", default=CPU, show_default=True, help="That a cohort learns on: cpu, cuda or auto."
 )
 @click.option("--steps", default=100_000, show_default=True, type=COUNT, help="Of training.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")

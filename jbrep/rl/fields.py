@@ -9,7 +9,7 @@ from jbrep.envs.task import MAX_EPISODE_STEPS, read_task
 from jbrep.errors import DamageError
 from jbrep.files.commit import are_commits
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
-from jbrep.rl.names import FLOAT32, PRECISIONS, SB3, TRAINERS, base_name
+from jbrep.rl.names import CPU, DEVICES, FLOAT32, PRECISIONS, SB3, TRAINERS, base_name
 
 FINISHED, FAILED = "finished", "failed"
 MAX_STEPS = 10**12  # of training
@@ -126,7 +126,7 @@ _SETTINGS = {
     "evaluation_episodes": whole_number(1, MAX_EVALUATION_EPISODES),
     "trainer": text("|".join(TRAINERS), " or ".join(TRAINERS)),
     "precision": text("|".join(PRECISIONS), " or ".join(PRECISIONS)),
-    "device": text("cpu|cuda", "cpu or cuda"),
+    "device": text("|".join(DEVICES), " or ".join(DEVICES)),
     "from": Kind(lambda v: v is None or _SHA256.allows(v), f"null or {_SHA256.words}"),
 }
 POLICY = {"activation_fn": "relu"}  # arguments of every policy unless a run sets others
@@ -138,7 +138,7 @@ _ADDED = {  # what early runs of this version lack
     "overrides": {},
     "trainer": SB3,
     "precision": FLOAT32,
-    "device": "cpu",
+    "device": CPU,
 }
 _POLICY_FILE = {
     "settings": _OBJECT,

@@ -10,7 +10,7 @@ CLASSES = {  # by the names of algorithms
     "tqc": "sb3_contrib.TQC",
     "crossq": "sb3_contrib.CrossQ",
 }
-CPU, CUDA = "cpu", "cuda"
+DEVICES = CPU, CUDA = "cpu", "cuda"
 COHORT, SB3 = "cohort", "sb3"
 TRAINERS = {COHORT: ("ddpg", "td3", "sac"), SB3: tuple(CLASSES)}  # and the algorithms that each has
 FLOAT32, BFLOAT16 = "float32", "bfloat16"

@@ -51,9 +51,7 @@ class Run:
     begin_from: str = ""  # the folder of a finished run, whose policy this one begins with
     trainer: str = ""  # cohort or sb3; by default cohort, for the algorithms that it has
     precision: str = FLOAT32  # of products of matrices: float32 or bfloat16
-    device: str = (
-        "cpu"  # that gradient steps are taken on: cpu, cuda, or auto: cuda if there is one
-    )
+    device: str = CPU  # of gradient steps: cpu, cuda, or auto, which is cuda if there is one
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "task", as_task(self.task))

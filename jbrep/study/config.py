@@ -14,7 +14,7 @@ from jbrep.errors import InputError
 from jbrep.files.storage import read_regular
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl.learner import Learner
-from jbrep.rl.names import FLOAT32
+from jbrep.rl.names import CPU, FLOAT32
 from jbrep.rl.run import Run
 from jbrep.study.representations import ByName, Given, name_of, read_representation
 from jbrep.text import slug
@@ -58,7 +58,7 @@ class Study:
     evaluation_episodes: int = 10
     trainer: str = ""  # cohort or sb3; by default cohort, for the algorithms that it has
     precision: str = FLOAT32  # of products of matrices: float32 or bfloat16
-    device: str = "cpu"  # that gradient steps are taken on: cpu or cuda
+    device: str = CPU  # of gradient steps: cpu, cuda, or auto, which is cuda if there is one
     episode_steps: int | None = None  # time limit; None: each task's own
     environment: Mapping[str, Any] = field(default_factory=dict)  # arguments of environments
     data: Data | None = None  # None: the shipped encoders

@@ -9,7 +9,12 @@ from torch.autograd import Function
 
 from jbrep.rl.names import FLOAT32
 
-Product = Callable[[Tensor, Tensor], Tensor]  # of (n, rows, in) and (n, in, out)
+
+class Product(NamedTuple):
+    """How matrices are multiplied: each is cast once, however many products it is a factor of."""
+
+    cast: Callable[[Tensor], Tensor]
+    multiply: Callable[[Tensor, Tensor], Tensor]  # factors (n, rows, in) and (n, in, out), cast
 
 
 class Layer(NamedTuple):
@@ -42,17 +47,19 @@ class _Affine(Function):
 
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor, product: Product) -> Tensor:
+        inputs, weight = map(product.cast, (inputs, weight))
         ctx.save_for_backward(inputs, weight)
         ctx.product = product
-        return product(inputs, weight).add_(bias)
+        return product.multiply(inputs, weight).add_(bias)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
         inputs, weight = ctx.saved_tensors
         of_inputs, of_layer, *_ = ctx.needs_input_grad
+        factor, multiply = ctx.product.cast(gradient), ctx.product.multiply
         return (
-            ctx.product(gradient, weight.mT) if of_inputs else None,
-            ctx.product(inputs.mT, gradient) if of_layer else None,
+            multiply(factor, weight.mT) if of_inputs else None,
+            multiply(inputs.mT, factor) if of_layer else None,
             gradient.sum(1, keepdim=True) if of_layer else None,
             None,
         )
@@ -60,12 +67,12 @@ class _Affine(Function):
 
 def get_product(precision: str, device: torch.device) -> Product:
     """How matrices are multiplied, with a precision, on a device."""
-    product = torch.bmm if device.type == "cuda" else _one_by_one
+    multiply = torch.bmm if device.type == "cuda" else _one_by_one
     if precision == FLOAT32:
-        return product
+        return Product(lambda values: values, multiply)
     if device.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported():
-        return lambda left, right: product(left.bfloat16(), right.bfloat16()).to(left.dtype)
-    return lambda left, right: _rounded(product(_rounded(left), _rounded(right)))
+        return Product(Tensor.bfloat16, lambda left, right: multiply(left, right).float())
+    return Product(_rounded, lambda left, right: _rounded(multiply(left, right)))
 
 
 def _rounded(values: Tensor) -> Tensor:
