@@ -191,12 +191,14 @@ def compare_studies(steps: int, device: str) -> None:
             seconds = timed(lambda: run_study(plan, on_this_machine, usual_workers(plan)))
         return seconds, (sum(os.times()[:4]) - before) / seconds / cpu_count()
 
-    (together, busy), (alone, _) = measured("cohort", device=device), measured("sb3")
+    alone, _ = measured("sb3")
     runs = len(Plan(STUDY, Path()).cells)
     print(f"a study of {runs} runs of {steps:,} steps, {os.cpu_count()} cores")
-    show("cohorts [s]", [together])
-    show("their share of the cores' time", [busy])
-    show("times the rate of stable-baselines3's workers", [alone / together])
+    for precision in PRECISIONS:
+        together, busy = measured("cohort", device=device, precision=precision)
+        show(f"cohorts, {precision} [s]", [together])
+        show("their share of the cores' time", [busy])
+        show("times the rate of stable-baselines3's workers", [alone / together])
 
 
 if __name__ == "__main__":
