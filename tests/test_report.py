@@ -518,6 +518,20 @@ def test_a_run_of_a_newer_jbrep_is_named(tmp_path):
         read_results(plan.folder)
 
 
+def check_close(ours, theirs):
+    """The same JSON, but for the last digits, which depend on the processor."""
+    if isinstance(ours, dict):
+        assert ours.keys() == theirs.keys()
+        ours, theirs = list(ours.values()), [theirs[name] for name in ours]
+    if isinstance(ours, list):
+        for mine, other in zip(ours, theirs, strict=True):
+            check_close(mine, other)
+    elif isinstance(ours, float):
+        assert ours == pytest.approx(theirs, rel=1e-9)
+    else:
+        assert ours == theirs
+
+
 @pytest.mark.parametrize("study", ["desk", "yaw"])
 def test_results_of_the_first_release_are_read_and_are_those_of_today(study):
     """From returns.csv, the same numbers as in statistics.json, but for the profiles."""
@@ -549,7 +563,7 @@ def test_results_of_the_first_release_are_read_and_are_those_of_today(study):
             del group["profile_returns"]
             for label in group["labels"]:
                 del label["profile"], label["settings"]
-    assert today == first
+    check_close(today, first)
     reached = first["groups"][0]["labels"][0]["numbers"]["reached_solved"][0]
     assert reached == 1  # each run of full came to 900
 
