@@ -100,7 +100,7 @@ codes: encoders ## results/codes/ anew: hours
 desk ddpg yaw codes: $(READY)
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
-	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json heuristics.csv) results/$@/
+	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json references.csv) results/$@/
 	$(BIN)/jbrep report results/$@
 
 trainers: $(READY) ## results/trainers/ anew: eight hours; goes on where it was stopped

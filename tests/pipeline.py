@@ -13,7 +13,7 @@ from command import in_this_process, jbrep, start, wait_for, wait_for_the_end_of
 from small import contents
 
 from jbrep.report.report import SUMMARY
-from jbrep.study.heuristics import HEURISTIC_RETURNS
+from jbrep.study.references import REFERENCE_RETURNS
 from jbrep.study.results import RETURNS, STATISTICS
 from jbrep.study.runner import BACKENDS
 
@@ -54,7 +54,6 @@ def stages(folder, workers=2):
 def in_peace(folder):
     """Run all, the report by its own command; what each said."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jbrep.study.heuristics._EPISODES", 2)  # they would take as long as the rest
         patch.setitem(BACKENDS, "local", in_this_process)
         with pytest.MonkeyPatch.context() as once:
             once.setattr("jbrep.report.write_report", lambda folder, out: [])
@@ -66,7 +65,7 @@ def killed(folder, seed, peace):
     """Kill each stage at a point that the seed draws, and start it again; where it was killed."""
     random, told = np.random.default_rng(seed), []
     (folder / "study").mkdir(parents=True)
-    shutil.copy(peace / "study" / HEURISTIC_RETURNS, folder / "study")
+    shutil.copy(peace / "study" / REFERENCE_RETURNS, folder / "study")
     for stage, given in stages(folder).items():
         point = POINTS[stage][random.integers(len(POINTS[stage]))]
         delay = random.uniform(0, _LONGEST)

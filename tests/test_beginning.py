@@ -19,7 +19,13 @@ from jbrep.rl.files import BEGINNING, POLICY, RUN, read_evaluations, read_run
 from jbrep.rl.policy import load_run, load_untrained
 
 CART = describe(cart.ID)
-SETTINGS = {"task": CART, "algorithm": "sac", "preset": "modern", "evaluation_episodes": 2}
+SETTINGS = {
+    "task": CART,
+    "algorithm": "sac",
+    "preset": "modern",
+    "evaluation_episodes": 2,
+    "final_episodes": 2,
+}
 
 
 @pytest.fixture(scope="module")

@@ -28,8 +28,7 @@ COMMANDS = sorted({*main.commands} - {*GROUPS}) + [
 ]
 
 
-def test_a_run_from_training_to_its_returns(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
+def test_a_run_from_training_to_its_returns(tmp_path):
     run = tmp_path / "runs" / "dae-8"
     settings = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 40)
     settings += ("--episode-steps", 100)

@@ -16,7 +16,6 @@ OWN = Path("examples/own/own.py").resolve()
 @pytest.mark.usefixtures("one_figure")
 @pytest.mark.filterwarnings("ignore")  # a user sees them once, if at all
 def test_everything_that_one_can_bring(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
     monkeypatch.setitem(BACKENDS, "local", in_this_process)
     monkeypatch.setattr("jbrep.envs.names._imported", [])  # it imports net
     monkeypatch.setattr(sys, "argv", [str(OWN), str(tmp_path / "out")])

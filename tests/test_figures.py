@@ -26,7 +26,7 @@ from jbrep.rollouts.behaviour import SPEEDS, observe
 from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.claims import LESS_VARIANCE
+from jbrep.stats.first_claims import LESS_VARIANCE
 
 STEPS = np.arange(0, 50_001, 10_000)
 FINAL = {"full": 900, "dae-8": 500, "pca-4": 300}
@@ -86,7 +86,9 @@ def returns():
 
 @pytest.fixture(scope="module")
 def plots(analysis, returns):
-    drawn = study_plots(analysis, returns, {"face_direction": [910, 950, 990]}, LABELS)
+    drawn = study_plots(
+        analysis, returns, {"face_direction": {"hand-written": [910, 950, 990]}}, LABELS
+    )
     return {plot.name: plot for plot in drawn}
 
 

@@ -11,6 +11,7 @@ from jbrep.collect.policies import (
     Constant,
     Heuristic,
     OrnsteinUhlenbeck,
+    Still,
     Uniform,
     acts_on_observations,
     generators,
@@ -105,7 +106,7 @@ def test_policies_as_people_write_them(text, policy):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("sprint", "unknown policy 'sprint': choose one of uniform, heuristic"),
+        ("sprint", "unknown policy 'sprint': choose one of uniform, still, heuristic"),
         ("constant:speed=1", "no constant 'speed': it has drive"),
         ("uniform:low=0", "no constant 'low': it has none"),
         ("constant:kind=heuristic", "no constant 'kind'"),
@@ -140,6 +141,13 @@ def test_actions_of_several_numbers_keep_to_the_bounds_of_each(policy):
         share = (actions.mean(axis=(0, 1)) - low) / (high - low)
         np.testing.assert_allclose(share, 0.5, atol=0.1)
         np.testing.assert_allclose(np.corrcoef(actions.reshape(-1, 3).T), np.eye(3), atol=0.15)
+
+
+def test_standing_still_is_zero_or_what_is_next_to_it():
+    pushed = replace(ARM, action_low=(0.5, 0.0, -2.0))
+    for task, expected in ((ARM, [0, 0, 0]), (pushed, [0.5, 0, 0])):
+        actions = drives(Still(), lanes=2, steps=3, task=task)
+        np.testing.assert_array_equal(actions, np.broadcast_to(expected, (3, 2, 3)))
 
 
 def test_drives_are_not_rescaled_where_the_bounds_are_those_of_drives():

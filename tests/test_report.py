@@ -31,8 +31,8 @@ from jbrep.rl.files import ENCODER, Evaluation, write_rows, write_run
 from jbrep.rollouts.sources import find_episode
 from jbrep.stats import RunCurve, analyse
 from jbrep.study.config import Study, read_study
-from jbrep.study.heuristics import HEURISTIC_RETURNS, write_heuristics
 from jbrep.study.plan import Plan
+from jbrep.study.references import REFERENCE_RETURNS, write_references
 from jbrep.study.results import read_results, write_results
 from jbrep.text import SIGNIFICANT, number
 
@@ -47,7 +47,7 @@ STUDY = Study(
     evaluate_every=1000,
     evaluation_episodes=2,
 )
-TABLES = ("runs.json", "returns.csv", "statistics.json", "heuristics.csv")
+TABLES = ("runs.json", "returns.csv", "statistics.json", "references.csv")
 TRAP = "<script>document.title = 'run'</script>"
 
 
@@ -104,8 +104,12 @@ def whole(tmp_path_factory, one_picture):
     """The folder of a study at its end, with one failed run, and its report."""
     folder = tmp_path_factory.mktemp("whole") / "a-study"
     make_study(folder, failed=(1,))
-    rows = [("face_direction", episode, 940 + episode) for episode in range(20)]
-    write_csv(folder / HEURISTIC_RETURNS, ("task", "episode", "return"), rows)
+    rows = [
+        ("face_direction", policy, episode, mean + episode)
+        for policy, mean in (("standing still", 250), ("random", 100), ("hand-written", 940))
+        for episode in range(20)
+    ]
+    write_csv(folder / REFERENCE_RETURNS, ("task", "policy", "episode", "return"), rows)
     conclude(folder)
     return folder
 
@@ -411,17 +415,17 @@ def test_of_single_runs_it_shows_what_there_is(tmp_path):
     assert (plan.folder / FIGURES / "every_run.png").exists()
 
 
-def test_heuristics_are_played_once_on_the_starts_of_evaluation(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 2)
-    rows = list(
-        csv.reader(write_heuristics(map(describe, STUDY.tasks), tmp_path).read_text().splitlines())
-    )
-    assert rows[0] == ["task", "episode", "return"]
-    assert len(rows) == 1 + 2
-    alone = find_episode("heuristic", 1, describe("face_direction")).reward.sum()
-    assert float(rows[2][2]) == pytest.approx(alone, abs=1e-3)
-    monkeypatch.setattr("jbrep.study.heuristics.episode_returns", None)
-    write_heuristics(map(describe, STUDY.tasks), tmp_path)
+def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkeypatch):
+    tasks = [(describe("face_direction", max_episode_steps=50), 2)]
+    rows = list(csv.reader(write_references(tasks, tmp_path).read_text().splitlines()))
+    assert rows[0] == ["task", "policy", "episode", "return"]
+    policies = {"standing still": "still", "random": "uniform", "hand-written": "heuristic"}
+    assert [row[1] for row in rows[1:]] == [name for name in policies for _ in range(2)]
+    for _, name, episode, played in rows[1:]:
+        alone = find_episode(policies[name], int(episode), tasks[0][0]).reward.sum()
+        assert float(played) == pytest.approx(alone, abs=1e-3)
+    monkeypatch.setattr("jbrep.study.references.find_player", None)
+    write_references(tasks, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -455,8 +459,8 @@ def test_heuristics_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
         ("returns.csv", lambda text: text + "a,b,c,0,0,0,nan\n", "returns.csv is damaged or"),
         ("returns.csv", lambda text: text + "a,b,c,0,0,0,1e16\n", "returns.csv is damaged or"),
         ("returns.csv", lambda text: text + '"' + "a" * 200_000, "returns.csv is damaged or"),
-        ("heuristics.csv", lambda text: text + "x", "heuristics.csv is damaged or cut short"),
-        ("heuristics.csv", lambda text: b"\xff", "heuristics.csv is damaged: it is not UTF-8"),
+        ("references.csv", lambda text: text + "x", "references.csv is damaged or cut short"),
+        ("references.csv", lambda text: b"\xff", "references.csv is damaged: it is not UTF-8"),
         ("returns.csv", None, r"can't read .*returns\.csv"),
         ("runs.json", None, "is not the folder of a study: it has neither runs nor a runs.json"),
     ],

@@ -128,7 +128,8 @@ def test_a_runs_folder(short):
     assert {"torch", "mujoco", "stable-baselines3"} <= set(run["versions"])
     assert run["seconds"] > 0
     assert run["cpu"]
-    assert [(e.step, e.episode) for e in read_evaluations(short)] == [(0, 0), (80, 0)]
+    played = [(e.step, e.episode) for e in read_evaluations(short)]
+    assert played == [(0, 0), *((80, episode) for episode in range(10))]
     assert (short / "episodes.csv").read_text() == "step,lane,return,length,diverged\n"
     assert list((short / "tensorboard").glob("events.*"))
     assert not (short / "checkpoint.safetensors").exists()
@@ -143,7 +144,7 @@ def test_plain_sb3_loads_the_policy_that_was_evaluated(short):
     np.testing.assert_array_equal(trained.policy.predict(rows, deterministic=True)[0], expected)
     returns = Evaluator(TASK, trained.encoder, 1).returns(trained.policy)
     at_end = [e.episode_return for e in read_evaluations(short) if e.step == 80]
-    np.testing.assert_allclose(returns, at_end, atol=5e-4)
+    np.testing.assert_allclose(returns, at_end[:1], atol=5e-4)
 
 
 def test_evaluation_is_the_deterministic_policys_return():

@@ -39,7 +39,14 @@ SHORT = {
 def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     task = describe("face_direction", max_episode_steps=200)
-    settings = Run(task=task, algorithm="a2c", encoder="dae-8", steps=64, evaluation_episodes=2)
+    settings = Run(
+        task=task,
+        algorithm="a2c",
+        encoder="dae-8",
+        steps=64,
+        evaluation_episodes=2,
+        final_episodes=2,
+    )
     train(settings, folder)
     return folder
 

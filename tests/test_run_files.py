@@ -210,14 +210,15 @@ def test_a_run_of_an_earlier_version_is_read(run):
         "-1,0,1",
         f"0,{10**8},1",
         "0,1,1",
-        "0,0,1\n80,0,1\n80,1,1",
+        "0,0,1\n0,1,1\n80,0,1",
+        "0,0,1\n40,0,1\n40,1,1\n80,0,1",
         "80,0,1\n0,0,1",
         "0,0,1\n0,0,1",
         "0,0,1\n" + "9" * 200_000,
         '0,0,"1',
         "\0",
     ],
-    ids=range(15),
+    ids=range(16),
 )
 def test_evaluations_that_are_none(rows, run):
     header = "step,episode,return\n" if rows else ""

@@ -35,7 +35,13 @@ from jbrep.study.results import read_results
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
 SMALL = {"net_arch": [8], "learning_starts": 10, "train_freq": 5, "batch_size": 8}
-QUICK = {"task": TASK, "preset": "modern", "steps": 60, "evaluation_episodes": 2}
+QUICK = {
+    "task": TASK,
+    "preset": "modern",
+    "steps": 60,
+    "evaluation_episodes": 2,
+    "final_episodes": 2,
+}
 SAC_RUN = Run(**QUICK, settings={**SMALL, "normalize": True})
 
 

@@ -13,15 +13,6 @@ from scipy import stats
 from jbrep.errors import DamageError, InputError
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.claims import (
-    CLAIMS,
-    FASTER_LEARNING,
-    LESS_VARIANCE,
-    VERDICTS,
-    decide,
-    mean_p,
-    variance_p,
-)
 from jbrep.stats.comparison import holm, probability_of_improvement
 from jbrep.stats.curves import (
     bands,
@@ -31,6 +22,15 @@ from jbrep.stats.curves import (
     mean_return,
     on_grid,
     steps_to,
+)
+from jbrep.stats.first_claims import (
+    CLAIMS,
+    FASTER_LEARNING,
+    LESS_VARIANCE,
+    VERDICTS,
+    decide,
+    mean_p,
+    variance_p,
 )
 from jbrep.stats.intervals import deviation, difference, mean, percentile, variance_ratio
 from jbrep.stats.power import POWER, SEEDS, seeds_needed
@@ -374,7 +374,7 @@ def test_percentile_intervals_cover_as_often_as_is_written():
 
 @pytest.mark.parametrize(("n", "studies"), [(5, 200), (10, 200)])
 def test_the_permutation_test_holds_its_level(n, studies, monkeypatch):
-    monkeypatch.setattr("jbrep.stats.claims._PERMUTATIONS", 499)
+    monkeypatch.setattr("jbrep.stats.first_claims._PERMUTATIONS", 499)
     random = np.random.default_rng(n)
     fifths = np.where(random.random((2, studies, n)) < 0.2, 0, 600.0)
     fifths += random.normal(0, 10, fifths.shape)

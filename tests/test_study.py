@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
@@ -26,16 +27,15 @@ from command import (
 )
 
 from jbrep.encoders import load
-from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.rl.files import CHECKPOINT, RUN, read_run, write_run
 from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, read_study
-from jbrep.study.heuristics import HEURISTIC_RETURNS, write_heuristics
 from jbrep.study.plan import STUDY, Plan, plan_for, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.progress import Progress, duration
+from jbrep.study.references import REFERENCE_RETURNS, write_references
 from jbrep.study.results import (
     RETURNS,
     STATISTICS,
@@ -442,7 +442,6 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     stop = iter((False, True)).__next__  # after its first rollout
     assert work(plan.assigned([begun]), stop) is None
     assert (plan.folder_of(begun) / CHECKPOINT).exists()
-    monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
     reported = jbrep("report", out, "--json")
     assert reported.exit_code == 0, reported.output
     summary = json.loads(reported.stdout)
@@ -507,7 +506,6 @@ def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     out = shutil.copytree(done.folder, tmp_path / "out")
     monkeypatch.setattr("jbrep.study.study.run_study", lambda *given: 2)
     monkeypatch.setattr("jbrep.report.write_report", lambda folder, out: [])
-    monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 1)
     told = jbrep("study", tmp_path / "tiny.toml", "--out", out)
     assert told.exit_code == 1
     assert told.stderr.endswith("2 runs crashed: the same command tries them again\n")
@@ -530,7 +528,6 @@ training = {epochs = 2}
 @pytest.mark.usefixtures("one_figure")
 def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monkeypatch):
     """Its workers import the package; its report is made where that is missing."""
-    monkeypatch.setattr("jbrep.study.heuristics._EPISODES", 2)
     path, out = tmp_path / "mixed.toml", tmp_path / "mixed"
     path.write_text(MIXED)
     with monkeypatch.context() as once:
@@ -546,11 +543,11 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     returns = {task: [] for task in (robots.ID, "face_direction")}
     for task, _, _, _, _, _, each in list(csv.reader((out / RETURNS).read_text().splitlines()))[1:]:
         returns[task].append(float(each))
-    assert {len(each) for each in returns.values()} == {2 * 2 * 2}
+    assert {len(each) for each in returns.values()} == {2 * 2 * (1 + 10)}
     assert max(returns[robots.ID]) < 0 <= min(returns["face_direction"])
     assert max(returns["face_direction"]) <= 50
-    played = [line.split(",")[0] for line in (out / HEURISTIC_RETURNS).read_text().splitlines()]
-    assert played == ["task", "face_direction", "face_direction"]
+    played = [line.split(",")[0] for line in (out / REFERENCE_RETURNS).read_text().splitlines()]
+    assert Counter(played) == {"task": 1, "face_direction": 3 * 10, robots.ID: 2 * 10}
     assert {folder.name for folder in (out / "runs").iterdir()} == {
         "Robots-Pendulum-v1",
         "face_direction",
@@ -560,10 +557,10 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     assert "--import PACKAGE" in refused.stderr
 
 
-def test_no_hand_written_policy_no_table(tmp_path):
-    (tmp_path / HEURISTIC_RETURNS).write_text("of other runs")
-    assert write_heuristics([describe("Pendulum-v1")], tmp_path) is None
-    assert not (tmp_path / HEURISTIC_RETURNS).exists()
+def test_no_references_no_table(tmp_path):
+    (tmp_path / REFERENCE_RETURNS).write_text("of other runs")
+    assert write_references([], tmp_path) is None
+    assert not (tmp_path / REFERENCE_RETURNS).exists()
 
 
 def test_one_study_at_a_time(done):
@@ -576,13 +573,14 @@ def test_one_study_at_a_time(done):
 def test_the_long_table_holds_every_evaluation(done):
     lines = tables(done.folder)[0].decode().splitlines()
     assert lines[0] == "task,algorithm,representation,seed,step,episode,return"
-    assert len(lines) == 1 + 4 * 2
+    assert len(lines) == 1 + 4 * (1 + 10)
     assert lines[1].startswith("face_direction,a2c,full,0,0,0,")
     statistics = json.loads((done.folder / STATISTICS).read_text())
     final = statistics["groups"][0]["labels"][0]["by_run"]["final_return"]
-    assert final == [
-        float(line.split(",")[-1]) for line in lines[1:] if ",full," in line and ",80,0," in line
-    ]
+    at_end = [line.split(",") for line in lines[1:] if ",full," in line and ",80," in line]
+    for seed, each in enumerate(final):
+        returns = [float(row[-1]) for row in at_end if row[3] == str(seed)]
+        assert (len(returns), each) == (10, pytest.approx(np.mean(returns)))
 
 
 def test_a_single_seed_gives_its_returns_and_says_why_no_more(done, tmp_path):

@@ -126,7 +126,6 @@ def done(home):
     """A study of files and code, finished."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(home)
-        patch.setattr("jbrep.study.heuristics._EPISODES", 1)
         plan = Plan(with_own(PATTERN, CODE, DENSE, FROM_ONNX), home / "done")
         assert run_study(plan, in_this_process, 1) == 0
         conclude(plan.folder)
@@ -153,7 +152,7 @@ def test_a_module_and_its_onnx_model_give_equal_tables(done):
         [row.replace(name, "it") for row in rows if f",{name}," in row]
         for name in ("dense", "from-onnx")
     )
-    assert len(of_module) == 4
+    assert len(of_module) == 22
     assert of_module == of_file
     folder = done.folder_of(next(c for c in done.cells if c.representation.name == "dense"))
     assert read_run(folder)["settings"]["encoder_code"] is None

@@ -20,7 +20,7 @@ from jbrep.files.storage import write_whole
 from jbrep.report.tables import read_tables
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.claims import variance_p
+from jbrep.stats.first_claims import variance_p
 from jbrep.stats.intervals import difference, variance_ratio
 from jbrep.text import rounded, table
 

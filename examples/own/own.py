@@ -79,7 +79,7 @@ def encoder() -> None:
         [row[:which] + row[which + 1 :] for row in table if row[which] == name]
         for name in ("mine", "mine-onnx")
     )
-    assert len(mine) == 12
+    assert len(mine) == 48
     assert mine == onnx
     print("\nthe module and the file from ONNX give equal tables")
     run = "study/runs/face_direction/a2c-modern/mine/seed-0"

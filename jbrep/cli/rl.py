@@ -115,6 +115,12 @@ def given_settings(options: dict[str, Any]) -> dict[str, Any]:
     help="Of the deterministic policy, each time, from starts that training doesn't use.",
 )
 @click.option(
+    "--final-episodes",
+    type=COUNT,
+    default=0,
+    help="Of the last time.  [default: ten times as many]",
+)
+@click.option(
     "--from",
     "begin_from",
     default="",

@@ -112,6 +112,19 @@ class Constant(Constants):
 
 
 @dataclass(frozen=True)
+class Still(Constants):
+    """No action at all: zero, or what the bounds have next to it."""
+
+    kind: ClassVar[str] = "still"
+    open_loop: ClassVar[bool] = True
+
+    def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
+        """Nothing is drawn."""
+        actions = np.tile(np.clip(0.0, task.action_low, task.action_high), (len(seeds), 1))
+        return lambda observation: actions
+
+
+@dataclass(frozen=True)
 class OrnsteinUhlenbeck(Constants):
     """An Ornstein-Uhlenbeck process for each action, from its mean on, clipped to [-1, 1].
 
@@ -182,7 +195,9 @@ def _one_by_one(blocks: Iterator[NDArray[Any]]) -> Actor:
     return open_loop(action for block in blocks for action in block)
 
 
-POLICIES = {policy.kind: policy for policy in (Uniform, Heuristic, Constant, OrnsteinUhlenbeck)}
+POLICIES = {
+    policy.kind: policy for policy in (Uniform, Still, Heuristic, Constant, OrnsteinUhlenbeck)
+}
 _WEIGHT = re.compile(r":([\d.]+(?:e-?\d+)?)\+")  # between the parts of a mixture
 
 

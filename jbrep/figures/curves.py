@@ -26,7 +26,8 @@ from jbrep.stats.analysis import GroupAnalysis
 Groups = Sequence[GroupAnalysis]
 Evaluated = tuple[str, str, str, int, int]  # task, algorithm, representation, seed, step
 Runs = dict[int, dict[int, float]]  # mean returns of a label, by seed and step
-Heuristics = Mapping[str, Sequence[float]]  # returns of the hand-written policy, by task
+# returns of policies that learn nothing, by task and policy
+References = dict[str, dict[str, list[float]]]
 
 _MOST_ACROSS = 5  # panels of runs side by side
 _HANDLE, _CHARACTER = 0.5, 0.05  # widths in a legend [inches]
@@ -48,12 +49,12 @@ class Return(NamedTuple):
     episode_return: float
 
 
-def curves(groups: Groups, heuristics: Heuristics, looks: Looks) -> Plot:
+def curves(groups: Groups, references: References, looks: Looks) -> Plot:
     """Every representation on one axis, tasks by algorithms."""
-    extents = _extents(groups, heuristics)
+    extents = _extents(groups, references)
     caption = "Return of the deterministic policy over training: median and 10 to 90 % over n runs."
-    if any(heuristics.get(task) for task in extents):
-        caption += " Dashed: the hand-written policy's median on the same starts."
+    if any(references.get(task) for task in extents):
+        caption += " Dashed: medians of policies that don't learn, on the same starts."
     solved = {group.solved for group in groups if extents[group.task].contain(group.solved)}
     if solved:
         values = ", ".join(f"{value:,g}" for value in sorted(solved))
@@ -64,16 +65,16 @@ def curves(groups: Groups, heuristics: Heuristics, looks: Looks) -> Plot:
         caption,
         _COLUMNS,
         list(_rows(groups)),
-        lambda: _grid_of_curves(groups, heuristics, extents, looks),
+        lambda: _grid_of_curves(groups, references, extents, looks),
     )
 
 
-def _extents(groups: Groups, heuristics: Heuristics) -> dict[str, Limits]:
+def _extents(groups: Groups, references: References) -> dict[str, Limits]:
     """The limits of returns for each task, which its algorithms share."""
-    returns = defaultdict(list)
+    returns = defaultdict[str, list[float]](list)
     for group in groups:
-        if played := heuristics.get(group.task):
-            returns[group.task].append(float(np.median(played)))
+        played = references.get(group.task, {}).values()
+        returns[group.task] += [float(np.median(each)) for each in played]
         for label in group.labels:
             returns[group.task] += [*label.curve.p10, *label.curve.p90]
     facts = {group.task: (group.return_floor, group.solved) for group in groups}
@@ -91,7 +92,10 @@ def every_run(returns: Sequence[Return], looks: Looks) -> Plot:
     for row in returns:
         key = (row.task, row.algorithm, row.representation, row.seed, row.step)
         episodes[key].append(row.episode_return)
-    means = {key: float(np.mean(each)) for key, each in episodes.items()}
+    fewest: dict[tuple[Any, ...], int] = {}  # of an evaluation: the last one may have more starts
+    for (*run, _), each in episodes.items():
+        fewest[*run] = min(fewest.get((*run,), len(each)), len(each))
+    means = {key: float(np.mean(each[: fewest[key[:-1]]])) for key, each in episodes.items()}
     return Plot(
         "every_run",
         "Every run",
@@ -118,13 +122,13 @@ def cell(value: float) -> str:
 
 
 def _grid_of_curves(
-    groups: Groups, heuristics: Heuristics, extents: Mapping[str, Limits], looks: Looks
+    groups: Groups, references: References, extents: Mapping[str, Limits], looks: Looks
 ) -> Figure:
     look, names = looks(), names_with_runs(groups)
 
     def draw(axes: Axes, group: GroupAnalysis) -> None:
-        if returns := heuristics.get(group.task):
-            axes.axhline(float(np.median(returns)), label="hand-written", **reference())
+        for i, (policy, returns) in enumerate(references.get(group.task, {}).items()):
+            axes.axhline(float(np.median(returns)), label=policy, **reference(i))
         if extents[group.task].contain(group.solved):
             axes.axhline(group.solved, **solved_line_style())
         for label in group.labels:

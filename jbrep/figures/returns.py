@@ -23,8 +23,8 @@ from jbrep.figures.style import (
 )
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.claims import LESS_VARIANCE
 from jbrep.stats.comparison import Comparison
+from jbrep.stats.first_claims import LESS_VARIANCE
 
 _ENDS = ("low", "high")
 _LABEL = ("task", "algorithm", "representation")
@@ -39,7 +39,7 @@ def final_return(groups: Groups, looks: Looks) -> Plot:
     return Plot(
         "final_return",
         "Final return and its spread",
-        "Left: mean over the last tenth of training, a point for each of n runs, and the mean over "
+        "Left: mean return at the end of training, a point for each of n runs, and the mean over "
         "runs with its 95 % interval. Right: the standard deviation over runs with its 95 % "
         "interval." + _CUT,
         (

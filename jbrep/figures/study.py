@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from jbrep.encoders import FULL
-from jbrep.figures.curves import Heuristics, Return, curves, every_run
+from jbrep.figures.curves import References, Return, curves, every_run
 from jbrep.figures.diagnostics import diagnostics
 from jbrep.figures.diagrams import LabelRecord, diagrams
 from jbrep.figures.plot import Plot
@@ -18,7 +18,7 @@ from jbrep.stats.runs import in_order
 def study_plots(
     analysis: Analysis | None,
     returns: Sequence[Return],
-    heuristics: Heuristics,
+    references: References,
     labels: Mapping[str, LabelRecord],
     associations: Sequence[Association] = (),
 ) -> list[Plot]:
@@ -27,7 +27,7 @@ def study_plots(
     Args:
         analysis: statistics.json; None if there is none.
         returns: returns.csv.
-        heuristics: returns of the hand-written policy, by task.
+        references: returns of policies that learn nothing, by task and policy.
         labels: of runs.json.
         associations: of diagnostics with final returns.
     """
@@ -41,7 +41,7 @@ def study_plots(
     looks = partial(styles, in_order(names, baseline), baseline if baseline in names else None)
     plots = []
     if analysis:
-        plots += [curves(groups, heuristics, looks), final_return(groups, looks)]
+        plots += [curves(groups, references, looks), final_return(groups, looks)]
         if any(group.comparisons for group in groups):
             plots.append(variance_ratio(analysis, looks))
         plots += [learning_rate(groups, looks), profiles(analysis, looks)]

@@ -54,6 +54,7 @@ DARK: Any = {
     "grid.alpha": 0.16,
     "ytick.color": "#DDDDDD",
 }
+_DASHES = ("--", "-.", (0, (6, 1.5)))
 
 
 def ink() -> str:
@@ -61,9 +62,10 @@ def ink() -> str:
     return str(mpl.rcParams["text.color"])
 
 
-def reference() -> dict[str, Any]:
-    """A line to compare with."""
-    return {"color": ink(), "linestyle": "--", "linewidth": 0.9, "alpha": 0.65}
+def reference(number: int = 0) -> dict[str, Any]:
+    """A line to compare with; several have numbers, and dashes of their own."""
+    dashes = _DASHES[number % len(_DASHES)]
+    return {"color": ink(), "linestyle": dashes, "linewidth": 0.9, "alpha": 0.65}
 
 
 def solved_line_style() -> dict[str, Any]:

@@ -8,8 +8,8 @@ from jbrep.report.columns import are_numbers
 from jbrep.report.tables import Tables
 from jbrep.report.words import Answer, remark
 from jbrep.stats.analysis import GroupAnalysis
-from jbrep.stats.claims import CLAIMS
 from jbrep.stats.comparison import Verdict
+from jbrep.stats.first_claims import CLAIMS
 from jbrep.stats.summary import Rows, label_rows, margin
 
 # what would be read as markup: an underscore within a word and a bracket without a link are not

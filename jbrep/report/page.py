@@ -18,7 +18,7 @@ from jbrep.report.columns import are_numbers
 from jbrep.report.tables import Tables
 from jbrep.report.words import Answer, remark
 from jbrep.stats import Analysis
-from jbrep.stats.claims import CLAIMS
+from jbrep.stats.first_claims import CLAIMS
 from jbrep.stats.summary import Rows, group_tables, margin
 
 _WIDEST = 1000  # of a figure [CSS pixels]

@@ -40,7 +40,7 @@ def write_report(folder: Path, out: Path | None = None) -> list[Path]:
     verdicts = answers(tables.analysis) if tables.analysis else []
     associated = diagnostics.of_study(tables)
     plots = study_plots(
-        tables.analysis, tables.returns, tables.heuristics, tables.record["labels"], associated
+        tables.analysis, tables.returns, tables.references, tables.record["labels"], associated
     )
     predictions = diagnostics.diagnostic_tables(associated)
     texts = {

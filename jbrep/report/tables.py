@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypedDict
 
 from jbrep.encoders.diagnostics import DIAGNOSTICS, by_label, read_diagnostics
 from jbrep.errors import DamageError, InputError
-from jbrep.figures.curves import Return
+from jbrep.figures.curves import References, Return
 from jbrep.figures.diagrams import LabelRecord, TaskRecord
 from jbrep.files.storage import exists
 from jbrep.files.typed import read_json, typed
@@ -16,9 +16,10 @@ from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, TASKS
 from jbrep.rl.files import read_text
 from jbrep.stats import Analysis
 from jbrep.study import record
-from jbrep.study.heuristics import HEURISTIC_RETURNS
+from jbrep.study.references import HAND_WRITTEN, REFERENCE_RETURNS
 from jbrep.study.results import RETURNS, STATISTICS
 
+HEURISTIC_RETURNS = "heuristics.csv"  # of the first release
 _REPRESENTATIONS = list[str | dict[str, Any]]  # names, or what a user's own are made of
 _MOST = 1 << 53  # of a number: a float holds whole ones exactly
 # of the first release, which had no other robot
@@ -59,7 +60,7 @@ class Tables(NamedTuple):
     record: Record
     analysis: Analysis | None  # statistics.json
     returns: list[Return]  # returns.csv
-    heuristics: dict[str, list[float]]  # heuristics.csv: returns by task
+    references: References  # references.csv: returns by task and policy
     # diagnostics.csv: values by task and representation, then by name
     diagnostics: dict[tuple[str, str], dict[str, float | None]]
 
@@ -77,17 +78,27 @@ def read_tables(folder: Path) -> Tables:
     analysis = None
     if exists(folder / STATISTICS):
         analysis = Analysis.from_json(_text(folder / STATISTICS), folder / STATISTICS)
-    heuristics: dict[str, list[float]] = {}
-    if exists(folder / HEURISTIC_RETURNS):
-        columns = (str, _count, _episode_return)
-        for task, _, each in _read_csv(folder / HEURISTIC_RETURNS, columns):
-            heuristics.setdefault(task, []).append(each)
     columns_of_returns = (str, str, str, _count, _count, _count, _episode_return)
     returns = [Return(*row) for row in _read_csv(folder / RETURNS, columns_of_returns)]
     rows = read_diagnostics(folder / DIAGNOSTICS) if exists(folder / DIAGNOSTICS) else []
     name = folder.resolve().name.encode(errors="replace").decode()
     record_of_runs = _read_record(folder / record.RECORD)
-    return Tables(name, record_of_runs, analysis, returns, heuristics, by_label(rows))
+    references = _read_references(folder)
+    return Tables(name, record_of_runs, analysis, returns, references, by_label(rows))
+
+
+def _read_references(folder: Path) -> References:
+    """Returns of reference policies; the first release had hand-written ones alone."""
+    references: References = {}
+    if exists(folder / REFERENCE_RETURNS):
+        for task, policy, _, each in _read_csv(
+            folder / REFERENCE_RETURNS, (str, str, _count, _episode_return)
+        ):
+            references.setdefault(task, {}).setdefault(policy, []).append(each)
+    elif exists(folder / HEURISTIC_RETURNS):
+        for task, _, each in _read_csv(folder / HEURISTIC_RETURNS, (str, _count, _episode_return)):
+            references.setdefault(task, {}).setdefault(HAND_WRITTEN, []).append(each)
+    return references
 
 
 def _read_record(path: Path) -> Record:
@@ -114,6 +125,7 @@ def _check(checked: Record) -> None:
     if study := checked["study"]:
         typed(study.get("algorithms"), list[str], where="study.algorithms")
         typed(study.get("representations"), _REPRESENTATIONS, where="study.representations")
+        typed(study.get("learners", {}), dict[str, dict[str, Any]], where="study.learners")
     if "jbrep" not in (*checked["versions"], {})[0]:
         raise ValueError("the version of jbrep is missing")
     for run in checked["runs"]:

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from jbrep.stats import Analysis
-from jbrep.stats.claims import CLAIMS, Claim
 from jbrep.stats.comparison import Comparison, Verdict
+from jbrep.stats.first_claims import CLAIMS, Claim
 from jbrep.stats.summary import shown, shown_number
 
 

@@ -174,7 +174,7 @@ class Evaluator:
     Args:
         task: what is played.
         encoder: the policy's view of the observation.
-        episodes: the number of episodes.
+        episodes: how many are played at once.
         seed: of the first episode; the others take the numbers that follow.
         num_threads: as for `Lanes`.
     """
@@ -190,8 +190,8 @@ class Evaluator:
         self._lanes = Lanes(task, episodes, num_threads)
         self._encoder, self._seed = encoder, seed
 
-    def returns(self, policy: BasePolicy | BaseAlgorithm) -> Array:
-        """The return of each episode, (episodes,).
+    def returns(self, policy: BasePolicy | BaseAlgorithm, episodes: int | None = None) -> Array:
+        """The return of each episode, (episodes,): as many as are played at once, or as asked for.
 
         What an agent normalises, it normalises by its statistics so far, which stay as they are.
 
@@ -200,4 +200,7 @@ class Evaluator:
             EnvironmentFailedError: the environment fails in the middle of an episode.
         """
         act = deterministic(policy, self._encoder, self._lanes.task, statistics_of(policy))
-        return episode_returns(self._lanes, act, self._seed)
+        at_once = self._lanes.num_lanes
+        count = at_once if episodes is None else episodes
+        seeds = range(self._seed, self._seed + count, at_once)
+        return np.concatenate([episode_returns(self._lanes, act, s) for s in seeds])[:count]

@@ -124,6 +124,7 @@ _SETTINGS = {
     "steps": whole_number(1, MAX_STEPS),
     "evaluate_every": whole_number(1, MAX_STEPS),
     "evaluation_episodes": whole_number(1, MAX_EVALUATION_EPISODES),
+    "final_episodes": whole_number(1, MAX_EVALUATION_EPISODES),
     "trainer": text("|".join(TRAINERS), " or ".join(TRAINERS)),
     "precision": text("|".join(PRECISIONS), " or ".join(PRECISIONS)),
     "device": text("|".join(DEVICES), " or ".join(DEVICES)),
@@ -153,7 +154,8 @@ _VERSION_1 = {"task": _TASK, "episode_steps": whole_number(1, MAX_EPISODE_STEPS)
 def completed(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of a run, with what those of an earlier jbrep leave unsaid."""
     name = base_name(settings.get("algorithm", ""), settings.get("preset", ""))
-    return {**_ADDED, "learner": name, **settings}
+    episodes = {"final_episodes": settings.get("evaluation_episodes")}
+    return {**_ADDED, **episodes, "learner": name, **settings}
 
 
 def check_run(path: Path, run: Mapping[str, Any]) -> None:

@@ -79,6 +79,8 @@ def _cell(value: float) -> str | int:
 def read_evaluations(folder: Path) -> list[Evaluation]:
     """The evaluations of a run: ascending steps, each with the same episodes from 0.
 
+    The last one may have more of them.
+
     Raises:
         InputError: the file is missing.
         DamageError: it is not such a table.
@@ -93,7 +95,7 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     except (ValueError, TypeError, csv.Error):
         raise DamageError(
             f"{path} is damaged or not a table of evaluations: its columns must be step, episode "
-            "and a finite return, with the same episodes at every step"
+            "and a finite return, with the same episodes at every step, or more at the last"
         ) from None
     return evaluations
 
@@ -107,14 +109,14 @@ def _evaluation(step: str, episode: str, episode_return: str) -> Evaluation:
 
 
 def _check_grid(evaluations: list[Evaluation]) -> None:
-    steps, counts = [], set()
+    steps, counts = [], []
     for step, rows in groupby(evaluations, lambda row: row.step):
         episodes = [row.episode for row in rows]
         if episodes != [*range(len(episodes))]:
             raise ValueError
         steps.append(step)
-        counts.add(len(episodes))
-    if steps != sorted(set(steps)) or len(counts) > 1:
+        counts.append(len(episodes))
+    if steps != sorted(set(steps)) or len(set(counts[:-1])) > 1 or counts[-1:] < counts[:1]:
         raise ValueError
 
 

@@ -25,7 +25,9 @@ _LIMITS = {
     "steps": MAX_STEPS,
     "evaluate_every": MAX_STEPS,
     "evaluation_episodes": MAX_EVALUATION_EPISODES,
+    "final_episodes": MAX_EVALUATION_EPISODES,
 }
+_FINAL = 10  # times as many episodes as the other evaluations, if a run doesn't say how many
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +48,7 @@ class Run:
     steps: int = 100_000
     evaluate_every: int = 10_000  # steps
     evaluation_episodes: int = 10
+    final_episodes: int = 0  # of the last evaluation; 0: ten times as many as of the others
     representation: str = ""  # what tables call it; the encoder's own name by default
     encoder_seed: int | None = None  # that the encoder was made with, if each run has its own
     begin_from: str = ""  # the folder of a finished run, whose policy this one begins with
@@ -62,12 +65,20 @@ class Run:
         choose(self.trainer, TRAINERS, "trainer")
         choose(self.precision, PRECISIONS, "precision")
         object.__setattr__(self, "device", get_device(self.device).type)
+        if not self.final_episodes:
+            final = min(_FINAL * self.evaluation_episodes, MAX_EVALUATION_EPISODES)
+            object.__setattr__(self, "final_episodes", final)
         for name, limit in _LIMITS.items():
             if not 1 <= getattr(self, name) <= limit:
                 words = name.replace("_", " ")
                 raise InputError(
                     f"{words} is {getattr(self, name)}: it must be between 1 and {limit:,}"
                 )
+        if self.final_episodes < self.evaluation_episodes:
+            raise InputError(
+                f"final episodes are {self.final_episodes}: they must be as many as evaluation "
+                f"episodes, {self.evaluation_episodes}, or more"
+            )
         for name, seed in (("seed", self.seed), ("encoder seed", self.encoder_seed or 0)):
             if not 0 <= seed <= MAX_SEED:
                 raise InputError(f"the {name} is {seed}: it must be between 0 and {MAX_SEED:,}")
@@ -97,6 +108,10 @@ class Run:
             raise InputError(f"{self.trainer} has no {self.precision}: leave the precision out")
         elif self.device != CPU:
             raise InputError(f"{self.trainer} trains on the cpu here: leave the device out")
+
+    def episodes_at(self, step: int) -> int:
+        """Of the evaluation after so many steps."""
+        return self.final_episodes if step >= self.steps else self.evaluation_episodes
 
     @property
     def physics_threads(self) -> int | None:
@@ -149,6 +164,7 @@ class Run:
             "steps": self.steps,
             "evaluate_every": self.evaluate_every,
             "evaluation_episodes": self.evaluation_episodes,
+            "final_episodes": self.final_episodes,
             "from": None,
             "trainer": self.trainer,
             "precision": self.precision,

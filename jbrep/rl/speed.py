@@ -33,7 +33,8 @@ def estimate(runs: Sequence[Run]) -> float:
     with TemporaryDirectory() as folder, single_torch_thread():
         trial = _together if first.trainer == COHORT else _alone
         per_step, per_evaluation = trial(runs, Path(folder))
-    evaluations = first.steps // first.evaluate_every + 1
+    at_end = first.final_episodes / first.evaluation_episodes
+    evaluations = first.steps // first.evaluate_every + at_end
     return first.steps * per_step + evaluations * per_evaluation
 
 

@@ -12,9 +12,9 @@ from jbrep.encoders import FULL
 from jbrep.errors import DamageError
 from jbrep.files.typed import read_json, typed
 from jbrep.stats.bootstrap import Array
-from jbrep.stats.claims import CLAIMS
 from jbrep.stats.comparison import Comparison, adjusted, compare, simultaneous_level
-from jbrep.stats.curves import common_grid, on_grid
+from jbrep.stats.curves import common_grid, final_returns, on_grid
+from jbrep.stats.first_claims import CLAIMS
 from jbrep.stats.labels import RepresentationResult, check_names, describe
 from jbrep.stats.plain import READERS, to_plain
 from jbrep.stats.runs import LARGEST_RETURN, Group, RunCurve, groups
@@ -176,11 +176,11 @@ def _analyse_group(group: Group, family: int, seed: int) -> GroupAnalysis:
     """The results of a group; the p-values of its verdicts aren't adjusted yet."""
     first = next(iter(group.values()))[0]
     grid, cut = common_grid(group)
-    curves = [np.stack([on_grid(run, grid) for run in runs]) for runs in group.values()]
-    scale = scale_of(curves, grid, first.return_floor, first.solved)
+    curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in group.items()}
+    finals = final_returns(group, curves, grid)
+    scale = scale_of(list(finals.values()), next(iter(curves.values())), grid, first)
     baseline, *others = (
-        describe(runs, of_runs, scale, seed)
-        for runs, of_runs in zip(group.values(), curves, strict=True)
+        describe(runs, curves[name], finals[name], scale, seed) for name, runs in group.items()
     )
     compared = (compare(each, baseline, scale.reference, family, seed) for each in others)
     return GroupAnalysis(

@@ -1,153 +1,125 @@
-"""The claims about a representation, and what decides them: an interval and a boundary."""
+"""What is claimed of a representation: how each claim is measured, and what would decide it."""
 
 from collections.abc import Callable
-from math import comb
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtr
-from scipy.stats import permutation_test
+from scipy.optimize import brentq
 
-from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.intervals import constant, difference, variance_ratio, welch
+from jbrep.stats.arms import Arm, Frame
+from jbrep.stats.bootstrap import Interval
+from jbrep.stats.means import Bounds, Part, p_of_sum, sum_within
+from jbrep.stats.spread import Curves, ratio_of_spreads, spread_p
 
-MARGIN = 0.05  # of the baseline's gain over the reference: a smaller loss counts as similar
-_PERMUTATIONS = 9999
-VERDICTS = {1: "supported", -1: "contradicted", 0: "undecided"}
+_FURTHEST = 1e3  # shares of a gain that are looked for
 
 
 class Claim(NamedTuple):
-    """A claim that a representation's runs, x, support or contradict against the baseline's, y.
+    """A claim that runs on less state, x, support or contradict against those of the baseline, y.
 
-    Args:
-        name: in two words.
+    Attributes:
+        name: in a word or two.
         statement: the claim as a sentence.
-        quantity: what the interval is of, in words.
-        boundary_name: what the boundary is called before its value; empty if it has no name.
-        measure: what is compared, a value for each run.
-        interval: from x (..., n), y (..., m) and a level, (...).
-        boundary: what the interval must exclude, from y and the reference, (...).
-        side: 1 if an interval above the boundary supports the claim, -1 if one below does.
-        p_value: two-sided, of lying on the boundary, from x (n,), y (m,), the boundary and a seed.
-        allow_failures: whether the claim may be supported where runs of the representation failed.
-        allow_no_learning: whether it may be supported where they learned nothing.
-        least_p: the smallest possible p-value with n runs of each.
+        estimand: what is estimated, in words.
+        side: 1 if an estimate above the boundary speaks for the claim, -1 if one below does.
+        boundary: of the estimate, given the margin.
+        estimate: from x, y, their frame, the level of the interval and a seed.
+        p_value: two-sided, of the estimand lying on the boundary, from x, y, frame, boundary, seed.
     """
 
     name: str
     statement: str
-    quantity: str
-    boundary_name: str
-    measure: str
-    interval: Callable[[Array, Array, float], Interval]
-    boundary: Callable[[Array, float], Array]
+    estimand: str
     side: int
-    p_value: Callable[[Array, Array, float, int], float]
-    allow_failures: bool
-    allow_no_learning: bool
-    least_p: Callable[[int], float] = lambda runs: 0.0
+    boundary: Callable[[float], float]
+    estimate: Callable[[Arm, Arm, Frame, float, int], Interval]
+    p_value: Callable[[Arm, Arm, Frame, float, int], float]
 
 
-def decide(claim: Claim, interval: Interval, boundary: Array) -> Array:
-    """1 where the claim is supported, -1 where contradicted, 0 where undecided; (...)."""
-    above = np.asarray(interval.low) > boundary
-    below = np.asarray(interval.high) < boundary
-    return claim.side * (above.astype(int) - below.astype(int))
+def kept_gain(x: Arm, y: Arm, frame: Frame, level: float, seed: int = 0) -> Interval:
+    """The gain of x over standing still as a share of that of y, with its interval.
 
-
-def mean_p(x: Array, y: Array, boundary: float = 0, seed: int = 0) -> float:
-    """P-value of means of x (n,) and y (m,) differing by the boundary: Welch's two-sided test."""
-    value, error, freedom = welch(x, y)
-    return float(2 * stdtr(freedom, -np.abs(value - boundary) / error))
-
-
-def variance_p(x: Array, y: Array, boundary: float = 1, seed: int = 0) -> float:
-    """P-value of a ratio of variances at the boundary: a permutation test of its log, two-sided.
-
-    Runs are permuted after subtracting their group's median. Subtracting the mean instead, the
-    test rejects 10 % of skewed returns with equal variances at a level of 5 %, and 36 % of returns
-    of which a fifth are near 0. With the median it rejected, for 5, 10 and 20 runs per group:
-    normal 0.7, 3.5 and 4.7 %, skewed 0.9, 5.6 and 4.1 %, heavy tails 0.6, 4.1 and 5.4 %, a fifth
-    near 0 1.2, 5.5 and 4.4 % (1,000 samples each). So with five runs it hardly ever rejects.
+    The interval has the shares c with which the interval of mean(x) - c mean(y) has what standing
+    still would give (Fieller 1954); an end is infinite where y may not gain anything.
     """
-    if constant(x) or constant(y):
+    gained, of_y = x.final.mean() - frame.still, y.final.mean() - frame.still
+    if of_y <= 0:
+        return Interval(np.nan, np.nan, np.nan)
+    value = float(gained / of_y)
+
+    def room(share: float, direction: int) -> float:
+        parts = (Part(1, x.final), Part(-share, y.final))
+        _, low, high = sum_within(parts, frame.bounds, level)
+        return float((low if direction < 0 else high) - (1 - share) * frame.still) * direction
+
+    return Interval(value, *(_end(room, value, direction) for direction in (-1, 1)))
+
+
+def _end(room: Callable[[float, int], float], value: float, direction: int) -> float:
+    """The share in a direction from which on the interval is on one side; NaN if it has none."""
+    if np.isnan(room(value, direction)):
         return np.nan
-    centred = (x - np.median(x)) / np.sqrt(boundary), y - np.median(y)
-    result = permutation_test(
-        centred,
-        _log_ratio,
-        permutation_type="independent",
-        vectorized=True,
-        n_resamples=_PERMUTATIONS,
-        alternative="greater",
-        rng=np.random.default_rng(seed),
-    )
-    return float(result.pvalue)
+    step = 0.25
+    while step < _FURTHEST:
+        if room(value + direction * step, direction) < 0:
+            return float(brentq(room, value, value + direction * step, (direction,)))
+        step *= 2
+    return direction * np.inf
 
 
-def _log_ratio(x: Array, y: Array, axis: int) -> Array:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.abs(np.log(x.var(axis=axis, ddof=1)) - np.log(y.var(axis=axis, ddof=1)))
+def _kept_p(x: Arm, y: Arm, frame: Frame, boundary: float, seed: int) -> float:
+    parts = (Part(1, x.final), Part(-boundary, y.final))
+    return p_of_sum(parts, frame.bounds, (1 - boundary) * frame.still)
 
 
-def _least_of_permutations(runs: int) -> float:
-    """The share of the observed split, and of its mirror image, among all splits of the runs."""
-    return 2 / comb(2 * runs, runs)
+def time_lost(x: Arm, y: Arm, frame: Frame, level: float, seed: int = 0) -> Interval:
+    """Steps that x takes more than y to half of y's gain, restricted to those of training."""
+    return sum_within((Part(1, x.time), Part(-1, y.time)), Bounds(0, frame.steps), level)
 
 
-def _margin(y: Array, reference: float) -> Array:
-    """A share of the gain of y (..., m): returns may be negative, a gain isn't."""
-    return -MARGIN * np.maximum(y.mean(axis=-1) - reference, 0)
+def _time_p(x: Arm, y: Arm, frame: Frame, boundary: float, seed: int) -> float:
+    parts = (Part(1, x.time), Part(-1, y.time))
+    return p_of_sum(parts, Bounds(0, frame.steps), boundary)
 
 
-def _zero(y: Array, reference: float) -> Array:
-    return np.zeros(y.shape[:-1])
+def spread_ratio(x: Arm, y: Arm, frame: Frame, level: float, seed: int = 0) -> Interval:
+    """The spread of training curves of x over that of y."""
+    return ratio_of_spreads(_curves(x, y, frame), level, seed)
 
 
-def _one(y: Array, reference: float) -> Array:
-    return np.ones(y.shape[:-1])
+def _spread_p(x: Arm, y: Arm, frame: Frame, boundary: float, seed: int) -> float:
+    return spread_p(_curves(x, y, frame), seed)
 
 
-# runs that failed or learned nothing vary little, and runs that stay at a high return have a high
-# mean return: neither may count in favour of a representation
-SIMILAR_REWARD = Claim(
-    name="similar reward",
-    statement="The reduced state ends at a similar reward",
-    quantity="difference of mean final returns",
-    boundary_name=f"the margin of {100 * MARGIN:.0f} % of the gain,",
-    measure="final_return",
-    interval=difference,
-    boundary=_margin,
+def _curves(x: Arm, y: Arm, frame: Frame) -> Curves:
+    return Curves(x.curves, y.curves, frame.weights, frame.resolution)
+
+
+NOT_WORSE = Claim(
+    name="not worse",
+    statement="Agents on less state end no worse",
+    estimand="gain over standing still, as a share of that on the full state",
     side=1,
-    p_value=mean_p,
-    allow_failures=True,
-    allow_no_learning=True,
+    boundary=lambda margin: 1 - margin,
+    estimate=kept_gain,
+    p_value=_kept_p,
 )
 LESS_VARIANCE = Claim(
     name="less variance",
-    statement="It has less variance over training runs",
-    quantity="ratio of variances of final returns",
-    boundary_name="",
-    measure="final_return",
-    interval=variance_ratio,
-    boundary=_one,
+    statement="Their training varies less from run to run",
+    estimand="spread of training curves, as a multiple of that on the full state",
     side=-1,
-    p_value=variance_p,
-    allow_failures=False,
-    allow_no_learning=False,
-    least_p=_least_of_permutations,
+    boundary=lambda margin: 1.0,
+    estimate=spread_ratio,
+    p_value=_spread_p,
 )
-FASTER_LEARNING = Claim(
-    name="faster learning",
-    statement="It learns faster",
-    quantity="difference of mean returns over training",
-    boundary_name="",
-    measure="mean_return",
-    interval=difference,
-    boundary=_zero,
-    side=1,
-    p_value=mean_p,
-    allow_failures=True,
-    allow_no_learning=False,
+FASTER = Claim(
+    name="faster",
+    statement="They learn faster",
+    estimand="steps to half of the full agents' gain, beyond what these take",
+    side=-1,
+    boundary=lambda margin: 0.0,
+    estimate=time_lost,
+    p_value=_time_p,
 )
-CLAIMS = (SIMILAR_REWARD, LESS_VARIANCE, FASTER_LEARNING)
+CLAIMS = {claim.name: claim for claim in (NOT_WORSE, LESS_VARIANCE, FASTER)}

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import levene
 
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.claims import CLAIMS, VERDICTS, Claim, decide
+from jbrep.stats.first_claims import CLAIMS, VERDICTS, Claim, decide
 from jbrep.stats.intervals import FEWEST, LEVEL, constant, difference, percentile, variance_ratio
 from jbrep.stats.labels import RepresentationResult, check_names, check_numbers, median
 from jbrep.stats.power import seeds_needed

@@ -1,5 +1,6 @@
 """Learning curves on a grid of training steps that all compared runs share."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 
@@ -118,6 +119,32 @@ def final_return(curves: Array, grid: Array) -> Array:
     """The mean of curves (runs, g) over the evaluations in the last tenth of the grid's range."""
     start, end = grid[0], grid[-1]
     return curves[:, grid >= end - _LAST * (end - start)].mean(axis=1)
+
+
+def final_returns(
+    group: Mapping[str, Sequence[RunCurve]], curves: Mapping[str, Array], grid: Array
+) -> dict[str, Array]:
+    """The final return of each run of each representation, (runs,) each.
+
+    Where all that didn't fail end with an evaluation of more episodes, at the end of the grid, it
+    is their mean; else that of the evaluations in the last tenth of the grid. A run that failed
+    ends with its failure_return.
+
+    Args:
+        group: runs by representation.
+        curves: of the runs, on the grid, (runs, g) each.
+        grid: training steps, (g,).
+    """
+    whole = [run for runs in group.values() for run in runs if run.failed_at is None]
+    if not whole or any(run.final is None or run.steps[-1] > grid[-1] for run in whole):
+        return {name: final_return(each, grid) for name, each in curves.items()}
+    return {
+        name: np.array(
+            [curve[-1] if run.final is None else run.final.mean() for run, curve in each]
+        )
+        for name, runs in group.items()
+        for each in [zip(runs, curves[name], strict=True)]
+    }
 
 
 def mean_return(curves: Array, grid: Array) -> Array:

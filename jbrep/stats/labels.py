@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import binomtest, iqr, median_abs_deviation
 
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.curves import Curve, bands, final_return, iqm, mean_return, steps_to
+from jbrep.stats.curves import Curve, bands, iqm, mean_return, steps_to
 from jbrep.stats.intervals import LEVEL, UNDEFINED, deviation, mean, percentile
 from jbrep.stats.reliability import TAIL_OF_RUNS, expected_shortfall, fixed_policy, within_runs
 from jbrep.stats.runs import RunCurve
@@ -100,21 +100,24 @@ def check_numbers(numbers: Mapping[str, Interval], expected: Collection[str]) ->
         raise ValueError("each number must be one interval")
 
 
-def describe(runs: list[RunCurve], curves: Array, scale: Scale, seed: int) -> RepresentationResult:
+def describe(
+    runs: list[RunCurve], curves: Array, final: Array, scale: Scale, seed: int
+) -> RepresentationResult:
     """The results of a representation.
 
     Args:
         runs: all of the representation, in the order of seeds.
         curves: of the runs, on the grid of the scale, (runs, g).
+        final: final returns of the runs, (runs,).
         scale: of the group.
         seed: of the resamples.
     """
     grid = scale.grid
     failed = np.array([run.failed_at is not None for run in runs])
     by_run = {
-        "final_return": final_return(curves, grid),
+        "final_return": final,
         "mean_return": mean_return(curves, grid),
-        "gain": final_return(curves, grid) - curves[:, 0],
+        "gain": final - curves[:, 0],
         **{name: steps_to(curves, grid, each) for name, each in scale.thresholds.items()},
         **within_runs(curves, failed),
         **fixed_policy(runs, grid[-1]),

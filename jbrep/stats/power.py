@@ -3,7 +3,7 @@
 import numpy as np
 
 from jbrep.stats.bootstrap import Array
-from jbrep.stats.claims import Claim, decide
+from jbrep.stats.first_claims import Claim, decide
 
 SEEDS = (5, 10, 20, 40, 80, 160, 320)
 POWER = 0.8

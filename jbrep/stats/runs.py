@@ -35,8 +35,12 @@ class RunCurve:
         total_steps: training steps that were requested.
         failed_at: training step at which the run failed; None if it didn't.
         return_floor: the least possible return of an episode of the task; None if unknown.
+        return_ceiling: the largest possible one; None if unknown.
+        still: the mean return of standing still on the starts of evaluation; None if unknown.
         solved: the return from which on the task counts as solved; None if unknown.
         trainer: what trained it, and how exactly; equal for all runs that are compared.
+        final: the returns of the last evaluation, if it has more episodes than the others, (f,).
+        encoder_seed: of the encoder, if the representation has several.
         failure_return: what the run counts as once it has failed; None for the floor.
             `with_failure_returns` sets it for runs that are compared.
 
@@ -54,8 +58,12 @@ class RunCurve:
     total_steps: int
     failed_at: int | None = None
     return_floor: float | None = None
+    return_ceiling: float | None = None
+    still: float | None = None
     solved: float | None = None
     trainer: str = ""
+    final: Array | None = None
+    encoder_seed: int | None = None
     failure_return: float | None = None
 
     def __post_init__(self) -> None:
@@ -81,12 +89,14 @@ class RunCurve:
             )
         self._check_bounds(returns)
         self._check_length(steps)
+        if self.final is not None and not (np.abs(self.final) <= LARGEST_RETURN).all():
+            raise self._error("its final returns aren't finite", "give numbers, or None")
         for name, value in (("steps", steps), ("returns", returns.copy())):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
     def _check_bounds(self, returns: Array) -> None:
-        for what in ("return_floor", "solved", "failure_return"):
+        for what in ("return_floor", "return_ceiling", "still", "solved", "failure_return"):
             value = getattr(self, what)
             if value is not None and not abs(value) <= LARGEST_RETURN:
                 raise self._error(f"its {what} is {value}", "give a number, or None if unknown")
@@ -115,6 +125,11 @@ class RunCurve:
                 f"it was evaluated at steps {steps[0]} to {steps[-1]}",
                 f"they must be within its total_steps, {self.total_steps}",
             )
+
+    @property
+    def evaluations(self) -> list[Array]:
+        """The returns of each evaluation, (e,), of the last one maybe more."""
+        return [*self.returns] if self.final is None else [*self.returns[:-1], self.final]
 
     @property
     def label(self) -> str:
@@ -217,7 +232,7 @@ def _check_task(runs: list[RunCurve], name: str) -> None:
             f"{name}: its runs are of different trainers: {', '.join(trainers)}; report those of "
             "one, or all with --across-trainers"
         )
-    for what in ("return_floor", "solved"):
+    for what in ("return_floor", "return_ceiling", "still", "solved"):
         values = sorted({str(getattr(run, what)) for run in runs})
         if len(values) > 1:
             raise InputError(

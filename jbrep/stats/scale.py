@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.stats.bootstrap import Array
-from jbrep.stats.curves import final_return
+from jbrep.stats.runs import RunCurve
 
 SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the gain of the baseline's median run
 SOLVED = "steps_to_solved"
@@ -20,9 +20,7 @@ class Scale(NamedTuple):
 
     Args:
         grid: training steps at which runs are compared, (g,).
-        reference: the return that gains are counted from: the least possible return of the task
-            where it is known, else the baseline's mean return at the first step of the grid, that
-            is, of its untrained policies: the nearest thing to standing still that each run has.
+        reference: the return that gains are counted from, as `reference_of` has it.
         thresholds: the return to reach for each of STEPS_TO, NaN where there is none.
         profile_returns: at which performance profiles are evaluated, (k,): round numbers that
             enclose all final returns.
@@ -34,19 +32,31 @@ class Scale(NamedTuple):
     profile_returns: Array
 
 
-def scale_of(
-    curves: Sequence[Array], grid: Array, floor: float | None, solved: float | None
-) -> Scale:
+def reference_of(run: RunCurve, curves: Array) -> float:
+    """The return that gains are counted from.
+
+    That is what standing still returns where it was measured, else the least possible return of the
+    task where it is known, else the baseline's mean return at the first step of the grid, that is,
+    of its untrained policies.
+
+    Args:
+        run: any of the task.
+        curves: of the baseline's runs on the grid, (runs, g).
+    """
+    known = (each for each in (run.still, run.return_floor) if each is not None)
+    return float(next(known, curves[:, 0].mean()))
+
+
+def scale_of(finals: Sequence[Array], curves: Array, grid: Array, run: RunCurve) -> Scale:
     """The scale of a group of runs.
 
     Args:
-        curves: of each representation's runs on the grid, (runs, g) each, the baseline first.
+        finals: final returns of each representation's runs, (runs,) each, the baseline first.
+        curves: of the baseline's runs on the grid, (runs, g).
         grid: training steps, (g,).
-        floor: the least possible return; None if unknown.
-        solved: the return from which on the task counts as solved; None if unknown.
+        run: any of the group.
     """
-    finals = [final_return(each, grid) for each in curves]
-    reference = float(curves[0][:, 0].mean() if floor is None else floor)
+    reference, solved = reference_of(run, curves), run.solved
     gain = float(np.median(finals[0])) - reference
     shares = [reference + share * gain if gain > 0 else np.nan for share in SHARES.values()]
     thresholds = (*shares, np.nan if solved is None else float(solved))
@@ -54,7 +64,7 @@ def scale_of(
         grid=grid,
         reference=reference,
         thresholds=dict(zip(STEPS_TO, thresholds, strict=True)),
-        profile_returns=_round_numbers(np.concatenate(finals), floor),
+        profile_returns=_round_numbers(np.concatenate(finals), run.return_floor),
     )
 
 

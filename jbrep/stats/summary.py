@@ -7,7 +7,7 @@ import numpy as np
 
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.claims import LESS_VARIANCE, MARGIN
+from jbrep.stats.first_claims import LESS_VARIANCE, MARGIN
 from jbrep.stats.labels import REACHED, RepresentationResult
 from jbrep.stats.scale import STEPS_TO
 from jbrep.text import SIGNIFICANT, interval, number, table

@@ -22,7 +22,7 @@ from jbrep.text import slug
 _MAX_BYTES = 1 << 20
 _MOST_SEEDS = (1 << 16) - 1
 _RUN_SETTINGS = (
-    *("steps", "evaluate_every", "evaluation_episodes"),
+    *("steps", "evaluate_every", "evaluation_episodes", "final_episodes"),
     *("trainer", "precision", "device"),
 )
 _ITEMS: dict[Any, tuple[type, ...]] = {  # of lists, by the type of the field
@@ -56,6 +56,7 @@ class Study:
     steps: int
     evaluate_every: int = 10_000
     evaluation_episodes: int = 10
+    final_episodes: int = 0  # of the last evaluation; 0: ten times as many as of the others
     trainer: str = ""  # cohort or sb3; by default cohort, for the algorithms that it has
     precision: str = FLOAT32  # of products of matrices: float32 or bfloat16
     device: str = CPU  # of gradient steps: cpu, cuda, or auto, which is cuda if there is one

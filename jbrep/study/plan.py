@@ -24,7 +24,6 @@ from jbrep.training.trainer import get_device
 
 STUDY = "study.json"
 _GRID = ("tasks", "algorithms", "representations", "seeds", "learners", "evaluations")  # may change
-_BEFORE_TRAINERS = {"trainer": SB3}  # what the files of earlier versions leave unsaid
 _MAX_BYTES = 1 << 24
 
 
@@ -195,9 +194,14 @@ def read_plan(folder: Path) -> Plan | None:
     if not exists(path):
         return None
     try:
-        given = _BEFORE_TRAINERS | json.loads(read_regular(path, _MAX_BYTES))
+        given = _completed(json.loads(read_regular(path, _MAX_BYTES)))
         return Plan(as_study({n: v for n, v in given.items() if v is not None}), folder)
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         raise InputError(
             f"{path} is damaged, or of a newer jbrep ({error}): choose another folder"
         ) from None
+
+
+def _completed(study: dict[str, Any]) -> dict[str, Any]:
+    """A study's settings, with what the files of earlier versions leave unsaid."""
+    return {"trainer": SB3, "final_episodes": study["evaluation_episodes"], **study}

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,9 +16,9 @@ from jbrep.files.storage import exists, write_whole
 from jbrep.files.tables import write_csv
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
-from jbrep.study.heuristics import write_heuristics
 from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.record import RECORD, as_json, learner, record, shared_settings
+from jbrep.study.references import write_references
 from jbrep.text import rounded, table
 
 RETURNS = "returns.csv"
@@ -44,15 +44,15 @@ def conclude(folder: Path, across_trainers: bool = False) -> tuple[Results, list
 
     Returns:
         The results and the files: every return, what was run, the statistics if there are any, and
-        the returns of hand-written policies if the tasks have any.
+        the returns of reference policies.
 
     Raises:
         InputError: as `read_results` and `write_results`.
     """
     results = read_results(folder, across_trainers)
     paths = write_results(results, folder)
-    heuristics = write_heuristics(map(_task, map(read_run, results.folders)), folder)
-    return results, [*paths, heuristics] if heuristics else paths
+    references = write_references(_tasks(results.folders), folder)
+    return results, [*paths, references] if references else paths
 
 
 def read_results(folder: Path, across_trainers: bool = False) -> Results:
@@ -116,6 +116,16 @@ def _comparable(runs: list[RunCurve]) -> tuple[list[RunCurve], list[str]]:
     return kept, sorted(alone.values())
 
 
+def _tasks(folders: Iterable[Path]) -> Iterable[tuple[Task, int]]:
+    """The tasks of runs, with the most episodes that one was evaluated on at its end."""
+    tasks: dict[str, tuple[Task, int]] = {}
+    for run in map(read_run, folders):
+        task, episodes = _task(run), run["settings"]["final_episodes"]
+        _, most = tasks.get(task.name, (task, 0))
+        tasks[task.name] = task, max(most, episodes)
+    return tasks.values()
+
+
 def _task(run: Mapping[str, Any]) -> Task:
     """The task of a run, from the contents of its run.json."""
     return read_task(run["settings"]["environment"])
@@ -129,6 +139,7 @@ def _curve(folder: Path, across_trainers: bool = False) -> RunCurve:
     evaluations = read_evaluations(folder)
     steps = sorted({each.step for each in evaluations})
     returns = [[e.episode_return for e in evaluations if e.step == step] for step in steps]
+    episodes = min(map(len, returns), default=0)  # the last evaluation may have more
     return RunCurve(
         task=task.name,
         algorithm=learner(settings),
@@ -136,12 +147,13 @@ def _curve(folder: Path, across_trainers: bool = False) -> RunCurve:
         seed=run["settings"]["seed"],
         settings=hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8],
         steps=np.array(steps, dtype=np.int64),
-        returns=np.array(returns, dtype=np.float64),
+        returns=np.array([each[:episodes] for each in returns], dtype=np.float64),
         total_steps=max(run["steps"], settings["steps"]),
         failed_at=run["steps"] if run["status"] == FAILED else None,
         return_floor=task.return_floor,
         solved=task.solved_return,
         trainer="" if across_trainers else " ".join(trainer),
+        final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,
     )
 
 
@@ -180,8 +192,8 @@ def as_text(results: Results, width: int | None = None) -> str:
 
 def _rows(runs: list[RunCurve]) -> Iterator[tuple[Any, ...]]:
     for run in sorted(runs, key=lambda run: (run.label, run.seed)):
-        for step, returns in zip(run.steps.tolist(), run.returns.tolist(), strict=True):
-            for episode, each in enumerate(returns):
+        for step, returns in zip(run.steps.tolist(), run.evaluations, strict=True):
+            for episode, each in enumerate(returns.tolist()):
                 key = (run.task, run.algorithm, run.representation, run.seed)
                 yield (*key, step, episode, f"{each:.3f}")
 
@@ -193,7 +205,7 @@ def _last_evaluations(runs: list[RunCurve]) -> tuple[tuple[str, ...], Iterator[t
     def row(run: RunCurve) -> tuple[str, ...]:
         if run.failed_at is not None:
             return run.label, str(run.seed), f"{run.failed_at:,}", "failed", "-"
-        low, median, high = np.percentile(run.returns[-1], (10, 50, 90))
+        low, median, high = np.percentile(run.evaluations[-1], (10, 50, 90))
         steps = f"{run.steps[-1]:,}"
         at_low, at_median, at_high = rounded(low, median, high)
         return run.label, str(run.seed), steps, at_median, f"[{at_low}, {at_high}]"

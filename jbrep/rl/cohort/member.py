@@ -158,7 +158,8 @@ class Member:
         """Play its agent's policy, deterministically."""
         step = self.agent.num_timesteps
         try:
-            returns = self._evaluator.returns(self.agent).round(3).tolist()
+            episodes = self.job.run.episodes_at(step)
+            returns = self._evaluator.returns(self.agent, episodes).round(3).tolist()
         except NonFiniteActionError:
             self.fail(ACTIONS_NOT_FINITE)
             return

@@ -8,6 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from jbrep.rl.agent import Evaluator
 from jbrep.rl.files import Episode, Evaluation
 from jbrep.rl.history import WEIGHTS_NOT_FINITE, DivergedError, History, Watch
+from jbrep.rl.run import Run
 
 
 class Recorder(BaseCallback):
@@ -18,14 +19,14 @@ class Recorder(BaseCallback):
     Args:
         history: to record in.
         evaluator: of the policy.
-        evaluate_every: steps from one evaluation to the next.
+        run: that is recorded.
         watch: called with the progress before each rollout.
     """
 
-    def __init__(self, history: History, evaluator: Evaluator, evaluate_every: int, watch: Watch):
+    def __init__(self, history: History, evaluator: Evaluator, run: Run, watch: Watch):
         super().__init__()
         self._history, self._evaluator = history, evaluator
-        self._every, self._watch = evaluate_every, watch
+        self._run, self._watch = run, watch
         self._mean: float | None = None  # return of the last evaluation
 
     def _on_rollout_start(self) -> None:
@@ -42,7 +43,7 @@ class Recorder(BaseCallback):
             self._history.episodes.append(
                 Episode(self.num_timesteps, lane, total, length, diverged)
             )
-        due = self.num_timesteps % self._every < self.training_env.num_envs
+        due = self.num_timesteps % self._run.evaluate_every < self.training_env.num_envs
         if due and self.num_timesteps < self.model._total_timesteps:
             self._evaluate()
         return True
@@ -54,7 +55,8 @@ class Recorder(BaseCallback):
 
     def _evaluate(self) -> None:
         step = self.model.num_timesteps
-        returns = self._evaluator.returns(self.model).round(3).tolist()
+        episodes = self._run.episodes_at(step)
+        returns = self._evaluator.returns(self.model, episodes).round(3).tolist()
         self._history.evaluations += [Evaluation(step, i, each) for i, each in enumerate(returns)]
         self._mean = float(np.mean(returns))
         self.logger.record("evaluation/mean_return", self._mean)

@@ -42,7 +42,7 @@ def _train(job: Job, session: Session) -> dict[str, Any]:
     agent.set_logger(job.logger(session.writers))
     evaluator = Evaluator(run.task, job.encoder, run.evaluation_episodes)
     watch = partial(session.watch, job)
-    recorder = Recorder(job.history, evaluator, run.evaluate_every, watch)
+    recorder = Recorder(job.history, evaluator, run, watch)
     failure = _learn(agent, run.steps, [recorder, checkpointer])
     return job.end(agent.num_timesteps, failure, b"" if failure else policy_zip(agent))
 

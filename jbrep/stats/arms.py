@@ -1,0 +1,146 @@
+"""What the claims compare: the runs of each representation, measured on one scale."""
+
+from collections.abc import Collection, Mapping
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+
+from jbrep.stats.bootstrap import Array
+from jbrep.stats.curves import common_grid, final_returns, on_grid, steps_to
+from jbrep.stats.means import Bounds, mean_within
+from jbrep.stats.runs import Group, RunCurve
+from jbrep.stats.scale import reference_of
+
+FEWEST = 8  # units on either side of a verdict
+_HALF = 0.5  # of the baseline's gain: what a run that learns comes to
+_RESOLUTION = 0.01  # of that gain, of differences between curves
+_LEVEL = 0.95
+
+
+class Frame(NamedTuple):
+    """What the runs of a task and algorithm are held to.
+
+    Attributes:
+        still: the mean return of standing still.
+        half: the return half-way from there to the baseline's mean final return.
+        bounds: of returns.
+        steps: of training.
+        weights: of the evaluations in a mean over training, (g,), with a sum of 1.
+        resolution: of differences between curves.
+    """
+
+    still: float
+    half: float
+    bounds: Bounds
+    steps: float
+    weights: Array
+    resolution: float
+
+
+class Arm(NamedTuple):
+    """The runs of a representation.
+
+    A unit is what is independent of the others: a run, or an encoder with its runs if each of many
+    encoders has its own.
+
+    Attributes:
+        final: the mean final return of each unit, (u,).
+        time: the mean of its runs' steps to the frame's half, at most all of training, (u,).
+        curves: the first run of each unit over training, (u, g).
+        runs: how many there are.
+        learnt: how many of them end above the frame's half.
+        by_encoder: whether units are encoders.
+    """
+
+    final: Array
+    time: Array
+    curves: Array
+    runs: int
+    learnt: int
+    by_encoder: bool
+
+    @property
+    def units(self) -> int:
+        """How many there are."""
+        return len(self.final)
+
+
+def measure(group: Group, seeds: Collection[int]) -> tuple[Frame, dict[str, Arm]]:
+    """The frame of a group and the arms of its representations, the baseline first.
+
+    Args:
+        group: runs by representation.
+        seeds: that count; others are left out.
+
+    Raises:
+        InputError: the runs have no range of steps in common.
+    """
+    of_seeds = {n: [r for r in runs if r.seed in seeds] for n, runs in group.items()}
+    there = {name: runs for name, runs in of_seeds.items() if runs}
+    grid, _ = common_grid(there)
+    curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in there.items()}
+    finals = final_returns(there, curves, grid)
+    frame = _frame(there, finals, next(iter(curves.values())), grid)
+    return frame, {
+        name: _arm(runs, finals[name], curves[name], grid, frame) for name, runs in there.items()
+    }
+
+
+def learns(arm: Arm, frame: Frame) -> bool:
+    """Whether runs end above standing still, beyond chance."""
+    return bool(mean_within(arm.final, frame.bounds, _LEVEL).low > frame.still)
+
+
+def _frame(
+    group: Mapping[str, list[RunCurve]], finals: Mapping[str, Array], curves: Array, grid: Array
+) -> Frame:
+    (first, *_), *_ = group.values()
+    of_baseline = next(iter(finals.values()))
+    still = reference_of(first, curves)
+    gain = max(float(of_baseline.mean()) - still, 0.0)
+    widths = np.diff(grid)
+    weights = (np.append(widths, 0) + np.append(0, widths)) / 2
+    low, high = first.return_floor, first.return_ceiling
+    largest = max(float(np.abs(each).max()) for each in finals.values())
+    return Frame(
+        still=still,
+        half=still + _HALF * gain,
+        bounds=Bounds(-np.inf if low is None else low, np.inf if high is None else high),
+        steps=float(grid[-1] - grid[0]),
+        weights=weights / weights.sum(),
+        resolution=_RESOLUTION * gain or _RESOLUTION * largest or 1.0,
+    )
+
+
+def _arm(runs: list[RunCurve], final: Array, curves: Array, grid: Array, frame: Frame) -> Arm:
+    time = np.minimum(steps_to(curves, grid, frame.half) - grid[0], frame.steps)
+    units = _units(runs)
+    return Arm(
+        final=np.array([final[unit].mean() for unit in units]),
+        time=np.array([time[unit].mean() for unit in units]),
+        curves=np.stack([curves[unit[0]] for unit in units]),
+        runs=len(runs),
+        learnt=int(np.count_nonzero(final >= frame.half)),
+        by_encoder=len(units) < len(runs) or _own_encoders(runs),
+    )
+
+
+def _own_encoders(runs: list[RunCurve]) -> bool:
+    """Whether there are enough encoders to speak of others made like them."""
+    return len({run.encoder_seed for run in runs} - {None}) >= FEWEST
+
+
+def _units(runs: list[RunCurve]) -> list[list[int]]:
+    """The numbers of the runs in each unit."""
+    if not _own_encoders(runs):
+        return [[number] for number in range(len(runs))]
+    by_encoder: dict[int | None, list[int]] = {}
+    for number, run in enumerate(runs):
+        by_encoder.setdefault(run.encoder_seed, []).append(number)
+    return list(by_encoder.values())
+
+
+def all_seeds(group: Group) -> set[int]:
+    """Of all runs of a group."""
+    return {run.seed for run in chain.from_iterable(group.values())}

@@ -1,0 +1,115 @@
+"""How far apart whole training curves lie, and whether they lie closer together on less state.
+
+The spread of n curves is the mean over training of the logarithm of their median absolute
+deviation, plus a resolution, below which differences don't matter and without which equal curves
+would have none.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from jbrep.stats.bootstrap import Array, Interval
+
+PERMUTATIONS = 9999
+_FOR_INTERVALS = 499
+_FURTHEST = 12.0  # logarithm of a ratio of spreads: nobody has seen more
+_CLOSE = 1e-3  # of that logarithm
+_AT_ONCE = 1 << 22  # numbers in memory
+
+
+class Curves(NamedTuple):
+    """What two groups of runs are compared by.
+
+    Attributes:
+        x: curves of one, (n, g).
+        y: curves of the other, (m, g).
+        weights: of the g evaluations in a mean over training, with a sum of 1.
+        resolution: in units of return, above 0.
+    """
+
+    x: Array
+    y: Array
+    weights: Array
+    resolution: float
+
+
+def log_spread(curves: Array, weights: Array, resolution: float) -> Array:
+    """The spread of curves (..., n, g), (...)."""
+    apart = np.abs(curves - np.median(curves, axis=-2, keepdims=True))
+    return np.log(np.median(apart, axis=-2) + resolution) @ weights
+
+
+def ratio_of_spreads(curves: Curves, level: float, seed: int) -> Interval:
+    """By what the deviations of x must be divided to spread like those of y, with an interval.
+
+    The interval has the ratios that the permutation test doesn't reject (Hodges and Lehmann 1963).
+    """
+    ends = (-_FURTHEST, _FURTHEST)
+    if _excess(curves, ends[0]) <= 0 or _excess(curves, ends[1]) >= 0:
+        return Interval(np.nan, np.nan, np.nan)  # no curves differ from one another
+    value = float(brentq(partial(_excess, curves), *ends))
+    drawn = _permuted(curves, _FOR_INTERVALS, seed)
+
+    def is_rejected(log_ratio: float) -> bool:
+        return _p(curves, log_ratio, drawn) <= 1 - level
+
+    kept = (_last_kept(value, direction, is_rejected) for direction in (-1, 1))
+    return Interval(*(float(np.exp(each)) for each in (value, *kept)))
+
+
+def spread_p(curves: Curves, seed: int) -> float:
+    """P-value of equal spreads: whole curves are permuted after taking off their group's median.
+
+    Two-sided (Phipson and Smyth 2010: the curves as they are count as one permutation).
+    """
+    return _p(curves, 0.0, _permuted(curves, PERMUTATIONS, seed))
+
+
+def _shrunk(curves: Curves, log_ratio: float) -> tuple[Array, Array]:
+    """Curves about their group's median, those of x divided by a ratio."""
+    x, y = (each - np.median(each, axis=0) for each in (curves.x, curves.y))
+    return x / np.exp(log_ratio), y
+
+
+def _excess(curves: Curves, log_ratio: float) -> float:
+    """How much more x, divided by a ratio, spreads than y, as a logarithm."""
+    x, y = _shrunk(curves, log_ratio)
+    how = curves.weights, curves.resolution
+    return float(log_spread(x, *how) - log_spread(y, *how))
+
+
+def _permuted(curves: Curves, count: int, seed: int) -> NDArray[np.int64]:
+    """Orders of all curves, (count, n + m)."""
+    total = len(curves.x) + len(curves.y)
+    return np.random.default_rng(seed).random((count, total)).argsort(axis=1)
+
+
+def _p(curves: Curves, log_ratio: float, drawn: NDArray[np.int64]) -> float:
+    """P-value of a ratio of spreads."""
+    x, y = _shrunk(curves, log_ratio)
+    how, mixed_up = (curves.weights, curves.resolution), np.concatenate((x, y))
+    observed = abs(_excess(curves, log_ratio))
+    parts = np.array_split(drawn, -(-drawn.size * mixed_up.shape[1] // _AT_ONCE))
+    each = np.concatenate(
+        [
+            np.abs(log_spread(mixed[:, : len(x)], *how) - log_spread(mixed[:, len(x) :], *how))
+            for mixed in (mixed_up[orders] for orders in parts)
+        ]
+    )
+    return float((1 + np.count_nonzero(each >= observed * (1 - 1e-12))) / (1 + len(drawn)))
+
+
+def _last_kept(value: float, direction: int, is_rejected: Callable[[float], bool]) -> float:
+    """The furthest logarithm of a ratio in a direction that isn't rejected."""
+    kept, beyond = value, value + direction * _FURTHEST
+    if not is_rejected(beyond):
+        return direction * np.inf
+    while abs(beyond - kept) > _CLOSE:
+        middle = (kept + beyond) / 2
+        kept, beyond = (kept, middle) if is_rejected(middle) else (middle, beyond)
+    return kept

@@ -1,0 +1,69 @@
+"""Returns of policies that learn nothing, on the starts of evaluation: what learning is held to."""
+
+import csv
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+from jbrep.envs.task import Task
+from jbrep.errors import InputError
+from jbrep.files.tables import write_csv
+from jbrep.jitterbug.heuristics import HEURISTICS
+from jbrep.rollouts.sources import find_player
+
+REFERENCE_RETURNS = "references.csv"
+STILL, RANDOM, HAND_WRITTEN = "standing still", "random", "hand-written"
+_POLICIES = {STILL: "still", RANDOM: "uniform", HAND_WRITTEN: "heuristic"}
+_COLUMNS = ("task", "policy", "episode", "return")
+_Row = tuple[str, str, int, str]
+
+
+def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | None:
+    """Play the reference policies of tasks: standing still, random, and hand-written if there is.
+
+    What the file has already isn't played again; nor is a task whose environment is missing.
+
+    Args:
+        tasks: each with its number of episodes.
+        folder: for the file.
+
+    Returns:
+        The file; None if there is nothing to write.
+    """
+    path = folder / REFERENCE_RETURNS
+    there = _rows(path)
+    rows = [
+        row
+        for task, episodes in sorted(tasks, key=lambda each: each[0].name)
+        for policy in _POLICIES
+        if policy != HAND_WRITTEN or task.name in HEURISTICS
+        for row in _kept(there, task, policy, episodes) or _played(task, policy, episodes)
+    ]
+    if not rows:
+        path.unlink(missing_ok=True)
+        return None
+    if rows != there:
+        write_csv(path, _COLUMNS, rows)
+    return path
+
+
+def _rows(path: Path) -> list[_Row]:
+    """What the file has; nothing if there is none, or something else."""
+    with suppress(OSError, ValueError):
+        _, *rows = csv.reader(path.read_text().splitlines())
+        return [(task, policy, int(episode), each) for task, policy, episode, each in rows]
+    return []
+
+
+def _kept(there: list[_Row], task: Task, policy: str, episodes: int) -> list[_Row]:
+    """The rows of a task and policy, if they are those wanted."""
+    own = [row for row in there if row[:2] == (task.name, policy)]
+    return own if [row[2] for row in own] == [*range(episodes)] else []
+
+
+def _played(task: Task, policy: str, episodes: int) -> list[_Row]:
+    try:
+        returns = find_player(_POLICIES[policy], task).returns(episodes)
+    except InputError:  # reports don't need the environments
+        return []
+    return [(task.name, policy, i, f"{each:.3f}") for i, each in enumerate(returns)]
