@@ -18,6 +18,7 @@ from jbrep.stats.arms import Arm, Frame, measure
 from jbrep.stats.claims import FASTER, LESS_VARIANCE, NOT_WORSE, kept_gain
 from jbrep.stats.looks import levels
 from jbrep.stats.means import Bounds, Part, mean_within, p_of_sum, sum_within
+from jbrep.stats.nested import components
 from jbrep.stats.runs import RunCurve
 from jbrep.stats.spread import Curves, log_spread, ratio_of_spreads, spread_p
 from jbrep.stats.verdicts import Rules, judge, most_failing
@@ -309,3 +310,37 @@ def test_rules_that_contradict_one_another(rules, message):
 
 def test_the_sides_of_claims():
     assert (NOT_WORSE.side, LESS_VARIANCE.side, FASTER.side) == (1, -1, -1)
+
+
+def test_variance_components_are_those_of_restricted_maximum_likelihood():
+    mixed = pytest.importorskip("statsmodels.api").MixedLM
+    random = np.random.default_rng(2)
+    returns = random.normal(0, 50, (9, 1)) + random.normal(700, 30, (9, 3))
+    found = components(returns)
+    groups = np.repeat(np.arange(9), 3)
+    theirs = mixed(returns.ravel(), np.ones((27, 1)), groups).fit(reml=True)
+    assert found.encoders.value == pytest.approx(float(theirs.cov_re[0, 0]), rel=1e-3)
+    assert found.runs.value == pytest.approx(theirs.scale, rel=1e-3)
+    assert found.ratio.value == pytest.approx(found.encoders.value / found.runs.value)
+    for each in found:
+        assert 0 <= each.low < each.value < each.high
+
+
+def test_encoders_that_add_nothing_have_no_variance_below_0():
+    returns = np.tile([600.0, 700.0, 800.0], (4, 1))
+    found = components(returns)
+    assert found.encoders[:2] == found.ratio[:2] == (0, 0)
+    with pytest.raises(InputError, match="two encoders and two runs of each, not 1 times 5"):
+        components(np.zeros((1, 5)))
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.5, 4.0])
+def test_intervals_of_variance_components_cover_the_truth(ratio):
+    random = np.random.default_rng(0)
+    covered = np.zeros(3)
+    for _ in range(500):
+        encoders = random.normal(0, np.sqrt(ratio), (8, 1))
+        found = components(encoders + random.standard_normal((8, 2)))
+        truths = zip(found, (ratio, 1, ratio), strict=True)
+        covered += [each.low <= truth <= each.high for each, truth in truths]
+    assert (covered / 500 > 0.925).all()
