@@ -39,6 +39,11 @@ from jbrep.cli.environment import import_option
     help="local, for this machine, or ray, for the cluster that RAY_ADDRESS names.",
 )
 @click.option("--dry-run", is_flag=True, help="List the runs and estimate the time.")
+@click.option(
+    "--register",
+    is_flag=True,
+    help="Only write down the plan, with its hash and the code's version, before the first run.",
+)
 @import_option
 @click.pass_context
 def study(
@@ -50,6 +55,7 @@ def study(
     width: int | None,
     backend: str,
     dry_run: bool,
+    register: bool,
 ) -> None:
     """Train a grid of agents, and judge the paper's claims.
 
@@ -61,9 +67,10 @@ def study(
     from jbrep.study.config import read_study
     from jbrep.study.packing import usual_workers
     from jbrep.study.plan import plan_for
+    from jbrep.study.registration import REGISTRATION
     from jbrep.study.runner import get_backend
     from jbrep.study.study import dry_run as dry_run_text
-    from jbrep.study.study import run_study
+    from jbrep.study.study import register_study, run_study
     from jbrep.text import terminal_width
 
     plan = plan_for(read_study(study), out or Path("runs") / study.stem)
@@ -72,6 +79,11 @@ def study(
         click.echo(notice, err=True)
     if dry_run:
         click.echo(dry_run_text(plan, count, width, terminal_width()))
+        return
+    if register:
+        registered = register_study(plan)
+        click.echo(f"registered on {registered['date']} (SHA-256 {registered['sha256']})")
+        echo_paths([plan.folder / REGISTRATION])
         return
     with stoppable(RESUMES):
         crashed = run_study(plan, run, count, width)

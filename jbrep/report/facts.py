@@ -43,6 +43,19 @@ def outline(tables: Tables) -> str:
     )
 
 
+def registered(tables: Tables) -> str:
+    """Whether what ran is what was registered, in a sentence; empty for runs without a study."""
+    if not tables.record["study"]:
+        return ""
+    registration = tables.record.get("registration")
+    if not registration:
+        return "This study was not registered before its first run."
+    since = f"Registered on {registration['date'][:10]}, SHA-256 {registration['sha256'][:12]}: "
+    if not registration["deviations"]:
+        return f"{since}what ran is what was registered."
+    return f"{since}{'; '.join(registration['deviations'])}."
+
+
 def notices(tables: Tables) -> list[str]:
     """What the report lacks."""
     lines = []

@@ -36,6 +36,8 @@ def _lines(
     tables: Tables, answers: Sequence[Answer], predictions: Sequence[tuple[str, Rows]], picture: str
 ) -> Iterator[str]:
     yield from (f"# {escape(tables.name)}", "", escape(facts.outline(tables)), "")
+    if registered := facts.registered(tables):
+        yield from (escape(registered), "")
     for notice in facts.notices(tables):
         yield from (f"> {escape(notice)}", "")
     groups = tables.analysis.groups if tables.analysis else ()

@@ -44,6 +44,7 @@ def page(
     return template.from_string(_own("page.html.j2")).render(
         name=tables.name,
         outline=facts.outline(tables),
+        registered=facts.registered(tables),
         notices=facts.notices(tables),
         groups=[g for g in (tables.analysis.groups if tables.analysis else ()) if g.comparisons],
         baseline=tables.analysis.baseline if tables.analysis else "",

@@ -4,7 +4,7 @@ import csv
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypedDict
+from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
 
 from jbrep.encoders.diagnostics import DIAGNOSTICS, by_label, read_diagnostics
 from jbrep.errors import DamageError, InputError
@@ -41,10 +41,19 @@ class RunRecord(TypedDict):
     seconds: float
 
 
+class RegistrationRecord(TypedDict):
+    """Of a study that was registered."""
+
+    sha256: str
+    date: str  # ISO 8601, in UTC
+    deviations: list[str]  # in sentences
+
+
 class Record(TypedDict):
     """runs.json."""
 
     study: dict[str, Any] | None  # its settings; None for runs without a study
+    registration: NotRequired[RegistrationRecord | None]
     missing: dict[str, int]  # unfinished runs: training steps done
     left_out: list[str]  # what has no statistics, and why
     versions: list[dict[str, str]]  # by package

@@ -97,6 +97,7 @@ _OPTIONAL = {
     "latent_size": whole_number(1, _MAX_LATENT),  # early runs have it in their encoder alone
     "commits": Kind(are_commits, "an object of git commits"),
 }
+_SHA256_OR_NULL = Kind(lambda v: v is None or _SHA256.allows(v), f"null or {_SHA256.words}")
 _SETTINGS = {
     "task": _TASK,
     "environment": _OBJECT,
@@ -128,7 +129,8 @@ _SETTINGS = {
     "trainer": text("|".join(TRAINERS), " or ".join(TRAINERS)),
     "precision": text("|".join(PRECISIONS), " or ".join(PRECISIONS)),
     "device": text("|".join(DEVICES), " or ".join(DEVICES)),
-    "from": Kind(lambda v: v is None or _SHA256.allows(v), f"null or {_SHA256.words}"),
+    "from": _SHA256_OR_NULL,
+    "registration": _SHA256_OR_NULL,
 }
 POLICY = {"activation_fn": "relu"}  # arguments of every policy unless a run sets others
 _ADDED = {  # what early runs of this version lack
@@ -140,6 +142,7 @@ _ADDED = {  # what early runs of this version lack
     "trainer": SB3,
     "precision": FLOAT32,
     "device": CPU,
+    "registration": None,
 }
 _POLICY_FILE = {
     "settings": _OBJECT,

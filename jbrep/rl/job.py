@@ -41,6 +41,11 @@ Ended = tuple["Job", dict[str, Any]]  # a run, and the contents of its run.json
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 
 
+def packages() -> dict[str, str]:
+    """The versions of what every run is made with."""
+    return {name: version(name) for name in _PACKAGES}
+
+
 class Session(NamedTuple):
     """What goes on around training.
 
@@ -98,8 +103,7 @@ class Job:
     @cached_property
     def versions(self) -> dict[str, str]:
         """What, with the settings, decides every number."""
-        packages = {name: version(name) for name in _PACKAGES}
-        return environment_versions(self.run.task.id) | packages
+        return environment_versions(self.run.task.id) | packages()
 
     @cached_property
     def checkpoint(self) -> CheckpointFile:

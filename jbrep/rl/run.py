@@ -54,6 +54,7 @@ class Run:
     begin_from: str = ""  # the folder of a finished run, whose policy this one begins with
     trainer: str = ""  # cohort or sb3; by default cohort, for the algorithms that it has
     precision: str = FLOAT32  # of products of matrices: float32 or bfloat16
+    registration: str = ""  # SHA-256 of that of its study, if that is registered
     device: str = CPU  # of gradient steps: cpu, cuda, or auto, which is cuda if there is one
 
     def __post_init__(self) -> None:
@@ -169,6 +170,7 @@ class Run:
             "trainer": self.trainer,
             "precision": self.precision,
             "device": self.device,
+            "registration": self.registration or None,
         }
         if self.begin_from:
             folder = Path(self.begin_from)

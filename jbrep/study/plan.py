@@ -17,6 +17,7 @@ from jbrep.rl.learner import Learner
 from jbrep.rl.names import SB3, usual_trainer
 from jbrep.rl.run import plain
 from jbrep.study.config import Study, as_study
+from jbrep.study.registration import Registration, check_registered, read_registration
 from jbrep.study.representations import Representation, read_representation
 from jbrep.study.work import Assigned
 from jbrep.text import slug
@@ -73,6 +74,11 @@ class Plan:
             for representation in self.representations
         )
 
+    @cached_property
+    def registration(self) -> Registration | None:
+        """What was written down before the first run; None if nothing was."""
+        return read_registration(self.folder)
+
     def trainer(self, cell: Cell) -> str:
         """What trains a run."""
         return self.study.trainer or usual_trainer(cell.learner.algorithm)
@@ -119,6 +125,7 @@ class Plan:
             **cell.learner.run_settings,
             encoder=cell.representation.encoder(cell.task, cell.seed, made),
             seed=cell.seed,
+            registration=self.registration["sha256"] if self.registration else "",
             **cell.representation.settings(cell.seed),
             **self.study.run_settings,
         )
@@ -144,10 +151,12 @@ class Plan:
 
         Raises:
             InputError: the folder holds another study; only tasks, algorithms, representations and
-                seeds may change.
+                seeds may change, of a registered study only seeds be added.
         """
         make_folder(self.folder)
         settings = self.as_json()
+        if self.registration:
+            check_registered(self.registration, settings, self.folder)
         if there := read_plan(self.folder):
             fixed = {name: value for name, value in settings.items() if name not in _GRID}
             if self._has_limits_of(there):

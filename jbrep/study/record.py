@@ -12,7 +12,8 @@ from jbrep.files.storage import exists
 from jbrep.rl.files import ENCODER, read_run
 from jbrep.rl.names import base_name
 from jbrep.stats.runs import in_order
-from jbrep.study.plan import read_plan
+from jbrep.study.plan import Plan, read_plan
+from jbrep.study.registration import deviations
 from jbrep.study.work import read_progress
 
 RECORD = "runs.json"
@@ -42,7 +43,7 @@ def record(folder: Path, folders: Sequence[Path], left_out: Sequence[str]) -> di
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        **_study(folder),
+        **_study(folder, runs.values()),
         "left_out": list(left_out),
         "versions": _distinct(run["versions"] for run in runs.values()),
         "processors": _distinct(run["cpu"] for run in runs.values()),
@@ -81,7 +82,8 @@ def as_json(contents: Mapping[str, Any]) -> bytes:
 
 def shared_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that all runs of a label share: without the seed and what depends on it."""
-    shared = {n: value for n, value in settings.items() if n not in ("seed", "encoder_seed")}
+    own = ("seed", "encoder_seed", "registration")
+    shared = {name: value for name, value in settings.items() if name not in own}
     return shared | ({} if settings["encoder_seed"] is None else {"encoder": EACH_ITS_OWN})
 
 
@@ -128,15 +130,25 @@ def _common(encoders: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     return common
 
 
-def _study(folder: Path) -> dict[str, Any]:
-    """The study, and the steps done by each of its unfinished runs."""
+def _study(folder: Path, runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """The study, its registration, and the steps done by each of its unfinished runs."""
     plan = read_plan(folder)
     if plan is None:
-        return {"study": None, "missing": {}}
+        return {"study": None, "registration": None, "missing": {}}
     return {
         "study": plan.as_json(),
+        "registration": _registration(plan, runs),
         "missing": {c.name: read_progress(plan.folder_of(c))[0] for c in plan.unfinished},
     }
+
+
+def _registration(plan: Plan, runs: Iterable[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """When a study was registered, and how what ran differs from that; None if it wasn't."""
+    if plan.registration is None:
+        return None
+    differing = deviations(plan.registration, plan.as_json(), runs)
+    facts = {name: plan.registration[name] for name in ("sha256", "date")}
+    return {**facts, "deviations": differing}
 
 
 def _distinct(values: Any) -> list[Any]:

@@ -15,6 +15,7 @@ from jbrep.study.packing import Pack, packed, until_done
 from jbrep.study.plan import Plan
 from jbrep.study.prepare import check, prepare
 from jbrep.study.progress import Progress, duration
+from jbrep.study.registration import Registration, register
 from jbrep.study.representations import ByCode
 from jbrep.study.runner import Backend
 from jbrep.study.work import CRASHED
@@ -58,6 +59,17 @@ def run_study(plan: Plan, backend: Backend, workers: int, width: int | None = No
                 progress.report(outcome)
                 statuses[outcome.status] += 1
     return statuses[CRASHED]
+
+
+def register_study(plan: Plan) -> Registration:
+    """Write down what is going to be run, before the first run.
+
+    Raises:
+        InputError: as `run_study`, or there are runs already.
+    """
+    check(plan)
+    plan.write()
+    return register(plan.folder, plan.as_json())
 
 
 def dry_run(plan: Plan, workers: int, width: int | None = None, columns: int | None = None) -> str:

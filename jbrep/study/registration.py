@@ -1,0 +1,138 @@
+"""A study's plan, written down before its first run: what a report holds its runs against."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypedDict
+
+from jbrep.errors import DamageError, InputError, differences
+from jbrep.files.commit import commits
+from jbrep.files.storage import exists, read_regular, write_whole
+from jbrep.files.typed import read_json, typed
+from jbrep.rl.job import packages
+
+REGISTRATION = "registration.json"
+FORMAT = "jbrep registration"
+FORMAT_VERSION = 1
+_MAX_BYTES = 1 << 24
+_MAY_GROW = ("seeds",)  # after registration; what was added is exploratory
+
+
+class Registration(TypedDict):
+    """registration.json."""
+
+    study: dict[str, Any]  # its settings
+    sha256: str  # of the settings, the date, the versions and the commits
+    date: str  # ISO 8601, in UTC
+    versions: dict[str, str]  # by package
+    commits: dict[str, str]
+
+
+def register(folder: Path, study: Mapping[str, Any]) -> Registration:
+    """Write a study's plan into its folder; one that is registered stays as it is.
+
+    Args:
+        folder: of the study.
+        study: its settings as plain JSON.
+
+    Raises:
+        InputError: it is registered with other settings, or has runs already.
+    """
+    if there := read_registration(folder):
+        check_registered(there, study, folder)
+        return there
+    if any((folder / "runs").glob("**/*.*")):
+        raise InputError(f"{folder} has runs: a study is registered before its first run")
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    facts = {"study": dict(study), "date": now, "versions": packages(), "commits": dict(commits())}
+    made = Registration(sha256=_hash(facts), **facts)  # type: ignore[typeddict-item]
+    record = {"format": FORMAT, "format_version": FORMAT_VERSION, **made}
+    write_whole(folder / REGISTRATION, (json.dumps(record, indent=2) + "\n").encode())
+    return made
+
+
+def read_registration(folder: Path) -> Registration | None:
+    """What was registered in a folder; None if nothing was.
+
+    Raises:
+        DamageError: the file was changed since, or is damaged.
+        InputError: it is of a newer jbrep.
+    """
+    path = folder / REGISTRATION
+    if not exists(path):
+        return None
+    try:
+        text = read_regular(path, _MAX_BYTES).decode()
+        record = read_json(text, path, FORMAT, FORMAT_VERSION)
+        registration: Registration = typed(record, Registration)
+    except (OSError, ValueError) as error:
+        raise DamageError(f"{path} is damaged: {error}") from None
+    facts = {name: registration[name] for name in ("study", "date", "versions", "commits")}
+    if _hash(facts) != registration["sha256"]:
+        raise DamageError(
+            f"{path} was changed after it was written: restore it, or choose another folder"
+        )
+    return registration
+
+
+def check_registered(registration: Registration, study: Mapping[str, Any], folder: Path) -> None:
+    """Check that a study is the one that was registered, but for seeds that were added.
+
+    Raises:
+        InputError: it isn't.
+    """
+    if differing := differences(registration["study"], _fixed(registration, study)):
+        raise InputError(
+            f"{folder} holds the study registered on {registration['date'][:10]}, and its file "
+            f"was changed: {differing}; put it back, or choose another --out"
+        )
+
+
+def deviations(
+    registration: Registration, study: Mapping[str, Any], runs: Iterable[Mapping[str, Any]]
+) -> list[str]:
+    """How what ran differs from what was registered, in sentences.
+
+    Args:
+        registration: of the study.
+        study: its settings now.
+        runs: contents of run.json, of all that have ended.
+    """
+    found = []
+    if differing := differences(registration["study"], _fixed(registration, study)):
+        found.append(f"settings differ: {differing}")
+    registered = registration["study"]["seeds"]
+    if added := [seed for seed in study["seeds"] if seed not in registered]:
+        found.append(f"seeds were added, whose runs are exploratory: {_listed(added)}")
+    runs = list(runs)
+    if other := [run for run in runs if run["settings"]["registration"] != registration["sha256"]]:
+        found.append(f"{len(other)} of its runs weren't made under this registration")
+    for name, version in registration["versions"].items():
+        others = {run["versions"].get(name, "none") for run in runs} - {version}
+        if others:
+            found.append(f"{name} was {_listed(sorted(others))}, not {version}")
+    registered_commit = registration["commits"].get("jbrep")
+    others = {run.get("commits", {}).get("jbrep") for run in runs} - {registered_commit, None}
+    if others:
+        found.append("some runs were made by other commits of jbrep's code")
+    return found
+
+
+def _fixed(registration: Registration, study: Mapping[str, Any]) -> dict[str, Any]:
+    """A study's settings, without what was added to what may grow."""
+    kept = {
+        name: [each for each in study[name] if each in registration["study"][name]]
+        for name in _MAY_GROW
+    }
+    return {**study, **kept}
+
+
+def _listed(values: Iterable[object]) -> str:
+    return ", ".join(map(str, values))
+
+
+def _hash(facts: Mapping[str, Any]) -> str:
+    canonical = json.dumps(facts, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()

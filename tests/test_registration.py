@@ -1,0 +1,109 @@
+"""Studies whose plan is written down before the first run, and held against what ran."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from command import in_this_process, jbrep
+from test_study import TINY, TOML
+
+from jbrep.errors import InputError
+from jbrep.rl.files import RUN
+from jbrep.study.plan import Plan
+from jbrep.study.registration import REGISTRATION, deviations, read_registration
+from jbrep.study.results import conclude
+from jbrep.study.runner import BACKENDS
+from jbrep.study.study import register_study, run_study
+
+TINIER = replace(TINY, representations=("full",), seeds=(0, 1))
+
+
+@pytest.fixture(scope="module")
+def registered(tmp_path_factory):
+    """A study that was registered, and has run since."""
+    folder = tmp_path_factory.mktemp("registered") / "study"
+    register_study(Plan(TINIER, folder))
+    assert run_study(Plan(TINIER, folder), in_this_process, 1) == 0
+    conclude(folder)
+    return Plan(TINIER, folder)
+
+
+def test_a_plan_is_written_down(tmp_path):
+    (tmp_path / "tiny.toml").write_text(TOML)
+    command = ("study", tmp_path / "tiny.toml", "--out", tmp_path / "out", "--register")
+    told = jbrep(*command)
+    assert told.exit_code == 0, told.output
+    registration = read_registration(tmp_path / "out")
+    assert registration["sha256"] in told.output
+    assert str(tmp_path / "out" / REGISTRATION) in told.output
+    assert registration["study"]["seeds"] == [0, 1]
+    assert registration["versions"].keys() >= {"jbrep", "torch", "stable-baselines3"}
+    assert not list((tmp_path / "out").rglob(RUN))
+    assert jbrep(*command).exit_code == 0  # the same once more
+    assert read_registration(tmp_path / "out") == registration
+
+
+def test_what_ran_as_registered_says_so(registered):
+    registration = registered.registration
+    for path in registered.folder.rglob(RUN):
+        assert json.loads(path.read_text())["settings"]["registration"] == registration["sha256"]
+    told = jbrep("report", registered.folder)
+    assert told.exit_code == 0, told.output
+    page = (registered.folder / "report.html").read_text()
+    assert f"SHA-256 {registration['sha256'][:12]}: what ran is what was registered." in page
+    assert "what ran is what was registered" in (registered.folder / "summary.md").read_text()
+
+
+def test_a_changed_study_is_refused_but_for_new_seeds(registered):
+    with pytest.raises(InputError, match=r"was changed: steps 80 \(now: 90\); put it back"):
+        Plan(replace(TINIER, steps=90), registered.folder).write()
+    with pytest.raises(InputError, match="was changed: representations"):
+        Plan(TINY, registered.folder).write()
+    Plan(replace(TINIER, seeds=(0, 1, 2)), registered.folder).write()
+    Plan(TINIER, registered.folder).write()
+    with pytest.raises(InputError, match="was changed: seeds"):
+        Plan(replace(TINIER, seeds=(0,)), registered.folder).write()
+
+
+def test_every_deviation_is_told(registered):
+    registration, study = registered.registration, registered.as_json()
+    runs = [json.loads(path.read_text()) for path in sorted(registered.folder.rglob(RUN))]
+    assert deviations(registration, study, runs) == []
+    runs[0]["settings"]["registration"] = None
+    runs[0]["versions"]["torch"] = "2.0.0"
+    runs[0]["commits"] = {"jbrep": "0" * 40}
+    more = {**study, "seeds": [0, 1, 7], "steps": 81}
+    assert deviations(registration, more, runs) == [
+        "settings differ: steps 80 (now: 81)",
+        "seeds were added, whose runs are exploratory: 7",
+        "1 of its runs weren't made under this registration",
+        f"torch was 2.0.0, not {registration['versions']['torch']}",
+        "some runs were made by other commits of jbrep's code",
+    ]
+
+
+def test_a_registration_comes_first_and_stays_as_it_is(tmp_path):
+    plan = Plan(TINIER, tmp_path / "late")
+    register_study(plan)
+    path = plan.folder / REGISTRATION
+    path.write_text(path.read_text().replace('"steps": 80', '"steps": 81'))
+    with pytest.raises(InputError, match="was changed after it was written"):
+        read_registration(plan.folder)
+    path.unlink()
+    plan.folder_of(plan.cells[0]).mkdir(parents=True)
+    (plan.folder_of(plan.cells[0]) / RUN).write_text("{}")
+    with pytest.raises(InputError, match="has runs: a study is registered before its first run"):
+        register_study(Plan(TINIER, plan.folder))
+
+
+def test_a_study_begins_under_its_registration(tmp_path, monkeypatch):
+    monkeypatch.setitem(BACKENDS, "local", in_this_process)
+    (tmp_path / "tiny.toml").write_text(TOML)
+    command = ("study", tmp_path / "tiny.toml", "--out", tmp_path / "out")
+    assert jbrep(*command, "--register").exit_code == 0
+    (tmp_path / "tiny.toml").write_text(TOML.replace("steps = 80", "steps = 90", 1))
+    refused = jbrep(*command)
+    assert refused.exit_code == 2
+    assert "holds the study registered on" in refused.stderr
+    assert not list(Path(tmp_path / "out").rglob(RUN))
