@@ -103,8 +103,9 @@ desk ddpg yaw codes: $(READY)
 	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json references.csv) results/$@/
 	$(BIN)/jbrep report results/$@
 
-trainers: $(READY) ## results/trainers/ anew: eight hours; goes on where it was stopped
+trainers: $(READY) ## what results/trainers/ lacks: eight hours for all of it; goes on where it was stopped
 	for study in $(basename $(notdir $(wildcard studies/trainers/*.toml))); do \
+	  test ! -e results/trainers/$$study/returns.csv || continue; \
 	  $(BIN)/jbrep study studies/trainers/$$study.toml --out runs/trainers/$$study || exit; \
 	  mkdir -p results/trainers/$$study; cp runs/trainers/$$study/returns.csv runs/trainers/$$study/runs.json results/trainers/$$study/; \
 	done
