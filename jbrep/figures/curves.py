@@ -54,7 +54,7 @@ def curves(groups: Groups, references: References, looks: Looks) -> Plot:
     extents = _extents(groups, references)
     caption = "Return of the deterministic policy over training: median and 10 to 90 % over n runs."
     if any(references.get(task) for task in extents):
-        caption += " Dashed: medians of policies that don't learn, on the same starts."
+        caption += " Dashed: means of policies that don't learn, on the same starts."
     solved = {group.solved for group in groups if extents[group.task].contain(group.solved)}
     if solved:
         values = ", ".join(f"{value:,g}" for value in sorted(solved))
@@ -74,7 +74,7 @@ def _extents(groups: Groups, references: References) -> dict[str, Limits]:
     returns = defaultdict[str, list[float]](list)
     for group in groups:
         played = references.get(group.task, {}).values()
-        returns[group.task] += [float(np.median(each)) for each in played]
+        returns[group.task] += [float(np.mean(each)) for each in played]
         for label in group.labels:
             returns[group.task] += [*label.curve.p10, *label.curve.p90]
     facts = {group.task: (group.return_floor, group.solved) for group in groups}
@@ -128,7 +128,7 @@ def _grid_of_curves(
 
     def draw(axes: Axes, group: GroupAnalysis) -> None:
         for i, (policy, returns) in enumerate(references.get(group.task, {}).items()):
-            axes.axhline(float(np.median(returns)), label=policy, **reference(i))
+            axes.axhline(float(np.mean(returns)), label=policy, **reference(i))
         if extents[group.task].contain(group.solved):
             axes.axhline(group.solved, **solved_line_style())
         for label in group.labels:

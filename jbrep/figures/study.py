@@ -1,5 +1,6 @@
 """All figures of a study."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 
@@ -41,7 +42,8 @@ def study_plots(
     looks = partial(styles, in_order(names, baseline), baseline if baseline in names else None)
     plots = []
     if analysis:
-        plots += [curves(groups, references, looks), final_return(groups, looks)]
+        shown = _on_the_same_starts(references, returns)
+        plots += [curves(groups, shown, looks), final_return(groups, looks)]
         if any(group.comparisons for group in groups):
             plots.append(variance_ratio(analysis, looks))
         plots += [learning_rate(groups, looks), profiles(analysis, looks)]
@@ -50,3 +52,15 @@ def study_plots(
     if returns:
         plots.append(every_run(returns, looks))
     return [*plots, *diagrams(labels, looks)]
+
+
+def _on_the_same_starts(references: References, returns: Sequence[Return]) -> References:
+    """References in the episodes that curves are of; the last evaluation may have more."""
+    fewest: dict[str, int] = {}
+    counts = Counter((r.task, r.algorithm, r.representation, r.seed, r.step) for r in returns)
+    for (task, *_), count in counts.items():
+        fewest[task] = min(fewest.get(task, count), count)
+    return {
+        task: {policy: each[: fewest.get(task)] for policy, each in of_task.items()}
+        for task, of_task in references.items()
+    }
