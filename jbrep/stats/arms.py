@@ -1,7 +1,6 @@
 """What the claims compare: the runs of each representation, measured on one scale."""
 
 from collections.abc import Collection, Mapping
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -122,7 +121,7 @@ def _arm(runs: list[RunCurve], final: Array, curves: Array, grid: Array, frame: 
         curves=np.stack([curves[unit[0]] for unit in units]),
         runs=len(runs),
         learnt=int(np.count_nonzero(final >= frame.half)),
-        by_encoder=len(units) < len(runs) or _own_encoders(runs),
+        by_encoder=_own_encoders(runs),
     )
 
 
@@ -139,8 +138,3 @@ def _units(runs: list[RunCurve]) -> list[list[int]]:
     for number, run in enumerate(runs):
         by_encoder.setdefault(run.encoder_seed, []).append(number)
     return list(by_encoder.values())
-
-
-def all_seeds(group: Group) -> set[int]:
-    """Of all runs of a group."""
-    return {run.seed for run in chain.from_iterable(group.values())}

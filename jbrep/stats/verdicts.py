@@ -121,6 +121,7 @@ class _Cell:
     representation: str
     level: float  # its share
     verdicts: list[Verdict] = field(default_factory=list)  # of claims that are decided
+    undecided: Verdict | None = None  # of the claim that was tested last
     is_open: bool = True
 
     @property
@@ -151,12 +152,11 @@ def judge(
         for name in list(group)[1:]
         if "/".join((*key, name)) in rules.primary
     ]
-    last: dict[str, list[Verdict]] = {cell.name: [] for cell in cells}
     for look in range(len(rules.looks)):
-        _look(cells, groups, rules, look, seed, last)
+        _look(cells, groups, rules, look, seed)
     for cell in cells:
         shown = found[cell.key][cell.representation]
-        found[cell.key][cell.representation] = _whole(cell, last[cell.name], shown)
+        found[cell.key][cell.representation] = _whole(cell, shown)
     return found
 
 
@@ -166,7 +166,6 @@ def _look(
     rules: Rules,
     look: int,
     seed: int,
-    last: dict[str, list[Verdict]],
 ) -> None:
     """Test at a look whatever can be tested; levels that become free are used at once."""
     seeds = rules.seeds_at(look)
@@ -180,11 +179,11 @@ def _look(
             claim = CLAIMS[rules.claims[len(cell.verdicts)]]
             level = levels(rules.looks, cell.level)[look]
             verdict = _tested(claim, *ready[cell.name], rules, level, look + 1, seed)
-            last[cell.name] = [verdict]
             if verdict.verdict == UNDECIDED:
+                cell.undecided = verdict
                 continue
             cell.verdicts.append(verdict)
-            last[cell.name], tested = [], True
+            cell.undecided, tested = None, True
             if verdict.verdict == CONTRADICTED or len(cell.verdicts) == len(rules.claims):
                 cell.is_open = False
                 _pass_on(cell, cells)
@@ -299,9 +298,9 @@ def _explored(group: Group, name: str, rules: Rules, seed: int) -> tuple[Verdict
     )
 
 
-def _whole(cell: _Cell, last: list[Verdict], explored: tuple[Verdict, ...]) -> tuple[Verdict, ...]:
+def _whole(cell: _Cell, explored: tuple[Verdict, ...]) -> tuple[Verdict, ...]:
     """A verdict on each claim: decided, tested last, or not tested."""
-    tested = (*cell.verdicts, *last)
+    tested = (*cell.verdicts, *([cell.undecided] if cell.undecided else []))
     others = explored[len(tested) :]
     if not tested:
         nothing = Interval(np.nan, np.nan, np.nan)
