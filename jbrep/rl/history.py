@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.logger import TensorBoardOutputFormat
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.rl.files import Episode, Evaluation
@@ -42,6 +44,19 @@ class History:
     def seconds(self) -> float:
         """The wall time so far."""
         return round(self.earlier_seconds + time.monotonic() - self._started, 1)
+
+    def evaluated(self, step: int, returns: NDArray[np.float64], logger: Logger) -> float:
+        """Record an evaluation's returns (e,) after so many steps, and log their mean.
+
+        Returns:
+            The mean.
+        """
+        rounded = returns.round(3).tolist()
+        self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(rounded)]
+        mean = float(np.mean(rounded))
+        logger.record("evaluation/mean_return", mean)
+        logger.dump(step)
+        return mean
 
     def as_json(self) -> dict[str, Any]:
         """A record that `resume` takes."""

@@ -20,7 +20,7 @@ from jbrep.rl.agent import Evaluator, Spaces, make_agent, parameters
 from jbrep.rl.beginning import begin
 from jbrep.rl.checkpoint import PARAMETERS, Snapshot, without
 from jbrep.rl.cohort.draws import Draws
-from jbrep.rl.files import Episode, Evaluation
+from jbrep.rl.files import Episode
 from jbrep.rl.history import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE
 from jbrep.rl.job import Job
 from jbrep.rl.normalization import Statistics, normalized
@@ -159,15 +159,11 @@ class Member:
         step = self.agent.num_timesteps
         try:
             episodes = self.job.run.episodes_at(step)
-            returns = self._evaluator.returns(self.agent, episodes).round(3).tolist()
+            returns = self._evaluator.returns(self.agent, episodes)
         except NonFiniteActionError:
             self.fail(ACTIONS_NOT_FINITE)
             return
         except EnvironmentFailedError as error:
             self.fail(str(error))
             return
-        rows = [Evaluation(step, i, each) for i, each in enumerate(returns)]
-        self.job.history.evaluations += rows
-        self.mean = float(np.mean(returns))
-        self.agent.logger.record("evaluation/mean_return", self.mean)
-        self.agent.logger.dump(step)
+        self.mean = self.job.history.evaluated(step, returns, self.agent.logger)

@@ -6,7 +6,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from jbrep.rl.agent import Evaluator
-from jbrep.rl.files import Episode, Evaluation
+from jbrep.rl.files import Episode
 from jbrep.rl.history import WEIGHTS_NOT_FINITE, DivergedError, History, Watch
 from jbrep.rl.run import Run
 
@@ -56,11 +56,8 @@ class Recorder(BaseCallback):
     def _evaluate(self) -> None:
         step = self.model.num_timesteps
         episodes = self._run.episodes_at(step)
-        returns = self._evaluator.returns(self.model, episodes).round(3).tolist()
-        self._history.evaluations += [Evaluation(step, i, each) for i, each in enumerate(returns)]
-        self._mean = float(np.mean(returns))
-        self.logger.record("evaluation/mean_return", self._mean)
-        self.logger.dump(step)
+        returns = self._evaluator.returns(self.model, episodes)
+        self._mean = self._history.evaluated(step, returns, self.logger)
 
 
 def check_finite(agent: BaseAlgorithm) -> None:
