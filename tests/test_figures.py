@@ -16,6 +16,7 @@ from PIL import Image
 from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.figures import behaviour_plots, encoder_plots, study_plots, write
+from jbrep.figures.claims import claims
 from jbrep.figures.curves import Return, every_run
 from jbrep.figures.diagnostics import _free
 from jbrep.figures.families import family
@@ -26,7 +27,6 @@ from jbrep.rollouts.behaviour import SPEEDS, observe
 from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.first_claims import LESS_VARIANCE
 
 STEPS = np.arange(0, 50_001, 10_000)
 FINAL = {"full": 900, "dae-8": 500, "pca-4": 300}
@@ -103,7 +103,7 @@ def panels(figure):
 
 def test_a_study_has_every_figure(plots):
     assert list(plots) == [
-        *("representations", "final_return", "variance_ratio", "learning_rate", "profiles"),
+        *("representations", "final_return", "claims", "learning_rate", "profiles"),
         *("every_run", "system", "autoencoders"),
     ]
 
@@ -121,7 +121,7 @@ def test_each_figure_is_written_as_pdf_and_png_beside_its_table(analysis, return
         header, *rows = csv.reader(path.with_suffix(".csv").read_text().splitlines())
         assert header == list(plot.columns)
         assert len(rows) == len(plot.rows) > 0
-    write([plots["variance_ratio"]], tmp_path / "again")
+    write([plots["claims"]], tmp_path / "again")
     for path in (tmp_path / "again").iterdir():
         assert path.read_bytes() == (tmp_path / "figures" / path.name).read_bytes()
 
@@ -247,29 +247,28 @@ def test_no_interval_stretches_an_axis_and_cuts_are_marked(analysis):
     assert cut_marks(axes, "^v") == [(0.16, axes.get_ylim()[1], "^")]
 
 
-def test_variance_ratios_stand_with_both_intervals(plots, analysis):
-    axes = drawn(plots["variance_ratio"]).axes[0]
-    comparison = analysis.groups[0].comparisons[0]
-    ratio = comparison.numbers["variance_ratio"]
-    thin, thick, point = axes.lines[:3]
-    simultaneous = comparison.verdict(LESS_VARIANCE).simultaneous
-    np.testing.assert_array_equal(thin.get_xdata(), simultaneous[1:])
-    np.testing.assert_array_equal(thick.get_xdata(), ratio[1:])
-    assert point.get_xdata()[0] == ratio.value
-    assert axes.get_title(loc="left") == "face_direction, ddpg"
-    texts = [text.get_text() for text in axes.get_yticklabels()]
+def test_claims_stand_with_intervals_and_boundaries(plots, analysis):
+    kept, spread, time = drawn(plots["claims"]).axes[:3]
+    first, varies, *_ = analysis.groups[0].comparisons[0].verdicts
+    *boundaries, thin, thick, point = kept.lines[:5]
+    assert [line.get_xdata()[0] for line in boundaries] == [0.9, 0.95]
+    np.testing.assert_array_equal(thin.get_xdata(), first.interval[1:])
+    np.testing.assert_array_equal(thick.get_xdata(), first.estimate[1:])
+    assert point.get_xdata()[0] == first.estimate.value
+    assert kept.get_title(loc="left") == "face_direction, ddpg\nnot worse"
+    texts = [text.get_text() for text in kept.get_yticklabels()]
     assert texts == ["dae-8 (n = 4)", "pca-4 (n = 4)"]
-    assert axes.get_xlabel() == "variance relative to full (n = 4)"
+    assert (spread.get_xscale(), time.get_xscale()) == ("log", "linear")
+    assert spread.lines[3].get_xdata()[0] == varies.estimate.value
 
 
-def test_a_ratio_of_zero_is_marked_at_the_edge():
-    still = [
-        replace(run, returns=0 * run.returns) if run.representation == "dae-8" else run
-        for run in runs()
-        if (run.task, run.algorithm) == GROUPS[0]
-    ]
-    axes = drawn(study_plots(analyse(still), [], {}, {})[2]).axes[0]
-    assert axes.lines[2].get_xdata()[0] == 0
+def test_a_ratio_far_from_one_is_marked_at_the_edge(analysis):
+    (group, *_), far = analysis.groups, Interval(1e-9, 1e-12, 1e-6)
+    first, steady, *others = group.comparisons[0].verdicts
+    verdicts = (first, replace(steady, estimate=far, interval=far), *others)
+    comparisons = (replace(group.comparisons[0], verdicts=verdicts),)
+    changed = replace(group, labels=group.labels[:2], comparisons=comparisons)
+    axes = drawn(claims(replace(analysis, groups=(changed,)), lambda: styles(FINAL))).axes[1]
     low, high = axes.get_xlim()
     assert 1e-5 < low < 1 < high < 1e5
     assert (low, 0, "<") in cut_marks(axes, "<>")
@@ -319,7 +318,7 @@ def test_diagrams_show_what_any_method_does():
 
 
 def test_pages_have_a_light_and_a_dark_style(plots):
-    plot = plots["variance_ratio"]
+    plot = plots["claims"]
     light, dark = plot.on_paper.picture("svg"), Drawing(plot, DARK).picture("svg")
     assert b"#dddddd" in dark.lower()
     assert b"#dddddd" not in light.lower()

@@ -40,9 +40,9 @@ from jbrep.study.results import (
     RETURNS,
     STATISTICS,
     as_text,
+    conclude,
     read_results,
     read_runs,
-    write_results,
 )
 from jbrep.study.runner import get_backend, on_this_machine
 from jbrep.study.study import run_study
@@ -72,7 +72,7 @@ episode_steps = 100
 
 def tables(folder):
     """The tables of a study, as bytes."""
-    write_results(read_results(folder), folder)
+    conclude(folder)
     return [(folder / name).read_bytes() for name in (RETURNS, STATISTICS)]
 
 
@@ -193,7 +193,10 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
     assert study.comparisons == 0
     assert "compares nothing" in study.notices[0]
     assert TINY.comparisons == 1
-    assert not TINY.notices
+    assert TINY.notices == [
+        "This study is exploratory: its report will give no verdicts, as its file names no cell in "
+        "verdicts.primary."
+    ]
     path = tmp_path / "tiny.toml"
     path.write_text(TOML.replace('["full", "pca-8"]', json.dumps(representations)))
     monkeypatch.setattr("jbrep.study.study.estimate", lambda run: 60)

@@ -323,9 +323,12 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     nested = {"name": "random-4", "encoders": 2}
     files = {"name": "mine", "file": "encoders/{task}/mine-{encoder}.safetensors", "encoders": 2}
     own = {"name": "late-4", "kind": "slow", "latent": 4, "lags": [20]}
-    study = with_own(nested, files, own, seeds=(0, 1, 2), data=Data(folder=str(collected)))
-    assert study.notices == [
-        f"The seeds, 3 in number, share the 2 encoders of {name} unevenly."
+    few = {"seeds": (0, 1, 2), "data": Data(folder=str(collected))}
+    with pytest.raises(InputError, match="random-4 has 2 encoders for 3 seeds: each encoder must"):
+        with_own(nested, files, own, **few)
+    study = with_own(nested, files, own, **(few | {"seeds": (0, 1, 2, 3, 4)}))
+    assert study.notices[:2] == [
+        f"The seeds, 5 in number, share the 2 encoders of {name} unevenly."
         for name in ("random-4", "mine")
     ]
     plan = Plan(study, tmp_path / "it")
@@ -344,7 +347,8 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     assert told[5:7] == [("random-4-s1", "random-4", 1), ("mine-1", "mine", 1)]
     assert told[9:11] == told[1:3]
     assert runs["late-4", 0].find_encoder().representation == "late-4"
-    assert dataclasses.replace(study, seeds=(0, 1)).notices == []
+    (exploratory,) = dataclasses.replace(study, seeds=(0, 1)).notices
+    assert exploratory.startswith("This study is exploratory")
 
 
 @pytest.mark.parametrize(

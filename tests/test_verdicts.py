@@ -1,346 +1,185 @@
-"""Verdicts by rules fixed beforehand: levels, intervals, spreads, order, looks."""
+"""A study of known truth, registered, looked at twice, and extended; and what can't be decided."""
 
+import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import (
-    beta,
-    median_abs_deviation,
-    multivariate_normal,
-    norm,
-    permutation_test,
-    ttest_1samp,
-)
+from command import jbrep
+from made_up import SEEDS, STUDY, make_runs
 
 from jbrep.errors import InputError
-from jbrep.stats.arms import Arm, Frame, measure
-from jbrep.stats.claims import FASTER, LESS_VARIANCE, NOT_WORSE, kept_gain
-from jbrep.stats.looks import levels
-from jbrep.stats.means import Bounds, Part, mean_within, p_of_sum, sum_within
-from jbrep.stats.nested import components
-from jbrep.stats.runs import RunCurve
-from jbrep.stats.spread import Curves, log_spread, ratio_of_spreads, spread_p
-from jbrep.stats.verdicts import Rules, judge, most_failing
+from jbrep.report import report
+from jbrep.report.report import write_report
+from jbrep.stats.power import Arms, Prospect, prospects
+from jbrep.stats.rules import Planned, Rules
+from jbrep.study.config import as_study
+from jbrep.study.plan import Plan
+from jbrep.study.results import conclude
+from jbrep.study.study import register_study
 
-RETURNS = Bounds(0, 1000)
-STEPS = np.arange(0, 100_001, 10_000)
-KEY = ("face_direction", "ddpg")
-CELL = "face_direction/ddpg/dae-12"
+DOCS = Path(__file__).parent.parent / "docs" / "studies.md"
 
 
-def curve(end, time=50_000, seed=0, name="full", **facts):
-    """A run that stands still at 250 until it goes up within 10,000 steps to its final return."""
-    rise = np.clip((STEPS - time) / 10_000 + 0.5, 0, 1)
-    returns = 250 + (end - 250) * rise[:, None] + np.zeros((1, 3))
-    usual = {"return_floor": 0, "return_ceiling": 1000, "still": 250, "total_steps": 100_000}
-    return RunCurve(*KEY, name, seed, "", STEPS, returns, **(usual | facts))
+@pytest.fixture(scope="module")
+def looks(tmp_path_factory):
+    """The reports of a study after 5, 8 and all of its seeds, and after more were added."""
+    folder = tmp_path_factory.mktemp("looks") / "runs" / "decide"
+    register_study(Plan(STUDY, folder))
+    found = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "study_plots", lambda *_: [])
+        for seeds in (5, 8, SEEDS, SEEDS + 2):
+            plan = Plan(replace(STUDY, seeds=tuple(range(max(seeds, SEEDS)))), folder)
+            plan.write()
+            make_runs(plan, range(seeds))
+            results, _ = conclude(folder)
+            page, _, text, _ = write_report(folder)
+            found[seeds] = results.analysis, page.read_text(), text.read_text()
+            if seeds == SEEDS:
+                tables = {path.name: path.read_bytes() for path in folder.glob("*.*")}
+    whole = folder.parent / "whole"
+    whole.mkdir()
+    for name, content in tables.items():
+        (whole / name).write_bytes(content)
+    return folder, found
 
 
-def arm(name, finals, times=None, **facts):
-    times = np.full(len(finals), 50_000) if times is None else times
-    pairs = zip(finals, times, strict=True)
-    return [curve(f, t, seed, name, **facts) for seed, (f, t) in enumerate(pairs)]
+def cell(analysis, task, name):
+    (group,) = [group for group in analysis.groups if group.task == task]
+    (found,) = [each for each in group.comparisons if each.representation == name]
+    return found.verdicts
 
 
-def drawn(mean, sd, runs, seed):
-    """Numbers of exactly that mean and standard deviation."""
-    values = np.random.default_rng(seed).standard_normal(runs)
-    return mean + sd * (values - values.mean()) / values.std(ddof=1)
+def words(verdicts):
+    return [verdict.verdict for verdict in verdicts]
 
 
-def verdicts(full, other, primary=(CELL,), others=(), **rules):
-    groups = {KEY: {"full": full, "dae-12": other, **dict(others)}}
-    seeds = tuple(range(max(len(full), len(other))))
-    found = judge(groups, Rules(**({"primary": primary, "seeds": seeds} | rules)))
-    return found[KEY]
+def test_before_a_look_there_are_curves_and_counts_alone(looks):
+    analysis, page, text = looks[1][5]
+    assert words(cell(analysis, "face_direction", "dae-8")) == ["not yet"] * 4
+    assert "There are no verdicts yet: the first look is at 8 runs of each arm." in page
+    assert "Returns over training" in text
+    primary = re.search(r"Compared with full\n\n(?:.*\n)*?\n", str(analysis.groups[0]))
+    assert primary is None
+    assert words(cell(analysis, "move_in_direction", "dae-8")) == ["exploratory"] * 4
 
 
-def words(found):
-    return [verdict.verdict for verdict in found]
+def test_a_look_decides_what_is_far_from_its_boundary(looks):
+    analysis, _, _ = looks[1][8]
+    worse, *others = cell(analysis, "face_direction", "pca-8")
+    assert (worse.verdict, worse.look, worse.runs) == ("contradicted", 1, (8, 8))
+    assert {each.reason for each in others} == {"not tested: 'not worse' is contradicted"}
+    better, *_ = cell(analysis, "face_direction", "dae-8")
+    assert (better.verdict, better.look) == ("undecided", 1)
 
 
-@pytest.mark.parametrize(
-    ("shares", "level", "constants"),
-    [((0.5, 1.0), 0.05, (2.797, 1.977)), ((1 / 3, 2 / 3, 1.0), 0.05, (3.471, 2.454, 2.004))],
-)
-def test_levels_of_looks_are_those_of_o_brien_and_fleming(shares, level, constants):
-    """The constants as textbooks have them (Jennison and Turnbull 2000, table 2.3)."""
-    z = norm.isf(np.array(levels(shares, level)) / 2)
-    np.testing.assert_allclose(z, constants, atol=6e-4)
-    ratios = np.divide.outer(shares, shares)
-    together = multivariate_normal(cov=np.sqrt(np.minimum(ratios, 1 / ratios)))
-    assert 1 - together.cdf(z, lower_limit=-z) == pytest.approx(level, rel=1e-3)
-    assert levels((1.0,), level) == (level,)
-
-
-def test_without_bounds_the_interval_of_a_mean_is_student_s():
-    values = drawn(3, 2, 9, 0)
-    theirs = ttest_1samp(values, 0).confidence_interval(0.9)
-    np.testing.assert_allclose(mean_within(values, Bounds(), 0.9)[1:], theirs)
-    p = p_of_sum([Part(1, values)], Bounds(), 2)
-    assert p == pytest.approx(ttest_1samp(values, 2).pvalue, rel=1e-6)
-
-
-@pytest.mark.parametrize("bounds", [RETURNS, Bounds(0), Bounds(-np.inf, 1000)])
-def test_intervals_keep_to_what_is_possible(bounds):
-    for values in (np.array([1, 2, 900.0]), np.array([999, 998, 100.0]), np.array([0, 1000.0])):
-        mean, low, high = mean_within(values, bounds, 0.999)
-        assert bounds.low <= low < mean < high <= bounds.high
-        d, low, high = sum_within([Part(1, values), Part(-1, values[::-1])], RETURNS, 0.999)
-        assert -1000 <= low < d < high <= 1000
-
-
-def test_far_from_bounds_they_hardly_matter():
-    values = drawn(500, 5, 12, 1)
-    near = mean_within(values, RETURNS, 0.95)
-    np.testing.assert_allclose(near, mean_within(values, Bounds(), 0.95), atol=0.05)
-
-
-def test_intervals_of_bounded_means_cover_the_truth():
-    random = np.random.default_rng(0)
-    x, y = (1000 - random.gamma(2, 60, (4000, 10)) for _ in range(2))
-    assert x.min() > 0
-    one = mean_within(x, RETURNS, 0.95)
-    assert 0.92 < np.mean((one.low < 880) & (one.high > 880)) < 0.97
-    two = sum_within([Part(1, x), Part(-0.9, y)], RETURNS, 0.95)
-    assert 0.94 < np.mean((two.low < 88) & (two.high > 88)) < 0.98
-
-
-def test_the_spread_of_curves_by_hand():
-    curves = np.random.default_rng(0).normal(size=(7, 4))
-    weights = np.array([0.1, 0.2, 0.3, 0.4])
-    by_hand = np.log(median_abs_deviation(curves, axis=0) + 0.01) @ weights
-    assert log_spread(curves, weights, 0.01) == pytest.approx(by_hand)
-
-
-def test_the_permutation_of_curves_is_scipy_s():
-    random = np.random.default_rng(3)
-    x, y = random.normal(0, 1, (5, 1)), random.normal(0, 3, (5, 1))
-
-    def statistic(a, b, axis):
-        spreads = (np.log(median_abs_deviation(v, axis=axis) + 1e-9) for v in (a, b))
-        return np.abs(next(spreads) - next(spreads))
-
-    centred = [(v - np.median(v))[:, 0] for v in (x, y)]
-    exact = permutation_test(
-        centred, statistic, vectorized=True, n_resamples=np.inf, alternative="greater"
-    ).pvalue
-    ours = spread_p(Curves(x, y, np.ones(1), 1e-9), 0)
-    assert ours == pytest.approx(exact, abs=0.02)
-
-
-def test_the_interval_of_a_ratio_of_spreads_is_what_the_test_keeps():
-    random = np.random.default_rng(0)
-    y = random.normal(0, 50, (16, 1)) + random.normal(0, 10, (16, 9))
-    x = random.normal(0, 12, (16, 1)) + random.normal(0, 3, (16, 9))
-    curves = Curves(x, y, np.full(9, 1 / 9), 1.0)
-    value, low, high = ratio_of_spreads(curves, 0.95, 0)
-    assert low < value < high < 1
-    assert spread_p(curves, 0) < 0.05
-    twice = ratio_of_spreads(replace_x(curves, 2 * x), 0.95, 0)
-    np.testing.assert_allclose(twice, 2 * np.array([value, low, high]), rtol=2e-3)
-    equal = Curves(y, y + 100, np.full(9, 1 / 9), 1.0)
-    assert ratio_of_spreads(equal, 0.95, 0).value == pytest.approx(1)
-    assert spread_p(equal, 0) > 0.9
-
-
-def replace_x(curves, x):
-    return curves._replace(x=x)
-
-
-def frame(**changes):
-    usual = {"still": 250, "half": 575, "bounds": Bounds(), "steps": 1e5}
-    return Frame(**(usual | changes), weights=np.ones(1), resolution=1.0)
-
-
-def plain_arm(final):
-    none = np.zeros(len(final))
-    return Arm(final, none, none[:, None], len(final), len(final), by_encoder=False)
-
-
-def test_what_is_kept_of_a_gain_ends_where_its_test_does():
-    x, y = plain_arm(drawn(820, 60, 12, 0)), plain_arm(drawn(900, 30, 10, 1))
-    share, low, high = kept_gain(x, y, frame(), 0.95)
-    assert share == pytest.approx((820 - 250) / (900 - 250))
-    for end in (low, high):
-        assert NOT_WORSE.p_value(x, y, frame(), end, 0) == pytest.approx(0.05, rel=1e-4)
-    moved = kept_gain(
-        plain_arm(3 * x.final - 7), plain_arm(3 * y.final - 7), frame(still=3 * 250 - 7), 0.95
+def test_the_end_says_what_is_true(looks):
+    analysis, page, text = looks[1][SEEDS]
+    verdicts = cell(analysis, "face_direction", "dae-8")
+    assert words(verdicts) == ["supported"] * 4
+    kept, spread, time, _ = verdicts
+    assert kept.estimate.low < (848 - 250) / (850 - 250) < kept.estimate.high
+    assert 5 / 25 < spread.estimate.value < 0.5  # less than the ends alone, by the time before
+    assert time.estimate.low < -1500 < time.estimate.high
+    said = (
+        "In the 2 cells judged, &#39;not worse&#39; is supported in 1 and contradicted in 1, "
+        "&#39;less variance&#39; is supported in 1 and undecided in 1"
     )
-    np.testing.assert_allclose(moved, (share, low, high))
-    assert np.isnan(kept_gain(x, plain_arm(drawn(200, 10, 8, 2)), frame(), 0.95)).all()
-    unsure = plain_arm(np.array([100, 900.0, 120, 880]))
-    assert kept_gain(x, unsure, frame(), 0.95).high == np.inf
+    assert said in page
+    assert "what ran is what was registered." in text
+    assert "none from what was registered" in page
+    (across, *_) = (each for each in analysis.aggregates if each.representation == "pca-8")
+    assert across.tasks == ("face_direction", "move_in_direction")
+    assert across.iqm.low < (500 - 250) / (850 - 250) < across.iqm.high
 
 
-def test_arms_are_measured_on_one_scale():
-    full, other = arm("full", [850, 950]), arm("dae-12", [500, 900], [20_000, 60_000])
-    scale, arms = measure({"full": full, "dae-12": other}, {0, 1})
-    assert scale.half == (900 + 250) / 2
-    np.testing.assert_array_equal(arms["full"].final, [850, 950])
-    assert arms["dae-12"].time[0] == 100_000  # it never comes to half of the gain
-    assert arms["dae-12"].time[1] == pytest.approx(60_000, abs=5_000)
-    assert arms["dae-12"].learnt == 1
-    assert scale.weights.sum() == pytest.approx(1)
-    assert measure({"full": full, "dae-12": other}, {1})[1]["full"].runs == 1
+def test_seeds_that_were_added_are_exploratory(looks):
+    analysis, page, _ = looks[1][SEEDS + 2]
+    first, *_ = cell(analysis, "face_direction", "dae-8")
+    assert (first.verdict, first.runs) == ("supported", (SEEDS, SEEDS))
+    assert "seeds were added, whose runs are exploratory: 16, 17" in page
 
 
-def test_many_encoders_are_the_units():
-    runs = [
-        curve(800 + e + 10 * k, seed=2 * e + k, encoder_seed=e) for e in range(9) for k in (0, 1)
-    ]
-    _, arms = measure({"full": runs}, range(18))
-    assert (arms["full"].units, arms["full"].runs, arms["full"].by_encoder) == (9, 18, True)
-    np.testing.assert_allclose(arms["full"].final, 805 + np.arange(9))
-    few = [replace(run, encoder_seed=run.encoder_seed % 7) for run in runs]
-    assert measure({"full": few}, range(18))[1]["full"].units == 18
+def test_a_reader_gets_the_numbers_with_numpy_alone(looks, monkeypatch, capsys):
+    """By the lines in the docs."""
+    folder, found = looks
+    (block,) = re.findall(r"^```python\n(import numpy.*?)^```", DOCS.read_text(), re.M | re.S)
+    assert len([line for line in block.splitlines() if line]) <= 15
+    monkeypatch.chdir(folder.parent / "whole")
+    exec(compile(block.replace("runs/decide/", ""), "block", "exec"), {})
+    printed = dict(line.split(": ", 1) for line in capsys.readouterr().out.splitlines())
+    analysis = found[SEEDS][0]
+    group = analysis.groups[0]
+    for label in group.labels:
+        mean, deviation = (label.numbers[f"final_return_{each}"].value for each in ("mean", "sd"))
+        expected = [f"final return {mean:.1f}", f"SD {deviation:.1f}"]
+        if label.representation == "dae-8":  # pca-8 was decided at the first look
+            kept = cell(analysis, "face_direction", "dae-8")[0].estimate.value
+            expected.append(f"{kept:.3f} of the gain")
+        assert printed[label.representation].split(", ")[: len(expected)] == expected
 
 
-def test_the_last_evaluation_is_the_final_return():
-    runs = [curve(800, seed=seed, final=np.arange(700, 800.0)) for seed in (0, 1)]
-    assert measure({"full": runs}, {0, 1})[1]["full"].final == pytest.approx(749.5)
-    failed = curve(800, seed=2, failed_at=70_000, failure_return=0)
-    finals = measure({"full": [*runs, failed]}, {0, 1, 2})[1]["full"].final
-    np.testing.assert_allclose(finals, [749.5, 749.5, 0])
-
-
-FULL = arm("full", drawn(900, 30, 20, 0), drawn(50_000, 8_000, 20, 1))
-BETTER = arm("dae-12", drawn(905, 5, 20, 2), drawn(30_000, 1_000, 20, 3))
-WORSE = arm("dae-12", drawn(600, 30, 20, 4))
-
-
-def test_claims_are_tested_in_their_order():
-    found = verdicts(FULL, BETTER)["dae-12"]
-    assert [verdict.claim for verdict in found] == ["not worse", "less variance", "faster"]
-    assert words(found) == ["supported"] * 3
-    kept, ratio, lost = found
-    assert kept.interval.low > kept.boundary == 0.9
-    assert ratio.estimate.value < 0.3
-    assert lost.estimate.value == pytest.approx(-20_000, abs=1_000)
-    contradicted, *others = verdicts(FULL, WORSE)["dae-12"]
-    assert contradicted.verdict == "contradicted"
-    assert contradicted.interval.high < contradicted.boundary
-    assert {v.reason for v in others} == {"not tested: 'not worse' is contradicted"}
-    assert words(others) == ["undecided"] * 2
-
-
-def test_the_order_can_be_another_but_for_the_first():
-    found = verdicts(FULL, BETTER, claims=("not worse", "faster"))["dae-12"]
-    assert [verdict.claim for verdict in found] == ["not worse", "faster"]
-
-
-def test_few_runs_decide_nothing():
-    found = verdicts(FULL[:7], BETTER[:7])["dae-12"]
-    assert words(found) == ["undecided"] * 3
-    assert found[0].reason == "7 runs; verdicts take 8"
-
-
-def test_what_may_fail_often_is_not_called_as_good():
-    """Of ten runs that all learn, a quarter may fail: the limit is a fifth."""
-    found = verdicts(FULL[:10], BETTER[:10], looks=(1.0,))["dae-12"][0]
-    assert (found.verdict, found.runs) == ("undecided", (10, 10))
-    assert found.reason == "up to 26 % of its runs may fail to learn; the limit is 20 %"
-    lenient = verdicts(FULL[:10], BETTER[:10], looks=(1.0,), failing=0.3)["dae-12"]
-    assert words(lenient) == ["supported"] * 3
-    assert most_failing(0, 10) == pytest.approx(1 - 0.05 ** (1 / 10))
-    assert most_failing(3, 16) == pytest.approx(beta.ppf(0.95, 4, 13))
-
-
-def test_nothing_follows_from_agents_that_learn_nothing():
-    idle = arm("full", drawn(250, 20, 20, 0))
-    found = verdicts(idle, arm("dae-12", drawn(250, 10, 20, 1)))["dae-12"]
-    assert found[0].reason == "agents on the full state didn't learn"
-
-
-def test_nothing_is_said_between_looks():
-    early = verdicts(FULL[:9], BETTER[:9], seeds=tuple(range(20)))["dae-12"]
-    assert words(early) == ["not yet"] * 3
-    assert all(np.isnan(verdict.estimate.value) for verdict in early)
-    worse = arm("dae-12", [*drawn(500, 30, 10, 0), *drawn(900, 5, 9, 1)])
-    half = verdicts(FULL[:19], worse, seeds=tuple(range(20)))["dae-12"][0]
-    assert (half.verdict, half.look, half.runs) == ("contradicted", 1, (10, 10))
-    assert half.level == pytest.approx(0.0052, abs=1e-4)
-    later = verdicts(FULL, BETTER, looks=(0.5, 1.0))["dae-12"][0]
-    assert (later.look, later.runs) == (2, (20, 20))  # with ten runs each some may fail
-    assert later.level == pytest.approx(0.048, abs=1e-3)
-
-
-def test_runs_beyond_the_plan_do_not_count():
-    late = [*BETTER, *(curve(0, seed=seed, name="dae-12") for seed in range(20, 30))]
-    found = verdicts([*FULL, *(curve(900, seed=s) for s in range(20, 30))], late, seeds=range(20))
-    assert found["dae-12"][0].runs == (20, 20)
-    assert found["dae-12"][0].verdict == "supported"
-
-
-def test_cells_share_the_level_and_pass_it_on():
-    other = "face_direction/ddpg/dae-8"
-    rough = arm("dae-8", drawn(885, 150, 20, 5))
-    both = verdicts(FULL, WORSE, (CELL, other), {"dae-8": rough}.items(), looks=(1.0,))
-    assert both["dae-12"][0].level == pytest.approx(0.025)
-    assert both["dae-8"][0].level == pytest.approx(0.05)  # what dae-12 no longer needs
-
-
-def test_what_is_not_primary_gets_no_verdict():
-    found = verdicts(FULL, BETTER, primary=())["dae-12"]
-    assert words(found) == ["exploratory"] * 3
-    assert found[0].estimate.low > 0.9
-    three = verdicts(FULL[:3], BETTER[:3], primary=())["dae-12"]
-    assert np.isnan(three[0].estimate.low)
-    assert three[0].estimate.value > 0.9
+# before a study
 
 
 @pytest.mark.parametrize(
-    ("rules", "message"),
+    ("changes", "message"),
     [
-        ({"margin": 0}, "margin is 0: it must be between 0 and 1"),
-        ({"failing": 1.0}, "failing is 1.0"),
-        ({"looks": (0.5,)}, r"looks are \[0.5\]: they must be shares of the seeds that ascend to"),
-        ({"looks": (0.5, 0.5, 1.0)}, "ascend to 1"),
-        ({"looks": ()}, "ascend to 1"),
-        ({"claims": ("slower",)}, "unknown claim 'slower': choose of not worse, less variance"),
-        ({"claims": ("faster",)}, "'not worse' comes first"),
-        ({"claims": ("not worse", "faster", "faster")}, "each may be there once"),
+        (
+            {"verdicts": {"primary": ["face_direction/sac/pca-4"]}},
+            "verdicts.primary has face_direction/sac/pca-4: it must be of TASK/ALGORITHM/REPRESENT",
+        ),
+        ({"verdicts": {"primary": ["face_direction/sac/full"]}}, "verdicts.primary has face_direc"),
+        (
+            {"seeds": 7},
+            "no outcome could support 'not worse' of face_direction/sac/dae-8: a side has 7 runs",
+        ),
+        ({"seeds": 12}, "even if all 12 runs learn, up to 22 % may fail, and the limit is 20 %"),
+        ({"verdicts": {"margins": 0.1}}, "unknown verdicts.margins"),
+        ({"verdicts": {"margin": "a tenth"}}, "verdicts.margin is 'a tenth': it must be"),
+        ({"verdicts": {"looks": [1.0, 0.5]}}, "looks are .*: they must be shares of the seeds"),
+        ({"verdicts": {"claims": ["faster"]}}, "'not worse' comes first"),
+        ({"verdicts": {"primary": ["a", "a"]}}, "each cell may be there once"),
     ],
 )
-def test_rules_that_contradict_one_another(rules, message):
-    with pytest.raises(InputError, match=message):
-        Rules(**rules)
+def test_rules_that_do_not_fit_the_study(changes, message):
+    given = json.loads(json.dumps(Plan(STUDY, Path()).as_json()))
+    given = {name: value for name, value in given.items() if value is not None}
+    with pytest.raises(InputError, match=message) as raised:
+        as_study({**given, **changes})
+    assert "\n" not in str(raised.value)
 
 
-def test_the_sides_of_claims():
-    assert (NOT_WORSE.side, LESS_VARIANCE.side, FASTER.side) == (1, -1, -1)
+def test_a_dry_run_tells_what_could_be_found(tmp_path, monkeypatch):
+    monkeypatch.setattr("jbrep.study.study.estimate", lambda runs: 60)
+    settings = Plan(STUDY, Path()).as_json()
+    lines = [f"{name} = {json.dumps(settings[name])}" for name in ("tasks", "algorithms", "seeds")]
+    lines += [f"steps = 10_000\nrepresentations = {json.dumps(settings['representations'])}"]
+    lines += [f"[verdicts]\nprimary = {json.dumps(settings['verdicts']['primary'])}"]
+    (tmp_path / "it.toml").write_text("\n".join(lines))
+    told = jbrep("study", tmp_path / "it.toml", "--dry-run", "--out", tmp_path / "out")
+    assert told.exit_code == 0, told.output
+    words = " ".join(told.output.split())
+    assert "face_direction/sac/dae-8: less variance" in words
+    assert "Verdicts may come after 8 and 16 runs of each arm" in words
+    assert "exploratory: its report" not in words
 
 
-def test_variance_components_are_those_of_restricted_maximum_likelihood():
-    mixed = pytest.importorskip("statsmodels.api").MixedLM
-    random = np.random.default_rng(2)
-    returns = random.normal(0, 50, (9, 1)) + random.normal(700, 30, (9, 3))
-    found = components(returns)
-    groups = np.repeat(np.arange(9), 3)
-    theirs = mixed(returns.ravel(), np.ones((27, 1)), groups).fit(reml=True)
-    assert found.encoders.value == pytest.approx(float(theirs.cov_re[0, 0]), rel=1e-3)
-    assert found.runs.value == pytest.approx(theirs.scale, rel=1e-3)
-    assert found.ratio.value == pytest.approx(found.encoders.value / found.runs.value)
-    for each in found:
-        assert 0 <= each.low < each.value < each.high
-
-
-def test_encoders_that_add_nothing_have_no_variance_below_0():
-    returns = np.tile([600.0, 700.0, 800.0], (4, 1))
-    found = components(returns)
-    assert found.encoders[:2] == found.ratio[:2] == (0, 0)
-    with pytest.raises(InputError, match="two encoders and two runs of each, not 1 times 5"):
-        components(np.zeros((1, 5)))
-
-
-@pytest.mark.parametrize("ratio", [0.0, 0.5, 4.0])
-def test_intervals_of_variance_components_cover_the_truth(ratio):
-    random = np.random.default_rng(0)
-    covered = np.zeros(3)
-    for _ in range(500):
-        encoders = random.normal(0, np.sqrt(ratio), (8, 1))
-        found = components(encoders + random.standard_normal((8, 2)))
-        truths = zip(found, (ratio, 1, ratio), strict=True)
-        covered += [each.low <= truth <= each.high for each, truth in truths]
-    assert (covered / 500 > 0.925).all()
+def test_power_is_that_of_the_t_test():
+    """Against statsmodels, where shares of the gain hardly differ from 1."""
+    power = pytest.importorskip("statsmodels.stats.power")
+    rules = Rules(primary=("a/b/c",), looks=(1.0,), margin=0.1)
+    planned, arms = Planned(rules, tuple(range(16))), {"a/b/c": Arms(16, 16, 16)}
+    found = {each.claim: each for each in prospects(planned, arms)}
+    first = found["not worse"]
+    assert isinstance(first, Prospect)
+    expected = power.TTestIndPower().power(0.1 / 0.1, 16, 0.05)
+    assert first.power[1] == pytest.approx(expected, abs=0.08)
+    assert first.power == tuple(sorted(first.power, reverse=True))
+    steady = found["less variance"]
+    assert steady.least_p == pytest.approx(1e-4)
+    assert np.diff(steady.power).min() >= 0
+    assert steady.power[-1] > 0.9

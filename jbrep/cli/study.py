@@ -75,10 +75,11 @@ def study(
 
     plan = plan_for(read_study(study), out or Path("runs") / study.stem)
     run, count = get_backend(backend), workers or usual_workers(plan)
+    text = dry_run_text(plan, count, width, terminal_width()) if dry_run else ""
     for notice in plan.study.notices:
         click.echo(notice, err=True)
     if dry_run:
-        click.echo(dry_run_text(plan, count, width, terminal_width()))
+        click.echo(text)
         return
     if register:
         registered = register_study(plan)

@@ -186,6 +186,13 @@ class Task:
             return None
         return min(self.reward_low, 0.0) * self.max_episode_steps
 
+    @property
+    def return_ceiling(self) -> float | None:
+        """The largest possible return of an episode; None where none is known."""
+        if self.reward_high is None:
+            return None
+        return max(self.reward_high, 0.0) * self.max_episode_steps
+
     @cached_property
     def _centre(self) -> Array:
         return np.array([(f.high + f.low) / 2 if _ranged(f) else 0 for f in self.features])  # type: ignore[operator]

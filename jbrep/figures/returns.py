@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from jbrep.figures.curves import Groups, below, cell, names_with_runs
 from jbrep.figures.limits import Limits, limits
@@ -23,14 +22,11 @@ from jbrep.figures.style import (
 )
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.comparison import Comparison
-from jbrep.stats.first_claims import LESS_VARIANCE
 
-_ENDS = ("low", "high")
 _LABEL = ("task", "algorithm", "representation")
 _JITTER = 0.16  # between the outermost runs and the middle of their representation
 _ROOM = 0.04  # of an axis, at its ends, for whole markers
-_MAX_DECADES = 4  # of a variance ratio, on each side of 1
+_DASHED = " Dashed: policies that don't learn, on the same starts."
 _CUT = " A triangle at an edge: the interval goes beyond it."
 
 
@@ -41,7 +37,7 @@ def final_return(groups: Groups, looks: Looks) -> Plot:
         "Final return and its spread",
         "Left: mean return at the end of training, a point for each of n runs, and the mean over "
         "runs with its 95 % interval. Right: the standard deviation over runs with its 95 % "
-        "interval." + _CUT,
+        "interval." + _dashed(groups) + _CUT,
         (
             *(*_LABEL, "seed", "final_return", "mean", "mean_low", "mean_high"),
             *("sd", "sd_low", "sd_high"),
@@ -57,29 +53,10 @@ def learning_rate(groups: Groups, looks: Looks) -> Plot:
         "learning_rate",
         "How fast agents learn",
         "Mean return over all of training (the area under the learning curve), a point for each of "
-        "n runs, and the mean over runs with its 95 % interval." + _CUT,
+        "n runs, and the mean over runs with its 95 % interval." + _dashed(groups) + _CUT,
         (*_LABEL, "seed", "mean_return", "mean", "mean_low", "mean_high"),
         list(_by_run(groups, "mean_return", ("mean_return_mean",))),
         lambda: _draw_learning(groups, looks),
-    )
-
-
-def variance_ratio(analysis: Analysis, looks: Looks) -> Plot:
-    """Variances of final returns against the baseline's."""
-    level = f"{100 * analysis.simultaneous_level:.2f} %"
-    return Plot(
-        "variance_ratio",
-        f"Variance relative to {analysis.baseline}",
-        f"Ratio of the variance of final returns to that on {analysis.baseline}. Thick: 95 % "
-        f"interval; thin: {level}, at which all verdicts hold together. Below 1 varies less."
-        + _CUT,
-        (*_LABEL, "ratio", *_ENDS, "low_together", "high_together", "verdict"),
-        [
-            (group.task, group.algorithm, comparison.representation, *_ratio_cells(comparison))
-            for group in analysis.groups
-            for comparison in group.comparisons
-        ],
-        lambda: _draw_ratios(analysis.groups, looks),
     )
 
 
@@ -89,8 +66,9 @@ def profiles(analysis: Analysis, looks: Looks) -> Plot:
         "profiles",
         "Performance profiles",
         "The share of n runs whose final return is above that on the axis, with its 95 % bootstrap "
-        "interval (Agarwal et al. 2021). Higher is better; steep is steady.",
-        (*_LABEL, "final_return", "share", *_ENDS),
+        "interval (Agarwal et al. 2021). Higher is better; steep is steady."
+        + _dashed(analysis.groups),
+        (*_LABEL, "final_return", "share", "low", "high"),
         [
             (group.task, group.algorithm, label.representation, *row)
             for group in analysis.groups
@@ -110,10 +88,8 @@ def _by_run(groups: Groups, value: str, numbers: Sequence[str]) -> Iterator[tupl
                 yield (*key, seed, cell(each), *shared)
 
 
-def _ratio_cells(comparison: Comparison) -> list[Any]:
-    verdict = comparison.verdict(LESS_VARIANCE)
-    numbers = (*comparison.numbers["variance_ratio"], *verdict.simultaneous[1:])
-    return [*(number if np.isfinite(number) else "" for number in numbers), verdict.verdict]
+def _dashed(groups: Groups) -> str:
+    return _DASHED if any(group.references for group in groups) else ""
 
 
 def _panels(groups: Groups, columns: int, height: float = 1.7) -> tuple[Figure, Any]:
@@ -144,6 +120,7 @@ def _draw_final(groups: Groups, looks: Looks) -> Figure:
         _name_columns(right, group)
         for i, (label, deviation) in enumerate(zip(group.labels, deviations, strict=True)):
             _draw_interval(right, i, deviation, look[label.representation])
+    below(figure, panels.ravel())
     return figure
 
 
@@ -154,6 +131,7 @@ def _draw_learning(groups: Groups, looks: Looks) -> Figure:
         extent = _extent(group, "mean_return")
         axes.set(ylabel="mean return", ylim=extent.with_room(_ROOM))
         _draw_runs(axes, group, look, "mean_return")
+    below(figure, panels.ravel())
     return figure
 
 
@@ -161,6 +139,7 @@ def _extent(group: GroupAnalysis, value: str, solved: float = np.nan) -> Limits:
     """The limits of a number of all runs, and of the intervals of its means."""
     runs = np.concatenate([label.by_run[value] for label in group.labels])
     means = [label.numbers[f"{value}_mean"] for label in group.labels]
+    runs = np.append(runs, [each.value for each in group.references.values()])
     return limits(runs, group.return_floor, solved).with_ends(means, group.return_floor)
 
 
@@ -175,6 +154,8 @@ def _from_zero(axes: Axes, intervals: Sequence[Interval], limit: float) -> None:
 def _draw_runs(axes: Axes, group: GroupAnalysis, look: Styles, value: str) -> None:
     """A point for each run of each representation, and the mean with its interval."""
     _name_columns(axes, group)
+    for i, (policy, each) in enumerate(group.references.items()):
+        axes.axhline(each.value, label=policy, **reference(i))
     for i, label in enumerate(group.labels):
         style, runs = look[label.representation], label.by_run[value]
         beside = i - 0.22 + np.linspace(-_JITTER, _JITTER, len(runs)) * (len(runs) > 1)
@@ -199,51 +180,6 @@ def _draw_interval(axes: Axes, at: float, values: Interval, style: dict[str, Any
     mark_cut(axes, "y", at, values, style["color"])
 
 
-def _draw_ratios(groups: Groups, looks: Looks) -> Figure:
-    """A panel for each group, a row for each representation, all to one scale."""
-    compared = [group for group in groups if group.comparisons]
-    most = max(len(group.comparisons) for group in compared)
-    figure, panels = _panels(compared, 1, 0.45 + 0.19 * most)
-    look = looks()
-    decades = max(_decades(c) for group in compared for c in group.comparisons)
-    for (axes,), group in zip(panels, compared, strict=True):
-        baseline, *names = names_with_runs([group]).values()
-        axes.set(xscale="log", xlim=(10 ** -(decades + 0.1), 10 ** (decades + 0.1)))
-        for i, comparison in enumerate(group.comparisons):
-            _draw_ratio(axes, i, comparison, look[comparison.representation])
-        axes.axvline(1, **reference())
-        axes.set_yticks(range(len(names)), names)
-        axes.set(ylim=(len(names) - 0.4, -0.6), xlabel=f"variance relative to {baseline}")
-        _few_decades(axes, decades)
-        axes.grid(visible=False, axis="y")
-        axes.set_title(plain(group.name))
-    return figure
-
-
-def _decades(comparison: Comparison) -> float:
-    """How many powers of ten the intervals extend from 1, where they are above 0; not too many."""
-    simultaneous = comparison.verdict(LESS_VARIANCE).simultaneous
-    ends = np.array([*comparison.numbers["variance_ratio"], *simultaneous, 1])
-    return min(float(np.abs(np.log10(ends[ends > 0])).max()), _MAX_DECADES)
-
-
-def _draw_ratio(axes: Axes, row: int, comparison: Comparison, style: dict[str, Any]) -> None:
-    simultaneous = comparison.verdict(LESS_VARIANCE).simultaneous
-    nominal, colour = comparison.numbers["variance_ratio"], style["color"]
-    for (_, *ends), width in ((simultaneous, 0.8), (nominal, 2)):
-        axes.plot(ends, [row, row], color=colour, linewidth=width)
-    axes.plot([nominal.value], [row], style["marker"], color=colour, ms=4)
-    mark_cut(axes, "x", row, [*nominal, *simultaneous], colour)
-
-
-def _few_decades(axes: Axes, limit: float) -> None:
-    """Ticks as 0.1 and 10, or as 1/3 and 3 where the axis is short."""
-    ticks = 3.0 ** np.arange(-1, 2) if limit < 1 else 10.0 ** np.arange(-int(limit), limit + 0.01)
-    axes.xaxis.set_major_locator(FixedLocator(ticks[:: -(-len(ticks) // 7)].tolist()))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.2g}" if x < 1 else f"{x:,.0f}"))
-
-
 def _draw_profiles(analysis: Analysis, looks: Looks) -> Figure:
     groups = analysis.groups
     figure, panels = _panels(groups, 1, 2.0)
@@ -255,6 +191,8 @@ def _draw_profiles(analysis: Analysis, looks: Looks) -> Figure:
             axes.fill_between(returns, low, high, step="post", color=colour, alpha=0.12, lw=0)
             name = names[label.representation]
             axes.step(returns, share, where="post", color=colour, label=name)
+        for i, (policy, each) in enumerate(group.references.items()):
+            axes.axvline(each.value, label=policy, **reference(i))
         extent = limits(group.profile_returns, solved=group.solved)
         if extent.contain(group.solved):
             axes.axvline(group.solved, **solved_line_style())

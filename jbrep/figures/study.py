@@ -5,11 +5,12 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from jbrep.encoders import FULL
+from jbrep.figures.claims import claims
 from jbrep.figures.curves import References, Return, curves, every_run
 from jbrep.figures.diagnostics import diagnostics
 from jbrep.figures.diagrams import LabelRecord, diagrams
 from jbrep.figures.plot import Plot
-from jbrep.figures.returns import final_return, learning_rate, profiles, variance_ratio
+from jbrep.figures.returns import final_return, learning_rate, profiles
 from jbrep.figures.style import styles
 from jbrep.stats import Analysis
 from jbrep.stats.association import Association
@@ -45,7 +46,7 @@ def study_plots(
         shown = _on_the_same_starts(references, returns)
         plots += [curves(groups, shown, looks), final_return(groups, looks)]
         if any(group.comparisons for group in groups):
-            plots.append(variance_ratio(analysis, looks))
+            plots.append(claims(analysis, looks))
         plots += [learning_rate(groups, looks), profiles(analysis, looks)]
     if associations:
         plots.append(diagnostics(associations, looks))

@@ -6,11 +6,10 @@ from collections.abc import Iterator, Sequence
 from jbrep.report import facts
 from jbrep.report.columns import are_numbers
 from jbrep.report.tables import Tables
-from jbrep.report.words import Answer, remark
-from jbrep.stats.analysis import GroupAnalysis
-from jbrep.stats.comparison import Verdict
-from jbrep.stats.first_claims import CLAIMS
-from jbrep.stats.summary import Rows, label_rows, margin
+from jbrep.report.words import Answer, headline, remark
+from jbrep.stats.analysis import Analysis, GroupAnalysis
+from jbrep.stats.summary import Rows, across_tasks, label_rows, reference_words
+from jbrep.stats.verdict import Statement, Verdict
 
 # what would be read as markup: an underscore within a word and a bracket without a link are not
 _MARKUP = re.compile(
@@ -40,30 +39,44 @@ def _lines(
         yield from (escape(registered), "")
     for notice in facts.notices(tables):
         yield from (f"> {escape(notice)}", "")
-    groups = tables.analysis.groups if tables.analysis else ()
-    for group in groups:
+    yield from (f"**{escape(headline(tables.analysis))}**", "")
+    if tables.analysis:
+        yield from _findings(tables.analysis, answers)
+        yield from (f"![Returns over training]({picture})", "")
+        yield from _numbers(tables.analysis)
+    for title, (header, rows) in predictions:
+        yield from (f"{escape(title)}:", "", *_table(header, rows), "")
+
+
+def _findings(analysis: Analysis, answers: Sequence[Answer]) -> Iterator[str]:
+    """Verdicts as tables, then in sentences."""
+    for group in analysis.groups:
         if group.comparisons:
-            yield from (f"Verdicts on {escape(group.name)}:", "", *_verdicts(group), "")
-            yield from (escape(f"{margin(group)}."), "")
+            title = f"Verdicts on {escape(group.name)}:"
+            yield from (title, "", *_verdicts(group, analysis.claims), "")
+            yield from (escape(f"Gains are counted from {reference_words(group)}."), "")
+    for note in analysis.notes:
+        yield from (escape(note), "")
     for answer in answers:
         yield from (f"**{escape(answer.headline)}.**", "")
         for finding in answer.findings:
             yield f"- {escape(finding.where)}: *{finding.verdict}*. {escape(finding.sentence)}"
         yield ""
-    if groups:
-        yield from (f"![Returns over training]({picture})", "")
-    for group in groups:
+
+
+def _numbers(analysis: Analysis) -> Iterator[str]:
+    for group in analysis.groups:
         yield from (f"{escape(group.name)}, with 95 % intervals over runs:", "")
         yield from (*_table(*label_rows(group)), "")
-    for title, (header, rows) in predictions:
+    for title, (header, rows) in across_tasks(analysis):
         yield from (f"{escape(title)}:", "", *_table(header, rows), "")
 
 
-def _verdicts(group: GroupAnalysis) -> list[str]:
+def _verdicts(group: GroupAnalysis, claims: Sequence[Statement]) -> list[str]:
     """A row for each representation, a column for each claim."""
-    header = ("representation", *(claim.name for claim in CLAIMS))
+    header = ("representation", *(claim.name for claim in claims))
     rows = [
-        (comparison.representation, *(_short(comparison.verdict(claim)) for claim in CLAIMS))
+        (comparison.representation, *map(_short, comparison.verdicts))
         for comparison in group.comparisons
     ]
     return _table(header, rows)

@@ -16,10 +16,9 @@ from jbrep.progress import Progress
 from jbrep.report import facts
 from jbrep.report.columns import are_numbers
 from jbrep.report.tables import Tables
-from jbrep.report.words import Answer, remark
+from jbrep.report.words import details, headline, remark
 from jbrep.stats import Analysis
-from jbrep.stats.first_claims import CLAIMS
-from jbrep.stats.summary import Rows, group_tables, margin
+from jbrep.stats.summary import Rows, across_tasks, group_tables
 
 _WIDEST = 1000  # of a figure [CSS pixels]
 _PER_INCH = 96  # CSS pixels: on a narrow screen a figure is shown at its size on paper
@@ -27,7 +26,6 @@ _PER_INCH = 96  # CSS pixels: on a narrow screen a figure is shown at its size o
 
 def page(
     tables: Tables,
-    answers: Sequence[Answer],
     plots: Sequence[Plot],
     predictions: Sequence[tuple[str, Rows]],
 ) -> str:
@@ -35,7 +33,6 @@ def page(
 
     Args:
         tables: of the study.
-        answers: on each claim.
         plots: figures.
         predictions: tables of how well diagnostics predict learning, each with a title.
     """
@@ -46,12 +43,11 @@ def page(
         outline=facts.outline(tables),
         registered=facts.registered(tables),
         notices=facts.notices(tables),
-        groups=[g for g in (tables.analysis.groups if tables.analysis else ()) if g.comparisons],
-        baseline=tables.analysis.baseline if tables.analysis else "",
-        claims=CLAIMS,
+        headline=headline(tables.analysis),
+        analysis=tables.analysis,
+        registration=tables.record.get("registration"),
         remark=remark,
-        margin=margin,
-        answers=answers,
+        details=details,
         are_numbers=are_numbers,
         figures=[_figure(plot) for plot in Progress(plots, unit="figure", delay=1, leave=False)],
         tables=[*(_tables(tables.analysis) if tables.analysis else ()), *predictions],
@@ -70,12 +66,13 @@ def page(
 
 
 def _tables(analysis: Analysis) -> list[tuple[str, Rows]]:
-    """Every table of every group, each with a title that names the group."""
-    return [
+    """Every table of every group, each with a title that names the group; those across tasks."""
+    of_groups = [
         (f"{group.name}. {title}" if i else title, rows)
         for group in analysis.groups
         for i, (title, rows) in enumerate(group_tables(group, analysis))
     ]
+    return [*of_groups, *across_tasks(analysis)]
 
 
 def _figure(plot: Plot) -> dict[str, Any]:

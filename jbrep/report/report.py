@@ -16,7 +16,7 @@ from jbrep.stats.plain import to_plain
 
 PAGE, SUMMARY, MARKDOWN, FIGURES = "report.html", "summary.json", "summary.md", "figures"
 FORMAT = "jbrep summary"
-FORMAT_VERSION = 2  # before, numbers of 900 had that in their names
+FORMAT_VERSION = 3  # before, claims were those of the first release
 _MAIN_FIGURE = "representations"
 
 
@@ -44,7 +44,7 @@ def write_report(folder: Path, out: Path | None = None) -> list[Path]:
     )
     predictions = diagnostics.diagnostic_tables(associated)
     texts = {
-        PAGE: page(tables, verdicts, plots, predictions),
+        PAGE: page(tables, plots, predictions),
         SUMMARY: json.dumps(_summary(tables, verdicts), indent=1, allow_nan=False) + "\n",
         MARKDOWN: markdown(tables, verdicts, predictions, f"{FIGURES}/{_MAIN_FIGURE}.png"),
     }

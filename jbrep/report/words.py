@@ -2,13 +2,21 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+from jbrep.report.tables import RegistrationRecord
 from jbrep.stats import Analysis
-from jbrep.stats.comparison import Comparison, Verdict
-from jbrep.stats.first_claims import CLAIMS, Claim
-from jbrep.stats.summary import shown, shown_number
+from jbrep.stats.analysis import GroupAnalysis
+from jbrep.stats.comparison import Comparison
+from jbrep.stats.summary import probability, reference_words, shown, shown_number
+from jbrep.stats.verdict import EXPLORATORY, NOT_YET, Statement, Verdict
+
+_BESIDE = {  # a claim's verdict: what else is known of it
+    "not worse": ("Difference of final returns", "final_return_difference"),
+    "less variance": ("Ratio of variances of final returns", "variance_ratio"),
+    "faster": ("Ratio of median steps to half of the gain", "steps_to_50_percent_ratio"),
+}
 
 
 class Finding(NamedTuple):
@@ -29,68 +37,138 @@ class Answer(NamedTuple):
     findings: list[Finding]
 
 
-def answers(analysis: Analysis) -> list[Answer]:
-    """Each claim of the paper, with every verdict on it."""
-    return [_answer(claim, analysis) for claim in CLAIMS]
+def headline(analysis: Analysis | None) -> str:
+    """What was found, in a sentence."""
+    if analysis is None:
+        return "There are no statistics yet, and so no verdicts."
+    found = list(_all(analysis))
+    if not found:
+        return "No reduced state was compared with the full one."
+    judged = [verdicts for verdicts in found if verdicts[0].verdict != EXPLORATORY]
+    if not judged:
+        return "There are no verdicts: no cell was named primary before the runs."
+    decided = [verdicts for verdicts in judged if verdicts[0].verdict != NOT_YET]
+    if not decided:
+        return f"There are no verdicts yet: {judged[0][0].reason}."
+    cells = "the one cell" if len(judged) == 1 else f"the {len(judged)} cells"
+    columns = zip(analysis.claims, zip(*judged, strict=True), strict=True)
+    parts = [f"{claim.name!r} is {_overall(_counts(each))}" for claim, each in columns]
+    return f"In {cells} judged, {', '.join(parts[:-1])}{' and ' if parts[:-1] else ''}{parts[-1]}."
 
 
-def _answer(claim: Claim, analysis: Analysis) -> Answer:
-    findings = list(_findings(claim, analysis))
-    counts = Counter(finding.verdict for finding in findings)
-    headline = f"{claim.statement}: {_overall(counts)}"
-    return Answer(claim.name, headline, dict(counts), findings)
+def _all(analysis: Analysis) -> Iterator[tuple[Verdict, ...]]:
+    return (each.verdicts for group in analysis.groups for each in group.comparisons)
+
+
+def _counts(verdicts: Sequence[Verdict]) -> Counter[str]:
+    return Counter(verdict.verdict for verdict in verdicts)
 
 
 def _overall(counts: Counter[str]) -> str:
     """The verdict if all agree, otherwise how many there are of each."""
-    if not counts:
-        return "no reduced state was compared"
     if len(counts) == 1:
-        (verdict,) = counts
-        return verdict
-    return ", ".join(f"{verdict} in {count}" for verdict, count in counts.most_common())
+        return next(iter(counts))
+    return " and ".join(f"{verdict} in {count}" for verdict, count in counts.most_common())
 
 
-def _findings(claim: Claim, analysis: Analysis) -> Iterator[Finding]:
-    for group in analysis.groups:
-        for comparison in group.comparisons:
-            verdict = comparison.verdict(claim).verdict
-            sentence = _sentence(claim, comparison, analysis)
-            yield Finding(group.name, comparison.representation, verdict, sentence)
+def answers(analysis: Analysis) -> list[Answer]:
+    """Each claim, with every verdict on it."""
+    return [_answer(number, claim, analysis) for number, claim in enumerate(analysis.claims)]
 
 
-def _sentence(claim: Claim, comparison: Comparison, analysis: Analysis) -> str:
-    """The numbers behind a verdict; of an undecided one, why or what would decide it."""
-    verdict = comparison.verdict(claim)
-    pair = f"{comparison.representation} against {analysis.baseline}"
-    sentence = f"{pair}: {claim.quantity} {shown(verdict.nominal)}"
-    _, low, high = verdict.simultaneous
-    if math.isfinite(low) and math.isfinite(high):
-        level = f"{100 * analysis.simultaneous_level:.2f} %"
-        bound = f"{claim.boundary_name} {shown_number(verdict.boundary)}".lstrip()
-        ends = f"[{shown_number(low)}, {shown_number(high)}]"
-        sentence += f"; at {level}, {ends} {_place(verdict)} {bound}"
-    return f"{sentence}{_outlook(verdict)}."
+def _answer(number: int, claim: Statement, analysis: Analysis) -> Answer:
+    pairs = [(group, each) for group in analysis.groups for each in group.comparisons]
+    findings = [
+        Finding(
+            group.name,
+            each.representation,
+            each.verdicts[number].verdict,
+            _sentence(claim, each.verdicts[number], each.representation, analysis.baseline),
+        )
+        for group, each in pairs
+    ]
+    counts = _counts([each.verdicts[number] for _, each in pairs])
+    overall = _overall(counts) if counts else "no reduced state was compared"
+    return Answer(claim.name, f"{claim.statement}: {overall}", dict(counts), findings)
+
+
+def _sentence(claim: Statement, verdict: Verdict, name: str, baseline: str) -> str:
+    """The numbers behind a verdict; of an undecided one, why."""
+    parts = [f"{name} against {baseline}: {claim.estimand} {shown(verdict.estimate)}"]
+    if test := _tested(verdict):
+        parts.append(test)
+    if verdict.reason:
+        parts.append(verdict.reason)
+    return f"{'; '.join(parts)}."
+
+
+def _tested(verdict: Verdict) -> str:
+    """Where the interval lies that decides; empty where nothing was tested."""
+    _, low, high = verdict.interval
+    if math.isnan(verdict.level) or math.isnan(low) or math.isnan(high):
+        return ""
+    ends = f"[{_end(low)}, {_end(high)}]"
+    level, boundary = f"{100 * (1 - verdict.level):.4g} %", shown_number(verdict.boundary)
+    return f"at {level}, {ends} {_place(verdict)} {boundary}"
+
+
+def _end(value: float) -> str:
+    return shown_number(value) if math.isfinite(value) else "unbounded"
 
 
 def _place(verdict: Verdict) -> str:
-    if verdict.simultaneous.low > verdict.boundary:
+    if verdict.interval.low > verdict.boundary:
         return "lies above"
-    return "lies below" if verdict.simultaneous.high < verdict.boundary else "contains"
-
-
-def _outlook(verdict: Verdict) -> str:
-    if verdict.reason:
-        return f"; undecided: {verdict.reason}"
-    if verdict.seeds_needed is None:
-        return ""
-    most = str(verdict.seeds_needed).removeprefix("> ")
-    count = f"about {most}" if isinstance(verdict.seeds_needed, int) else f"more than {most}"
-    return f"; {count} seeds would decide"
+    return "lies below" if verdict.interval.high < verdict.boundary else "contains"
 
 
 def remark(verdict: Verdict) -> str:
-    """Why a verdict is undecided, or how many seeds would decide it, for a narrow column."""
-    if verdict.seeds_needed is not None:
-        return f"{verdict.seeds_needed} seeds"
-    return verdict.reason or ""
+    """The estimate, or why there is none, for a narrow column."""
+    return (verdict.reason or "") if math.isnan(verdict.estimate.value) else shown(verdict.estimate)
+
+
+def details(
+    claim: Statement,
+    verdict: Verdict,
+    comparison: Comparison,
+    group: GroupAnalysis,
+    registration: RegistrationRecord | None,
+) -> list[tuple[str, str]]:
+    """All that a verdict rests on, each with a heading."""
+    rows = [
+        ("Claim", claim.statement),
+        ("Estimand", claim.estimand),
+        ("Gains are counted from", reference_words(group)),
+    ]
+    if not math.isnan(verdict.estimate.value):
+        rows.append(("Estimate with 95 % interval", shown(verdict.estimate)))
+    rows.append(("Boundary", shown_number(verdict.boundary)))
+    if not math.isnan(verdict.level):
+        tested = _tested(verdict) or "no interval"
+        levels = f"p {probability(verdict.p)} at a level of {probability(verdict.level)}"
+        rows.append((f"Test at look {verdict.look}", f"{tested}; {levels}"))
+    if verdict.reason:
+        rows.append(("Why", verdict.reason))
+    if verdict.claim in _BESIDE and comparison.is_open:
+        words, number = _BESIDE[verdict.claim]
+        rows.append((words, shown(comparison.numbers[number])))
+    runs = "{} of {} and {} of {}".format(
+        *(verdict.runs[0], comparison.representation),
+        *(verdict.runs[1], group.labels[0].representation),
+    )
+    rows += [("Runs", runs), ("It holds", scope(comparison, verdict, group))]
+    return [*rows, ("Deviations", _deviations(registration))]
+
+
+def scope(comparison: Comparison, verdict: Verdict, group: GroupAnalysis) -> str:
+    """What encoders a verdict speaks of."""
+    if verdict.encoders:
+        return f"for encoders made like these {verdict.encoders}, which are the units of the test"
+    (label,) = (each for each in group.labels if each.representation == comparison.representation)
+    return "for this encoder" if label.encoders == 1 else f"for these {label.encoders} encoders"
+
+
+def _deviations(registration: RegistrationRecord | None) -> str:
+    if registration is None:
+        return "not registered beforehand"
+    return "; ".join(registration["deviations"]) or "none from what was registered"

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +11,25 @@ import numpy as np
 from jbrep.encoders import FULL
 from jbrep.errors import DamageError
 from jbrep.files.typed import read_json, typed
-from jbrep.stats.bootstrap import Array
-from jbrep.stats.comparison import Comparison, adjusted, compare, simultaneous_level
+from jbrep.stats.aggregates import Aggregate, aggregates
+from jbrep.stats.bootstrap import Array, Interval
+from jbrep.stats.comparison import Comparison, compare
 from jbrep.stats.curves import common_grid, final_returns, on_grid
-from jbrep.stats.first_claims import CLAIMS
+from jbrep.stats.intervals import LEVEL
 from jbrep.stats.labels import RepresentationResult, check_names, describe
+from jbrep.stats.means import mean_within
+from jbrep.stats.older import in_version_2, in_version_3
 from jbrep.stats.plain import READERS, to_plain
+from jbrep.stats.rules import Planned
 from jbrep.stats.runs import LARGEST_RETURN, Group, RunCurve, groups
 from jbrep.stats.scale import SOLVED, STEPS_TO, scale_of
-from jbrep.stats.version1 import in_version_2
+from jbrep.stats.verdict import Judge, Statement, Verdict
 
 FORMAT = "jbrep statistics"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
+
+
+References = Mapping[str, Mapping[str, Sequence[float]]]  # returns by task and policy
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +42,11 @@ class GroupAnalysis:
         grid: training steps at which runs are compared, (g,).
         cut: which evaluations the grid leaves out, in words; None if it leaves out none.
         return_floor: the least possible return of the task; NaN if unknown.
+        return_ceiling: the largest possible one; NaN if unknown.
         failure_return: what a failed run counts as from the step of failure on.
         reference: the return that gains are counted from, as in `Scale`.
+        references: mean returns of policies that don't learn, each with its 95 % interval over
+            starts.
         thresholds: the return to reach for each of STEPS_TO; NaN where there is none.
         profile_returns: where performance profiles are evaluated, ascending, (k,).
         labels: results of each representation, the baseline first.
@@ -51,8 +61,10 @@ class GroupAnalysis:
     grid: Array
     cut: str | None
     return_floor: float
+    return_ceiling: float
     failure_return: float
     reference: float
+    references: Mapping[str, Interval]
     thresholds: Mapping[str, float]
     profile_returns: Array
     labels: tuple[RepresentationResult, ...]
@@ -94,8 +106,10 @@ class Analysis:
     Args:
         baseline: the representation that the others are compared with.
         seed: of all resampling.
-        simultaneous_level: of each verdict's interval, so that all hold together at 95 %.
+        claims: that there are verdicts on.
+        notes: how verdicts were reached, in sentences.
         groups: by task and algorithm.
+        aggregates: results across tasks, where an algorithm learned several.
 
     Raises:
         ValueError: parts that don't fit together.
@@ -103,10 +117,15 @@ class Analysis:
 
     baseline: str
     seed: int
-    simultaneous_level: float
+    claims: tuple[Statement, ...]
+    notes: tuple[str, ...]
     groups: tuple[GroupAnalysis, ...]
+    aggregates: tuple[Aggregate, ...]
 
     def __post_init__(self) -> None:
+        claims = [claim.name for claim in self.claims]
+        for comparison in (each for group in self.groups for each in group.comparisons):
+            check_names("claims", [verdict.claim for verdict in comparison.verdicts], claims)
         first = {group.labels[0].representation for group in self.groups}
         if first != {self.baseline}:
             raise ValueError(f"each group must begin with the baseline {self.baseline}")
@@ -133,47 +152,61 @@ class Analysis:
             InputError: it is of a newer jbrep.
         """
         record = read_json(text, path, FORMAT, FORMAT_VERSION)
-        if record["format_version"] == 1:
-            record = in_version_2(record)
         try:
+            if record["format_version"] == 1:
+                record = in_version_2(record)
+            if record["format_version"] < FORMAT_VERSION:
+                record = in_version_3(record)
             analysis: Analysis = typed(record, cls, READERS)
         except ValueError as error:
             raise DamageError(f"{path} is damaged: {error}") from None
+        except (LookupError, TypeError, AttributeError):
+            raise DamageError(f"{path} is damaged: parts of it are missing or misplaced") from None
         return analysis
 
 
 def analyse(
-    runs: Sequence[RunCurve], baseline: str = FULL, seed: int = 0, planned: int = 0
+    runs: Sequence[RunCurve],
+    judge: Judge | None = None,
+    baseline: str = FULL,
+    seed: int = 0,
+    references: References | None = None,
 ) -> Analysis:
     """All numbers and verdicts of a study; they don't depend on the order of its runs.
 
     Args:
         runs: every run of the study.
+        judge: what reaches verdicts; by default there are estimates of each claim alone.
         baseline: the representation that the others are compared with.
         seed: of all resampling.
-        planned: comparisons with the baseline in the whole study. If only a part of its runs is
-            given, the verdicts are still as strict as those of the whole.
+        references: returns of policies that don't learn, by task and policy.
 
     Raises:
         InputError: runs that can't be compared, or would mislead; see jbrep.stats.runs.groups.
     """
-    runs_by_group = groups(runs, baseline)
-    family = len(CLAIMS) * max(planned, sum(len(group) - 1 for group in runs_by_group.values()))
-    analysed = [_analyse_group(group, family, seed) for group in runs_by_group.values()]
-    comparisons = iter(adjusted([c for group in analysed for c in group.comparisons]))
+    judge = judge or Planned()
+    by_group = groups(runs, baseline)
+    verdicts = judge(by_group, seed)
+    analysed = tuple(
+        _analyse_group(group, verdicts[key], (references or {}).get(key[0], {}), seed)
+        for key, group in by_group.items()
+    )
     return Analysis(
         baseline=baseline,
         seed=seed,
-        simultaneous_level=simultaneous_level(family),
-        groups=tuple(
-            replace(group, comparisons=tuple(next(comparisons) for _ in group.comparisons))
-            for group in analysed
-        ),
+        claims=tuple(judge.claims),
+        notes=tuple(judge.notes),
+        groups=analysed,
+        aggregates=tuple(aggregates(_scores(analysed), seed)),
     )
 
 
-def _analyse_group(group: Group, family: int, seed: int) -> GroupAnalysis:
-    """The results of a group; the p-values of its verdicts aren't adjusted yet."""
+def _analyse_group(
+    group: Group,
+    verdicts: Mapping[str, tuple[Verdict, ...]],
+    references: Mapping[str, Sequence[float]],
+    seed: int,
+) -> GroupAnalysis:
     first = next(iter(group.values()))[0]
     grid, cut = common_grid(group)
     curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in group.items()}
@@ -182,17 +215,35 @@ def _analyse_group(group: Group, family: int, seed: int) -> GroupAnalysis:
     baseline, *others = (
         describe(runs, curves[name], finals[name], scale, seed) for name, runs in group.items()
     )
-    compared = (compare(each, baseline, scale.reference, family, seed) for each in others)
     return GroupAnalysis(
         task=first.task,
         algorithm=first.algorithm,
         cut=cut,
         return_floor=_or_nan(first.return_floor),
+        return_ceiling=_or_nan(first.return_ceiling),
         failure_return=_or_nan(first.failure_return),
+        references={
+            policy: mean_within(np.array(returns), first.bounds, LEVEL)
+            for policy, returns in references.items()
+        },
         labels=(baseline, *others),
-        comparisons=tuple(compared),
+        comparisons=tuple(
+            compare(each, baseline, verdicts[each.representation], first.bounds, seed)
+            for each in others
+        ),
         **scale._asdict(),
     )
+
+
+def _scores(groups: Sequence[GroupAnalysis]) -> dict[str, dict[str, dict[str, Array]]]:
+    """What each run gains as a share of the full state's gain: by algorithm, label and task."""
+    scores: dict[str, dict[str, dict[str, Array]]] = {}
+    for group in groups:
+        gain = float(group.labels[0].by_run["final_return"].mean()) - group.reference
+        for label in group.labels if gain > 0 else ():
+            by_task = scores.setdefault(group.algorithm, {}).setdefault(label.representation, {})
+            by_task[group.task] = (label.by_run["final_return"] - group.reference) / gain
+    return scores
 
 
 def _ascend(values: Array) -> bool:

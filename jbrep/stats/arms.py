@@ -7,6 +7,7 @@ import numpy as np
 
 from jbrep.stats.bootstrap import Array
 from jbrep.stats.curves import common_grid, final_returns, on_grid, steps_to
+from jbrep.stats.intervals import LEVEL
 from jbrep.stats.means import Bounds, mean_within
 from jbrep.stats.runs import Group, RunCurve
 from jbrep.stats.scale import reference_of
@@ -14,7 +15,6 @@ from jbrep.stats.scale import reference_of
 FEWEST = 8  # units on either side of a verdict
 _HALF = 0.5  # of the baseline's gain: what a run that learns comes to
 _RESOLUTION = 0.01  # of that gain, of differences between curves
-_LEVEL = 0.95
 
 
 class Frame(NamedTuple):
@@ -88,7 +88,7 @@ def measure(group: Group, seeds: Collection[int]) -> tuple[Frame, dict[str, Arm]
 
 def learns(arm: Arm, frame: Frame) -> bool:
     """Whether runs end above standing still, beyond chance."""
-    return bool(mean_within(arm.final, frame.bounds, _LEVEL).low > frame.still)
+    return bool(mean_within(arm.final, frame.bounds, LEVEL).low > frame.still)
 
 
 def _frame(
@@ -100,12 +100,11 @@ def _frame(
     gain = max(float(of_baseline.mean()) - still, 0.0)
     widths = np.diff(grid)
     weights = (np.append(widths, 0) + np.append(0, widths)) / 2
-    low, high = first.return_floor, first.return_ceiling
     largest = max(float(np.abs(each).max()) for each in finals.values())
     return Frame(
         still=still,
         half=still + _HALF * gain,
-        bounds=Bounds(-np.inf if low is None else low, np.inf if high is None else high),
+        bounds=first.bounds,
         steps=float(grid[-1] - grid[0]),
         weights=weights / weights.sum(),
         resolution=_RESOLUTION * gain or _RESOLUTION * largest or 1.0,

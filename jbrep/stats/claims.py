@@ -10,6 +10,7 @@ from jbrep.stats.arms import Arm, Frame
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.means import Bounds, Part, p_of_sum, sum_within
 from jbrep.stats.spread import Curves, ratio_of_spreads, spread_p
+from jbrep.stats.verdict import Statement
 
 _FURTHEST = 1e3  # shares of a gain that are looked for
 
@@ -18,8 +19,8 @@ class Claim(NamedTuple):
     """A claim that runs on less state, x, support or contradict against those of the baseline, y.
 
     Attributes:
-        name: in a word or two.
-        statement: the claim as a sentence.
+        name: in a few words.
+        statement: the claim as a sentence, with a place for the percentage that may be lost.
         estimand: what is estimated, in words.
         side: 1 if an estimate above the boundary speaks for the claim, -1 if one below does.
         boundary: of the estimate, given the margin.
@@ -34,6 +35,12 @@ class Claim(NamedTuple):
     boundary: Callable[[float], float]
     estimate: Callable[[Arm, Arm, Frame, float, int], Interval]
     p_value: Callable[[Arm, Arm, Frame, float, int], float]
+
+    def in_words(self, margin: float) -> Statement:
+        """What is claimed, given the margin."""
+        percent = f"{100 * (1 - self.boundary(margin)):.3g} %"
+        statement = self.statement.format(percent)
+        return Statement(self.name, statement, self.estimand, self.estimate is spread_ratio)
 
 
 def kept_gain(x: Arm, y: Arm, frame: Frame, level: float, seed: int = 0) -> Interval:
@@ -95,12 +102,22 @@ def _curves(x: Arm, y: Arm, frame: Frame) -> Curves:
     return Curves(x.curves, y.curves, frame.weights, frame.resolution)
 
 
+_KEPT = "gain over standing still, as a share of that on the full state"
 NOT_WORSE = Claim(
     name="not worse",
-    statement="Agents on less state end no worse",
-    estimand="gain over standing still, as a share of that on the full state",
+    statement="Agents on less state lose at most {} of the gain",
+    estimand=_KEPT,
     side=1,
     boundary=lambda margin: 1 - margin,
+    estimate=kept_gain,
+    p_value=_kept_p,
+)
+WITHIN_HALF = Claim(
+    name="within half the margin",
+    statement="They lose at most {} of it",
+    estimand=_KEPT,
+    side=1,
+    boundary=lambda margin: 1 - margin / 2,
     estimate=kept_gain,
     p_value=_kept_p,
 )
@@ -122,4 +139,4 @@ FASTER = Claim(
     estimate=time_lost,
     p_value=_time_p,
 )
-CLAIMS = {claim.name: claim for claim in (NOT_WORSE, LESS_VARIANCE, FASTER)}
+CLAIMS = {claim.name: claim for claim in (NOT_WORSE, LESS_VARIANCE, FASTER, WITHIN_HALF)}

@@ -1,17 +1,17 @@
 """A representation's runs against the baseline's: numbers, and verdicts on the claims."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import levene
 
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.first_claims import CLAIMS, VERDICTS, Claim, decide
-from jbrep.stats.intervals import FEWEST, LEVEL, constant, difference, percentile, variance_ratio
-from jbrep.stats.labels import RepresentationResult, check_names, check_numbers, median
-from jbrep.stats.power import seeds_needed
+from jbrep.stats.intervals import FEWEST, LEVEL, UNDEFINED, constant, percentile, variance_ratio
+from jbrep.stats.labels import RepresentationResult, check_numbers, median
+from jbrep.stats.means import Bounds, Part, sum_within
 from jbrep.stats.scale import STEPS_TO
+from jbrep.stats.verdict import NOT_YET, Verdict
 
 COMPARISON_NUMBERS = (
     "final_return_difference",
@@ -21,52 +21,6 @@ COMPARISON_NUMBERS = (
     "probability_of_improvement",
     *(f"{name}_ratio" for name in STEPS_TO),
 )
-_ERROR = 0.05  # the probability that any of a study's verdicts is wrong
-
-
-def simultaneous_level(family: int) -> float:
-    """The level of each of `family` intervals that hold together at 95 % (Bonferroni)."""
-    return 1 - _ERROR / max(family, 1)
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The verdict of the runs on a claim.
-
-    Args:
-        claim: its name.
-        verdict: supported, contradicted or undecided, by the simultaneous interval, and only where
-            the p-value agrees: if one run in ten fails to learn, Bonett's interval decides between
-            equal variances in 19 % of comparisons of 10 runs at a level of 0.56 %, the permutation
-            test in 0.3 %.
-        boundary: the value that the interval must exclude.
-        nominal: the quantity that the claim is about, with its 95 % interval.
-        simultaneous: the same with an interval of the level that all verdicts of the study share.
-        p: two-sided, of lying on the boundary; NaN where it is undefined.
-        p_holm: adjusted for all verdicts of the study.
-        seeds_needed: runs per representation that would decide an undecided claim, or "> 320";
-            None if it is decided or has a reason.
-        reason: why it is undecided, if not because the interval is too wide.
-
-    Raises:
-        ValueError: an unknown verdict, or several intervals in place of one.
-    """
-
-    claim: str
-    verdict: str
-    boundary: float
-    nominal: Interval
-    simultaneous: Interval
-    p: float
-    p_holm: float
-    seeds_needed: int | str | None
-    reason: str | None
-
-    def __post_init__(self) -> None:
-        if self.verdict not in VERDICTS.values():
-            raise ValueError(f"unknown verdict {self.verdict!r}")
-        if np.ndim(self.nominal.value) or np.ndim(self.simultaneous.value):
-            raise ValueError("nominal and simultaneous must be one interval each")
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +32,10 @@ class Comparison:
         numbers: COMPARISON_NUMBERS, each with its 95 % interval.
         brown_forsythe_p: of equal variances of final returns, as a check of the permutation test;
             NaN where it is undefined.
-        verdicts: one for each of CLAIMS, in that order.
+        verdicts: one for each claim.
 
     Raises:
-        ValueError: numbers or verdicts that are missing or unknown.
+        ValueError: numbers that are missing or unknown.
     """
 
     representation: str
@@ -91,36 +45,38 @@ class Comparison:
 
     def __post_init__(self) -> None:
         check_numbers(self.numbers, COMPARISON_NUMBERS)
-        check_names("claims", [v.claim for v in self.verdicts], [claim.name for claim in CLAIMS])
 
-    def verdict(self, claim: Claim) -> Verdict:
-        """The verdict on a claim."""
-        return next(verdict for verdict in self.verdicts if verdict.claim == claim.name)
+    @property
+    def is_open(self) -> bool:
+        """Whether it may be looked at: it has no claim that waits for the first look."""
+        return all(verdict.verdict != NOT_YET for verdict in self.verdicts)
 
 
 def compare(
     label: RepresentationResult,
     baseline: RepresentationResult,
-    reference: float,
-    family: int,
+    verdicts: tuple[Verdict, ...],
+    bounds: Bounds,
     seed: int,
 ) -> Comparison:
-    """A representation against the baseline; the p-values of its verdicts aren't adjusted yet.
+    """A representation against the baseline.
 
     Args:
         label: of the representation.
         baseline: of the same task and algorithm.
-        reference: the return that gains are counted from.
-        family: the number of verdicts in the study.
+        verdicts: on the claims.
+        bounds: of returns.
         seed: of all resampling.
     """
     final, final_of_baseline = label.by_run["final_return"], baseline.by_run["final_return"]
     numbers = {
-        "final_return_difference": difference(final, final_of_baseline),
-        "mean_return_difference": difference(
-            label.by_run["mean_return"], baseline.by_run["mean_return"]
+        **{
+            f"{name}_difference": _difference(label.by_run[name], baseline.by_run[name], bounds)
+            for name in ("final_return", "mean_return")
+        },
+        "variance_ratio": _unless_few(
+            variance_ratio(final, final_of_baseline), final, final_of_baseline
         ),
-        "variance_ratio": variance_ratio(final, final_of_baseline),
         "variance_ratio_bootstrap": percentile(
             _ratio_of_variances, final, final_of_baseline, seed=seed
         ),
@@ -136,8 +92,16 @@ def compare(
         representation=label.representation,
         numbers=numbers,
         brown_forsythe_p=_brown_forsythe(final, final_of_baseline),
-        verdicts=tuple(_judge(claim, label, baseline, reference, family, seed) for claim in CLAIMS),
+        verdicts=verdicts,
     )
+
+
+def _difference(x: Array, y: Array, bounds: Bounds) -> Interval:
+    return _unless_few(sum_within((Part(1, x), Part(-1, y)), bounds, LEVEL), x, y)
+
+
+def _unless_few(interval: Interval, x: Array, y: Array) -> Interval:
+    return interval if min(len(x), len(y)) >= FEWEST else UNDEFINED._replace(value=interval.value)
 
 
 def probability_of_improvement(x: Array, y: Array) -> Array:
@@ -161,66 +125,3 @@ def _brown_forsythe(x: Array, y: Array) -> float:
     if constant(x) or constant(y) or min(len(x), len(y)) < FEWEST:
         return np.nan
     return float(levene(x, y, center="median").pvalue)
-
-
-def _judge(
-    claim: Claim,
-    label: RepresentationResult,
-    baseline: RepresentationResult,
-    reference: float,
-    family: int,
-    seed: int,
-) -> Verdict:
-    x, y = label.by_run[claim.measure], baseline.by_run[claim.measure]
-    level = simultaneous_level(family)
-    boundary = claim.boundary(y, reference)
-    simultaneous = claim.interval(x, y, level)
-    decided = int(decide(claim, simultaneous, boundary))
-    p = claim.p_value(x, y, float(boundary), seed)
-    reason = _reason(claim, x, y)
-    if not baseline.learned:  # then there is nothing to compare with
-        decided, reason = 0, f"{baseline.representation} didn't learn"
-    elif decided > 0 and label.failed and not claim.allow_failures:
-        decided, reason = 0, "failed runs"
-    elif decided > 0 and not label.learned and not claim.allow_no_learning:
-        decided, reason = 0, f"{label.representation} didn't learn"
-    elif decided and p > 1 - level:
-        decided, reason = 0, "its p-value disagrees"
-    needed = None if decided or reason else seeds_needed(claim, x, y, reference, level, seed)
-    return Verdict(
-        claim=claim.name,
-        verdict=VERDICTS[decided],
-        boundary=float(boundary),
-        nominal=claim.interval(x, y, LEVEL),
-        simultaneous=simultaneous,
-        p=p,
-        p_holm=p,
-        seeds_needed=needed,
-        reason=reason,
-    )
-
-
-def _reason(claim: Claim, x: Array, y: Array) -> str | None:
-    if not np.isnan(claim.interval(x, y, LEVEL).low):
-        return None
-    return "no variance" if constant(x) or constant(y) else "too few runs"
-
-
-def adjusted(comparisons: Sequence[Comparison]) -> list[Comparison]:
-    """The comparisons with the p-values of all their verdicts adjusted together."""
-    p = np.array([verdict.p for c in comparisons for verdict in c.verdicts])
-    p_holm = iter(holm(p).tolist())
-    return [
-        replace(c, verdicts=tuple(replace(v, p_holm=next(p_holm)) for v in c.verdicts))
-        for c in comparisons
-    ]
-
-
-def holm(p: Array) -> Array:
-    """P-values (k,) adjusted for their number (Holm 1979); NaN counts as 1 and stays NaN."""
-    counted = np.where(np.isnan(p), 1, p)
-    order = np.argsort(counted, kind="stable")
-    factors = np.arange(len(p), 0, -1)
-    p_holm = np.empty(len(p))
-    p_holm[order] = np.minimum(np.maximum.accumulate(factors * counted[order]), 1)
-    return np.where(np.isnan(p), np.nan, p_holm)

@@ -50,7 +50,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
-from scipy.stats import norm, trim_mean, ttest_1samp
+from scipy.stats import norm, trim_mean
 
 from jbrep.stats.bootstrap import Array, Interval
 
@@ -58,19 +58,25 @@ LEVEL = 0.95
 RESAMPLES = 2000
 UNDEFINED = Interval(np.nan, np.nan, np.nan)
 _TINY = np.finfo(float).tiny  # against 0 / 0
-FEWEST = 3  # runs for an interval of a variance: with two, Bonett's covers 86 %
+_FEWEST_FOR_RATIOS = 3  # with two runs Bonett's interval of a ratio covers 86 %
+FEWEST = 4  # runs for an interval: three or fewer are better shown as points
 
 
 def percentile(statistic: Callable[..., Array], *samples: Array, seed: int = 0) -> Interval:
     """A statistic with its 95 % percentile interval, from a stratified bootstrap over whole runs.
 
-    Resamples in which the statistic is undefined widen the interval at both ends.
+    Resamples in which the statistic is undefined widen the interval at both ends. Of fewer runs
+    than FEWEST in a sample there is no interval: it is NaN.
 
     Args:
         statistic: maps samples with runs on the last axis, (..., n) each, to values, (...).
         samples: one for each group, (..., n) each; each group is resampled on its own.
         seed: of the resamples.
     """
+    if min(sample.shape[-1] for sample in samples) < FEWEST:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            value = statistic(*samples)
+        return Interval(value, value * np.nan, value * np.nan)
     random = np.random.default_rng(seed)
     drawn = []
     for sample in samples:
@@ -89,14 +95,6 @@ def percentile(statistic: Callable[..., Array], *samples: Array, seed: int = 0) 
 def constant(values: Array) -> NDArray[np.bool_]:
     """Whether values (..., n) differ by no more than rounding, (...)."""
     return np.ptp(values, axis=-1) <= 1e-9 * np.abs(values).max(axis=-1)
-
-
-def mean(values: Array) -> Interval:
-    """The mean of (n,) with Student's 95 % interval, which is NaN where nothing varies."""
-    if constant(values):
-        return Interval(values.mean(), np.nan, np.nan)
-    ends = ttest_1samp(values, 0).confidence_interval(LEVEL)
-    return Interval(values.mean(), ends.low, ends.high)
 
 
 def difference(x: Array, y: Array, level: float = LEVEL) -> Interval:
@@ -128,7 +126,8 @@ def deviation(values: Array) -> Interval:
 
     Bonett 2006, "Approximate confidence interval for standard deviation of nonnormal
     distributions", Computational Statistics & Data Analysis 50: an interval of the log variance,
-    with a kurtosis about a trimmed mean. It is NaN for two runs, and where nothing varies.
+    with a kurtosis about a trimmed mean. It is NaN for fewer runs than FEWEST, and where nothing
+    varies.
     """
     runs, value = len(values), values.std(ddof=1)
     if runs < FEWEST or constant(values):
@@ -151,7 +150,7 @@ def variance_ratio(x: Array, y: Array, level: float = LEVEL) -> Interval:
     """
     n, m = x.shape[-1], y.shape[-1]
     (quartic_x, squares_x), (quartic_y, squares_y) = _moments(x), _moments(y)
-    known = ~constant(x) & ~constant(y) & (min(n, m) >= FEWEST)
+    known = ~constant(x) & ~constant(y) & (min(n, m) >= _FEWEST_FOR_RATIOS)
     with np.errstate(divide="ignore", invalid="ignore"):
         value = (squares_x / (n - 1)) / (squares_y / (m - 1))
         kurtosis = (n + m) * (quartic_x + quartic_y) / (squares_x + squares_y) ** 2

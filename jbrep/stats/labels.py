@@ -8,7 +8,9 @@ from scipy.stats import binomtest, iqr, median_abs_deviation
 
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.curves import Curve, bands, iqm, mean_return, steps_to
-from jbrep.stats.intervals import LEVEL, UNDEFINED, deviation, mean, percentile
+from jbrep.stats.intervals import FEWEST, LEVEL, UNDEFINED, deviation, percentile
+from jbrep.stats.means import Bounds, mean_within
+from jbrep.stats.nested import components
 from jbrep.stats.reliability import TAIL_OF_RUNS, expected_shortfall, fixed_policy, within_runs
 from jbrep.stats.runs import RunCurve
 from jbrep.stats.scale import STEPS_TO, Scale
@@ -22,6 +24,11 @@ WITHIN = (  # of one run
     "policy_dispersion",
     "policy_risk",
 )
+COMPONENTS = {  # of the variance of final returns, where each of several encoders has several runs
+    "encoder_variance": "encoders",
+    "run_variance": "runs",
+    "encoder_variance_ratio": "ratio",
+}
 RUN_NUMBERS = ("final_return", "mean_return", "gain", *STEPS_TO, *WITHIN)
 NUMBERS = (  # of all runs
     *(
@@ -34,6 +41,7 @@ NUMBERS = (  # of all runs
     "risk_across_runs",
     *(name for pair in REACHED.items() for name in pair),
     *WITHIN,
+    *COMPONENTS,
 )
 
 
@@ -46,6 +54,7 @@ class RepresentationResult:
         settings: that all runs share.
         seeds: of the runs, in ascending order.
         failed: seeds of the runs that failed.
+        encoders: how many they have among them.
         curve: over the grid of the group.
         by_run: RUN_NUMBERS, (runs,) each, in the order of seeds.
         numbers: NUMBERS, each with its 95 % interval.
@@ -60,6 +69,7 @@ class RepresentationResult:
     settings: str
     seeds: tuple[int, ...]
     failed: tuple[int, ...]
+    encoders: int
     curve: Curve
     by_run: Mapping[str, Array]
     numbers: Mapping[str, Interval]
@@ -71,12 +81,6 @@ class RepresentationResult:
         lengths = {len(self.seeds), *(len(values) for values in self.by_run.values())}
         if len(lengths) > 1:
             raise ValueError(f"{len(self.seeds)} seeds, but numbers of {sorted(lengths)} runs")
-
-    @property
-    def learned(self) -> bool:
-        """Whether the final return lies above the untrained policy's, beyond chance."""
-        gain = self.numbers["gain"]
-        return bool(gain.value > 0 and not gain.low <= 0)  # low is NaN where nothing varies
 
 
 def check_names(what: str, there: Collection[str], expected: Collection[str]) -> None:
@@ -127,9 +131,10 @@ def describe(
         settings=runs[0].settings,
         seeds=tuple(int(run.seed) for run in runs),
         failed=tuple(int(run.seed) for run in runs if run.failed_at is not None),
+        encoders=len({run.encoder_seed for run in runs}),
         curve=bands(curves, seed),
         by_run=by_run,
-        numbers=_numbers(by_run, seed),
+        numbers={**_numbers(by_run, runs[0].bounds, seed), **_components(runs, final)},
         profile=profile(by_run["final_return"], scale.profile_returns, seed),
     )
 
@@ -140,14 +145,32 @@ def profile(final_return: Array, returns: Array, seed: int) -> Interval:
     return percentile(lambda values: values.mean(axis=-1), above, seed=seed)
 
 
-def _numbers(by_run: Mapping[str, Array], seed: int) -> dict[str, Interval]:
+def _components(runs: list[RunCurve], final: Array) -> dict[str, Interval]:
+    """The variance of encoders and of runs, where each encoder has as many runs, at least two."""
+    by_encoder: dict[int | None, list[float]] = {}
+    for run, each in zip(runs, final.tolist(), strict=True):
+        by_encoder.setdefault(run.encoder_seed, []).append(each)
+    counts = {len(each) for each in by_encoder.values()}
+    if len(by_encoder) < 2 or len(counts) > 1 or counts == {1}:
+        return dict.fromkeys(COMPONENTS, UNDEFINED)
+    found = components(np.array([*by_encoder.values()]))
+    return {name: getattr(found, part) for name, part in COMPONENTS.items()}
+
+
+def _mean(values: Array, bounds: Bounds) -> Interval:
+    if len(values) < FEWEST:
+        return UNDEFINED._replace(value=values.mean())
+    return mean_within(values, bounds, LEVEL)
+
+
+def _numbers(by_run: Mapping[str, Array], bounds: Bounds, seed: int) -> dict[str, Interval]:
     numbers = {}
     for name in ("final_return", "mean_return"):
         values = by_run[name]
-        numbers[f"{name}_mean"] = mean(values)
+        numbers[f"{name}_mean"] = _mean(values, bounds)
         numbers[f"{name}_median"] = percentile(median, values, seed=seed)
         numbers[f"{name}_iqm"] = percentile(iqm, values, seed=seed)
-    numbers["gain"] = mean(by_run["gain"])
+    numbers["gain"] = _mean(by_run["gain"], Bounds())
     final = by_run["final_return"]
     numbers["final_return_sd"] = deviation(final)
     numbers["final_return_iqr"] = percentile(lambda v: iqr(v, axis=-1), final, seed=seed)
@@ -176,5 +199,7 @@ def _share_reached(steps: Array) -> Interval:
     if np.isnan(steps).any():
         return UNDEFINED
     reached = int(np.isfinite(steps).sum())
+    if len(steps) < FEWEST:
+        return UNDEFINED._replace(value=reached / len(steps))
     ends = binomtest(reached, len(steps)).proportion_ci(LEVEL, method="wilson")
     return Interval(reached / len(steps), ends.low, ends.high)

@@ -56,12 +56,21 @@ def mean_within(values: Array, bounds: Bounds, level: float) -> Interval:
 
 
 def sum_within(parts: Sequence[Part], bounds: Bounds, level: float) -> Interval:
-    """The sum of means (...) times their factors, with its interval, (...)."""
-    each = [(part.factor, mean_within(part.values, bounds, level)) for part in parts]
+    """The sum of means (...) times their factors, with its interval, (...).
+
+    What doesn't vary adds nothing to the interval, which is NaN where nothing varies.
+    """
+    each = [(part.factor, _known(mean_within(part.values, bounds, level))) for part in parts]
     value = sum(factor * mean.value for factor, mean in each)
     downwards = sum((f * (m.value - (m.low if f > 0 else m.high))) ** 2 for f, m in each)
     upwards = sum((f * (m.value - (m.high if f > 0 else m.low))) ** 2 for f, m in each)
-    return Interval(value, value - np.sqrt(downwards), value + np.sqrt(upwards))
+    low, high = value - np.sqrt(downwards), value + np.sqrt(upwards)
+    return Interval(value, *(np.where(low < high, end, np.nan) for end in (low, high)))
+
+
+def _known(mean: Interval) -> Interval:
+    """Without width where the interval isn't known."""
+    return Interval(mean.value, *(np.where(np.isnan(e), mean.value, e) for e in mean[1:]))
 
 
 def p_of_sum(parts: Sequence[Part], bounds: Bounds, boundary: float) -> float:

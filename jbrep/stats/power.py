@@ -1,52 +1,126 @@
-"""How many seeds would decide an undecided claim, if the observed effect is the true one."""
+"""What a study could find, before its first run: least p-values, and power at given effects."""
+
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from math import comb
+from typing import NamedTuple
 
 import numpy as np
 
-from jbrep.stats.bootstrap import Array
-from jbrep.stats.first_claims import Claim, decide
+from jbrep.stats.arms import FEWEST
+from jbrep.stats.claims import CLAIMS, FASTER, LESS_VARIANCE, NOT_WORSE, WITHIN_HALF
+from jbrep.stats.looks import levels
+from jbrep.stats.means import Bounds, Part, sum_within
+from jbrep.stats.rules import ERROR, Planned, Rules, most_failing
+from jbrep.stats.spread import PERMUTATIONS, Curves, spread_p
 
-SEEDS = (5, 10, 20, 40, 80, 160, 320)
-POWER = 0.8
-_STUDIES = 1000
+EFFECTS = (
+    f"Power of {NOT_WORSE.name!r} and {WITHIN_HALF.name!r}: if agents keep all of the gain, and "
+    "final returns of runs have an SD of 5, 10 or 20 % of it, on either side. Of "
+    f"{LESS_VARIANCE.name!r}: if the spread of curves is 1/2, 1/3 or 1/5 of the full agents'. Of "
+    f"{FASTER.name!r}: if half of the gain comes earlier by a tenth of training, and the time "
+    "varies by an SD of 5, 10 or 20 % of training."
+)
+_SDS = (0.05, 0.1, 0.2)
+_RATIOS = (1 / 2, 1 / 3, 1 / 5)
+_EARLIER = 0.1
+_STUDIES = 2000
+_STUDIES_OF_CURVES = 200
+_LEAST_PERMUTATIONS = 999
 
 
-def seeds_needed(
-    claim: Claim, x: Array, y: Array, reference: float, level: float, seed: int = 0
-) -> int | str:
-    """The fewest seeds per representation with which four of five simulated studies are decided.
+class Arms(NamedTuple):
+    """How many runs are planned of a representation and of the baseline.
 
-    The rule and the interval are those of the verdict; of the p-value only its smallest possible
-    value is taken into account, so variances may need somewhat more. A simulated study draws the
-    runs of both groups from the runs given.
+    Attributes:
+        runs: of the representation.
+        units: its encoders, if they are the units of tests, else its runs.
+        baseline: runs of the full observation.
+    """
+
+    runs: int
+    units: int
+    baseline: int
+
+
+class Prospect(NamedTuple):
+    """What can be found of a claim in a primary cell."""
+
+    cell: str
+    claim: str
+    arms: Arms
+    level: float  # of the test at the last look, if no other cell passes on its level
+    least_p: float
+    power: tuple[float, ...]  # at EFFECTS
+
+
+def obstacle(rules: Rules, claim: str, arms: Arms) -> str | None:
+    """Why no outcome of a study could support a claim; None if one could."""
+    fewest = min(arms.units, arms.baseline)
+    if fewest < FEWEST:
+        return f"a side has {fewest} runs or encoders, and verdicts take {FEWEST}"
+    if _least_p(claim, arms) > _level(Planned(rules, (*range(arms.runs),))):
+        return f"its least p-value is {_least_p(claim, arms):.2g}, above its level"
+    most = most_failing(0, arms.runs)
+    if most > rules.failing:
+        return (
+            f"even if all {arms.runs} runs learn, up to {100 * most:.0f} % may fail, and the limit "
+            f"is {100 * rules.failing:.0f} %; plan more runs, or set verdicts.failing"
+        )
+    return None
+
+
+def prospects(planned: Planned, arms: Mapping[str, Arms]) -> Iterator[Prospect]:
+    """What can be found of each claim in each primary cell.
 
     Args:
-        claim: to be decided.
-        x: a value for each run of the representation, (n,).
-        y: a value for each run of the baseline, (m,).
-        reference: the return that gains are counted from.
-        level: of the interval.
-        seed: of the simulated studies.
+        planned: the rules and seeds of a study.
+        arms: of each primary cell.
     """
-    for count in SEEDS:
-        if claim.least_p(count) > 1 - level:
-            continue
-        random = np.random.default_rng(seed)
-        ours, theirs = _draw(x, count, random), _draw(y, count, random)
-        boundary = claim.boundary(theirs, reference)
-        decided = decide(claim, claim.interval(ours, theirs, level), boundary)
-        if np.mean(decided != 0) >= POWER:
-            return count
-    return f"> {SEEDS[-1]}"
+    level = _level(planned)
+    for cell in planned.rules.primary:
+        for claim in planned.rules.claims:
+            least = _least_p(claim, arms[cell])
+            power = _power(claim, planned.rules.margin, arms[cell], level)
+            yield Prospect(cell, claim, arms[cell], level, least, power)
 
 
-def _draw(values: Array, count: int, random: np.random.Generator) -> Array:
-    """Studies with `count` runs each, (studies, count), drawn with replacement.
+def _level(planned: Planned) -> float:
+    return levels(planned.looks, ERROR / max(1, len(planned.rules.primary)))[-1]
 
-    The variance of the draws is (n - 1) / n of the runs' variance, so the draws are stretched about
-    the mean to make up for it. A few runs don't show the tails of their distribution, which makes
-    the result for variances rough: mostly within one step of SEEDS for normal returns, and blind to
-    outliers that haven't occurred.
-    """
-    runs, mean = len(values), values.mean()
-    stretched = mean + (values - mean) * np.sqrt(runs / (runs - 1))
-    return stretched[random.integers(0, runs, (_STUDIES, count))]
+
+def _least_p(claim: str, arms: Arms) -> float:
+    """Of a permutation of n and m curves; that of a mean can be any."""
+    if claim != LESS_VARIANCE.name:
+        return 0.0
+    splits = comb(arms.units + arms.baseline, arms.units)
+    return max(1 / (PERMUTATIONS + 1), (1 + (arms.units == arms.baseline)) / splits)
+
+
+@lru_cache(256)
+def _power(claim: str, margin: float, arms: Arms, level: float) -> tuple[float, ...]:
+    if claim == LESS_VARIANCE.name:
+        return tuple(_power_of_spread(ratio, arms, level) for ratio in _RATIOS)
+    boundary = CLAIMS[claim].boundary(margin)
+    share, effect = (1.0, _EARLIER) if claim == FASTER.name else (boundary, 1 - boundary)
+    return tuple(_power_of_means(sd, share, effect, arms, level) for sd in _SDS)
+
+
+def _power_of_means(sd: float, share: float, effect: float, arms: Arms, level: float) -> float:
+    """How often the interval of mean(x) - share mean(y), which is the effect, lies above 0."""
+    random = np.random.default_rng(0)
+    x = random.normal(effect, sd, (_STUDIES, arms.units))
+    y = random.normal(0, sd, (_STUDIES, arms.baseline))
+    _, low, _ = sum_within((Part(1, x), Part(-share, y)), Bounds(), 1 - level)
+    return float(np.mean(low > 0))
+
+
+def _power_of_spread(ratio: float, arms: Arms, level: float) -> float:
+    """How often the permutation test finds curves closer together by a ratio."""
+    random = np.random.default_rng(0)
+    count = max(_LEAST_PERMUTATIONS, min(PERMUTATIONS, int(5 / level)))
+    found = 0
+    for seed in range(_STUDIES_OF_CURVES):
+        x, y = (random.normal(0, sd, (n, 1)) for sd, n in ((ratio, arms.units), (1, arms.baseline)))
+        found += spread_p(Curves(x, y, np.ones(1), 0.01), seed, count) <= level
+    return found / _STUDIES_OF_CURVES

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError
 from jbrep.stats.bootstrap import Array
+from jbrep.stats.means import Bounds
 
 LARGEST_RETURN = 1e15  # of either sign: beyond, a number has diverged
 _ROUNDING = 1e-6  # of returns, relative to the largest
@@ -125,6 +126,12 @@ class RunCurve:
                 f"it was evaluated at steps {steps[0]} to {steps[-1]}",
                 f"they must be within its total_steps, {self.total_steps}",
             )
+
+    @property
+    def bounds(self) -> Bounds:
+        """Of the returns of the task."""
+        low, high = self.return_floor, self.return_ceiling
+        return Bounds(-np.inf if low is None else low, np.inf if high is None else high)
 
     @property
     def evaluations(self) -> list[Array]:

@@ -62,12 +62,12 @@ def ratio_of_spreads(curves: Curves, level: float, seed: int) -> Interval:
     return Interval(*(float(np.exp(each)) for each in (value, *kept)))
 
 
-def spread_p(curves: Curves, seed: int) -> float:
+def spread_p(curves: Curves, seed: int, permutations: int = PERMUTATIONS) -> float:
     """P-value of equal spreads: whole curves are permuted after taking off their group's median.
 
     Two-sided (Phipson and Smyth 2010: the curves as they are count as one permutation).
     """
-    return _p(curves, 0.0, _permuted(curves, PERMUTATIONS, seed))
+    return _p(curves, 0.0, _permuted(curves, permutations, seed))
 
 
 def _shrunk(curves: Curves, log_ratio: float) -> tuple[Array, Array]:

@@ -2,32 +2,34 @@
 
 import math
 import textwrap
+from collections.abc import Sequence
 
 import numpy as np
 
+from jbrep.stats.aggregates import Aggregate
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.first_claims import LESS_VARIANCE, MARGIN
-from jbrep.stats.labels import REACHED, RepresentationResult
+from jbrep.stats.labels import COMPONENTS, REACHED, RepresentationResult
 from jbrep.stats.scale import STEPS_TO
 from jbrep.text import SIGNIFICANT, interval, number, table
 
 Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]  # a header, and the rows below it
+STILL = "standing still"  # among policies that don't learn
 _KEY = "representation"
 _MOST_DIGITS = 9  # after the point
 
 
 def statistics_text(analysis: Analysis, width: int | None = None) -> str:
-    """All tables of an analysis, by task and algorithm.
+    """All tables of an analysis: by task and algorithm, then across tasks.
 
     Args:
         analysis: of a study.
         width: that tables must fit, in columns; None for tables of any width.
     """
+    tables = [each for group in analysis.groups for each in group_tables(group, analysis)]
     parts = (
         part
-        for group in analysis.groups
-        for title, (header, rows) in group_tables(group, analysis)
+        for title, (header, rows) in (*tables, *across_tasks(analysis))
         for part in (_wrapped(title, width), table(header, rows, width))
     )
     return "\n\n".join(parts)
@@ -38,7 +40,7 @@ def _wrapped(title: str, width: int | None) -> str:
 
 
 def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[tuple[str, Rows]]:
-    """Up to four tables, each with a title."""
+    """Up to five tables, each with a title."""
     runs = sum(len(label.seeds) for label in group.labels)
     cut = f"; the comparison {group.cut}" if group.cut else ""
     tables = [
@@ -52,33 +54,63 @@ def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[tuple[str, Ro
             spread_rows(group),
         ),
     ]
+    if any(label.encoders > 1 for label in group.labels):
+        tables.append(("Variance of final returns: of encoders and of runs", component_rows(group)))
+    if any(comparison.is_open for comparison in group.comparisons):
+        tables.append((f"Compared with {analysis.baseline}", comparison_rows(group)))
     if group.comparisons:
-        level = f"{100 * analysis.simultaneous_level:.2f} %"
-        tables += [
-            (f"Compared with {analysis.baseline}", comparison_rows(group)),
-            (
-                f"Verdicts, by intervals at {level}, which hold together at 95 %; seeds: the "
-                f"number per representation that would decide. {margin(group)}",
-                verdict_rows(group),
-            ),
-        ]
+        from_where = f"Gains are counted from {reference_words(group)}."
+        tables.append((f"Verdicts. {' '.join((*analysis.notes, from_where))}", verdict_rows(group)))
     return tables
 
 
-def margin(group: GroupAnalysis) -> str:
-    """The margin of the claim of similar reward, in a line."""
-    known = not math.isnan(group.return_floor)
-    what = "the least possible return" if known else "the mean return of its untrained policies"
-    return (
-        f"Similar reward: a loss of up to {100 * MARGIN:.0f} % of the gain of "
-        f"{group.labels[0].representation} over {what}, {shown_number(group.reference)}"
-    )
+def across_tasks(analysis: Analysis) -> list[tuple[str, Rows]]:
+    """A table for each algorithm that learned several tasks, with a title."""
+    header = (_KEY, "runs", "IQM", "optimality gap")
+    return [
+        (
+            f"{algorithm} across {len(first.tasks)} tasks: gains over standing still as shares of "
+            f"that on {analysis.baseline}; 95 % intervals over runs within tasks",
+            (
+                header,
+                [
+                    (
+                        each.representation,
+                        f"{each.runs} of each",
+                        shown(each.iqm, ".2f"),
+                        shown(each.optimality_gap, ".2f"),
+                    )
+                    for each in (first, *others)
+                ],
+            ),
+        )
+        for algorithm, (first, *others) in _by_algorithm(analysis.aggregates).items()
+    ]
+
+
+def _by_algorithm(aggregates: Sequence[Aggregate]) -> dict[str, list[Aggregate]]:
+    found: dict[str, list[Aggregate]] = {}
+    for each in aggregates:
+        found.setdefault(each.algorithm, []).append(each)
+    return found
+
+
+def reference_words(group: GroupAnalysis) -> str:
+    """What gains are counted from."""
+    if STILL in group.references:
+        what = "what standing still returns"
+    elif not math.isnan(group.return_floor):
+        what = "the least possible return"
+    else:
+        what = "the mean return of untrained policies"
+    return f"{what}, {shown_number(group.reference)}"
 
 
 def label_rows(group: GroupAnalysis) -> Rows:
-    """A row for each representation; after the steps, how many of its runs reached the return.
+    """A row for each representation, then for each policy that doesn't learn.
 
-    Steps to a return that isn't known are left out.
+    After the steps there is how many runs reached the return; steps to a return that isn't known
+    are left out.
     """
     solved = [] if math.isnan(group.solved) else [f"to solved ({group.solved:,g})"]
     header = (
@@ -86,7 +118,7 @@ def label_rows(group: GroupAnalysis) -> Rows:
         *("steps to 50 %", "to 90 %", *solved),
     )
     form = _form(group)
-    return header, [
+    rows = [
         (
             label.representation,
             str(len(label.seeds)),
@@ -98,6 +130,11 @@ def label_rows(group: GroupAnalysis) -> Rows:
         )
         for label in group.labels
     ]
+    references = [
+        (policy, "-", "-", shown(each, form), *["-"] * (4 + len(solved)))
+        for policy, each in group.references.items()
+    ]
+    return header, [*rows, *references]
 
 
 def _form(group: GroupAnalysis, more: int = 0) -> str:
@@ -121,6 +158,19 @@ def spread_rows(group: GroupAnalysis) -> Rows:
     ]
 
 
+def component_rows(group: GroupAnalysis) -> Rows:
+    """A row for each representation of several encoders."""
+    return (_KEY, "encoders", "their variance", "variance of runs", "ratio"), [
+        (
+            label.representation,
+            str(label.encoders),
+            *(shown(label.numbers[name]) for name in COMPONENTS),
+        )
+        for label in group.labels
+        if label.encoders > 1
+    ]
+
+
 def _steps(label: RepresentationResult, name: str) -> str:
     steps = shown_number(label.numbers[name].value, ",.0f")
     reached, runs = label.numbers[REACHED[name]].value, len(label.seeds)
@@ -128,10 +178,10 @@ def _steps(label: RepresentationResult, name: str) -> str:
 
 
 def comparison_rows(group: GroupAnalysis) -> Rows:
-    """A row for each comparison with the baseline."""
+    """A row for each comparison with the baseline, but for those that wait for a look."""
     header = (
         *(_KEY, "final return", "mean return", "P(improvement)", "variance ratio"),
-        *("by bootstrap", "permutation p", "Brown-Forsythe p"),
+        *("by bootstrap", "Brown-Forsythe p"),
     )
     form = _form(group)
     return header, [
@@ -142,25 +192,25 @@ def comparison_rows(group: GroupAnalysis) -> Rows:
             shown(comparison.numbers["probability_of_improvement"], ".2f"),
             shown(comparison.numbers["variance_ratio"]),
             shown(comparison.numbers["variance_ratio_bootstrap"]),
-            _probability(comparison.verdict(LESS_VARIANCE).p),
-            _probability(comparison.brown_forsythe_p),
+            probability(comparison.brown_forsythe_p),
         )
         for comparison in group.comparisons
+        if comparison.is_open
     ]
 
 
 def verdict_rows(group: GroupAnalysis) -> Rows:
-    """A row for each verdict, with the interval that decides and the bound it must exclude."""
-    header = ("representation: claim", "verdict", "interval", "bound", "p", "Holm's p", "seeds")
+    """A row for each verdict, with the interval that decides and the boundary."""
+    header = ("representation: claim", "verdict", "estimate", "boundary", "p", "level", "runs")
     return header, [
         (
             f"{comparison.representation}: {verdict.claim}",
             verdict.verdict + (f" ({verdict.reason})" if verdict.reason else ""),
-            shown(verdict.simultaneous),
+            shown(verdict.estimate if math.isnan(verdict.level) else verdict.interval),
             shown_number(verdict.boundary),
-            _probability(verdict.p),
-            _probability(verdict.p_holm),
-            "-" if verdict.seeds_needed is None else str(verdict.seeds_needed),
+            probability(verdict.p),
+            probability(verdict.level),
+            " and ".join(map(str, verdict.runs)),
         )
         for comparison in group.comparisons
         for verdict in comparison.verdicts
@@ -177,7 +227,8 @@ def shown_number(value: float, form: str = SIGNIFICANT) -> str:
     return number(value if math.isfinite(value) else None, form)
 
 
-def _probability(p: float) -> str:
+def probability(p: float) -> str:
+    """A probability to three digits; a dash where there is none."""
     if math.isnan(p):
         return "-"
     return "<0.001" if p < 0.001 else f"{p:.3f}"

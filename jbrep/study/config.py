@@ -4,6 +4,7 @@ import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, get_origin
 
@@ -16,7 +17,16 @@ from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl.learner import Learner
 from jbrep.rl.names import CPU, FLOAT32
 from jbrep.rl.run import Run
-from jbrep.study.representations import ByName, Given, name_of, read_representation
+from jbrep.stats.arms import FEWEST
+from jbrep.stats.power import Arms, obstacle
+from jbrep.stats.rules import Rules
+from jbrep.study.representations import (
+    ByName,
+    Given,
+    Representation,
+    name_of,
+    read_representation,
+)
 from jbrep.text import slug
 
 _MAX_BYTES = 1 << 20
@@ -28,6 +38,7 @@ _RUN_SETTINGS = (
 _ITEMS: dict[Any, tuple[type, ...]] = {  # of lists, by the type of the field
     tuple[str, ...]: (str,),
     tuple[int, ...]: (int,),
+    tuple[float, ...]: (float, int),
     tuple[Given, ...]: (str, dict),
 }
 _ANY_TASK = TASKS["face_direction"].describe()
@@ -66,6 +77,7 @@ class Study:
     training: Mapping[str, Any] = field(default_factory=dict)  # of encoders, other than the usual
     learners: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # with own settings
     evaluations: tuple[str, ...] = ()  # folders from jbrep evaluate; {task} is each task's name
+    verdicts: Mapping[str, Any] = field(default_factory=dict)  # arguments of Rules
 
     def __post_init__(self) -> None:
         for name in ("tasks", "algorithms", "representations", "seeds"):
@@ -77,8 +89,7 @@ class Study:
         for algorithm in self.algorithms:
             settings = self.learner(algorithm).run_settings
             Run(task=_ANY_TASK, **settings, **self.run_settings).check_trainer()
-        for given in self.representations:
-            representation = read_representation(given, self.training)
+        for given, representation in zip(self.representations, self.observed, strict=True):
             if isinstance(representation, ByName) and not (isinstance(given, str) or self.data):
                 raise InputError(
                     f"representation {representation.name} is trained by the study, on the states "
@@ -90,6 +101,7 @@ class Study:
             raise InputError("data must have either steps, to collect, or the folder of a data set")
         if self.training and not self.data:
             raise InputError("training is for encoders made by the study: [data] is missing")
+        self._check_verdicts()
 
     def learner(self, name: str) -> Learner:
         """The learner of that name: a preset, or one with settings of its own.
@@ -126,6 +138,49 @@ class Study:
                 "numbers, true or false, lists or tables"
             ) from None
 
+    def _check_verdicts(self) -> None:
+        """Check that what is to be decided is there, and that the runs could decide it."""
+        cells = {
+            "/".join((task, algorithm, name)): each
+            for task in self.tasks
+            for algorithm in self.algorithms
+            for name, each in ((each.name, each) for each in self.observed)
+            if name != FULL
+        }
+        for cell in self.rules.primary:
+            if cell not in cells or not self.comparisons:
+                raise InputError(
+                    f"verdicts.primary has {cell}: it must be of TASK/ALGORITHM/REPRESENTATION of "
+                    f"this study, compared with {FULL}"
+                )
+            for claim in self.rules.claims:
+                if reason := obstacle(self.rules, claim, self.arms(cells[cell])):
+                    raise InputError(
+                        f"verdicts: no outcome could support {claim!r} of {cell}: {reason}"
+                    )
+        for each in self.observed:
+            counts = each.shares(self.seeds)
+            if min(counts) < 2 and len(set(counts)) > 1:
+                raise InputError(
+                    f"{each.name} has {each.encoders} encoders for {len(self.seeds)} seeds: each "
+                    "encoder must have as many runs, or at least two"
+                )
+
+    def arms(self, representation: Representation) -> Arms:
+        """How many runs are planned of a representation, and of the full observation."""
+        runs, encoders = len(self.seeds), len(representation.shares(self.seeds))
+        return Arms(runs, encoders if encoders >= FEWEST else runs, runs)
+
+    @cached_property
+    def rules(self) -> Rules:
+        """How verdicts are reached."""
+        return Rules(**_checked(Rules, dict(self.verdicts), "verdicts."))
+
+    @cached_property
+    def observed(self) -> tuple[Representation, ...]:
+        """What agents observe."""
+        return tuple(read_representation(each, self.training) for each in self.representations)
+
     @property
     def run_settings(self) -> dict[str, Any]:
         """The settings of a Run that all runs share."""
@@ -144,13 +199,18 @@ class Study:
         lines = [
             f"The seeds, {len(self.seeds)} in number, share the {each.encoders} encoders of "
             f"{each.name} unevenly."
-            for given in self.representations
-            if not (each := read_representation(given, self.training)).is_even(self.seeds)
+            for each in self.observed
+            if len(set(each.shares(self.seeds))) > 1
         ]
         if not self.comparisons:
             lines.append(
                 f"This study compares nothing: representations must have {FULL} and at least one "
                 "other."
+            )
+        elif not self.rules.primary:
+            lines.append(
+                "This study is exploratory: its report will give no verdicts, as its file names no "
+                "cell in verdicts.primary."
             )
         return lines
 
@@ -222,9 +282,9 @@ def _typed(kind: Any, value: Any, name: str) -> Any:
             words = " and ".join(each.__name__ for each in inner)
             raise InputError(f"{name} is {value!r}: it must be a list of {words}{number}")
         return tuple(items)
-    scalar = {int: int, int | None: int, str: str}.get(kind)
-    if scalar and type(value) is not scalar:
-        raise InputError(f"{name} is {value!r}: it must be of type {scalar.__name__}")
+    scalar = {int: (int,), int | None: (int,), str: (str,), float: (float, int)}.get(kind)
+    if scalar and type(value) not in scalar:
+        raise InputError(f"{name} is {value!r}: it must be of type {scalar[0].__name__}")
     if get_origin(kind) is Mapping and not isinstance(value, dict):
         raise InputError(f"{name} is {value!r}: it must be a table")
     if name == "learners" and (bad := [n for n, each in value.items() if type(each) is not dict]):

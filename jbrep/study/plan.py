@@ -16,9 +16,10 @@ from jbrep.rl.files import RUN
 from jbrep.rl.learner import Learner
 from jbrep.rl.names import SB3, usual_trainer
 from jbrep.rl.run import plain
+from jbrep.stats.rules import Planned
 from jbrep.study.config import Study, as_study
 from jbrep.study.registration import Registration, check_registered, read_registration
-from jbrep.study.representations import Representation, read_representation
+from jbrep.study.representations import Representation
 from jbrep.study.work import Assigned
 from jbrep.text import slug
 from jbrep.training.trainer import get_device
@@ -36,6 +37,11 @@ class Cell:
     learner: Learner
     representation: Representation
     seed: int
+
+    @property
+    def label(self) -> str:
+        """What it shares with the runs of other seeds: TASK/ALGORITHM/REPRESENTATION."""
+        return f"{self.task}/{self.learner.name}/{self.representation.name}"
 
     @property
     def name(self) -> str:
@@ -59,8 +65,7 @@ class Plan:
     @cached_property
     def representations(self) -> tuple[Representation, ...]:
         """What agents observe."""
-        study = self.study
-        return tuple(read_representation(each, study.training) for each in study.representations)
+        return self.study.observed
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
@@ -78,6 +83,12 @@ class Plan:
     def registration(self) -> Registration | None:
         """What was written down before the first run; None if nothing was."""
         return read_registration(self.folder)
+
+    @property
+    def judge(self) -> Planned:
+        """What reaches verdicts: the study's rules, on the seeds that were registered, if any."""
+        seeds = self.registration["study"]["seeds"] if self.registration else self.study.seeds
+        return Planned(self.study.rules, tuple(seeds))
 
     def trainer(self, cell: Cell) -> str:
         """What trains a run."""

@@ -15,7 +15,8 @@ REFERENCE_RETURNS = "references.csv"
 STILL, RANDOM, HAND_WRITTEN = "standing still", "random", "hand-written"
 _POLICIES = {STILL: "still", RANDOM: "uniform", HAND_WRITTEN: "heuristic"}
 _COLUMNS = ("task", "policy", "episode", "return")
-_Row = tuple[str, str, int, str]
+_Row = tuple[str, str, int, float]
+References = dict[str, dict[str, list[float]]]  # returns by task and policy
 
 
 def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | None:
@@ -47,11 +48,19 @@ def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | 
     return path
 
 
+def read_references(folder: Path) -> References:
+    """What `write_references` wrote; nothing if there is no such file, or something else."""
+    found: References = {}
+    for task, policy, _, each in _rows(folder / REFERENCE_RETURNS):
+        found.setdefault(task, {}).setdefault(policy, []).append(each)
+    return found
+
+
 def _rows(path: Path) -> list[_Row]:
     """What the file has; nothing if there is none, or something else."""
     with suppress(OSError, ValueError):
         _, *rows = csv.reader(path.read_text().splitlines())
-        return [(task, policy, int(episode), each) for task, policy, episode, each in rows]
+        return [(task, policy, int(episode), float(each)) for task, policy, episode, each in rows]
     return []
 
 
@@ -66,4 +75,4 @@ def _played(task: Task, policy: str, episodes: int) -> list[_Row]:
         returns = find_player(_POLICIES[policy], task).returns(episodes)
     except InputError:  # reports don't need the environments
         return []
-    return [(task.name, policy, i, f"{each:.3f}") for i, each in enumerate(returns)]
+    return [(task.name, policy, i, round(float(each), 3)) for i, each in enumerate(returns)]

@@ -61,10 +61,10 @@ class Representation(ABC):
         """Which of several encoders a run with that seed has; None if there is one."""
         return None if self.encoders is None else seed % self.encoders
 
-    def is_even(self, seeds: Iterable[int]) -> bool:
-        """Whether each of its encoders serves as many of the runs with these seeds."""
-        counts = Counter(map(self.number, seeds))
-        return self.encoders is None or len({counts[i] for i in range(self.encoders)}) == 1
+    def shares(self, seeds: Iterable[int]) -> list[int]:
+        """How many of the runs with these seeds each of its encoders serves."""
+        counts = Counter(self.settings(seed).get("encoder_seed") for seed in seeds)
+        return [counts[i] for i in range(self.encoders)] if self.encoders else [*counts.values()]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,9 +16,11 @@ from jbrep.files.storage import exists, write_whole
 from jbrep.files.tables import write_csv
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
+from jbrep.stats.rules import Planned
+from jbrep.stats.verdict import Judge
 from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.record import RECORD, as_json, learner, record, shared_settings
-from jbrep.study.references import write_references
+from jbrep.study.references import STILL, References, read_references, write_references
 from jbrep.text import rounded, table
 
 RETURNS = "returns.csv"
@@ -35,12 +37,15 @@ class Results(NamedTuple):
     left_out: list[str]  # what there are no statistics of, and why
 
 
-def conclude(folder: Path, across_trainers: bool = False) -> tuple[Results, list[Path]]:
+def conclude(
+    folder: Path, across_trainers: bool = False, judge: Judge | None = None
+) -> tuple[Results, list[Path]]:
     """Write the tables of the runs below a folder, of a study or not, as far as they have ended.
 
     Args:
         folder: with the runs.
         across_trainers: compare runs of different trainers, too.
+        judge: what reaches verdicts; by default the rules of the study.
 
     Returns:
         The results and the files: every return, what was run, the statistics if there are any, and
@@ -49,29 +54,33 @@ def conclude(folder: Path, across_trainers: bool = False) -> tuple[Results, list
     Raises:
         InputError: as `read_results` and `write_results`.
     """
-    results = read_results(folder, across_trainers)
+    references = write_references(_tasks(_folders(folder, read_plan(folder))), folder)
+    results = read_results(folder, across_trainers, judge)
     paths = write_results(results, folder)
-    references = write_references(_tasks(results.folders), folder)
     return results, [*paths, references] if references else paths
 
 
-def read_results(folder: Path, across_trainers: bool = False) -> Results:
+def read_results(
+    folder: Path, across_trainers: bool = False, judge: Judge | None = None
+) -> Results:
     """The runs below a folder that have finished or failed, with statistics if they allow any.
 
     Args:
         folder: with the runs.
         across_trainers: compare runs of different trainers, too.
+        judge: what reaches verdicts; by default the rules of the study.
 
     Raises:
         InputError: there is no such run, or a file is damaged.
     """
     plan = read_plan(folder)
     folders = _folders(folder, plan)
-    runs = [_curve(each, across_trainers) for each in folders]
+    references = read_references(folder)
+    runs = [_curve(each, references, across_trainers) for each in folders]
     compared, left_out = _comparable(runs)
-    planned = plan.study.comparisons if plan else 0
+    judge = judge or (plan.judge if plan else Planned())
     try:
-        analysis = analyse(compared, planned=planned) if compared else None
+        analysis = analyse(compared, judge, references=references) if compared else None
         return Results(folders, runs, analysis, left_out)
     except InputError as error:
         return Results(folders, runs, None, [*left_out, str(error)])
@@ -83,7 +92,8 @@ def read_runs(folder: Path) -> list[RunCurve]:
     Raises:
         InputError: there is none, or a file of one is damaged.
     """
-    return [_curve(each) for each in _folders(folder, read_plan(folder))]
+    references = read_references(folder)
+    return [_curve(each, references) for each in _folders(folder, read_plan(folder))]
 
 
 def has_runs(folder: Path) -> bool:
@@ -131,7 +141,7 @@ def _task(run: Mapping[str, Any]) -> Task:
     return read_task(run["settings"]["environment"])
 
 
-def _curve(folder: Path, across_trainers: bool = False) -> RunCurve:
+def _curve(folder: Path, references: References, across_trainers: bool = False) -> RunCurve:
     run = read_run(folder)
     task = _task(run)
     settings = shared_settings(run["settings"])
@@ -139,6 +149,7 @@ def _curve(folder: Path, across_trainers: bool = False) -> RunCurve:
     evaluations = read_evaluations(folder)
     steps = sorted({each.step for each in evaluations})
     returns = [[e.episode_return for e in evaluations if e.step == step] for step in steps]
+    still = references.get(task.name, {}).get(STILL)
     episodes = min(map(len, returns), default=0)  # the last evaluation may have more
     return RunCurve(
         task=task.name,
@@ -151,9 +162,12 @@ def _curve(folder: Path, across_trainers: bool = False) -> RunCurve:
         total_steps=max(run["steps"], settings["steps"]),
         failed_at=run["steps"] if run["status"] == FAILED else None,
         return_floor=task.return_floor,
+        return_ceiling=task.return_ceiling,
+        still=float(np.mean(still)) if still else None,
         solved=task.solved_return,
         trainer="" if across_trainers else " ".join(trainer),
         final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,
+        encoder_seed=run["settings"]["encoder_seed"],
     )
 
 

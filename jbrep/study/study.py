@@ -11,6 +11,8 @@ from jbrep.files.lock import exclusive
 from jbrep.rl import Run
 from jbrep.rl.job import Job
 from jbrep.rl.speed import estimate
+from jbrep.stats.power import EFFECTS, prospects
+from jbrep.stats.summary import probability
 from jbrep.study.packing import Pack, packed, until_done
 from jbrep.study.plan import Plan
 from jbrep.study.prepare import check, prepare
@@ -104,7 +106,32 @@ def dry_run(plan: Plan, workers: int, width: int | None = None, columns: int | N
         f"{duration(until_done(each, workers))} with {workers} workers, besides data and encoders"
     )
     told = textwrap.fill(summary, columns) if columns else summary
-    return f"{table(('run', 'cohort', 'time'), rows, columns)}\n\n{told}" if rows else told
+    parts = [table(("run", "cohort", "time"), rows, columns)] if rows else []
+    return "\n\n".join([*parts, told, *_outlook(plan, columns)])
+
+
+def _outlook(plan: Plan, columns: int | None) -> list[str]:
+    """What could be found in the primary cells."""
+    judge = plan.judge
+    if not judge.rules.primary:
+        return []
+    arms = {cell.label: plan.study.arms(cell.representation) for cell in plan.cells}
+    rows = [
+        (
+            f"{each.cell}: {each.claim}",
+            f"{each.arms.units} and {each.arms.baseline}",
+            probability(each.level),
+            probability(each.least_p),
+            ", ".join(f"{100 * power:.0f} %" for power in each.power),
+        )
+        for each in prospects(judge, arms)
+    ]
+    header = ("primary cell: claim", "runs", "level", "least p", "power")
+    words = (*judge.notes, EFFECTS)
+    return [
+        table(header, rows, columns),
+        *(textwrap.fill(each, columns) if columns else each for each in words),
+    ]
 
 
 def _kind(pack: Pack) -> tuple[object, ...]:

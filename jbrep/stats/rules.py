@@ -10,6 +10,7 @@ is done passes its share on to the others (Holm 1979; with orders within cells, 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -18,18 +19,25 @@ from scipy.stats import binomtest
 from jbrep.errors import InputError
 from jbrep.stats.arms import FEWEST, Arm, Frame, learns, measure
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.claims import CLAIMS, NOT_WORSE, Claim
+from jbrep.stats.claims import CLAIMS, NOT_WORSE, Claim, kept_gain
+from jbrep.stats.intervals import FEWEST as FEWEST_FOR_INTERVALS
+from jbrep.stats.intervals import LEVEL, UNDEFINED
 from jbrep.stats.looks import levels
 from jbrep.stats.runs import Group
+from jbrep.stats.verdict import (
+    CONTRADICTED,
+    EXPLORATORY,
+    NOT_YET,
+    SUPPORTED,
+    UNDECIDED,
+    Key,
+    Statement,
+    Verdict,
+    Verdicts,
+)
 
 ERROR = 0.05  # the probability that any of a study's verdicts is wrong, two-sided
-LEVEL = 0.95  # of intervals that are shown
-SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
-NOT_YET, EXPLORATORY = "not yet", "exploratory"
-VERDICTS = (SUPPORTED, CONTRADICTED, UNDECIDED, NOT_YET, EXPLORATORY)
-_FEWEST_FOR_INTERVALS = 4  # with three runs or fewer, points are shown
-
-Key = tuple[str, str]  # task and algorithm
+_USUAL_LOOKS = (0.5, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,29 +46,30 @@ class Rules:
 
     Args:
         primary: the cells that get verdicts, TASK/ALGORITHM/REPRESENTATION each.
-        seeds: of the planned runs, in their order.
         claims: names, in the order in which they are tested.
         margin: the share of the gain that "not worse" may lose.
         failing: the share of runs that may fail to learn where it is supported, at most.
-        looks: shares of the seeds after which there may be verdicts, ascending to 1.
+        looks: shares of the seeds after which there may be verdicts, ascending to 1; none for
+            half of them and all, or all alone where half are too few for a verdict.
 
     Raises:
         InputError: they contradict one another.
     """
 
     primary: tuple[str, ...] = ()
-    seeds: tuple[int, ...] = ()
     claims: tuple[str, ...] = tuple(CLAIMS)
     margin: float = 0.1
     failing: float = 0.2
-    looks: tuple[float, ...] = (0.5, 1.0)
+    looks: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("margin", "failing"):
             if not 0 < getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}: it must be between 0 and 1")
+        if len({*self.primary}) < len(self.primary):
+            raise InputError(f"primary is {list(self.primary)}: each cell may be there once")
         looks = (0.0, *self.looks)
-        if self.looks[-1:] != (1,) or any(a >= b for a, b in pairwise(looks)):
+        if looks[-1] not in (0, 1) or any(a >= b for a, b in pairwise(looks)):
             raise InputError(
                 f"looks are {list(self.looks)}: they must be shares of the seeds that ascend to 1"
             )
@@ -72,45 +81,86 @@ class Rules:
                 "comes first, as agents that learn nothing vary little"
             )
 
-    def seeds_at(self, look: int) -> tuple[int, ...]:
-        """The seeds whose runs count at a look."""
-        return self.seeds[: math.ceil(self.looks[look] * len(self.seeds) - 1e-9)]
-
 
 @dataclass(frozen=True)
-class Verdict:
-    """What is found of a claim in a cell.
+class Planned:
+    """Verdicts by rules on the runs that were planned; others are exploratory.
 
     Args:
-        claim: its name.
-        verdict: one of VERDICTS.
-        estimate: with its 95 % interval; without one for three runs or fewer.
-        boundary: that the estimate is held against.
-        p: two-sided, of lying on the boundary; NaN where there is none.
-        level: of the last test, two-sided; NaN if there was none.
-        interval: of that level.
-        runs: of the representation and of the baseline that count.
-        look: how many looks had come when it was decided or last tested; 0 if none.
-        reason: why it is not decided, if not because the estimate is too rough.
-
-    Raises:
-        ValueError: an unknown verdict.
+        rules: of the study.
+        seeds: of the planned runs, in their order.
     """
 
-    claim: str
-    verdict: str
-    estimate: Interval
-    boundary: float
-    p: float
-    level: float
-    interval: Interval
-    runs: tuple[int, int]
-    look: int
-    reason: str | None
+    rules: Rules = Rules()
+    seeds: tuple[int, ...] = ()
 
-    def __post_init__(self) -> None:
-        if self.verdict not in VERDICTS:
-            raise ValueError(f"unknown verdict {self.verdict!r}")
+    @cached_property
+    def looks(self) -> tuple[float, ...]:
+        """Shares of the seeds after which there may be verdicts."""
+        if self.rules.looks:
+            return self.rules.looks
+        return _USUAL_LOOKS if self._count(_USUAL_LOOKS[0]) >= FEWEST else (1.0,)
+
+    @cached_property
+    def counts(self) -> tuple[int, ...]:
+        """How many seeds there are at each look."""
+        return tuple(map(self._count, self.looks))
+
+    def _count(self, share: float) -> int:
+        return math.ceil(share * len(self.seeds) - 1e-9)
+
+    @property
+    def claims(self) -> tuple[Statement, ...]:
+        """What is claimed."""
+        return tuple(CLAIMS[name].in_words(self.rules.margin) for name in self.rules.claims)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """How verdicts are reached, in sentences."""
+        cells = len(self.rules.primary)
+        if not cells:
+            return (
+                "No cell was named primary before the runs: all numbers are exploratory, and there "
+                "are no verdicts.",
+            )
+        shared = "one primary cell has" if cells == 1 else f"{cells} primary cells share"
+        counts = " and ".join(map(str, self.counts))
+        return (
+            f"Claims are tested in the order {', '.join(self.rules.claims)}, each once the one "
+            f"before it is supported; {shared} an error of {100 * ERROR:.0f} %, two-sided, in "
+            f"Holm's way.",
+            f"Verdicts may come after {counts} runs of each arm, at O'Brien and Fleming's levels; "
+            "other cells are exploratory.",
+        )
+
+    def __call__(self, groups: Mapping[Key, Group], seed: int = 0) -> Verdicts:
+        """What is found of each claim, for each representation but the first of each group.
+
+        Args:
+            groups: runs by task and algorithm, then by representation, the baseline first.
+            seed: of all resampling.
+
+        Raises:
+            InputError: runs of a group have no range of steps in common.
+        """
+        cells = [
+            _Cell(key, name, ERROR / len(self.rules.primary))
+            for key, group in groups.items()
+            for name in list(group)[1:]
+            if "/".join((*key, name)) in self.rules.primary
+        ]
+        for look in range(len(self.looks)):
+            _look(cells, groups, self, look, seed)
+        by_name = {(cell.key, cell.representation): cell for cell in cells}
+        return {
+            key: {
+                name: _whole(by_name[key, name], group, self, seed)
+                if (key, name) in by_name
+                else _explored(group, name, self.rules, seed)
+                for name in list(group)[1:]
+            }
+            for key, group in groups.items()
+        }
 
 
 @dataclass
@@ -129,46 +179,15 @@ class _Cell:
         return "/".join((*self.key, self.representation))
 
 
-def judge(
-    groups: Mapping[Key, Group], rules: Rules, seed: int = 0
-) -> dict[Key, dict[str, tuple[Verdict, ...]]]:
-    """What is found of each claim, for each representation but the first of each group.
-
-    Args:
-        groups: runs by task and algorithm, then by representation, the baseline first.
-        rules: of the study.
-        seed: of all resampling.
-
-    Raises:
-        InputError: runs of a group have no range of steps in common.
-    """
-    found = {
-        key: {name: _explored(group, name, rules, seed) for name in list(group)[1:]}
-        for key, group in groups.items()
-    }
-    cells = [
-        _Cell(key, name, ERROR / len(rules.primary))
-        for key, group in groups.items()
-        for name in list(group)[1:]
-        if "/".join((*key, name)) in rules.primary
-    ]
-    for look in range(len(rules.looks)):
-        _look(cells, groups, rules, look, seed)
-    for cell in cells:
-        shown = found[cell.key][cell.representation]
-        found[cell.key][cell.representation] = _whole(cell, shown)
-    return found
-
-
 def _look(
     cells: Sequence[_Cell],
     groups: Mapping[Key, Group],
-    rules: Rules,
+    planned: Planned,
     look: int,
     seed: int,
 ) -> None:
     """Test at a look whatever can be tested; levels that become free are used at once."""
-    seeds = rules.seeds_at(look)
+    rules, seeds = planned.rules, planned.seeds[: planned.counts[look]]
     ready = {c.name: m for c in cells if (m := _measured(groups[c.key], c.representation, seeds))}
     tested = True
     while tested:
@@ -177,7 +196,7 @@ def _look(
             if not cell.is_open or cell.name not in ready:
                 continue
             claim = CLAIMS[rules.claims[len(cell.verdicts)]]
-            level = levels(rules.looks, cell.level)[look]
+            level = levels(planned.looks, cell.level)[look]
             verdict = _tested(claim, *ready[cell.name], rules, level, look + 1, seed)
             if verdict.verdict == UNDECIDED:
                 cell.undecided = verdict
@@ -217,21 +236,17 @@ def _tested(
     look: int,
     seed: int,
 ) -> Verdict:
-    boundary = claim.boundary(rules.margin)
-    verdict = _estimated(claim, x, y, frame, boundary, seed)
+    estimated = _estimated(claim, x, y, frame, rules, seed)
+    boundary = estimated.boundary
     p = claim.p_value(x, y, frame, boundary, seed)
-    direction = claim.side * np.sign(verdict.estimate.value - boundary) if p <= level else 0
+    direction = claim.side * np.sign(estimated.estimate.value - boundary) if p <= level else 0
     reason = _reason(claim, x, y, frame, rules, direction)
-    word = {1: SUPPORTED, -1: CONTRADICTED, 0: UNDECIDED}[0 if reason else int(direction)]
-    return Verdict(
-        claim=claim.name,
-        verdict=word,
-        estimate=verdict.estimate,
-        boundary=boundary,
+    return replace(
+        estimated,
+        verdict={1: SUPPORTED, -1: CONTRADICTED, 0: UNDECIDED}[0 if reason else int(direction)],
         p=p,
         level=level,
         interval=claim.estimate(x, y, frame, 1 - level, seed),
-        runs=(x.runs, y.runs),
         look=look,
         reason=reason,
     )
@@ -245,7 +260,7 @@ def _reason(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, direction:
         return f"{fewest} {what}; verdicts take {FEWEST}"
     if not learns(y, frame):
         return "agents on the full state didn't learn"
-    if claim is NOT_WORSE and direction > 0:
+    if claim.estimate is kept_gain and direction > 0:
         most = most_failing(x.runs - x.learnt, x.runs)
         if most > rules.failing:
             return (
@@ -261,20 +276,21 @@ def most_failing(failing: int, runs: int) -> float:
     return float(test.proportion_ci(LEVEL, method="exact").high)
 
 
-def _estimated(claim: Claim, x: Arm, y: Arm, frame: Frame, boundary: float, seed: int) -> Verdict:
+def _estimated(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, seed: int) -> Verdict:
     """An estimate without a verdict."""
     estimate = claim.estimate(x, y, frame, LEVEL, seed)
-    if min(x.units, y.units) < _FEWEST_FOR_INTERVALS:
+    if min(x.units, y.units) < FEWEST_FOR_INTERVALS:
         estimate = Interval(estimate.value, np.nan, np.nan)
     return Verdict(
         claim=claim.name,
         verdict=EXPLORATORY,
         estimate=estimate,
-        boundary=boundary,
+        boundary=claim.boundary(rules.margin),
         p=np.nan,
         level=np.nan,
         interval=Interval(estimate.value, np.nan, np.nan),
         runs=(x.runs, y.runs),
+        encoders=x.units if x.by_encoder else 0,
         look=0,
         reason=None,
     )
@@ -285,27 +301,20 @@ def _explored(group: Group, name: str, rules: Rules, seed: int) -> tuple[Verdict
     baseline = next(iter(group))
     both = {each: group[each] for each in (baseline, name)}
     frame, arms = measure(both, {run.seed for runs in both.values() for run in runs})
-    return tuple(
-        _estimated(
-            CLAIMS[claim],
-            arms[name],
-            arms[baseline],
-            frame,
-            CLAIMS[claim].boundary(rules.margin),
-            seed,
-        )
-        for claim in rules.claims
-    )
+    x, y = arms[name], arms[baseline]
+    return tuple(_estimated(CLAIMS[each], x, y, frame, rules, seed) for each in rules.claims)
 
 
-def _whole(cell: _Cell, explored: tuple[Verdict, ...]) -> tuple[Verdict, ...]:
+def _whole(cell: _Cell, group: Group, planned: Planned, seed: int) -> tuple[Verdict, ...]:
     """A verdict on each claim: decided, tested last, or not tested."""
+    explored = _explored(group, cell.representation, planned.rules, seed)
     tested = (*cell.verdicts, *([cell.undecided] if cell.undecided else []))
     others = explored[len(tested) :]
     if not tested:
-        nothing = Interval(np.nan, np.nan, np.nan)
+        reason = f"the first look is at {planned.counts[0]} runs of each arm"
         return tuple(
-            replace(each, verdict=NOT_YET, estimate=nothing, interval=nothing) for each in others
+            replace(each, verdict=NOT_YET, estimate=UNDEFINED, interval=UNDEFINED, reason=reason)
+            for each in others
         )
     before = tested[-1]
     reason = f"not tested: {before.claim!r} is {before.verdict}"
