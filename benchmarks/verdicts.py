@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from jbrep.progress import Progress
 from jbrep.stats.claims import CLAIMS
+from jbrep.stats.rules import Planned, Rules
 from jbrep.stats.runs import RunCurve
-from jbrep.stats.verdicts import CONTRADICTED, SUPPORTED, Rules, judge
+from jbrep.stats.verdict import CONTRADICTED, SUPPORTED
 from jbrep.text import table
 
 Draw = Callable[[np.random.Generator, int], NDArray[np.float64]]
@@ -95,9 +96,10 @@ def study(truth: Truth, runs: int, seed: int) -> dict[str, list[RunCurve]]:
 
 def judged(name: str, runs: int, seed: int) -> tuple[str, ...]:
     """The verdicts on a made-up study."""
-    rules = Rules(primary=(f"{TASK}/{ALGORITHM}/{OTHER}",), seeds=tuple(range(runs)))
-    groups = {(TASK, ALGORITHM): study(TRUTHS[name], runs, seed)}
-    found = judge(groups, rules, seed)[TASK, ALGORITHM][OTHER]
+    judge = Planned(Rules(primary=(f"{TASK}/{ALGORITHM}/{OTHER}",)), tuple(range(runs)))
+    found = judge({(TASK, ALGORITHM): study(TRUTHS[name], runs, seed)}, seed)[TASK, ALGORITHM][
+        OTHER
+    ]
     return tuple(verdict.verdict for verdict in found)
 
 

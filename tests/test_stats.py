@@ -12,6 +12,7 @@ from scipy import stats
 
 from jbrep.errors import DamageError, InputError
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
+from jbrep.stats.aggregates import aggregates
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.comparison import probability_of_improvement
 from jbrep.stats.curves import (
@@ -32,6 +33,7 @@ from jbrep.stats.first_claims import (
 )
 from jbrep.stats.intervals import deviation, difference, percentile, variance_ratio
 from jbrep.stats.means import Bounds, mean_within
+from jbrep.stats.nested import components
 from jbrep.stats.reliability import drawdown, expected_shortfall, fixed_policy, within_runs
 from jbrep.text import SIGNIFICANT, interval
 
@@ -697,6 +699,67 @@ def test_rliable_gives_the_same_numbers():
     found = percentile(probability_of_improvement, x, y)
     assert found.value == pytest.approx(values["xy"][0])
     assert found[1:] == pytest.approx(intervals["xy"][:, 0], abs=0.05)
+
+
+def test_results_across_tasks_are_rliable_s():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        library = pytest.importorskip("rliable.library")
+        metrics = pytest.importorskip("rliable.metrics")
+    random = np.random.default_rng(0)
+    scores = np.stack([random.normal(0.9, 0.1, 12), random.normal(0.6, 0.2, 12)])
+    by_task = {"one": scores[0], "other": np.append(scores[1], 9.0)}  # the 13th has no partner
+    (found,) = aggregates({"sac": {"x": by_task, "y": {"one": scores[0]}}}, 0)
+    np.random.seed(0)  # noqa: NPY002  rliable ignores its random_state
+    values, intervals = library.get_interval_estimates(
+        {"x": scores.T},
+        lambda s: np.array([metrics.aggregate_iqm(s), metrics.aggregate_optimality_gap(s)]),
+        reps=4000,
+    )
+    for i, ours in enumerate((found.iqm, found.optimality_gap)):
+        assert ours.value == pytest.approx(values["x"][i])
+        assert ours[1:] == pytest.approx(intervals["x"][:, i], abs=0.01)
+    shares, _ = library.create_performance_profile({"x": scores.T}, found.scores, reps=10)
+    np.testing.assert_allclose(found.profile.value, shares["x"])
+    assert (found.runs, found.tasks) == (12, ("one", "other"))
+
+
+def test_encoders_of_a_representation_have_a_variance_of_their_own():
+    random = np.random.default_rng(1)
+    of_encoder = random.normal(500, 60, 5)
+    nested = [
+        make("dae-8", seed, of_encoder[seed % 5] + random.normal(0, 5), encoder_seed=seed % 5)
+        for seed in range(10)
+    ]
+    runs = [*study({"full": random.normal(500, 20, 10)}), *nested]
+    (group,) = analyse(runs).groups
+    numbers = group.labels[1].numbers
+    assert group.labels[1].encoders == 5
+    assert numbers["encoder_variance"].low > 10 * numbers["run_variance"].value
+    expected = components(group.labels[1].by_run["final_return"].reshape(2, 5).T)
+    assert numbers["encoder_variance"] == expected.encoders
+    assert "Variance of final returns: of encoders and of runs" in statistics_text(analyse(runs))
+    (alone,) = analyse(runs[:-1]).groups  # unevenly nested
+    assert np.isnan(alone.labels[1].numbers["run_variance"].value)
+    assert np.isnan(group.labels[0].numbers["run_variance"].value)
+
+
+def test_three_runs_are_points_and_no_interval_leaves_what_is_possible():
+    few = analyse(study({"full": [500, 510, 990], "dae-8": [480, 520, 530]})).groups[0]
+    for label in few.labels:
+        assert all(np.isnan(each.low) for each in label.numbers.values())
+        assert np.isnan(label.curve.iqm.low).all()
+    assert np.isnan(few.comparisons[0].numbers["final_return_difference"].low)
+    levels = {"full": [1000, 999, 998, 600, 1000], "dae-8": [1, 0, 2, 400, 1]}
+    runs = [replace(run, return_ceiling=1000.0) for run in study(levels)]
+    (group,) = analyse(runs).groups
+    for label in group.labels:
+        for by in ("final_return_mean", "mean_return_mean"):
+            _, low, high = label.numbers[by]
+            assert 0 < low < high < 1000
+        assert label.numbers["final_return_sd"].low > 0
+    _, low, high = group.comparisons[0].numbers["final_return_difference"]
+    assert -1000 < low < high < 1000
 
 
 def test_three_digits_are_shown_without_powers_of_ten():

@@ -50,9 +50,10 @@ def registered(tables: Tables) -> str:
     registration = tables.record.get("registration")
     if not registration:
         return "This study was not registered before its first run."
+    so_far = "what ran so far" if tables.record["missing"] else "what ran"
     since = f"Registered on {registration['date'][:10]}, SHA-256 {registration['sha256'][:12]}: "
     if not registration["deviations"]:
-        return f"{since}what ran is what was registered."
+        return f"{since}{so_far} is what was registered."
     return f"{since}{'; '.join(registration['deviations'])}."
 
 

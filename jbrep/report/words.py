@@ -52,8 +52,8 @@ def headline(analysis: Analysis | None) -> str:
         return f"There are no verdicts yet: {judged[0][0].reason}."
     cells = "the one cell" if len(judged) == 1 else f"the {len(judged)} cells"
     columns = zip(analysis.claims, zip(*judged, strict=True), strict=True)
-    parts = [f"{claim.name!r} is {_overall(_counts(each))}" for claim, each in columns]
-    return f"In {cells} judged, {', '.join(parts[:-1])}{' and ' if parts[:-1] else ''}{parts[-1]}."
+    parts = [f"{claim.name} {_overall(_counts(each))}" for claim, each in columns]
+    return f"In {cells} judged: {'; '.join(parts)}."
 
 
 def _all(analysis: Analysis) -> Iterator[tuple[Verdict, ...]]:
@@ -68,7 +68,7 @@ def _overall(counts: Counter[str]) -> str:
     """The verdict if all agree, otherwise how many there are of each."""
     if len(counts) == 1:
         return next(iter(counts))
-    return " and ".join(f"{verdict} in {count}" for verdict, count in counts.most_common())
+    return ", ".join(f"{verdict} in {count}" for verdict, count in counts.most_common())
 
 
 def answers(analysis: Analysis) -> list[Answer]:

@@ -296,20 +296,22 @@ def _estimated(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, seed: i
     )
 
 
-def _explored(group: Group, name: str, rules: Rules, seed: int) -> tuple[Verdict, ...]:
-    """Estimates of each claim from all runs."""
+def _explored(
+    group: Group, name: str, rules: Rules, seed: int, tested: int = 0
+) -> tuple[Verdict, ...]:
+    """Estimates from all runs of each claim but the first, which are tested."""
     baseline = next(iter(group))
     both = {each: group[each] for each in (baseline, name)}
     frame, arms = measure(both, {run.seed for runs in both.values() for run in runs})
     x, y = arms[name], arms[baseline]
-    return tuple(_estimated(CLAIMS[each], x, y, frame, rules, seed) for each in rules.claims)
+    claims = rules.claims[tested:]
+    return tuple(_estimated(CLAIMS[each], x, y, frame, rules, seed) for each in claims)
 
 
 def _whole(cell: _Cell, group: Group, planned: Planned, seed: int) -> tuple[Verdict, ...]:
     """A verdict on each claim: decided, tested last, or not tested."""
-    explored = _explored(group, cell.representation, planned.rules, seed)
     tested = (*cell.verdicts, *([cell.undecided] if cell.undecided else []))
-    others = explored[len(tested) :]
+    others = _explored(group, cell.representation, planned.rules, seed, len(tested))
     if not tested:
         reason = f"the first look is at {planned.counts[0]} runs of each arm"
         return tuple(
