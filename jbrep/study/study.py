@@ -8,6 +8,7 @@ from dataclasses import replace
 from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
 from jbrep.files.lock import exclusive
+from jbrep.progress import Progress as Bar
 from jbrep.rl import Run
 from jbrep.rl.job import Job
 from jbrep.rl.speed import estimate
@@ -92,7 +93,7 @@ def dry_run(plan: Plan, workers: int, width: int | None = None, columns: int | N
     examples = {_kind(pack): pack for pack in packs}
     seconds = {
         kind: estimate([_example(plan.run(cell)) for cell in pack])
-        for kind, pack in examples.items()
+        for kind, pack in Bar(examples.items(), desc="timing", unit="trial", delay=1, leave=False)
     }
     each = [seconds[_kind(pack)] for pack in packs]
     rows = [
