@@ -3,6 +3,8 @@
 Studies of one primary cell are made up and judged at their default looks. Returns of runs are
 normally distributed, skewed, or of runs of which some learn and others don't. A verdict is wrong
 if it supports what isn't so, or contradicts what is; on the boundary of a claim any verdict is.
+A third of the runs may fail to learn, so that eight that don't are enough: with the usual fifth,
+fewer than fourteen runs never support anything, and are wrong less often.
 """
 
 import argparse
@@ -57,16 +59,20 @@ def failing(share: float) -> Draw:
     return draw
 
 
+MAY_FAIL = 1 / 3
 ON_MARGIN = STILL + 0.9 * (880 - STILL)
+EQUAL = ((CONTRADICTED,), BOTH, BOTH, (CONTRADICTED,))
+LESS = (BOTH, BOTH, BOTH, (SUPPORTED,))
+WORSE = ((SUPPORTED,), BOTH, BOTH, (SUPPORTED,))
 TRUTHS = {
-    "normal, equal": Truth(normal(880), normal(880), ((CONTRADICTED,), BOTH, BOTH)),
-    "normal, a tenth of the gain less": Truth(normal(880), normal(ON_MARGIN), (BOTH, BOTH, BOTH)),
-    "skewed, equal": Truth(skewed(880), skewed(880), ((CONTRADICTED,), BOTH, BOTH)),
-    "skewed, a tenth of the gain less": Truth(skewed(880), skewed(ON_MARGIN), (BOTH, BOTH, BOTH)),
-    "a fifth fails on both": Truth(failing(0.2), failing(0.2), (BOTH, BOTH, BOTH)),
-    "a fifth fails on less state": Truth(normal(880), failing(0.2), ((SUPPORTED,), BOTH, BOTH)),
-    "all fail on less state": Truth(normal(880), failing(1), ((SUPPORTED,), BOTH, BOTH)),
-    "all fail on both": Truth(failing(1), failing(1), (BOTH, BOTH, BOTH)),
+    "normal, equal": Truth(normal(880), normal(880), EQUAL),
+    "normal, a tenth of the gain less": Truth(normal(880), normal(ON_MARGIN), LESS),
+    "skewed, equal": Truth(skewed(880), skewed(880), EQUAL),
+    "skewed, a tenth of the gain less": Truth(skewed(880), skewed(ON_MARGIN), LESS),
+    "a fifth fails on both": Truth(failing(0.2), failing(0.2), EQUAL),
+    "a fifth fails on less state": Truth(normal(880), failing(0.2), WORSE),
+    "all fail on less state": Truth(normal(880), failing(1), WORSE),
+    "all fail on both": Truth(failing(1), failing(1), (BOTH,) * 4),
 }
 
 
@@ -96,11 +102,10 @@ def study(truth: Truth, runs: int, seed: int) -> dict[str, list[RunCurve]]:
 
 def judged(name: str, runs: int, seed: int) -> tuple[str, ...]:
     """The verdicts on a made-up study."""
-    judge = Planned(Rules(primary=(f"{TASK}/{ALGORITHM}/{OTHER}",)), tuple(range(runs)))
-    found = judge({(TASK, ALGORITHM): study(TRUTHS[name], runs, seed)}, seed)[TASK, ALGORITHM][
-        OTHER
-    ]
-    return tuple(verdict.verdict for verdict in found)
+    rules = Rules(primary=(f"{TASK}/{ALGORITHM}/{OTHER}",), failing=MAY_FAIL)
+    groups = {(TASK, ALGORITHM): study(TRUTHS[name], runs, seed)}
+    found = Planned(rules, tuple(range(runs)))(groups, seed)
+    return tuple(verdict.verdict for verdict in found[TASK, ALGORITHM][OTHER])
 
 
 def main(studies: int) -> None:
