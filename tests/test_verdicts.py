@@ -84,7 +84,7 @@ def test_the_end_says_what_is_true(looks):
     assert kept.estimate.low < (848 - 250) / (850 - 250) < kept.estimate.high
     assert 5 / 25 < spread.estimate.value < 0.5  # less than the ends alone, by the time before
     assert time.estimate.low < -1500 < time.estimate.high
-    said = "In the 2 cells judged: not worse supported in 1, contradicted in 1; less variance supp"
+    said = "In the 2 cells judged: &#39;not worse&#39; supported in 1, contradicted in 1; "
     assert said in page
     assert "what ran is what was registered." in text
     assert "none from what was registered" in page

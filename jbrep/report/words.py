@@ -52,7 +52,7 @@ def headline(analysis: Analysis | None) -> str:
         return f"There are no verdicts yet: {judged[0][0].reason}."
     cells = "the one cell" if len(judged) == 1 else f"the {len(judged)} cells"
     columns = zip(analysis.claims, zip(*judged, strict=True), strict=True)
-    parts = [f"{claim.name} {_overall(_counts(each))}" for claim, each in columns]
+    parts = [f"{claim.name!r} {_overall(_counts(each))}" for claim, each in columns]
     return f"In {cells} judged: {'; '.join(parts)}."
 
 
