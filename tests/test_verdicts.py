@@ -136,6 +136,7 @@ def test_a_reader_gets_the_numbers_with_numpy_alone(looks, monkeypatch, capsys):
             {"seeds": 7},
             "no outcome could support 'not worse' of face_direction/sac/dae-8: a side has 7 runs",
         ),
+        ({"tasks": ["Jitterbug/FaceDirection-v0"]}, "say face_direction, as tables do, where"),
         ({"seeds": 12}, "even if all 12 runs learn, up to 22 % may fail, and the limit is 20 %"),
         ({"verdicts": {"margins": 0.1}}, "unknown verdicts.margins"),
         ({"verdicts": {"margin": "a tenth"}}, "verdicts.margin is 'a tenth': it must be"),

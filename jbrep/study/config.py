@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, get_origin
 
 from jbrep.encoders import FULL
-from jbrep.envs.names import find_spec
+from jbrep.envs.names import find_spec, short_names
 from jbrep.envs.task import MAX_EPISODE_STEPS
 from jbrep.errors import InputError
 from jbrep.files.storage import read_regular
@@ -147,6 +147,11 @@ class Study:
             for name, each in ((each.name, each) for each in self.observed)
             if name != FULL
         }
+        short = {full: name for name, full in short_names().items()}
+        if self.rules.primary and (long := [task for task in self.tasks if task in short]):
+            raise InputError(
+                f"tasks has {long[0]}: say {short[long[0]]}, as tables do, where there are verdicts"
+            )
         for cell in self.rules.primary:
             if cell not in cells or not self.comparisons:
                 raise InputError(
