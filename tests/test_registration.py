@@ -11,6 +11,7 @@ from test_study import TINY, TOML
 from jbrep.errors import InputError
 from jbrep.rl.files import RUN
 from jbrep.study.plan import Plan
+from jbrep.study.record import run_name
 from jbrep.study.registration import REGISTRATION, deviations, read_registration
 from jbrep.study.results import conclude
 from jbrep.study.runner import BACKENDS
@@ -69,15 +70,19 @@ def test_a_changed_study_is_refused_but_for_new_seeds(registered):
 def test_every_deviation_is_told(registered):
     registration, study = registered.registration, registered.as_json()
     runs = [json.loads(path.read_text()) for path in sorted(registered.folder.rglob(RUN))]
-    assert deviations(registration, study, runs) == []
+    named = {run_name(run["settings"]): run for run in runs}
+    assert registration["encoders"].keys() == named.keys()
+    assert deviations(registration, study, named) == []
     runs[0]["settings"]["registration"] = None
     runs[0]["versions"]["torch"] = "2.0.0"
     runs[0]["commits"] = {"jbrep": "0" * 40}
+    runs[1]["settings"]["encoder"] = "0" * 64
     more = {**study, "seeds": [0, 1, 7], "steps": 81}
-    assert deviations(registration, more, runs) == [
+    assert deviations(registration, more, named) == [
         "settings differ: steps 80 (now: 81)",
         "seeds were added, whose runs are exploratory: 7",
         "1 of its runs weren't made under this registration",
+        "1 of its runs have other encoders than there were",
         f"torch was 2.0.0, not {registration['versions']['torch']}",
         "some runs were made by other commits of jbrep's code",
     ]

@@ -111,7 +111,7 @@ def test_the_spread_of_curves_by_hand():
     curves = np.random.default_rng(0).normal(size=(7, 4))
     weights = np.array([0.1, 0.2, 0.3, 0.4])
     by_hand = np.log(median_abs_deviation(curves, axis=0) + 0.01) @ weights
-    assert log_spread(curves, weights, 0.01) == pytest.approx(by_hand)
+    assert log_spread(curves.T, weights, 0.01) == pytest.approx(by_hand)
 
 
 def test_the_permutation_of_curves_is_scipy_s():

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -140,6 +141,15 @@ class Plan:
             **cell.representation.settings(cell.seed),
             **self.study.run_settings,
         )
+
+    @property
+    def fingerprints(self) -> dict[str, str]:
+        """The SHA-256 of each run's encoder, by the run's label and seed, of those that exist."""
+        found = {}
+        for cell in self.cells:
+            with suppress(InputError):  # the study will make it
+                found[f"{cell.label}/seed-{cell.seed}"] = self.run(cell).find_encoder().fingerprint
+        return found
 
     def assigned(self, cells: Iterable[Cell]) -> list[Assigned]:
         """Runs for a worker.

@@ -43,7 +43,7 @@ def record(folder: Path, folders: Sequence[Path], left_out: Sequence[str]) -> di
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        **_study(folder, runs.values()),
+        **_study(folder, {run_name(run["settings"]): run for run in runs.values()}),
         "left_out": list(left_out),
         "versions": _distinct(run["versions"] for run in runs.values()),
         "processors": _distinct(run["cpu"] for run in runs.values()),
@@ -68,6 +68,11 @@ def _sort_key(settings: Mapping[str, Any], order: list[str]) -> tuple[Any, ...]:
 def run_label(settings: Mapping[str, Any]) -> str:
     """Task, learner, representation: face_direction/sac-modern/dae-8."""
     return f"{settings['task']}/{learner(settings)}/{settings['representation']}"
+
+
+def run_name(settings: Mapping[str, Any]) -> str:
+    """The same with the seed: face_direction/sac-modern/dae-8/seed-0."""
+    return f"{run_label(settings)}/seed-{settings['seed']}"
 
 
 def learner(settings: Mapping[str, Any]) -> str:
@@ -130,7 +135,7 @@ def _common(encoders: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     return common
 
 
-def _study(folder: Path, runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+def _study(folder: Path, runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """The study, its registration, and the steps done by each of its unfinished runs."""
     plan = read_plan(folder)
     if plan is None:
@@ -142,7 +147,7 @@ def _study(folder: Path, runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _registration(plan: Plan, runs: Iterable[Mapping[str, Any]]) -> dict[str, Any] | None:
+def _registration(plan: Plan, runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
     """When a study was registered, and how what ran differs from that; None if it wasn't."""
     if plan.registration is None:
         return None

@@ -17,6 +17,7 @@ REGISTRATION = "registration.json"
 FORMAT = "jbrep registration"
 FORMAT_VERSION = 1
 _MAX_BYTES = 1 << 24
+_HASHED = ("study", "encoders", "date", "versions", "commits")
 _MAY_GROW = ("seeds",)  # after registration; what was added is exploratory
 
 
@@ -24,18 +25,20 @@ class Registration(TypedDict):
     """registration.json."""
 
     study: dict[str, Any]  # its settings
-    sha256: str  # of the settings, the date, the versions and the commits
+    encoders: dict[str, str]  # of those that were there: SHA-256 by the name of the run
+    sha256: str  # of all else
     date: str  # ISO 8601, in UTC
     versions: dict[str, str]  # by package
     commits: dict[str, str]
 
 
-def register(folder: Path, study: Mapping[str, Any]) -> Registration:
+def register(folder: Path, study: Mapping[str, Any], encoders: Mapping[str, str]) -> Registration:
     """Write a study's plan into its folder; one that is registered stays as it is.
 
     Args:
         folder: of the study.
         study: its settings as plain JSON.
+        encoders: the SHA-256 of those that are there, by the name of the run.
 
     Raises:
         InputError: it is registered with other settings, or has runs already.
@@ -46,7 +49,13 @@ def register(folder: Path, study: Mapping[str, Any]) -> Registration:
     if any((folder / "runs").glob("**/*.*")):
         raise InputError(f"{folder} has runs: a study is registered before its first run")
     now = datetime.now(UTC).isoformat(timespec="seconds")
-    facts = {"study": dict(study), "date": now, "versions": packages(), "commits": dict(commits())}
+    facts = {
+        "study": dict(study),
+        "encoders": dict(encoders),
+        "date": now,
+        "versions": packages(),
+        "commits": dict(commits()),
+    }
     made = Registration(sha256=_hash(facts), **facts)  # type: ignore[typeddict-item]
     record = {"format": FORMAT, "format_version": FORMAT_VERSION, **made}
     write_whole(folder / REGISTRATION, (json.dumps(record, indent=2) + "\n").encode())
@@ -69,7 +78,7 @@ def read_registration(folder: Path) -> Registration | None:
         registration: Registration = typed(record, Registration)
     except (OSError, ValueError) as error:
         raise DamageError(f"{path} is damaged: {error}") from None
-    facts = {name: registration[name] for name in ("study", "date", "versions", "commits")}
+    facts = {name: value for name, value in registration.items() if name in _HASHED}
     if _hash(facts) != registration["sha256"]:
         raise DamageError(
             f"{path} was changed after it was written: restore it, or choose another folder"
@@ -91,14 +100,14 @@ def check_registered(registration: Registration, study: Mapping[str, Any], folde
 
 
 def deviations(
-    registration: Registration, study: Mapping[str, Any], runs: Iterable[Mapping[str, Any]]
+    registration: Registration, study: Mapping[str, Any], runs: Mapping[str, Mapping[str, Any]]
 ) -> list[str]:
     """How what ran differs from what was registered, in sentences.
 
     Args:
         registration: of the study.
         study: its settings now.
-        runs: contents of run.json, of all that have ended.
+        runs: contents of run.json, of all that have ended, by label and seed.
     """
     found = []
     if differing := differences(registration["study"], _fixed(registration, study)):
@@ -106,15 +115,21 @@ def deviations(
     registered = registration["study"]["seeds"]
     if added := [seed for seed in study["seeds"] if seed not in registered]:
         found.append(f"seeds were added, whose runs are exploratory: {_listed(added)}")
-    runs = list(runs)
-    if other := [run for run in runs if run["settings"]["registration"] != registration["sha256"]]:
-        found.append(f"{len(other)} of its runs weren't made under this registration")
+    every = list(runs.values())
+    if strays := [
+        run for run in every if run["settings"]["registration"] != registration["sha256"]
+    ]:
+        found.append(f"{len(strays)} of its runs weren't made under this registration")
+    known = registration["encoders"]
+    used = {name: run["settings"]["encoder"] for name, run in runs.items()}
+    if other := [name for name, encoder in used.items() if known.get(name, encoder) != encoder]:
+        found.append(f"{len(other)} of its runs have other encoders than there were")
     for name, version in registration["versions"].items():
-        others = {run["versions"].get(name, "none") for run in runs} - {version}
+        others = {run["versions"].get(name, "none") for run in every} - {version}
         if others:
             found.append(f"{name} was {_listed(sorted(others))}, not {version}")
     registered_commit = registration["commits"].get("jbrep")
-    others = {run.get("commits", {}).get("jbrep") for run in runs} - {registered_commit, None}
+    others = {run.get("commits", {}).get("jbrep") for run in every} - {registered_commit, None}
     if others:
         found.append("some runs were made by other commits of jbrep's code")
     return found

@@ -72,7 +72,7 @@ def register_study(plan: Plan) -> Registration:
     """
     check(plan)
     plan.write()
-    return register(plan.folder, plan.as_json())
+    return register(plan.folder, plan.as_json(), plan.fingerprints)
 
 
 def dry_run(plan: Plan, workers: int, width: int | None = None, columns: int | None = None) -> str:
