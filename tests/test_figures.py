@@ -255,7 +255,7 @@ def test_claims_stand_with_intervals_and_boundaries(plots, analysis):
     np.testing.assert_array_equal(thin.get_xdata(), first.interval[1:])
     np.testing.assert_array_equal(thick.get_xdata(), first.estimate[1:])
     assert point.get_xdata()[0] == first.estimate.value
-    assert kept.get_title(loc="left") == "face_direction, ddpg\nnot worse"
+    assert kept.get_title(loc="left") == "face_direction, ddpg\nnot worse, within half the margin"
     texts = [text.get_text() for text in kept.get_yticklabels()]
     assert texts == ["dae-8 (n = 4)", "pca-4 (n = 4)"]
     assert (spread.get_xscale(), time.get_xscale()) == ("log", "linear")

@@ -708,8 +708,10 @@ def test_results_across_tasks_are_rliable_s():
         metrics = pytest.importorskip("rliable.metrics")
     random = np.random.default_rng(0)
     scores = np.stack([random.normal(0.9, 0.1, 12), random.normal(0.6, 0.2, 12)])
-    by_task = {"one": scores[0], "other": np.append(scores[1], 9.0)}  # the 13th has no partner
-    (found,) = aggregates({"sac": {"x": by_task, "y": {"one": scores[0]}}}, 0)
+    full = np.ones(10)
+    one = {"full": full, "x": scores[0], "y": scores[0]}
+    other = {"full": full, "x": np.append(scores[1], 9.0)}  # the 13th has no partner
+    (_, found) = aggregates({"sac": {"one": one, "other": other}}, 0)
     np.random.seed(0)  # noqa: NPY002  rliable ignores its random_state
     values, intervals = library.get_interval_estimates(
         {"x": scores.T},
@@ -722,6 +724,20 @@ def test_results_across_tasks_are_rliable_s():
     shares, _ = library.create_performance_profile({"x": scores.T}, found.scores, reps=10)
     np.testing.assert_allclose(found.profile.value, shares["x"])
     assert (found.runs, found.tasks) == (12, ("one", "other"))
+
+
+def test_the_full_agents_scatter_counts_across_tasks():
+    """Intervals of scores relative to their mean cover the truth, of equal agents 1."""
+    random = np.random.default_rng(0)
+    covered = 0
+    for _ in range(60):
+        tasks = {
+            task: {"full": random.normal(600, 60, 10), "x": random.normal(600, 60, 10)}
+            for task in ("one", "other")
+        }
+        _, found = aggregates({"sac": tasks}, 0)
+        covered += found.iqm.low <= 1 <= found.iqm.high
+    assert covered >= 53
 
 
 def test_encoders_of_a_representation_have_a_variance_of_their_own():

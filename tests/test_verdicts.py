@@ -142,6 +142,7 @@ def test_a_reader_gets_the_numbers_with_numpy_alone(looks, monkeypatch, capsys):
         ({"verdicts": {"margin": "a tenth"}}, "verdicts.margin is 'a tenth': it must be"),
         ({"verdicts": {"looks": [1.0, 0.5]}}, "looks are .*: they must be shares of the seeds"),
         ({"verdicts": {"claims": ["faster"]}}, "'not worse' comes first"),
+        ({"verdicts": {"looks": [0.99, 1]}}, "of 16 seeds, they come after 16 and 16"),
         ({"verdicts": {"primary": ["a", "a"]}}, "each cell may be there once"),
     ],
 )
@@ -180,6 +181,6 @@ def test_power_is_that_of_the_t_test():
     assert first.power[1] == pytest.approx(expected, abs=0.08)
     assert first.power == tuple(sorted(first.power, reverse=True))
     steady = found["less variance"]
-    assert steady.least_p == pytest.approx(1e-4)
+    assert steady.least_p == pytest.approx(2e-4)
     assert np.diff(steady.power).min() >= 0
     assert steady.power[-1] > 0.9

@@ -26,8 +26,8 @@ def claims(analysis: Analysis, looks: Looks) -> Plot:
         "claims",
         "What is claimed",
         f"Each representation against {analysis.baseline}. Thick: 95 % interval; thin: the "
-        "interval of the test that was made; dashed: the boundary, which it must not contain. A "
-        "triangle at an edge: the interval goes beyond it.",
+        "interval of the test that was made; dashed: the boundary of each claim, which it must "
+        "not contain. A triangle at an edge: the interval goes beyond it.",
         (
             *("task", "algorithm", "representation", "claim", "estimate", "low", "high"),
             *("test_low", "test_high", "boundary", "verdict"),
@@ -59,8 +59,9 @@ def _draw(analysis: Analysis, looks: Looks) -> Figure:
         for axes, group in zip(panels[:, j], groups, strict=True):
             _scale(axes, claim.is_ratio, groups, numbers)
             _draw_panel(axes, group, numbers, look)
-            axes.set_title(plain(f"{group.name}\n{claim.name}" if j == 0 else f"\n{claim.name}"))
-            axes.set_xlabel(textwrap.fill(claim.estimand, _ACROSS))
+            title = ", ".join(analysis.claims[number].name for number in numbers)
+            axes.set_title(plain(f"{group.name}\n{title}" if j == 0 else f"\n{title}"))
+            axes.set_xlabel(textwrap.fill(plain(claim.estimand), _ACROSS))
     for axes, group in zip(panels[:, 0], groups, strict=True):
         _, *names = names_with_runs([group]).values()
         axes.set_yticks(range(len(names)), names)

@@ -128,7 +128,7 @@ def _grid_of_curves(
 
     def draw(axes: Axes, group: GroupAnalysis) -> None:
         for i, (policy, returns) in enumerate(references.get(group.task, {}).items()):
-            axes.axhline(float(np.mean(returns)), label=policy, **reference(i))
+            axes.axhline(float(np.mean(returns)), label=plain(policy), **reference(i))
         if extents[group.task].contain(group.solved):
             axes.axhline(group.solved, **solved_line_style())
         for label in group.labels:

@@ -155,7 +155,7 @@ def _draw_runs(axes: Axes, group: GroupAnalysis, look: Styles, value: str) -> No
     """A point for each run of each representation, and the mean with its interval."""
     _name_columns(axes, group)
     for i, (policy, each) in enumerate(group.references.items()):
-        axes.axhline(each.value, label=policy, **reference(i))
+        axes.axhline(each.value, label=plain(policy), **reference(i))
     for i, label in enumerate(group.labels):
         style, runs = look[label.representation], label.by_run[value]
         beside = i - 0.22 + np.linspace(-_JITTER, _JITTER, len(runs)) * (len(runs) > 1)
@@ -192,7 +192,7 @@ def _draw_profiles(analysis: Analysis, looks: Looks) -> Figure:
             name = names[label.representation]
             axes.step(returns, share, where="post", color=colour, label=name)
         for i, (policy, each) in enumerate(group.references.items()):
-            axes.axvline(each.value, label=policy, **reference(i))
+            axes.axvline(each.value, label=plain(policy), **reference(i))
         extent = limits(group.profile_returns, solved=group.solved)
         if extent.contain(group.solved):
             axes.axvline(group.solved, **solved_line_style())

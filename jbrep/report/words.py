@@ -107,13 +107,9 @@ def _tested(verdict: Verdict) -> str:
     _, low, high = verdict.interval
     if math.isnan(verdict.level) or math.isnan(low) or math.isnan(high):
         return ""
-    ends = f"[{_end(low)}, {_end(high)}]"
+    ends = f"[{shown_number(low)}, {shown_number(high)}]"
     level, boundary = f"{100 * (1 - verdict.level):.4g} %", shown_number(verdict.boundary)
     return f"at {level}, {ends} {_place(verdict)} {boundary}"
-
-
-def _end(value: float) -> str:
-    return shown_number(value) if math.isfinite(value) else "unbounded"
 
 
 def _place(verdict: Verdict) -> str:
@@ -123,8 +119,9 @@ def _place(verdict: Verdict) -> str:
 
 
 def remark(verdict: Verdict) -> str:
-    """The estimate, or why there is none, for a narrow column."""
-    return (verdict.reason or "") if math.isnan(verdict.estimate.value) else shown(verdict.estimate)
+    """The estimate, and why there is no verdict, for a narrow column."""
+    estimate = "" if math.isnan(verdict.estimate.value) else shown(verdict.estimate)
+    return "; ".join(filter(None, (estimate, verdict.reason)))
 
 
 def details(

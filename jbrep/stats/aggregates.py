@@ -2,10 +2,11 @@
 
 After Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice".
 A run's score is its gain over standing still as a share of the mean gain on the full state, so that
-tasks can be put together: 0 is no better than standing still, 1 as good as the full state.
+tasks can be put together: 0 is no better than standing still, 1 as good as the full state, whose
+runs are resampled, too.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ class Aggregate:
     Args:
         algorithm: its name.
         representation: its name.
-        tasks: their names.
+        tasks: their names; those where agents on the full state gain nothing are left out.
         runs: on each task: the first of those with more.
         iqm: interquartile mean of scores, with its 95 % interval.
         optimality_gap: mean of what scores lack to 1, with its 95 % interval.
@@ -52,43 +53,62 @@ class Aggregate:
 
 
 def aggregates(
-    scores: Mapping[str, Mapping[str, Mapping[str, Array]]], seed: int
+    gains: Mapping[str, Mapping[str, Mapping[str, Array]]], seed: int
 ) -> Iterator[Aggregate]:
     """The results of each algorithm and representation that has runs on two tasks or more.
 
     Args:
-        scores: by algorithm, representation and task, (runs,) each.
+        gains: by algorithm, task and representation, the baseline first, (runs,) each.
         seed: of the resamples.
     """
-    for algorithm, by_name in scores.items():
-        tasks = max((tuple(by_task) for by_task in by_name.values()), key=len)
-        for name, by_task in by_name.items():
-            if len(tasks) > 1 and by_task.keys() == set(tasks):
-                yield _aggregate(algorithm, name, tasks, [by_task[task] for task in tasks], seed)
+    for algorithm, by_task in gains.items():
+        names = dict.fromkeys(name for by_name in by_task.values() for name in by_name)
+        for name in names if len(by_task) > 1 else ():
+            if all(name in by_name for by_name in by_task.values()):
+                yield _aggregate(algorithm, name, by_task, seed)
 
 
 def _aggregate(
-    algorithm: str, name: str, tasks: tuple[str, ...], scores: Sequence[Array], seed: int
+    algorithm: str, name: str, by_task: Mapping[str, Mapping[str, Array]], seed: int
 ) -> Aggregate:
-    runs = min(map(len, scores))
-    samples = [each[:runs] for each in scores]
+    runs = min(len(by_name[name]) for by_name in by_task.values())
+    own = [by_name[name][:runs] for by_name in by_task.values()]
+    baselines = [next(iter(by_name.items())) for by_name in by_task.values()]
+    others = [each for baseline, each in baselines if baseline != name]
+
+    def interval(statistic: Callable[[Array], Array]) -> Interval:
+        def of_samples(*samples: Array) -> Array:
+            mine = samples[: len(own)]
+            return statistic(_scores(mine, samples[len(own) :] or mine))
+
+        return percentile(of_samples, *own, *others, seed=seed)
+
     return Aggregate(
         algorithm=algorithm,
         representation=name,
-        tasks=tasks,
+        tasks=tuple(by_task),
         runs=runs,
-        iqm=percentile(lambda *each: iqm(_together(each)), *samples, seed=seed),
-        optimality_gap=percentile(
-            lambda *each: (1 - np.minimum(_together(each), 1)).mean(axis=-1), *samples, seed=seed
-        ),
+        iqm=interval(iqm),
+        optimality_gap=interval(lambda scores: (1 - np.minimum(scores, 1)).mean(axis=-1)),
         scores=SCORES,
-        profile=percentile(
-            lambda *each: _together(each).mean(axis=-1),
-            *((sample > SCORES[:, None]).astype(float) for sample in samples),
-            seed=seed,
-        ),
+        profile=interval(_shares_above),
     )
 
 
-def _together(samples: Sequence[Array]) -> Array:
-    return np.concatenate(samples, axis=-1)
+def _scores(gains: Sequence[Array], of_baseline: Sequence[Array]) -> Array:
+    """The scores of all tasks together, (..., tasks x runs); NaN where the baseline gains nothing.
+
+    Args:
+        gains: for each task, (..., runs).
+        of_baseline: for each task, (..., baseline's runs).
+    """
+    means = (each.mean(axis=-1, keepdims=True) for each in of_baseline)
+    scored = [
+        gain / np.where(mean > 0, mean, np.nan) for gain, mean in zip(gains, means, strict=True)
+    ]
+    return np.concatenate(scored, axis=-1)
+
+
+def _shares_above(scores: Array) -> Array:
+    above = scores > SCORES.reshape(-1, *[1] * scores.ndim)
+    return np.where(np.isnan(scores).any(axis=-1), np.nan, above.mean(axis=-1))

@@ -124,8 +124,11 @@ class Analysis:
 
     def __post_init__(self) -> None:
         claims = [claim.name for claim in self.claims]
+        if not claims or len(set(claims)) < len(claims):
+            raise ValueError("there must be claims, each once")
         for comparison in (each for group in self.groups for each in group.comparisons):
-            check_names("claims", [verdict.claim for verdict in comparison.verdicts], claims)
+            if (found := [verdict.claim for verdict in comparison.verdicts]) != claims:
+                raise ValueError(f"claims: {', '.join(found)}; expected {', '.join(claims)}")
         first = {group.labels[0].representation for group in self.groups}
         if first != {self.baseline}:
             raise ValueError(f"each group must begin with the baseline {self.baseline}")
@@ -197,7 +200,7 @@ def analyse(
         claims=tuple(judge.claims),
         notes=tuple(judge.notes),
         groups=analysed,
-        aggregates=tuple(aggregates(_scores(analysed), seed)),
+        aggregates=tuple(aggregates(_gains(analysed), seed)),
     )
 
 
@@ -235,15 +238,16 @@ def _analyse_group(
     )
 
 
-def _scores(groups: Sequence[GroupAnalysis]) -> dict[str, dict[str, dict[str, Array]]]:
-    """What each run gains as a share of the full state's gain: by algorithm, label and task."""
-    scores: dict[str, dict[str, dict[str, Array]]] = {}
+def _gains(groups: Sequence[GroupAnalysis]) -> dict[str, dict[str, dict[str, Array]]]:
+    """What each run gains, by algorithm, task and representation, where the baseline gains."""
+    gains: dict[str, dict[str, dict[str, Array]]] = {}
     for group in groups:
-        gain = float(group.labels[0].by_run["final_return"].mean()) - group.reference
-        for label in group.labels if gain > 0 else ():
-            by_task = scores.setdefault(group.algorithm, {}).setdefault(label.representation, {})
-            by_task[group.task] = (label.by_run["final_return"] - group.reference) / gain
-    return scores
+        finals = {each.representation: each.by_run["final_return"] for each in group.labels}
+        if next(iter(finals.values())).mean() > group.reference:
+            gains.setdefault(group.algorithm, {})[group.task] = {
+                name: each - group.reference for name, each in finals.items()
+            }
+    return gains
 
 
 def _ascend(values: Array) -> bool:

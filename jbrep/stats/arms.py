@@ -48,7 +48,7 @@ class Arm(NamedTuple):
         time: the mean of its runs' steps to the frame's half, at most all of training, (u,).
         curves: the first run of each unit over training, (u, g).
         runs: how many there are.
-        learnt: how many of them end above the frame's half.
+        learnt: of how many units all runs end above the frame's half.
         by_encoder: whether units are encoders.
     """
 
@@ -70,7 +70,7 @@ def measure(group: Group, seeds: Collection[int]) -> tuple[Frame, dict[str, Arm]
 
     Args:
         group: runs by representation.
-        seeds: that count; others are left out.
+        seeds: that count; others are left out, but for what units are.
 
     Raises:
         InputError: the runs have no range of steps in common.
@@ -82,13 +82,15 @@ def measure(group: Group, seeds: Collection[int]) -> tuple[Frame, dict[str, Arm]
     finals = final_returns(there, curves, grid)
     frame = _frame(there, finals, next(iter(curves.values())), grid)
     return frame, {
-        name: _arm(runs, finals[name], curves[name], grid, frame) for name, runs in there.items()
+        name: _arm(runs, _own_encoders(group[name]), finals[name], curves[name], grid, frame)
+        for name, runs in there.items()
     }
 
 
 def learns(arm: Arm, frame: Frame) -> bool:
     """Whether runs end above standing still, beyond chance."""
-    return bool(mean_within(arm.final, frame.bounds, LEVEL).low > frame.still)
+    mean, low, _ = mean_within(arm.final, frame.bounds, LEVEL)
+    return bool((mean if np.isnan(low) else low) > frame.still)  # NaN where all end alike
 
 
 def _frame(
@@ -111,16 +113,18 @@ def _frame(
     )
 
 
-def _arm(runs: list[RunCurve], final: Array, curves: Array, grid: Array, frame: Frame) -> Arm:
+def _arm(
+    runs: list[RunCurve], by_encoder: bool, final: Array, curves: Array, grid: Array, frame: Frame
+) -> Arm:
+    units = _units(runs) if by_encoder else [[number] for number in range(len(runs))]
     time = np.minimum(steps_to(curves, grid, frame.half) - grid[0], frame.steps)
-    units = _units(runs)
     return Arm(
         final=np.array([final[unit].mean() for unit in units]),
         time=np.array([time[unit].mean() for unit in units]),
         curves=np.stack([curves[unit[0]] for unit in units]),
-        runs=len(runs),
-        learnt=int(np.count_nonzero(final >= frame.half)),
-        by_encoder=_own_encoders(runs),
+        runs=len(final),
+        learnt=sum(bool((final[unit] >= frame.half).all()) for unit in units),
+        by_encoder=by_encoder,
     )
 
 
@@ -130,9 +134,7 @@ def _own_encoders(runs: list[RunCurve]) -> bool:
 
 
 def _units(runs: list[RunCurve]) -> list[list[int]]:
-    """The numbers of the runs in each unit."""
-    if not _own_encoders(runs):
-        return [[number] for number in range(len(runs))]
+    """The numbers of the runs of each encoder."""
     by_encoder: dict[int | None, list[int]] = {}
     for number, run in enumerate(runs):
         by_encoder.setdefault(run.encoder_seed, []).append(number)

@@ -47,7 +47,8 @@ def kept_gain(x: Arm, y: Arm, frame: Frame, level: float, seed: int = 0) -> Inte
     """The gain of x over standing still as a share of that of y, with its interval.
 
     The interval has the shares c with which the interval of mean(x) - c mean(y) has what standing
-    still would give (Fieller 1954); an end is infinite where y may not gain anything.
+    still would give (Fieller 1954), as far as they are looked for: an end is 1,000 or -1,000
+    where y may not gain anything.
     """
     gained, of_y = x.final.mean() - frame.still, y.final.mean() - frame.still
     if of_y <= 0:
@@ -71,7 +72,7 @@ def _end(room: Callable[[float, int], float], value: float, direction: int) -> f
         if room(value + direction * step, direction) < 0:
             return float(brentq(room, value, value + direction * step, (direction,)))
         step *= 2
-    return direction * np.inf
+    return direction * _FURTHEST
 
 
 def _kept_p(x: Arm, y: Arm, frame: Frame, boundary: float, seed: int) -> float:

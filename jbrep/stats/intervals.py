@@ -41,7 +41,7 @@ the others near 50, from runs that don't (40,000 samples each):
       of 99.44 %                         94.6  80.7  85.3    93.4  86.5  97.1
 
 because a group in which all runs happen to learn seems to vary little. That is why a verdict on
-variances also takes the permutation test (jbrep.stats.comparison).
+variances also takes the permutation test (jbrep.stats.first_claims).
 """
 
 import math

@@ -28,7 +28,7 @@ def levels(shares: Sequence[float], level: float) -> tuple[float, ...]:
     if len(shares) == 1:
         return (level,)
     least = norm.isf(level / 2)
-    constant = brentq(lambda c: _decided(shares, c) - level, least, 2 * least + 2)
+    constant = brentq(lambda c: _decided(shares, c) - level, least - 0.1, 2 * least + 2)
     return tuple(2 * norm.sf(constant / np.sqrt(shares)).astype(float))
 
 

@@ -37,7 +37,8 @@ class Part(NamedTuple):
 def mean_within(values: Array, bounds: Bounds, level: float) -> Interval:
     """The mean of (..., n) with its interval, (...); NaN where nothing varies."""
     runs, mean = values.shape[-1], values.mean(axis=-1)
-    error = np.where(constant(values), np.nan, values.std(axis=-1, ddof=1) / np.sqrt(runs))
+    deviation = values.std(axis=-1, ddof=1) if runs > 1 else np.nan
+    error = np.where(constant(values), np.nan, deviation / np.sqrt(runs))
     half = stdtrit(runs - 1, (1 + level) / 2) * error
     above, below = mean - bounds.low, bounds.high - mean
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):

@@ -19,7 +19,8 @@ EFFECTS = (
     "final returns of runs have an SD of 5, 10 or 20 % of it, on either side. Of "
     f"{LESS_VARIANCE.name!r}: if the spread of curves is 1/2, 1/3 or 1/5 of the full agents'. Of "
     f"{FASTER.name!r}: if half of the gain comes earlier by a tenth of training, and the time "
-    "varies by an SD of 5, 10 or 20 % of training."
+    "varies by an SD of 5, 10 or 20 % of training. Each by itself: claims before it, and runs that "
+    "fail to learn, may stop a verdict."
 )
 _SDS = (0.05, 0.1, 0.2)
 _RATIOS = (1 / 2, 1 / 3, 1 / 5)
@@ -61,11 +62,12 @@ def obstacle(rules: Rules, claim: str, arms: Arms) -> str | None:
         return f"a side has {fewest} runs or encoders, and verdicts take {FEWEST}"
     if _least_p(claim, arms) > _level(Planned(rules, (*range(arms.runs),))):
         return f"its least p-value is {_least_p(claim, arms):.2g}, above its level"
-    most = most_failing(0, arms.runs)
+    most = most_failing(0, arms.units)
     if most > rules.failing:
+        what = "encoders" if arms.units < arms.runs else "runs"
         return (
-            f"even if all {arms.runs} runs learn, up to {100 * most:.0f} % may fail, and the limit "
-            f"is {100 * rules.failing:.0f} %; plan more runs, or set verdicts.failing"
+            f"even if all {arms.units} {what} learn, up to {100 * most:.0f} % may fail, and the "
+            f"limit is {100 * rules.failing:.0f} %; plan more, or set verdicts.failing"
         )
     return None
 
@@ -90,11 +92,11 @@ def _level(planned: Planned) -> float:
 
 
 def _least_p(claim: str, arms: Arms) -> float:
-    """Of a permutation of n and m curves; that of a mean can be any."""
+    """Of a permutation of n and m curves, two-sided; that of a mean can be any."""
     if claim != LESS_VARIANCE.name:
         return 0.0
     splits = comb(arms.units + arms.baseline, arms.units)
-    return max(1 / (PERMUTATIONS + 1), (1 + (arms.units == arms.baseline)) / splits)
+    return 2 / min(PERMUTATIONS + 1, splits)
 
 
 @lru_cache(256)

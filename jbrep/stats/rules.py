@@ -8,7 +8,7 @@ is done passes its share on to the others (Holm 1979; with orders within cells, 
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -69,7 +69,7 @@ class Rules:
         if len({*self.primary}) < len(self.primary):
             raise InputError(f"primary is {list(self.primary)}: each cell may be there once")
         looks = (0.0, *self.looks)
-        if looks[-1] not in (0, 1) or any(a >= b for a, b in pairwise(looks)):
+        if looks[-1] not in (0, 1) or not all(a < b for a, b in pairwise(looks)):
             raise InputError(
                 f"looks are {list(self.looks)}: they must be shares of the seeds that ascend to 1"
             )
@@ -125,12 +125,13 @@ class Planned:
             )
         shared = "one primary cell has" if cells == 1 else f"{cells} primary cells share"
         counts = " and ".join(map(str, self.counts))
+        levels = ", at O'Brien and Fleming's levels" if len(self.counts) > 1 else ""
         return (
             f"Claims are tested in the order {', '.join(self.rules.claims)}, each once the one "
             f"before it is supported; {shared} an error of {100 * ERROR:.0f} %, two-sided, in "
             f"Holm's way.",
-            f"Verdicts may come after {counts} runs of each arm, at O'Brien and Fleming's levels; "
-            "other cells are exploratory.",
+            f"Verdicts may come after {counts} runs of each arm{levels}; other cells are "
+            "exploratory.",
         )
 
     def __call__(self, groups: Mapping[Key, Group], seed: int = 0) -> Verdicts:
@@ -143,20 +144,12 @@ class Planned:
         Raises:
             InputError: runs of a group have no range of steps in common.
         """
-        cells = [
-            _Cell(key, name, ERROR / len(self.rules.primary))
-            for key, group in groups.items()
-            for name in list(group)[1:]
-            if "/".join((*key, name)) in self.rules.primary
-        ]
+        cells = {name: _Cell(name, ERROR / len(self.rules.primary)) for name in self.rules.primary}
         for look in range(len(self.looks)):
-            _look(cells, groups, self, look, seed)
-        by_name = {(cell.key, cell.representation): cell for cell in cells}
+            _look(list(cells.values()), groups, self, look, seed)
         return {
             key: {
-                name: _whole(by_name[key, name], group, self, seed)
-                if (key, name) in by_name
-                else _explored(group, name, self.rules, seed)
+                name: _whole(cells.get("/".join((*key, name))), group, name, self, seed)
                 for name in list(group)[1:]
             }
             for key, group in groups.items()
@@ -165,18 +158,13 @@ class Planned:
 
 @dataclass
 class _Cell:
-    """A primary cell while it is tested."""
+    """A primary cell while it is tested, whether or not it has runs."""
 
-    key: Key
-    representation: str
+    name: str
     level: float  # its share
     verdicts: list[Verdict] = field(default_factory=list)  # of claims that are decided
     undecided: Verdict | None = None  # of the claim that was tested last
     is_open: bool = True
-
-    @property
-    def name(self) -> str:
-        return "/".join((*self.key, self.representation))
 
 
 def _look(
@@ -188,7 +176,12 @@ def _look(
 ) -> None:
     """Test at a look whatever can be tested; levels that become free are used at once."""
     rules, seeds = planned.rules, planned.seeds[: planned.counts[look]]
-    ready = {c.name: m for c in cells if (m := _measured(groups[c.key], c.representation, seeds))}
+    ready = {
+        "/".join((*key, name)): measured
+        for key, group in groups.items()
+        for name in list(group)[1:]
+        if (measured := _measured(group, name, seeds))
+    }
     tested = True
     while tested:
         tested = False
@@ -197,7 +190,7 @@ def _look(
                 continue
             claim = CLAIMS[rules.claims[len(cell.verdicts)]]
             level = levels(planned.looks, cell.level)[look]
-            verdict = _tested(claim, *ready[cell.name], rules, level, look + 1, seed)
+            verdict = _tested(claim, *ready[cell.name], planned, level, look + 1, seed)
             if verdict.verdict == UNDECIDED:
                 cell.undecided = verdict
                 continue
@@ -220,7 +213,7 @@ def _measured(
     """The arms of a representation and of the baseline, if all runs of the seeds are there."""
     baseline = next(iter(group))
     both = {name: group[name] for name in (baseline, representation)}
-    if not all({run.seed for run in runs}.issuperset(seeds) for runs in both.values()):
+    if not seeds or not all({r.seed for r in runs}.issuperset(seeds) for runs in both.values()):
         return None
     frame, arms = measure(both, seeds)
     return arms[representation], arms[baseline], frame
@@ -231,16 +224,20 @@ def _tested(
     x: Arm,
     y: Arm,
     frame: Frame,
-    rules: Rules,
+    planned: Planned,
     level: float,
     look: int,
     seed: int,
 ) -> Verdict:
-    estimated = _estimated(claim, x, y, frame, rules, seed)
+    estimated = _estimated(claim, x, y, frame, planned.rules, seed)
     boundary = estimated.boundary
     p = claim.p_value(x, y, frame, boundary, seed)
     direction = claim.side * np.sign(estimated.estimate.value - boundary) if p <= level else 0
-    reason = _reason(claim, x, y, frame, rules, direction)
+    reason = _reason(claim, x, y, frame, planned.rules, direction)
+    if reason is None and np.isnan(p):
+        reason = "nothing varies from run to run"
+    if reason is None and not direction and look < len(planned.counts):
+        reason = f"another look comes at {planned.counts[look]} runs"
     return replace(
         estimated,
         verdict={1: SUPPORTED, -1: CONTRADICTED, 0: UNDECIDED}[0 if reason else int(direction)],
@@ -261,10 +258,11 @@ def _reason(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, direction:
     if not learns(y, frame):
         return "agents on the full state didn't learn"
     if claim.estimate is kept_gain and direction > 0:
-        most = most_failing(x.runs - x.learnt, x.runs)
+        most = most_failing(x.units - x.learnt, x.units)
         if most > rules.failing:
+            what = "encoders" if x.by_encoder else "runs"
             return (
-                f"up to {100 * most:.0f} % of its runs may fail to learn; the limit is "
+                f"up to {100 * most:.0f} % of its {what} may fail to learn; the limit is "
                 f"{100 * rules.failing:.0f} %"
             )
     return None
@@ -297,30 +295,37 @@ def _estimated(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, seed: i
 
 
 def _explored(
-    group: Group, name: str, rules: Rules, seed: int, tested: int = 0
+    group: Group, name: str, rules: Rules, seeds: Collection[int], seed: int, tested: int = 0
 ) -> tuple[Verdict, ...]:
-    """Estimates from all runs of each claim but the first, which are tested."""
+    """Estimates from runs of some seeds, of each claim but the first, which are tested."""
     baseline = next(iter(group))
-    both = {each: group[each] for each in (baseline, name)}
-    frame, arms = measure(both, {run.seed for runs in both.values() for run in runs})
+    frame, arms = measure({each: group[each] for each in (baseline, name)}, seeds)
     x, y = arms[name], arms[baseline]
     claims = rules.claims[tested:]
     return tuple(_estimated(CLAIMS[each], x, y, frame, rules, seed) for each in claims)
 
 
-def _whole(cell: _Cell, group: Group, planned: Planned, seed: int) -> tuple[Verdict, ...]:
-    """A verdict on each claim: decided, tested last, or not tested."""
+def _whole(
+    cell: _Cell | None, group: Group, name: str, planned: Planned, seed: int
+) -> tuple[Verdict, ...]:
+    """A verdict on each claim: decided, tested last, or not tested; estimates of other cells."""
+    rules, every = planned.rules, {run.seed for runs in group.values() for run in runs}
+    if cell is None:
+        return _explored(group, name, rules, every, seed)
     tested = (*cell.verdicts, *([cell.undecided] if cell.undecided else []))
-    others = _explored(group, cell.representation, planned.rules, seed, len(tested))
     if not tested:
         reason = f"the first look is at {planned.counts[0]} runs of each arm"
         return tuple(
             replace(each, verdict=NOT_YET, estimate=UNDEFINED, interval=UNDEFINED, reason=reason)
-            for each in others
+            for each in _explored(group, name, rules, every, seed)
         )
     before = tested[-1]
+    seeds = planned.seeds[: planned.counts[before.look - 1]]
     reason = f"not tested: {before.claim!r} is {before.verdict}"
     return (
         *tested,
-        *(replace(each, verdict=UNDECIDED, look=before.look, reason=reason) for each in others),
+        *(
+            replace(each, verdict=UNDECIDED, look=before.look, reason=reason)
+            for each in _explored(group, name, rules, seeds, seed, len(tested))
+        ),
     )

@@ -101,13 +101,18 @@ class RunCurve:
             value = getattr(self, what)
             if value is not None and not abs(value) <= LARGEST_RETURN:
                 raise self._error(f"its {what} is {value}", "give a number, or None if unknown")
-        if self.return_floor is None or not returns.size:
+        every = returns if self.final is None else np.append(returns, self.final)
+        if not every.size:
             return
-        rounding = _ROUNDING * max(1, abs(self.return_floor), np.abs(returns).max())
-        if returns.min() < self.return_floor - rounding:
+        low, high = self.bounds
+        rounding = _ROUNDING * max(1, np.abs(every).max())
+        if every.min() < low - rounding:
             raise self._error(
-                f"its least return is {returns.min():g}",
-                f"its task has none below {self.return_floor:g}",
+                f"its least return is {every.min():g}", f"its task has none below {low:g}"
+            )
+        if every.max() > high + rounding:
+            raise self._error(
+                f"its largest return is {every.max():g}", f"its task has none above {high:g}"
             )
 
     def _check_length(self, steps: NDArray[np.int64]) -> None:

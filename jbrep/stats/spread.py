@@ -18,7 +18,8 @@ from jbrep.stats.bootstrap import Array, Interval
 PERMUTATIONS = 9999
 _FOR_INTERVALS = 499
 _FURTHEST = 12.0  # logarithm of a ratio of spreads: nobody has seen more
-_CLOSE = 1e-3  # of that logarithm
+_CLOSE = 5e-3  # of that logarithm
+_LEVEL = 0.95  # of intervals that are shown; those of tests have higher ones
 _AT_ONCE = 1 << 22  # numbers in memory
 
 
@@ -53,13 +54,18 @@ def _median(values: Array) -> Array:
 def ratio_of_spreads(curves: Curves, level: float, seed: int) -> Interval:
     """By what the deviations of x must be divided to spread like those of y, with an interval.
 
-    The interval has the ratios that the permutation test doesn't reject (Hodges and Lehmann 1963).
+    The interval has the ratios that the permutation test doesn't reject (Hodges and Lehmann 1963):
+    that of a test by its own permutations, so that they agree. Ratios are looked for from e^-12 to
+    e^12; all is NaN where no curves differ from one another.
     """
-    ends = (-_FURTHEST, _FURTHEST)
-    if _excess(curves, ends[0]) <= 0 or _excess(curves, ends[1]) >= 0:
-        return Interval(np.nan, np.nan, np.nan)  # no curves differ from one another
-    value = float(brentq(partial(_excess, curves), *ends))
-    drawn = _permuted(curves, _FOR_INTERVALS, seed)
+    most, least = _excess(curves, -_FURTHEST), _excess(curves, _FURTHEST)
+    if most == least == 0:
+        return Interval(np.nan, np.nan, np.nan)
+    if most > 0 > least:
+        value = float(brentq(partial(_excess, curves), -_FURTHEST, _FURTHEST))
+    else:
+        value = _FURTHEST if least >= 0 else -_FURTHEST
+    drawn = _permuted(curves, PERMUTATIONS if level > _LEVEL else _FOR_INTERVALS, seed)
 
     def is_rejected(log_ratio: float) -> bool:
         return _p(curves, log_ratio, drawn) <= 1 - level
@@ -71,7 +77,8 @@ def ratio_of_spreads(curves: Curves, level: float, seed: int) -> Interval:
 def spread_p(curves: Curves, seed: int, permutations: int = PERMUTATIONS) -> float:
     """P-value of equal spreads: whole curves are permuted after taking off their group's median.
 
-    Two-sided (Phipson and Smyth 2010: the curves as they are count as one permutation).
+    Two-sided, twice the smaller share, as that of few curves isn't symmetrical (Phipson and Smyth
+    2010: the curves as they are count as one permutation).
     """
     return _p(curves, 0.0, _permuted(curves, permutations, seed))
 
@@ -99,22 +106,26 @@ def _p(curves: Curves, log_ratio: float, drawn: NDArray[np.int64]) -> float:
     """P-value of a ratio of spreads."""
     x, y = _shrunk(curves, log_ratio)
     how, by_step = (curves.weights, curves.resolution), np.concatenate((x, y)).T.copy()
-    observed = abs(_excess(curves, log_ratio))
+    observed = _excess(curves, log_ratio)
     parts = np.array_split(drawn, -(-drawn.size * len(by_step) // _AT_ONCE))
     each = np.concatenate(
         [
-            np.abs(log_spread(mixed[..., : len(x)], *how) - log_spread(mixed[..., len(x) :], *how))
+            log_spread(mixed[..., : len(x)], *how) - log_spread(mixed[..., len(x) :], *how)
             for mixed in (by_step[:, orders] for orders in parts)
         ]
     )
-    return float((1 + np.count_nonzero(each >= observed * (1 - 1e-12))) / (1 + len(drawn)))
+    rounding = 1e-12 * abs(observed)
+    beyond = (each >= observed - rounding).sum(), (each <= observed + rounding).sum()
+    return float(min(1.0, 2 * (1 + min(beyond)) / (1 + len(drawn))))
 
 
 def _last_kept(value: float, direction: int, is_rejected: Callable[[float], bool]) -> float:
-    """The furthest logarithm of a ratio in a direction that isn't rejected."""
-    kept, beyond = value, value + direction * _FURTHEST
-    if not is_rejected(beyond):
-        return direction * np.inf
+    """The furthest logarithm of a ratio in a direction that isn't rejected, as far as is looked."""
+    kept, step = value, 0.5
+    while not is_rejected(beyond := value + direction * step):
+        kept, step = beyond, 2 * step
+        if step > _FURTHEST:
+            return direction * _FURTHEST
     while abs(beyond - kept) > _CLOSE:
         middle = (kept + beyond) / 2
         kept, beyond = (kept, middle) if is_rejected(middle) else (middle, beyond)

@@ -65,11 +65,20 @@ def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[tuple[str, Ro
 
 
 def across_tasks(analysis: Analysis) -> list[tuple[str, Rows]]:
-    """A table for each algorithm that learned several tasks, with a title."""
+    """A table for each algorithm that learned several tasks, with a title.
+
+    What waits for a look on any task is left out.
+    """
+    closed = {
+        comparison.representation
+        for group in analysis.groups
+        for comparison in group.comparisons
+        if not comparison.is_open
+    }
     header = (_KEY, "runs", "IQM", "optimality gap")
     return [
         (
-            f"{algorithm} across {len(first.tasks)} tasks: gains over standing still as shares of "
+            f"{algorithm} across {', '.join(first.tasks)}: gains over standing still as shares of "
             f"that on {analysis.baseline}; 95 % intervals over runs within tasks",
             (
                 header,
@@ -81,6 +90,7 @@ def across_tasks(analysis: Analysis) -> list[tuple[str, Rows]]:
                         shown(each.optimality_gap, ".2f"),
                     )
                     for each in (first, *others)
+                    if each.representation not in closed
                 ],
             ),
         )

@@ -19,7 +19,7 @@ from jbrep.rl.names import CPU, FLOAT32
 from jbrep.rl.run import Run
 from jbrep.stats.arms import FEWEST
 from jbrep.stats.power import Arms, obstacle
-from jbrep.stats.rules import Rules
+from jbrep.stats.rules import Planned, Rules
 from jbrep.study.representations import (
     ByName,
     Given,
@@ -152,6 +152,12 @@ class Study:
             raise InputError(
                 f"tasks has {long[0]}: say {short[long[0]]}, as tables do, where there are verdicts"
             )
+        counts = Planned(self.rules, self.seeds).counts
+        if len(set(counts)) < len(counts):
+            raise InputError(
+                f"verdicts.looks are {list(self.rules.looks)}: of {len(self.seeds)} seeds, they "
+                f"come after {' and '.join(map(str, counts))}"
+            )
         for cell in self.rules.primary:
             if cell not in cells or not self.comparisons:
                 raise InputError(
@@ -164,8 +170,8 @@ class Study:
                         f"verdicts: no outcome could support {claim!r} of {cell}: {reason}"
                     )
         for each in self.observed:
-            counts = each.shares(self.seeds)
-            if min(counts) < 2 and len(set(counts)) > 1:
+            shares = each.shares(self.seeds)
+            if min(shares) < 2 and len(set(shares)) > 1:
                 raise InputError(
                     f"{each.name} has {each.encoders} encoders for {len(self.seeds)} seeds: each "
                     "encoder must have as many runs, or at least two"
@@ -262,6 +268,11 @@ def as_study(given: Mapping[str, Any]) -> Study:
     study = Study(**_checked(Study, given, ""))
     named = ((name, study.learner(name).table) for name in study.algorithms)
     return replace(study, learners={name: table for name, table in named if table})
+
+
+def known(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a study that its JSON says, which has null where there is nothing."""
+    return {name: value for name, value in settings.items() if value is not None}
 
 
 def _checked(kind: Any, given: Any, where: str) -> dict[str, Any]:

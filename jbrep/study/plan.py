@@ -18,7 +18,7 @@ from jbrep.rl.learner import Learner
 from jbrep.rl.names import SB3, usual_trainer
 from jbrep.rl.run import plain
 from jbrep.stats.rules import Planned
-from jbrep.study.config import Study, as_study
+from jbrep.study.config import Study, as_study, known
 from jbrep.study.registration import Registration, check_registered, read_registration
 from jbrep.study.representations import Representation
 from jbrep.study.work import Assigned
@@ -87,9 +87,11 @@ class Plan:
 
     @property
     def judge(self) -> Planned:
-        """What reaches verdicts: the study's rules, on the seeds that were registered, if any."""
-        seeds = self.registration["study"]["seeds"] if self.registration else self.study.seeds
-        return Planned(self.study.rules, tuple(seeds))
+        """What reaches verdicts: the rules that were registered, on the seeds that were."""
+        if not self.registration:
+            return Planned()
+        registered = as_study(known(self.registration["study"]))
+        return Planned(registered.rules, registered.seeds)
 
     def trainer(self, cell: Cell) -> str:
         """What trains a run."""
@@ -225,7 +227,7 @@ def read_plan(folder: Path) -> Plan | None:
         return None
     try:
         given = _completed(json.loads(read_regular(path, _MAX_BYTES)))
-        return Plan(as_study({n: v for n, v in given.items() if v is not None}), folder)
+        return Plan(as_study(known(given)), folder)
     except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         raise InputError(
             f"{path} is damaged, or of a newer jbrep ({error}): choose another folder"

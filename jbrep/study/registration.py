@@ -12,6 +12,7 @@ from jbrep.files.commit import commits
 from jbrep.files.storage import exists, read_regular, write_whole
 from jbrep.files.typed import read_json, typed
 from jbrep.rl.job import packages
+from jbrep.study.config import as_study, known
 
 REGISTRATION = "registration.json"
 FORMAT = "jbrep registration"
@@ -46,7 +47,7 @@ def register(folder: Path, study: Mapping[str, Any], encoders: Mapping[str, str]
     if there := read_registration(folder):
         check_registered(there, study, folder)
         return there
-    if any((folder / "runs").glob("**/*.*")):
+    if has_begun(folder):
         raise InputError(f"{folder} has runs: a study is registered before its first run")
     now = datetime.now(UTC).isoformat(timespec="seconds")
     facts = {
@@ -60,6 +61,11 @@ def register(folder: Path, study: Mapping[str, Any], encoders: Mapping[str, str]
     record = {"format": FORMAT, "format_version": FORMAT_VERSION, **made}
     write_whole(folder / REGISTRATION, (json.dumps(record, indent=2) + "\n").encode())
     return made
+
+
+def has_begun(folder: Path) -> bool:
+    """Whether a study has runs, at whatever step."""
+    return any((folder / "runs").glob("**/*.*"))
 
 
 def read_registration(folder: Path) -> Registration | None:
@@ -76,6 +82,7 @@ def read_registration(folder: Path) -> Registration | None:
         text = read_regular(path, _MAX_BYTES).decode()
         record = read_json(text, path, FORMAT, FORMAT_VERSION)
         registration: Registration = typed(record, Registration)
+        as_study(known(registration["study"]))
     except (OSError, ValueError) as error:
         raise DamageError(f"{path} is damaged: {error}") from None
     facts = {name: value for name, value in registration.items() if name in _HASHED}

@@ -17,7 +17,6 @@ from jbrep.files.tables import write_csv
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.stats.rules import Planned
-from jbrep.stats.verdict import Judge
 from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.record import RECORD, as_json, learner, record, shared_settings
 from jbrep.study.references import STILL, References, read_references, write_references
@@ -37,15 +36,12 @@ class Results(NamedTuple):
     left_out: list[str]  # what there are no statistics of, and why
 
 
-def conclude(
-    folder: Path, across_trainers: bool = False, judge: Judge | None = None
-) -> tuple[Results, list[Path]]:
+def conclude(folder: Path, across_trainers: bool = False) -> tuple[Results, list[Path]]:
     """Write the tables of the runs below a folder, of a study or not, as far as they have ended.
 
     Args:
         folder: with the runs.
         across_trainers: compare runs of different trainers, too.
-        judge: what reaches verdicts; by default the rules of the study.
 
     Returns:
         The results and the files: every return, what was run, the statistics if there are any, and
@@ -55,20 +51,17 @@ def conclude(
         InputError: as `read_results` and `write_results`.
     """
     references = write_references(_tasks(_folders(folder, read_plan(folder))), folder)
-    results = read_results(folder, across_trainers, judge)
+    results = read_results(folder, across_trainers)
     paths = write_results(results, folder)
     return results, [*paths, references] if references else paths
 
 
-def read_results(
-    folder: Path, across_trainers: bool = False, judge: Judge | None = None
-) -> Results:
+def read_results(folder: Path, across_trainers: bool = False) -> Results:
     """The runs below a folder that have finished or failed, with statistics if they allow any.
 
     Args:
         folder: with the runs.
         across_trainers: compare runs of different trainers, too.
-        judge: what reaches verdicts; by default the rules of the study.
 
     Raises:
         InputError: there is no such run, or a file is damaged.
@@ -78,7 +71,7 @@ def read_results(
     references = read_references(folder)
     runs = [_curve(each, references, across_trainers) for each in folders]
     compared, left_out = _comparable(runs)
-    judge = judge or (plan.judge if plan else Planned())
+    judge = plan.judge if plan else Planned()
     try:
         analysis = analyse(compared, judge, references=references) if compared else None
         return Results(folders, runs, analysis, left_out)

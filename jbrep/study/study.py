@@ -13,12 +13,13 @@ from jbrep.rl import Run
 from jbrep.rl.job import Job
 from jbrep.rl.speed import estimate
 from jbrep.stats.power import EFFECTS, prospects
+from jbrep.stats.rules import Planned
 from jbrep.stats.summary import probability
 from jbrep.study.packing import Pack, packed, until_done
 from jbrep.study.plan import Plan
 from jbrep.study.prepare import check, prepare
 from jbrep.study.progress import Progress, duration
-from jbrep.study.registration import Registration, register
+from jbrep.study.registration import Registration, has_begun, register
 from jbrep.study.representations import ByCode
 from jbrep.study.runner import Backend
 from jbrep.study.work import CRASHED
@@ -27,6 +28,8 @@ from jbrep.text import table
 
 def run_study(plan: Plan, backend: Backend, workers: int, width: int | None = None) -> int:
     """Collect data, train encoders, and train every agent that hasn't been trained yet.
+
+    A study that names primary cells is registered first, unless it has begun.
 
     `jbrep.study.results.conclude` then writes what came of it.
 
@@ -48,6 +51,9 @@ def run_study(plan: Plan, backend: Backend, workers: int, width: int | None = No
     packs = packed(plan, unfinished, workers, width)
     plan.write()
     with exclusive(plan.folder):
+        if plan.study.rules.primary and not has_begun(plan.folder):
+            register(plan.folder, plan.as_json(), plan.fingerprints)
+            plan = Plan(plan.study, plan.folder)  # its runs name the registration
         prepare(plan)
         for cell in plan.cells:  # so that any mistake shows before the first run
             _ = Job(plan.run(cell), plan.folder_of(cell)).result
@@ -113,7 +119,7 @@ def dry_run(plan: Plan, workers: int, width: int | None = None, columns: int | N
 
 def _outlook(plan: Plan, columns: int | None) -> list[str]:
     """What could be found in the primary cells."""
-    judge = plan.judge
+    judge = Planned(plan.study.rules, plan.study.seeds)
     if not judge.rules.primary:
         return []
     arms = {cell.label: plan.study.arms(cell.representation) for cell in plan.cells}
