@@ -325,6 +325,16 @@ def test_pages_have_a_light_and_a_dark_style(plots):
     assert Drawing(plot, DARK).picture("svg") == dark
 
 
+def test_policies_with_dollar_signs_are_no_formulas(analysis, returns):
+    odd = {"$x^{$": Interval(300.0, 290.0, 310.0)}
+    groups = tuple(replace(group, references=odd) for group in analysis.groups)
+    claim = replace(analysis.claims[0], estimand="$x^{$")
+    changed = replace(analysis, groups=groups, claims=(claim, *analysis.claims[1:]))
+    played = {"face_direction": {"$x^{$": [300.0]}}
+    for plot in study_plots(changed, returns, played, {})[:5]:
+        drawn(plot).canvas.draw()
+
+
 def test_names_with_dollar_signs_are_no_formulas(returns):
     odd = [row._replace(representation="$x^{") for row in returns]
     (plot, *_) = study_plots(None, odd, {}, {})

@@ -102,6 +102,29 @@ def test_a_registration_comes_first_and_stays_as_it_is(tmp_path):
         register_study(Plan(TINIER, plan.folder))
 
 
+def test_a_registration_without_a_study_is_refused(registered, tmp_path):
+    record = json.loads((registered.folder / REGISTRATION).read_text())
+    (tmp_path / REGISTRATION).write_text(json.dumps({**record, "study": {}}))
+    with pytest.raises(InputError, match="is damaged: tasks is missing"):
+        read_registration(tmp_path)
+
+
+def test_a_study_with_primary_cells_is_registered_when_it_begins(tmp_path):
+    """Without a registration before the first run, there are no verdicts."""
+    primary = {"primary": ["face_direction/a2c/pca-8"], "failing": 0.4}
+    seeds = tuple(range(8))
+    study = replace(TINY, seeds=seeds, steps=16, evaluate_every=16, verdicts=primary)
+    plan = Plan(study, tmp_path / "study")
+    assert run_study(plan, in_this_process, 1) == 0
+    again = Plan(study, tmp_path / "study")
+    assert (again.judge.rules.primary, again.judge.seeds) == (tuple(primary["primary"]), seeds)
+    for path in (tmp_path / "study").rglob(RUN):
+        settings = json.loads(path.read_text())["settings"]
+        assert settings["registration"] == again.registration["sha256"]
+    (again.folder / REGISTRATION).unlink()
+    assert Plan(study, tmp_path / "study").judge.rules.primary == ()
+
+
 def test_a_study_begins_under_its_registration(tmp_path, monkeypatch):
     monkeypatch.setitem(BACKENDS, "local", in_this_process)
     (tmp_path / "tiny.toml").write_text(TOML)

@@ -107,6 +107,8 @@ def shapes(n, random, studies=3000):
         ),
         ({"returns": np.full((11, 3), -1e16)}, "returns aren't finite, or beyond"),
         ({"returns": np.full((11, 3), -1.0)}, "least return is -1; its task has none below 0"),
+        ({"return_ceiling": 400.0}, r"largest return is \d+(\.\d+)?; its task has none above 400"),
+        ({"final": np.full(5, -9.0)}, "least return is -9; its task has none below 0"),
         ({"return_floor": -np.inf}, "its return_floor is -inf; give a number, or None if unknown"),
         ({"solved": np.nan}, "its solved is nan"),
         (
@@ -647,6 +649,8 @@ DAMAGES = [
         "unknown verdict '<b>'",
     ),
     (lambda whole, group: group["comparisons"][0]["verdicts"].pop(), "claims: .*expected"),
+    (lambda whole, group: group["comparisons"][0]["verdicts"].reverse(), "claims: .*expected"),
+    (lambda whole, group: whole.update(claims=[]), "there must be claims, each once"),
     (lambda whole, group: group["comparisons"][0]["verdicts"][0].update(p="0"), "number or null"),
 ]
 
