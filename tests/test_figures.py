@@ -104,7 +104,7 @@ def panels(figure):
 def test_a_study_has_every_figure(plots):
     assert list(plots) == [
         *("representations", "final_return", "claims", "learning_rate", "profiles"),
-        *("every_run", "system", "autoencoders"),
+        *("across_tasks", "every_run", "system", "autoencoders"),
     ]
 
 
@@ -283,6 +283,15 @@ def test_a_profile_falls_from_all_runs_to_none(analysis):
     at = group.profile_returns.tolist().index(900)
     assert share[at] == (label.by_run["final_return"] > 900).mean()
     assert np.all(np.diff(share) <= 0)
+
+
+def test_profiles_across_tasks_are_those_of_the_statistics(plots, analysis):
+    (axes,) = drawn(plots["across_tasks"]).axes
+    assert axes.get_title(loc="left") == "sac, 2 tasks"
+    _, *steps = [line for line in axes.lines if len(line.get_xdata()) == 2 or line.get_label()]
+    for line, each in zip(steps, analysis.aggregates, strict=True):
+        np.testing.assert_array_equal(line.get_ydata(), each.profile.value)
+    assert steps[1].get_label() == "dae-8 (n = 3)"
 
 
 def test_without_statistics_the_runs_are_drawn_all_the_same(returns):

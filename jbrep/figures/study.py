@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from jbrep.encoders import FULL
+from jbrep.figures.across import across_tasks
 from jbrep.figures.claims import claims
 from jbrep.figures.curves import References, Return, curves, every_run
 from jbrep.figures.diagnostics import diagnostics
@@ -48,6 +49,8 @@ def study_plots(
         if any(group.comparisons for group in groups):
             plots.append(claims(analysis, looks))
         plots += [learning_rate(groups, looks), profiles(analysis, looks)]
+        if analysis.aggregates:
+            plots.append(across_tasks(analysis, looks))
     if associations:
         plots.append(diagnostics(associations, looks))
     if returns:
