@@ -19,7 +19,7 @@ def across_tasks(analysis: Analysis, looks: Looks) -> Plot:
         ("algorithm", "representation", "tasks", "score", "share", "low", "high"),
         [
             (each.algorithm, each.representation, ", ".join(each.tasks), *map(cell, row))
-            for each in analysis.aggregates
+            for each in analysis.open_aggregates
             for row in zip(each.scores, *each.profile, strict=True)
         ],
         lambda: _draw(analysis, looks),
@@ -27,20 +27,19 @@ def across_tasks(analysis: Analysis, looks: Looks) -> Plot:
 
 
 def _draw(analysis: Analysis, looks: Looks) -> Figure:
-    algorithms = list(dict.fromkeys(each.algorithm for each in analysis.aggregates))
+    aggregates = analysis.open_aggregates
+    algorithms = list(dict.fromkeys(each.algorithm for each in aggregates))
     figure, panels = panel_grid(len(algorithms), 2.0)
     look = looks()
     for axes, algorithm in zip(panels, algorithms, strict=True):
         axes.axvline(1, **reference())
-        for each in analysis.aggregates:
-            if each.algorithm != algorithm:
-                continue
+        own = [each for each in aggregates if each.algorithm == algorithm]
+        for each in own:
             colour, (share, low, high) = look[each.representation]["color"], each.profile
             axes.fill_between(each.scores, low, high, step="post", color=colour, alpha=0.12, lw=0)
             name = with_runs(each.representation, [each.runs])
             axes.step(each.scores, share, where="post", color=colour, label=name)
-        tasks = next(len(each.tasks) for each in analysis.aggregates if each.algorithm == algorithm)
-        axes.set_title(plain(f"{algorithm}, {tasks} tasks"))
+        axes.set_title(plain(f"{algorithm}, {len(own[0].tasks)} tasks"))
         axes.set(ylim=(-0.02, 1.02), xlabel="share of the full agents' gain")
         axes.set(ylabel="share of runs above")
     below(figure, panels)

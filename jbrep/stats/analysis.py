@@ -133,6 +133,13 @@ class Analysis:
         if first != {self.baseline}:
             raise ValueError(f"each group must begin with the baseline {self.baseline}")
 
+    @property
+    def open_aggregates(self) -> list[Aggregate]:
+        """Results across tasks of the representations that wait for a look on none."""
+        every = (each for group in self.groups for each in group.comparisons)
+        closed = {each.representation for each in every if not each.is_open}
+        return [each for each in self.aggregates if each.representation not in closed]
+
     def to_json(self) -> str:
         """All of it as JSON; an interval is [value, low, high], null stands for not finite."""
         record = {"format": FORMAT, "format_version": FORMAT_VERSION, **self.tolist()}

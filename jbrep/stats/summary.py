@@ -65,16 +65,7 @@ def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[tuple[str, Ro
 
 
 def across_tasks(analysis: Analysis) -> list[tuple[str, Rows]]:
-    """A table for each algorithm that learned several tasks, with a title.
-
-    What waits for a look on any task is left out.
-    """
-    closed = {
-        comparison.representation
-        for group in analysis.groups
-        for comparison in group.comparisons
-        if not comparison.is_open
-    }
+    """A table for each algorithm that learned several tasks, with a title."""
     header = (_KEY, "runs", "IQM", "optimality gap")
     return [
         (
@@ -90,11 +81,10 @@ def across_tasks(analysis: Analysis) -> list[tuple[str, Rows]]:
                         shown(each.optimality_gap, ".2f"),
                     )
                     for each in (first, *others)
-                    if each.representation not in closed
                 ],
             ),
         )
-        for algorithm, (first, *others) in _by_algorithm(analysis.aggregates).items()
+        for algorithm, (first, *others) in _by_algorithm(analysis.open_aggregates).items()
     ]
 
 
