@@ -7,6 +7,7 @@ import pytest
 from joblib import cpu_count
 
 from jbrep.errors import InputError
+from jbrep.rl import Run, speed
 from jbrep.rl.cohort.replay import memory_of
 from jbrep.study.config import Study
 from jbrep.study.packing import packed, until_done, usual_workers
@@ -72,3 +73,15 @@ def test_a_gpu_has_one_wide_cohort_at_a_time(tmp_path, monkeypatch):
     monkeypatch.setattr(Plan, "device", "cuda")
     assert usual_workers(plan) == 1
     assert [len(pack) for pack in packed(plan, plan.cells, 1)] == [60, 60]
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "short"),
+    [("ddpg", {"train_freq": 2, "gradient_steps": 1}), ("td3", {"train_freq": 1}), ("sac", {})],
+)
+def test_trials_take_rollouts_as_short_as_can_be(algorithm, short):
+    """The paper's TD3 takes a thousand gradient steps after as many steps."""
+    run = Run(task="face_direction", algorithm=algorithm)
+    found = speed._at_once(run)
+    assert {"learning_starts": 0, **short}.items() <= found.items()
+    replace(run, settings={**run.settings, **found}).check()

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from math import gcd
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -28,14 +29,27 @@ def estimate(runs: Sequence[Run]) -> float:
     """
     first = runs[0]
     if issubclass(ALGORITHMS[first.algorithm], OffPolicyAlgorithm):
-        at_once = {"learning_starts": 0}  # gradient steps from the first rollout on
-        runs = [replace(run, settings={**run.settings, **at_once}) for run in runs]
+        runs = [replace(run, settings={**run.settings, **_at_once(run)}) for run in runs]
     with TemporaryDirectory() as folder, single_torch_thread():
         trial = _together if first.trainer == COHORT else _alone
         per_step, per_evaluation = trial(runs, Path(folder))
     at_end = first.final_episodes / first.evaluation_episodes
     evaluations = first.steps // first.evaluate_every + at_end
     return first.steps * per_step + evaluations * per_evaluation
+
+
+def _at_once(run: Run) -> dict[str, int]:
+    """Settings with gradient steps from the first rollout on, in rollouts as short as can be."""
+    used = run.used.settings
+    every, many = used.get("train_freq"), used.get("gradient_steps")
+    if type(every) is not int or type(many) is not int or many < 1:
+        return {"learning_starts": 0}
+    shared = gcd(every, many)
+    return {
+        "learning_starts": 0,
+        "train_freq": every // shared,
+        "gradient_steps": many // shared,
+    }
 
 
 def _alone(runs: Sequence[Run], folder: Path) -> tuple[float, float]:
