@@ -184,7 +184,7 @@ def test_titles_of_many_representations_do_not_overlap(returns):
     names = [f"representation-{number}" for number in range(7)]
     full = [row for row in returns if row[:3] == (*GROUPS[0], "full")]
     rows = [row._replace(representation=name) for name in names for row in full]
-    figure = Drawing(every_run(rows, lambda: styles(names)), PAPER)._figure
+    figure = Drawing(every_run(rows, {}, lambda: styles(names)), PAPER)._figure
     titles = [t for t in figure.findobj(Text) if t.get_text().endswith(" (n = 4)")]
     assert len(titles) == len(names)
     boxes = [title.get_window_extent() for title in titles]
@@ -193,7 +193,7 @@ def test_titles_of_many_representations_do_not_overlap(returns):
 
 def test_every_run_is_drawn(plots, returns):
     axes = drawn(plots["every_run"]).axes[0]
-    assert len(axes.lines) == 4 + 1  # and the median
+    assert len(axes.lines) == 1 + 4 + 1  # a policy, the runs and their median
     (first,) = [row for row in plots["every_run"].rows if row[:5] == (*GROUPS[0], "full", 0, 0)]
     episodes = [r.episode_return for r in returns if r[:5] == first[:5]]
     assert float(first[5]) == pytest.approx(np.mean(episodes), abs=1e-3)

@@ -81,11 +81,12 @@ def _extents(groups: Groups, references: References) -> dict[str, Limits]:
     return {task: limits(values, *facts[task]) for task, values in returns.items()}
 
 
-def every_run(returns: Sequence[Return], looks: Looks) -> Plot:
+def every_run(returns: Sequence[Return], references: References, looks: Looks) -> Plot:
     """Each run by itself: a row for each task and algorithm, a panel for each representation.
 
     Args:
         returns: at least one.
+        references: returns of policies that learn nothing, by task and policy.
         looks: of the representations, in the order of their panels.
     """
     episodes = defaultdict(list)
@@ -99,10 +100,11 @@ def every_run(returns: Sequence[Return], looks: Looks) -> Plot:
     return Plot(
         "every_run",
         "Every run",
-        "Mean return of each evaluation, a line for each of n runs; thick: their median.",
+        "Mean return of each evaluation, a line for each of n runs; thick: their median."
+        + (" Dashed: policies that don't learn, on the same starts." if references else ""),
         ("task", "algorithm", "representation", "seed", "step", "mean_return"),
         [(*key, cell(mean)) for key, mean in means.items()],
-        lambda: _draw_runs(means, looks),
+        lambda: _draw_runs(means, references, looks),
     )
 
 
@@ -127,8 +129,7 @@ def _grid_of_curves(
     look, names = looks(), names_with_runs(groups)
 
     def draw(axes: Axes, group: GroupAnalysis) -> None:
-        for i, (policy, returns) in enumerate(references.get(group.task, {}).items()):
-            axes.axhline(float(np.mean(returns)), label=plain(policy), **reference(i))
+        _draw_references(axes, references.get(group.task, {}))
         if extents[group.task].contain(group.solved):
             axes.axhline(group.solved, **solved_line_style())
         for label in group.labels:
@@ -147,6 +148,11 @@ def _grid_of_curves(
             )
 
     return _grid(groups, extents, draw)
+
+
+def _draw_references(axes: Axes, played: Mapping[str, Sequence[float]]) -> None:
+    for i, (policy, returns) in enumerate(played.items()):
+        axes.axhline(float(np.mean(returns)), label=plain(policy), **reference(i))
 
 
 def names_with_runs(groups: Groups) -> dict[str, str]:
@@ -208,12 +214,14 @@ def _is_broken(handle: Any) -> bool:
     return isinstance(handle, Line2D) and handle.get_linestyle() not in ("-", "None")
 
 
-def _draw_runs(means: Mapping[Evaluated, float], looks: Looks) -> Figure:
+def _draw_runs(means: Mapping[Evaluated, float], references: References, looks: Looks) -> Figure:
     runs: dict[tuple[str, ...], Runs] = defaultdict(lambda: defaultdict(dict))  # by label
     of_task = defaultdict(list)
     for (task, algorithm, name, seed, step), mean in means.items():
         runs[task, algorithm, name][seed][step] = mean
         of_task[task].append(mean)
+    for task, played in references.items():
+        of_task[task] += [float(np.mean(each)) for each in played.values()]
     look, groups = looks(), list(dict.fromkeys(label[:2] for label in runs))
     names = [name for name in look if any(label[2] == name for label in runs)]
     across = min(len(names), _MOST_ACROSS)
@@ -225,6 +233,7 @@ def _draw_runs(means: Mapping[Evaluated, float], looks: Looks) -> Figure:
         if label not in runs:
             axes.set_axis_off()
             continue
+        _draw_references(axes, references.get(groups[i][0], {}))
         _draw_label(axes, runs[label], look[names[j]]["color"])
         group = f"{', '.join(groups[i])}\n" if j == 0 else ""
         axes.set_title(plain(group) + with_runs(names[j], [len(runs[label])]))
@@ -234,6 +243,7 @@ def _draw_runs(means: Mapping[Evaluated, float], looks: Looks) -> Figure:
         is_lowest = i == len(groups) - 1 and j >= len(names) - across
         axes.set_xlabel("training step" if is_lowest else "")
         axes.set_ylabel("" if j % across else "return")
+    below(figure, panels.ravel())
     return figure
 
 

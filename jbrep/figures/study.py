@@ -42,9 +42,8 @@ def study_plots(
         *(shared["settings"]["representation"] for shared in labels.values()),
     }
     looks = partial(styles, in_order(names, baseline), baseline if baseline in names else None)
-    plots = []
+    plots, shown = [], _on_the_same_starts(references, returns)
     if analysis:
-        shown = _on_the_same_starts(references, returns)
         plots += [curves(groups, shown, looks), final_return(groups, looks)]
         if any(group.comparisons for group in groups):
             plots.append(claims(analysis, looks))
@@ -54,7 +53,7 @@ def study_plots(
     if associations:
         plots.append(diagnostics(associations, looks))
     if returns:
-        plots.append(every_run(returns, looks))
+        plots.append(every_run(returns, shown, looks))
     return [*plots, *diagrams(labels, looks)]
 
 
