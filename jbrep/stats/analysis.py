@@ -14,7 +14,7 @@ from jbrep.files.typed import read_json, typed
 from jbrep.stats.aggregates import Aggregate, aggregates
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.comparison import Comparison, compare
-from jbrep.stats.curves import common_grid, final_returns, on_grid
+from jbrep.stats.curves import compared
 from jbrep.stats.intervals import LEVEL
 from jbrep.stats.labels import RepresentationResult, check_names, describe
 from jbrep.stats.means import mean_within
@@ -218,9 +218,7 @@ def _analyse_group(
     seed: int,
 ) -> GroupAnalysis:
     first = next(iter(group.values()))[0]
-    grid, cut = common_grid(group)
-    curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in group.items()}
-    finals = final_returns(group, curves, grid)
+    grid, cut, curves, finals = compared(group)
     scale = scale_of(list(finals.values()), next(iter(curves.values())), grid, first)
     baseline, *others = (
         describe(runs, curves[name], finals[name], scale, seed) for name, runs in group.items()

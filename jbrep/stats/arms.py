@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.stats.bootstrap import Array
-from jbrep.stats.curves import common_grid, final_returns, on_grid, steps_to
+from jbrep.stats.curves import compared, steps_to
 from jbrep.stats.intervals import LEVEL
 from jbrep.stats.means import Bounds, mean_within
 from jbrep.stats.runs import Group, RunCurve
@@ -77,9 +77,7 @@ def measure(group: Group, seeds: Collection[int]) -> tuple[Frame, dict[str, Arm]
     """
     of_seeds = {n: [r for r in runs if r.seed in seeds] for n, runs in group.items()}
     there = {name: runs for name, runs in of_seeds.items() if runs}
-    grid, _ = common_grid(there)
-    curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in there.items()}
-    finals = final_returns(there, curves, grid)
+    grid, _, curves, finals = compared(there)
     frame = _frame(there, finals, next(iter(curves.values())), grid)
     return frame, {
         name: _arm(runs, _own_encoders(group[name]), finals[name], curves[name], grid, frame)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import trim_mean
@@ -145,6 +146,33 @@ def final_returns(
         for name, runs in group.items()
         for each in [zip(runs, curves[name], strict=True)]
     }
+
+
+class Compared(NamedTuple):
+    """The runs of a group where they are compared.
+
+    Attributes:
+        grid: training steps, (g,).
+        cut: which evaluations it leaves out, in words; None if it leaves out none.
+        curves: of each representation's runs on the grid, (runs, g), the baseline first.
+        finals: the final return of each of these runs, (runs,).
+    """
+
+    grid: Array
+    cut: str | None
+    curves: dict[str, Array]
+    finals: dict[str, Array]
+
+
+def compared(group: Group) -> Compared:
+    """The runs of a group on their common grid.
+
+    Raises:
+        InputError: as `common_grid`.
+    """
+    grid, cut = common_grid(group)
+    curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in group.items()}
+    return Compared(grid, cut, curves, final_returns(group, curves, grid))
 
 
 def mean_return(curves: Array, grid: Array) -> Array:

@@ -12,7 +12,7 @@ from scipy.special import stdtr
 from scipy.stats import permutation_test
 
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.curves import common_grid, final_returns, mean_return, on_grid
+from jbrep.stats.curves import compared, mean_return
 from jbrep.stats.intervals import LEVEL, constant, difference, variance_ratio, welch
 from jbrep.stats.means import Bounds, mean_within
 from jbrep.stats.runs import Group
@@ -207,9 +207,7 @@ class FirstClaims:
 
 def _judged(group: Group, level: float, seed: int) -> dict[str, tuple[Verdict, ...]]:
     (first, *_), *_ = group.values()
-    grid, _ = common_grid(group)
-    curves = {n: np.stack([on_grid(run, grid) for run in runs]) for n, runs in group.items()}
-    finals = final_returns(group, curves, grid)
+    grid, _, curves, finals = compared(group)
     reference = reference_of(first, next(iter(curves.values())))
     baseline, *others = (
         _Arm(

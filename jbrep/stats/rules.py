@@ -149,7 +149,7 @@ class Planned:
             _look(list(cells.values()), groups, self, look, seed)
         return {
             key: {
-                name: _whole(cells.get("/".join((*key, name))), group, name, self, seed)
+                name: _whole(cells.get(_cell_name(key, name)), group, name, self, seed)
                 for name in list(group)[1:]
             }
             for key, group in groups.items()
@@ -167,6 +167,10 @@ class _Cell:
     is_open: bool = True
 
 
+def _cell_name(key: Key, representation: str) -> str:
+    return "/".join((*key, representation))
+
+
 def _look(
     cells: Sequence[_Cell],
     groups: Mapping[Key, Group],
@@ -177,7 +181,7 @@ def _look(
     """Test at a look whatever can be tested; levels that become free are used at once."""
     rules, seeds = planned.rules, planned.seeds[: planned.counts[look]]
     ready = {
-        "/".join((*key, name)): measured
+        _cell_name(key, name): measured
         for key, group in groups.items()
         for name in list(group)[1:]
         if (measured := _measured(group, name, seeds))
@@ -251,16 +255,14 @@ def _tested(
 
 def _reason(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, direction: int) -> str | None:
     """Why there can't be a verdict; None if there can."""
-    fewest = min(x.units, y.units)
+    fewest, what = min(x.units, y.units), "encoders" if x.by_encoder else "runs"
     if fewest < FEWEST:
-        what = "encoders" if x.by_encoder else "runs"
         return f"{fewest} {what}; verdicts take {FEWEST}"
     if not learns(y, frame):
         return "agents on the full state didn't learn"
     if claim.estimate is kept_gain and direction > 0:
         most = most_failing(x.units - x.learnt, x.units)
         if most > rules.failing:
-            what = "encoders" if x.by_encoder else "runs"
             return (
                 f"up to {100 * most:.0f} % of its {what} may fail to learn; the limit is "
                 f"{100 * rules.failing:.0f} %"

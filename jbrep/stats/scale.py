@@ -11,6 +11,7 @@ from jbrep.stats.runs import RunCurve
 
 SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the gain of the baseline's median run
 SOLVED = "steps_to_solved"
+STILL = "standing still"  # the policy that gains are counted from, among those that don't learn
 STEPS_TO = (*(f"steps_to_{name}" for name in SHARES), SOLVED)
 _POINTS = 50  # of a performance profile, about, or half as many: round numbers
 

@@ -10,11 +10,10 @@ from jbrep.stats.aggregates import Aggregate
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.labels import COMPONENTS, REACHED, RepresentationResult
-from jbrep.stats.scale import STEPS_TO
+from jbrep.stats.scale import STEPS_TO, STILL
 from jbrep.text import SIGNIFICANT, interval, number, table
 
 Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]  # a header, and the rows below it
-STILL = "standing still"  # among policies that don't learn
 _KEY = "representation"
 _MOST_DIGITS = 9  # after the point
 

@@ -10,9 +10,10 @@ from jbrep.errors import InputError
 from jbrep.files.tables import write_csv
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.rollouts.sources import find_player
+from jbrep.stats.scale import STILL
 
 REFERENCE_RETURNS = "references.csv"
-STILL, RANDOM, HAND_WRITTEN = "standing still", "random", "hand-written"
+RANDOM, HAND_WRITTEN = "random", "hand-written"
 _POLICIES = {STILL: "still", RANDOM: "uniform", HAND_WRITTEN: "heuristic"}
 _COLUMNS = ("task", "policy", "episode", "return")
 _Row = tuple[str, str, int, float]

@@ -17,9 +17,10 @@ from jbrep.files.tables import write_csv
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.stats.rules import Planned
+from jbrep.stats.scale import STILL
 from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.record import RECORD, as_json, learner, record, shared_settings
-from jbrep.study.references import STILL, References, read_references, write_references
+from jbrep.study.references import References, read_references, write_references
 from jbrep.text import rounded, table
 
 RETURNS = "returns.csv"
