@@ -10,7 +10,7 @@ TASKS := move_from_origin face_direction move_in_direction move_to_position move
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes trainers behaviour clean
+.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes trainers policies behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -110,6 +110,10 @@ trainers: $(READY) ## what results/trainers/ lacks: eight hours for all of it; g
 	  mkdir -p results/trainers/$$study; cp runs/trainers/$$study/returns.csv runs/trainers/$$study/runs.json results/trainers/$$study/; \
 	done
 	$(BIN)/python tools/trainers.py results/trainers
+
+policies: $(READY) ## the trained policies that ship, anew: hours; goes on where it was stopped
+	$(BIN)/jbrep study studies/policies.toml --out runs/policies
+	$(BIN)/python tools/policies.py runs/policies
 
 behaviour: $(READY) ## results/behaviour/ anew: half an hour
 	$(BIN)/jbrep rl --task move_in_direction --preset modern --steps 100k --out runs/mid/full

@@ -15,6 +15,7 @@ from command import jbrep
 from my_encoders import LATENT, SIZE, FirstFeatures, dense
 from onnx import helper, numpy_helper
 
+from jbrep.dataset import Dataset
 from jbrep.encoders import find, load, save
 from jbrep.encoders.diagnostics import DIAGNOSTICS, read_diagnostics
 from jbrep.envs import describe
@@ -351,6 +352,49 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     assert exploratory.startswith("This study is exploratory")
 
 
+def test_each_encoder_of_several_learns_from_its_own_data(tmp_path):
+    """Of two data sets, the third encoder learns from the first again, with another seed."""
+    tasks = (TASK, "move_in_direction")
+    several = ({"name": "pca-4", "encoders": 2}, {"name": "random-4", "encoders": 3}, "full")
+    study = dataclasses.replace(
+        TINY,
+        tasks=tasks,
+        representations=several,
+        seeds=tuple(range(6)),
+        data=Data(steps=400, seed=5, sets=2),
+    )
+    plan = Plan(study, tmp_path / "it")
+    prepare(plan)
+    for task in tasks:
+        made = {path.stem: load(path).header for path in plan.encoders(task).glob("*.safetensors")}
+        learned = {name: header["data"]["seed"] for name, header in made.items()}
+        assert learned == {
+            **{"pca-4-s0": 5, "pca-4-s1": 6, "identity": 5},
+            **{"random-4-s0": 5, "random-4-s1": 6, "random-4-s2": 5},
+        }
+        assert made["random-4-s2"]["training"]["seed"] == 2
+        runs = [plan.run(cell) for cell in plan.cells if cell.task == task]
+        assert [Path(run.encoder).stem for run in runs[:4]] == [
+            *("pca-4-s0", "random-4-s0", "identity", "pca-4-s1")
+        ]
+        first, second = (Dataset(plan.data(task, number)) for number in range(2))
+        assert first.manifest.settings.seed == 5
+        assert not np.array_equal(first["observation"][:], second["observation"][:])
+    assert not (tmp_path / "it" / "data" / TASK / "manifest.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"steps": 100, "sets": 0}, "data.sets is 0: it must be from 1 to 1,000"),
+        ({"folder": "data", "sets": 2}, "data.sets is 2: .* is left out where there is a folder"),
+    ],
+)
+def test_mistaken_numbers_of_data_sets_are_refused(data, message):
+    with pytest.raises(InputError, match=message):
+        dataclasses.replace(TINY, data=Data(**data))
+
+
 @pytest.mark.parametrize(
     ("own", "message"),
     [
@@ -426,7 +470,7 @@ def test_own_encoders_are_checked_before_the_first_run(own, message, home, tmp_p
             for n in (0, True, 1.5, 1001)
         ),
         ([{"name": "a", "encoders": 2}], "a: unknown representation 'a'"),
-        ([{"name": "slow-8", "encoders": 2}], "slow-8: slow has no seed, so all its encoders"),
+        ([{"name": "slow-8", "encoders": 2}], "slow-8: slow has no seed, so encoders of the same"),
         (
             [{"name": "a", "kind": "dae", "latent": 8, "seed": 1, "encoders": 2}],
             "a: its encoders have the seeds 0 to 1: leave out seed",

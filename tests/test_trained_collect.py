@@ -61,9 +61,9 @@ def runs(tmp_path_factory):
 
 def some(policy, folder, **changes):
     """Settings and policy of what a command would collect."""
-    actor = find_policy(str(policy), folder)
-    usual = {"task": SHORT, "steps": 240, "shard_episodes": 4, "store_state": True}
-    return settings(policy=actor.settings(), **{**usual, **changes}), actor
+    usual = {"task": SHORT, "steps": 240, "shard_episodes": 4, "store_state": True, **changes}
+    actor = find_policy(str(policy), folder, usual["task"])
+    return settings(policy=actor.settings(), **usual), actor
 
 
 def gather(policy, folder, how=None, **changes):

@@ -8,7 +8,7 @@ from jbrep.cli.doctor import doctor
 from jbrep.cli.encoders import encoder, evaluate
 from jbrep.cli.env import env
 from jbrep.cli.inspect import inspect
-from jbrep.cli.policies import behaviour, evaluate_policy
+from jbrep.cli.policies import behaviour, evaluate_policy, policies
 from jbrep.cli.render import render
 from jbrep.cli.rl import rl
 from jbrep.cli.study import report, study
@@ -24,7 +24,7 @@ def main() -> None:
 
 _COMMANDS = (
     *(env, collect, data, train_dae, train_encoder, evaluate, encoder),
-    *(rl, tune, evaluate_policy, behaviour, study, report, inspect),
+    *(rl, tune, policies, evaluate_policy, behaviour, study, report, inspect),
     *(render, doctor),
 )
 for _command in _COMMANDS:

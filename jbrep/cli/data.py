@@ -47,8 +47,8 @@ _data = click.argument("data", type=click.Path(path_type=Path))
     default="uniform",
     show_default=True,
     help="uniform, constant:drive=0.5, ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3, for the "
-    "Jitterbug heuristic; the folder of a run; or several with weights, of which each episode has "
-    "one: uniform:0.5+runs/a:0.5.",
+    "Jitterbug heuristic and trained (see jbrep policies); the folder of a run; or several with "
+    "weights, of which each episode has one: uniform:0.5+runs/a:0.5.",
 )
 @click.option(
     "--store-state",
@@ -97,7 +97,7 @@ def collect(
             "repair the data set",
             err=True,
         )
-    actor = find_policy(policy, out)
+    actor = find_policy(policy, out, task)
     settings = Settings(
         task=task,
         policy=actor.settings(),

@@ -51,10 +51,10 @@ def evaluate_policy(
     """Show the returns of a policy.
 
     POLICY is a folder of jbrep rl, a zip file that stable-baselines3 wrote, or a policy by its
-    name, such as heuristic; a zip file and a name need a --task, which is face_direction if not
-    given. A run that is under way or was stopped plays its last checkpoint. Of a
-    folder only numbers are read. A zip file from elsewhere runs as code when it is opened, so it
-    needs --trust. A policy by name may act on what an encoder's latent is decoded to: the return
+    name, such as heuristic, or trained, which ships; a zip file and a name need a --task, which is
+    face_direction if not given. A run that is under way or was stopped plays its last checkpoint.
+    Of a folder only numbers are read. A zip file from elsewhere runs as code when it is opened, so
+    it needs --trust. A policy by name may act on what an encoder's latent is decoded to: the return
     that it loses measures what the latent lacks.
     """
     import numpy as np
@@ -100,9 +100,9 @@ def _interval(low: float, median: float, high: float) -> str:
 
 def _title(policy: str, player: "Player") -> str:
     """The task, and what is not in the command: what a trained policy observes, its step."""
-    from jbrep.collect.policies import POLICIES
+    from jbrep.rollouts.sources import is_by_name
 
-    if policy.partition(":")[0] in POLICIES:
+    if is_by_name(policy):
         return f"{player.task.name}, {player.name}"
     step = "" if player.step is None else f" at step {player.step:,}"
     return f"{player.task.name} on {player.representation}{step}"
@@ -112,26 +112,37 @@ def _find(
     policy: str, task: "Task | None", algorithm: str, encoder: str | None, trust: bool
 ) -> "Player":
     """The policy of a run, by name, or in a zip file."""
-    from jbrep.collect.policies import POLICIES
     from jbrep.encoders import find
     from jbrep.envs.description import describe
     from jbrep.files.storage import exists
-    from jbrep.rollouts.sources import as_player, find_player, is_trained, run_folder
+    from jbrep.rl.shipped import SHIPPED
+    from jbrep.rollouts.sources import (
+        as_player,
+        find_player,
+        is_by_name,
+        is_trained,
+        policy_names,
+        run_folder,
+    )
 
     path = Path(policy)
     folder = run_folder(policy)
+    if policy == SHIPPED:
+        task = task or describe(_TASK)
     if is_trained(policy) or (exists(path) and path.is_dir()):
         if encoder and not (folder and encoder == _code_of(folder)):
-            raise InputError(f"{policy} is a run, which has its own encoder: leave out --encoder")
+            raise InputError(
+                f"{policy} is a trained policy, which has its own encoder: leave out --encoder"
+            )
         return find_player(policy, task)
     task = task or describe(_TASK)
-    if policy.partition(":")[0] in POLICIES:
+    if is_by_name(policy):
         player = find_player(policy, task)
         return player.with_reconstruction(find(encoder, task)) if encoder else player
     if not exists(path):
         raise InputError(
             f"no policy at {policy}: a folder of jbrep rl is needed, a zip file of "
-            f"stable-baselines3, or a name: {', '.join(POLICIES)}"
+            f"stable-baselines3, or a name: {policy_names()}"
         )
     from jbrep.encoders import FULL
     from jbrep.rl.policy import load_zip  # imports torch
@@ -144,6 +155,48 @@ def _code_of(folder: Path) -> str | None:
     from jbrep.rl.policy import run_settings  # imports torch
 
     return run_settings(folder)["encoder_code"]
+
+
+@click.command(epilog=example("jbrep policies"))
+@as_json
+def policies(as_json: bool) -> None:
+    """Show the trained policies that ship.
+
+    Every command that takes a policy knows the one for its --task as trained, as in jbrep render
+    trained --task face_direction --out walk.mp4.
+    """
+    import numpy as np
+
+    from jbrep.rl.shipped import SHIPPED, shipped
+    from jbrep.text import table, terminal_width
+
+    ships = shipped()
+    ranges = [
+        {name: np.percentile(each, (10, 50, 90)).tolist() for name, each in policy.returns.items()}
+        for policy in ships
+    ]
+    if as_json:
+        names = ("percentile_10", "median", "percentile_90")
+        return echo_json(
+            {
+                policy.task: {
+                    "observes": policy.observes,
+                    "learner": policy.learner,
+                    "steps": policy.steps,
+                    "episodes": len(policy.returns[SHIPPED]),
+                    **{name: dict(zip(names, each, strict=True)) for name, each in played.items()},
+                }
+                for policy, played in zip(ships, ranges, strict=True)
+            }
+        )
+    rows = [
+        (task, observes, learner, f"{steps:,}", *(_interval(*each) for each in played.values()))
+        for (task, observes, learner, steps, _), played in zip(ships, ranges, strict=True)
+    ]
+    header = ("task", "observes", "learned by", "steps", *ranges[0])
+    click.echo(table(header, rows, terminal_width()))
+    episodes = len(ships[0].returns[SHIPPED])
+    return click.echo(f"\nreturns: median [10 %, 90 %] of the same {episodes} episodes")
 
 
 @click.command(epilog=example("jbrep behaviour runs/full runs/dae-4 --out behaviour"))

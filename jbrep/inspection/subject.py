@@ -22,7 +22,7 @@ from jbrep.inspection.recording import SUFFIX, check_out
 from jbrep.inspection.traversal import record_traversal
 from jbrep.rl.files import ENCODER, is_run
 from jbrep.rollouts.rollout import Rollout
-from jbrep.rollouts.sources import find_episode, is_trained, run_folder
+from jbrep.rollouts.sources import find_episode, is_trained, policy_file, run_folder
 from jbrep.study.results import has_runs, read_runs
 
 FOLDER = Path("inspect")  # of recordings without an --out
@@ -125,7 +125,7 @@ def _find(
     rollout = find_episode(source, episode, task, _acting(run_folder(source), encoder))
     if encoder is not None:
         return rollout, find(encoder, rollout.task)
-    return rollout, _own(source) if is_trained(source) else None
+    return rollout, _own(source, rollout.task) if is_trained(source) else None
 
 
 def _examples(source: str | None, episode: int, data: Path | None, task: Task) -> Examples | None:
@@ -153,7 +153,7 @@ def _acting(folder: Path | None, encoder: Any) -> Any:
     return encoder if is_object and folder and not exists(folder / ENCODER) else None
 
 
-def _own(source: str) -> BaseEncoder | None:
+def _own(source: str, task: Task) -> BaseEncoder | None:
     """The encoder of a run, or of a policy's file; None if it observes the full state."""
     if folder := run_folder(source):
         from jbrep.rl.policy import run_encoder, run_settings  # imports torch
@@ -162,7 +162,7 @@ def _own(source: str) -> BaseEncoder | None:
     else:
         from jbrep.rl.policy_weights import load_encoder  # imports torch
 
-        encoder = load_encoder(Path(source))
+        encoder = load_encoder(policy_file(source, task))
     return None if encoder.kind == IDENTITY else encoder
 
 

@@ -90,13 +90,14 @@ def _one_by_one(trained: Trained) -> Actor:
     return act
 
 
-def freeze(source: str, folder: Path, file: str) -> Frozen:
+def freeze(source: str, path: Path, folder: Path, file: str) -> Frozen:
     """The policy of a run, or of a policy's file, for a data set.
 
     One that the data set has already stays, even if the run has gone on since.
 
     Args:
-        source: the run's folder, or the file.
+        source: what manifests call it.
+        path: the run's folder, or the file.
         folder: of the data set.
         file: name of the policy's file in it.
 
@@ -107,7 +108,6 @@ def freeze(source: str, folder: Path, file: str) -> Frozen:
     name = _line(source)
     if kept := _kept(folder / file, name):
         return kept
-    path = Path(source)
     if is_policy_file(path):
         return Frozen(file, read_file(path))
     if not exists(path / ENCODER):

@@ -19,8 +19,10 @@ from jbrep.envs.task import Array, Task, check_same
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
 from jbrep.progress import Progress
+from jbrep.rl import shipped
 from jbrep.rl.fields import MAX_EVALUATION_EPISODES
 from jbrep.rl.files import EVALUATION_SEED, POLICY, is_policy_file, is_run
+from jbrep.rl.shipped import SHIPPED
 from jbrep.rollouts.rollout import Begin, Rollout, play, replay
 
 if TYPE_CHECKING:
@@ -153,7 +155,7 @@ def find_episode(
     return player.play([episode])[0]
 
 
-def find_policy(text: str, folder: Path) -> Policy:
+def find_policy(text: str, folder: Path, task: Task) -> Policy:
     """The policy that a text names, to collect with: of a run, by its name, or a mixture of them.
 
     The policy of a run is frozen: it is the one that the data set has already, or else the run's
@@ -163,6 +165,7 @@ def find_policy(text: str, folder: Path) -> Policy:
         text: the run's folder or a policy's file, a name such as constant:drive=0.5, or a mixture
             such as uniform:0.5+runs/a:0.5.
         folder: of the data set.
+        task: of the data set.
 
     Raises:
         InputError: it names nothing of these, or what it names can't be used.
@@ -178,7 +181,8 @@ def find_policy(text: str, folder: Path) -> Policy:
 
         file = next(files)
         if is_trained(part) or has_kept(part, folder / file):
-            return freeze(str(run_folder(part) or part), folder, file)
+            path = run_folder(part) or policy_file(part, task)
+            return freeze(part if part == SHIPPED else str(path), path, folder, file)
         return None
 
     return parse_policy(text, frozen)
@@ -196,16 +200,35 @@ def kept_policy(folder: Path) -> Callable[[Mapping[str, Any]], Policy]:
 
 
 def is_trained(source: str) -> bool:
-    """Whether a source is a run or a policy's file."""
-    return run_folder(source) is not None or is_policy_file(Path(source))
+    """Whether a source is a run, a policy's file, or the policy that ships for a task."""
+    return source == SHIPPED or run_folder(source) is not None or is_policy_file(Path(source))
+
+
+def is_by_name(source: str) -> bool:
+    """Whether a source is a policy by its name, which needs a task."""
+    return source == SHIPPED or source.partition(":")[0] in POLICIES
+
+
+def policy_names() -> str:
+    """The names of policies, for messages."""
+    return ", ".join((*POLICIES, SHIPPED))
+
+
+def policy_file(source: str, task: Task | None) -> Path:
+    """The path of the policy's file that a source names: that path, or the one that ships.
+
+    Raises:
+        InputError: none ships for the task, or no task is given.
+    """
+    return shipped.find(_needed(task, source)) if source == SHIPPED else Path(source)
 
 
 def find_player(source: str, task: Task | None = None, encoder: Any = None) -> Player:
     """The policy of a run, or one by its name, such as heuristic or constant:drive=0.5.
 
     Args:
-        source: the run's folder, or the policy.zip in it, a policy's file, or the name. A run that
-            is not over plays its last checkpoint.
+        source: the run's folder, or the policy.zip in it, a policy's file, or the name; trained is
+            the one that ships for the task. A run that is not over plays its last checkpoint.
         task: for a policy by its name. A run has its own; if one is given, it must be of the same
             environment, and is played instead: with other arguments or another time limit.
         encoder: the object that a run was made with, if its encoder is a user's own.
@@ -217,21 +240,25 @@ def find_player(source: str, task: Task | None = None, encoder: Any = None) -> P
         return _trained(source, task, encoder)
     if exists(Path(source) / MANIFEST):
         raise InputError(f"{source} is a data set: give the folder of a run or a policy")
-    if source.partition(":")[0] not in POLICIES:
+    if not is_by_name(source):
         raise InputError(
             f"{source} is no data set, no run with a policy or checkpoint, and no policy by name: "
-            f"those are {', '.join(POLICIES)}"
+            f"those are {policy_names()}"
         )
+    return Player(source, _needed(task, source), parse_policy(source).begin)
+
+
+def _needed(task: Task | None, policy: str) -> Task:
     if task is None:
-        raise InputError(f"policy {source} needs a --task")
-    return Player(source, task, parse_policy(source).begin)
+        raise InputError(f"policy {policy} needs a --task")
+    return task
 
 
 def run_folder(source: str) -> Path | None:
     """The folder of the run that a source names by it, or by its policy.zip; None for another."""
     path = Path(source)
     folder = path.parent if path.name == POLICY else path
-    return folder if is_run(folder) else None
+    return folder if source != SHIPPED and is_run(folder) else None
 
 
 def find_untrained(folder: Path) -> Player:
@@ -250,7 +277,7 @@ def _trained(source: str, task: Task | None, encoder: Any) -> Player:
     from jbrep.rl.policy_weights import load
 
     folder = run_folder(source)
-    trained = load_run(folder, encoder) if folder else load(Path(source))
+    trained = load_run(folder, encoder) if folder else load(policy_file(source, task))
     name = str(folder or source)
     _check_task(name, trained.task, task)
     if trained.step is not None:

@@ -21,6 +21,7 @@ from jbrep.stats.arms import FEWEST
 from jbrep.stats.power import Arms, obstacle
 from jbrep.stats.rules import Planned, Rules
 from jbrep.study.representations import (
+    MAX_ENCODERS,
     ByName,
     Given,
     Representation,
@@ -50,6 +51,7 @@ class Data:
 
     steps: int = 0
     seed: int = 0
+    sets: int = 1  # to collect, of seed, seed + 1, ...; encoder i of several learns from set i
     folder: str = ""  # a data set, or a folder with one for each task
 
 
@@ -89,18 +91,9 @@ class Study:
         for algorithm in self.algorithms:
             settings = self.learner(algorithm).run_settings
             Run(task=_ANY_TASK, **settings, **self.run_settings).check_trainer()
-        for given, representation in zip(self.representations, self.observed, strict=True):
-            if isinstance(representation, ByName) and not (isinstance(given, str) or self.data):
-                raise InputError(
-                    f"representation {representation.name} is trained by the study, on the states "
-                    "that [data] gives: [data] is missing"
-                )
         for seed in self.seeds:
             Run(task=_ANY_TASK, seed=seed)  # checks the number
-        if self.data and bool(self.data.steps) == bool(self.data.folder):
-            raise InputError("data must have either steps, to collect, or the folder of a data set")
-        if self.training and not self.data:
-            raise InputError("training is for encoders made by the study: [data] is missing")
+        self._check_data()
         self._check_verdicts()
 
     def learner(self, name: str) -> Learner:
@@ -115,6 +108,33 @@ class Study:
             return Learner.of_table(name, self.learners[name])
         except InputError as error:
             raise InputError(f"[algorithms.{name}]: {error}") from None
+
+    def _check_data(self) -> None:
+        """Check where data come from, and that the study can make its encoders of them."""
+        if self.data and bool(self.data.steps) == bool(self.data.folder):
+            raise InputError("data must have either steps, to collect, or the folder of a data set")
+        if self.data and not 1 <= self.data.sets <= (1 if self.data.folder else MAX_ENCODERS):
+            raise InputError(
+                f"data.sets is {self.data.sets}: it must be from 1 to {MAX_ENCODERS:,} where data "
+                "are collected, and is left out where there is a folder"
+            )
+        if self.training and not self.data:
+            raise InputError("training is for encoders made by the study: [data] is missing")
+        for given, representation in zip(self.representations, self.observed, strict=True):
+            if not isinstance(representation, ByName):
+                continue
+            if not (isinstance(given, str) or self.data):
+                raise InputError(
+                    f"representation {representation.name} is trained by the study, on the states "
+                    "that [data] gives: [data] is missing"
+                )
+            sets = self.data.sets if self.data else 1
+            if sets < (representation.encoders or 1) and not representation.is_drawn:
+                raise InputError(
+                    f"representation {representation.name}: {representation.kind} has no seed, so "
+                    "encoders of the same data are the same: leave out encoders, or collect as "
+                    "many data.sets"
+                )
 
     def _check_tasks(self) -> None:
         """Check what can be checked of tasks without making their environments."""

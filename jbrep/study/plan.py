@@ -165,9 +165,11 @@ class Plan:
         """The folder of the encoders that the study trains for a task."""
         return self.folder / "encoders" / slug(task)
 
-    def data(self, task: str) -> Path:
-        """The folder of the data set that the study collects for a task."""
-        return self.folder / "data" / slug(task)
+    def data(self, task: str, number: int = 0) -> Path:
+        """The folder of a data set that the study collects for a task, one of several or alone."""
+        folder = self.folder / "data" / slug(task)
+        several = self.study.data is not None and self.study.data.sets > 1
+        return folder / f"set-{number}" if several else folder
 
     def write(self) -> None:
         """Make the folder, and write what the study is.

@@ -1,7 +1,9 @@
 """The data sets and encoders that a study's runs need."""
 
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from jbrep.collect import collect
 from jbrep.collect.collector import usual_shard_episodes
@@ -37,7 +39,7 @@ def check(plan: Plan) -> None:
         if data and data.folder:
             folder = _existing(data, name)
             check_same(task, Dataset(folder).task, f"the data set {folder}")
-            _check_fits(plan, name, folder)
+            _check_fits(plan, name, folder, 0)
         for representation in _by_name(plan):
             if data is None:
                 _check_shipped(representation, task)
@@ -102,36 +104,44 @@ def prepare(plan: Plan) -> None:
     if data is None:
         return
     for task in plan.study.tasks:
-        folder = _existing(data, task) if data.folder else _collect(plan, data, task)
-        fitter = _check_fits(plan, task, folder)
-        for representation in _by_name(plan):
-            for name, settings in representation.fits.items():
-                fitter.fit(representation.kind, name=name, **settings)
+        for number in range(data.sets):
+            folder = _existing(data, task) if data.folder else _collect(plan, data, task, number)
+            fitter = _check_fits(plan, task, folder, number)
+            for name, kind, settings in _fits(plan, number):
+                fitter.fit(kind, name=name, **settings)
 
 
-def _check_fits(plan: Plan, task: str, folder: Path) -> Fitter:
+def _check_fits(plan: Plan, task: str, folder: Path, number: int) -> Fitter:
     """Check that the encoders of a task can be made from a data set; what makes them."""
     fitter = Fitter(ScaledDataset(Dataset(folder)), plan.encoders(task))
-    for representation in _by_name(plan):
-        for name, settings in representation.fits.items():
-            try:
-                fitter.plan(representation.kind, name=name, **settings)
-            except InputError as error:
-                raise InputError(f"{name} can't be trained for {task}: {error}") from None
+    for name, kind, settings in _fits(plan, number):
+        try:
+            fitter.plan(kind, name=name, **settings)
+        except InputError as error:
+            raise InputError(f"{name} can't be trained for {task}: {error}") from None
     return fitter
 
 
-def _collect(plan: Plan, data: Data, task: str) -> Path:
+def _fits(plan: Plan, number: int) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Names, kinds and settings of the encoders that are made from the data set of that number."""
+    assert plan.study.data is not None
+    for representation in _by_name(plan):
+        for name, fit in representation.fits.items():
+            if fit.number % plan.study.data.sets == number:
+                yield name, representation.kind, fit.settings
+
+
+def _collect(plan: Plan, data: Data, task: str, number: int) -> Path:
     """Collect a task's data set; for the Jitterbug's other tasks, derive it from the first's."""
-    folder = plan.data(task)
+    folder = plan.data(task, number)
     first = next((name for name in plan.study.tasks if name in TASKS), task)
     if task in TASKS and task != first:
-        derive(plan.data(first), task, folder)
+        derive(plan.data(first, number), task, folder)
     else:
         described = plan.task(task)
         with_state = bool(described.state)
         settings = Settings(
-            task=described, steps=data.steps, seed=data.seed, store_state=with_state
+            task=described, steps=data.steps, seed=data.seed + number, store_state=with_state
         )
         episodes = usual_shard_episodes(settings, folder)
         collect(replace(settings, shard_episodes=episodes), folder)

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
@@ -67,6 +67,13 @@ class Representation(ABC):
         return [counts[i] for i in range(self.encoders)] if self.encoders else [*counts.values()]
 
 
+class Fit(NamedTuple):
+    """An encoder that the study trains."""
+
+    number: int  # among the encoders of its representation
+    settings: Mapping[str, Any]  # of its method
+
+
 @dataclass(frozen=True, kw_only=True)
 class ByName(Representation):
     """The whole observation, or an encoder that ships or that the study trains.
@@ -85,12 +92,21 @@ class ByName(Representation):
         return self.name if made is None else str(made / f"{stem}{SUFFIX}")
 
     @property
-    def fits(self) -> dict[str, dict[str, Any]]:
-        """The settings of each encoder that the study trains, by the encoder's name."""
+    def fits(self) -> dict[str, Fit]:
+        """The encoders that the study trains, by their names."""
         if self.encoders is None:
-            return {self._stem(None): dict(self.training)}
-        seeds = range(self.encoders)
-        return {self._stem(seed): {**self.training, "seed": seed} for seed in seeds}
+            return {self._stem(None): Fit(0, self.training)}
+        return {
+            self._stem(number): Fit(
+                number, {**self.training, "seed": number} if self.is_drawn else self.training
+            )
+            for number in range(self.encoders)
+        }
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether an encoder depends on a seed, and not on the data alone."""
+        return "seed" in get_method(self.kind).own
 
     def _stem(self, number: int | None) -> str:
         name = IDENTITY if self.name == FULL else self.name
@@ -240,10 +256,6 @@ def _trained(
     check_name(name)
     method, settings = recipe.method, _training(recipe, training)
     method.settings(settings)
-    if encoders is not None and "seed" not in method.own:
-        raise InputError(
-            f"{method.name} has no seed, so all its encoders are the same: leave out encoders"
-        )
     if encoders is not None and "seed" in settings:
         raise InputError(f"its encoders have the seeds 0 to {encoders - 1}: leave out seed")
     return ByName(name=name, encoders=encoders, kind=method.name, training=settings)

@@ -1,0 +1,95 @@
+"""The policies that ship: the best agent that was trained for each of the Jitterbug's tasks."""
+
+import csv
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jbrep.envs.task import Array, Task
+from jbrep.errors import DamageError, InputError
+from jbrep.files import container
+from jbrep.files.storage import exists, read_regular
+from jbrep.files.tables import write_csv
+from jbrep.rl.files import POLICY_SUFFIX
+
+SHIPPED = "trained"  # what commands call the one that ships for their task
+FOLDER = Path(__file__).parent / "shipped"
+_RETURNS = "returns.csv"
+_COLUMNS = ("task", "policy", "episode", "return")
+_MAX_BYTES = 1 << 20
+
+Returns = Mapping[str, Array]  # by policy, in the first episodes that every run is evaluated on
+
+
+class Shipped(NamedTuple):
+    """A policy that ships."""
+
+    task: str
+    observes: str  # as tables call it
+    learner: str
+    steps: int  # of training
+    returns: Returns  # of this policy, SHIPPED, and of others by their names
+
+
+def file_of(task: str) -> Path:
+    """Where the policy for a task is, if one ships."""
+    return FOLDER / f"{task}{POLICY_SUFFIX}"
+
+
+def find(task: Task) -> Path:
+    """The file of the policy that ships for a task, whatever its time limit and the robot's body.
+
+    Raises:
+        InputError: there is none.
+    """
+    path = file_of(task.slug)
+    if not exists(path):
+        ships = ", ".join(sorted(each.stem for each in FOLDER.glob(f"*{POLICY_SUFFIX}")))
+        raise InputError(f"no {SHIPPED} policy ships for {task.name}: only for {ships}")
+    return path
+
+
+def shipped() -> list[Shipped]:
+    """All policies that ship, with what they return.
+
+    Raises:
+        DamageError: a file that ships isn't what was written.
+    """
+    return [_described(task, returns) for task, returns in _read_returns().items()]
+
+
+def _described(task: str, returns: Returns) -> Shipped:
+    _, header = container.read(file_of(task), "policy")
+    settings = header["settings"]
+    names = (settings["representation"], settings["learner"])
+    return Shipped(task, *names, header["step"], returns)
+
+
+def write_returns(played: Mapping[str, Returns], folder: Path = FOLDER) -> None:
+    """Write what policies return, by task."""
+    rows: Iterable[tuple[str, str, int, str]] = (
+        (task, policy, episode, f"{value:.3f}")
+        for task, returns in played.items()
+        for policy, values in returns.items()
+        for episode, value in enumerate(values)
+    )
+    write_csv(folder / _RETURNS, _COLUMNS, rows)
+
+
+def _read_returns() -> dict[str, Returns]:
+    path = FOLDER / _RETURNS
+    try:
+        header, *rows = csv.reader(read_regular(path, _MAX_BYTES).decode().splitlines())
+        if tuple(header) != _COLUMNS:
+            raise ValueError
+        found: dict[str, dict[str, list[float]]] = {}
+        for task, policy, _, value in rows:
+            found.setdefault(task, {}).setdefault(policy, []).append(float(value))
+    except (OSError, ValueError) as error:
+        raise DamageError(f"{path} is damaged: install jbrep again") from error
+    return {
+        task: {policy: np.array(values) for policy, values in returns.items()}
+        for task, returns in found.items()
+    }

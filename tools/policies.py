@@ -1,0 +1,60 @@
+"""Ship the best agent for each task: python tools/policies.py FOLDER...
+
+The folders have the runs of any studies. A task's best run has the highest mean return in the last
+tenth of training. Those episodes have other starts than the evaluation's, so the returns that are
+written, which are of the evaluation's episodes, aren't what it was chosen by.
+"""
+
+import csv
+import sys
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from jbrep.envs.description import describe
+from jbrep.jitterbug.tasks import TASKS
+from jbrep.rl.files import EPISODES, FINISHED, RUN, read_run
+from jbrep.rl.policy import load_run
+from jbrep.rl.policy_weights import save
+from jbrep.rl.shipped import SHIPPED, file_of, write_returns
+from jbrep.rollouts.sources import find_player
+
+SHOWN = (SHIPPED, "heuristic")
+COUNTED = 100  # episodes
+LAST = 0.1  # part of training
+
+
+def score(run: Path, steps: int) -> float:
+    """Mean return of the episodes that ended in the last part of training."""
+    with (run / EPISODES).open() as file:
+        episodes = [(int(row["step"]), float(row["return"])) for row in csv.DictReader(file)]
+    return float(np.mean([value for step, value in episodes if step > (1 - LAST) * steps]))
+
+
+def best(folders: list[Path]) -> dict[str, tuple[float, Path]]:
+    """The best run of each task, with its score."""
+    found: dict[str, tuple[float, Path]] = {}
+    for path in sorted(chain.from_iterable(folder.rglob(RUN) for folder in folders)):
+        run = read_run(path.parent)
+        task = run["settings"]["task"]
+        if run["status"] == FINISHED and task in TASKS:
+            scored = (score(path.parent, run["settings"]["steps"]), path.parent)
+            found[task] = max(found.get(task, scored), scored)
+    return {task: found[task] for task in TASKS if task in found}
+
+
+def main() -> None:
+    folders = [Path(each) for each in sys.argv[1:]]
+    played = {}
+    for task, (value, run) in best(folders).items():
+        save(load_run(run), file_of(task), SHIPPED)
+        played[task] = {
+            policy: find_player(policy, describe(task)).returns(COUNTED) for policy in SHOWN
+        }
+        print(f"{task}: {run}, {value:.0f} in the last tenth of training")
+    write_returns(played)
+
+
+if __name__ == "__main__":
+    main()
