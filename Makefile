@@ -10,7 +10,7 @@ TASKS := move_from_origin face_direction move_in_direction move_to_position move
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes trainers policies behaviour clean
+.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes ablation screen trainers policies behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -97,7 +97,11 @@ desk: ## results/desk/ anew: a night or two; goes on where it was stopped
 ddpg: ## results/ddpg/ anew: a night
 yaw: data ## results/yaw/ anew: hours
 codes: encoders ## results/codes/ anew: hours
-desk ddpg yaw codes: $(READY)
+ablation: encoders/ablation ## results/ablation/ anew: hours
+screen: ## results/screen/ anew: a night or two; makes its own data sets and encoders
+encoders/ablation: $(READY)
+	$(BIN)/python tools/ablate.py $@
+desk ddpg yaw codes ablation screen: $(READY)
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
 	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json references.csv) results/$@/
