@@ -87,7 +87,19 @@ def done(tmp_path_factory):
 def test_the_presets_are_studies():
     studies = {p.stem: read_study(p) for p in Path("studies").glob("*.toml")}
     assert set(studies) == {
-        *("ablation", "demo", "codes", "ddpg", "desk", "paper", "policies", "screen", "yaw")
+        *(
+            "ablation",
+            "breadth",
+            "demo",
+            "codes",
+            "ddpg",
+            "desk",
+            "paper",
+            "policies",
+            "screen",
+            "screen-normalized",
+            "yaw",
+        )
     }
     paper = studies["paper"]
     assert (paper.steps, len(paper.seeds), paper.data) == (5_000_000, 10, Data(steps=5_000_000))

@@ -1,7 +1,7 @@
 """Give a code one feature, and take it from others: python tools/ablate.py OUT.
 
-For each task of studies/ablation.toml, from encoders that ship: dae-8 with the rate of yaw beside it,
-and with the height beside it instead; the full observation, and forward-8, that see no rate of yaw.
+For each task of studies/ablation.toml, from encoders that ship: dae-8 with the rate of yaw beside
+it, and with the height beside it instead; the full observation and forward-8 without rate of yaw.
 """
 
 import sys
