@@ -30,6 +30,7 @@ from jbrep.encoders import load
 from jbrep.errors import InputError
 from jbrep.rl.files import CHECKPOINT, RUN, read_run, write_run
 from jbrep.rl.presets import PRESETS, get_preset
+from jbrep.rollouts.behaviour import observe
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, read_study
 from jbrep.study.plan import STUDY, Plan, plan_for, read_plan
@@ -648,3 +649,14 @@ def test_interpolation_leaves_evaluations_as_they_are(done):
     run = read_runs(done.folder)[0]
     assert run.steps.tolist() == [0, 80]
     assert np.all((run.returns >= 0) & (run.returns <= 1000))
+
+
+def test_the_runs_below_a_folder_behave_as_one_policy(done):
+    folder = done.folder / "runs" / "face_direction" / "a2c" / "full"
+    _, (before, after) = observe([str(folder)], None, 3, 0.5)
+    assert before.name.endswith("full, before training")
+    assert after.name.endswith("full, 2 runs")
+    seeds = [folder / f"seed-{seed}" for seed in (0, 1)]
+    alone = [observe([str(each)], None, 3, 0.5)[1][1] for each in seeds]
+    np.testing.assert_array_equal(after.returns, np.concatenate([each.returns for each in alone]))
+    np.testing.assert_allclose(after.motor, np.mean([each.motor for each in alone], axis=0))

@@ -213,7 +213,8 @@ def behaviour(
     """Draw how policies turn the motor and where they go.
 
     For the Jitterbug's tasks alone. A policy is the folder of a run, shown before and after
-    training, or a name, such as heuristic. All play the same episodes.
+    training; a folder with several runs, which count as one; or a name, such as heuristic. All play
+    the same episodes.
     """
     import numpy as np
 

@@ -43,13 +43,13 @@ def behaviour_plots(
         speeds: edges of the bins of motor velocity [rad/s], (b + 1,).
         target_yaw: the direction of the targets [rad].
     """
-    episodes = len(behaviours[0].returns)
+    counts = sorted({len(each.returns) for each in behaviours})
+    episodes = f"{' or '.join(map(str, counts))} episodes"
     return [
         Plot(
             "motor_velocity",
             f"{task}: how the motor turns",
-            f"Share of time at each motor velocity over {episodes} episodes, with their median "
-            "return.",
+            f"Share of time at each motor velocity over {episodes}, with their median return.",
             ("policy", "low", "high", "share"),
             [
                 (each.name, low, high, share)
@@ -61,7 +61,7 @@ def behaviour_plots(
         Plot(
             "positions",
             f"{task}: where the robot goes",
-            f"Share of time in each 2 cm cell over {episodes} episodes that start at the circle; "
+            f"Share of time in each 2 cm cell over {episodes} that start at the circle; "
             "the arrow points in the target's direction.",
             ("policy", "x", "y", "share"),
             [row for each in behaviours for row in _cells(each)],

@@ -1,6 +1,8 @@
 """What policies do, as tables: how the motor turns, and where the robot goes."""
 
 from collections.abc import Sequence
+from itertools import chain
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,8 +10,9 @@ from numpy.typing import NDArray
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 from jbrep.figures.behaviour import Behaviour
+from jbrep.rl.files import RUN
 from jbrep.rollouts.jitterbug import jitterbug_task
-from jbrep.rollouts.sources import Player, find_player, find_untrained, run_folder
+from jbrep.rollouts.sources import Player, find_player, find_untrained, is_by_name, run_folder
 
 SPEEDS = np.linspace(-180, 180, 73)  # edges of the bins of the motor's velocity [rad/s]
 _CELL = 0.02  # edge of a cell of the floor [m]
@@ -18,45 +21,63 @@ _CELL = 0.02  # edge of a cell of the floor [m]
 def observe(
     sources: Sequence[str], task: Task | None, episodes: int, target_yaw: float
 ) -> tuple[Task, list[Behaviour]]:
-    """What policies do in the same episodes; for a run, also the policy that it began with.
+    """What policies do in the same episodes; for runs, also the policies that they began with.
 
     The tables are of the Jitterbug's motor, and of its place on the floor.
 
     Args:
-        sources: as `find_player` takes them.
+        sources: as `find_player` takes them, or folders with several runs, which count as one.
         task: for policies by their names.
-        episodes: how many.
+        episodes: how many, of each run.
         target_yaw: where every target points [rad].
 
     Raises:
         InputError: as `find_player`, or policies of several tasks, or of another robot's.
     """
-    players: list[Player] = []
+    subjects: dict[str, list[Player]] = {}
     for source in sources:
-        player = find_player(source, task)
-        task = player.task
-        if jitterbug_task(task) is None:
-            raise InputError(
-                f"{source} is of {task.name}: only the Jitterbug's tasks have the motor and the "
-                "free body whose behaviour is drawn"
-            )
-        if folder := run_folder(source):
-            players.append(find_untrained(folder))
-        players.append(player)
-    played = [_Visits(player, episodes, target_yaw) for player in players]
+        runs = _runs(source)
+        players = [find_player(str(each), task) for each in runs or (source,)]
+        for player in players:
+            task = _only(player, task)
+        name = f"{source}, {len(runs)} runs" if len(runs) > 1 else players[0].name
+        if runs:
+            subjects[f"{source}, before training"] = [find_untrained(run) for run in runs]
+        subjects[name] = players
+    played = [_Visits(*each, episodes, target_yaw) for each in subjects.items()]
     reach = max(np.abs(visits.position).max() for visits in played)
     cells = int(np.ceil((reach + _CELL) / _CELL))
     edges: Array = _CELL * np.arange(-cells, cells + 1, dtype=np.float64)
-    return players[0].task, [visits.counted(edges) for visits in played]
+    assert task is not None  # the last player's
+    return task, [visits.counted(edges) for visits in played]
+
+
+def _runs(source: str) -> list[Path]:
+    """The run that a source names, or the finished ones below a folder; none of a name."""
+    if folder := run_folder(source):
+        return [folder]
+    return [] if is_by_name(source) else sorted(path.parent for path in Path(source).rglob(RUN))
+
+
+def _only(player: Player, task: Task | None) -> Task:
+    """The task of a player, which must be the Jitterbug's and that of those before."""
+    if jitterbug_task(player.task) is None:
+        raise InputError(
+            f"{player.name} is of {player.task.name}: only the Jitterbug's tasks have the motor "
+            "and the free body whose behaviour is drawn"
+        )
+    if task is not None and task != player.task:
+        raise InputError(f"{player.name} is of {player.task.name}, not of {task.name}")
+    return player.task
 
 
 class _Visits:
-    """Where a policy went, and how the motor turned."""
+    """Where policies that count as one went, and how the motor turned."""
 
-    def __init__(self, player: Player, episodes: int, target_yaw: float):
-        self._name = player.name
+    def __init__(self, name: str, players: Sequence[Player], episodes: int, target_yaw: float):
+        self._name = name
         returns, motor, position = [], [], []
-        for rollout in player.play_first(episodes, target_yaw):
+        for rollout in chain.from_iterable(p.play_first(episodes, target_yaw) for p in players):
             assert rollout.motion is not None  # the Jitterbug has one
             returns.append(rollout.episode_return)
             motor.append(rollout.motion.qvel[:, -1].copy())  # a view would keep the whole rollout
