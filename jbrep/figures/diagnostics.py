@@ -31,7 +31,7 @@ def diagnostics(associations: Sequence[Association], looks: Looks) -> Plot:
     """
     return Plot(
         "diagnostics",
-        "Do diagnostics predict learning?",
+        "Final return against diagnostics",
         "Left: the rank correlation of each diagnostic of the codes with their final return, with "
         "its 95 % bootstrap interval over codes, where there are at least five: 1 if the code with "
         "the better value always has the higher return. Right: each code by the main diagnostics, "

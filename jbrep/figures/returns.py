@@ -27,6 +27,7 @@ _LABEL = ("task", "algorithm", "representation")
 _JITTER = 0.16  # between the outermost runs and the middle of their representation
 _ROOM = 0.04  # of an axis, at its ends, for whole markers
 _DASHED = " Dashed: policies that don't learn, on the same starts."
+_INTERVALS = " Bars: 95 % intervals, from four runs on."
 _CUT = " A triangle at an edge: the interval goes beyond it."
 
 
@@ -35,9 +36,8 @@ def final_return(groups: Groups, looks: Looks) -> Plot:
     return Plot(
         "final_return",
         "Final return and its spread",
-        "Left: mean return at the end of training, a point for each of n runs, and the mean over "
-        "runs with its 95 % interval. Right: the standard deviation over runs with its 95 % "
-        "interval." + _dashed(groups) + _CUT,
+        "Left: mean return at the end of training, a point for each of n runs, and their mean. "
+        "Right: the standard deviation over runs." + _INTERVALS + _dashed(groups) + _CUT,
         (
             *(*_LABEL, "seed", "final_return", "mean", "mean_low", "mean_high"),
             *("sd", "sd_low", "sd_high"),
@@ -53,7 +53,7 @@ def learning_rate(groups: Groups, looks: Looks) -> Plot:
         "learning_rate",
         "How fast agents learn",
         "Mean return over all of training (the area under the learning curve), a point for each of "
-        "n runs, and the mean over runs with its 95 % interval." + _dashed(groups) + _CUT,
+        "n runs, and their mean." + _INTERVALS + _dashed(groups) + _CUT,
         (*_LABEL, "seed", "mean_return", "mean", "mean_low", "mean_high"),
         list(_by_run(groups, "mean_return", ("mean_return_mean",))),
         lambda: _draw_learning(groups, looks),
