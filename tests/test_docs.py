@@ -90,8 +90,17 @@ def test_every_data_command_is_shown_and_every_one_shown_exists():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_and_pictures_lead_somewhere(page):
-    targets = re.findall(r"\]\(([^)#]+)\)", page.read_text())
-    assert not [t for t in targets if "://" not in t and not (page.parent / t).exists()]
+    targets = [t for t in re.findall(r"\]\(([^)]+)\)", page.read_text()) if "://" not in t]
+    for path, _, heading in (target.partition("#") for target in targets):
+        there = page.parent / path if path else page
+        assert there.exists(), path
+        assert not heading or heading in anchors(there), f"{path}#{heading}"
+
+
+def anchors(page):
+    """What links to the headings of a page are called, by GitHub's rule."""
+    headings = re.findall(r"^#+ (.*)", page.read_text(), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def test_the_citation_is_of_this_version():
