@@ -191,6 +191,24 @@ def test_titles_of_many_representations_do_not_overlap(returns):
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
 
 
+def test_a_study_of_many_representations_can_be_read():
+    """Legends don't take the room of panels, and no two lines look alike."""
+    some = [run for run in runs() if (run.task, run.algorithm) == GROUPS[0]]
+    full, other = (
+        [run for run in some if run.representation == name] for name in ("full", "dae-8")
+    )
+    names = [f"another-one-{number}" for number in range(15)]
+    many = [replace(run, representation=name) for name in names for run in other]
+    plots = study_plots(analyse(full + many), [], {}, {})
+    for plot in plots:
+        if plot.name in ("representations", "profiles", "learning_rate", "claims"):
+            figure = Drawing(plot, PAPER)._figure
+            heights = [axes.get_window_extent().height / figure.dpi for axes in figure.axes]
+            assert min(heights) > 0.8, plot.name
+    colours = {style["color"] for style in styles(["full", *names], "full").values()}
+    assert len(colours) == 16
+
+
 def test_every_run_is_drawn(plots, returns):
     axes = drawn(plots["every_run"]).axes[0]
     assert len(axes.lines) == 1 + 4 + 1  # a policy, the runs and their median

@@ -30,7 +30,10 @@ Runs = dict[int, dict[int, float]]  # mean returns of a label, by seed and step
 References = dict[str, dict[str, list[float]]]
 
 _MOST_ACROSS = 5  # panels of runs side by side
-_HANDLE, _CHARACTER = 0.5, 0.05  # widths in a legend [inches]
+_TITLE = 0.062  # width of a character in a panel's title [inches]
+_HANDLE, _CHARACTER, _LINE = 0.5, 0.05, 0.14  # of a legend: widths, height of a line [inches]
+_USUAL_LINES = 3  # of a legend, that figures have room for
+_FEW = 7  # representations on one axis, beyond which a panel is a page wide and bands are faint
 _COLUMNS = (
     *("task", "algorithm", "representation", "step"),
     *("p10", "p50", "p90", "iqm", "iqm_low", "iqm_high"),
@@ -127,6 +130,7 @@ def _grid_of_curves(
     groups: Groups, references: References, extents: Mapping[str, Limits], looks: Looks
 ) -> Figure:
     look, names = looks(), names_with_runs(groups)
+    faint = 0.15 if len(names) <= _FEW else 0.05
 
     def draw(axes: Axes, group: GroupAnalysis) -> None:
         _draw_references(axes, references.get(group.task, {}))
@@ -135,7 +139,7 @@ def _grid_of_curves(
         for label in group.labels:
             style, curve = look[label.representation], label.curve
             axes.fill_between(
-                group.grid, curve.p10, curve.p90, color=style["color"], alpha=0.15, linewidth=0
+                group.grid, curve.p10, curve.p90, color=style["color"], alpha=faint, linewidth=0
             )
             axes.plot(
                 group.grid,
@@ -171,7 +175,8 @@ def _grid(
     tasks = list(dict.fromkeys(group.task for group in groups))
     algorithms = list(dict.fromkeys(group.algorithm for group in groups))
     by_place = {(group.task, group.algorithm): group for group in groups}
-    width = COLUMN if len(algorithms) == 1 else PAGE
+    is_narrow = len(algorithms) == 1 and len(names_with_runs(groups)) <= _FEW
+    width = COLUMN if is_narrow else PAGE
     figure = Figure(figsize=(width, 0.5 + (2.0 if len(algorithms) < 3 else 1.6) * len(tasks)))
     panels = figure.subplots(len(tasks), len(algorithms), squeeze=False, sharey="row")
     for (i, j), axes in np.ndenumerate(panels):
@@ -197,7 +202,10 @@ def _training_axes(axes: Axes, last: float, extent: Limits, ticks: int = 5) -> N
 
 
 def below(figure: Figure, panels: Iterable[Axes]) -> None:
-    """One legend below all panels, reference lines last, in as many columns as fit."""
+    """One legend below all panels, reference lines last, in as many columns as fit.
+
+    The figure grows by the lines of the legend beyond the usual number.
+    """
     entries = {
         name: handle
         for axes in panels
@@ -206,6 +214,8 @@ def below(figure: Figure, panels: Iterable[Axes]) -> None:
     names = sorted(entries, key=lambda name: _is_broken(entries[name]))
     longest = max(map(len, names), default=0)
     columns = max(1, int(figure.get_figwidth() / (_HANDLE + longest * _CHARACTER)))
+    lines = -(-len(names) // columns)
+    figure.set_figheight(figure.get_figheight() + _LINE * max(0, lines - _USUAL_LINES))
     handles = [entries[name] for name in names]
     figure.legend(handles, names, loc="outside lower center", ncols=columns)
 
@@ -224,7 +234,8 @@ def _draw_runs(means: Mapping[Evaluated, float], references: References, looks: 
         of_task[task] += [float(np.mean(each)) for each in played.values()]
     look, groups = looks(), list(dict.fromkeys(label[:2] for label in runs))
     names = [name for name in look if any(label[2] == name for label in runs)]
-    across = min(len(names), _MOST_ACROSS)
+    titles = max(len(with_runs(label[2], [len(each)])) for label, each in runs.items())
+    across = min(len(names), _MOST_ACROSS, max(1, int(PAGE / (_TITLE * titles))))
     down = -(-len(names) // across)  # rows of a group
     figure = Figure(figsize=(PAGE, 0.35 + 1.35 * len(groups) * down))
     panels = figure.subplots(len(groups) * down, across, squeeze=False, sharey="row", sharex="row")

@@ -6,6 +6,7 @@ from typing import Any
 import matplotlib as mpl
 from cycler import cycler
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
 Styles = dict[str, dict[str, Any]]  # colour and marker, by name
@@ -54,6 +55,7 @@ DARK: Any = {
     "grid.alpha": 0.16,
     "ytick.color": "#DDDDDD",
 }
+_SHADES = (0.25, 0.5)  # how far from a colour to that of text, where colours are used again
 _DASHES = ("--", "-.", (0, (6, 1.5)))
 
 
@@ -83,10 +85,21 @@ def styles(names: Iterable[str], first: str | None = None) -> Styles:
     colours = mpl.rcParams["axes.prop_cycle"].by_key()["color"]
     others = [name for name in dict.fromkeys(names) if name != first]
     coloured = {
-        name: {"color": colours[i % len(colours)], "marker": MARKERS[(i + 1) % len(MARKERS)]}
+        name: {"color": _colour(colours, i), "marker": MARKERS[(i + 1) % len(MARKERS)]}
         for i, name in enumerate(others)
     }
     return {**({first: {"color": ink(), "marker": MARKERS[0]}} if first else {}), **coloured}
+
+
+def _colour(colours: Sequence[str], number: int) -> str:
+    """One of the colours, or beyond the last a shade of one, nearer to the colour of text."""
+    colour, used = colours[number % len(colours)], number // len(colours)
+    if not used:
+        return colour
+    share = _SHADES[used % len(_SHADES)]
+    pairs = zip(to_rgb(colour), to_rgb(ink()), strict=True)
+    mixed = [(1 - share) * own + share * text for own, text in pairs]
+    return to_hex((mixed[0], mixed[1], mixed[2]))
 
 
 def panel_grid(count: int, height: float, above: float = 0.0) -> tuple[Figure, Sequence[Axes]]:
