@@ -97,15 +97,23 @@ desk: ## results/desk/ anew: a night or two; goes on where it was stopped
 ddpg: ## results/ddpg/ anew: a night
 yaw: data ## results/yaw/ anew: hours
 codes: encoders ## results/codes/ anew: hours
-ablation: encoders/ablation ## results/ablation/ anew: hours
-screen: ## results/screen/ anew: a night or two; makes its own data sets and encoders
+ablation: encoders/ablation data/unseen ## results/ablation/ anew: hours
+ablation: JUDGED = forward-8 dae-8 encoders/ablation/$$task/*.safetensors
+screen: data/unseen ## results/screen/ anew: a night or two; makes its own data sets and encoders
+screen: JUDGED = runs/screen/encoders/$$task/*.safetensors
 encoders/ablation: $(READY)
 	$(BIN)/python tools/ablate.py $@
+data/unseen: $(READY)
+	$(BIN)/jbrep collect --task face_direction --steps 500k --seed 100 --store-state --out $@/face_direction
+	$(BIN)/jbrep data derive $@/face_direction --task move_in_direction --out $@/move_in_direction
 desk ddpg yaw codes ablation screen: $(READY)
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
 	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json references.csv) results/$@/
-	$(BIN)/jbrep report results/$@
+	$(if $(JUDGED),for task in face_direction move_in_direction; do \
+	  $(BIN)/jbrep evaluate --encoder $(JUDGED) --data data/unseen/$$task --out results/$@/$$task || exit; \
+	done)
+	$(BIN)/jbrep report results/$@ $(if $(JUDGED),--evaluation 'results/$@/{task}')
 
 trainers: $(READY) ## what results/trainers/ lacks: eight hours for all of it; goes on where it was stopped
 	for study in $(basename $(notdir $(wildcard studies/trainers/*.toml))); do \
