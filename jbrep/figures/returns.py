@@ -28,6 +28,8 @@ _JITTER = 0.16  # between the outermost runs and the middle of their representat
 _ROOM = 0.04  # of an axis, at its ends, for whole markers
 _DASHED = " Dashed: policies that don't learn, on the same starts."
 _INTERVALS = " Bars: 95 % intervals, from four runs on."
+_TILTED = 0.03  # height that a character of a tilted name takes [inches]
+_USUAL_NAME = 16  # characters, that panels have room for
 _CUT = " A triangle at an edge: the interval goes beyond it."
 
 
@@ -92,7 +94,13 @@ def _dashed(groups: Groups) -> str:
     return _DASHED if any(group.references for group in groups) else ""
 
 
-def _panels(groups: Groups, columns: int, height: float = 1.7) -> tuple[Figure, Any]:
+def _height(groups: Groups) -> float:
+    """Of a row of panels with the names of representations below, tilted if they are many."""
+    longest = max(map(len, names_with_runs(groups).values()))
+    return 1.7 + _TILTED * max(0, longest - _USUAL_NAME)
+
+
+def _panels(groups: Groups, columns: int, height: float) -> tuple[Figure, Any]:
     """A row of panels for each group; two groups side by side where a row has one panel."""
     across = 1 if columns > 1 or len(groups) == 1 else 2
     rows = -(-len(groups) // across)
@@ -106,7 +114,7 @@ def _panels(groups: Groups, columns: int, height: float = 1.7) -> tuple[Figure, 
 
 
 def _draw_final(groups: Groups, looks: Looks) -> Figure:
-    figure, panels = _panels(groups, 2)
+    figure, panels = _panels(groups, 2, _height(groups))
     look = looks()
     for (left, right), group in zip(panels, groups, strict=True):
         extent = _extent(group, "final_return", group.solved)
@@ -125,7 +133,7 @@ def _draw_final(groups: Groups, looks: Looks) -> Figure:
 
 
 def _draw_learning(groups: Groups, looks: Looks) -> Figure:
-    figure, panels = _panels(groups, 1)
+    figure, panels = _panels(groups, 1, _height(groups))
     look = looks()
     for (axes,), group in zip(panels, groups, strict=True):
         extent = _extent(group, "mean_return")
