@@ -14,7 +14,7 @@ import numpy as np
 
 from jbrep.envs.description import describe
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.rl.files import EPISODES, FINISHED, RUN, read_run
+from jbrep.rl.files import EPISODES, FINISHED, read_run, runs_below
 from jbrep.rl.policy import load_run
 from jbrep.rl.policy_weights import save
 from jbrep.rl.shipped import SHIPPED, file_of, write_returns
@@ -35,11 +35,11 @@ def score(run: Path, steps: int) -> float:
 def best(folders: list[Path]) -> dict[str, tuple[float, Path]]:
     """The best run of each task, with its score."""
     found: dict[str, tuple[float, Path]] = {}
-    for path in sorted(chain.from_iterable(folder.rglob(RUN) for folder in folders)):
-        run = read_run(path.parent)
+    for path in chain.from_iterable(map(runs_below, folders)):
+        run = read_run(path)
         task = run["settings"]["task"]
         if run["status"] == FINISHED and task in TASKS:
-            scored = (score(path.parent, run["settings"]["steps"]), path.parent)
+            scored = (score(path, run["settings"]["steps"]), path)
             found[task] = max(found.get(task, scored), scored)
     return {task: found[task] for task in TASKS if task in found}
 

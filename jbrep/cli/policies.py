@@ -19,7 +19,7 @@ from jbrep.errors import InputError
 from jbrep.text import rounded
 
 if TYPE_CHECKING:
-    from jbrep.envs.task import Task
+    from jbrep.envs.task import Array, Task
     from jbrep.rollouts.sources import Player
 
 _TASK = "face_direction"
@@ -57,8 +57,6 @@ def evaluate_policy(
     it needs --trust. A policy by name may act on what an encoder's latent is decoded to: the return
     that it loses measures what the latent lacks.
     """
-    import numpy as np
-
     from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import source_of
 
@@ -66,7 +64,6 @@ def evaluate_policy(
     player = _find(policy, given_task(options, required=False), algorithm, encoder, trust)
     source = None if encoder is None else source_of(encoder, player.task)
     returns = player.returns(episodes)
-    low, median, high = np.percentile(returns, (10, 50, 90))
     if as_json:
         echo_json(
             {
@@ -77,9 +74,7 @@ def evaluate_policy(
                 **({} if player.step is None else {"step": player.step}),
                 "episodes": episodes,
                 "returns": returns.tolist(),
-                "median": median,
-                "percentile_10": low,
-                "percentile_90": high,
+                **_percentiles(returns),
             }
         )
         return
@@ -87,15 +82,22 @@ def evaluate_policy(
         click.echo(printable(f"encoder: {source}"))
     click.echo(
         printable(
-            f"{_title(policy, player)}: median return {_interval(low, median, high)} "
+            f"{_title(policy, player)}: median return {_interval(returns)} "
             f"(10-90 % of {episodes} episodes)"
         )
     )
 
 
-def _interval(low: float, median: float, high: float) -> str:
-    at_low, at_median, at_high = rounded(low, median, high)
-    return f"{at_median} [{at_low}, {at_high}]"
+def _percentiles(returns: "Array") -> dict[str, float]:
+    import numpy as np
+
+    low, median, high = np.percentile(returns, (10, 50, 90)).tolist()
+    return {"median": median, "percentile_10": low, "percentile_90": high}
+
+
+def _interval(returns: "Array") -> str:
+    median, low, high = rounded(*_percentiles(returns).values())
+    return f"{median} [{low}, {high}]"
 
 
 def _title(policy: str, player: "Player") -> str:
@@ -115,7 +117,6 @@ def _find(
     from jbrep.encoders import find
     from jbrep.envs.description import describe
     from jbrep.files.storage import exists
-    from jbrep.rl.shipped import SHIPPED
     from jbrep.rollouts.sources import (
         as_player,
         find_player,
@@ -127,7 +128,7 @@ def _find(
 
     path = Path(policy)
     folder = run_folder(policy)
-    if policy == SHIPPED:
+    if is_by_name(policy):
         task = task or describe(_TASK)
     if is_trained(policy) or (exists(path) and path.is_dir()):
         if encoder and not (folder and encoder == _code_of(folder)):
@@ -135,10 +136,9 @@ def _find(
                 f"{policy} is a trained policy, which has its own encoder: leave out --encoder"
             )
         return find_player(policy, task)
-    task = task or describe(_TASK)
     if is_by_name(policy):
         player = find_player(policy, task)
-        return player.with_reconstruction(find(encoder, task)) if encoder else player
+        return player.with_reconstruction(find(encoder, player.task)) if encoder else player
     if not exists(path):
         raise InputError(
             f"no policy at {policy}: a folder of jbrep rl is needed, a zip file of "
@@ -147,6 +147,7 @@ def _find(
     from jbrep.encoders import FULL
     from jbrep.rl.policy import load_zip  # imports torch
 
+    task = task or describe(_TASK)
     return as_player(policy, load_zip(path, task, algorithm, encoder or FULL, trust))
 
 
@@ -165,18 +166,11 @@ def policies(as_json: bool) -> None:
     Every command that takes a policy knows the one for its --task as trained, as in jbrep render
     trained --task face_direction --out walk.mp4.
     """
-    import numpy as np
-
     from jbrep.rl.shipped import SHIPPED, shipped
     from jbrep.text import table, terminal_width
 
     ships = shipped()
-    ranges = [
-        {name: np.percentile(each, (10, 50, 90)).tolist() for name, each in policy.returns.items()}
-        for policy in ships
-    ]
     if as_json:
-        names = ("percentile_10", "median", "percentile_90")
         return echo_json(
             {
                 policy.task: {
@@ -184,16 +178,16 @@ def policies(as_json: bool) -> None:
                     "learner": policy.learner,
                     "steps": policy.steps,
                     "episodes": len(policy.returns[SHIPPED]),
-                    **{name: dict(zip(names, each, strict=True)) for name, each in played.items()},
+                    **{name: _percentiles(each) for name, each in policy.returns.items()},
                 }
-                for policy, played in zip(ships, ranges, strict=True)
+                for policy in ships
             }
         )
     rows = [
-        (task, observes, learner, f"{steps:,}", *(_interval(*each) for each in played.values()))
-        for (task, observes, learner, steps, _), played in zip(ships, ranges, strict=True)
+        (task, observes, learner, f"{steps:,}", *map(_interval, returns.values()))
+        for task, observes, learner, steps, returns in ships
     ]
-    header = ("task", "observes", "learned by", "steps", *ranges[0])
+    header = ("task", "observes", "learned by", "steps", *ships[0].returns)
     click.echo(table(header, rows, terminal_width()))
     episodes = len(ships[0].returns[SHIPPED])
     return click.echo(f"\nreturns: median [10 %, 90 %] of the same {episodes} episodes")
@@ -225,8 +219,5 @@ def behaviour(
     with stoppable("the same command starts again"):
         shared_task, behaviours = observe(policies, task, episodes, yaw)
     for each in behaviours:
-        low, median, high = np.percentile(each.returns, (10, 50, 90))
-        click.echo(
-            printable(f"{each.name}: median return {_interval(low, median, high)} (10-90 %)")
-        )
+        click.echo(printable(f"{each.name}: median return {_interval(each.returns)} (10-90 %)"))
     echo_paths(write(behaviour_plots(shared_task.name, behaviours, SPEEDS, yaw), out))

@@ -61,9 +61,8 @@ def render(
 
     A source is the folder of a data set or of a run, or the name of a policy, such as uniform,
     heuristic, trained or constant:drive=0.5, which needs a --task. The robot must be one of MuJoCo.
-    The
-    Jitterbug's motor turns up to 23 times a second: at full speed and 25
-    frames per second it seems to creep backwards; --speed 0.25 shows how it turns.
+    The Jitterbug's motor turns up to 23 times a second: at full speed and 25 frames per second it
+    seems to creep backwards; --speed 0.25 shows how it turns.
     """
     from jbrep.opengl import find_opengl
 

@@ -61,6 +61,11 @@ def is_run(folder: Path) -> bool:
     return exists(folder / RUN) or exists(folder / CHECKPOINT)
 
 
+def runs_below(folder: Path) -> list[Path]:
+    """The folders of the runs below a folder that have finished or failed, in order."""
+    return sorted(file.parent for file in folder.rglob(RUN))
+
+
 def is_policy_file(path: Path) -> bool:
     """Whether this is a policy's file as `jbrep.rl.policy_weights` writes it."""
     return path.suffix == POLICY_SUFFIX and container.format_of(path) == POLICY_FORMAT

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 from jbrep.figures.behaviour import Behaviour
-from jbrep.rl.files import RUN
+from jbrep.rl.files import runs_below
 from jbrep.rollouts.jitterbug import jitterbug_task
 from jbrep.rollouts.sources import Player, find_player, find_untrained, is_by_name, run_folder
 
@@ -36,10 +36,11 @@ def observe(
     """
     subjects: dict[str, list[Player]] = {}
     for source in sources:
-        runs = _runs(source)
-        players = [find_player(str(each), task) for each in runs or (source,)]
-        for player in players:
-            task = _only(player, task)
+        runs, players = _runs(source), []
+        for each in runs or (source,):
+            player = find_player(str(each), task)
+            task = _of_the_jitterbug(player)
+            players.append(player)
         name = f"{source}, {len(runs)} runs" if len(runs) > 1 else players[0].name
         if runs:
             subjects[f"{source}, before training"] = [find_untrained(run) for run in runs]
@@ -56,18 +57,16 @@ def _runs(source: str) -> list[Path]:
     """The run that a source names, or the finished ones below a folder; none of a name."""
     if folder := run_folder(source):
         return [folder]
-    return [] if is_by_name(source) else sorted(path.parent for path in Path(source).rglob(RUN))
+    return [] if is_by_name(source) else runs_below(Path(source))
 
 
-def _only(player: Player, task: Task | None) -> Task:
-    """The task of a player, which must be the Jitterbug's and that of those before."""
+def _of_the_jitterbug(player: Player) -> Task:
+    """The task of a player, which must be the Jitterbug's."""
     if jitterbug_task(player.task) is None:
         raise InputError(
             f"{player.name} is of {player.task.name}: only the Jitterbug's tasks have the motor "
             "and the free body whose behaviour is drawn"
         )
-    if task is not None and task != player.task:
-        raise InputError(f"{player.name} is of {player.task.name}, not of {task.name}")
     return player.task
 
 

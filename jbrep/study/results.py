@@ -14,7 +14,7 @@ from jbrep.envs.task import Task, read_task
 from jbrep.errors import InputError
 from jbrep.files.storage import exists, write_whole
 from jbrep.files.tables import write_csv
-from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run
+from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, runs_below
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import STILL
@@ -96,7 +96,7 @@ def has_runs(folder: Path) -> bool:
 
 
 def _folders(folder: Path, plan: Plan | None) -> list[Path]:
-    folders = sorted(file.parent for file in folder.rglob(RUN))
+    folders = runs_below(folder)
     if not folders:
         what_to_do = "jbrep study resumes it" if plan else "train one with jbrep rl or jbrep study"
         raise InputError(f"no finished run below {folder}: {what_to_do}")
