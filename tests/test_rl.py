@@ -29,6 +29,7 @@ from jbrep.files import container
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, read_evaluations, read_run
+from jbrep.rl.names import COHORT, SB3
 from jbrep.rl.policy import load_run, load_zip
 from jbrep.rl.presets import ALGORITHMS, PRESETS, get_preset
 from jbrep.rl.sb3.checkpointer import restore, take
@@ -352,6 +353,17 @@ def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
     assert train(run, tmp_path / "wild") == result
     with pytest.raises(InputError, match="failed: it has no policy"):
         load_run(tmp_path / "wild")
+
+
+@pytest.mark.parametrize("trainer", [COHORT, SB3])
+def test_a_run_tells_all_its_steps_before_its_last_evaluation(trainer, tmp_path):
+    told = []
+    run = Run(algorithm="ddpg", steps=1200, evaluate_every=600, trainer=trainer, **QUICK)
+    train(run, tmp_path / "run", lambda *each: told.append(each))
+    evaluations = read_evaluations(tmp_path / "run")
+    means = [np.mean([e.episode_return for e in evaluations if e.step == s]) for s in (600, 1200)]
+    assert means[0] != means[1]
+    assert told[-2:] == [(1200, pytest.approx(means[0])), (1200, pytest.approx(means[1]))]
 
 
 def test_an_error_whose_words_sound_like_divergence_is_not_taken_for_it(tmp_path):

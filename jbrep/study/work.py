@@ -55,7 +55,8 @@ def work(
             make_folder(each.folder)
         import_modules(modules)
         runs = {each.folder: each.run for each in assigned}
-        results = dict(train_all(runs, _ProgressFiles(), stop=stop))
+        progress = _ProgressFiles(assigned[0].run.steps)
+        results = dict(train_all(runs, progress, stop=stop))
     except StoppedError:
         return None
     except Exception as error:
@@ -92,11 +93,12 @@ def read_progress(folder: Path) -> tuple[int, str]:
 class _ProgressFiles:
     """Tells the parent process, through files, how far runs are."""
 
-    def __init__(self) -> None:
+    def __init__(self, steps: int) -> None:
+        self._steps = steps  # of each run
         self._written: dict[Path, float] = {}
 
     def __call__(self, folder: Path, step: int, mean: float | None) -> None:
         now = time.monotonic()
-        if now - self._written.get(folder, 0.0) >= _WRITE_EVERY:
+        if step >= self._steps or now - self._written.get(folder, 0.0) >= _WRITE_EVERY:
             (folder / PROGRESS).write_text(f"{step} {'-' if mean is None else rounded(mean)[0]}")
             self._written[folder] = now

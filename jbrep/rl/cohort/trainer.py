@@ -75,6 +75,7 @@ def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
                 if cohort.is_evaluation_due:
                     cohort.evaluate()
             cohort.learn()
+        _tell(cohort, session)  # the last evaluation can take minutes
         cohort.evaluate()
         _tell(cohort, session)
         yield from map(_end, cohort.members)

@@ -50,6 +50,7 @@ class Recorder(BaseCallback):
 
     def _on_training_end(self) -> None:
         check_finite(self.model)
+        self._watch(self.model.num_timesteps, self._mean)  # the last evaluation can take minutes
         self._evaluate()
         self._watch(self.model.num_timesteps, self._mean)
 
