@@ -423,7 +423,7 @@ def test_a_study_of_learners(tmp_path):
     written = json.loads((out / "study.json").read_text())
     assert (written["algorithms"], written["learners"]) == (["a2c-modern", *own], own)
     assert read_plan(out).study == read_study(path)
-    labels = record(out, read_results(out).folders, [])["labels"]
+    labels = record(out, read_results(out).ended, [])["labels"]
     assert [*labels] == [f"Pendulum-v1/{name}/full" for name in ("a2c-modern", *own)]
     settings = labels["Pendulum-v1/tuned/full"]["settings"]
     assert (settings["preset"], settings["hidden"]) == ("modern", [4])

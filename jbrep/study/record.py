@@ -9,7 +9,7 @@ from jbrep.encoders import FULL, load
 from jbrep.envs.encoding import OWN
 from jbrep.envs.task import read_task
 from jbrep.files.storage import exists
-from jbrep.rl.files import ENCODER, read_run
+from jbrep.rl.files import ENCODER
 from jbrep.rl.names import base_name
 from jbrep.stats.runs import in_order
 from jbrep.study.plan import Plan, read_plan
@@ -23,20 +23,21 @@ EACH_ITS_OWN = "runs have different encoders"
 _RECORDS = ("training", "data", "metrics")  # of an encoder
 
 
-def record(folder: Path, folders: Sequence[Path], left_out: Sequence[str]) -> dict[str, Any]:
+def record(
+    folder: Path, ended: Mapping[Path, Mapping[str, Any]], left_out: Sequence[str]
+) -> dict[str, Any]:
     """What was run, as plain JSON.
 
     Args:
         folder: of a study, or any folder with runs below it.
-        folders: of the runs that have finished or failed.
+        ended: what run.json says of each run that has finished or failed, by folder.
         left_out: what the statistics leave out, in sentences.
 
     Raises:
         InputError: a file is damaged.
     """
-    runs = {each: read_run(each) for each in folders}
-    order = in_order((run["settings"]["representation"] for run in runs.values()), FULL)
-    runs = dict(sorted(runs.items(), key=lambda item: _sort_key(item[1]["settings"], order)))
+    order = in_order((run["settings"]["representation"] for run in ended.values()), FULL)
+    runs = dict(sorted(ended.items(), key=lambda item: _sort_key(item[1]["settings"], order)))
     labels: dict[str, dict[Path, Mapping[str, Any]]] = {}
     for each, run in runs.items():
         labels.setdefault(run_label(run["settings"]), {})[each] = run

@@ -18,20 +18,21 @@ from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, runs_below
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import STILL
-from jbrep.study.plan import STUDY, Plan, read_plan
+from jbrep.study.plan import STUDY, read_plan
 from jbrep.study.record import RECORD, as_json, learner, record, shared_settings
 from jbrep.study.references import References, read_references, write_references
 from jbrep.text import rounded, table
 
 RETURNS = "returns.csv"
 STATISTICS = "statistics.json"
+Ended = dict[Path, dict[str, Any]]  # what run.json says of each run that has ended, by folder
 _COLUMNS = ("task", "algorithm", "representation", "seed", "step", "episode", "return")
 
 
 class Results(NamedTuple):
     """The runs in a folder, and what the statistics say of them."""
 
-    folders: list[Path]  # of the runs
+    ended: Ended
     runs: list[RunCurve]
     analysis: Analysis | None
     left_out: list[str]  # what there are no statistics of, and why
@@ -51,8 +52,9 @@ def conclude(folder: Path, across_trainers: bool = False) -> tuple[Results, list
     Raises:
         InputError: as `read_results` and `write_results`.
     """
-    references = write_references(_tasks(_folders(folder, read_plan(folder))), folder)
-    results = read_results(folder, across_trainers)
+    ended = _ended(folder)
+    references = write_references(_tasks(ended.values()), folder)
+    results = _results(folder, ended, across_trainers)
     paths = write_results(results, folder)
     return results, [*paths, references] if references else paths
 
@@ -67,17 +69,19 @@ def read_results(folder: Path, across_trainers: bool = False) -> Results:
     Raises:
         InputError: there is no such run, or a file is damaged.
     """
-    plan = read_plan(folder)
-    folders = _folders(folder, plan)
-    references = read_references(folder)
-    runs = [_curve(each, references, across_trainers) for each in folders]
+    return _results(folder, _ended(folder), across_trainers)
+
+
+def _results(folder: Path, ended: Ended, across_trainers: bool) -> Results:
+    plan, references = read_plan(folder), read_references(folder)
+    runs = [_curve(*each, references, across_trainers) for each in ended.items()]
     compared, left_out = _comparable(runs)
     judge = plan.judge if plan else Planned()
     try:
         analysis = analyse(compared, judge, references=references) if compared else None
-        return Results(folders, runs, analysis, left_out)
+        return Results(ended, runs, analysis, left_out)
     except InputError as error:
-        return Results(folders, runs, None, [*left_out, str(error)])
+        return Results(ended, runs, None, [*left_out, str(error)])
 
 
 def read_runs(folder: Path) -> list[RunCurve]:
@@ -87,7 +91,7 @@ def read_runs(folder: Path) -> list[RunCurve]:
         InputError: there is none, or a file of one is damaged.
     """
     references = read_references(folder)
-    return [_curve(each, references) for each in _folders(folder, read_plan(folder))]
+    return [_curve(*each, references) for each in _ended(folder).items()]
 
 
 def has_runs(folder: Path) -> bool:
@@ -95,12 +99,15 @@ def has_runs(folder: Path) -> bool:
     return exists(folder / STUDY) or any(folder.rglob(RUN))
 
 
-def _folders(folder: Path, plan: Plan | None) -> list[Path]:
+def _ended(folder: Path) -> Ended:
     folders = runs_below(folder)
     if not folders:
-        what_to_do = "jbrep study resumes it" if plan else "train one with jbrep rl or jbrep study"
+        resumed = exists(folder / STUDY)
+        what_to_do = (
+            "jbrep study resumes it" if resumed else "train one with jbrep rl or jbrep study"
+        )
         raise InputError(f"no finished run below {folder}: {what_to_do}")
-    return folders
+    return {each: read_run(each) for each in folders}
 
 
 def _comparable(runs: list[RunCurve]) -> tuple[list[RunCurve], list[str]]:
@@ -120,10 +127,10 @@ def _comparable(runs: list[RunCurve]) -> tuple[list[RunCurve], list[str]]:
     return kept, sorted(alone.values())
 
 
-def _tasks(folders: Iterable[Path]) -> Iterable[tuple[Task, int]]:
+def _tasks(runs: Iterable[Mapping[str, Any]]) -> Iterable[tuple[Task, int]]:
     """The tasks of runs, with the most episodes that one was evaluated on at its end."""
     tasks: dict[str, tuple[Task, int]] = {}
-    for run in map(read_run, folders):
+    for run in runs:
         task, episodes = _task(run), run["settings"]["final_episodes"]
         _, most = tasks.get(task.name, (task, 0))
         tasks[task.name] = task, max(most, episodes)
@@ -135,8 +142,9 @@ def _task(run: Mapping[str, Any]) -> Task:
     return read_task(run["settings"]["environment"])
 
 
-def _curve(folder: Path, references: References, across_trainers: bool = False) -> RunCurve:
-    run = read_run(folder)
+def _curve(
+    folder: Path, run: Mapping[str, Any], references: References, across_trainers: bool = False
+) -> RunCurve:
     task = _task(run)
     settings = shared_settings(run["settings"])
     trainer = [settings.pop(name) for name in ("trainer", "precision", "device")]
@@ -171,7 +179,7 @@ def write_results(results: Results, folder: Path) -> list[Path]:
     Raises:
         InputError: a file of a run is damaged, or a table can't be written.
     """
-    contents = record(folder, results.folders, results.left_out)
+    contents = record(folder, results.ended, results.left_out)
     paths = [folder / RETURNS, folder / RECORD]
     write_csv(paths[0], _COLUMNS, _rows(results.runs))
     write_whole(paths[1], as_json(contents))
