@@ -653,10 +653,12 @@ def test_interpolation_leaves_evaluations_as_they_are(done):
 
 def test_the_runs_below_a_folder_behave_as_one_policy(done):
     folder = done.folder / "runs" / "face_direction" / "a2c" / "full"
-    _, (before, after) = observe([str(folder)], None, 3, 0.5)
-    assert before.name.endswith("full, before training")
-    assert after.name.endswith("full, 2 runs")
+    task, (before, after) = observe([str(folder)], None, 3, 0.5)
+    assert [before.name, after.name] == ["full, before training", "full, 2 runs"]
     seeds = [folder / f"seed-{seed}" for seed in (0, 1)]
+    _, (_, *others) = observe([str(folder), str(seeds[1]), "still"], task, 1, 0.5)
+    names = ["full, 2 runs", "full/seed-1, before training", "full/seed-1", "still"]
+    assert [each.name for each in others] == names
     alone = [observe([str(each)], None, 3, 0.5)[1][1] for each in seeds]
     np.testing.assert_array_equal(after.returns, np.concatenate([each.returns for each in alone]))
     np.testing.assert_allclose(after.motor, np.mean([each.motor for each in alone], axis=0))

@@ -1,5 +1,6 @@
 """What policies do, as tables: how the motor turns, and where the robot goes."""
 
+import os
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
@@ -35,22 +36,36 @@ def observe(
         InputError: as `find_player`, or policies of several tasks, or of another robot's.
     """
     subjects: dict[str, list[Player]] = {}
-    for source in sources:
+    for source, short in zip(sources, _short(sources), strict=True):
         runs, players = _runs(source), []
         for each in runs or (source,):
             player = find_player(str(each), task)
             task = _of_the_jitterbug(player)
             players.append(player)
-        name = f"{source}, {len(runs)} runs" if len(runs) > 1 else players[0].name
         if runs:
-            subjects[f"{source}, before training"] = [find_untrained(run) for run in runs]
-        subjects[name] = players
+            subjects[f"{short}, before training"] = [find_untrained(run) for run in runs]
+        subjects[_title(short, players)] = players
     played = [_Visits(*each, episodes, target_yaw) for each in subjects.items()]
     reach = max(np.abs(visits.position).max() for visits in played)
     cells = int(np.ceil((reach + _CELL) / _CELL))
     edges: Array = _CELL * np.arange(-cells, cells + 1, dtype=np.float64)
     assert task is not None  # the last player's
     return task, [visits.counted(edges) for visits in played]
+
+
+def _short(sources: Sequence[str]) -> list[str]:
+    """What tells sources apart: of paths, what follows the folder that all of them are in."""
+    places = {each: (run_folder(each) or Path(each)).absolute() for each in sources}
+    folders = [place.parent for each, place in places.items() if not is_by_name(each)]
+    shared = os.path.commonpath(folders) if folders else ""
+    return [each if is_by_name(each) else os.path.relpath(places[each], shared) for each in sources]
+
+
+def _title(short: str, players: Sequence[Player]) -> str:
+    if len(players) > 1:
+        return f"{short}, {len(players)} runs"
+    step = players[0].step
+    return short if step is None else f"{short} at step {step:,}"
 
 
 def _runs(source: str) -> list[Path]:
