@@ -10,9 +10,9 @@ TASKS := move_from_origin face_direction move_in_direction move_to_position move
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes ablation screen screen-normalized breadth trainers policies behaviour clean
+.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes ablation ablation-speed screen screen-normalized breadth trainers policies behaviour clean
 help: ## what there is to make
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
 setup: $(READY) ## a virtual environment with everything in it
 $(READY): $(READY_DEMO)
@@ -97,22 +97,26 @@ desk: ## results/desk/ anew: a night or two; goes on where it was stopped
 ddpg: ## results/ddpg/ anew: a night
 yaw: data ## results/yaw/ anew: hours
 codes: encoders ## results/codes/ anew: hours
-ablation: encoders/ablation data/unseen ## results/ablation/ anew: hours
-ablation: JUDGED = forward-8 dae-8 encoders/ablation/$$task/*.safetensors
+ablation: ## results/ablation/ anew: hours
+ablation-speed: ## results/ablation-speed/ anew: an hour
+ablation ablation-speed: %: encoders/% data/unseen
+ablation ablation-speed: JUDGED = forward-8 dae-8 encoders/$@/$$task/*.safetensors
+ablation-speed: JUDGED_TASKS = move_in_direction
 screen: data/unseen ## results/screen/ anew: a night or two; makes its own data sets and encoders
 breadth: ## results/breadth/ anew: a night
 screen-normalized: screen
 screen: JUDGED = runs/screen/encoders/$$task/*.safetensors
-encoders/ablation: $(READY)
-	$(BIN)/python tools/ablate.py $@
+JUDGED_TASKS = face_direction move_in_direction
+encoders/ablation encoders/ablation-speed: encoders/%: $(READY)
+	$(BIN)/python tools/ablate.py $* $@
 data/unseen: $(READY)
 	$(BIN)/jbrep collect --task face_direction --steps 500k --seed 100 --store-state --out $@/face_direction
 	$(BIN)/jbrep data derive $@/face_direction --task move_in_direction --out $@/move_in_direction
-desk ddpg yaw codes ablation screen screen-normalized breadth: $(READY)
+desk ddpg yaw codes ablation ablation-speed screen screen-normalized breadth: $(READY)
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
 	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json references.csv) results/$@/
-	$(if $(JUDGED),for task in face_direction move_in_direction; do \
+	$(if $(JUDGED),for task in $(JUDGED_TASKS); do \
 	  $(BIN)/jbrep evaluate --encoder $(JUDGED) --data data/unseen/$$task --out results/$@/$$task || exit; \
 	done)
 	$(BIN)/jbrep report results/$@ $(if $(JUDGED),--evaluation 'results/$@/{task}')

@@ -1,14 +1,14 @@
-"""Give a code one feature, and take it from others: python tools/ablate.py OUT.
+"""Give a code features, and take them from others: python tools/ablate.py STUDY OUT.
 
-For each task of studies/ablation.toml, from encoders that ship: dae-8 with the rate of yaw beside
-it, and with the height beside it instead; the full observation and forward-8 without rate of yaw.
+For ablation or ablation-speed in studies/, from encoders that ship: dae-8 with features beside it;
+the full observation and forward-8 without one.
 """
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,22 +17,43 @@ from jbrep.encoders.encoder import IMPORTED, Layer
 from jbrep.encoders.file import SUFFIX
 from jbrep.envs import describe
 
-TASKS = ("face_direction", "move_in_direction")
-LACKING, OTHER = "angular_velocity_z", "position_z"
+FEATURES = {
+    "yaw-rate": "angular_velocity_z",
+    "height": "position_z",
+    "speed": "velocity_in_target_frame_x",
+}
 
 
-def given(encoder: Encoder, feature: str, name: str) -> Encoder:
-    """The code with a scaled feature as one more number."""
-    return replace(encoder, header=named(encoder, name), keep=(feature,))
+class Ablation(NamedTuple):
+    """What a study asks."""
+
+    tasks: Sequence[str]
+    taken: str  # from the full observation and from forward-8
+    given: Sequence[Sequence[str]]  # to dae-8
 
 
-def blinded(encoder: Encoder, feature: str, name: str) -> Encoder:
+STUDIES = {
+    "ablation": Ablation(
+        ("face_direction", "move_in_direction"), "yaw-rate", [["yaw-rate"], ["height"]]
+    ),
+    "ablation-speed": Ablation(["move_in_direction"], "speed", [["speed"], ["speed", "yaw-rate"]]),
+}
+
+
+def given(encoder: Encoder, features: Sequence[str]) -> Encoder:
+    """The code with scaled features as more numbers."""
+    name = f"{encoder.name}-with-{'-and-'.join(features)}"
+    keep = tuple(FEATURES[each] for each in features)
+    return replace(encoder, header=named(encoder, name), keep=keep)
+
+
+def blinded(encoder: Encoder, name: str, feature: str) -> Encoder:
     """The code of observations in which a feature is always midway in its range."""
     size = encoder.size
     nothing = Layer(np.eye(size, dtype=np.float32), np.zeros(size, np.float32), "linear")
     first, *others = encoder.encoder or (nothing,)
     weight = first.weight.copy()
-    weight[:, encoder.feature_names.index(feature)] = 0
+    weight[:, encoder.feature_names.index(FEATURES[feature])] = 0
     layers = (first._replace(weight=weight), *others)
     decoder = encoder.decoder or (nothing,)
     return replace(encoder, header=named(encoder, name), encoder=layers, decoder=decoder)
@@ -43,22 +64,22 @@ def named(encoder: Encoder, name: str) -> dict[str, Any]:
     return {**encoder.header, "name": name, "kind": IMPORTED}
 
 
-def ablations(task: str) -> Iterator[Encoder]:
+def ablated(study: Ablation, task: str) -> Iterator[Encoder]:
     known = {name: find(name, describe(task)) for name in (FULL, "dae-8", "forward-8")}
     encoders = {name: each for name, each in known.items() if isinstance(each, Encoder)}
-    yield given(encoders["dae-8"], LACKING, "dae-8-with-yaw-rate")
-    yield given(encoders["dae-8"], OTHER, "dae-8-with-height")
-    yield blinded(encoders["forward-8"], LACKING, "forward-8-without-yaw-rate")
-    yield blinded(encoders[FULL], LACKING, "full-without-yaw-rate")
+    for features in study.given:
+        yield given(encoders["dae-8"], features)
+    for name in ("forward-8", FULL):
+        yield blinded(encoders[name], f"{name}-without-{study.taken}", study.taken)
 
 
-def main(out: Path) -> None:
-    for task in TASKS:
+def main(study: Ablation, out: Path) -> None:
+    for task in study.tasks:
         (out / task).mkdir(parents=True, exist_ok=True)
-        for encoder in ablations(task):
+        for encoder in ablated(study, task):
             save(encoder, out / task / f"{encoder.name}{SUFFIX}")
             print(out / task / f"{encoder.name}{SUFFIX}")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(STUDIES[sys.argv[1]], Path(sys.argv[2]))
