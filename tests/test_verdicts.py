@@ -67,6 +67,11 @@ def test_before_a_look_there_are_curves_and_counts_alone(looks):
     assert "Compared with full" not in dict(group_tables(analysis.groups[0], analysis))
     assert "Compared with full" in dict(group_tables(analysis.groups[1], analysis))
     assert words(cell(analysis, "move_in_direction", "dae-8")) == ["exploratory"] * 4
+    titles = [[t.split(".")[0] for t, _ in group_tables(g, analysis)] for g in analysis.groups]
+    assert [each[-1] for each in titles] == ["Verdicts", "What the claims are about"]
+    header, rows = group_tables(analysis.groups[1], analysis)[-1][1]
+    assert header == ("representation", "not worse", "less variance", "faster")
+    assert [row[0] for row in rows] == ["dae-8", "pca-8"]
 
 
 def test_a_look_decides_what_is_far_from_its_boundary(looks):

@@ -8,13 +8,12 @@ from jbrep.report.columns import are_numbers
 from jbrep.report.tables import Tables
 from jbrep.report.words import Answer, headline, remark
 from jbrep.stats.analysis import Analysis, GroupAnalysis
-from jbrep.stats.summary import Rows, across_tasks, label_rows, reference_words
-from jbrep.stats.verdict import Statement, Verdict
+from jbrep.stats.summary import Rows, across_tasks, estimate_rows, label_rows, reference_words
+from jbrep.stats.verdict import EXPLORATORY, Statement, Verdict
 
 # what would be read as markup: an underscore within a word and a bracket without a link are not
-_MARKUP = re.compile(
-    r"[\\`*<|~#]|&(?=[#\w])|(?<!\w)_|_(?!\w)|!(?=\[)|\](?=[(\[:])|^[-+=>]|^\d+(?=[.)])"
-)
+_WITHIN_A_LINE = r"[\\`*<|~#]|&(?=[#\w])|(?<!\w)_|_(?!\w)|!(?=\[)|\](?=[(\[:])"
+_AT_ITS_START = r"^[-+=>]|^\d+(?=[.)])"
 
 
 def markdown(
@@ -52,16 +51,19 @@ def _findings(analysis: Analysis, answers: Sequence[Answer]) -> Iterator[str]:
     """Verdicts as tables, then in sentences."""
     for group in analysis.groups:
         if group.comparisons:
-            title = f"Verdicts on {escape(group.name)}:"
-            yield from (title, "", *_verdicts(group, analysis.claims), "")
+            title = f"{group.name}, compared with {analysis.baseline}:"
+            yield from (escape(title), "", *_compared(group, analysis.claims), "")
             yield from (escape(f"Gains are counted from {reference_words(group)}."), "")
     for note in analysis.notes:
         yield from (escape(note), "")
-    for answer in answers:
-        yield from (f"**{escape(answer.headline)}.**", "")
-        for finding in answer.findings:
+    for claim, answer in zip(analysis.claims, answers, strict=True):
+        estimated = f"{claim.name!r} is estimated by: {claim.estimand}."
+        yield from (f"**{escape(answer.headline)}.** {escape(estimated)}", "")
+        judged = [each for each in answer.findings if each.verdict != EXPLORATORY]
+        for finding in judged:
             yield f"- {escape(finding.where)}: *{finding.verdict}*. {escape(finding.sentence)}"
-        yield ""
+        if judged:
+            yield ""
 
 
 def _numbers(analysis: Analysis) -> Iterator[str]:
@@ -72,8 +74,10 @@ def _numbers(analysis: Analysis) -> Iterator[str]:
         yield from (f"{escape(title)}:", "", *_table(header, rows), "")
 
 
-def _verdicts(group: GroupAnalysis, claims: Sequence[Statement]) -> list[str]:
+def _compared(group: GroupAnalysis, claims: Sequence[Statement]) -> list[str]:
     """A row for each representation, a column for each claim."""
+    if not any(comparison.is_judged for comparison in group.comparisons):
+        return _table(*estimate_rows(group, claims))
     header = ("representation", *(claim.name for claim in claims))
     rows = [
         (comparison.representation, *map(_short, comparison.verdicts))
@@ -88,14 +92,19 @@ def _short(verdict: Verdict) -> str:
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     rule = ["---:" if numbers else "---" for numbers in are_numbers(rows)]
-    lines = ([escape(cell) for cell in line] for line in (header, *rows))
+    lines = ([_in_a_line(cell) for cell in line] for line in (header, *rows))
     first, *others = ("| " + " | ".join(line) + " |" for line in lines)
     return [first, "| " + " | ".join(rule) + " |", *others]
 
 
 def escape(text: str) -> str:
     """Text on one line in which nothing is markup."""
-    return _MARKUP.sub(lambda match: _escaped(match[0]), " ".join(text.split()))
+    return re.sub(_AT_ITS_START, lambda match: _escaped(match[0]), _in_a_line(text))
+
+
+def _in_a_line(text: str) -> str:
+    """The same, for text that begins no line."""
+    return re.sub(_WITHIN_A_LINE, r"\\\g<0>", " ".join(text.split()))
 
 
 def _escaped(markup: str) -> str:

@@ -11,7 +11,7 @@ from jbrep.stats.intervals import FEWEST, LEVEL, UNDEFINED, constant, percentile
 from jbrep.stats.labels import RepresentationResult, check_numbers, median
 from jbrep.stats.means import Bounds, Part, sum_within
 from jbrep.stats.scale import STEPS_TO
-from jbrep.stats.verdict import NOT_YET, Verdict
+from jbrep.stats.verdict import EXPLORATORY, NOT_YET, Verdict
 
 COMPARISON_NUMBERS = (
     "final_return_difference",
@@ -50,6 +50,11 @@ class Comparison:
     def is_open(self) -> bool:
         """Whether it may be looked at: it has no claim that waits for the first look."""
         return all(verdict.verdict != NOT_YET for verdict in self.verdicts)
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether it has verdicts: it isn't exploratory."""
+        return any(verdict.verdict != EXPLORATORY for verdict in self.verdicts)
 
 
 def compare(

@@ -11,6 +11,7 @@ from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.labels import COMPONENTS, REACHED, RepresentationResult
 from jbrep.stats.scale import STEPS_TO, STILL
+from jbrep.stats.verdict import Statement
 from jbrep.text import SIGNIFICANT, interval, number, table
 
 Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]  # a header, and the rows below it
@@ -58,8 +59,11 @@ def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[tuple[str, Ro
     if any(comparison.is_open for comparison in group.comparisons):
         tables.append((f"Compared with {analysis.baseline}", comparison_rows(group)))
     if group.comparisons:
+        judged = any(comparison.is_judged for comparison in group.comparisons)
+        rows = verdict_rows(group) if judged else estimate_rows(group, analysis.claims)
         from_where = f"Gains are counted from {reference_words(group)}."
-        tables.append((f"Verdicts. {' '.join((*analysis.notes, from_where))}", verdict_rows(group)))
+        what = "Verdicts" if judged else "What the claims are about"
+        tables.append((f"{what}. {' '.join((*analysis.notes, from_where))}", rows))
     return tables
 
 
@@ -213,6 +217,16 @@ def verdict_rows(group: GroupAnalysis) -> Rows:
         )
         for comparison in group.comparisons
         for verdict in comparison.verdicts
+    ]
+
+
+def estimate_rows(group: GroupAnalysis, claims: Sequence[Statement]) -> Rows:
+    """A row for each comparison without verdicts: estimates, where claims share one only once."""
+    estimands = [claim.estimand for claim in claims]
+    columns = [i for i, each in enumerate(estimands) if estimands.index(each) == i]
+    return (_KEY, *(claims[i].name for i in columns)), [
+        (comparison.representation, *(shown(comparison.verdicts[i].estimate) for i in columns))
+        for comparison in group.comparisons
     ]
 
 
