@@ -90,6 +90,7 @@ def test_the_presets_are_studies():
     assert set(studies) == {
         *(
             "ablation",
+            "ablation-speed",
             "breadth",
             "demo",
             "codes",
