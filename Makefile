@@ -133,10 +133,9 @@ policies: $(READY) ## the trained policies that ship, anew: hours; goes on where
 	$(BIN)/jbrep study studies/policies.toml --out runs/policies
 	$(BIN)/python tools/policies.py runs/policies
 
-behaviour: $(READY) ## results/behaviour/ anew: half an hour
-	$(BIN)/jbrep rl --task move_in_direction --preset modern --steps 100k --out runs/mid/full
-	$(BIN)/jbrep rl --task move_in_direction --preset modern --encoder dae-4 --steps 40k --out runs/mid/dae-4
-	$(BIN)/jbrep behaviour runs/mid/full runs/mid/dae-4 --out results/behaviour
+behaviour: $(READY) ## results/behaviour/ anew, of the agents of make ablation
+	$(BIN)/jbrep behaviour $(addprefix runs/ablation/runs/move_in_direction/sac-modern/,full forward-8 dae-8) \
+	  --episodes 20 --out results/behaviour
 
 clean: ## remove the environment and the demo's files
 	rm -rf $(VENV) $(DEMO) *.egg-info

@@ -12,6 +12,8 @@ from jbrep.figures.plot import Plot
 from jbrep.figures.style import COLUMN, PAGE, ink, plain, styles
 from jbrep.stats.bootstrap import Array
 
+_ACROSS = 4  # panels, at most
+
 
 @dataclass(frozen=True, eq=False)
 class Behaviour:
@@ -96,13 +98,14 @@ def _draw_motor(task: str, behaviours: Sequence[Behaviour], speeds: Array) -> Fi
 
 
 def _draw_places(task: str, behaviours: Sequence[Behaviour], target_yaw: float) -> Figure:
-    across = min(4, len(behaviours))
-    rows = -(-len(behaviours) // across)
+    rows = -(-len(behaviours) // _ACROSS)
+    across = -(-len(behaviours) // rows)
     width = COLUMN if across == 1 else PAGE
     figure = Figure(figsize=(width, 0.55 + rows * (0.4 + (width - 0.8) / across)))
     panels = figure.subplots(rows, across, squeeze=False, sharex=True, sharey=True).ravel()
     lowest = min(each.places[each.places > 0].min() for each in behaviours)
     norm = LogNorm(lowest, max(each.places.max() for each in behaviours))
+    hidden = len(panels) - len(behaviours)
     for axes in panels[len(behaviours) :]:
         axes.set_axis_off()
     for axes, each in zip(panels, behaviours, strict=False):
@@ -112,7 +115,8 @@ def _draw_places(task: str, behaviours: Sequence[Behaviour], target_yaw: float) 
         _draw_target(axes, each.edges[-1], target_yaw)
         title = f"{each.name}\nreturn {np.median(each.returns):.0f}"
         axes.set_title(plain(title.replace(", ", "\n")), size=6.5)
-        axes.set(aspect="equal", xlabel="x [m]")
+        axes.set(aspect="equal", xlabel="x [m]" if axes in panels[-across - hidden :] else "")
+        axes.tick_params(labelbottom=axes in panels[-across - hidden :])
         axes.set_ylabel("y [m]" if axes in panels[::across] else "")
     figure.colorbar(mesh, ax=panels.tolist(), label="share of time", shrink=0.85, aspect=30)
     return figure
