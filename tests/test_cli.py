@@ -106,8 +106,10 @@ def test_lists_of_commands_say_what_each_does_in_whole_sentences(group):
 def test_what_policies_do_is_drawn(tmp_path):
     policies = ("heuristic", "constant:drive=0.5", "--task", "move_in_direction")
     told = jbrep("behaviour", *policies, "--episodes", 2, "--out", tmp_path / "drawn").stdout
+    header = r"^policy +return \[10, 90 %\] +motor < -30 rad/s +> 30 rad/s"
+    assert re.search(header, told, re.M)
     for name in ("heuristic", "constant"):
-        assert re.search(rf"^{name}.*: median return \d+ \[\d+, \d+\] \(10-90 %\)$", told, re.M)
+        assert re.search(rf"^{name}\S* +\d+ \[\d+, \d+\] +\d+ % +\d+ %", told, re.M)
     for path in (tmp_path / "drawn").glob("*.png"):
         assert str(path) in told
         assert path.with_suffix(".csv").exists()

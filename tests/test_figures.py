@@ -23,7 +23,7 @@ from jbrep.figures.families import family
 from jbrep.figures.methods import method_plots, timescales
 from jbrep.figures.plot import Drawing
 from jbrep.figures.style import COLUMN, DARK, PAGE, PAPER, styles, with_runs
-from jbrep.rollouts.behaviour import SPEEDS, observe
+from jbrep.rollouts.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
 from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval
@@ -461,6 +461,9 @@ def test_a_constant_drive_turns_the_motor_one_way(behaviours):
     middles = (SPEEDS[1:] + SPEEDS[:-1]) / 2
     assert constant.motor.sum() == pytest.approx(1)
     assert constant.motor[middles > 50].sum() > 0.9  # 145 rad/s at full drive
+    assert fast_shares(constant) == pytest.approx(
+        (0, constant.motor[middles > FAST].sum()), abs=1e-12
+    )
     assert heuristic.motor[middles < -20].sum() > 0.2
     assert heuristic.motor[middles > 20].sum() > 0.2
 
@@ -468,8 +471,7 @@ def test_a_constant_drive_turns_the_motor_one_way(behaviours):
 def test_the_heuristic_goes_where_the_target_points(behaviours):
     _, heuristic = behaviours
     assert heuristic.places.sum() == pytest.approx(1)
-    middles = (heuristic.edges[1:] + heuristic.edges[:-1]) / 2
-    x, y = heuristic.places.sum(axis=1) @ middles, heuristic.places.sum(axis=0) @ middles
+    x, y = mean_place(heuristic)
     assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(45, abs=15)
     assert len(heuristic.returns) == 3
 

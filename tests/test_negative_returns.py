@@ -315,7 +315,7 @@ def folder(analysis, runs, returns, tmp_path_factory):
 def test_the_report_says_what_failed_runs_count_as_and_what_the_margin_is(folder, group):
     text = (folder / "summary.md").read_text()
     assert "> 2 runs are counted as return -1,612, the worst of the task and algorithm" in text
-    assert f"Verdicts on {TASK}, sac:" in text
+    assert f"{TASK}, sac, compared with full:" in text
     assert f"the mean return of untrained policies, {group.reference:,.0f}." in text.replace(
         "\\", ""
     )

@@ -78,6 +78,12 @@ def printable(line: str) -> str:
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
+def echo_text(text: str) -> None:
+    """Print several lines, each as `printable` makes it."""
+    for line in text.splitlines():
+        click.echo(printable(line))
+
+
 @contextmanager
 def on_stop(handle: Callable[[int, FrameType | None], object]) -> Iterator[None]:
     """Install a handler of Ctrl-C and SIGTERM, and put back those before at the end."""

@@ -15,6 +15,7 @@ from jbrep.cli.base import (
     RESUMES,
     as_json,
     echo_json,
+    echo_text,
     example,
     on_stop,
     printable,
@@ -156,8 +157,7 @@ def info(data: Path, as_json: bool) -> None:
     if as_json:
         echo_json(describe(Dataset(data)))
         return
-    for line in card(Dataset(data), terminal_width()).splitlines():
-        click.echo(printable(line))
+    echo_text(card(Dataset(data), terminal_width()))
 
 
 @data.command(epilog=example("jbrep data verify data/face --replay 50"))

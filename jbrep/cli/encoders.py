@@ -11,6 +11,7 @@ from jbrep.cli.base import (
     data_option,
     echo_json,
     echo_paths,
+    echo_text,
     example,
     printable,
     stoppable,
@@ -186,8 +187,7 @@ def info(encoder: str, as_json: bool, **options: Any) -> None:
     shown, source = find_alone(encoder, task), source_of(encoder, task)
     if as_json:
         return echo_json(describe(shown, source))
-    for line in card(shown, source, terminal_width()).splitlines():
-        click.echo(printable(line))
+    echo_text(card(shown, source, terminal_width()))
     return None
 
 
@@ -255,5 +255,4 @@ def import_model(
         raise InputError(f"{out} exists already: choose another file")
     made = convert(model, task, decoder, name or out.name.removesuffix(SUFFIX))
     save(made, out)
-    for line in card(made, str(out), terminal_width()).splitlines():
-        click.echo(printable(line))
+    echo_text(card(made, str(out), terminal_width()))

@@ -4,7 +4,7 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import as_json, echo_json, example, printable
+from jbrep.cli.base import as_json, echo_json, echo_text, example
 from jbrep.cli.environment import given_task, task_options
 from jbrep.text import terminal_width
 
@@ -28,5 +28,4 @@ def env(as_json: bool, **options: Any) -> None:
     if as_json:
         echo_json(task.as_json())
         return
-    for line in card(task, terminal_width()).splitlines():
-        click.echo(printable(line))
+    echo_text(card(task, terminal_width()))

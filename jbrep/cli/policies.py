@@ -10,6 +10,7 @@ from jbrep.cli.base import (
     as_json,
     echo_json,
     echo_paths,
+    echo_text,
     example,
     printable,
     stoppable,
@@ -213,11 +214,24 @@ def behaviour(
     import numpy as np
 
     from jbrep.figures import behaviour_plots, write
-    from jbrep.rollouts.behaviour import SPEEDS, observe
+    from jbrep.rollouts.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
+    from jbrep.text import table, terminal_width
 
     yaw, task = np.deg2rad(target_yaw), given_task(options, required=False)
     with stoppable("the same command starts again"):
         shared_task, behaviours = observe(policies, task, episodes, yaw)
-    for each in behaviours:
-        click.echo(printable(f"{each.name}: median return {_interval(each.returns)} (10-90 %)"))
+    header = (
+        *("policy", "return [10, 90 %]", f"motor < -{FAST:g} rad/s", f"> {FAST:g} rad/s"),
+        "mean x, y [m]",
+    )
+    rows = [
+        (
+            each.name,
+            _interval(each.returns),
+            *(f"{100 * share:.0f} %" for share in fast_shares(each)),
+            "{:.2f}, {:.2f}".format(*mean_place(each)),
+        )
+        for each in behaviours
+    ]
+    echo_text(table(header, rows, terminal_width()))
     echo_paths(write(behaviour_plots(shared_task.name, behaviours, SPEEDS, yaw), out))

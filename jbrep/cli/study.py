@@ -10,6 +10,7 @@ from jbrep.cli.base import (
     as_json,
     echo_json,
     echo_paths,
+    echo_text,
     example,
     printable,
     stoppable,
@@ -146,8 +147,7 @@ def _conclude(
     if has_runs(folder):
         results, paths = conclude(folder, across_trainers)
         if not as_json:
-            for line in as_text(results, terminal_width()).splitlines():
-                click.echo(printable(line))
+            echo_text(as_text(results, terminal_width()))
     for line in add_diagnostics(folder, evaluations):
         click.echo(printable(line), err=True)
     paths += write_report(folder, out)

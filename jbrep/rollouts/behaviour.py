@@ -16,6 +16,7 @@ from jbrep.rollouts.jitterbug import jitterbug_task
 from jbrep.rollouts.sources import Player, find_player, find_untrained, is_by_name, run_folder
 
 SPEEDS = np.linspace(-180, 180, 73)  # edges of the bins of the motor's velocity [rad/s]
+FAST = 30.0  # of the motor, either way [rad/s]
 _CELL = 0.02  # edge of a cell of the floor [m]
 
 
@@ -51,6 +52,18 @@ def observe(
     edges: Array = _CELL * np.arange(-cells, cells + 1, dtype=np.float64)
     assert task is not None  # the last player's
     return task, [visits.counted(edges) for visits in played]
+
+
+def fast_shares(behaviour: Behaviour) -> tuple[float, float]:
+    """Shares of time in which the motor turns at FAST or more, one way and the other."""
+    low, high = SPEEDS[:-1], SPEEDS[1:]
+    return behaviour.motor[high <= -FAST].sum(), behaviour.motor[low >= FAST].sum()
+
+
+def mean_place(behaviour: Behaviour) -> tuple[float, float]:
+    """The mean of where the robot is, x and y [m], to a fraction of a cell."""
+    middles = (behaviour.edges[:-1] + behaviour.edges[1:]) / 2
+    return behaviour.places.sum(1) @ middles, behaviour.places.sum(0) @ middles
 
 
 def _short(sources: Sequence[str]) -> list[str]:
