@@ -333,6 +333,10 @@ def test_the_rate_after_resuming_counts_the_steps_since():
         bar.show(500, None)
         bar.show(600, 1.0)
         assert (bar._progress.n, bar._progress.initial) == (600, 500)
+        bar.show(1000, 1.0)
+        assert bar._progress.postfix == "evaluation=final one under way"
+        bar.show(1000, 2.0)
+        assert bar._progress.postfix == "evaluation=2.00"
     trained, resumed = agent_of("a2c").learn(80), agent_of("a2c").learn(40)
     restore(resumed, take(trained))
     assert resumed.num_timesteps == resumed._num_timesteps_at_start == 80

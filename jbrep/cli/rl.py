@@ -195,16 +195,21 @@ class _Bar:
         self._progress: Any = None
 
     def show(self, step: int, mean: float | None) -> None:
-        """Show the steps so far and the mean return of the last evaluation."""
+        """Show the steps so far and the mean return of the last evaluation.
+
+        The final evaluation can take minutes: all steps are told before it, and after it again.
+        """
         from jbrep.progress import Progress
 
         if self._progress is None:
             self._progress = Progress(
                 total=self._steps, initial=step, desc=self._name, unit="step", delay=0.5
             )
+        is_final = self._progress.n < step == self._steps
         self._progress.update(step - self._progress.n)
         evaluation = "-" if mean is None else rounded(mean)[0]
-        self._progress.set_postfix(evaluation=evaluation, refresh=False)
+        shown = "final one under way" if is_final else evaluation
+        self._progress.set_postfix(evaluation=shown, refresh=is_final)
 
     def close(self) -> None:
         """End the bar's line."""
