@@ -290,7 +290,15 @@ def test_principal_components():
 def test_recordings_are_small_and_bring_their_layout(recording, request):
     path = request.getfixturevalue(recording)
     assert path.stat().st_size < 6e6
-    assert [store.application_id for store in RrdReader(path).blueprints()] == ["jbrep"]
+    (layout,) = RrdReader(path).blueprints()
+    assert layout.application_id == "jbrep"
+    played = {
+        name: column.to_pylist()
+        for chunk in RrdReader(path).stream(store=layout)
+        if str(chunk.entity_path) == "/time_panel"
+        for name, column in columns(chunk).items()
+    }
+    assert played["TimePanelBlueprint:play_state"] == [[2]]  # playing
 
 
 def test_the_provenance(entities, rollout):

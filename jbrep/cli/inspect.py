@@ -1,5 +1,6 @@
 """Looking at episodes, encoders and studies in the Rerun viewer."""
 
+import os
 import socket
 import subprocess
 import sys
@@ -94,11 +95,12 @@ def _free_ports(count: int) -> list[int]:
 def _run_viewer(path: Path, *options: str) -> None:
     """Run Rerun's viewer until it ends, or this process does in whatever way."""
     command = [sys.executable, "-m", "rerun", "--bind", _ADDRESS, *options, str(path)]
+    quiet = {"RUST_LOG": "warn", **os.environ}
     with (
         stoppable(f"{path} stays"),
         subprocess.Popen(_KEEPER, stdin=subprocess.PIPE, process_group=0) as keeper,
         # in the keeper's group, as is the program that this script starts
-        subprocess.Popen(command, process_group=keeper.pid) as viewer,
+        subprocess.Popen(command, process_group=keeper.pid, env=quiet) as viewer,
     ):
         try:
             code = viewer.wait()

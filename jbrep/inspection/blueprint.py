@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import rerun as rr
@@ -115,13 +115,18 @@ def curves_layout(groups: Sequence[str], last_step: int) -> rrb.Blueprint:
     plots = [_series(f"{group}: mean return", [f"{group}/**"], axis_x=training) for group in groups]
     text = rrb.TextDocumentView(origin=PROVENANCE, name="runs")
     layout = rrb.Horizontal(rrb.Grid(*plots), text, column_shares=[2, 1])
-    return _blueprint(layout, TRAINING_STEP)
+    return _blueprint(layout, TRAINING_STEP, "paused")
 
 
-def _blueprint(layout: rrb.Container | rrb.View, timeline: str) -> rrb.Blueprint:
+def _blueprint(
+    layout: rrb.Container | rrb.View,
+    timeline: str,
+    play_state: Literal["playing", "paused"] = "playing",
+) -> rrb.Blueprint:
+    """Plays from the start, again and again, if not told otherwise."""
     return rrb.Blueprint(
         layout,
-        rrb.TimePanel(state="collapsed", timeline=timeline),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state=play_state, loop_mode="all"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
