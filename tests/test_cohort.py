@@ -248,7 +248,7 @@ def test_an_environment_that_fails_ends_its_run_alone(done, tmp_path, monkeypatc
         ({"trainer": "both"}, "unknown trainer 'both': choose one of cohort, sb3"),
         ({"trainer": "cohort", "algorithm": "ppo"}, "cohorts train ddpg, td3, sac, not ppo: add"),
         ({"settings": {"use_sde": True}}, "can't learn with use_sde = True: add --trainer sb3"),
-        ({"settings": {"train_freq": [1, "episode"]}}, "train_freq in episodes: add --trainer sb3"),
+        ({"settings": {"train_freq": [1, "episode"]}}, "takes train_freq as a number of steps: add --trainer sb3"),
         ({"trainer": "sb3", "precision": "bfloat16"}, "sb3 has no bfloat16: leave the precision"),
         ({"precision": "half"}, "unknown precision 'half'"),
         ({"device": "cuda"}, "no device 'cuda' on this machine: choose auto or cpu"),

@@ -3,16 +3,21 @@
 import json
 import math
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
 from jbrep.cli.output import lasting_output
 from jbrep.errors import InputError
+from jbrep.text import rounded
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 _EXTRAS = {  # the extra that installs a missing package
     **dict.fromkeys(
@@ -174,3 +179,17 @@ def echo_json(value: Any) -> None:
 def echo_paths(paths: Iterable[Path]) -> None:
     """Print where files are, after an empty line."""
     click.echo("\n" + "\n".join(printable(str(path)) for path in paths))
+
+
+def percentiles(returns: "Sequence[float] | NDArray[np.float64]") -> dict[str, float]:
+    """The median of returns, and their 10 and 90 %."""
+    import numpy as np
+
+    low, median, high = np.percentile(returns, (10, 50, 90)).tolist()
+    return {"median": median, "percentile_10": low, "percentile_90": high}
+
+
+def interval_of(returns: "Sequence[float] | NDArray[np.float64]") -> str:
+    """The same for a reader: 812 [650, 901]."""
+    median, low, high = rounded(*percentiles(returns).values())
+    return f"{median} [{low}, {high}]"

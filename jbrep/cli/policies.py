@@ -12,15 +12,16 @@ from jbrep.cli.base import (
     echo_paths,
     echo_text,
     example,
+    interval_of,
+    percentiles,
     printable,
     stoppable,
 )
 from jbrep.cli.environment import given_task, task_options
 from jbrep.errors import InputError
-from jbrep.text import rounded
 
 if TYPE_CHECKING:
-    from jbrep.envs.task import Array, Task
+    from jbrep.envs.task import Task
     from jbrep.rollouts.sources import Player
 
 _TASK = "face_direction"
@@ -75,7 +76,7 @@ def evaluate_policy(
                 **({} if player.step is None else {"step": player.step}),
                 "episodes": episodes,
                 "returns": returns.tolist(),
-                **_percentiles(returns),
+                **percentiles(returns),
             }
         )
         return
@@ -83,22 +84,10 @@ def evaluate_policy(
         click.echo(printable(f"encoder: {source}"))
     click.echo(
         printable(
-            f"{_title(policy, player)}: median return {_interval(returns)} "
+            f"{_title(policy, player)}: median return {interval_of(returns)} "
             f"(10-90 % of {episodes} episodes)"
         )
     )
-
-
-def _percentiles(returns: "Array") -> dict[str, float]:
-    import numpy as np
-
-    low, median, high = np.percentile(returns, (10, 50, 90)).tolist()
-    return {"median": median, "percentile_10": low, "percentile_90": high}
-
-
-def _interval(returns: "Array") -> str:
-    median, low, high = rounded(*_percentiles(returns).values())
-    return f"{median} [{low}, {high}]"
 
 
 def _title(policy: str, player: "Player") -> str:
@@ -179,13 +168,13 @@ def policies(as_json: bool) -> None:
                     "learner": policy.learner,
                     "steps": policy.steps,
                     "episodes": len(policy.returns[SHIPPED]),
-                    **{name: _percentiles(each) for name, each in policy.returns.items()},
+                    **{name: percentiles(each) for name, each in policy.returns.items()},
                 }
                 for policy in ships
             }
         )
     rows = [
-        (task, observes, learner, f"{steps:,}", *map(_interval, returns.values()))
+        (task, observes, learner, f"{steps:,}", *map(interval_of, returns.values()))
         for task, observes, learner, steps, returns in ships
     ]
     header = ("task", "observes", "learned by", "steps", *ships[0].returns)
@@ -227,7 +216,7 @@ def behaviour(
     rows = [
         (
             each.name,
-            _interval(each.returns),
+            interval_of(each.returns),
             *(f"{100 * share:.0f} %" for share in fast_shares(each)),
             "{:.2f}, {:.2f}".format(*mean_place(each)),
         )

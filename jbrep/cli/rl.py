@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, on_stop, printable
+from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, interval_of, on_stop, printable
 from jbrep.cli.environment import given_task, parse_arguments, task_options
 from jbrep.rl.names import CLASSES, CPU, FLOAT32
 from jbrep.text import rounded
@@ -172,9 +172,11 @@ def rl(context: click.Context, /, out: Path, project: str | None, **settings: An
     click.echo(printable(f"encoder: {source}"))
     rows = read_evaluations(out)
     last = [e.episode_return for e in rows if e.step == rows[-1].step]
-    returns = ", ".join(rounded(*last))
     name = result["settings"]["representation"]
-    click.echo(f"returns on {name} at the end: {returns}; all evaluations: {out / EVALUATIONS}")
+    click.echo(
+        f"returns on {name} at the end: {interval_of(last)}, median [10 %, 90 %] of {len(last)} "
+        f"episodes; all evaluations: {out / EVALUATIONS}"
+    )
 
 
 def _writers(project: str | None, run: "Run", out: Path) -> "list[KVWriter]":
@@ -205,7 +207,7 @@ class _Bar:
             self._progress = Progress(
                 total=self._steps, initial=step, desc=self._name, unit="step", delay=0.5
             )
-        is_final = self._progress.n < step == self._steps
+        is_final = self._progress.n < self._steps <= step
         self._progress.update(step - self._progress.n)
         evaluation = "-" if mean is None else rounded(mean)[0]
         shown = "final one under way" if is_final else evaluation

@@ -91,7 +91,8 @@ def study(
         crashed = run_study(plan, run, count, width)
     if crashed:
         click.echo(f"{crashed} runs crashed: the same command tries them again", err=True)
-    _conclude(plan.folder)
+    if any(map(plan.has_ended, plan.cells)):
+        _conclude(plan.folder)
     if crashed:
         context.exit(1)
 

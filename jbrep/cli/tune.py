@@ -24,7 +24,11 @@ from jbrep.text import rounded
 @click.option("--steps", default=20_000, show_default=True, type=COUNT, help="Of each run.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of the search and runs.")
 @click.option(
-    "--evaluation-episodes", default=10, show_default=True, type=COUNT, help="Of each run."
+    "--evaluation-episodes",
+    default=10,
+    show_default=True,
+    type=COUNT,
+    help="That a run is judged by.",
 )
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="A folder for this search."
@@ -50,7 +54,8 @@ def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **settin
 
         settings |= {"task": given_task(settings), "settings": given_settings(settings)}
         import_code(settings["encoder"])
-        run = Run(**settings, evaluate_every=settings["steps"])
+        episodes = settings["evaluation_episodes"]
+        run = Run(**settings, evaluate_every=settings["steps"], final_episodes=episodes)
         try:
             best = search(run, trials, seeds, out, show, stop=lambda: bool(received))
         except StoppedError as error:

@@ -2,7 +2,6 @@
 
 import json
 import math
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -19,11 +18,10 @@ from jbrep.envs.make import creator, make_env, one_line
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import MAX_EPISODE_STEPS, SEED_BITS, Feature, Task
 from jbrep.errors import InputError
-from jbrep.files.storage import read_regular
+from jbrep.files.toml import read_toml
 
 _PROBE_STEPS = 200  # of each instance whose episodes are compared
 _LONGEST_PROBE = 10_000  # steps in search of a time limit
-_MAX_BYTES = 1 << 20  # of a file of features
 _FEATURE_FIELDS = ("name", "unit", "low", "high", "group")
 _TASK_FIELDS = ("timestep", "reward_low", "reward_high", "solved_return")
 
@@ -248,8 +246,8 @@ def _with_features(task: Task, path: Path) -> Task:
     Raises:
         InputError: no such file, or one with unknown or unfitting entries.
     """
+    given = read_toml(path)
     try:
-        given = tomllib.loads(read_regular(path, _MAX_BYTES).decode())
         rows = given.pop("features", None)
         if rows is not None and (not isinstance(rows, list) or len(rows) != task.size):
             raise ValueError(f"it must have a [[features]] for each of the {task.size} features")
@@ -259,8 +257,6 @@ def _with_features(task: Task, path: Path) -> Task:
         ]
         changed = replace(task, features=tuple(features), **_known(given, _TASK_FIELDS))
         return type(task)(**{f: getattr(changed, f) for f in Task.__dataclass_fields__})
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from error
     except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{path} can't be used for {task.name}: {one_line(error)}") from None
 

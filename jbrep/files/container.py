@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from jbrep.errors import DamageError, InputError
-from jbrep.files.storage import read_regular, write_whole
+from jbrep.files.storage import read_regular, regular_size, write_whole
 
 Tensors = dict[str, NDArray[Any]]
 
@@ -94,10 +94,15 @@ def unpack(raw: bytes, path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
     return tensors, header
 
 
-def format_of(path: Path, most: int = MAX_BYTES) -> str:
+def format_of(path: Path) -> str:
     """The format that the header of such a file names; empty for any other file."""
     try:
-        return str(_header(read_regular(path, most)).get("format", ""))
+        if not regular_size(path):
+            return ""
+        with path.open("rb") as file:
+            start = file.read(8)
+            start += file.read(min(int.from_bytes(start, "little"), MAX_BYTES))
+        return str(_header(start).get("format", ""))
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return ""
 

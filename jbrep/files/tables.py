@@ -2,11 +2,15 @@
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from jbrep.files.storage import write_whole
+from jbrep.errors import DamageError, InputError
+from jbrep.files.storage import read_regular, write_whole
+
+_MAX_BYTES = 1 << 28
+_MOST = 1 << 53  # of a number: a float holds whole ones exactly
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -25,3 +29,46 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]])
         InputError: it can't be written.
     """
     write_whole(path, csv_text(columns, rows).encode())
+
+
+def read_csv(path: Path, kinds: Sequence[Callable[[str], Any]]) -> list[tuple[Any, ...]]:
+    """The rows below the header, each cell of its column's kind.
+
+    Raises:
+        InputError: it can't be read.
+        DamageError: it isn't such a table.
+    """
+    try:
+        text = read_regular(path, _MAX_BYTES).decode()
+        return [
+            tuple(kind(cell) for kind, cell in zip(kinds, row, strict=True))
+            for row in list(csv.reader(io.StringIO(text, newline=""), strict=True))[1:]
+        ]
+    except OSError as error:
+        raise InputError(f"can't read {path}: {error.strerror or error}") from error
+    except (ValueError, csv.Error):
+        raise DamageError(f"{path} is damaged or cut short") from None
+
+
+def count(cell: str) -> int:
+    """A whole number from 0.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    number = int(cell)
+    if not 0 <= number < _MOST:
+        raise ValueError
+    return number
+
+
+def finite(cell: str) -> float:
+    """A number.
+
+    Raises:
+        ValueError: it is something else, or infinite.
+    """
+    number = float(cell)
+    if not abs(number) <= _MOST:
+        raise ValueError
+    return number

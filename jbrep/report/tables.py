@@ -1,8 +1,5 @@
 """The tables that a report is made from, read back from a study's folder and checked."""
 
-import csv
-import io
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
 
@@ -11,12 +8,13 @@ from jbrep.errors import DamageError, InputError
 from jbrep.figures.curves import References, Return
 from jbrep.figures.diagrams import LabelRecord, TaskRecord
 from jbrep.files.storage import exists
+from jbrep.files.tables import count, finite, read_csv
 from jbrep.files.typed import read_json, typed
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, TASKS
 from jbrep.rl.files import read_text
 from jbrep.stats import Analysis
 from jbrep.study import record
-from jbrep.study.references import HAND_WRITTEN, REFERENCE_RETURNS
+from jbrep.study.references import HAND_WRITTEN, REFERENCE_RETURNS, read_references
 from jbrep.study.results import RETURNS, STATISTICS
 
 HEURISTIC_RETURNS = "heuristics.csv"  # of the first release
@@ -87,8 +85,8 @@ def read_tables(folder: Path) -> Tables:
     analysis = None
     if exists(folder / STATISTICS):
         analysis = Analysis.from_json(_text(folder / STATISTICS), folder / STATISTICS)
-    columns_of_returns = (str, str, str, _count, _count, _count, _episode_return)
-    returns = [Return(*row) for row in _read_csv(folder / RETURNS, columns_of_returns)]
+    columns_of_returns = (str, str, str, count, count, count, finite)
+    returns = [Return(*row) for row in read_csv(folder / RETURNS, columns_of_returns)]
     rows = read_diagnostics(folder / DIAGNOSTICS) if exists(folder / DIAGNOSTICS) else []
     name = folder.resolve().name.encode(errors="replace").decode()
     record_of_runs = _read_record(folder / record.RECORD)
@@ -98,14 +96,11 @@ def read_tables(folder: Path) -> Tables:
 
 def _read_references(folder: Path) -> References:
     """Returns of reference policies; the first release had hand-written ones alone."""
-    references: References = {}
     if exists(folder / REFERENCE_RETURNS):
-        for task, policy, _, each in _read_csv(
-            folder / REFERENCE_RETURNS, (str, str, _count, _episode_return)
-        ):
-            references.setdefault(task, {}).setdefault(policy, []).append(each)
-    elif exists(folder / HEURISTIC_RETURNS):
-        for task, _, each in _read_csv(folder / HEURISTIC_RETURNS, (str, _count, _episode_return)):
+        return read_references(folder)
+    references: References = {}
+    if exists(folder / HEURISTIC_RETURNS):
+        for task, _, each in read_csv(folder / HEURISTIC_RETURNS, (str, count, finite)):
             references.setdefault(task, {}).setdefault(HAND_WRITTEN, []).append(each)
     return references
 
@@ -151,29 +146,3 @@ def _text(path: Path) -> str:
         return read_text(path)
     except UnicodeDecodeError:
         raise DamageError(f"{path} is damaged: it is not UTF-8") from None
-
-
-def _read_csv(path: Path, kinds: tuple[Callable[[str], Any], ...]) -> list[tuple[Any, ...]]:
-    """The rows below the header, each cell of its column's kind."""
-    text = _text(path)
-    try:
-        return [
-            tuple(kind(cell) for kind, cell in zip(kinds, row, strict=True))
-            for row in list(csv.reader(io.StringIO(text, newline=""), strict=True))[1:]
-        ]
-    except (ValueError, csv.Error):
-        raise DamageError(f"{path} is damaged or cut short") from None
-
-
-def _count(cell: str) -> int:
-    number = int(cell)
-    if not 0 <= number < _MOST:
-        raise ValueError
-    return number
-
-
-def _episode_return(cell: str) -> float:
-    number = float(cell)
-    if not abs(number) <= _MOST:
-        raise ValueError
-    return number

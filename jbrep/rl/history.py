@@ -75,8 +75,8 @@ class History:
 
 
 class Scalars(TensorBoardOutputFormat):
-    """TensorBoard's file from a step on; later steps of an earlier process are hidden."""
+    """TensorBoard's file after a step; later ones of an earlier process are hidden."""
 
     def __init__(self, folder: Path, step: int):
-        self.writer = SummaryWriter(str(folder), purge_step=step)
+        self.writer = SummaryWriter(str(folder), purge_step=step + 1)
         self._is_closed = False

@@ -100,6 +100,15 @@ class Job:
             raise InputError(f"{self.folder} holds another run: {others}; choose another folder")
         return result
 
+    def clear(self) -> None:
+        """Remove what a run that has ended may have left, if it was killed at the very end.
+
+        Raises:
+            InputError: the folder holds another run.
+        """
+        if self.result:
+            (self.folder / CHECKPOINT).unlink(missing_ok=True)
+
     @cached_property
     def versions(self) -> dict[str, str]:
         """What, with the settings, decides every number."""

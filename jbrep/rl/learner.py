@@ -3,14 +3,13 @@
 import hashlib
 import json
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from jbrep.errors import InputError, choose
-from jbrep.files.storage import read_regular
+from jbrep.files.toml import read_toml
 from jbrep.rl.fields import LEARNER, MAX_NAME
 from jbrep.rl.names import PAPER, base_name
 from jbrep.rl.presets import ALGORITHMS, PRESETS
@@ -18,7 +17,6 @@ from jbrep.rl.settings import used_settings
 from jbrep.text import slug
 
 _SUFFIX = ".toml"
-_MAX_BYTES = 1 << 20
 _MOST_LETTERS = 60  # of a name made from settings
 
 
@@ -148,12 +146,7 @@ def read_preset(path: Path, algorithm: str) -> tuple[str, dict[str, Any]]:
         InputError: no such file, not such a file, or a setting that the algorithm can't have.
     """
     choose(algorithm, ALGORITHMS, "algorithm")
-    try:
-        tables = tomllib.loads(read_regular(path, _MAX_BYTES).decode())
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not valid TOML: {error}") from None
+    tables = read_toml(path)
     if not isinstance(tables.get(algorithm), dict):
         raise InputError(
             f"{path} has no table [{algorithm}]: it has {', '.join(tables) or 'none at all'}"
@@ -185,7 +178,7 @@ def _toml(value: Any) -> str:
         return "{ " + ", ".join(toml_lines(value.items())) + " }"
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(_toml, value))}]"
-    return json.dumps(value)
+    return json.dumps("none" if value is None else value)
 
 
 def _preset_names() -> list[str]:

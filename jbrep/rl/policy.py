@@ -35,7 +35,7 @@ from jbrep.rl.files import (
 from jbrep.rl.normalization import Statistics
 from jbrep.rl.presets import ALGORITHMS, Preset
 from jbrep.rl.settings import check_shape, shaping
-from jbrep.rl.weights import fill, one_line, read_file, read_policy
+from jbrep.rl.weights import fill, one_line, read_file, read_policy, statistics_in
 from jbrep.training.trainer import single_torch_thread
 
 _WEIGHTS = f"{PARAMETERS}policy."
@@ -177,13 +177,15 @@ def load_zip(path: Path, task: Task, algorithm: str, encoder: str, trust: bool) 
         )
     learner = choose(algorithm, ALGORITHMS, "algorithm")
     seen = find(encoder, task)
-    content = io.BytesIO(read_file(path.resolve()))
+    raw = read_file(path.resolve())
     try:
-        agent = learner.load(content, Spaces(task, seen), device="cpu")
+        agent = learner.load(io.BytesIO(raw), Spaces(task, seen), device="cpu")
+        tensors = statistics_in(raw)
     except Exception as error:  # whatever its pickled parts do
         reason = one_line(error)
         raise InputError(f"{path} is no {algorithm} policy for {task.name}: {reason}") from None
-    return Trained(agent.policy, task, seen, seen.representation)
+    statistics = Statistics.read(tensors, seen.latent_size, path) if tensors else None
+    return Trained(agent.policy, task, seen, seen.representation, statistics=statistics)
 
 
 class _Checkpoint(NamedTuple):

@@ -16,7 +16,7 @@ from jbrep.rl.beginning import policy_to_begin_with
 from jbrep.rl.cohort.settings import check as check_settings
 from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_SEED, MAX_STEPS, NAME
 from jbrep.rl.learner import Learner, is_file
-from jbrep.rl.names import COHORT, CPU, FLOAT32, PRECISIONS, TRAINERS, usual_trainer
+from jbrep.rl.names import COHORT, CPU, DEVICES, FLOAT32, PRECISIONS, TRAINERS, usual_trainer
 from jbrep.rl.presets import Preset
 from jbrep.rl.settings import used_settings
 from jbrep.training.trainer import get_device, single_torch_thread
@@ -65,7 +65,7 @@ class Run:
         object.__setattr__(self, "trainer", self.trainer or usual_trainer(self.algorithm))
         choose(self.trainer, TRAINERS, "trainer")
         choose(self.precision, PRECISIONS, "precision")
-        object.__setattr__(self, "device", get_device(self.device).type)
+        object.__setattr__(self, "device", _device(self.device))
         if not self.final_episodes:
             final = min(_FINAL * self.evaluation_episodes, MAX_EVALUATION_EPISODES)
             object.__setattr__(self, "final_episodes", final)
@@ -148,6 +148,7 @@ class Run:
             InputError: as `check`.
         """
         self.check_trainer()
+        get_device(self.device)  # which another machine may have had
         is_kept_as_code = is_code(self.encoder) and not isinstance(encoder, Encoder)
         settings = {
             "task": self.task.name,
@@ -176,6 +177,11 @@ class Run:
             folder = Path(self.begin_from)
             settings["from"] = policy_to_begin_with(folder, plain(settings), encoder.latent_size)
         return settings
+
+
+def _device(name: str) -> str:
+    """The name of a device, which this machine need not have; for auto, of one that it has."""
+    return name if name in DEVICES else str(get_device(name).type)
 
 
 def plain(value: Any) -> Any:

@@ -37,7 +37,7 @@ _REFUSED = {  # arguments that are jbrep's own, with the reason
     "policy": "the policy is always an MlpPolicy",
     "env": "the environment is made from the task",
     "seed": "the seed is the run's own",
-    "device": "runs are on the CPU",
+    "device": "give it by --device",
     "verbose": "the command line shows the progress",
     "tensorboard_log": "it is always in the run's folder",
     "policy_kwargs": "set its parts by their own names, such as net_arch or activation_fn",

@@ -12,7 +12,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
-from jbrep.errors import InputError, differences
+from jbrep.errors import DamageError, InputError, differences
 from jbrep.files.lock import exclusive
 from jbrep.files.storage import make_folder, write_whole
 from jbrep.rl.files import FINISHED, read_evaluations
@@ -92,10 +92,14 @@ def tune(
 
 def _open(run: Run, seeds: int, folder: Path) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    storage = optuna.storages.JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
-    study = optuna.create_study(
-        storage=storage, study_name="tune", direction="maximize", load_if_exists=True
-    )
+    path = folder / JOURNAL
+    try:
+        storage = optuna.storages.JournalStorage(JournalFileBackend(str(path)))
+        study = optuna.create_study(
+            storage=storage, study_name="tune", direction="maximize", load_if_exists=True
+        )
+    except (ValueError, LookupError):
+        raise DamageError(f"{path} is damaged: delete it to start over") from None
     search = plain(run.describe(run.find_encoder())) | {"seeds": seeds}
     before = study.user_attrs.get("search", search)
     if differing := differences(before, search):

@@ -33,6 +33,8 @@ def typed(name: str, value: Any, annotation: Any) -> Any:
         InputError: it may not.
     """
     kinds = typing.get_args(annotation) if _is_union(annotation) else (annotation,)
+    if value == "none" and types.NoneType in kinds:  # TOML has no null
+        return None
     words = [word for kind in kinds for word, fits in [_kind(kind)] if word]
     if not any(fits(value) for _, fits in map(_kind, kinds)):
         raise refused(name, value, " or ".join(words))
@@ -56,7 +58,7 @@ def _kind(annotation: Any) -> tuple[str, Callable[[Any], bool]]:
     if annotation is str:
         return "text", lambda value: isinstance(value, str)
     if annotation is types.NoneType:
-        return "null", lambda value: value is None
+        return "none", lambda value: value is None
     if origin is tuple:
         return '[1, "episode"]', _is_frequency
     if Callable in (annotation, origin):

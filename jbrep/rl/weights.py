@@ -57,9 +57,7 @@ def read_policy(path: Path, sha256: str) -> PolicyFile:
             if name.endswith(".pkl"):
                 _check_globals(archive.read(name))
         weights = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-        has_statistics = STATISTICS in members.namelist()
-        tensors = safetensors.numpy.load(members.read(STATISTICS)) if has_statistics else {}
-        return PolicyFile(dict(weights), tensors)
+        return PolicyFile(dict(weights), _statistics(members))
     except Exception as error:  # zipfile and torch raise many types for a forged file
         raise DamageError(
             f"{path} is damaged, it holds no policy's weights: {one_line(error)}"
@@ -94,6 +92,20 @@ def read_file(path: Path) -> bytes:
         InputError: it is missing, not a regular file, or larger than a policy.
     """
     return storage.read_file(path, MAX_BYTES)
+
+
+def statistics_in(raw: bytes) -> dict[str, NDArray[Any]]:
+    """The statistics in a policy's zip file, of any compression; nothing if it has none.
+
+    Raises:
+        Exception: of many types, for a file that isn't one.
+    """
+    return _statistics(zipfile.ZipFile(io.BytesIO(raw)))
+
+
+def _statistics(members: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
+    found = STATISTICS in members.namelist()
+    return safetensors.numpy.load(members.read(STATISTICS)) if found else {}
 
 
 def _stored(raw: bytes) -> zipfile.ZipFile:

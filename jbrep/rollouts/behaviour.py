@@ -37,21 +37,23 @@ def observe(
         InputError: as `find_player`, or policies of several tasks, or of another robot's.
     """
     subjects: dict[str, list[Player]] = {}
+    shared = task
     for source, short in zip(sources, _short(sources), strict=True):
         runs, players = _runs(source), []
         for each in runs or (source,):
-            player = find_player(str(each), task)
-            task = _of_the_jitterbug(player)
+            player = find_player(str(each), shared if is_by_name(str(each)) else task)
+            shared = _shared(player, shared)
             players.append(player)
         if runs:
-            subjects[f"{short}, before training"] = [find_untrained(run) for run in runs]
+            assert shared is not None  # the players'
+            subjects[f"{short}, before training"] = [find_untrained(run, shared) for run in runs]
         subjects[_title(short, players)] = players
     played = [_Visits(*each, episodes, target_yaw) for each in subjects.items()]
     reach = max(np.abs(visits.position).max() for visits in played)
     cells = int(np.ceil((reach + _CELL) / _CELL))
     edges: Array = _CELL * np.arange(-cells, cells + 1, dtype=np.float64)
-    assert task is not None  # the last player's
-    return task, [visits.counted(edges) for visits in played]
+    assert shared is not None  # the players'
+    return shared, [visits.counted(edges) for visits in played]
 
 
 def fast_shares(behaviour: Behaviour) -> tuple[float, float]:
@@ -88,8 +90,15 @@ def _runs(source: str) -> list[Path]:
     return [] if is_by_name(source) else runs_below(Path(source))
 
 
-def _of_the_jitterbug(player: Player) -> Task:
-    """The task of a player, which must be the Jitterbug's."""
+def _shared(player: Player, shared: Task | None) -> Task:
+    """The task of a player, which must be the Jitterbug's, and that of the others if there are."""
+    if shared and player.task.id != shared.id:
+        raise InputError(f"{player.name} is of {player.task.name}, not of {shared.name}")
+    if shared and player.task != shared:
+        raise InputError(
+            f"{player.name} learned with another body or time limit than the policies before it: "
+            f"add --task {shared.name}, with --env or --episode-steps, to play all in the same"
+        )
     if jitterbug_task(player.task) is None:
         raise InputError(
             f"{player.name} is of {player.task.name}: only the Jitterbug's tasks have the motor "

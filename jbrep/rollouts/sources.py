@@ -261,15 +261,16 @@ def run_folder(source: str) -> Path | None:
     return folder if source != SHIPPED and is_run(folder) else None
 
 
-def find_untrained(folder: Path) -> Player:
-    """The policy that a run began with.
+def find_untrained(folder: Path, task: Task) -> Player:
+    """The policy that a run began with, to play a task of the same environment.
 
     Raises:
         InputError: the run's files are damaged or inconsistent.
     """
     from jbrep.rl.policy import load_untrained  # imports torch
 
-    return as_player(f"{folder}, before training", load_untrained(folder))
+    player = as_player(f"{folder}, before training", load_untrained(folder))
+    return player._replace(task=task)
 
 
 def _trained(source: str, task: Task | None, encoder: Any) -> Player:

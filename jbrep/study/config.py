@@ -1,18 +1,19 @@
 """What a study is: a TOML file, checked."""
 
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_origin
 
+from jbrep.dataset import Settings
 from jbrep.encoders import FULL
 from jbrep.envs.names import find_spec, short_names
 from jbrep.envs.task import MAX_EPISODE_STEPS
 from jbrep.errors import InputError
-from jbrep.files.storage import read_regular
+from jbrep.files.storage import exists
+from jbrep.files.toml import read_toml
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl.learner import Learner
 from jbrep.rl.names import CPU, FLOAT32
@@ -30,7 +31,6 @@ from jbrep.study.representations import (
 )
 from jbrep.text import slug
 
-_MAX_BYTES = 1 << 20
 _MOST_SEEDS = (1 << 16) - 1
 _RUN_SETTINGS = (
     *("steps", "evaluate_every", "evaluation_episodes", "final_episodes"),
@@ -113,6 +113,9 @@ class Study:
         """Check where data come from, and that the study can make its encoders of them."""
         if self.data and bool(self.data.steps) == bool(self.data.folder):
             raise InputError("data must have either steps, to collect, or the folder of a data set")
+        if self.data and self.data.steps:
+            for seed in (self.data.seed, self.data.seed + self.data.sets - 1):
+                Settings(task=_ANY_TASK, steps=self.data.steps, seed=seed)  # checks the numbers
         if self.data and not 1 <= self.data.sets <= (1 if self.data.folder else MAX_ENCODERS):
             raise InputError(
                 f"data.sets is {self.data.sets}: it must be from 1 to {MAX_ENCODERS:,} where data "
@@ -253,14 +256,9 @@ def read_study(path: Path) -> Study:
         InputError: no such file, invalid TOML, or a name or value that is unknown, missing or out
             of range.
     """
-    try:
-        given = tomllib.loads(read_regular(path, _MAX_BYTES).decode())
-    except FileNotFoundError:
-        raise InputError(f"no study at {path}: it must be a TOML file") from None
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not valid TOML: {error}") from None
+    if not exists(path):
+        raise InputError(f"no study at {path}: it must be a TOML file")
+    given = read_toml(path)
     try:
         study = as_study(given)
         for task in study.tasks:

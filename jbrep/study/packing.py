@@ -4,6 +4,7 @@ import heapq
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from itertools import pairwise
 
 from joblib import cpu_count
@@ -12,6 +13,7 @@ from jbrep.errors import InputError
 from jbrep.rl.cohort.replay import memory_of
 from jbrep.rl.names import COHORT, CPU, CUDA
 from jbrep.study.plan import Cell, Plan
+from jbrep.study.representations import ByName
 
 Pack = tuple[Cell, ...]
 
@@ -48,9 +50,8 @@ def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = 
             groups[cell.task, cell.learner.name].append(cell)
         else:
             alone.append((cell,))
-    first = [group[0] for group in groups.values()]
     widest = _WIDEST[plan.device]
-    most = min((_most(plan, cell, workers) for cell in first), default=widest)
+    most = min((_most(plan, group, workers) for group in groups.values()), default=widest)
     if width and width > most:
         raise InputError(
             f"the width is {width}: {workers} cohorts of {most} agents are the most that this "
@@ -62,10 +63,21 @@ def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = 
     return sorted(best, key=len, reverse=True)
 
 
-def _most(plan: Plan, cell: Cell, workers: int) -> int:
-    """How many runs like that one memory holds, for each worker."""
+def _most(plan: Plan, cells: Sequence[Cell], workers: int) -> int:
+    """How many runs like those memory holds, for each worker."""
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") * _SHARE
-    return int((memory / workers - _OF_WORKER) // (memory_of(plan.run(cell)) + _OF_AGENT))
+    examples = {cell.representation.name: cell for cell in cells}.values()
+    of_each = memory_of(plan.run(cells[0]), max(_observed(plan, cell) for cell in examples))
+    return int((memory / workers - _OF_WORKER) // (of_each + _OF_AGENT))
+
+
+def _observed(plan: Plan, cell: Cell) -> int:
+    """Numbers that a run's replay memory has for an observation."""
+    run, seen = plan.run(cell), cell.representation
+    to_make = seen.training.get("latent", 0) if isinstance(seen, ByName) else 0
+    with suppress(InputError):  # the study has yet to make it
+        return max(run.task.size, run.find_encoder().latent_size)
+    return max(run.task.size, int(to_make))
 
 
 def _split(group: Sequence[Cell], most: int) -> list[Pack]:

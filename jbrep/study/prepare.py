@@ -9,7 +9,7 @@ from jbrep.collect import collect
 from jbrep.collect.collector import usual_shard_episodes
 from jbrep.collect.derive import derive
 from jbrep.dataset import Dataset, ScaledDataset, Settings
-from jbrep.dataset.manifest import MANIFEST
+from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
 from jbrep.encoders.shipped import names
@@ -132,11 +132,11 @@ def _fits(plan: Plan, number: int) -> Iterator[tuple[str, str, Mapping[str, Any]
 
 
 def _collect(plan: Plan, data: Data, task: str, number: int) -> Path:
-    """Collect a task's data set; for the Jitterbug's other tasks, derive it from the first's."""
+    """Collect a task's data set; one for the Jitterbug's tasks, of which the others are derived."""
     folder = plan.data(task, number)
-    first = next((name for name in plan.study.tasks if name in TASKS), task)
-    if task in TASKS and task != first:
-        derive(plan.data(first, number), task, folder)
+    collected = _collected(plan, number) if task in TASKS else task
+    if task != collected:
+        derive(plan.data(collected, number), task, folder)
     else:
         described = plan.task(task)
         with_state = bool(described.state)
@@ -146,6 +146,16 @@ def _collect(plan: Plan, data: Data, task: str, number: int) -> Path:
         episodes = usual_shard_episodes(settings, folder)
         collect(replace(settings, shard_episodes=episodes), folder)
     return folder
+
+
+def _collected(plan: Plan, number: int) -> str:
+    """The Jitterbug's task whose data are collected: those there with states, or the first's."""
+    there = [name for name in TASKS if exists(plan.data(name, number) / MANIFEST)]
+    with_states = (
+        name for name in there if read_manifest(plan.data(name, number)).settings.store_state
+    )
+    first = next(name for name in plan.study.tasks if name in TASKS)
+    return next(with_states, first)
 
 
 def _existing(data: Data, task: str) -> Path:

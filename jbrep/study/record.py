@@ -90,7 +90,11 @@ def shared_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that all runs of a label share: without the seed and what depends on it."""
     own = ("seed", "encoder_seed", "registration")
     shared = {name: value for name, value in settings.items() if name not in own}
-    return shared | ({} if settings["encoder_seed"] is None else {"encoder": EACH_ITS_OWN})
+    if settings["encoder_seed"] is not None:
+        shared["encoder"] = EACH_ITS_OWN
+    if settings["from"] is not None:
+        shared["from"] = "another run's policy"
+    return shared
 
 
 def _shared(runs: Mapping[Path, Mapping[str, Any]]) -> dict[str, Any]:

@@ -1,13 +1,13 @@
 """Returns of policies that learn nothing, on the starts of evaluation: what learning is held to."""
 
-import csv
 from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.files.tables import write_csv
+from jbrep.files.storage import exists
+from jbrep.files.tables import count, finite, read_csv, write_csv
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.rollouts.sources import find_player
 from jbrep.stats.scale import STILL
@@ -16,7 +16,7 @@ REFERENCE_RETURNS = "references.csv"
 RANDOM, HAND_WRITTEN = "random", "hand-written"
 _POLICIES = {STILL: "still", RANDOM: "uniform", HAND_WRITTEN: "heuristic"}
 _COLUMNS = ("task", "policy", "episode", "return")
-_Row = tuple[str, str, int, float]
+_Row = tuple[Any, ...]  # task, policy, episode, return
 References = dict[str, dict[str, list[float]]]  # returns by task and policy
 
 
@@ -31,6 +31,9 @@ def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | 
 
     Returns:
         The file; None if there is nothing to write.
+
+    Raises:
+        DamageError: what is there isn't such a file.
     """
     path = folder / REFERENCE_RETURNS
     there = _rows(path)
@@ -50,7 +53,11 @@ def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | 
 
 
 def read_references(folder: Path) -> References:
-    """What `write_references` wrote; nothing if there is no such file, or something else."""
+    """What `write_references` wrote; nothing if there is no such file.
+
+    Raises:
+        DamageError: it isn't what was written.
+    """
     found: References = {}
     for task, policy, _, each in _rows(folder / REFERENCE_RETURNS):
         found.setdefault(task, {}).setdefault(policy, []).append(each)
@@ -58,11 +65,8 @@ def read_references(folder: Path) -> References:
 
 
 def _rows(path: Path) -> list[_Row]:
-    """What the file has; nothing if there is none, or something else."""
-    with suppress(OSError, ValueError):
-        _, *rows = csv.reader(path.read_text().splitlines())
-        return [(task, policy, int(episode), float(each)) for task, policy, episode, each in rows]
-    return []
+    """What the file has; nothing if there is none."""
+    return read_csv(path, (str, str, count, finite)) if exists(path) else []
 
 
 def _kept(there: list[_Row], task: Task, policy: str, episodes: int) -> list[_Row]:
@@ -74,6 +78,6 @@ def _kept(there: list[_Row], task: Task, policy: str, episodes: int) -> list[_Ro
 def _played(task: Task, policy: str, episodes: int) -> list[_Row]:
     try:
         returns = find_player(_POLICIES[policy], task).returns(episodes)
-    except InputError:  # reports don't need the environments
+    except (InputError, ModuleNotFoundError):  # reports don't need the environments
         return []
     return [(task.name, policy, i, round(float(each), 3)) for i, each in enumerate(returns)]

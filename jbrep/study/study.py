@@ -8,6 +8,7 @@ from dataclasses import replace
 from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
 from jbrep.files.lock import exclusive
+from jbrep.files.storage import make_folder
 from jbrep.progress import Progress as Bar
 from jbrep.rl import Run
 from jbrep.rl.job import Job
@@ -49,14 +50,15 @@ def run_study(plan: Plan, backend: Backend, workers: int, width: int | None = No
     check(plan)
     unfinished = plan.unfinished
     packs = packed(plan, unfinished, workers, width)
-    plan.write()
+    make_folder(plan.folder)
     with exclusive(plan.folder):
+        plan.write()
         if plan.study.rules.primary and not has_begun(plan.folder):
             register(plan.folder, plan.as_json(), plan.fingerprints)
             plan = Plan(plan.study, plan.folder)  # its runs name the registration
         prepare(plan)
         for cell in plan.cells:  # so that any mistake shows before the first run
-            _ = Job(plan.run(cell), plan.folder_of(cell)).result
+            Job(plan.run(cell), plan.folder_of(cell)).clear()
         if not unfinished:
             return 0
         statuses = Counter[str]()

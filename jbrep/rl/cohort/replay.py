@@ -25,9 +25,9 @@ def capacity_of(run: Run) -> int:
     return min(size, -(-run.steps // rollout) * rollout)
 
 
-def memory_of(run: Run) -> int:
-    """Bytes of a run's replay memory."""
-    return 4 * capacity_of(run) * sum(_sizes(run.task.size, run.task.action_size))
+def memory_of(run: Run, observed: int) -> int:
+    """Bytes of a run's replay memory, where each observation has so many numbers."""
+    return 4 * capacity_of(run) * sum(_sizes(observed, run.task.action_size))
 
 
 def _sizes(observation: int, action: int) -> tuple[int, ...]:

@@ -29,7 +29,7 @@ def check(algorithm: str, preset: Preset) -> None:
         its = ", ".join(TRAINERS[COHORT])
         raise InputError(f"cohorts train {its}, not {algorithm}: {_INSTEAD}")
     if isinstance(preset.settings.get("train_freq"), list):
-        raise InputError(f"a cohort can't count train_freq in episodes: {_INSTEAD}")
+        raise InputError(f"a cohort takes train_freq as a number of steps: {_INSTEAD}")
     for name, value in _others(algorithm, preset):
         raise InputError(f"a cohort can't learn with {name} = {value}: {_INSTEAD}")
 

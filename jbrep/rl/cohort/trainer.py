@@ -1,7 +1,7 @@
 """Training runs together, in cohorts."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from itertools import groupby
 
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
@@ -14,6 +14,7 @@ from jbrep.rl.job import Ended, Job, Session
 from jbrep.rl.policy_file import policy_zip
 
 _Begun = tuple[Job, Snapshot | None]
+_Kind = tuple[str, bool, int, int, str]
 
 
 def train_together(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
@@ -30,17 +31,23 @@ def train_together(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
         InputError: a checkpoint can't be resumed.
         StoppedError: the session is to stop; the runs' checkpoints are written.
     """
-    begun = [(job, job.checkpoint.read()) for job in jobs]
+    groups = defaultdict[_Kind, list[_Begun]](list)
+    for job in jobs:
+        snapshot = job.checkpoint.read()
+        groups[_kind(job, snapshot)].append((job, snapshot))
+        del snapshot  # it holds a whole replay memory
     for job in jobs:  # now that no checkpoint of another run is there
         job.keep_encoder()
-
-    def kind(each: _Begun) -> tuple[str, int, int]:
-        job, _ = each
-        return shared_by(job.settings), job.history.first_step, filled_up(job)
-
-    for _, alike in groupby(sorted(begun, key=kind), kind):
+    for kind in sorted(groups):
+        cohort = _cohort(groups.pop(kind), session)
         with unchecked_distributions():
-            yield from _train(_cohort([*alike], session), session)
+            yield from _train(cohort, session)
+
+
+def _kind(job: Job, snapshot: Snapshot | None) -> _Kind:
+    """What is the same of all runs of a cohort; one that can't be continued is alone in its."""
+    alone = "" if job.run.task.reproducible else str(job.folder)
+    return shared_by(job.settings), snapshot is None, job.history.first_step, filled_up(job), alone
 
 
 def _cohort(begun: Sequence[_Begun], session: Session) -> Cohort:
