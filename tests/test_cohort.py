@@ -248,7 +248,10 @@ def test_an_environment_that_fails_ends_its_run_alone(done, tmp_path, monkeypatc
         ({"trainer": "both"}, "unknown trainer 'both': choose one of cohort, sb3"),
         ({"trainer": "cohort", "algorithm": "ppo"}, "cohorts train ddpg, td3, sac, not ppo: add"),
         ({"settings": {"use_sde": True}}, "can't learn with use_sde = True: add --trainer sb3"),
-        ({"settings": {"train_freq": [1, "episode"]}}, "takes train_freq as a number of steps: add --trainer sb3"),
+        (
+            {"settings": {"train_freq": [1, "episode"]}},
+            "takes train_freq as a number of steps: add",
+        ),
         ({"trainer": "sb3", "precision": "bfloat16"}, "sb3 has no bfloat16: leave the precision"),
         ({"precision": "half"}, "unknown precision 'half'"),
         ({"device": "cuda"}, "no device 'cuda' on this machine: choose auto or cpu"),
@@ -279,3 +282,12 @@ def test_a_stopped_cohort_goes_on_to_the_same_bytes(rollouts, done, tmp_path):
     for seed in "012":
         assert contents(tmp_path / seed) == contents(done / seed)
         assert not (tmp_path / seed / "checkpoint.safetensors").exists()
+
+
+def test_new_runs_learn_beside_those_that_were_stopped_before_their_first_step(done, tmp_path):
+    first, *others = runs(260, **SAC)
+    with pytest.raises(StoppedError):
+        together([first], tmp_path, stop=lambda: True)
+    together([first, *others], tmp_path)
+    for seed in "012":
+        assert contents(tmp_path / seed) == contents(done / seed)

@@ -9,7 +9,7 @@ from joblib import cpu_count
 from jbrep.errors import InputError
 from jbrep.rl import Run, speed
 from jbrep.rl.cohort.replay import memory_of
-from jbrep.study.config import Study
+from jbrep.study.config import Data, Study
 from jbrep.study.packing import packed, until_done, usual_workers
 from jbrep.study.plan import Plan
 
@@ -85,3 +85,12 @@ def test_trials_take_rollouts_as_short_as_can_be(algorithm, short):
     found = speed._at_once(run)
     assert {"learning_starts": 0, **short}.items() <= found.items()
     replace(run, settings={**run.settings, **found}).check()
+
+
+def test_codes_that_are_larger_than_the_observation_take_more_memory(tmp_path, monkeypatch):
+    data = Data(steps=1000)
+    study = replace(STUDY, algorithms=("sac-modern",), steps=1_000_000, data=data)
+    gib = 1 << 30
+    monkeypatch.setattr(os, "sysconf", {"SC_PHYS_PAGES": 4, "SC_PAGE_SIZE": gib}.__getitem__)
+    wide = Plan(replace(study, representations=("full", "noise-64")), tmp_path)
+    assert max(map(len, packed(wide, wide.cells, 2))) == 1  # 0.5 GiB each, of 0.9

@@ -18,6 +18,7 @@ import pytest
 import torch
 from command import jbrep
 from stable_baselines3 import A2C
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jbrep.encoders import find, save
 from jbrep.envs import describe
@@ -25,7 +26,18 @@ from jbrep.errors import InputError
 from jbrep.files import container
 from jbrep.rl import Run, train
 from jbrep.rl.agent import make_env
-from jbrep.rl.files import CHECKPOINT, ENCODER, EVALUATIONS, POLICY, RUN, read_evaluations, read_run
+from jbrep.rl.files import (
+    CHECKPOINT,
+    ENCODER,
+    EVALUATIONS,
+    POLICY,
+    POLICY_FORMAT,
+    RUN,
+    is_policy_file,
+    read_evaluations,
+    read_run,
+)
+from jbrep.rl.history import Scalars
 from jbrep.rl.policy import load_run, load_untrained, load_zip
 from jbrep.rollouts.sources import find_player
 from jbrep.study.results import read_results, write_results
@@ -470,3 +482,22 @@ def test_another_encoder_is_not_the_run_s(run):
     pose = {"task": "move_to_pose", "environment": describe("move_to_pose").as_json()}
     change(run, settings={**settings, "encoder": own, **pose})
     assert "was made for face_direction" in refused(load_run, run)
+
+
+def test_a_large_policy_is_recognised(tmp_path):
+    path = tmp_path / "large.safetensors"
+    weights = {"policy.weight": np.zeros((2200, 2200), np.float32)}  # 19 MB
+    container.write(path, weights, {"format": POLICY_FORMAT, "format_version": 1})
+    assert is_policy_file(path)
+    path.write_bytes(path.read_bytes()[:100])
+    assert not is_policy_file(path)
+
+
+def test_tensorboard_keeps_what_was_logged_at_the_step_of_a_checkpoint(tmp_path):
+    for step in (0, 20):  # before it was stopped, and after
+        scalars = Scalars(tmp_path, step)
+        scalars.write({"evaluation": 1.0}, {"evaluation": ()}, step + 20)
+        scalars.write({"evaluation": 2.0}, {"evaluation": ()}, step + 30)
+        scalars.close()
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert [e.step for e in events.Scalars("evaluation")] == [20, 40, 50]

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import shutil
 import tomllib
 import zipfile
 
@@ -24,7 +25,7 @@ from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, statistics_of
 from jbrep.rl.files import EVALUATION_SEED, POLICY, RUN, read_evaluations, read_run
 from jbrep.rl.learner import Learner, read_preset, usual_name, write_preset
-from jbrep.rl.policy import load_run, load_untrained
+from jbrep.rl.policy import load_run, load_untrained, load_zip
 from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.settings import setting_names, used_settings
 from jbrep.rl.weights import STATISTICS
@@ -101,7 +102,7 @@ def test_settings_reach_the_agent():
         ("sac", {"learning_rat": 1}, "sac has no setting 'learning_rat': did you mean learning_ra"),
         ("ppo", {"tau": 0.1}, "ppo has no setting 'tau': it has activation_fn, "),
         ("sac", {"xyz": 1}, "sac has no setting 'xyz': it has activation_fn, batch_size"),
-        ("sac", {"device": "cuda"}, "device can't be set: runs are on the CPU"),
+        ("sac", {"device": "cuda"}, "device can't be set: give it by --device"),
         ("a2c", {"use_rms_prop": True}, "use_rms_prop can't be set: the optimiser is always Adam"),
         ("sac", {"learning_rate": "fast"}, "learning_rate is fast: it must be a number or linear:"),
         ("sac", {"batch_size": 2.5}, "batch_size is 2.5: it must be a whole number"),
@@ -184,6 +185,20 @@ def test_a_preset_file(tmp_path):
             Run(task=TASK, algorithm=algorithm, preset=str(path))
     with pytest.raises(InputError, match=r"can't read .*none\.toml"):
         Run(task=TASK, preset="none.toml")
+    linked = tmp_path / "linked.toml"
+    linked.symlink_to(path)
+    assert read_preset(linked, "sac") == ("modern", settings)
+    linked.unlink()
+    linked.mkdir()
+    with pytest.raises(InputError, match=r"linked\.toml must be a regular file"):
+        read_preset(linked, "sac")
+
+
+def test_a_preset_file_can_say_none(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(write_preset("ppo", "paper", {"target_kl": None, "gamma": 0.9}))
+    run = Run(task=TASK, algorithm="ppo", preset=str(path))
+    assert run.used.settings["target_kl"] is None
 
 
 def test_learners_of_tables():
@@ -273,6 +288,11 @@ def test_normalisation_is_resumed_evaluated_and_read_back(run, tmp_path):
     assert not ours.policy.state_dict()[name].equal(theirs.policy.state_dict()[name])
     told = [json.loads(line) for line in evaluated(run, tmp_path / "without")]
     assert told[0]["returns"] != told[1]["returns"]
+    shutil.copy(run / POLICY, tmp_path / "moved.zip")
+    moved = load_zip(tmp_path / "moved.zip", TASK, "sac", "full", trust=True)
+    observations = np.zeros((2, TASK.size))
+    acts = [each.begin(TASK, [0, 1])(observations) for each in (moved, ours)]
+    np.testing.assert_array_equal(*acts)
 
 
 def evaluated(*folders):

@@ -26,17 +26,21 @@ from command import (
     workers_of,
 )
 
+from jbrep.dataset import Dataset
 from jbrep.encoders import load
-from jbrep.errors import InputError
+from jbrep.envs import describe
+from jbrep.errors import DamageError, InputError
+from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, RUN, read_run, write_run
 from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.rollouts.behaviour import observe
+from jbrep.rollouts.sources import find_player, find_untrained
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, read_study
 from jbrep.study.plan import STUDY, Plan, plan_for, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.progress import Progress, duration
-from jbrep.study.references import REFERENCE_RETURNS, write_references
+from jbrep.study.references import REFERENCE_RETURNS, read_references, write_references
 from jbrep.study.results import (
     RETURNS,
     STATISTICS,
@@ -663,3 +667,57 @@ def test_the_runs_below_a_folder_behave_as_one_policy(done):
     alone = [observe([str(each)], None, 3, 0.5)[1][1] for each in seeds]
     np.testing.assert_array_equal(after.returns, np.concatenate([each.returns for each in alone]))
     np.testing.assert_allclose(after.motor, np.mean([each.motor for each in alone], axis=0))
+
+
+def test_a_run_is_drawn_before_and_after_training_with_the_same_body(done):
+    run = done.folder / "runs" / "face_direction" / "a2c" / "full" / "seed-0"
+    other = describe("face_direction", {"body": 7}, 100)
+    assert find_untrained(run, other).task == find_player(str(run), other).task == other
+    task, _ = observe([str(run)], other, 1, 0.5)
+    assert task == other
+    train(Run(task=other, algorithm="a2c", steps=80, evaluation_episodes=1), done.folder / "other")
+    with pytest.raises(InputError, match="with another body or time limit than the policies bef"):
+        observe([str(run), str(done.folder / "other")], None, 1, 0.5)
+
+
+def test_tasks_may_come_and_go_whichever_was_collected(tmp_path):
+    def prepared(*tasks):
+        study = dataclasses.replace(
+            TINY, tasks=tasks, representations=("full", "random-1"), data=Data(steps=1000)
+        )
+        plan = Plan(study, tmp_path / "made")
+        plan.write()
+        prepare(plan)
+        return {task: Dataset(plan.data(task)).manifest.settings for task in tasks}
+
+    assert prepared("face_direction")["face_direction"].store_state
+    made = prepared("move_to_pose", "face_direction")
+    assert [made[task].store_state for task in ("move_to_pose", "face_direction")] == [False, True]
+    assert not prepared("move_to_pose")["move_to_pose"].store_state
+
+
+def test_a_study_for_a_gpu_is_read_where_there_is_none(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    study = dataclasses.replace(TINY, algorithms=("sac",), device="cuda")
+    Plan(study, tmp_path).write()
+    assert read_plan(tmp_path).study.device == "cuda"
+    with pytest.raises(InputError, match="no device 'cuda' on this machine: choose auto or cpu"):
+        run_study(Plan(study, tmp_path), on_this_machine, 1)
+
+
+def test_what_a_data_set_can_not_be_is_refused_before_anything_is_written():
+    with pytest.raises(InputError, match="-5"):
+        dataclasses.replace(TINY, data=Data(steps=-5))
+
+
+def test_damaged_references_are_named(done, tmp_path):
+    (tmp_path / REFERENCE_RETURNS).write_text("task,policy,episode,return\na,b,0,x\n")
+    with pytest.raises(DamageError, match=r"references\.csv is damaged or cut short"):
+        read_references(tmp_path)
+
+
+def test_what_a_run_killed_at_its_very_end_left_is_removed(done):
+    left = done.folder / "runs" / "face_direction" / "a2c" / "full" / "seed-0" / CHECKPOINT
+    left.write_bytes(b"left")
+    run_study(done, on_this_machine, 1)
+    assert not left.exists()
