@@ -15,6 +15,8 @@ from jbrep.rl.history import History
 
 MAX_BYTES = 1 << 34
 PARAMETERS = "parameters."  # begins the names of what gradient steps change
+LANES = "lanes."  # likewise, of what decides how the lanes continue
+COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")  # of an agent
 _QUICK = 2.0  # seconds of writing that don't matter
 MALFORMED = (KeyError, TypeError, ValueError, RuntimeError, IndexError, AttributeError)
 

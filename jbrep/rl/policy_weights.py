@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.encoders import Encoder
 from jbrep.encoders.file import unpack as unpack_encoder
@@ -18,7 +17,7 @@ from jbrep.files.storage import write_whole
 from jbrep.rl.fields import check_policy, check_settings, completed
 from jbrep.rl.files import POLICY_FORMAT
 from jbrep.rl.policy import Trained, build
-from jbrep.rl.weights import fill, read_file
+from jbrep.rl.weights import acting, fill, read_file
 
 FORMAT_VERSION = 1
 _WEIGHTS, _ENCODER = "policy.", "encoder."  # before the names of tensors
@@ -64,11 +63,6 @@ def pack(trained: Trained, run: str) -> bytes:
     if trained.statistics is not None:
         tensors |= trained.statistics.tensors
     return container.pack(tensors, header)
-
-
-def acting(policy: BasePolicy) -> BasePolicy:
-    """The part of a policy that chooses actions: without critics where they are apart."""
-    return getattr(policy, "actor", policy)
 
 
 def load(path: Path) -> Trained:

@@ -110,6 +110,10 @@ class Run:
         elif self.device != CPU:
             raise InputError(f"{self.trainer} trains on the cpu here: leave the device out")
 
+    def is_evaluation_due(self, step: int, lanes: int) -> bool:
+        """Whether the policy is to be evaluated after so many steps, which aren't all."""
+        return step % self.evaluate_every < lanes and step < self.steps
+
     def episodes_at(self, step: int) -> int:
         """Of the evaluation after so many steps."""
         return self.final_episodes if step >= self.steps else self.evaluation_episodes

@@ -80,9 +80,13 @@ def fill(policy: BasePolicy, weights: Mapping[str, torch.Tensor], path: Path) ->
         policy.load_state_dict(weights)
     except (AttributeError, RuntimeError, TypeError, ValueError) as error:
         raise InputError(f"{path} doesn't fit the run's settings: {one_line(error)}") from None
-    acting = getattr(policy, "actor", policy)
-    if not all(bool(torch.isfinite(part).all()) for part in acting.parameters()):
+    if not all(bool(torch.isfinite(part).all()) for part in acting(policy).parameters()):
         raise DamageError(f"{path} is damaged: the policy's weights are not finite")
+
+
+def acting(policy: BasePolicy) -> BasePolicy:
+    """The part of a policy that chooses actions: without critics where they are apart."""
+    return getattr(policy, "actor", policy)
 
 
 def read_file(path: Path) -> bytes:

@@ -10,15 +10,13 @@ from torch import Tensor
 
 from jbrep.envs.endless import Endless
 from jbrep.rl.agent import training_seed
-from jbrep.rl.checkpoint import Snapshot, without
+from jbrep.rl.checkpoint import LANES, Snapshot, without
 from jbrep.rl.cohort.learner import Learner, give_back, stacked
 from jbrep.rl.cohort.member import Array, Float32, Member
 from jbrep.rl.cohort.replay import Replay, capacity_of
 from jbrep.rl.cohort.steps import Batch, set_rate
 from jbrep.rl.history import ACTIONS_NOT_FINITE
 from jbrep.rl.job import Job
-
-_LANES = "lanes."  # begins the names of what decides how the lanes continue
 
 
 class Cohort:
@@ -51,8 +49,7 @@ class Cohort:
     @property
     def is_evaluation_due(self) -> bool:
         """Whether policies are to be evaluated at this step, which isn't the last."""
-        every = self.members[0].job.run.evaluate_every
-        return self.step % every < self._lanes and self.step < self._steps
+        return self.members[0].job.run.is_evaluation_due(self.step, self._lanes)
 
     @property
     def rollout(self) -> int:
@@ -106,7 +103,7 @@ class Cohort:
         tensors, counters = member.take()
         number = self.members.index(member)
         own = slice(number * self._lanes, (number + 1) * self._lanes)
-        tensors |= {f"{_LANES}{name}": each[own] for name, each in self._endless.state.items()}
+        tensors |= {f"{LANES}{name}": each[own] for name, each in self._endless.state.items()}
         tensors |= {"seen": self._seen[number], "replay": self._replay.of(number)}
         return Snapshot(tensors, {**counters, "added": self._replay.added})
 
@@ -120,7 +117,7 @@ class Cohort:
         tensors = [each.tensors for each in snapshots]
         self._seen = np.stack([each["seen"] for each in tensors])
         self._replay.refill([each["replay"] for each in tensors], snapshots[0].counters["added"])
-        lanes = [without(_LANES, each) for each in tensors]
+        lanes = [without(LANES, each) for each in tensors]
         self._endless.restore({n: joined([each[n] for each in lanes]) for n in lanes[0]})
 
     def member_of(self, lane: int) -> Member:

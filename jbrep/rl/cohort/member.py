@@ -18,7 +18,7 @@ from jbrep.envs.checks import NonFiniteActionError
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.rl.agent import Evaluator, Spaces, make_agent, parameters
 from jbrep.rl.beginning import begin
-from jbrep.rl.checkpoint import PARAMETERS, Snapshot, without
+from jbrep.rl.checkpoint import COUNTERS, PARAMETERS, Snapshot, without
 from jbrep.rl.cohort.draws import Draws
 from jbrep.rl.files import Episode
 from jbrep.rl.history import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE
@@ -29,7 +29,6 @@ Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 _LOG_EVERY = 4  # episodes, as in stable-baselines3
-_COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 _DRAWS = "draws."  # begins the names of what its random numbers come from
 
 
@@ -111,7 +110,7 @@ class Member:
         tensors |= {"returns": self._returns, "lengths": self._lengths}
         if self.normalizer:
             tensors |= Statistics.of(self.normalizer).tensors
-        counters |= {name: getattr(agent, name) for name in _COUNTERS}
+        counters |= {name: getattr(agent, name) for name in COUNTERS}
         counters |= {"mean": self.mean, "episodes": list(agent.ep_info_buffer)}
         return Snapshot(tensors, counters)
 
@@ -123,7 +122,7 @@ class Member:
                 each.copy_(torch.from_numpy(tensors[f"{PARAMETERS}{name}"]))
         self.draws.restore(without(_DRAWS, tensors), counters)
         self._returns, self._lengths = tensors["returns"].copy(), tensors["lengths"].copy()
-        for name in _COUNTERS:
+        for name in COUNTERS:
             setattr(agent, name, counters[name])
         agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that is logged
         agent.ep_info_buffer.extend(counters["episodes"])

@@ -19,6 +19,8 @@ from jbrep.errors import InputError
 from jbrep.files.container import Tensors
 from jbrep.rl.agent import parameters, statistics_of
 from jbrep.rl.checkpoint import (
+    COUNTERS,
+    LANES,
     MALFORMED,
     PARAMETERS,
     CheckpointFile,
@@ -27,9 +29,8 @@ from jbrep.rl.checkpoint import (
     without,
 )
 from jbrep.rl.normalization import Statistics
+from jbrep.rl.weights import acting
 
-_LANES = "lanes."  # likewise, of what decides how the lanes continue
-_COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 _ROLLOUT = ("_last_obs", "_last_episode_starts")
 _UNSCALED = "_last_original_obs"  # before it was normalised
 _EXPLORATION = ("exploration_mat", "exploration_matrices")
@@ -90,7 +91,7 @@ def take(agent: BaseAlgorithm) -> Snapshot:
     monitor, env = _envs(agent)
     kind, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 draws there
     tensors = {f"{PARAMETERS}{name}": tensor.numpy() for name, tensor in parameters(agent)}
-    tensors |= {f"{_LANES}{name}": values for name, values in env.state.items()}
+    tensors |= {f"{LANES}{name}": values for name, values in env.state.items()}
     tensors |= {f"noise.{i}": n.noise_prev for i, n in enumerate(_drifting_noises(agent))}
     tensors |= {f"rollout.{name}": getattr(agent, name) for name in _ROLLOUT}
     if statistics := statistics_of(agent):
@@ -99,7 +100,7 @@ def take(agent: BaseAlgorithm) -> Snapshot:
     tensors |= {"torch": torch.get_rng_state().numpy(), "numpy": np.asarray(keys)}
     if noise := _state_dependent_noise(agent):
         tensors |= {name: getattr(noise, name).detach().numpy() for name in _EXPLORATION}
-    counters = {name: getattr(agent, name) for name in _COUNTERS}
+    counters = {name: getattr(agent, name) for name in COUNTERS}
     counters |= {
         "numpy": (kind, position, has_gauss, gauss),
         "action_space": agent.action_space.np_random.bit_generator.state,
@@ -130,11 +131,11 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
         (size,) = agent.observation_space.shape or ()
         Statistics.read(tensors, size, "the checkpoint").give(normalizer)
         setattr(agent, _UNSCALED, tensors[_UNSCALED])
-    for name in _COUNTERS:
+    for name in COUNTERS:
         setattr(agent, name, counters[name])
     agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that TensorBoard shows
     monitor.episode_returns, monitor.episode_lengths = tensors["returns"], tensors["lengths"]
-    env.restore(without(_LANES, tensors))
+    env.restore(without(LANES, tensors))
     assert agent.ep_info_buffer is not None
     agent.ep_info_buffer.extend(counters["episodes"])
     agent.action_space.np_random.bit_generator.state = counters["action_space"]
@@ -153,7 +154,7 @@ def _restore_draws(agent: BaseAlgorithm, tensors: Tensors) -> None:
 
 def _state_dependent_noise(agent: BaseAlgorithm) -> StateDependentNoiseDistribution | None:
     """The distribution that explores by noise on features, with use_sde."""
-    distribution = getattr(getattr(agent, "actor", agent.policy), "action_dist", None)
+    distribution = getattr(acting(agent.policy), "action_dist", None)
     is_one = isinstance(distribution, StateDependentNoiseDistribution)
     return distribution if is_one else None
 

@@ -9,6 +9,7 @@ from jbrep.rl.agent import Evaluator
 from jbrep.rl.files import Episode
 from jbrep.rl.history import WEIGHTS_NOT_FINITE, DivergedError, History, Watch
 from jbrep.rl.run import Run
+from jbrep.rl.weights import acting
 
 
 class Recorder(BaseCallback):
@@ -43,8 +44,7 @@ class Recorder(BaseCallback):
             self._history.episodes.append(
                 Episode(self.num_timesteps, lane, total, length, diverged)
             )
-        due = self.num_timesteps % self._run.evaluate_every < self.training_env.num_envs
-        if due and self.num_timesteps < self.model._total_timesteps:
+        if self._run.is_evaluation_due(self.num_timesteps, self.training_env.num_envs):
             self._evaluate()
         return True
 
@@ -70,6 +70,5 @@ def check_finite(agent: BaseAlgorithm) -> None:
     for name, value in agent.logger.name_to_value.items():
         if name.endswith("loss") and not np.isfinite(value):
             raise DivergedError(f"{name} is {value}")
-    actor = getattr(agent, "actor", agent.policy)
-    if not all(bool(torch.isfinite(p.sum())) for p in actor.parameters()):
+    if not all(bool(torch.isfinite(p.sum())) for p in acting(agent.policy).parameters()):
         raise DivergedError(WEIGHTS_NOT_FINITE)
