@@ -106,7 +106,7 @@ def compare_one_row() -> None:
         _, there = encoder._prepare(values, SIZE, "observations")
 
         def bare(values: object = values, there: object = there) -> object:
-            return run(there.encoder, (values - there.centre) / there.half_width)
+            return run(there.encoder, there.scaler.scale(values))
 
         over = []
         for _ in range(2 * ROUNDS):

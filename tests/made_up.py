@@ -23,6 +23,7 @@ STUDY = as_study(
         "final_episodes": 5,
         "verdicts": {
             "primary": ["face_direction/sac/dae-8", "face_direction/sac/pca-8"],
+            "failing": 0.25,
         },
     }
 )

@@ -497,3 +497,16 @@ def test_the_command(tmp_path):
     done = jbrep("data", "import", tmp_path / "pole.npz", "--out", out)
     assert done.exit_code == 2
     assert done.stderr == f"Error: {out} exists already: choose another name\n"
+
+
+def test_an_end_must_be_true_or_false(tmp_path):
+    flat = {
+        "observations": np.zeros((6, 2), np.float32),
+        "actions": np.zeros((6, 1), np.float32),
+        "rewards": np.zeros(6, np.float32),
+        "terminations": np.array([0, 0, np.nan, 0, 0, 1]),
+    }
+    np.savez(tmp_path / "flat.npz", **flat)
+    told = jbrep("data", "import", tmp_path / "flat.npz", "--out", tmp_path / "out")
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    assert "has a terminated that is neither true nor false" in told.output

@@ -19,6 +19,7 @@ from jbrep.stats.claims import FASTER, LESS_VARIANCE, NOT_WORSE, kept_gain
 from jbrep.stats.looks import levels
 from jbrep.stats.means import Bounds, Part, mean_within, p_of_sum, sum_within
 from jbrep.stats.nested import components
+from jbrep.stats.power import Arms, obstacle
 from jbrep.stats.rules import Planned, Rules, most_failing
 from jbrep.stats.runs import RunCurve
 from jbrep.stats.spread import Curves, log_spread, ratio_of_spreads, spread_p
@@ -306,8 +307,8 @@ def test_what_may_fail_often_is_not_called_as_good():
     assert found.reason == "up to 26 % of its runs may fail to learn; the limit is 20 %"
     lenient = verdicts(FULL[:10], BETTER[:10], looks=(1.0,), failing=0.3)["dae-12"]
     assert words(lenient) == ["supported"] * 4
-    assert most_failing(0, 10) == pytest.approx(1 - 0.05 ** (1 / 10))
-    assert most_failing(3, 16) == pytest.approx(beta.ppf(0.95, 4, 13))
+    assert most_failing(0, 10, 0.05) == pytest.approx(1 - 0.05 ** (1 / 10))
+    assert most_failing(3, 16, 0.05) == pytest.approx(beta.ppf(0.95, 4, 13))
 
 
 def test_nothing_follows_from_agents_that_learn_nothing():
@@ -407,3 +408,12 @@ def test_intervals_of_variance_components_cover_the_truth(ratio):
         truths = zip(found, (ratio, 1, ratio), strict=True)
         covered += [each.low <= truth <= each.high for each, truth in truths]
     assert (covered / 500 > 0.925).all()
+
+
+def test_the_bound_on_failing_runs_errs_as_rarely_as_the_test():
+    """With n cells each has a share of the error, and more runs must learn."""
+    arms = Arms(16, 16, 16)
+    one, three = (Rules(primary=tuple("abc"[:n]), looks=(1.0,)) for n in (1, 3))
+    assert obstacle(one, "not worse", arms) is None
+    most = round(100 * (1 - (0.05 / 3) ** (1 / 16)))
+    assert f"up to {most} % may fail" in obstacle(three, "not worse", arms)

@@ -581,7 +581,8 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
 
 
 def test_no_references_no_table(tmp_path):
-    (tmp_path / REFERENCE_RETURNS).write_text("of other runs")
+    text = "task,policy,episode,return\nof other runs,random,0,1.0\n"
+    (tmp_path / REFERENCE_RETURNS).write_text(text)
     assert write_references([], tmp_path) is None
     assert not (tmp_path / REFERENCE_RETURNS).exists()
 

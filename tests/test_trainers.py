@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jbrep.figures.curves import Return
 from jbrep.study.record import RECORD
-from jbrep.study.results import RETURNS
+from jbrep.study.results import COLUMNS, RETURNS
 
 SEEDS, STEPS, EPISODES = 20, (5_000, 10_000), 10
 ARMS = {  # mean and standard deviation of runs
@@ -32,7 +31,7 @@ def write_arm(folder, mean, spread, rng):
     of_runs = mean + spread * (runs - runs.mean()) / runs.std(ddof=1)
     with (folder / RETURNS).open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(Return._fields)
+        writer.writerow(COLUMNS)
         for seed, of_run in enumerate(of_runs):
             for step in STEPS:
                 for episode in range(EPISODES):

@@ -13,11 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jbrep.errors import InputError
 from jbrep.figures import write
 from jbrep.figures.curves import curves
 from jbrep.figures.style import styles
 from jbrep.files.storage import write_whole
 from jbrep.report.tables import read_tables
+from jbrep.rl.files import FINISHED
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.first_claims import variance_p
@@ -59,8 +61,9 @@ class Compared(NamedTuple):
     @property
     def differs(self) -> bool:
         """Whether means or variances differ, at the level for that."""
-        of_means = not self.surely.low <= 0 <= self.surely.high
-        return of_means or (not self.ratio.low <= 1 <= self.ratio.high and self.p < 1 - SURE)
+        of_means = self.surely.low > 0 or self.surely.high < 0
+        of_variances = self.ratio.low > 1 or self.ratio.high < 1
+        return of_means or (of_variances and self.p < 1 - SURE)
 
     def is_within(self, margin: float) -> bool:
         """Whether the means differ by less, as the test of equivalence has it."""
@@ -90,9 +93,16 @@ def verdict(measures: Mapping[str, Compared]) -> str:
 
 
 def read_arm(folder: Path, arm: str) -> list[RunCurve]:
-    """The runs of a study, with the arm in the place of what they observe."""
+    """The runs of a study, with the arm in the place of what they observe.
+
+    Raises:
+        InputError: a run failed, for which the plan has no rule.
+    """
+    tables = read_tables(folder)
+    if failed := [run["seed"] for run in tables.record["runs"] if run["status"] != FINISHED]:
+        raise InputError(f"{folder}: the runs of the seeds {failed} failed")
     returns: dict[int, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in read_tables(folder).returns:
+    for row in tables.returns:
         returns[row.seed][row.step].append(row.episode_return)
     return [
         RunCurve(

@@ -2,12 +2,14 @@
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from jbrep.errors import DamageError, InputError
 from jbrep.files.storage import read_regular, write_whole
+
+Columns = Mapping[str, Callable[[str], Any]]  # by their names: what their cells are
 
 _MAX_BYTES = 1 << 28
 _MOST = 1 << 53  # of a number: a float holds whole ones exactly
@@ -31,8 +33,12 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]])
     write_whole(path, csv_text(columns, rows).encode())
 
 
-def read_csv(path: Path, kinds: Sequence[Callable[[str], Any]]) -> list[tuple[Any, ...]]:
-    """The rows below the header, each cell of its column's kind.
+def read_csv(path: Path, columns: Columns) -> list[tuple[Any, ...]]:
+    """The rows below the header, each cell as its column has it.
+
+    Args:
+        path: of the file.
+        columns: the header must have these.
 
     Raises:
         InputError: it can't be read.
@@ -40,9 +46,12 @@ def read_csv(path: Path, kinds: Sequence[Callable[[str], Any]]) -> list[tuple[An
     """
     try:
         text = read_regular(path, _MAX_BYTES).decode()
+        header, *rows = csv.reader(io.StringIO(text, newline=""), strict=True)
+        if header != [*columns]:
+            raise ValueError
         return [
-            tuple(kind(cell) for kind, cell in zip(kinds, row, strict=True))
-            for row in list(csv.reader(io.StringIO(text, newline=""), strict=True))[1:]
+            tuple(kind(cell) for kind, cell in zip(columns.values(), row, strict=True))
+            for row in rows
         ]
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error

@@ -273,12 +273,18 @@ def _folder(settings: Mapping[str, Any]) -> str:
     return "/".join(map(slug, (settings["task"], learner(settings), settings["representation"])))
 
 
+_OPTIONS = (
+    *("task", "algorithm", "preset", "trainer", "precision", "device", "steps"),
+    *("evaluate_every", "evaluation_episodes", "final_episodes"),
+)
+
+
 def _command(shared: LabelRecord, out: str) -> str:
     settings: Mapping[str, Any] = shared["settings"]
-    options = ("task", "algorithm", "preset", "steps", "evaluate_every", "evaluation_episodes")
     parts = ["jbrep", "rl"]
-    for name in options:
-        parts += [f"--{name.replace('_', '-')}", str(settings[name])]
+    for name in _OPTIONS:
+        if name in settings:  # runs of the first release lack some
+            parts += [f"--{name.replace('_', '-')}", str(settings[name])]
     for name, value in settings.get("overrides", {}).items():
         parts += ["--set", f"{name}={json.dumps(value)}"]
     environment: Mapping[str, Any] = settings.get("environment", {})

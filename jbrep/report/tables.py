@@ -8,14 +8,14 @@ from jbrep.errors import DamageError, InputError
 from jbrep.figures.curves import References, Return
 from jbrep.figures.diagrams import LabelRecord, TaskRecord
 from jbrep.files.storage import exists
-from jbrep.files.tables import count, finite, read_csv
+from jbrep.files.tables import Columns, count, finite, read_csv
 from jbrep.files.typed import read_json, typed
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, TASKS
 from jbrep.rl.files import read_text
 from jbrep.stats import Analysis
 from jbrep.study import record
 from jbrep.study.references import HAND_WRITTEN, REFERENCE_RETURNS, read_references
-from jbrep.study.results import RETURNS, STATISTICS
+from jbrep.study.results import COLUMNS, RETURNS, STATISTICS
 
 HEURISTIC_RETURNS = "heuristics.csv"  # of the first release
 _REPRESENTATIONS = list[str | dict[str, Any]]  # names, or what a user's own are made of
@@ -85,8 +85,7 @@ def read_tables(folder: Path) -> Tables:
     analysis = None
     if exists(folder / STATISTICS):
         analysis = Analysis.from_json(_text(folder / STATISTICS), folder / STATISTICS)
-    columns_of_returns = (str, str, str, count, count, count, finite)
-    returns = [Return(*row) for row in read_csv(folder / RETURNS, columns_of_returns)]
+    returns = [Return(*row) for row in read_csv(folder / RETURNS, COLUMNS)]
     rows = read_diagnostics(folder / DIAGNOSTICS) if exists(folder / DIAGNOSTICS) else []
     name = folder.resolve().name.encode(errors="replace").decode()
     record_of_runs = _read_record(folder / record.RECORD)
@@ -100,7 +99,8 @@ def _read_references(folder: Path) -> References:
         return read_references(folder)
     references: References = {}
     if exists(folder / HEURISTIC_RETURNS):
-        for task, _, each in read_csv(folder / HEURISTIC_RETURNS, (str, count, finite)):
+        columns: Columns = {"task": str, "episode": count, "return": finite}
+        for task, _, each in read_csv(folder / HEURISTIC_RETURNS, columns):
             references.setdefault(task, {}).setdefault(HAND_WRITTEN, []).append(each)
     return references
 

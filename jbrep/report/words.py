@@ -9,6 +9,7 @@ from jbrep.report.tables import RegistrationRecord
 from jbrep.stats import Analysis
 from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.comparison import Comparison
+from jbrep.stats.rules import NONE_PRIMARY
 from jbrep.stats.summary import probability, reference_words, shown, shown_number
 from jbrep.stats.verdict import EXPLORATORY, NOT_YET, Statement, Verdict
 
@@ -45,8 +46,10 @@ def headline(analysis: Analysis | None) -> str:
     if not found:
         return "No reduced state was compared with the full one."
     judged = [verdicts for verdicts in found if verdicts[0].verdict != EXPLORATORY]
-    if not judged:
+    if not judged and NONE_PRIMARY in analysis.notes:
         return "There are no verdicts: no cell was named primary before the runs."
+    if not judged:
+        return "There are no verdicts yet: no primary cell has two runs of each side."
     decided = [verdicts for verdicts in judged if verdicts[0].verdict != NOT_YET]
     if not decided:
         return f"There are no verdicts yet: {judged[0][0].reason}."

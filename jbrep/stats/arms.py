@@ -1,6 +1,7 @@
 """What the claims compare: the runs of each representation, measured on one scale."""
 
 from collections.abc import Collection, Mapping
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ from jbrep.stats.bootstrap import Array
 from jbrep.stats.curves import compared, steps_to
 from jbrep.stats.intervals import LEVEL
 from jbrep.stats.means import Bounds, mean_within
-from jbrep.stats.runs import Group, RunCurve
+from jbrep.stats.runs import Group, RunCurve, with_failure_returns
 from jbrep.stats.scale import reference_of
 
 FEWEST = 8  # units on either side of a verdict
@@ -70,13 +71,15 @@ def measure(group: Group, seeds: Collection[int]) -> tuple[Frame, dict[str, Arm]
 
     Args:
         group: runs by representation.
-        seeds: that count; others are left out, but for what units are.
+        seeds: that count; others are left out, but for what units are. What a failed run counts as
+            is known from these alone, too.
 
     Raises:
         InputError: the runs have no range of steps in common.
     """
-    of_seeds = {n: [r for r in runs if r.seed in seeds] for n, runs in group.items()}
-    there = {name: runs for name, runs in of_seeds.items() if runs}
+    counted = with_failure_returns([r for r in chain(*group.values()) if r.seed in seeds])
+    of_each = {name: [r for r in counted if r.representation == name] for name in group}
+    there = {name: runs for name, runs in of_each.items() if runs}
     grid, _, curves, finals = compared(there)
     frame = _frame(there, finals, next(iter(curves.values())), grid)
     return frame, {

@@ -1,6 +1,7 @@
 """What is claimed of a representation: how each claim is measured, and what would decide it."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.optimize import brentq
 from jbrep.stats.arms import Arm, Frame
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.means import Bounds, Part, p_of_sum, sum_within
-from jbrep.stats.spread import Curves, ratio_of_spreads, spread_p
+from jbrep.stats.spread import PERMUTATIONS, TO_SHOW, Curves, ratio_of_spreads, spread_p
 from jbrep.stats.verdict import Statement
 
 _FURTHEST = 1e3  # shares of a gain that are looked for
@@ -25,6 +26,7 @@ class Claim(NamedTuple):
         side: 1 if an estimate above the boundary speaks for the claim, -1 if one below does.
         boundary: of the estimate, given the margin.
         estimate: from x, y, their frame, the level of the interval and a seed.
+        tested: the same with the interval that the test itself keeps.
         p_value: two-sided, of the estimand lying on the boundary, from x, y, frame, boundary, seed.
     """
 
@@ -34,6 +36,7 @@ class Claim(NamedTuple):
     side: int
     boundary: Callable[[float], float]
     estimate: Callable[[Arm, Arm, Frame, float, int], Interval]
+    tested: Callable[[Arm, Arm, Frame, float, int], Interval]
     p_value: Callable[[Arm, Arm, Frame, float, int], float]
 
     def in_words(self, margin: float) -> Statement:
@@ -90,9 +93,11 @@ def _time_p(x: Arm, y: Arm, frame: Frame, boundary: float, seed: int) -> float:
     return p_of_sum(parts, Bounds(0, frame.steps), boundary)
 
 
-def spread_ratio(x: Arm, y: Arm, frame: Frame, level: float, seed: int = 0) -> Interval:
+def spread_ratio(
+    x: Arm, y: Arm, frame: Frame, level: float, seed: int = 0, permutations: int = TO_SHOW
+) -> Interval:
     """The spread of training curves of x over that of y."""
-    return ratio_of_spreads(_curves(x, y, frame), level, seed)
+    return ratio_of_spreads(_curves(x, y, frame), level, seed, permutations)
 
 
 def _spread_p(x: Arm, y: Arm, frame: Frame, boundary: float, seed: int) -> float:
@@ -111,6 +116,7 @@ NOT_WORSE = Claim(
     side=1,
     boundary=lambda margin: 1 - margin,
     estimate=kept_gain,
+    tested=kept_gain,
     p_value=_kept_p,
 )
 WITHIN_HALF = Claim(
@@ -120,6 +126,7 @@ WITHIN_HALF = Claim(
     side=1,
     boundary=lambda margin: 1 - margin / 2,
     estimate=kept_gain,
+    tested=kept_gain,
     p_value=_kept_p,
 )
 LESS_VARIANCE = Claim(
@@ -129,6 +136,7 @@ LESS_VARIANCE = Claim(
     side=-1,
     boundary=lambda margin: 1.0,
     estimate=spread_ratio,
+    tested=partial(spread_ratio, permutations=PERMUTATIONS),
     p_value=_spread_p,
 )
 FASTER = Claim(
@@ -138,6 +146,7 @@ FASTER = Claim(
     side=-1,
     boundary=lambda margin: 0.0,
     estimate=time_lost,
+    tested=time_lost,
     p_value=_time_p,
 )
 CLAIMS = {claim.name: claim for claim in (NOT_WORSE, LESS_VARIANCE, FASTER, WITHIN_HALF)}

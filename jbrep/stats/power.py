@@ -60,9 +60,10 @@ def obstacle(rules: Rules, claim: str, arms: Arms) -> str | None:
     fewest = min(arms.units, arms.baseline)
     if fewest < FEWEST:
         return f"a side has {fewest} runs or encoders, and verdicts take {FEWEST}"
-    if _least_p(claim, arms) > _level(Planned(rules, (*range(arms.runs),))):
+    level = _level(Planned(rules, (*range(arms.runs),)))
+    if _least_p(claim, arms) > level:
         return f"its least p-value is {_least_p(claim, arms):.2g}, above its level"
-    most = most_failing(0, arms.units)
+    most = most_failing(0, arms.units, level)
     if most > rules.failing:
         what = "encoders" if arms.units < arms.runs else "runs"
         return (

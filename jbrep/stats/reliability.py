@@ -72,7 +72,7 @@ def fixed_policy(runs: list[RunCurve], end: float) -> dict[str, Array]:
     }
     for i, run in enumerate(runs):
         if run.failed_at is None:
-            last = run.returns[run.steps <= end][-1]
+            last = run.evaluations[np.flatnonzero(run.steps <= end)[-1]]
             numbers["policy_dispersion"][i] = iqr(last)
             numbers["policy_risk"][i] = expected_shortfall(last, TAIL)
     return numbers

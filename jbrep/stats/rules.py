@@ -36,6 +36,10 @@ from jbrep.stats.verdict import (
     Verdicts,
 )
 
+NONE_PRIMARY = (
+    "No cell was named primary before the runs: all numbers are exploratory, and there are no "
+    "verdicts."
+)
 ERROR = 0.05  # the probability that any of a study's verdicts is wrong, two-sided
 _USUAL_LOOKS = (0.5, 1.0)
 
@@ -119,10 +123,7 @@ class Planned:
         """How verdicts are reached, in sentences."""
         cells = len(self.rules.primary)
         if not cells:
-            return (
-                "No cell was named primary before the runs: all numbers are exploratory, and there "
-                "are no verdicts.",
-            )
+            return (NONE_PRIMARY,)
         shared = "one primary cell has" if cells == 1 else f"{cells} primary cells share"
         counts = " and ".join(map(str, self.counts))
         levels = ", at O'Brien and Fleming's levels" if len(self.counts) > 1 else ""
@@ -237,7 +238,7 @@ def _tested(
     boundary = estimated.boundary
     p = claim.p_value(x, y, frame, boundary, seed)
     direction = claim.side * np.sign(estimated.estimate.value - boundary) if p <= level else 0
-    reason = _reason(claim, x, y, frame, planned.rules, direction)
+    reason = _reason(claim, x, y, frame, planned.rules, direction, level)
     if reason is None and np.isnan(p):
         reason = "nothing varies from run to run"
     if reason is None and not direction and look < len(planned.counts):
@@ -247,13 +248,15 @@ def _tested(
         verdict={1: SUPPORTED, -1: CONTRADICTED, 0: UNDECIDED}[0 if reason else int(direction)],
         p=p,
         level=level,
-        interval=claim.estimate(x, y, frame, 1 - level, seed),
+        interval=claim.tested(x, y, frame, 1 - level, seed),
         look=look,
         reason=reason,
     )
 
 
-def _reason(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, direction: int) -> str | None:
+def _reason(
+    claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, direction: int, level: float
+) -> str | None:
     """Why there can't be a verdict; None if there can."""
     fewest, what = min(x.units, y.units), "encoders" if x.by_encoder else "runs"
     if fewest < FEWEST:
@@ -261,7 +264,7 @@ def _reason(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, direction:
     if not learns(y, frame):
         return "agents on the full state didn't learn"
     if claim.estimate is kept_gain and direction > 0:
-        most = most_failing(x.units - x.learnt, x.units)
+        most = most_failing(x.units - x.learnt, x.units, level)
         if most > rules.failing:
             return (
                 f"up to {100 * most:.0f} % of its {what} may fail to learn; the limit is "
@@ -270,10 +273,16 @@ def _reason(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, direction:
     return None
 
 
-def most_failing(failing: int, runs: int) -> float:
-    """The exact upper bound (Clopper and Pearson 1934) at 95 % on the share of runs that fail."""
+def most_failing(failing: int, runs: int, level: float) -> float:
+    """The exact upper bound on the share of runs that fail (Clopper and Pearson 1934).
+
+    Args:
+        failing: runs that failed.
+        runs: in all.
+        level: of the test that rests on it, so that they err together no more often.
+    """
     test = binomtest(failing, runs, alternative="less")
-    return float(test.proportion_ci(LEVEL, method="exact").high)
+    return float(test.proportion_ci(1 - level, method="exact").high)
 
 
 def _estimated(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, seed: int) -> Verdict:

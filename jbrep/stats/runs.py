@@ -177,7 +177,7 @@ def with_failure_returns(runs: Sequence[RunCurve]) -> list[RunCurve]:
 
     That is the least possible return of the task where it is known, else the worst return of any
     episode in which a run of that task and algorithm was evaluated, whatever its representation.
-    It stays unknown, None, where none was evaluated.
+    Where none was evaluated, it stays as it was.
     """
     worst: dict[tuple[str, str], float] = {}
     for run in runs:
@@ -185,7 +185,10 @@ def with_failure_returns(runs: Sequence[RunCurve]) -> list[RunCurve]:
         key = run.task, run.algorithm
         worst[key] = min(worst.get(key, np.inf), float(seen))
     known = {key: value for key, value in worst.items() if np.isfinite(value)}
-    return [replace(run, failure_return=known.get((run.task, run.algorithm))) for run in runs]
+    return [
+        replace(run, failure_return=known.get((run.task, run.algorithm), run.failure_return))
+        for run in runs
+    ]
 
 
 def groups(runs: Sequence[RunCurve], baseline: str) -> dict[tuple[str, str], Group]:

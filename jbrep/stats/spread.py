@@ -16,10 +16,9 @@ from scipy.optimize import brentq
 from jbrep.stats.bootstrap import Array, Interval
 
 PERMUTATIONS = 9999
-_FOR_INTERVALS = 499
+TO_SHOW = 499  # permutations, for intervals that no test rests on
 _FURTHEST = 12.0  # logarithm of a ratio of spreads: nobody has seen more
 _CLOSE = 5e-3  # of that logarithm
-_LEVEL = 0.95  # of intervals that are shown; those of tests have higher ones
 _AT_ONCE = 1 << 22  # numbers in memory
 
 
@@ -51,11 +50,13 @@ def _median(values: Array) -> Array:
     return (ordered[..., last // 2] + ordered[..., -(-last // 2)]) / 2
 
 
-def ratio_of_spreads(curves: Curves, level: float, seed: int) -> Interval:
+def ratio_of_spreads(
+    curves: Curves, level: float, seed: int, permutations: int = TO_SHOW
+) -> Interval:
     """By what the deviations of x must be divided to spread like those of y, with an interval.
 
     The interval has the ratios that the permutation test doesn't reject (Hodges and Lehmann 1963):
-    that of a test by its own permutations, so that they agree. Ratios are looked for from e^-12 to
+    with `PERMUTATIONS`, as `spread_p` has, they agree. Ratios are looked for from e^-12 to
     e^12; all is NaN where no curves differ from one another.
     """
     most, least = _excess(curves, -_FURTHEST), _excess(curves, _FURTHEST)
@@ -65,7 +66,7 @@ def ratio_of_spreads(curves: Curves, level: float, seed: int) -> Interval:
         value = float(brentq(partial(_excess, curves), -_FURTHEST, _FURTHEST))
     else:
         value = _FURTHEST if least >= 0 else -_FURTHEST
-    drawn = _permuted(curves, PERMUTATIONS if level > _LEVEL else _FOR_INTERVALS, seed)
+    drawn = _permuted(curves, permutations, seed)
 
     def is_rejected(log_ratio: float) -> bool:
         return _p(curves, log_ratio, drawn) <= 1 - level

@@ -7,7 +7,7 @@ from typing import Any
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.files.storage import exists
-from jbrep.files.tables import count, finite, read_csv, write_csv
+from jbrep.files.tables import Columns, count, finite, read_csv, write_csv
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.rollouts.sources import find_player
 from jbrep.stats.scale import STILL
@@ -15,7 +15,7 @@ from jbrep.stats.scale import STILL
 REFERENCE_RETURNS = "references.csv"
 RANDOM, HAND_WRITTEN = "random", "hand-written"
 _POLICIES = {STILL: "still", RANDOM: "uniform", HAND_WRITTEN: "heuristic"}
-_COLUMNS = ("task", "policy", "episode", "return")
+_COLUMNS: Columns = {"task": str, "policy": str, "episode": count, "return": finite}
 _Row = tuple[Any, ...]  # task, policy, episode, return
 References = dict[str, dict[str, list[float]]]  # returns by task and policy
 
@@ -48,7 +48,7 @@ def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | 
         path.unlink(missing_ok=True)
         return None
     if rows != there:
-        write_csv(path, _COLUMNS, rows)
+        write_csv(path, [*_COLUMNS], rows)
     return path
 
 
@@ -66,7 +66,7 @@ def read_references(folder: Path) -> References:
 
 def _rows(path: Path) -> list[_Row]:
     """What the file has; nothing if there is none."""
-    return read_csv(path, (str, str, count, finite)) if exists(path) else []
+    return read_csv(path, _COLUMNS) if exists(path) else []
 
 
 def _kept(there: list[_Row], task: Task, policy: str, episodes: int) -> list[_Row]:

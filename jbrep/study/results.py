@@ -13,7 +13,7 @@ from jbrep.encoders import FULL
 from jbrep.envs.task import Task, read_task
 from jbrep.errors import InputError
 from jbrep.files.storage import exists, write_whole
-from jbrep.files.tables import write_csv
+from jbrep.files.tables import Columns, count, finite, write_csv
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, runs_below
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.stats.rules import Planned
@@ -26,7 +26,10 @@ from jbrep.text import rounded, table
 RETURNS = "returns.csv"
 STATISTICS = "statistics.json"
 Ended = dict[Path, dict[str, Any]]  # what run.json says of each run that has ended, by folder
-_COLUMNS = ("task", "algorithm", "representation", "seed", "step", "episode", "return")
+COLUMNS: Columns = {  # of the long table of returns
+    **{"task": str, "algorithm": str, "representation": str},
+    **{"seed": count, "step": count, "episode": count, "return": finite},
+}
 
 
 class Results(NamedTuple):
@@ -181,7 +184,7 @@ def write_results(results: Results, folder: Path) -> list[Path]:
     """
     contents = record(folder, results.ended, results.left_out)
     paths = [folder / RETURNS, folder / RECORD]
-    write_csv(paths[0], _COLUMNS, _rows(results.runs))
+    write_csv(paths[0], [*COLUMNS], _rows(results.runs))
     write_whole(paths[1], as_json(contents))
     if results.analysis:
         paths.append(folder / STATISTICS)

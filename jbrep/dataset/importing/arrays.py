@@ -10,6 +10,7 @@ from jbrep.dataset.importing.episodes import (
     Incoming,
     Source,
     check_kinds,
+    flags,
     incoming,
 )
 from jbrep.dataset.importing.flat import CHUNK, PerEpisode, check_columns, split
@@ -85,15 +86,15 @@ def _listed(where: str, given: dict[str, Any]) -> Incoming | None:
     check_lengths(where, {n: len(v) for n, v in arrays.items()})
     last = {} if final is None else {"final_observation": np.asarray(final)[None]}
     check_kinds(where, kinds({**arrays, **last}))
-    ends = [arrays[n].astype(bool) for n in ("terminated", "truncated") if n in arrays]
-    check_ends(where, *ends)
+    ends = {n: flags(where, n, arrays[n]) for n in ("terminated", "truncated") if n in arrays}
+    check_ends(where, *ends.values())
     return incoming(
         where,
         arrays["observation"],
         arrays["action"],
         arrays["reward"],
         None if final is None else np.asarray(final),
-        bool(arrays["terminated"][-1:].any()) if "terminated" in arrays else False,
+        bool(ends["terminated"][-1:].any()) if "terminated" in ends else False,
         seed,
     )
 

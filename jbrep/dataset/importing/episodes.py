@@ -120,6 +120,17 @@ def _single(where: str, what: str, values: Array) -> NDArray[np.float32]:
     return single
 
 
+def flags(where: str, name: str, values: Array) -> NDArray[np.bool_]:
+    """Whether each row is such an end.
+
+    Raises:
+        InputError: a value is neither 0 nor 1.
+    """
+    if not np.isin(values, (0, 1)).all():
+        raise InputError(f"{where} has a {name} that is neither true nor false, 0 nor 1")
+    return values.astype(bool)
+
+
 def check_kinds(name: str, columns: Mapping[str, tuple[np.dtype[Any], Sequence[int]]]) -> None:
     """Make sure that columns hold what can be imported.
 

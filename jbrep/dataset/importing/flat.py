@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.dataset.importing.episodes import WIDE, Incoming, check_kinds, incoming
+from jbrep.dataset.importing.episodes import WIDE, Incoming, check_kinds, flags, incoming
 from jbrep.dataset.schema import UNKNOWN_SEED
 from jbrep.envs.task import MAX_EPISODE_STEPS
 from jbrep.errors import InputError
@@ -157,7 +157,7 @@ def split(name: str, chunks: Iterable[Rows], once: PerEpisode) -> Iterator[Incom
         chunk = {n: narrow(n, values) for n, values in given.items()}
         rest = chunk if rest is None else {n: np.concatenate((rest[n], chunk[n])) for n in rest}
         begin = 0
-        for end in _ends(rest):
+        for end in _ends(name, rest):
             yield from _some(splitter.episode({n: v[begin:end] for n, v in rest.items()}))
             begin = end
         rest = {n: v[begin:] for n, v in rest.items()}
@@ -185,12 +185,12 @@ def _some(episode: Incoming | None) -> list[Incoming]:
     return [] if episode is None else [episode]
 
 
-def _ends(rows: Rows) -> list[int]:
+def _ends(name: str, rows: Rows) -> list[int]:
     """Where episodes end: after which rows, but the last one unless it says so itself."""
     is_end = np.zeros(len(rows["reward"]), dtype=bool)
     for flag in ("terminated", "truncated"):
         if flag in rows:
-            is_end |= rows[flag].astype(bool)
+            is_end |= flags(name, flag, rows[flag])
     if "episode" in rows:
         is_end[:-1] |= rows["episode"][1:] != rows["episode"][:-1]
     elif "step" in rows:
