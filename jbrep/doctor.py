@@ -74,7 +74,7 @@ def _gpu() -> str:
     except ModuleNotFoundError:
         return "not looked for, without torch"
     if not torch.cuda.is_available():
-        return "none: train-dae takes the CPU, as rl and study always do"
+        return "none: train-dae takes the CPU, as do rl and study"
     device = torch.cuda.get_device_properties(0)
     memory = f"{device.total_memory / 2**30:.0f} GiB"
     return f"{device.name}, {memory}, CUDA {torch.version.cuda}: train-dae takes it"

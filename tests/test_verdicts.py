@@ -115,7 +115,7 @@ def test_a_reader_gets_the_numbers_with_numpy_alone(looks, monkeypatch, capsys):
     (block,) = re.findall(r"^```python\n(import numpy.*?)^```", DOCS.read_text(), re.M | re.S)
     assert len([line for line in block.splitlines() if line]) <= 15
     monkeypatch.chdir(folder.parent / "whole")
-    exec(compile(block.replace("runs/decide/", ""), "block", "exec"), {})
+    exec(compile(block.replace("runs/demo/", ""), "block", "exec"), {})
     printed = dict(line.split(": ", 1) for line in capsys.readouterr().out.splitlines())
     analysis = found[SEEDS][0]
     group = analysis.groups[0]

@@ -186,7 +186,7 @@ def policies(as_json: bool) -> None:
 @click.command(epilog=example("jbrep behaviour runs/full runs/dae-4 --out behaviour"))
 @click.argument("policies", nargs=-1, required=True)
 @task_options()
-@click.option("--episodes", default=100, show_default=True, type=POSITIVE, help="Of each policy.")
+@click.option("--episodes", default=100, show_default=True, type=POSITIVE, help="Of each run.")
 @click.option(
     "--target-yaw", default=45.0, show_default=True, help="Where every target points [degrees]."
 )
