@@ -25,8 +25,12 @@ class Progress(tqdm):
         super().__init__(*args, **options)
 
     def set_postfix(self, *args: Any, refresh: bool = False, **values: Any) -> None:
-        """What stands behind the rate, from the next time on that anything is shown."""
-        super().set_postfix(*args, refresh=refresh, **values)
+        """What stands behind the rate, from the next time on that anything is shown.
+
+        With refresh that is at once, if it is a bar.
+        """
+        is_bar = sys.stderr is not None and sys.stderr.isatty()
+        super().set_postfix(*args, refresh=refresh and is_bar, **values)
 
     def set_postfix_str(self, s: str = "", refresh: bool = False) -> None:
         """The same, as text."""

@@ -113,14 +113,14 @@ class Study:
         """Check where data come from, and that the study can make its encoders of them."""
         if self.data and bool(self.data.steps) == bool(self.data.folder):
             raise InputError("data must have either steps, to collect, or the folder of a data set")
-        if self.data and self.data.steps:
-            for seed in (self.data.seed, self.data.seed + self.data.sets - 1):
-                Settings(task=_ANY_TASK, steps=self.data.steps, seed=seed)  # checks the numbers
         if self.data and not 1 <= self.data.sets <= (1 if self.data.folder else MAX_ENCODERS):
             raise InputError(
                 f"data.sets is {self.data.sets}: it must be from 1 to {MAX_ENCODERS:,} where data "
                 "are collected, and is left out where there is a folder"
             )
+        if self.data and self.data.steps:
+            for seed in (self.data.seed, self.data.seed + self.data.sets - 1):
+                Settings(task=_ANY_TASK, steps=self.data.steps, seed=seed)  # checks the numbers
         if self.training and not self.data:
             raise InputError("training is for encoders made by the study: [data] is missing")
         for given, representation in zip(self.representations, self.observed, strict=True):
