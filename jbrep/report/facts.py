@@ -20,6 +20,10 @@ from jbrep.text import SIGNIFICANT, number, slug
 Row = tuple[str, ...]
 Rows = list[Row]
 _BARE = re.compile(r"[\w-]+", re.ASCII)  # a key that TOML needs no quotes for
+_OPTIONS = (  # of jbrep rl, by the names of settings
+    *("task", "algorithm", "preset", "trainer", "precision", "device", "steps"),
+    *("evaluate_every", "evaluation_episodes", "final_episodes"),
+)
 
 
 def outline(tables: Tables) -> str:
@@ -271,12 +275,6 @@ def _inline(value: Any) -> str:
 def _folder(settings: Mapping[str, Any]) -> str:
     """Of the runs with a label, below that of all; a task's id may contain a slash."""
     return "/".join(map(slug, (settings["task"], learner(settings), settings["representation"])))
-
-
-_OPTIONS = (
-    *("task", "algorithm", "preset", "trainer", "precision", "device", "steps"),
-    *("evaluate_every", "evaluation_episodes", "final_episodes"),
-)
 
 
 def _command(shared: LabelRecord, out: str) -> str:

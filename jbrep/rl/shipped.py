@@ -1,6 +1,5 @@
 """The policies that ship: the best agent that was trained for each of the Jitterbug's tasks."""
 
-import csv
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -10,15 +9,14 @@ import numpy as np
 from jbrep.envs.task import Array, Task
 from jbrep.errors import DamageError, InputError
 from jbrep.files import container
-from jbrep.files.storage import exists, read_regular
-from jbrep.files.tables import write_csv
+from jbrep.files.storage import exists
+from jbrep.files.tables import Columns, count, finite, read_csv, write_csv
 from jbrep.rl.files import POLICY_SUFFIX
 
 SHIPPED = "trained"  # what commands call the one that ships for their task
 FOLDER = Path(__file__).parent / "shipped"
 _RETURNS = "returns.csv"
-_COLUMNS = ("task", "policy", "episode", "return")
-_MAX_BYTES = 1 << 20
+_COLUMNS: Columns = {"task": str, "policy": str, "episode": count, "return": finite}
 
 Returns = Mapping[str, Array]  # by policy, in the first episodes that every run is evaluated on
 
@@ -75,20 +73,18 @@ def write_returns(played: Mapping[str, Returns], folder: Path = FOLDER) -> None:
         for policy, values in returns.items()
         for episode, value in enumerate(values)
     )
-    write_csv(folder / _RETURNS, _COLUMNS, rows)
+    write_csv(folder / _RETURNS, [*_COLUMNS], rows)
 
 
 def _read_returns() -> dict[str, Returns]:
     path = FOLDER / _RETURNS
     try:
-        header, *rows = csv.reader(read_regular(path, _MAX_BYTES).decode().splitlines())
-        if tuple(header) != _COLUMNS:
-            raise ValueError
-        found: dict[str, dict[str, list[float]]] = {}
-        for task, policy, _, value in rows:
-            found.setdefault(task, {}).setdefault(policy, []).append(float(value))
-    except (OSError, ValueError) as error:
+        rows = read_csv(path, _COLUMNS)
+    except InputError as error:
         raise DamageError(f"{path} is damaged: install jbrep again") from error
+    found: dict[str, dict[str, list[float]]] = {}
+    for task, policy, _, value in rows:
+        found.setdefault(task, {}).setdefault(policy, []).append(value)
     return {
         task: {policy: np.array(values) for policy, values in returns.items()}
         for task, returns in found.items()
