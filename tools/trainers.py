@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from jbrep.errors import InputError
 from jbrep.figures import write
@@ -30,6 +31,7 @@ SB3, *COHORTS = ARMS = ("sb3", "float32", "bfloat16")
 LEARNERS = ("sac", "ddpg")
 WIDE, NARROW = 100, 50  # points of return
 SURE, USUAL = 0.99, 0.90  # of intervals: to call arms different, and to call them equal
+POWER = 0.8
 HEADER = (
     "cohort, measure",
     "mean",
@@ -40,6 +42,7 @@ HEADER = (
     "p",
 )
 SUMMARY = "summary.txt"
+UNDECIDED = "undecided"
 
 
 class Compared(NamedTuple):
@@ -89,7 +92,16 @@ def verdict(measures: Mapping[str, Compared]) -> str:
     for margin in (NARROW, WIDE):
         if all(each.is_within(margin) for each in measures.values()):
             return f"equal, within {margin} points"
-    return "undecided"
+    return UNDECIDED
+
+
+def runs_to_decide(x: Array, y: Array) -> int:
+    """Runs on either side that find means, if they are the same, equal within WIDE with POWER.
+
+    From the normal approximation of two one-sided tests with the deviations seen.
+    """
+    quantiles = stats.norm.ppf((1 + USUAL) / 2) + stats.norm.ppf((1 + POWER) / 2)
+    return int(np.ceil((x.var(ddof=1) + y.var(ddof=1)) * (quantiles / WIDE) ** 2))
 
 
 def read_arm(folder: Path, arm: str) -> list[RunCurve]:
@@ -137,7 +149,10 @@ def main(results: Path) -> None:
             its = measured(arms[arm])
             compared = {name: Compared.of(its[name], usual[name]) for name in usual}
             rows += [(f"{arm}, {name}", *each.cells) for name, each in compared.items()]
-            verdicts.append(f"{arm}: {verdict(compared)}")
+            verdicts.append(f"{arm}: {(outcome := verdict(compared))}")
+            if outcome == UNDECIDED:
+                runs_needed = max(runs_to_decide(its[name], usual[name]) for name in usual)
+                verdicts[-1] += f"; {runs_needed} runs on either side have a power of {POWER:.0%}"
         counts = ", ".join(f"{len(each)} of {arm}" for arm, each in arms.items())
         texts.append("\n".join((f"{learner}: runs, {counts}", table(HEADER, rows), *verdicts)))
     text = "\n\n".join(texts) + "\n"
