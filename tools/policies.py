@@ -1,8 +1,9 @@
 """Ship the best agent for each task: python tools/policies.py FOLDER...
 
 The folders have the runs of any studies. A task's best run has the highest mean return in the last
-tenth of training. Those episodes have other starts than the evaluation's, so the returns that are
-written, which are of the evaluation's episodes, aren't what it was chosen by.
+tenth of training; a task that none has learned gets no policy. Those episodes have other starts
+than the evaluation's, so the returns that are written, which are of the evaluation's episodes,
+aren't what it was chosen by.
 """
 
 import csv
@@ -23,6 +24,7 @@ from jbrep.rollouts.sources import find_player
 SHOWN = (SHIPPED, "heuristic")
 COUNTED = 100  # episodes
 LAST = 0.1  # part of training
+WORTHWHILE = 100  # return, of 1,000, below which an agent hasn't learned the task
 
 
 def score(run: Path, steps: int) -> float:
@@ -48,6 +50,9 @@ def main() -> None:
     folders = [Path(each) for each in sys.argv[1:]]
     played = {}
     for task, (value, run) in best(folders).items():
+        if value < WORTHWHILE:
+            print(f"{task}: not shipped, {value:.0f} in the last tenth of training of {run}")
+            continue
         save(load_run(run), file_of(task), SHIPPED)
         played[task] = {
             policy: find_player(policy, describe(task)).returns(COUNTED) for policy in SHOWN
