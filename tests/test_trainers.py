@@ -49,7 +49,7 @@ def test_verdicts_go_by_the_rule(tmp_path):
     ).stdout
     sac, ddpg = told.split("\n\n")
     assert sac.splitlines()[-2:] == ["float32: equal, within 50 points", "bfloat16: different"]
-    undecided = "undecided; 16 runs on either side have a power of 80%"
+    undecided = "undecided; 80% power to find equal means equal takes 16 runs on either side"
     assert ddpg.splitlines()[-2:] == ["float32: different", f"bfloat16: {undecided}"]
     assert (tmp_path / "summary.txt").read_text() == told
     assert list((tmp_path / "figures").glob("*.png"))

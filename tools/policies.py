@@ -24,7 +24,6 @@ from jbrep.rollouts.sources import find_player
 SHOWN = (SHIPPED, "heuristic")
 COUNTED = 100  # episodes
 LAST = 0.1  # part of training
-WORTHWHILE = 100  # return, of 1,000, below which an agent hasn't learned the task
 
 
 def score(run: Path, steps: int) -> float:
@@ -46,12 +45,21 @@ def best(folders: list[Path]) -> dict[str, tuple[float, Path]]:
     return {task: found[task] for task in TASKS if task in found}
 
 
+def has_learned(run: Path, task: str) -> bool:
+    """Whether a run's median return is nearer to the hand-written policy than to standing still."""
+    still, learned, written = (
+        np.median(find_player(policy, describe(task)).returns(COUNTED))
+        for policy in ("still", str(run), "heuristic")
+    )
+    return bool(learned - still > written - learned)
+
+
 def main() -> None:
     folders = [Path(each) for each in sys.argv[1:]]
     played = {}
     for task, (value, run) in best(folders).items():
-        if value < WORTHWHILE:
-            print(f"{task}: not shipped, {value:.0f} in the last tenth of training of {run}")
+        if not has_learned(run, task):
+            print(f"{task}: none shipped, as {run} returns about what standing still does")
             continue
         save(load_run(run), file_of(task), SHIPPED)
         played[task] = {

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy.stats import norm
 
 from jbrep.errors import InputError
 from jbrep.figures import write
@@ -42,7 +42,6 @@ HEADER = (
     "p",
 )
 SUMMARY = "summary.txt"
-UNDECIDED = "undecided"
 
 
 class Compared(NamedTuple):
@@ -54,12 +53,14 @@ class Compared(NamedTuple):
     surely: Interval  # the same at the level that calls them different
     ratio: Interval  # of variances
     p: float  # of equal variances
+    enough: int  # runs on either side that find the means, if they are the same, equal
 
     @classmethod
     def of(cls, x: Array, y: Array) -> "Compared":
         """Of the runs of a cohort (n,) and those of stable-baselines3 (m,)."""
         differences = (difference(x, y, level) for level in (USUAL, SURE))
-        return cls(x.mean(), y.mean(), *differences, variance_ratio(x, y, SURE), variance_p(x, y))
+        ratio, p = variance_ratio(x, y, SURE), variance_p(x, y)
+        return cls(x.mean(), y.mean(), *differences, ratio, p, runs_to_decide(x, y))
 
     @property
     def differs(self) -> bool:
@@ -92,7 +93,10 @@ def verdict(measures: Mapping[str, Compared]) -> str:
     for margin in (NARROW, WIDE):
         if all(each.is_within(margin) for each in measures.values()):
             return f"equal, within {margin} points"
-    return UNDECIDED
+    enough = max(each.enough for each in measures.values())
+    return (
+        f"undecided; {POWER:.0%} power to find equal means equal takes {enough} runs on either side"
+    )
 
 
 def runs_to_decide(x: Array, y: Array) -> int:
@@ -100,7 +104,7 @@ def runs_to_decide(x: Array, y: Array) -> int:
 
     From the normal approximation of two one-sided tests with the deviations seen.
     """
-    quantiles = stats.norm.ppf((1 + USUAL) / 2) + stats.norm.ppf((1 + POWER) / 2)
+    quantiles = norm.ppf((1 + USUAL) / 2) + norm.ppf((1 + POWER) / 2)
     return int(np.ceil((x.var(ddof=1) + y.var(ddof=1)) * (quantiles / WIDE) ** 2))
 
 
@@ -149,10 +153,7 @@ def main(results: Path) -> None:
             its = measured(arms[arm])
             compared = {name: Compared.of(its[name], usual[name]) for name in usual}
             rows += [(f"{arm}, {name}", *each.cells) for name, each in compared.items()]
-            verdicts.append(f"{arm}: {(outcome := verdict(compared))}")
-            if outcome == UNDECIDED:
-                runs_needed = max(runs_to_decide(its[name], usual[name]) for name in usual)
-                verdicts[-1] += f"; {runs_needed} runs on either side have a power of {POWER:.0%}"
+            verdicts.append(f"{arm}: {verdict(compared)}")
         counts = ", ".join(f"{len(each)} of {arm}" for arm, each in arms.items())
         texts.append("\n".join((f"{learner}: runs, {counts}", table(HEADER, rows), *verdicts)))
     text = "\n\n".join(texts) + "\n"
