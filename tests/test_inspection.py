@@ -391,8 +391,8 @@ def a_walk(walker, examples, stop=200):
     return Rollout(walker, "a walk", 0, observation, action, reward, False, True)
 
 
-def test_a_fan_foretells_what_comes_of_actions(walk, walker):
-    """Also across episodes' ends nothing would be foretold this well."""
+def test_a_fan_predicts_what_comes_of_actions(walk, walker):
+    """Also across episodes' ends nothing would be predicted this well."""
     others = Examples(walk.observations[1:], walk.actions[1:], "others")
     full = find("full", walker)
     fan = make_fan(a_walk(walker, walk), full, others)
@@ -449,7 +449,7 @@ def test_a_code_that_cannot_decode_is_read_by_regression(walk, walker):
     assert fan.explained[3, 0] > 0.9
 
 
-def test_too_little_to_foretell_from(walk, walker):
+def test_too_little_to_predict_from(walk, walker):
     full = find("full", walker)
     few = Examples(walk.observations[:1], walk.actions[:1], "")
     assert make_fan(a_walk(walker, walk, stop=4), full, few) is None

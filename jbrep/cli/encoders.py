@@ -52,7 +52,7 @@ def evaluate(
 ) -> None:
     """Show what encoders lose and keep, side by side.
 
-    Judged on the held-out episodes: how well they foretell the state and the reward, what they say
+    Judged on the held-out episodes: how well they predict the state and the reward, what they say
     of a good policy's value and action, linear and nonlinear probes, reconstruction, corruption,
     the latent's units and dimensions, nearest neighbours, and the prediction of the next latent. An
     encoder of your own is code such as mymodule:MyEncoder; its module is imported, which runs it.

@@ -61,7 +61,7 @@ def inspect(
     uniform, which needs a --task, as does an encoder by its name. An unfinished run plays its last
     checkpoint. The robot is shown where MuJoCo simulates it; with an encoder, what is decoded is
     shown beside what was observed, and for the Jitterbug the decoded robot beside the true one; so
-    are the next 20 steps as its latent foretells them, and the latent's slow and fast directions.
+    are the next 20 steps as its latent predicts them, and the latent's slow and fast directions.
     """
     if view and serve:
         raise InputError("--view and --serve exclude each other: choose one")

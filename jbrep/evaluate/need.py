@@ -18,7 +18,7 @@ from jbrep.stats.bootstrap import Array
 _HORIZON = 10  # steps ahead
 _NEEDED = 0.1  # need from which a feature is needed
 _KEPT = 0.5  # R^2 from which it is kept
-_FORETOLD = 0.1  # R^2 below which nothing can be learnt about what a prediction needs
+_PREDICTABLE = 0.1  # R^2 below which nothing can be learnt about what a prediction needs
 _NUMBERS = 1 << 18  # rows times features, at most, in which features are shuffled
 
 
@@ -27,7 +27,7 @@ class Needs(NamedTuple):
 
     Attributes:
         reward: for the mean reward of the next 10 steps, (d,); None where episodes are too short,
-            or it can't be foretold.
+            or it can't be predicted.
         controller: for that, directly or not, or for what a policy does, by the feature's name;
             empty where episodes are too short.
     """
@@ -118,12 +118,12 @@ def _shares(
     least = error(observation)
     explained = variance - least
     shares = np.zeros((observation.shape[1], wanted.shape[1]))
-    foretold = explained > _FORETOLD * variance
+    predicted = explained > _PREDICTABLE * variance
     for feature, column in enumerate(observation.T):
         shuffled = observation.copy()
         shuffled[:, feature] = random.permutation(column)
         more = error(shuffled) - least
-        shares[feature, foretold] = more[foretold] / explained[foretold]
+        shares[feature, predicted] = more[predicted] / explained[predicted]
     return shares.clip(0, 1)
 
 

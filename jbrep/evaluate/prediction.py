@@ -133,7 +133,7 @@ def changes(
     """What features change by in so many steps after rows, (n, d).
 
     Angles by all that they turn, each step the shorter way round: the difference of two angles
-    jumps where a joint turns more than half round, and hardly anything could foretell it.
+    jumps where a joint turns more than half round, and hardly anything could predict it.
 
     Args:
         task: which says what is an angle.

@@ -92,7 +92,7 @@ class _Steps(NamedTuple):
 
 
 def dynamics(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
-    """How well latent and action foretell, by a ridge regression, what comes next.
+    """How well latent and action predict, by a ridge regression, what comes next.
 
     R^2 of the next latent, predicted from latent and action, and predicted as unchanged; and R^2 of
     the change of the observation from latent and action, each feature's change scaled to unit

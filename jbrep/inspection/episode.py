@@ -31,7 +31,7 @@ def record_episode(
     Args:
         rollout: the episode.
         path: the .rrd file.
-        encoder: for the episode's task; its latent is shown with what it foretells, and its
+        encoder: for the episode's task; its latent is shown with what it predicts, and its
             reconstruction if it decodes.
         examples: what forecasts and directions are fitted to; the episode itself if not given.
 

@@ -1,4 +1,4 @@
-"""The next steps as an encoder's code foretells them, for several sequences of actions."""
+"""The next steps as an encoder's code predicts them, for several sequences of actions."""
 
 from typing import NamedTuple
 
@@ -74,7 +74,7 @@ class Fan(NamedTuple):
     def about(self) -> str:
         """What they are worth, as Markdown."""
         lines = [
-            f"Forecasts are fitted to {self.source}. Grey is what came true; orange is foretold "
+            f"Forecasts are fitted to {self.source}. Grey is what came true; orange is predicted "
             "for the actions taken; blue, green and pink for all actions held at their lowest, "
             "midway and highest. R² of each quantity's change over some steps, under the actions "
             "taken in this episode:",
@@ -89,7 +89,7 @@ class Fan(NamedTuple):
 
 
 def make_fan(rollout: Rollout, encoder: BaseEncoder, examples: Examples) -> Fan | None:
-    """Forecasts from every fifth state that has as many after it as are foretold.
+    """Forecasts from every fifth state that has as many after it as are predicted.
 
     Nothing is used of later states; of later actions, those that are said to be taken.
 
