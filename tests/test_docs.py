@@ -3,6 +3,8 @@
 import re
 import shlex
 import tomllib
+from dataclasses import fields
+from itertools import chain
 from pathlib import Path
 
 import click
@@ -11,7 +13,8 @@ import pytest
 
 from jbrep.cli import main
 from jbrep.envs import describe
-from jbrep.study.config import as_study
+from jbrep.stats.rules import Rules
+from jbrep.study.config import Data, Study, as_study
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / name for name in ("README.md", "data/README.md", "CONTRIBUTING.md")]
@@ -66,6 +69,21 @@ def test_the_features_are_those_of_the_environment_shown(tmp_path, monkeypatch):
     task = describe("Cart-v0", features=tmp_path / "features.toml")
     assert [(f.name, f.unit) for f in task.features] == [("position", "m"), ("speed", "m/s")]
     assert (task.reward_high, task.timestep, task.reproducible) == (0, 0.1, True)
+
+
+def test_the_table_of_keys_has_those_that_a_study_takes():
+    shown = re.findall(
+        r"^\| `([a-z_.]+)` \|[^|]*\|[^|]*\|$", (ROOT / "docs/studies.md").read_text(), re.M
+    )
+    tables = {"data": Data, "verdicts": Rules}
+    keys = (
+        [f"{field.name}.{key.name}" for key in fields(tables[field.name])]
+        if field.name in tables
+        else [field.name]
+        for field in fields(Study)
+        if field.name != "learners"  # the tables under algorithms
+    )
+    assert sorted(shown) == sorted(chain(*keys))
 
 
 @pytest.mark.parametrize("line", found(r"^ {4}jbrep ([^\n]*)"))

@@ -2,8 +2,8 @@
 
 The return of a run is a mean plus what its encoder adds plus what the run adds, each with a
 variance of its own: the one-way random effects model (Searle, Casella and McCulloch 1992, "Variance
-Components"). With as many runs of each encoder, the estimates are those of restricted maximum
-likelihood. Intervals assume normal distributions.
+Components"). The estimates are those of the analysis of variance, cut off at 0. Intervals assume
+normal distributions.
 """
 
 from typing import NamedTuple
