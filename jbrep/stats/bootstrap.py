@@ -16,7 +16,7 @@ _BOUNDS = (2.5, 97.5)  # [%]
 
 
 class Interval(NamedTuple):
-    """A value with its interval: the 95 % percentile bootstrap interval unless stated otherwise."""
+    """A value with its interval."""
 
     value: Any
     low: Any

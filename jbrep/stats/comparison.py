@@ -30,8 +30,7 @@ class Comparison:
     Args:
         representation: its name.
         numbers: COMPARISON_NUMBERS, each with its 95 % interval.
-        brown_forsythe_p: of equal variances of final returns, as a check of the permutation test;
-            NaN where it is undefined.
+        brown_forsythe_p: of equal variances of final returns; NaN where it is undefined.
         verdicts: one for each claim.
 
     Raises:

@@ -40,8 +40,9 @@ the others near 50, from runs that don't (40,000 samples each):
     ratio of variances: Bonett's         55.9  54.7  78.0    58.8  80.8  94.4
       of 99.44 %                         94.6  80.7  85.3    93.4  86.5  97.1
 
-because a group in which all runs happen to learn seems to vary little. That is why a verdict on
-variances also takes the permutation test (jbrep.stats.first_claims).
+because a group in which all runs happen to learn seems to vary little. That is why no verdict
+depends on a ratio of variances; those of the first release also took a permutation test
+(jbrep.stats.first_claims).
 """
 
 import math

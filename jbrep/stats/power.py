@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
-from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -61,8 +60,8 @@ def obstacle(rules: Rules, claim: str, arms: Arms) -> str | None:
     if fewest < FEWEST:
         return f"a side has {fewest} runs or encoders, and verdicts take {FEWEST}"
     level = _level(Planned(rules, (*range(arms.runs),)))
-    if _least_p(claim, arms) > level:
-        return f"its least p-value is {_least_p(claim, arms):.2g}, above its level"
+    if _least_p(claim) > level:
+        return f"its least p-value is {_least_p(claim):.2g}, above its level"
     most = most_failing(0, arms.units, level)
     if most > rules.failing:
         what = "encoders" if arms.units < arms.runs else "runs"
@@ -83,7 +82,7 @@ def prospects(planned: Planned, arms: Mapping[str, Arms]) -> Iterator[Prospect]:
     level = _level(planned)
     for cell in planned.rules.primary:
         for claim in planned.rules.claims:
-            least = _least_p(claim, arms[cell])
+            least = _least_p(claim)
             power = _power(claim, planned.rules.margin, arms[cell], level)
             yield Prospect(cell, claim, arms[cell], level, least, power)
 
@@ -92,12 +91,9 @@ def _level(planned: Planned) -> float:
     return levels(planned.looks, ERROR / max(1, len(planned.rules.primary)))[-1]
 
 
-def _least_p(claim: str, arms: Arms) -> float:
-    """Of a permutation of n and m curves, two-sided; that of a mean can be any."""
-    if claim != LESS_VARIANCE.name:
-        return 0.0
-    splits = comb(arms.units + arms.baseline, arms.units)
-    return 2 / min(PERMUTATIONS + 1, splits)
+def _least_p(claim: str) -> float:
+    """Of random permutations, two-sided, which are fewer than all; that of a mean can be any."""
+    return 2 / (PERMUTATIONS + 1) if claim == LESS_VARIANCE.name else 0.0
 
 
 @lru_cache(256)
