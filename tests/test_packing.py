@@ -41,6 +41,12 @@ def test_packs_are_even(tmp_path, workers, seeds, sizes):
     assert [len(pack) for pack in packs] == sizes
 
 
+def test_the_first_seeds_go_first_in_all_tasks(tmp_path):
+    packs = packs_of(tmp_path, 2, width=3, algorithms=("sac-modern",))
+    order = [(pack[0].seed, pack[0].task) for pack in packs]
+    assert order == [(seed, task) for seed in STUDY.seeds for task in STUDY.tasks]
+
+
 def test_a_width_is_not_passed_and_what_has_no_cohort_goes_alone(tmp_path):
     packs = packs_of(tmp_path, 2, width=5)
     assert [len(pack) for pack in packs] == [4] * 6 + [1] * 24

@@ -30,7 +30,7 @@ def usual_workers(plan: Plan) -> int:
 
 
 def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = None) -> list[Pack]:
-    """Runs in packs, one for a worker at a time, the longest first.
+    """Runs in packs, one for a worker at a time: the longest first, of these the first runs'.
 
     Runs of one task and learner can be in one pack, whatever they observe, if their trainer is the
     cohort. Their number is that with which the last worker ends earliest.
@@ -45,7 +45,9 @@ def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = 
         InputError: memory doesn't hold so many runs.
     """
     groups, alone = defaultdict[tuple[str, str], list[Cell]](list), []
-    for cell in cells:
+    place = {}
+    for number, cell in enumerate(cells):
+        place[cell.name] = number
         if plan.trainer(cell) == COHORT:
             groups[cell.task, cell.learner.name].append(cell)
         else:
@@ -60,7 +62,7 @@ def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = 
     choices = range(width or min(widest, max(most, 1)), 0, -1)
     each = [alone + [p for group in groups.values() for p in _split(group, n)] for n in choices]
     best = min(each, key=lambda packs: until_done([len(p) + _OVERHEAD for p in packs], workers))
-    return sorted(best, key=len, reverse=True)
+    return sorted(best, key=lambda pack: (-len(pack), place[pack[0].name]))
 
 
 def _most(plan: Plan, cells: Sequence[Cell], workers: int) -> int:
