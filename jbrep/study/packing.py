@@ -32,8 +32,9 @@ def usual_workers(plan: Plan) -> int:
 def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = None) -> list[Pack]:
     """Runs in packs, one for a worker at a time: the longest first, of these the first runs'.
 
-    Runs of one task and learner can be in one pack, whatever they observe, if their trainer is the
-    cohort. Their number is that with which the last worker ends earliest.
+    Runs of one task and learner whose trainer is the cohort are in one pack, whatever they observe,
+    if it is no more than their task has, or as much. The number of runs in a pack is that with
+    which the last worker ends earliest.
 
     Args:
         plan: of the study.
@@ -44,16 +45,19 @@ def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = 
     Raises:
         InputError: memory doesn't hold so many runs.
     """
-    groups, alone = defaultdict[tuple[str, str], list[Cell]](list), []
-    place = {}
+    groups, alone = defaultdict[tuple[str, str, int], list[Cell]](list), []
+    place, observed = {}, {}
     for number, cell in enumerate(cells):
         place[cell.name] = number
         if plan.trainer(cell) == COHORT:
-            groups[cell.task, cell.learner.name].append(cell)
+            seen = cell.task, cell.representation.name
+            if seen not in observed:
+                observed[seen] = _observed(plan, cell)
+            groups[cell.task, cell.learner.name, observed[seen]].append(cell)
         else:
             alone.append((cell,))
     widest = _WIDEST[plan.device]
-    most = min((_most(plan, group, workers) for group in groups.values()), default=widest)
+    most = min((_most(plan, g[0], key[2], workers) for key, g in groups.items()), default=widest)
     if width and width > most:
         raise InputError(
             f"the width is {width}: {workers} cohorts of {most} agents are the most that this "
@@ -65,16 +69,15 @@ def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = 
     return sorted(best, key=lambda pack: (-len(pack), place[pack[0].name]))
 
 
-def _most(plan: Plan, cells: Sequence[Cell], workers: int) -> int:
-    """How many runs like those memory holds, for each worker."""
+def _most(plan: Plan, cell: Cell, observed: int, workers: int) -> int:
+    """How many runs like this one memory holds, for each worker."""
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") * _SHARE
-    examples = {cell.representation.name: cell for cell in cells}.values()
-    of_each = memory_of(plan.run(cells[0]), max(_observed(plan, cell) for cell in examples))
+    of_each = memory_of(plan.run(cell), observed)
     return int((memory / workers - _OF_WORKER) // (of_each + _OF_AGENT))
 
 
 def _observed(plan: Plan, cell: Cell) -> int:
-    """Numbers that a run's replay memory has for an observation."""
+    """Numbers that a cohort has for each observation of a run: those of its task at least."""
     run, seen = plan.run(cell), cell.representation
     to_make = seen.training.get("latent", 0) if isinstance(seen, ByName) else 0
     with suppress(InputError):  # the study has yet to make it
