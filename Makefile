@@ -10,7 +10,7 @@ TASKS := move_from_origin face_direction move_in_direction move_to_position move
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes ablation ablation-speed screen screen-normalized breadth trainers policies behaviour clean
+.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes ablation ablation-speed screen screen-normalized confirm breadth trainers policies behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -102,22 +102,25 @@ ablation-speed: ## results/ablation-speed/ anew: an hour
 ablation ablation-speed: %: encoders/% data/unseen
 ablation ablation-speed: JUDGED = forward-8 dae-8 encoders/$@/$$task/*.safetensors
 ablation-speed: JUDGED_TASKS = move_in_direction
-screen: data/unseen ## results/screen/ anew: a night or two; makes its own data sets and encoders
+screen: ## results/screen/ anew: three hours; makes its own data sets and encoders
+confirm: screen ## results/confirm/ anew: an hour; on the encoders of the screen
 breadth: ## results/breadth/ anew: a night
 screen-normalized: screen
-screen: JUDGED = runs/screen/encoders/$$task/*.safetensors
+screen: JUDGED = $$(ls runs/screen/encoders/$$task/*.safetensors | grep -v -e '-s[1-9]') # made of set-0
+screen: JUDGED_ON = runs/screen/data/$$task/set-1
+JUDGED_ON = data/unseen/$$task
 JUDGED_TASKS = face_direction move_in_direction
 encoders/ablation encoders/ablation-speed: encoders/%: $(READY)
 	$(BIN)/python tools/ablate.py $* $@
 data/unseen: $(READY)
 	$(BIN)/jbrep collect --task face_direction --steps 500k --seed 100 --store-state --out $@/face_direction
 	$(BIN)/jbrep data derive $@/face_direction --task move_in_direction --out $@/move_in_direction
-desk ddpg yaw codes ablation ablation-speed screen screen-normalized breadth: $(READY)
+desk ddpg yaw codes ablation ablation-speed screen screen-normalized confirm breadth: $(READY)
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
 	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json references.csv) results/$@/
 	$(if $(JUDGED),for task in $(JUDGED_TASKS); do \
-	  $(BIN)/jbrep evaluate --encoder $(JUDGED) --data data/unseen/$$task --out results/$@/$$task || exit; \
+	  $(BIN)/jbrep evaluate --encoder $(JUDGED) --data $(JUDGED_ON) --out results/$@/$$task || exit; \
 	done)
 	$(BIN)/jbrep report results/$@ $(if $(JUDGED),--evaluation 'results/$@/{task}')
 
