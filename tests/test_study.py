@@ -96,6 +96,7 @@ def test_the_presets_are_studies():
             "ablation",
             "ablation-speed",
             "breadth",
+            "cheetah",
             "confirm",
             "demo",
             "codes",
