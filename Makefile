@@ -107,7 +107,7 @@ confirm: screen ## results/confirm/ anew: an hour; on the encoders of the screen
 breadth: ## results/breadth/ anew: a night
 cheetah: ## results/cheetah/ anew: hours
 screen-normalized: screen
-screen: JUDGED = $$(ls runs/screen/encoders/$$task/*.safetensors | grep -v -e '-s[1-9]') # made of set-0
+screen: JUDGED = $$(ls runs/screen/encoders/$$task/*.safetensors | grep -v -e '-s[1-9]' -e identity -e full-nominal -e noise) # these are the full observation
 screen: JUDGED_ON = runs/screen/data/$$task/set-1
 JUDGED_ON = data/unseen/$$task
 JUDGED_TASKS = face_direction move_in_direction
