@@ -103,11 +103,12 @@ ablation ablation-speed: %: encoders/% data/unseen
 ablation ablation-speed: JUDGED = forward-8 dae-8 encoders/$@/$$task/*.safetensors
 ablation-speed: JUDGED_TASKS = move_in_direction
 screen: ## results/screen/ anew: three hours; makes its own data sets and encoders
-confirm: screen ## results/confirm/ anew: an hour; on the encoders of the screen
+confirm: screen ## results/confirm/ anew: an hour after the screen, on its encoders
 breadth: ## results/breadth/ anew: a night
 cheetah: ## results/cheetah/ anew: hours
 screen-normalized: screen
-screen: JUDGED = $$(ls runs/screen/encoders/$$task/*.safetensors | grep -v -e '-s[1-9]' -e identity -e full-nominal -e noise) # these are the full observation
+# the first encoder of each kind; identity, full-nominal and noise keep the whole observation, which is judged anyway
+screen: JUDGED = $$(ls runs/screen/encoders/$$task/*.safetensors | grep -v -e '-s[1-9]' -e identity -e full-nominal -e noise)
 screen: JUDGED_ON = runs/screen/data/$$task/set-1
 JUDGED_ON = data/unseen/$$task
 JUDGED_TASKS = face_direction move_in_direction

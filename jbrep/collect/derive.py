@@ -68,8 +68,10 @@ def derive(
     described = task.describe(before.arguments, before.max_episode_steps)
     settings = replace(settings, task=described, store_state=store_state)
     versions = new_manifest(settings).versions
-    simulated = {**dataset.manifest.versions, "jbrep": versions["jbrep"]}  # any reads the states
-    if differing := differences(simulated, versions):
+    # the states of an earlier jbrep are as good; what simulated and draws them must be the same
+    if differing := differences(
+        {**dataset.manifest.versions, "jbrep": versions["jbrep"]}, versions
+    ):
         raise InputError(
             f"{source} was collected with other versions: {differing}; a derived data set needs "
             "the same"

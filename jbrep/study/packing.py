@@ -32,9 +32,9 @@ def usual_workers(plan: Plan) -> int:
 def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = None) -> list[Pack]:
     """Runs in packs, one for a worker at a time: the longest first, of these the first runs'.
 
-    Runs of one task and learner whose trainer is the cohort are in one pack, whatever they observe,
-    if it is no more than their task has, or as much. The number of runs in a pack is that with
-    which the last worker ends earliest.
+    Runs of one task and learner can be in one pack if their trainer is the cohort; those that
+    observe more numbers than their task has, only with others that observe as many. The number of
+    runs in a pack is that with which the last worker ends earliest.
 
     Args:
         plan: of the study.
@@ -57,7 +57,8 @@ def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = 
         else:
             alone.append((cell,))
     widest = _WIDEST[plan.device]
-    most = min((_most(plan, g[0], key[2], workers) for key, g in groups.items()), default=widest)
+    limits = (_most(plan, group[0], size, workers) for (_, _, size), group in groups.items())
+    most = min(limits, default=widest)
     if width and width > most:
         raise InputError(
             f"the width is {width}: {workers} cohorts of {most} agents are the most that this "
