@@ -105,8 +105,8 @@ ablation-speed: JUDGED_TASKS = move_in_direction
 screen: ## results/screen/ anew: three hours; makes its own data sets and encoders
 confirm: screen ## results/confirm/ anew: an hour after the screen, on its encoders
 confirm-move: screen ## results/confirm-move/ anew: three hours after the screen, on its encoders
-breadth: ## results/breadth/ anew: a night
-cheetah: ## results/cheetah/ anew: hours
+breadth: ## results/breadth/ anew: an hour
+cheetah: ## results/cheetah/ anew: half an hour
 screen-normalized: screen
 # the first encoder of each kind; identity, full-nominal and noise keep the whole observation, which is judged anyway
 screen: JUDGED = $$(ls runs/screen/encoders/$$task/*.safetensors | grep -v -e '-s[1-9]' -e identity -e full-nominal -e noise)
