@@ -47,6 +47,12 @@ def test_the_first_seeds_go_first_in_all_tasks(tmp_path):
     assert order == [(seed, task) for seed in STUDY.seeds for task in STUDY.tasks]
 
 
+def test_the_first_seeds_go_first_in_uneven_packs(tmp_path):
+    packs = packs_of(tmp_path, 2, 5, algorithms=("sac-modern",), seeds=(0, 1, 2, 3, 4, 5, 6))
+    order = [(len(pack), pack[0].seed) for pack in packs]
+    assert order == [(5, 0), (5, 0), *[(4, seed) for seed in (1, 3, 4, 5) for _ in STUDY.tasks]]
+
+
 def test_a_width_is_not_passed_and_what_has_no_cohort_goes_alone(tmp_path):
     packs = packs_of(tmp_path, 2, width=5)
     assert [len(pack) for pack in packs] == [4] * 6 + [1] * 24

@@ -87,9 +87,10 @@ def _observed(plan: Plan, cell: Cell) -> int:
 
 
 def _split(group: Sequence[Cell], most: int) -> list[Pack]:
-    """Packs of about the same size."""
+    """Packs of about the same size, the larger ones first."""
     count = -(-len(group) // most)
-    ends = [len(group) * number // count for number in range(count + 1)]
+    each, more = divmod(len(group), count)
+    ends = [number * each + min(number, more) for number in range(count + 1)]
     return [tuple(group[a:b]) for a, b in pairwise(ends)]
 
 
