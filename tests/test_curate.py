@@ -23,6 +23,7 @@ from jbrep.dataset.manifest import (
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
 from jbrep.errors import InputError
+from jbrep.jitterbug import model
 from jbrep.jitterbug.tasks import TASKS
 
 
@@ -194,6 +195,22 @@ def test_other_versions_are_not_passed_off_as_these(copied, tmp_path):
     with pytest.raises(InputError, match="a derived data set needs the same"):
         derive(copied, "move_to_pose", tmp_path / "derived")
     assert not (tmp_path / "derived").exists()
+
+
+def test_states_of_an_earlier_jbrep_are_derived_from_if_the_robot_is_the_same(
+    copied, tmp_path, monkeypatch
+):
+    manifest = read_manifest(copied)
+    write_manifest(copied, replace(manifest, versions={**manifest.versions, "jbrep": "0.0.9"}))
+    heavier = model.read_xml().replace('density="7700"', 'density="7701"')
+    with monkeypatch.context() as changed:
+        changed.setattr(model, "read_xml", lambda: heavier)
+        model.fast_model.cache_clear()
+        with pytest.raises(InputError, match="needs the same states"):
+            derive(copied, "move_to_pose", tmp_path / "derived")
+    model.fast_model.cache_clear()
+    assert not (tmp_path / "derived").exists()
+    assert derive(copied, "move_to_pose", tmp_path / "derived").rows == manifest.settings.steps
 
 
 def test_a_shard_written_by_another_hdf5_is_adopted_if_its_columns_are_the_same(copied):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from jbrep.collect.collector import Written, write_shards
 from jbrep.collect.policies import acts_on_observations
+from jbrep.collect.replay import replay_problems
 from jbrep.collect.shards import Missing, Produce
 from jbrep.dataset import Dataset, Settings, version1
 from jbrep.dataset.manifest import new_manifest, open_shard
@@ -45,8 +46,8 @@ def derive(
         num_threads: threads to use; None takes one for each core.
 
     Raises:
-        InputError: the source has no states, is unfinished or damaged, or was collected by a
-            policy that depends on observations; or as `collect` does.
+        InputError: the source has no states, is unfinished or damaged, was collected by a policy
+            that depends on observations or with other versions; or as `collect` does.
     """
     dataset = Dataset(source)
     settings = dataset.manifest.settings
@@ -68,20 +69,26 @@ def derive(
     described = task.describe(before.arguments, before.max_episode_steps)
     settings = replace(settings, task=described, store_state=store_state)
     versions = new_manifest(settings).versions
-    # the states of an earlier jbrep are as good; what simulated and draws them must be the same
-    if differing := differences(
-        {**dataset.manifest.versions, "jbrep": versions["jbrep"]}, versions
-    ):
-        raise InputError(
-            f"{source} was collected with other versions: {differing}; a derived data set needs "
-            "the same"
-        )
+    _check_versions(dataset, versions, num_threads)
     if (dataset.episodes["length"] < before.max_episode_steps).any():
         raise InputError(
             f"the physics diverged in {source}, after which no state is stored: run jbrep collect "
             f"--task {task_name} instead"
         )
     return write_shards(settings, folder, _deriving(dataset, task, settings, num_threads))
+
+
+def _check_versions(dataset: Dataset, versions: Mapping[str, str], num_threads: int | None) -> None:
+    """Check that this jbrep, MuJoCo and NumPy give the states of a data set; jbrep may be later."""
+    earlier = dataset.manifest.versions
+    if differing := differences({**earlier, "jbrep": versions["jbrep"]}, versions):
+        raise InputError(
+            f"{dataset.folder} was collected with other versions: {differing}; a derived data set "
+            "needs the same"
+        )
+    if earlier["jbrep"] != versions["jbrep"]:
+        for problem in replay_problems(dataset, 1, num_threads):
+            raise InputError(f"{problem} A derived data set needs the same states")
 
 
 def _deriving(
