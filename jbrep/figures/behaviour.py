@@ -102,22 +102,23 @@ def _draw_places(task: str, behaviours: Sequence[Behaviour], target_yaw: float) 
     across = -(-len(behaviours) // rows)
     width = COLUMN if across == 1 else PAGE
     figure = Figure(figsize=(width, 0.55 + rows * (0.4 + (width - 0.8) / across)))
-    panels = figure.subplots(rows, across, squeeze=False, sharex=True, sharey=True).ravel()
+    grid = figure.subplots(rows, across, squeeze=False, sharex=True, sharey=True)
+    panels = grid.ravel(order="F")  # before and after training are one above the other
     lowest = min(each.places[each.places > 0].min() for each in behaviours)
     norm = LogNorm(lowest, max(each.places.max() for each in behaviours))
-    hidden = len(panels) - len(behaviours)
     for axes in panels[len(behaviours) :]:
         axes.set_axis_off()
-    for axes, each in zip(panels, behaviours, strict=False):
+    for number, (axes, each) in enumerate(zip(panels, behaviours, strict=False), 1):
+        at_bottom = number % rows == 0 or number == len(behaviours)
         shown = np.ma.masked_equal(each.places.T, 0)
         mesh = axes.pcolormesh(each.edges, each.edges, shown, norm=norm, cmap="viridis")
         mesh.set_rasterized(True)
         _draw_target(axes, each.edges[-1], target_yaw)
         title = f"{each.name}\nreturn {np.median(each.returns):.0f}"
         axes.set_title(plain(title.replace(", ", "\n")), size=6.5)
-        axes.set(aspect="equal", xlabel="x [m]" if axes in panels[-across - hidden :] else "")
-        axes.tick_params(labelbottom=axes in panels[-across - hidden :])
-        axes.set_ylabel("y [m]" if axes in panels[::across] else "")
+        axes.set(aspect="equal", xlabel="x [m]" if at_bottom else "")
+        axes.tick_params(labelbottom=at_bottom)
+        axes.set_ylabel("y [m]" if number <= rows else "")
     figure.colorbar(mesh, ax=panels.tolist(), label="share of time", shrink=0.85, aspect=30)
     return figure
 

@@ -1,7 +1,7 @@
 """What evaluations say of the encoders of a study's runs, in its diagnostics.csv."""
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
@@ -62,7 +62,7 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
             task in turn. The first that knows an encoder counts.
 
     Returns:
-        A line for each representation that no evaluation knows.
+        A line for each task with representations that no evaluation knows.
 
     Raises:
         InputError: a given folder has no evaluation, or a file is of a newer jbrep.
@@ -141,11 +141,15 @@ def _key(row: Diagnosed) -> _Key:
 
 
 def _unknown(used: Sequence[Diagnosed], known: Mapping[_Key, _Values]) -> Iterator[str]:
-    """What to do about each representation without numbers."""
+    """What to do about the representations of each task without numbers."""
     encoders = Counter(row[:2] for row in used)
     missing = Counter(row[:2] for row in used if _key(row) not in known)
+    names = defaultdict[str, list[str]](list)
     for (task, name), count in missing.items():
-        of = "" if encoders[task, name] == 1 else f"{count} of {encoders[task, name]} encoders of "
+        total = encoders[task, name]
+        names[task].append(name if total == 1 else f"{name} ({count} of {total} encoders)")
+    for task, unknown in names.items():
         yield (
-            f"no diagnostics of {of}{name} for {task}: evaluate it, then jbrep report --evaluation"
+            f"no diagnostics for {task} of {', '.join(unknown)}: evaluate them, then jbrep report "
+            "--evaluation"
         )
