@@ -10,7 +10,7 @@ TASKS := move_from_origin face_direction move_in_direction move_to_position move
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes ablation ablation-speed screen screen-normalized confirm confirm-move breadth cheetah trainers policies behaviour clean
+.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes ablation ablation-speed screen screen-normalized confirm confirm-move longer breadth cheetah trainers policies behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -105,6 +105,7 @@ ablation-speed: JUDGED_TASKS = move_in_direction
 screen: ## results/screen/ anew: three hours; makes its own data sets and encoders
 confirm: screen ## results/confirm/ anew: an hour after the screen, on its encoders
 confirm-move: screen ## results/confirm-move/ anew: three hours after the screen, on its encoders
+longer: screen ## results/longer/ anew: half an hour after the screen, on its encoders
 breadth: ## results/breadth/ anew: an hour
 cheetah: ## results/cheetah/ anew: half an hour
 screen-normalized: screen
@@ -118,7 +119,7 @@ encoders/ablation encoders/ablation-speed: encoders/%: $(READY)
 data/unseen: $(READY)
 	$(BIN)/jbrep collect --task face_direction --steps 500k --seed 100 --store-state --out $@/face_direction
 	$(BIN)/jbrep data derive $@/face_direction --task move_in_direction --out $@/move_in_direction
-desk ddpg yaw codes ablation ablation-speed screen screen-normalized confirm confirm-move breadth cheetah: $(READY)
+desk ddpg yaw codes ablation ablation-speed screen screen-normalized confirm confirm-move longer breadth cheetah: $(READY)
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
 	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json references.csv) results/$@/
