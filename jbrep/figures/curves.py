@@ -179,14 +179,17 @@ def _grid(
     width = COLUMN if is_narrow else PAGE
     figure = Figure(figsize=(width, 0.5 + (2.0 if len(algorithms) < 3 else 1.6) * len(tasks)))
     panels = figure.subplots(len(tasks), len(algorithms), squeeze=False, sharey="row")
+    titles = max(len(f"{task}, {algorithm}") for task, algorithm in by_place)
+    gap = ", " if _TITLE * titles < width / len(algorithms) else ",\n"
     for (i, j), axes in np.ndenumerate(panels):
         group = by_place.get((tasks[i], algorithms[j]))
         if group is None:
             axes.set_axis_off()
             continue
         draw(axes, group)
-        axes.set_title(plain(f"{tasks[i]}, {algorithms[j]}"))
-        _training_axes(axes, group.grid[-1], extents[group.task])
+        axes.set_title(plain(f"{tasks[i]}{gap}{algorithms[j]}"))
+        ticks = 5 if len(algorithms) < _MOST_ACROSS else 3
+        _training_axes(axes, group.grid[-1], extents[group.task], ticks)
         axes.set_xlabel("training step" if i == len(tasks) - 1 else "")
         axes.set_ylabel("" if j else "return")
     below(figure, panels.ravel())
