@@ -140,9 +140,9 @@ policies: $(READY) ## the trained policies that ship, anew: hours; goes on where
 	$(BIN)/jbrep study studies/policies.toml --out runs/policies
 	$(BIN)/python tools/policies.py runs/policies
 
-behaviour: $(READY) ## results/behaviour/ anew, of the agents of make ablation
-	$(BIN)/jbrep behaviour $(addprefix runs/ablation/runs/move_in_direction/sac-modern/,full forward-8 dae-8) \
-	  --episodes 20 --out results/behaviour
+behaviour: $(READY) ## results/behaviour/ anew, of the agents of make confirm-move
+	$(BIN)/jbrep behaviour $(addprefix runs/confirm-move/runs/move_in_direction/small-ddpg/,full linear-changes-12 dae-12) \
+	  --episodes 7 --out results/behaviour
 
 clean: ## remove the environment and the demo's files
 	rm -rf $(VENV) $(DEMO) *.egg-info
