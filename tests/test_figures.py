@@ -191,6 +191,21 @@ def test_titles_of_many_representations_do_not_overlap(returns):
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
 
 
+def test_titles_of_many_algorithms_do_not_overlap():
+    full = [
+        run
+        for run in runs()
+        if (run.task, run.algorithm, run.representation) == (*GROUPS[0], "full")
+    ]
+    many = [replace(run, algorithm=f"algorithm-{number}") for number in range(6) for run in full]
+    (curves,) = (p for p in study_plots(analyse(many), [], {}, {}) if p.name == "representations")
+    figure = Drawing(curves, PAPER)._figure
+    titles = [t for t in figure.findobj(Text) if "algorithm-" in t.get_text()]
+    assert len(titles) == 6
+    boxes = [title.get_window_extent() for title in titles]
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+
+
 def test_a_study_of_many_representations_can_be_read():
     """Legends don't take the room of panels, and no two lines look alike."""
     some = [run for run in runs() if (run.task, run.algorithm) == GROUPS[0]]
@@ -486,6 +501,18 @@ def test_behaviour_is_drawn_from_its_tables(behaviours, tmp_path):
     mesh = drawn(places).axes[1].collections[0].get_array()
     assert mesh.sum() == pytest.approx(1)
     write((motor, places), tmp_path)
+
+
+def test_before_and_after_training_stand_one_above_the_other(behaviours):
+    titles = [f"{name}, {when}" for name in "abc" for when in ("before training", "4 runs")]
+    several = [replace(behaviours[0], name=title) for title in titles]
+    _, places = behaviour_plots("move_in_direction", several, SPEEDS, np.pi / 4)
+    panel = {axes.get_title(loc="left").split("\nreturn")[0]: axes for axes in drawn(places).axes}
+    for name in "abc":
+        above, below = (panel[f"{name}\n{when}"] for when in ("before training", "4 runs"))
+        above, below = (axes.get_subplotspec() for axes in (above, below))
+        assert (above.rowspan.start, below.rowspan.start) == (0, 1)
+        assert above.colspan == below.colspan
 
 
 def test_the_task_of_a_policy_is_needed_and_no_data_set():

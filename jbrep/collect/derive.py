@@ -86,9 +86,10 @@ def _check_versions(dataset: Dataset, versions: Mapping[str, str], num_threads: 
             f"{dataset.folder} was collected with other versions: {differing}; a derived data set "
             "needs the same"
         )
-    if earlier["jbrep"] != versions["jbrep"]:
-        for problem in replay_problems(dataset, 1, num_threads):
-            raise InputError(f"{problem} A derived data set needs the same states")
+    if earlier["jbrep"] != versions["jbrep"] and (
+        problem := next(replay_problems(dataset, 1, num_threads), None)
+    ):
+        raise InputError(f"{problem} A derived data set needs the same states")
 
 
 def _deriving(

@@ -179,8 +179,8 @@ def _grid(
     width = COLUMN if is_narrow else PAGE
     figure = Figure(figsize=(width, 0.5 + (2.0 if len(algorithms) < 3 else 1.6) * len(tasks)))
     panels = figure.subplots(len(tasks), len(algorithms), squeeze=False, sharey="row")
-    titles = max(len(f"{task}, {algorithm}") for task, algorithm in by_place)
-    gap = ", " if _TITLE * titles < width / len(algorithms) else ",\n"
+    longest = max(len(group.name) for group in groups)
+    gap = ", " if _TITLE * longest < width / len(algorithms) else ",\n"
     for (i, j), axes in np.ndenumerate(panels):
         group = by_place.get((tasks[i], algorithms[j]))
         if group is None:
@@ -188,20 +188,19 @@ def _grid(
             continue
         draw(axes, group)
         axes.set_title(plain(f"{tasks[i]}{gap}{algorithms[j]}"))
-        ticks = 5 if len(algorithms) < _MOST_ACROSS else 3
-        _training_axes(axes, group.grid[-1], extents[group.task], ticks)
+        _training_axes(axes, group.grid[-1], extents[group.task], len(algorithms))
         axes.set_xlabel("training step" if i == len(tasks) - 1 else "")
         axes.set_ylabel("" if j else "return")
     below(figure, panels.ravel())
     return figure
 
 
-def _training_axes(axes: Axes, last: float, extent: Limits, ticks: int = 5) -> None:
-    """Steps from 0 on, and returns."""
+def _training_axes(axes: Axes, last: float, extent: Limits, across: int) -> None:
+    """Steps from 0 on, and returns, of one of so many panels side by side."""
     axes.set(xlim=(0, max(last, 1)), ylim=extent.with_room(0.015))
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.xaxis.set_major_locator(MaxNLocator(ticks))
+    axes.xaxis.set_major_locator(MaxNLocator(5 if across < _MOST_ACROSS else 3))
 
 
 def below(figure: Figure, panels: Iterable[Axes]) -> None:
@@ -253,7 +252,7 @@ def _draw_runs(means: Mapping[Evaluated, float], references: References, looks: 
         axes.set_title(plain(group) + with_runs(names[j], [len(runs[label])]))
         last = max(key[4] for key in means if key[:2] == groups[i])
         extent = limits(of_task[groups[i][0]])
-        _training_axes(axes, last, extent, ticks=5 if across < 5 else 3)
+        _training_axes(axes, last, extent, across)
         is_lowest = i == len(groups) - 1 and j >= len(names) - across
         axes.set_xlabel("training step" if is_lowest else "")
         axes.set_ylabel("" if j % across else "return")

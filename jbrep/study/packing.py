@@ -5,8 +5,8 @@ import os
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from itertools import pairwise
 
+import numpy as np
 from joblib import cpu_count
 
 from jbrep.errors import InputError
@@ -88,10 +88,8 @@ def _observed(plan: Plan, cell: Cell) -> int:
 
 def _split(group: Sequence[Cell], most: int) -> list[Pack]:
     """Packs of about the same size, the larger ones first."""
-    count = -(-len(group) // most)
-    each, more = divmod(len(group), count)
-    ends = [number * each + min(number, more) for number in range(count + 1)]
-    return [tuple(group[a:b]) for a, b in pairwise(ends)]
+    parts = np.array_split(range(len(group)), -(-len(group) // most))
+    return [tuple(group[number] for number in part) for part in parts]
 
 
 def until_done(durations: Iterable[float], workers: int) -> float:
