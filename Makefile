@@ -104,7 +104,7 @@ ablation ablation-speed: JUDGED = forward-8 dae-8 encoders/$@/$$task/*.safetenso
 ablation-speed: JUDGED_TASKS = move_in_direction
 screen: ## results/screen/ anew: three hours; makes its own data sets and encoders
 confirm: screen ## results/confirm/ anew: an hour after the screen, on its encoders
-confirm-move: screen ## results/confirm-move/ anew: three hours after the screen, on its encoders
+confirm-move: screen ## results/confirm-move/ anew: two hours after the screen, on its encoders
 longer: screen ## results/longer/ anew: half an hour after the screen, on its encoders
 breadth: ## results/breadth/ anew: an hour
 cheetah: ## results/cheetah/ anew: half an hour
