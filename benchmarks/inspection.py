@@ -14,7 +14,7 @@ from timing import timed
 from jbrep.encoders import find
 from jbrep.inspection.episode import record_episode
 from jbrep.inspection.traversal import record_traversal
-from jbrep.rollouts.sources import find_episode
+from jbrep.play.sources import find_episode
 
 ROUNDS = 5
 TASK = "move_to_pose"  # which observes most

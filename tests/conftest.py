@@ -21,7 +21,7 @@ needs_egl = pytest.mark.skipif(not HEADLESS, reason="no EGL: install libegl1 and
 @pytest.fixture(scope="session", autouse=True)
 def quick_figures():
     """Fonts as outlines: embedding them takes half of a report's time."""
-    from jbrep.figures.style import PAPER
+    from jbrep.report.figures.style import PAPER
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PAPER, "pdf.fonttype", 3)
@@ -42,7 +42,7 @@ def quick_evaluations():
     """Nonlinear regressions that learn little; test_prediction.py has them learn."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jbrep.evaluate.regression._STEPS", 2)
-        patch.setattr("jbrep.rollouts.good_policy._EPISODES", 2)
+        patch.setattr("jbrep.play.good_policy._EPISODES", 2)
         yield
 
 

@@ -37,4 +37,4 @@ def write_again(source, folder):
 
 def contents(folder):
     """The bytes of all files that belong to a data set."""
-    return {p.name: p.read_bytes() for p in sorted(folder.iterdir()) if p.name != ".lock"}
+    return {p.name: p.read_bytes() for p in sorted(folder.iterdir())}

@@ -28,7 +28,7 @@ from jbrep.dataset.schema import episode_seed
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe, environment_id
 from jbrep.errors import InputError
-from jbrep.files.lock import exclusive
+from jbrep.records.lock import exclusive
 
 
 def test_rows_are_the_episodes_of_a_random_policy(collected):
@@ -337,7 +337,7 @@ def test_a_write_that_reads_back_otherwise_is_refused(collected, tmp_path, monke
         )
         with pytest.raises(InputError, match=r"can't write .*it reads back otherwise"):
             write_again(collected, tmp_path / "data")
-    assert [path.name for path in (tmp_path / "data").iterdir()] == [".lock"]
+    assert [path.name for path in (tmp_path / "data").iterdir()] == []
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -362,7 +362,7 @@ def test_a_second_collector_is_refused_until_the_first_is_dead(collected, tmp_pa
     folder = tmp_path / "data"
     folder.mkdir()
     script = (
-        "import sys, time; from pathlib import Path; from jbrep.files.lock import exclusive\n"
+        "import sys, time; from pathlib import Path; from jbrep.records.lock import exclusive\n"
         "with exclusive(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
     holder = subprocess.Popen([sys.executable, "-c", script, folder], stdout=subprocess.PIPE)

@@ -12,7 +12,7 @@ from jbrep.dataset.manifest import read_manifest, write_manifest
 from jbrep.encoders import find, load, save
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.files import commit
+from jbrep.records import commit
 from jbrep.rl.fields import check_run
 
 HEAD = "0123456789" * 4

@@ -11,7 +11,7 @@ from tensors import TensorWindows
 from jbrep.dae.network import ARCHITECTURES
 from jbrep.dae.objective import Reconstruction
 from jbrep.errors import DamageError, InputError
-from jbrep.files import container
+from jbrep.records import container
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT
 from jbrep.training import checkpoint

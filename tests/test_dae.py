@@ -12,8 +12,8 @@ from jbrep.dae.network import ARCHITECTURES, layers, stacks
 from jbrep.dae.objective import Reconstruction
 from jbrep.encoders.encoder import run
 from jbrep.errors import InputError
-from jbrep.files import container
 from jbrep.methods.autoencoder import AE, DAE
+from jbrep.records import container
 from jbrep.training import checkpoint
 from jbrep.training.order import POOL, RUN, shuffled
 from jbrep.training.trainer import Schedule, Trainer, default_batch_size, get_device, prefetch

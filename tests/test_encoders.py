@@ -25,8 +25,8 @@ from jbrep.encoders.onnx import export
 from jbrep.encoders.shipped import names, source_of
 from jbrep.envs import Feature, JitterbugVecEnv, Task, describe
 from jbrep.errors import InputError
-from jbrep.files import container
 from jbrep.jitterbug.tasks import TASKS
+from jbrep.records import container
 
 TASK = describe("face_direction")
 PENDULUM = describe("Pendulum-v1", {"g": 1.6})

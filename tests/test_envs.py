@@ -240,7 +240,7 @@ _RENDERS = {
     "dm_control": "from jbrep import jitterbug\n"
     "jitterbug.load('face_direction').physics.render(48, 64)",
     "camera": "from jbrep.opengl import find_opengl; find_opengl()\n"
-    "from jbrep.render.pictures import Camera; Camera()",
+    "from jbrep.play.pictures import Camera; Camera()",
 }
 
 

@@ -29,10 +29,10 @@ from jbrep.evaluate.readout import correlation, dynamics, neighbours, probes
 from jbrep.evaluate.reconstruction import NOISES, corruption, reconstruction
 from jbrep.evaluate.summary import evaluation_text
 from jbrep.evaluate.truth import quantities, state
-from jbrep.figures import encoder_plots
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods import random
 from jbrep.methods.linear import principal_code
+from jbrep.report.figures import encoder_plots
 from jbrep.stats.bootstrap import bootstrap, by_episode
 
 

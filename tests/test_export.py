@@ -14,8 +14,8 @@ import pytest
 from jbrep.dataset import Dataset
 from jbrep.dataset.export import FORMATS, export
 from jbrep.errors import InputError
-from jbrep.files.lock import exclusive_file
 from jbrep.jitterbug.tasks import TASKS
+from jbrep.records.lock import exclusive_file
 
 
 @pytest.fixture(scope="module")

@@ -15,15 +15,15 @@ from PIL import Image
 
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.figures import behaviour_plots, encoder_plots, study_plots, write
-from jbrep.figures.claims import claims
-from jbrep.figures.curves import Return, every_run
-from jbrep.figures.diagnostics import _free
-from jbrep.figures.families import family
-from jbrep.figures.methods import method_plots, timescales
-from jbrep.figures.plot import Drawing
-from jbrep.figures.style import COLUMN, DARK, PAGE, PAPER, styles, with_runs
-from jbrep.rollouts.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
+from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
+from jbrep.report.figures import behaviour_plots, encoder_plots, study_plots, write
+from jbrep.report.figures.claims import claims
+from jbrep.report.figures.curves import Return, every_run
+from jbrep.report.figures.diagnostics import _free
+from jbrep.report.figures.families import family
+from jbrep.report.figures.methods import method_plots, timescales
+from jbrep.report.figures.plot import Drawing
+from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, styles, with_runs
 from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval

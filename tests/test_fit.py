@@ -22,12 +22,12 @@ from jbrep.dataset.manifest import open_shard, read_manifest
 from jbrep.dataset.scaling import SCALINGS
 from jbrep.encoders import load, save
 from jbrep.errors import InputError
-from jbrep.files.lock import exclusive
 from jbrep.methods import fit
 from jbrep.methods.fit import Fitter
 from jbrep.methods.held_out import ratio_to_pca
 from jbrep.methods.registry import METHODS, name_of, read_name
 from jbrep.methods.settings import REQUIRED
+from jbrep.records.lock import exclusive
 from jbrep.training import checkpoint
 from jbrep.training.rows import available_memory
 from jbrep.training.trainer import Schedule, Trainer

@@ -32,7 +32,7 @@ from jbrep.envs import describe
 from jbrep.envs.task import check_same
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import seen
-from jbrep.rollouts.rollout import replay
+from jbrep.play.rollout import replay
 
 
 def import_data(given, folder, task=None):

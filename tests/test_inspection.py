@@ -21,7 +21,6 @@ from jbrep.envs.encoding import as_encoder
 from jbrep.envs.physics import Motion
 from jbrep.errors import InputError
 from jbrep.evaluate.truth import state
-from jbrep.files import container
 from jbrep.inspection import inspect
 from jbrep.inspection.blueprint import curves_layout
 from jbrep.inspection.directions import name_directions
@@ -36,6 +35,11 @@ from jbrep.inspection.scene import contacts
 from jbrep.inspection.shapes import own_colours, shapes
 from jbrep.inspection.signals import MOST_LINES, panels
 from jbrep.inspection.traversal import POINTS, SPACING, sweep
+from jbrep.play import jitterbug
+from jbrep.play.jitterbug import reward_terms
+from jbrep.play.rollout import Rollout
+from jbrep.play.sources import find_episode
+from jbrep.records import container
 from jbrep.rl import Run
 from jbrep.rl.agent import make_agent, make_env
 from jbrep.rl.files import (
@@ -49,10 +53,6 @@ from jbrep.rl.files import (
     write_run,
 )
 from jbrep.rl.presets import Preset
-from jbrep.rollouts import jitterbug
-from jbrep.rollouts.jitterbug import reward_terms
-from jbrep.rollouts.rollout import Rollout
-from jbrep.rollouts.sources import find_episode
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
 ROWS = 1001

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from jbrep.errors import InputError
-from jbrep.figures import study_plots, write
-from jbrep.figures.curves import Return
-from jbrep.figures.limits import limits
-from jbrep.figures.style import PAPER
-from jbrep.files.tables import write_csv
+from jbrep.records.tables import write_csv
 from jbrep.report import write_report
+from jbrep.report.figures import study_plots, write
+from jbrep.report.figures.curves import Return
+from jbrep.report.figures.limits import limits
+from jbrep.report.figures.style import PAPER
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.rules import Planned, Rules

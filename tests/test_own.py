@@ -24,8 +24,8 @@ from jbrep.envs.encoding import as_encoder
 from jbrep.errors import InputError
 from jbrep.evaluate import diagnose
 from jbrep.evaluate.summary import evaluation_text
-from jbrep.figures import encoder_plots
 from jbrep.inspection import inspect
+from jbrep.report.figures import encoder_plots
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, ENCODER, RUN
 from jbrep.rl.policy import load_run
@@ -317,7 +317,7 @@ def test_evaluate_takes_code(tmp_path, monkeypatch):
     probes = {"nonlinear_probes": lambda encoder, held_out: {}}
     monkeypatch.setattr("jbrep.evaluate.evaluation._DIAGNOSTICS", probes)
     monkeypatch.setattr("jbrep.evaluate.summary.evaluation_text", lambda *given: "")
-    monkeypatch.setattr("jbrep.figures.encoder_plots", lambda evaluation: [])
+    monkeypatch.setattr("jbrep.report.figures.encoder_plots", lambda evaluation: [])
     chosen = ("--encoder", "test_own:Half", "test_own:make_half", "dae-8")
     command = ("evaluate", "--data", "data/sample/face_direction", "--out", tmp_path, *chosen)
     told = jbrep(*command)

@@ -34,7 +34,7 @@ from jbrep.evaluate.readout import nonlinear_probes, probes
 from jbrep.evaluate.regression import Problem, beside, fit
 from jbrep.evaluate.summary import evaluation_text
 from jbrep.evaluate.truth import in_words
-from jbrep.rollouts.good_policy import find_good_policy
+from jbrep.play.good_policy import find_good_policy
 
 NAMES = ("place", "speed", "load", "idle")
 STEPS, EPISODES = 60, 200

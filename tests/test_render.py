@@ -18,10 +18,10 @@ from jbrep.envs.make import make_env
 from jbrep.envs.physics import Motion, physics_of
 from jbrep.errors import InputError
 from jbrep.jitterbug.model import plain_model
-from jbrep.render.film import Film, Pace
-from jbrep.render.formats import encode_gif, encode_mp4, get_format
-from jbrep.render.pictures import Camera, add_caption, band_height, find_camera
-from jbrep.rollouts.sources import find_episode
+from jbrep.play.film import Film, Pace
+from jbrep.play.formats import encode_gif, encode_mp4, get_format
+from jbrep.play.pictures import Camera, add_caption, band_height, find_camera
+from jbrep.play.sources import find_episode
 
 SIZE = (96, 64)
 SAMPLE = "data/sample/move_to_pose"
@@ -272,7 +272,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, tmp_path, mon
 def test_ctrl_c_leaves_no_file(tmp_path, monkeypatch):
     import signal
 
-    from jbrep.render import film
+    from jbrep.play import film
 
     monkeypatch.setattr(film, "add_caption", lambda *given: signal.raise_signal(signal.SIGINT))
     stopped = render(SAMPLE, "--out", tmp_path / "a.mp4")

@@ -17,18 +17,18 @@ from jbrep.encoders.diagnostics import DIAGNOSTICS, Diagnosed, write_diagnostics
 from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.evaluate.headline import SCALARS
-from jbrep.figures import study_plots, write
-from jbrep.files.tables import write_csv
+from jbrep.play.sources import find_episode
+from jbrep.records.tables import write_csv
 from jbrep.report import report, write_report
 from jbrep.report.columns import are_numbers
 from jbrep.report.facts import reproduce, setting_rows
+from jbrep.report.figures import study_plots, write
 from jbrep.report.markdown import escape, markdown
 from jbrep.report.page import page as page_of
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, SUMMARY
 from jbrep.report.tables import read_tables
 from jbrep.report.words import answers, headline
 from jbrep.rl.files import ENCODER, Evaluation, write_rows, write_run
-from jbrep.rollouts.sources import find_episode
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.claims import CLAIMS
 from jbrep.stats.first_claims import FirstClaims

@@ -25,7 +25,7 @@ from jbrep.cli.rl import _Bar
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
 from jbrep.errors import InputError
-from jbrep.files import container
+from jbrep.records import container
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, read_evaluations, read_run

@@ -14,7 +14,7 @@ from jbrep.encoders import find
 from jbrep.envs import describe
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
-from jbrep.files import container
+from jbrep.records import container
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.files import (

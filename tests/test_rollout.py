@@ -21,13 +21,13 @@ from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import TASKS
+from jbrep.play.behaviour import observe
+from jbrep.play.jitterbug import read, reward_terms
+from jbrep.play.rollout import play, replay
+from jbrep.play.sources import Player, find_episode, find_player
 from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, read_evaluations
 from jbrep.rl.policy import load_untrained
-from jbrep.rollouts.behaviour import observe
-from jbrep.rollouts.jitterbug import read, reward_terms
-from jbrep.rollouts.rollout import play, replay
-from jbrep.rollouts.sources import Player, find_episode, find_player
 
 SHORT = {
     name: describe(name, max_episode_steps=30)

@@ -23,7 +23,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from jbrep.encoders import find, save
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.files import container
+from jbrep.play.sources import find_player
+from jbrep.records import container
 from jbrep.rl import Run, train
 from jbrep.rl.agent import make_env
 from jbrep.rl.files import (
@@ -39,7 +40,6 @@ from jbrep.rl.files import (
 )
 from jbrep.rl.history import Scalars
 from jbrep.rl.policy import load_run, load_untrained, load_zip
-from jbrep.rollouts.sources import find_player
 from jbrep.study.results import read_results, write_results
 
 TASK = describe("face_direction")

@@ -16,7 +16,7 @@ from jbrep.encoders.from_onnx import convert
 from jbrep.encoders.onnx import export
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.files import container
+from jbrep.records import container
 
 RANDOM = np.random.default_rng(0)
 TASK = describe("face_direction")

@@ -8,8 +8,8 @@ from command import jbrep
 
 from jbrep.dataset import Dataset
 from jbrep.envs import describe
+from jbrep.play.sources import find_episode, find_player
 from jbrep.rl.shipped import FOLDER, SHIPPED, file_of, shipped
-from jbrep.rollouts.sources import find_episode, find_player
 
 SHIPS = shipped()
 

@@ -30,11 +30,11 @@ from jbrep.dataset import Dataset
 from jbrep.encoders import load
 from jbrep.envs import describe
 from jbrep.errors import DamageError, InputError
+from jbrep.play.behaviour import observe
+from jbrep.play.sources import find_player, find_untrained
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, RUN, read_run, write_run
 from jbrep.rl.presets import PRESETS, get_preset
-from jbrep.rollouts.behaviour import observe
-from jbrep.rollouts.sources import find_player, find_untrained
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, read_study
 from jbrep.study.plan import STUDY, Plan, plan_for, read_plan
@@ -592,7 +592,7 @@ def test_no_references_no_table(tmp_path):
 
 
 def test_one_study_at_a_time(done):
-    from jbrep.files.lock import exclusive
+    from jbrep.records.lock import exclusive
 
     with exclusive(done.folder), pytest.raises(InputError, match="is being written by process"):
         run_study(done, on_this_machine, 1)

@@ -22,9 +22,9 @@ from jbrep.envs import describe
 from jbrep.envs.names import import_modules
 from jbrep.errors import DamageError, InputError
 from jbrep.evaluate.files import write
-from jbrep.figures.diagrams import autoencoders
-from jbrep.figures.style import styles
 from jbrep.report.facts import encoder_rows, outline, reproduce
+from jbrep.report.figures.diagrams import autoencoders
+from jbrep.report.figures.style import styles
 from jbrep.report.tables import read_tables
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.files import ENCODER, read_run

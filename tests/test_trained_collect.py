@@ -17,13 +17,13 @@ from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError
-from jbrep.files import container
 from jbrep.inspection.subject import _find
+from jbrep.play.sources import find_player, find_policy
+from jbrep.records import container
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, RUN
 from jbrep.rl.policy import load_run
 from jbrep.rl.policy_weights import load, save
-from jbrep.rollouts.sources import find_player, find_policy
 
 import_modules(["environments"])
 SHORT = describe("face_direction", max_episode_steps=40)

@@ -4,8 +4,8 @@ import json
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-from jbrep.figures import encoder_plots, write
 from jbrep.report import write_report
+from jbrep.report.figures import encoder_plots, write
 
 RESULTS = Path("results")
 

@@ -15,11 +15,11 @@ import numpy as np
 
 from jbrep.envs.description import describe
 from jbrep.jitterbug.tasks import TASKS
+from jbrep.play.sources import find_player
 from jbrep.rl.files import EPISODES, FINISHED, read_run, runs_below
 from jbrep.rl.policy import load_run
 from jbrep.rl.policy_weights import save
 from jbrep.rl.shipped import SHIPPED, file_of, write_returns
-from jbrep.rollouts.sources import find_player
 
 SHOWN = (SHIPPED, "heuristic")
 COUNTED = 100  # episodes

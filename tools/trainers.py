@@ -15,10 +15,10 @@ import numpy as np
 from scipy.stats import norm
 
 from jbrep.errors import InputError
-from jbrep.figures import write
-from jbrep.figures.curves import curves
-from jbrep.figures.style import styles
-from jbrep.files.storage import write_whole
+from jbrep.records.storage import write_whole
+from jbrep.report.figures import write
+from jbrep.report.figures.curves import curves
+from jbrep.report.figures.style import styles
 from jbrep.report.tables import read_tables
 from jbrep.rl.files import FINISHED
 from jbrep.stats import RunCurve, analyse

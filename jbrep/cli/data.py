@@ -88,7 +88,7 @@ def collect(
     from jbrep.collect import collect as run
     from jbrep.collect.collector import usual_shard_episodes
     from jbrep.dataset import Settings
-    from jbrep.rollouts.sources import find_policy
+    from jbrep.play.sources import find_policy
 
     task = given_task(options)
     assert task is not None
@@ -202,7 +202,7 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
 def repair(data: Path, lanes: int, threads: int | None) -> None:
     """Restore damaged and missing files as they were."""
     from jbrep.collect.repair import repair as run
-    from jbrep.rollouts.sources import kept_policy
+    from jbrep.play.sources import kept_policy
 
     with stoppable(RESUMES):
         repaired = False

@@ -64,9 +64,9 @@ def evaluate(
     from jbrep.encoders.shipped import source_of
     from jbrep.evaluate.files import EVALUATION, write
     from jbrep.evaluate.summary import evaluation_text
-    from jbrep.figures import encoder_plots
-    from jbrep.figures import write as write_plots
-    from jbrep.rollouts.good_policy import find_good_policy
+    from jbrep.play.good_policy import find_good_policy
+    from jbrep.report.figures import encoder_plots
+    from jbrep.report.figures import write as write_plots
 
     for name in encoder:
         import_code(name)
@@ -247,7 +247,7 @@ def import_model(
     from jbrep.encoders.card import card
     from jbrep.encoders.file import SUFFIX, save
     from jbrep.encoders.from_onnx import convert
-    from jbrep.files.storage import exists
+    from jbrep.records.storage import exists
 
     task = given_task(options)
     assert task is not None

@@ -22,7 +22,7 @@ from jbrep.errors import InputError
 
 if TYPE_CHECKING:
     from jbrep.envs.task import Task
-    from jbrep.rollouts.sources import Player
+    from jbrep.play.sources import Player
 
 _TASK = "face_direction"
 
@@ -92,7 +92,7 @@ def evaluate_policy(
 
 def _title(policy: str, player: "Player") -> str:
     """The task, and what is not in the command: what a trained policy observes, its step."""
-    from jbrep.rollouts.sources import is_by_name
+    from jbrep.play.sources import is_by_name
 
     if is_by_name(policy):
         return f"{player.task.name}, {player.name}"
@@ -106,8 +106,7 @@ def _find(
     """The policy of a run, by name, or in a zip file."""
     from jbrep.encoders import find
     from jbrep.envs.description import describe
-    from jbrep.files.storage import exists
-    from jbrep.rollouts.sources import (
+    from jbrep.play.sources import (
         as_player,
         find_player,
         is_by_name,
@@ -115,6 +114,7 @@ def _find(
         policy_names,
         run_folder,
     )
+    from jbrep.records.storage import exists
 
     path = Path(policy)
     folder = run_folder(policy)
@@ -202,8 +202,8 @@ def behaviour(
     """
     import numpy as np
 
-    from jbrep.figures import behaviour_plots, write
-    from jbrep.rollouts.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
+    from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
+    from jbrep.report.figures import behaviour_plots, write
     from jbrep.text import table, terminal_width
 
     yaw, task = np.deg2rad(target_yaw), given_task(options, required=False)

@@ -67,10 +67,10 @@ def render(
     from jbrep.opengl import find_opengl
 
     find_opengl()
-    from jbrep.render.film import Film, Pace
-    from jbrep.render.formats import get_format
-    from jbrep.render.pictures import Camera
-    from jbrep.rollouts.sources import find_episode
+    from jbrep.play.film import Film, Pace
+    from jbrep.play.formats import get_format
+    from jbrep.play.pictures import Camera
+    from jbrep.play.sources import find_episode
 
     form = get_format(out)
     pace = Pace(form.fps if fps is None else fps, speed, seconds)

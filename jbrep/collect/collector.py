@@ -28,9 +28,9 @@ from jbrep.dataset.settings import Settings
 from jbrep.envs.checks import check_counts
 from jbrep.envs.make import is_batched
 from jbrep.errors import InputError, differences
-from jbrep.files.lock import exclusive
-from jbrep.files.storage import check_space, exists, make_folder, read_regular, write_whole
 from jbrep.progress import Progress
+from jbrep.records.lock import exclusive
+from jbrep.records.storage import check_space, exists, make_folder, read_regular, write_whole
 
 _MAX_SHARDS = 10_000
 _BATCH_ROWS, _SHARD_ROWS = 100_000, 20_000  # of a shard

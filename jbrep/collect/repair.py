@@ -26,8 +26,8 @@ from jbrep.dataset.manifest import (
 from jbrep.dataset.shard import column_hashes
 from jbrep.envs.checks import check_counts
 from jbrep.errors import DamageError, InputError
-from jbrep.files.lock import exclusive
 from jbrep.progress import Progress
+from jbrep.records.lock import exclusive
 
 
 def repair(

@@ -14,7 +14,7 @@ from jbrep.encoders import Layer
 from jbrep.encoders.activations import AVG_L1_NORM, activate
 from jbrep.encoders.encoder import MAX_UNITS
 from jbrep.errors import InputError, choose
-from jbrep.files.container import MAX_BYTES
+from jbrep.records.container import MAX_BYTES
 
 
 class AvgL1Norm(nn.Module):

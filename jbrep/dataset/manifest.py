@@ -24,8 +24,8 @@ from jbrep.dataset.shard import (
 )
 from jbrep.envs.task import Task, read_task
 from jbrep.errors import DamageError, InputError, check_version
-from jbrep.files.commit import are_commits, commits
-from jbrep.files.storage import exists, read_regular, write_whole
+from jbrep.records.commit import are_commits, commits
+from jbrep.records.storage import exists, read_regular, write_whole
 
 MANIFEST = "manifest.json"
 BACKUP = "manifest.backup.json"
@@ -53,7 +53,7 @@ class Manifest:
     versions: Mapping[str, str]  # of the packages that made it
     shards: tuple[Entry, ...] = ()
     format_version: int = FORMAT_VERSION
-    commits: Mapping[str, str] = field(default_factory=dict)  # as `jbrep.files.commit` gives them
+    commits: Mapping[str, str] = field(default_factory=dict)  # as `jbrep.records.commit` gives them
 
     @property
     def task(self) -> Task:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.schema import EPISODES, Columns, Spec
 from jbrep.errors import DamageError, InputError
-from jbrep.files.storage import regular_size
+from jbrep.records.storage import regular_size
 
 REPAIR = "run jbrep data repair to restore it"
 FileState = tuple[int, ...] | None  # see `file_state`

@@ -33,8 +33,8 @@ from jbrep.dataset.schema import (
 from jbrep.dataset.shard import REPAIR, column_hash
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError
-from jbrep.files.storage import read_regular
 from jbrep.progress import Progress
+from jbrep.records.storage import read_regular
 
 _MAX_POLICY_BYTES = 1 << 28
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jbrep.errors import DamageError, InputError
-from jbrep.files.storage import read_regular
-from jbrep.files.tables import write_csv
+from jbrep.records.storage import read_regular
+from jbrep.records.tables import write_csv
 
 DIAGNOSTICS = "diagnostics.csv"
 _KEY = ("task", "representation", "sha256")

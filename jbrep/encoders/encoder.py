@@ -15,8 +15,8 @@ from jbrep.encoders.activations import ACTIVATIONS, FIRST_ACTIVATIONS, activate
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task, check_same, read_task
 from jbrep.errors import InputError
-from jbrep.files import container
 from jbrep.jitterbug.tasks import get_task
+from jbrep.records import container
 
 Float32 = NDArray[np.float32]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor

@@ -12,9 +12,9 @@ from jbrep.dataset import Scaler
 from jbrep.encoders.encoder import FORMAT, FORMAT_VERSION, IMPORTED, Encoder, Layer
 from jbrep.encoders.names import check_name
 from jbrep.errors import InputError, check_version
-from jbrep.files import container
-from jbrep.files.container import Tensors
-from jbrep.files.storage import write_whole
+from jbrep.records import container
+from jbrep.records.container import Tensors
+from jbrep.records.storage import write_whole
 
 SUFFIX = ".safetensors"
 HELD_OUT_MSE = "held_out_mse"  # the metric that every encoder has, unless it was trained elsewhere

@@ -10,7 +10,7 @@ from onnx import TensorProto, helper
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.onnx_graph import Graph
 from jbrep.errors import InputError
-from jbrep.files.storage import exists, write_whole
+from jbrep.records.storage import exists, write_whole
 
 _OPSET, _IR_VERSION = 17, 8
 _LATER = 20, 9  # the same for models with GELU

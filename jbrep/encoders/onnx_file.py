@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, numpy_helper
 
 from jbrep.errors import InputError
-from jbrep.files.storage import exists, read_file
+from jbrep.records.storage import exists, read_file
 
 _MAX_BYTES = 1 << 26  # of a model, and of the file of its numbers
 _MAX_NODES = 1000

@@ -13,7 +13,7 @@ from jbrep.encoders.names import EncoderName
 from jbrep.envs.encoding import BaseEncoder, as_encoder
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.files.storage import exists
+from jbrep.records.storage import exists
 
 _FOLDER = Path(__file__).parent / "shipped"
 

@@ -18,7 +18,7 @@ from jbrep.envs.make import creator, make_env, one_line
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import MAX_EPISODE_STEPS, SEED_BITS, Feature, Task
 from jbrep.errors import InputError
-from jbrep.files.toml import read_toml
+from jbrep.records.toml import read_toml
 
 _PROBE_STEPS = 200  # of each instance whose episodes are compared
 _LONGEST_PROBE = 10_000  # steps in search of a time limit

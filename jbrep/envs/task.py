@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.errors import InputError
-from jbrep.files.typed import typed
+from jbrep.records.typed import typed
 from jbrep.text import slug
 
 Array = NDArray[np.float64]

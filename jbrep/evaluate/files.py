@@ -12,7 +12,7 @@ from jbrep.encoders.own import as_file
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import diagnose
 from jbrep.evaluate.policy import GoodPolicy
-from jbrep.files.storage import exists, make_folder, write_whole
+from jbrep.records.storage import exists, make_folder, write_whole
 from jbrep.training.trainer import single_torch_thread
 
 EVALUATION = "evaluation.json"

@@ -23,7 +23,7 @@ from jbrep.inspection.signals import (
     feature_panels,
     latent_panels,
 )
-from jbrep.rollouts.jitterbug import jitterbug_task
+from jbrep.play.jitterbug import jitterbug_task
 
 TRAVERSE = "traverse"  # a timeline, and the parent entity of its series
 TRAINING_STEP = "training_step"

@@ -16,8 +16,8 @@ from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import send_scene
 from jbrep.inspection.signals import send_signals, send_terms, times_at
-from jbrep.rollouts.jitterbug import jitterbug_task
-from jbrep.rollouts.rollout import Rollout
+from jbrep.play.jitterbug import jitterbug_task
+from jbrep.play.rollout import Rollout
 
 
 def record_episode(

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset import Dataset
 from jbrep.dataset.scaled import sample
-from jbrep.rollouts.rollout import Rollout
+from jbrep.play.rollout import Rollout
 
 _ROWS = 10_000  # about as many states in all
 _EPISODES = 100  # at most

@@ -22,8 +22,8 @@ from jbrep.inspection.forecast import (
 from jbrep.inspection.recording import GREEN, GREY, ORANGE, PURPLE, SKY, Colour, Recording
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.signals import MOST_LINES, times_at
-from jbrep.rollouts.jitterbug import jitterbug_task
-from jbrep.rollouts.rollout import Rollout
+from jbrep.play.jitterbug import jitterbug_task
+from jbrep.play.rollout import Rollout
 
 FAN = "world/fan"
 SERIES = "forecast"

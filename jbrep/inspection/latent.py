@@ -10,7 +10,7 @@ from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Array
 from jbrep.inspection.recording import SKY, YELLOW, Recording
 from jbrep.inspection.signals import latent_panels, send_decoded, send_features
-from jbrep.rollouts.rollout import Rollout
+from jbrep.play.rollout import Rollout
 
 PATH = "latent/path"
 _ALL_COLOUR = (90, 98, 112)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from jbrep.envs.physics import Motion
 from jbrep.envs.task import Array, Feature, Task
 from jbrep.inspection.recording import GREY, Recording, lighten, palette
-from jbrep.rollouts.jitterbug import reward_terms
-from jbrep.rollouts.rollout import Rollout
+from jbrep.play.jitterbug import reward_terms
+from jbrep.play.rollout import Rollout
 
 STEP = "step"
 TIME = "time"

@@ -14,15 +14,15 @@ from jbrep.encoders.shipped import find_alone, source_of
 from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
-from jbrep.files.storage import exists
 from jbrep.inspection.curves import record_curves
 from jbrep.inspection.episode import record_episode
 from jbrep.inspection.examples import Examples, from_dataset
 from jbrep.inspection.recording import SUFFIX, check_out
 from jbrep.inspection.traversal import record_traversal
+from jbrep.play.rollout import Rollout
+from jbrep.play.sources import find_episode, is_trained, policy_file, run_folder
+from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, is_run
-from jbrep.rollouts.rollout import Rollout
-from jbrep.rollouts.sources import find_episode, is_trained, policy_file, run_folder
 from jbrep.study.results import has_runs, read_runs
 
 FOLDER = Path("inspect")  # of recordings without an --out

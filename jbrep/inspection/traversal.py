@@ -17,8 +17,8 @@ from jbrep.inspection.recording import GREY, Recording
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import WORLD, send_floor
 from jbrep.jitterbug.tasks import POSITION
-from jbrep.rollouts.jitterbug import jitterbug_task
-from jbrep.rollouts.rollout import Rollout
+from jbrep.play.jitterbug import jitterbug_task
+from jbrep.play.rollout import Rollout
 
 POINTS = 101
 SPACING = 0.12  # [m] between the robots

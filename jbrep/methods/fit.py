@@ -14,15 +14,15 @@ from jbrep.encoders import FULL, Encoder, load, save
 from jbrep.encoders.file import HELD_OUT_MSE, SUFFIX
 from jbrep.encoders.names import check_name
 from jbrep.errors import InputError, differences
-from jbrep.files.commit import commits
-from jbrep.files.lock import exclusive
-from jbrep.files.storage import exists, make_folder
 from jbrep.methods.held_out import held_out_error
 from jbrep.methods.method import ClosedForm, Learned, Made, Method
 from jbrep.methods.registry import get_method, name_of
 from jbrep.methods.settings import CODED, SCALED
 from jbrep.methods.shape import complete
 from jbrep.progress import Progress
+from jbrep.records.commit import commits
+from jbrep.records.lock import exclusive
+from jbrep.records.storage import exists, make_folder
 from jbrep.training import checkpoint
 from jbrep.training.objective import Objective
 from jbrep.training.trainer import (

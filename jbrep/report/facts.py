@@ -9,7 +9,7 @@ from typing import Any
 from jbrep.encoders import FULL
 from jbrep.encoders.file import HELD_OUT_MSE
 from jbrep.envs.encoding import OWN
-from jbrep.figures.diagrams import EncoderRecord, LabelRecord
+from jbrep.report.figures.diagrams import EncoderRecord, LabelRecord
 from jbrep.report.tables import Tables
 from jbrep.rl.files import FAILED
 from jbrep.stats.runs import in_order

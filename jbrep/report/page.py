@@ -9,12 +9,12 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from jbrep.figures.plot import Drawing, Plot
-from jbrep.figures.style import DARK, PAGE
-from jbrep.files.tables import csv_text
 from jbrep.progress import Progress
+from jbrep.records.tables import csv_text
 from jbrep.report import facts
 from jbrep.report.columns import are_numbers
+from jbrep.report.figures.plot import Drawing, Plot
+from jbrep.report.figures.style import DARK, PAGE
 from jbrep.report.tables import Tables
 from jbrep.report.words import details, headline, remark
 from jbrep.stats import Analysis

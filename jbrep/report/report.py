@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jbrep.figures import study_plots, write
-from jbrep.files.storage import make_folder, write_whole
+from jbrep.records.storage import make_folder, write_whole
 from jbrep.report import diagnostics, facts
+from jbrep.report.figures import study_plots, write
 from jbrep.report.markdown import markdown
 from jbrep.report.page import page
 from jbrep.report.tables import Tables, read_tables

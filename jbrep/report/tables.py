@@ -5,12 +5,12 @@ from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
 
 from jbrep.encoders.diagnostics import DIAGNOSTICS, by_label, read_diagnostics
 from jbrep.errors import DamageError, InputError
-from jbrep.figures.curves import References, Return
-from jbrep.figures.diagrams import LabelRecord, TaskRecord
-from jbrep.files.storage import exists
-from jbrep.files.tables import Columns, count, finite, read_csv
-from jbrep.files.typed import read_json, typed
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, TASKS
+from jbrep.records.storage import exists
+from jbrep.records.tables import Columns, count, finite, read_csv
+from jbrep.records.typed import read_json, typed
+from jbrep.report.figures.curves import References, Return
+from jbrep.report.figures.diagrams import LabelRecord, TaskRecord
 from jbrep.rl.files import read_text
 from jbrep.stats import Analysis
 from jbrep.study import record

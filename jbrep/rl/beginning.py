@@ -9,7 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from jbrep.encoders import load
 from jbrep.envs.task import read_task
 from jbrep.errors import InputError, differences
-from jbrep.files.storage import write_whole
+from jbrep.records.storage import write_whole
 from jbrep.rl.files import BEGINNING, ENCODER, POLICY, read_finished
 from jbrep.rl.normalization import Statistics
 from jbrep.rl.settings import shaping

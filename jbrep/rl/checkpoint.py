@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jbrep.errors import DamageError, InputError
-from jbrep.files import container
-from jbrep.files.container import Tensors
-from jbrep.files.storage import exists
+from jbrep.records import container
+from jbrep.records.container import Tensors
+from jbrep.records.storage import exists
 from jbrep.rl.fields import completed
 from jbrep.rl.files import differing
 from jbrep.rl.history import History

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 from jbrep.envs.task import MAX_EPISODE_STEPS, read_task
 from jbrep.errors import DamageError
-from jbrep.files.commit import are_commits
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
+from jbrep.records.commit import are_commits
 from jbrep.rl.names import CPU, DEVICES, FLOAT32, PRECISIONS, SB3, TRAINERS, base_name
 
 FINISHED, FAILED = "finished", "failed"

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jbrep.errors import DamageError, InputError, check_version, differences
-from jbrep.files import container
-from jbrep.files.storage import exists, read_regular, write_whole
-from jbrep.files.tables import write_csv
+from jbrep.records import container
+from jbrep.records.storage import exists, read_regular, write_whole
+from jbrep.records.tables import write_csv
 from jbrep.rl.fields import FAILED as FAILED
 from jbrep.rl.fields import FINISHED as FINISHED
 from jbrep.rl.fields import (

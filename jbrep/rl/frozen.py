@@ -16,7 +16,7 @@ from jbrep.envs.recording import Actor
 from jbrep.envs.sb3 import agent_spaces
 from jbrep.envs.task import Array, Task, check_same
 from jbrep.errors import DamageError, InputError
-from jbrep.files.storage import exists
+from jbrep.records.storage import exists
 from jbrep.rl.agent import unchecked_distributions
 from jbrep.rl.files import ENCODER, is_policy_file
 from jbrep.rl.policy import Trained, load_run

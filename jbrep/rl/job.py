@@ -14,8 +14,8 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from jbrep.encoders import Encoder, save
 from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError
-from jbrep.files.commit import commits
-from jbrep.files.storage import exists, write_whole
+from jbrep.records.commit import commits
+from jbrep.records.storage import exists, write_whole
 from jbrep.rl.checkpoint import CheckpointFile
 from jbrep.rl.fields import MAX_LINE
 from jbrep.rl.files import (

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.errors import InputError, choose
-from jbrep.files.toml import read_toml
+from jbrep.records.toml import read_toml
 from jbrep.rl.fields import LEARNER, MAX_NAME
 from jbrep.rl.names import PAPER, base_name
 from jbrep.rl.presets import ALGORITHMS, PRESETS

@@ -17,8 +17,8 @@ from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.recording import Actor
 from jbrep.envs.task import Array, Task, read_task
 from jbrep.errors import DamageError, InputError, choose
-from jbrep.files import container
-from jbrep.files.storage import exists
+from jbrep.records import container
+from jbrep.records.storage import exists
 from jbrep.rl.agent import Spaces, deterministic, make_agent
 from jbrep.rl.checkpoint import MAX_BYTES, PARAMETERS
 from jbrep.rl.fields import MAX_STEPS, check_settings, completed, from_version_1, whole_number

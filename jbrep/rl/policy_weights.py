@@ -12,8 +12,8 @@ import torch
 from jbrep.encoders import Encoder
 from jbrep.encoders.file import unpack as unpack_encoder
 from jbrep.errors import DamageError, InputError, check_version
-from jbrep.files import container
-from jbrep.files.storage import write_whole
+from jbrep.records import container
+from jbrep.records.storage import write_whole
 from jbrep.rl.fields import check_policy, check_settings, completed
 from jbrep.rl.files import POLICY_FORMAT
 from jbrep.rl.policy import Trained, build

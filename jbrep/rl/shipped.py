@@ -8,9 +8,9 @@ import numpy as np
 
 from jbrep.envs.task import Array, Task
 from jbrep.errors import DamageError, InputError
-from jbrep.files import container
-from jbrep.files.storage import exists
-from jbrep.files.tables import Columns, count, finite, read_csv, write_csv
+from jbrep.records import container
+from jbrep.records.storage import exists
+from jbrep.records.tables import Columns, count, finite, read_csv, write_csv
 from jbrep.rl.files import POLICY_SUFFIX
 
 SHIPPED = "trained"  # what commands call the one that ships for their task

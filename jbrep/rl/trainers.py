@@ -7,8 +7,8 @@ from typing import Any
 
 from stable_baselines3.common.logger import KVWriter
 
-from jbrep.files.lock import exclusive
-from jbrep.files.storage import make_folder
+from jbrep.records.lock import exclusive
+from jbrep.records.storage import make_folder
 from jbrep.rl.cohort.trainer import train_together
 from jbrep.rl.history import Watch
 from jbrep.rl.job import Job, Session

@@ -13,8 +13,8 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from jbrep.errors import DamageError, InputError, differences
-from jbrep.files.lock import exclusive
-from jbrep.files.storage import make_folder, write_whole
+from jbrep.records.lock import exclusive
+from jbrep.records.storage import make_folder, write_whole
 from jbrep.rl.files import FINISHED, read_evaluations
 from jbrep.rl.learner import write_preset
 from jbrep.rl.run import Run, plain

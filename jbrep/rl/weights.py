@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.errors import DamageError, InputError
-from jbrep.files import storage
+from jbrep.records import storage
 
 MAX_BYTES = 1 << 28  # of the file
 STATISTICS = "observation_statistics.safetensors"  # by which an agent normalises what it sees

@@ -10,7 +10,7 @@ import numpy as np
 
 from jbrep.encoders import FULL
 from jbrep.errors import DamageError
-from jbrep.files.typed import read_json, typed
+from jbrep.records.typed import read_json, typed
 from jbrep.stats.aggregates import Aggregate, aggregates
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.comparison import Comparison, compare

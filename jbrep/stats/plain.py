@@ -50,4 +50,4 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-READERS = {Array: _array, Interval: _interval, float: _number}  # for jbrep.files.typed
+READERS = {Array: _array, Interval: _interval, float: _number}  # for jbrep.records.typed

@@ -12,9 +12,9 @@ from jbrep.encoders import FULL
 from jbrep.envs.names import find_spec, short_names
 from jbrep.envs.task import MAX_EPISODE_STEPS
 from jbrep.errors import InputError
-from jbrep.files.storage import exists
-from jbrep.files.toml import read_toml
 from jbrep.jitterbug.tasks import TASKS
+from jbrep.records.storage import exists
+from jbrep.records.toml import read_toml
 from jbrep.rl.learner import Learner
 from jbrep.rl.names import CPU, FLOAT32
 from jbrep.rl.run import Run

@@ -10,8 +10,8 @@ from jbrep.encoders import FULL
 from jbrep.encoders.diagnostics import DIAGNOSTICS, Diagnosed, read_diagnostics, write_diagnostics
 from jbrep.errors import DamageError, InputError
 from jbrep.evaluate.headline import headline
-from jbrep.files.storage import exists, read_file
-from jbrep.files.typed import read_json, typed
+from jbrep.records.storage import exists, read_file
+from jbrep.records.typed import read_json, typed
 from jbrep.study import record
 from jbrep.text import slug
 

@@ -11,7 +11,7 @@ from typing import Any
 from jbrep.envs.description import describe
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
-from jbrep.files.storage import exists, make_folder, read_regular, write_whole
+from jbrep.records.storage import exists, make_folder, read_regular, write_whole
 from jbrep.rl import Run
 from jbrep.rl.files import RUN
 from jbrep.rl.learner import Learner

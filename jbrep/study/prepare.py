@@ -15,10 +15,10 @@ from jbrep.encoders.code import is_code
 from jbrep.encoders.shipped import names
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
-from jbrep.files.storage import exists
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method
+from jbrep.records.storage import exists
 from jbrep.rl import Run
 from jbrep.study.config import Data
 from jbrep.study.plan import Plan

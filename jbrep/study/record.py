@@ -8,7 +8,7 @@ from typing import Any
 from jbrep.encoders import FULL, load
 from jbrep.envs.encoding import OWN
 from jbrep.envs.task import read_task
-from jbrep.files.storage import exists
+from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER
 from jbrep.rl.names import base_name
 from jbrep.stats.runs import in_order

@@ -6,10 +6,10 @@ from typing import Any
 
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.files.storage import exists
-from jbrep.files.tables import Columns, count, finite, read_csv, write_csv
 from jbrep.jitterbug.heuristics import HEURISTICS
-from jbrep.rollouts.sources import find_player
+from jbrep.play.sources import find_player
+from jbrep.records.storage import exists
+from jbrep.records.tables import Columns, count, finite, read_csv, write_csv
 from jbrep.stats.scale import STILL
 
 REFERENCE_RETURNS = "references.csv"

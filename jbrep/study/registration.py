@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 from jbrep.errors import DamageError, InputError, differences
-from jbrep.files.commit import commits
-from jbrep.files.storage import exists, read_regular, write_whole
-from jbrep.files.typed import read_json, typed
+from jbrep.records.commit import commits
+from jbrep.records.storage import exists, read_regular, write_whole
+from jbrep.records.typed import read_json, typed
 from jbrep.rl.job import packages
 from jbrep.study.config import as_study, known
 

@@ -12,8 +12,8 @@ import numpy as np
 from jbrep.encoders import FULL
 from jbrep.envs.task import Task, read_task
 from jbrep.errors import InputError
-from jbrep.files.storage import exists, write_whole
-from jbrep.files.tables import Columns, count, finite, write_csv
+from jbrep.records.storage import exists, write_whole
+from jbrep.records.tables import Columns, count, finite, write_csv
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, runs_below
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.stats.rules import Planned

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
-from jbrep.files.lock import exclusive
-from jbrep.files.storage import make_folder
 from jbrep.progress import Progress as Bar
+from jbrep.records.lock import exclusive
+from jbrep.records.storage import make_folder
 from jbrep.rl import Run
 from jbrep.rl.job import Job
 from jbrep.rl.speed import estimate

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jbrep.envs.names import import_modules
-from jbrep.files.storage import make_folder
+from jbrep.records.storage import make_folder
 from jbrep.rl import Run, StoppedError
 from jbrep.rl.trainers import train_all
 from jbrep.text import rounded

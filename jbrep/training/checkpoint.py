@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from jbrep.errors import DamageError, InputError, differences
-from jbrep.files import container
+from jbrep.records import container
 from jbrep.training.trainer import Epoch, Trainer
 
 

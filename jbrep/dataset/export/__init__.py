@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jbrep.dataset import Dataset
 from jbrep.errors import InputError, choose
-from jbrep.files.storage import check_space
+from jbrep.records.storage import check_space
 
 FORMATS = {name: f"{__name__}.{name}" for name in ("minari", "parquet", "npz")}  # modules
 

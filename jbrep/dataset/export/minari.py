@@ -22,9 +22,9 @@ from jbrep.dataset.schema import UNKNOWN_SEED
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.files.publish import publish_folder, unfinished
-from jbrep.files.storage import exists, write_whole
 from jbrep.progress import Progress
+from jbrep.records.publish import publish_folder, unfinished
+from jbrep.records.storage import exists, write_whole
 
 _ROOT = "MINARI_DATASETS_PATH"  # Minari takes the folder of its data sets from the environment only
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from jbrep.dataset import Dataset
-from jbrep.files.publish import publish_file, unfinished
 from jbrep.progress import Progress
+from jbrep.records.publish import publish_file, unfinished
 
 
 def write(dataset: Dataset, out: Path) -> str:

@@ -11,8 +11,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jbrep.dataset import Dataset
-from jbrep.files.publish import publish_file, unfinished
 from jbrep.progress import Progress
+from jbrep.records.publish import publish_file, unfinished
 
 
 def write(dataset: Dataset, out: Path) -> str:

@@ -8,7 +8,7 @@ from jbrep.dataset.importing.episodes import Source
 from jbrep.dataset.importing.writer import write
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.errors import InputError, choose
-from jbrep.files.storage import exists
+from jbrep.records.storage import exists
 
 __all__ = ["FORMATS", "Source", "open_source", "write"]
 

@@ -25,7 +25,7 @@ from jbrep.envs.description import describe, features_of
 from jbrep.envs.make import one_line
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.files.storage import exists, read_regular
+from jbrep.records.storage import exists, read_regular
 
 Array = NDArray[Any]
 _ROOT = "MINARI_DATASETS_PATH"

@@ -25,7 +25,7 @@ from jbrep.dataset.importing.flat import (
 )
 from jbrep.envs.task import Feature, Task, read_task
 from jbrep.errors import InputError
-from jbrep.files.storage import exists
+from jbrep.records.storage import exists
 
 _ACTION = re.compile(r"actions?(_\d+)?")
 _NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former

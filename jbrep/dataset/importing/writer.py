@@ -18,9 +18,9 @@ from jbrep.envs.description import features_of
 from jbrep.envs.make import one_line
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.files.publish import publish_folder, unfinished
-from jbrep.files.storage import check_space, make_folder
 from jbrep.progress import Progress
+from jbrep.records.publish import publish_folder, unfinished
+from jbrep.records.storage import check_space, make_folder
 
 _SHARD_ROWS = 20_000
 _MOST_SHARDS = 5_000

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor
 
-from jbrep.files.container import Tensors
+from jbrep.records.container import Tensors
 from jbrep.rl.presets import NormalNoise, OrnsteinUhlenbeckNoise
 
 Noise = NormalNoise | OrnsteinUhlenbeckNoise

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.envs.sb3 import TaskVecEnv
 from jbrep.errors import InputError
-from jbrep.files.container import Tensors
+from jbrep.records.container import Tensors
 from jbrep.rl.agent import parameters, statistics_of
 from jbrep.rl.checkpoint import (
     COUNTERS,

@@ -1,0 +1,181 @@
+"""Films: episodes as a sequence of frames, and their files."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from jbrep.errors import InputError
+from jbrep.play.formats import get_format
+from jbrep.play.pictures import Camera, add_caption, join
+from jbrep.play.rollout import Rollout
+from jbrep.progress import Progress
+from jbrep.records.storage import make_folder, write_whole
+
+_LONGEST = 3600  # [s]
+_SPEEDS = (0.01, 100)
+_WIDEST = 7680  # [pixels]
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast a film shows simulated time.
+
+    Args:
+        fps: frames per second of the film.
+        speed: simulated seconds per second of the film.
+        seconds: simulated seconds to show, from the start; all if None.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    fps: float = 25
+    speed: float = 1
+    seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        for what, value, (low, high) in (
+            ("frames per second", self.fps, (1, 50)),
+            ("speed", self.speed, _SPEEDS),
+            ("simulated seconds", self.seconds, (0.001, _LONGEST)),
+        ):
+            if value is not None and not low <= value <= high:
+                raise InputError(f"{what} is {value:g}: it must be from {low:g} to {high:g}")
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """Episodes side by side; one that ends before the others stands still afterwards.
+
+    Their robots must have been simulated by MuJoCo, and the time step of their task be known.
+
+    Args:
+        rollouts: the episodes, of the same task and from the same start.
+        camera: shows each episode.
+        pace: how fast to show them.
+
+    Raises:
+        InputError: there is no robot to show, the tasks or starts differ, or the frames would be
+            too wide.
+    """
+
+    rollouts: Sequence[Rollout]
+    camera: Camera
+    pace: Pace
+
+    def __post_init__(self) -> None:
+        if self.width > _WIDEST:
+            raise InputError(
+                f"{len(self.rollouts)} pictures side by side are {self.width:,} pixels wide: at "
+                f"most {_WIDEST:,} are possible; choose a smaller --size"
+            )
+        for rollout in self.rollouts:
+            _check_shown(rollout)
+        first = self.rollouts[0]
+        for other in self.rollouts[1:]:
+            if not _start_alike(first, other):
+                raise InputError(
+                    f"{first.name} and {other.name} differ in their task or start: only episodes "
+                    "that share both can be shown side by side, as those of policies of one task"
+                )
+
+    @property
+    def width(self) -> int:
+        """Width of a frame [pixels]."""
+        return len(self.rollouts) * self.camera.width
+
+    @property
+    def seconds(self) -> float:
+        """Length of the film [s]."""
+        return len(self) / self.pace.fps
+
+    def __len__(self) -> int:
+        longest = self.timestep * max(map(len, self.rollouts))
+        shown = longest if self.pace.seconds is None else min(self.pace.seconds, longest)
+        return max(1, round(shown / self.pace.speed * self.pace.fps))
+
+    @property
+    def timestep(self) -> float:
+        """From one state to the next [s]."""
+        timestep = self.rollouts[0].task.timestep
+        assert timestep is not None  # checked
+        return timestep
+
+    @property
+    def states(self) -> NDArray[np.int_]:
+        """The state nearest in time to each frame, (frames,), as if no episode ended."""
+        times = np.arange(len(self)) * self.pace.speed / self.pace.fps
+        return np.rint(times / self.timestep).astype(int)
+
+    def frames(self) -> Iterator[Image.Image]:
+        """The frames in order."""
+        for state in self.states:
+            yield join([self._picture(rollout, state) for rollout in self.rollouts])
+
+    def _picture(self, rollout: Rollout, state: int) -> Image.Image:
+        state = min(state, len(rollout))
+        assert rollout.motion is not None  # checked
+        so_far, now = rollout.reward[:state].sum(dtype=np.float64), self.timestep * state
+        picture = Image.fromarray(self.camera.picture(rollout.motion, state))
+        add_caption(picture, rollout.name, f"return {so_far:.0f}    {now:.2f} s")
+        return picture
+
+    def write(self, path: Path, show: bool = False) -> None:
+        """Encode it into a new file, whole or not at all.
+
+        Args:
+            path: the file, .mp4 or .gif.
+            show: whether to show progress.
+
+        Raises:
+            InputError: another suffix, the file exists or can't be written, or the film is too
+                long or too large for a GIF.
+        """
+        form = get_format(path)
+        pixels = len(self) * self.width * self.camera.height
+        if pixels > form.most_pixels:
+            raise InputError(
+                f"{path} would have {pixels:,} pixels: at most {form.most_pixels:,.0f} fit into "
+                f"a {path.suffix} file; choose a smaller --size or --fps, fewer --seconds, or .mp4"
+            )
+        make_folder(path.parent)
+        with (
+            TemporaryDirectory() as folder,
+            Progress(
+                self.frames(), total=len(self), unit="frame", delay=0.5, disable=not show
+            ) as bar,
+        ):
+            encoded = Path(folder) / path.name
+            form.encode(bar, encoded, self.pace.fps)
+            write_whole(path, encoded.read_bytes())
+
+
+def _check_shown(rollout: Rollout) -> None:
+    """Make sure that an episode has all that a film needs.
+
+    Raises:
+        InputError: it hasn't.
+    """
+    if rollout.motion is None:
+        why = rollout.note or f"{rollout.task.name} has no MuJoCo model and data"
+        raise InputError(f"{why}: only MuJoCo's robots can be filmed; jbrep inspect shows signals")
+    if rollout.task.timestep is None:
+        raise InputError(
+            f"the time step of {rollout.task.name} is not known: give it as timestep in a file of "
+            "--features"
+        )
+
+
+def _start_alike(one: Rollout, other: Rollout) -> bool:
+    if one.task != other.task or one.motion is None or other.motion is None:
+        return False
+    places = [
+        (one.motion.arrays[name][0], other.motion.arrays[name][0])
+        for name in ("qpos", "mocap_pos", "mocap_quat")
+    ]
+    return all(np.array_equal(a, b) for a, b in places)

@@ -1,0 +1,178 @@
+"""Single episodes to look at: replayed from a data set, or played by a policy."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.collect.replay import simulate_again
+from jbrep.dataset import Dataset, Episode
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.physics import Motion, MotionReader
+from jbrep.envs.recording import Actor, Recording, record
+from jbrep.envs.task import Array, Task
+from jbrep.errors import InputError
+from jbrep.play.jitterbug import hold_diverged, turn_targets
+from jbrep.progress import Progress
+
+Begin = Callable[[Task, Sequence[int]], Actor]  # as `Policy.begin`
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Rollout:
+    """An episode of n steps; states are before, between and after the steps.
+
+    Args:
+        task: whose episode it is.
+        name: where the episode comes from, for titles.
+        seed: of the episode.
+        observation: of each state in physical units, (n + 1, d).
+        action: (n, k).
+        reward: of each step, (n,).
+        terminated: whether a state ended the episode.
+        truncated: whether the time limit did, or physics that diverged.
+        motion: of the robot, n + 1 states; None where there is no MuJoCo.
+        note: why there is no motion though the environment may have one.
+
+    Raises:
+        InputError: an array of another shape.
+    """
+
+    task: Task
+    name: str
+    seed: int
+    observation: NDArray[np.float32]
+    action: NDArray[np.floating]
+    reward: NDArray[np.float32]
+    terminated: bool
+    truncated: bool
+    motion: Motion | None = None
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        steps = len(self.action)
+        shapes = {
+            "action": (steps, self.task.action_size),
+            "observation": (steps + 1, self.task.size),
+            "reward": (steps,),
+        }
+        for name, shape in shapes.items():
+            if (actual := getattr(self, name).shape) != shape:
+                raise InputError(
+                    f"a rollout of {steps} actions has {name} of shape {actual}: it must be {shape}"
+                )
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    def __repr__(self) -> str:
+        return f"Rollout({self.name!r}: {self.task.name}, {len(self):,} steps)"
+
+    @property
+    def episode_return(self) -> float:
+        """Sum of the rewards."""
+        return float(self.reward.sum(dtype=np.float64))
+
+    @property
+    def time(self) -> Array | None:
+        """Time of each state [s], (n + 1,); None where the task's time step isn't known."""
+        if self.task.timestep is None:
+            return None
+        return self.task.timestep * np.arange(len(self) + 1, dtype=np.float64)
+
+
+def replay(dataset: Dataset, episode: int) -> Rollout:
+    """An episode of a data set, simulated again for the motion of its robot.
+
+    Where that isn't possible here, or leads elsewhere, it is as stored, with a note and no motion.
+
+    Raises:
+        InputError: the data set has no such episode, or it has no steps.
+    """
+    stored = dataset.episode(episode)
+    if not len(stored):
+        raise InputError(f"episode {episode} of {dataset.folder} has no steps: choose another")
+    rollout = _as_stored(stored)
+    read = MotionReader()
+    try:
+        recording = simulate_again([stored], read, tick=lambda steps: None)
+    except (InputError, ModuleNotFoundError) as error:
+        return replace(rollout, note=f"{rollout.name} is shown without the robot: {error}")
+    if not _is_same(recording, rollout):
+        note = (
+            f"{rollout.name} is shown as stored, without the robot: simulated again it differs, as "
+            f"{dataset.task.name} isn't reproducible here"
+        )
+        return replace(rollout, note=note)
+    return replace(rollout, motion=read.motion(recording, 0, len(rollout)))
+
+
+def _as_stored(episode: Episode) -> Rollout:
+    ends = episode.record
+    return Rollout(
+        task=episode.dataset.task,
+        name=f"{episode.dataset.folder}, episode {episode.number}",
+        seed=int(ends["seed"]),
+        observation=np.concatenate((episode["observation"], ends["final_observation"][None])),
+        action=episode["action"],
+        reward=episode["reward"],
+        terminated=bool(ends["terminated"]),
+        truncated=bool(ends["truncated"]),
+    )
+
+
+def _is_same(recording: Recording, rollout: Rollout) -> bool:
+    """Whether the first lane went through the rollout, to the last bit."""
+    steps = len(rollout)
+    return (
+        recording.observation[: steps + 1, 0].tobytes() == rollout.observation.tobytes()
+        and recording.reward[:steps, 0].tobytes() == rollout.reward.tobytes()
+    )
+
+
+def play(
+    task: Task, begin: Begin, name: str, seeds: Sequence[int], target_yaw: float | None = None
+) -> list[Rollout]:
+    """Play one episode for each seed.
+
+    Args:
+        task: whose environment is made.
+        begin: of the policy.
+        name: of the policy.
+        seeds: an episode starts like a Gymnasium environment reset with its seed.
+        target_yaw: orientation of the Jitterbug's target in every episode [rad]; None draws it.
+
+    Raises:
+        InputError: the environment can't be made, or fails.
+    """
+    lanes = Lanes(task, len(seeds))
+    lanes.reset(range(len(seeds)), seeds)
+    if target_yaw is not None:
+        turn_targets(lanes, target_yaw)
+    act, read = begin(task, seeds), MotionReader()
+    total = task.max_episode_steps * len(seeds)
+    with Progress(total=total, unit="step", unit_scale=True, leave=False, delay=1) as progress:
+        recording = record(lanes, act, progress.update, read)
+    lanes.close()
+    return [_rollout(task, recording, lane, name, seed, read) for lane, seed in enumerate(seeds)]
+
+
+def _rollout(
+    task: Task, recording: Recording, lane: int, name: str, seed: int, read: MotionReader
+) -> Rollout:
+    steps = int(recording.length[lane])
+    rollout = Rollout(
+        task=task,
+        name=name,
+        seed=seed,
+        observation=recording.observation[: steps + 1, lane],
+        action=recording.action[:steps, lane],
+        reward=recording.reward[:steps, lane],
+        terminated=bool(recording.terminated[lane]),
+        truncated=bool(recording.truncated[lane]),
+    )
+    motion = read.motion(recording, lane, steps)
+    if motion and rollout.truncated and steps < task.max_episode_steps:
+        motion = hold_diverged(task, motion)
+    return replace(rollout, motion=motion)

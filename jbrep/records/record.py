@@ -1,0 +1,131 @@
+"""Records: what a file or a table of settings holds, each as one frozen class.
+
+A field says its type, its range and its words once::
+
+    steps: Annotated[int, Meta(ge=1, le=10**12, description="Of training.")] = 100_000
+
+From that follow the check of each value that is given, with a message of one line, the JSON that
+files hold, the options of the command line and the tables in docs/. msgspec reads the types:
+https://jcristharif.com/msgspec/constraints.html
+"""
+
+import re
+from typing import Any, Self, TypeVar
+
+import msgspec
+from msgspec import NODEFAULT
+from msgspec.structs import force_setattr
+
+from jbrep.errors import InputError
+from jbrep.records.words import at, must_be
+
+_Kind = TypeVar("_Kind")
+
+_AT = re.compile(r"(?P<reason>.*?)(?: - at `\$(?P<path>.*)`)?", re.DOTALL)
+_MISSING = re.compile(r"Object missing required field `(.*)`")
+_UNKNOWN = re.compile(r"Object contains unknown field `(.*)`")
+_OF_MSGSPEC = re.compile(r"Expected |Invalid |Number out of range|Integer value out of range")
+_MOST_SHOWN = 60  # letters of a value
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, dict=True):
+    """A frozen record whose fields are checked when it is made, in Python or from a file.
+
+    A list is taken for a tuple, a whole number for a float, a NumPy scalar for Python's.
+
+    Raises:
+        InputError: a field isn't of its type or out of its range, or `check` says so.
+    """
+
+    def __post_init__(self) -> None:
+        for field in msgspec.structs.fields(type(self)):
+            if field.type is not Any:
+                value = getattr(self, field.name)
+                force_setattr(self, field.name, _fitting(value, field.type, field.encode_name))
+        self.check()
+
+    def check(self) -> None:
+        """Check what no field can say alone.
+
+        Raises:
+            InputError: fields that don't fit together; the message says why.
+        """
+
+    def replace(self, **changes: Any) -> Self:
+        """The same with other values of some fields, checked again."""
+        return msgspec.structs.replace(self, **changes)
+
+
+def _fitting(value: Any, kind: Any, name: str) -> Any:
+    """A value as its field's type."""
+    value = value.item() if hasattr(value, "dtype") and not getattr(value, "shape", 0) else value
+    return converted(value, kind, name)
+
+
+def from_plain(value: Any, kind: type[_Kind], where: str = "") -> _Kind:
+    """A record, or any other type, from plain JSON or TOML.
+
+    Args:
+        value: as json.loads or tomllib.loads return it.
+        kind: the class, or another type that msgspec knows.
+        where: the value stands, for messages: "data" makes them speak of data.steps.
+
+    Raises:
+        InputError: it doesn't fit; the message names the part, what it is and what it must be.
+    """
+    return converted(value, kind, where)
+
+
+def converted(value: Any, kind: Any, where: str) -> Any:
+    """The same for types that aren't classes."""
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(_said(str(error), value, kind, where)) from None
+    except RecursionError:
+        raise InputError(f"{where or 'it'} must be nested less deeply") from None
+
+
+def to_plain(record: Any) -> Any:
+    """A record as plain JSON: its fields in order, tuples as lists."""
+    return msgspec.to_builtins(record)
+
+
+def _said(message: str, value: Any, kind: Any, where: str) -> str:
+    """An error of msgspec's as a line for people."""
+    found = _AT.fullmatch(message)
+    reason, path = (found["reason"], found["path"] or "") if found else (message, "")
+    part = at(value, kind, path)
+    name = f"{where}{part.name}".removeprefix(".")
+    if missing := _MISSING.fullmatch(reason):
+        return f"{_inside(name, missing[1])} is missing"
+    if unknown := _UNKNOWN.fullmatch(reason):
+        return f"unknown {_inside(name, unknown[1])}: it must be one of {', '.join(part.names)}"
+    if not _OF_MSGSPEC.match(reason):  # what `check` said
+        return f"{name}: {reason}" if name else reason
+    return f"{name or 'it'} is {shown(part.value)}: it must be {must_be(part.kind)}"
+
+
+def _inside(name: str, field: str) -> str:
+    return f"{name}.{field}" if name else field
+
+
+def shown(value: Any) -> str:
+    """A value in a message: short, on one line, and with nothing that controls a terminal."""
+    text = value if isinstance(value, str) else ascii(_plain_or_text(value))
+    text = "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
+    text = text if len(text) <= _MOST_SHOWN else f"{text[: _MOST_SHOWN - 3]}..."
+    return repr(text) if isinstance(value, str) else text
+
+
+def _plain_or_text(value: Any) -> Any:
+    """A value as plain JSON where that can be."""
+    try:
+        return to_plain(value)
+    except (TypeError, ValueError, RecursionError):
+        return f"of type {type(value).__name__}"
+
+
+def default_of(field: msgspec.structs.FieldInfo) -> Any:
+    """A field's default; NODEFAULT where there is none."""
+    return field.default if field.default_factory is NODEFAULT else field.default_factory()

@@ -1,0 +1,83 @@
+"""Tables as CSV."""
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jbrep.errors import DamageError, InputError
+from jbrep.records.storage import read_regular, write_whole
+
+Columns = Mapping[str, Callable[[str], Any]]  # by their names: what their cells are
+
+_MAX_BYTES = 1 << 28
+_MOST = 1 << 53  # of a number: a float holds whole ones exactly
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A header and rows as CSV."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a table, whole or not at all.
+
+    Raises:
+        InputError: it can't be written.
+    """
+    write_whole(path, csv_text(columns, rows).encode())
+
+
+def read_csv(path: Path, columns: Columns) -> list[tuple[Any, ...]]:
+    """The rows below the header, each cell as its column has it.
+
+    Args:
+        path: of the file.
+        columns: the header must have these.
+
+    Raises:
+        InputError: it can't be read.
+        DamageError: it isn't such a table.
+    """
+    try:
+        text = read_regular(path, _MAX_BYTES).decode()
+        header, *rows = csv.reader(io.StringIO(text, newline=""), strict=True)
+        if header != [*columns]:
+            raise ValueError
+        return [
+            tuple(kind(cell) for kind, cell in zip(columns.values(), row, strict=True))
+            for row in rows
+        ]
+    except OSError as error:
+        raise InputError(f"can't read {path}: {error.strerror or error}") from error
+    except (ValueError, csv.Error):
+        raise DamageError(f"{path} is damaged or cut short") from None
+
+
+def count(cell: str) -> int:
+    """A whole number from 0.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    number = int(cell)
+    if not 0 <= number < _MOST:
+        raise ValueError
+    return number
+
+
+def finite(cell: str) -> float:
+    """A number.
+
+    Raises:
+        ValueError: it is something else, or infinite.
+    """
+    number = float(cell)
+    if not abs(number) <= _MOST:
+        raise ValueError
+    return number

@@ -1,0 +1,40 @@
+"""TOML files, as users write them."""
+
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jbrep.errors import InputError
+from jbrep.records.storage import read_file
+
+_MAX_BYTES = 1 << 20
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The contents of a TOML file, or of the one that a link leads to.
+
+    Raises:
+        InputError: it can't be read, is empty or larger than a MiB, or isn't valid TOML.
+    """
+    content = read_file(Path(os.path.realpath(path)), _MAX_BYTES)
+    try:
+        return tomllib.loads(content.decode())
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not valid TOML: {error}") from None
+
+
+def toml_text(tables: Mapping[str, Any]) -> str:
+    """Tables as TOML; None, which TOML lacks, as the text "none"."""
+    import tomli_w  # only writers need it
+
+    return tomli_w.dumps(_without_null(tables))
+
+
+def _without_null(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _without_null(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_null(each) for each in value]
+    return "none" if value is None else value

@@ -1,0 +1,269 @@
+"""Learning curves: returns over training."""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, MaxNLocator
+
+from jbrep.report.figures.limits import Limits, limits
+from jbrep.report.figures.plot import Plot
+from jbrep.report.figures.style import (
+    COLUMN,
+    PAGE,
+    Looks,
+    plain,
+    reference,
+    solved_line_style,
+    with_runs,
+)
+from jbrep.stats.analysis import GroupAnalysis
+
+Groups = Sequence[GroupAnalysis]
+Evaluated = tuple[str, str, str, int, int]  # task, algorithm, representation, seed, step
+Runs = dict[int, dict[int, float]]  # mean returns of a label, by seed and step
+# returns of policies that learn nothing, by task and policy
+References = dict[str, dict[str, list[float]]]
+
+_MOST_ACROSS = 5  # panels of runs side by side
+_TITLE = 0.062  # width of a character in a panel's title [inches]
+_HANDLE, _CHARACTER, _LINE = 0.5, 0.05, 0.14  # of a legend: widths, height of a line [inches]
+_USUAL_LINES = 3  # of a legend, that figures have room for
+_FEW = 7  # representations on one axis, beyond which a panel is a page wide and bands are faint
+_COLUMNS = (
+    *("task", "algorithm", "representation", "step"),
+    *("p10", "p50", "p90", "iqm", "iqm_low", "iqm_high"),
+)
+
+
+class Return(NamedTuple):
+    """A row of returns.csv: an episode of an evaluation."""
+
+    task: str
+    algorithm: str
+    representation: str
+    seed: int
+    step: int
+    episode: int
+    episode_return: float
+
+
+def curves(groups: Groups, references: References, looks: Looks) -> Plot:
+    """Every representation on one axis, tasks by algorithms."""
+    extents = _extents(groups, references)
+    caption = "Return of the deterministic policy over training: median and 10 to 90 % over n runs."
+    if any(references.get(task) for task in extents):
+        caption += " Dashed: means of policies that don't learn, on the same starts."
+    solved = {group.solved for group in groups if extents[group.task].contain(group.solved)}
+    if solved:
+        values = ", ".join(f"{value:,g}" for value in sorted(solved))
+        caption += f" Dotted: the return from which on a task counts as solved ({values})."
+    return Plot(
+        "representations",
+        "Return over training by representation",
+        caption,
+        _COLUMNS,
+        list(_rows(groups)),
+        lambda: _grid_of_curves(groups, references, extents, looks),
+    )
+
+
+def _extents(groups: Groups, references: References) -> dict[str, Limits]:
+    """The limits of returns for each task, which its algorithms share."""
+    returns = defaultdict[str, list[float]](list)
+    for group in groups:
+        played = references.get(group.task, {}).values()
+        returns[group.task] += [float(np.mean(each)) for each in played]
+        for label in group.labels:
+            returns[group.task] += [*label.curve.p10, *label.curve.p90]
+    facts = {group.task: (group.return_floor, group.solved) for group in groups}
+    return {task: limits(values, *facts[task]) for task, values in returns.items()}
+
+
+def every_run(returns: Sequence[Return], references: References, looks: Looks) -> Plot:
+    """Each run by itself: a row for each task and algorithm, a panel for each representation.
+
+    Args:
+        returns: at least one.
+        references: returns of policies that learn nothing, by task and policy.
+        looks: of the representations, in the order of their panels.
+    """
+    episodes = defaultdict(list)
+    for row in returns:
+        key = (row.task, row.algorithm, row.representation, row.seed, row.step)
+        episodes[key].append(row.episode_return)
+    fewest: dict[tuple[Any, ...], int] = {}  # of an evaluation: the last one may have more starts
+    for (*run, _), each in episodes.items():
+        fewest[*run] = min(fewest.get((*run,), len(each)), len(each))
+    means = {key: float(np.mean(each[: fewest[key[:-1]]])) for key, each in episodes.items()}
+    return Plot(
+        "every_run",
+        "Every run",
+        "Mean return of each evaluation, a line for each of n runs; thick: their median."
+        + (" Dashed: policies that don't learn, on the same starts." if references else ""),
+        ("task", "algorithm", "representation", "seed", "step", "mean_return"),
+        [(*key, cell(mean)) for key, mean in means.items()],
+        lambda: _draw_runs(means, references, looks),
+    )
+
+
+def _rows(groups: Groups) -> Iterator[tuple[Any, ...]]:
+    for group in groups:
+        for label in group.labels:
+            curve = label.curve
+            columns = (group.grid, curve.p10, curve.p50, curve.p90, *curve.iqm)
+            for step, *values in zip(*columns, strict=True):
+                key = (group.task, group.algorithm, label.representation, int(step))
+                yield *key, *(cell(value) for value in values)
+
+
+def cell(value: float) -> str:
+    """A number in a figure's table; nothing for what isn't finite."""
+    return f"{value:.7g}" if np.isfinite(value) else ""
+
+
+def _grid_of_curves(
+    groups: Groups, references: References, extents: Mapping[str, Limits], looks: Looks
+) -> Figure:
+    look, names = looks(), names_with_runs(groups)
+    faint = 0.15 if len(names) <= _FEW else 0.05
+
+    def draw(axes: Axes, group: GroupAnalysis) -> None:
+        _draw_references(axes, references.get(group.task, {}))
+        if extents[group.task].contain(group.solved):
+            axes.axhline(group.solved, **solved_line_style())
+        for label in group.labels:
+            style, curve = look[label.representation], label.curve
+            axes.fill_between(
+                group.grid, curve.p10, curve.p90, color=style["color"], alpha=faint, linewidth=0
+            )
+            axes.plot(
+                group.grid,
+                curve.p50,
+                label=names[label.representation],
+                ms=2.5,
+                markevery=max(1, len(group.grid) // 8),
+                clip_on=False,  # whole markers at the edges
+                **style,
+            )
+
+    return _grid(groups, extents, draw)
+
+
+def _draw_references(axes: Axes, played: Mapping[str, Sequence[float]]) -> None:
+    for i, (policy, returns) in enumerate(played.items()):
+        axes.axhline(float(np.mean(returns)), label=plain(policy), **reference(i))
+
+
+def names_with_runs(groups: Groups) -> dict[str, str]:
+    """Each representation for a legend, with the number of its runs."""
+    counts = defaultdict(list)
+    for group in groups:
+        for label in group.labels:
+            counts[label.representation].append(len(label.seeds))
+    return {name: with_runs(name, each) for name, each in counts.items()}
+
+
+def _grid(
+    groups: Groups, extents: Mapping[str, Limits], draw: Callable[[Axes, GroupAnalysis], None]
+) -> Figure:
+    """A panel for each task (rows) and algorithm (columns), over steps of training."""
+    tasks = list(dict.fromkeys(group.task for group in groups))
+    algorithms = list(dict.fromkeys(group.algorithm for group in groups))
+    by_place = {(group.task, group.algorithm): group for group in groups}
+    is_narrow = len(algorithms) == 1 and len(names_with_runs(groups)) <= _FEW
+    width = COLUMN if is_narrow else PAGE
+    figure = Figure(figsize=(width, 0.5 + (2.0 if len(algorithms) < 3 else 1.6) * len(tasks)))
+    panels = figure.subplots(len(tasks), len(algorithms), squeeze=False, sharey="row")
+    longest = max(len(group.name) for group in groups)
+    gap = ", " if _TITLE * longest < width / len(algorithms) else ",\n"
+    for (i, j), axes in np.ndenumerate(panels):
+        group = by_place.get((tasks[i], algorithms[j]))
+        if group is None:
+            axes.set_axis_off()
+            continue
+        draw(axes, group)
+        axes.set_title(plain(f"{tasks[i]}{gap}{algorithms[j]}"))
+        _training_axes(axes, group.grid[-1], extents[group.task], len(algorithms))
+        axes.set_xlabel("training step" if i == len(tasks) - 1 else "")
+        axes.set_ylabel("" if j else "return")
+    below(figure, panels.ravel())
+    return figure
+
+
+def _training_axes(axes: Axes, last: float, extent: Limits, across: int) -> None:
+    """Steps from 0 on, and returns, of one of so many panels side by side."""
+    axes.set(xlim=(0, max(last, 1)), ylim=extent.with_room(0.015))
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_major_locator(MaxNLocator(5 if across < _MOST_ACROSS else 3))
+
+
+def below(figure: Figure, panels: Iterable[Axes]) -> None:
+    """One legend below all panels, reference lines last, in as many columns as fit.
+
+    The figure grows by the lines of the legend beyond the usual number.
+    """
+    entries = {
+        name: handle
+        for axes in panels
+        for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    names = sorted(entries, key=lambda name: _is_broken(entries[name]))
+    longest = max(map(len, names), default=0)
+    columns = max(1, int(figure.get_figwidth() / (_HANDLE + longest * _CHARACTER)))
+    lines = -(-len(names) // columns)
+    figure.set_figheight(figure.get_figheight() + _LINE * max(0, lines - _USUAL_LINES))
+    handles = [entries[name] for name in names]
+    figure.legend(handles, names, loc="outside lower center", ncols=columns)
+
+
+def _is_broken(handle: Any) -> bool:
+    return isinstance(handle, Line2D) and handle.get_linestyle() not in ("-", "None")
+
+
+def _draw_runs(means: Mapping[Evaluated, float], references: References, looks: Looks) -> Figure:
+    runs: dict[tuple[str, ...], Runs] = defaultdict(lambda: defaultdict(dict))  # by label
+    of_task = defaultdict(list)
+    for (task, algorithm, name, seed, step), mean in means.items():
+        runs[task, algorithm, name][seed][step] = mean
+        of_task[task].append(mean)
+    for task, played in references.items():
+        of_task[task] += [float(np.mean(each)) for each in played.values()]
+    look, groups = looks(), list(dict.fromkeys(label[:2] for label in runs))
+    names = [name for name in look if any(label[2] == name for label in runs)]
+    titles = max(len(with_runs(label[2], [len(each)])) for label, each in runs.items())
+    across = min(len(names), _MOST_ACROSS, max(1, int(PAGE / (_TITLE * titles))))
+    down = -(-len(names) // across)  # rows of a group
+    figure = Figure(figsize=(PAGE, 0.35 + 1.35 * len(groups) * down))
+    panels = figure.subplots(len(groups) * down, across, squeeze=False, sharey="row", sharex="row")
+    for (i, j), axes in np.ndenumerate(panels.reshape(len(groups), -1)):
+        label = (*groups[i], *names[j : j + 1])  # without a name beyond the last
+        if label not in runs:
+            axes.set_axis_off()
+            continue
+        _draw_references(axes, references.get(groups[i][0], {}))
+        _draw_label(axes, runs[label], look[names[j]]["color"])
+        group = f"{', '.join(groups[i])}\n" if j == 0 else ""
+        axes.set_title(plain(group) + with_runs(names[j], [len(runs[label])]))
+        last = max(key[4] for key in means if key[:2] == groups[i])
+        extent = limits(of_task[groups[i][0]])
+        _training_axes(axes, last, extent, across)
+        is_lowest = i == len(groups) - 1 and j >= len(names) - across
+        axes.set_xlabel("training step" if is_lowest else "")
+        axes.set_ylabel("" if j % across else "return")
+    below(figure, panels.ravel())
+    return figure
+
+
+def _draw_label(axes: Axes, runs: Runs, colour: str) -> None:
+    for steps in runs.values():
+        axes.plot(list(steps), list(steps.values()), color=colour, linewidth=0.6, alpha=0.55)
+    shared = sorted(set.intersection(*(set(steps) for steps in runs.values())))
+    if len(runs) > 1:
+        middle = [np.median([steps[step] for steps in runs.values()]) for step in shared]
+        axes.plot(shared, middle, color=colour, linewidth=1.6)

@@ -1,0 +1,153 @@
+"""Do diagnostics predict learning? Final returns of a study against diagnostics of its codes."""
+
+from collections.abc import Sequence
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jbrep.report.figures.curves import below, cell
+from jbrep.report.figures.limits import limits
+from jbrep.report.figures.plot import Plot
+from jbrep.report.figures.style import PAGE, Looks, Styles, ink, plain, reference
+from jbrep.stats.analysis import GroupAnalysis
+from jbrep.stats.association import Association
+
+_SHOWN = ("rewarded", "forward", "reward", "value", "action", "error")  # in panels of their own
+_ACROSS, _HEIGHT = 3, 1.65  # panels beside each other, and their height [inches]
+_PANEL = (1.05, 0.95)  # of their axes, about [inches]
+_CHARACTER, _LINE, _MARKER = 0.038, 0.08, 0.045  # of a name, and of a point's radius [inches]
+_ROOM = 0.08  # of an axis, at its ends
+
+
+def diagnostics(associations: Sequence[Association], looks: Looks) -> Plot:
+    """How well each diagnostic ranks the codes, and the codes by the main ones.
+
+    Args:
+        associations: at least one.
+        looks: of the representations.
+    """
+    return Plot(
+        "diagnostics",
+        "Final return against diagnostics",
+        "Left: the rank correlation of each diagnostic of the codes with their final return, with "
+        "its 95 % bootstrap interval over codes, where there are at least five: 1 if the code with "
+        "the better value always has the higher return. Right: each code by the main diagnostics, "
+        "better ones to the right, with its mean final return.",
+        (
+            *("task", "algorithm", "diagnostic", "representation", "value", "final_return"),
+            *("rank_correlation", "low", "high", "codes"),
+        ),
+        [
+            (
+                *(each.group.task, each.group.algorithm, each.diagnostic.name, name),
+                *(cell(value), cell(final)),
+                *(*map(cell, each.correlation), len(each.values)),
+            )
+            for each in associations
+            for name, value, final in zip(
+                each.representations, each.values, each.returns, strict=True
+            )
+        ],
+        lambda: _draw(associations, looks),
+    )
+
+
+def _draw(associations: Sequence[Association], looks: Looks) -> Figure:
+    """For each group a column of rank correlations, and beside it panels of codes."""
+    groups = {each.group.name: each.group for each in associations}
+    by_group = {name: [a for a in associations if a.group.name == name] for name in groups}
+    rows = max(-(-len(_main(each)) // _ACROSS) for each in by_group.values())
+    rows = max(rows, 2)  # room for the names of all diagnostics
+    figure = Figure(figsize=(PAGE, 0.6 + _HEIGHT * rows * len(groups)))
+    grid = figure.add_gridspec(rows * len(groups), 1 + _ACROSS, width_ratios=(1.15, 1, 1, 1))
+    look, panels = looks(), []
+    for i, (name, group) in enumerate(groups.items()):
+        left = figure.add_subplot(grid[i * rows : (i + 1) * rows, 0])
+        _draw_correlations(left, by_group[name])
+        left.set_title(plain(f"{group.task},\n{group.algorithm}"))
+        for j, each in enumerate(_main(by_group[name])):
+            axes = figure.add_subplot(grid[i * rows + j // _ACROSS, 1 + j % _ACROSS])
+            _draw_codes(axes, each, group, look)
+            axes.set_ylabel("" if j % _ACROSS else "final return")
+            panels.append(axes)
+    below(figure, panels)
+    return figure
+
+
+def _main(associations: Sequence[Association]) -> list[Association]:
+    by_name = {each.diagnostic.name: each for each in associations}
+    return [by_name[name] for name in _SHOWN if name in by_name]
+
+
+def _draw_correlations(axes: Axes, associations: Sequence[Association]) -> None:
+    """A row for each diagnostic."""
+    axes.axvline(0, **reference())
+    for row, each in enumerate(associations):
+        value, low, high = each.correlation
+        axes.plot((low, high), (row, row), color=ink(), lw=1.4)
+        axes.plot(value, row, "o", color=ink(), ms=4)
+    axes.set_yticks(range(len(associations)), [plain(a.diagnostic.name) for a in associations])
+    axes.set(xlim=(-1.05, 1.05), ylim=(len(associations) - 0.4, -0.6))
+    axes.set_xlabel("rank correlation with final return")
+    axes.grid(visible=False, axis="y")
+
+
+def _draw_codes(axes: Axes, association: Association, group: GroupAnalysis, look: Styles) -> None:
+    """A point for each code, with its name where there is room."""
+    values, returns = association.values, association.returns
+    wide = limits(values)
+    extent = limits(label.numbers["final_return_mean"].value for label in group.labels)
+    axes.set(xlim=wide.with_room(_ROOM), ylim=extent.with_room(_ROOM))
+    if association.diagnostic.better < 0:
+        axes.invert_xaxis()
+    for name, x, y in zip(association.representations, values, returns, strict=True):
+        style = {**look[name], "linestyle": "none"}
+        axes.plot(x, y, ms=4, label=plain(name), clip_on=False, **style)
+    places = axes.transLimits.transform(np.stack((values, returns), 1)) * _PANEL
+    names = association.representations
+    for name, x, y, place in zip(names, values, returns, _free(names, places), strict=True):
+        if place is not None:
+            _write_name(axes, name, (x, y), place)
+    correlation = association.correlation.value
+    known = f" {correlation:.2f}" if np.isfinite(correlation) else ""
+    axes.set_title(plain(association.diagnostic.name) + known)
+    axes.set_xlabel(plain(fill(association.diagnostic.words, 30)), size=6)
+
+
+def _write_name(axes: Axes, name: str, at: tuple[float, float], place: tuple[float, float]) -> None:
+    offset: Any = tuple(72 * inches for inches in place)
+    axes.annotate(
+        *(plain(name), at, offset), textcoords="offset points", size=5, va="center", ha="left"
+    )
+
+
+def _free(names: Sequence[str], points: Any) -> list[tuple[float, float] | None]:
+    """Where each name can begin, from its point [inches]; None where it would cover something.
+
+    Args:
+        names: in order of precedence.
+        points: of each, (n, 2) [inches].
+    """
+    taken = [(x - _MARKER, y - _MARKER, x + _MARKER, y + _MARKER) for x, y in points]
+    places: list[tuple[float, float] | None] = []
+    for name, (x, y) in zip(names, points, strict=True):
+        width = _CHARACTER * len(name)
+        sides = ((0.05, 0.0), (-0.05 - width, 0.0), (-width / 2, 0.09), (-width / 2, -0.09))
+        for dx, dy in sides:
+            box = (x + dx, y + dy - _LINE / 2, x + dx + width, y + dy + _LINE / 2)
+            inside = box[0] >= 0 and box[1] >= 0 and box[2] <= _PANEL[0] and box[3] <= _PANEL[1]
+            if inside and not any(_overlap(box, other) for other in taken):
+                taken.append(box)
+                places.append((dx, dy))
+                break
+        else:
+            places.append(None)
+    return places
+
+
+def _overlap(a: Sequence[float], b: Sequence[float]) -> bool:
+    """Whether two boxes (left, bottom, right, top) share some area."""
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

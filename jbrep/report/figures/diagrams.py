@@ -1,0 +1,237 @@
+"""Drawings of the autoencoder and of the system around it, to their actual sizes."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from textwrap import fill
+from typing import Any, NotRequired, TypedDict
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+
+from jbrep.dataset.scaling import EXTREMA
+from jbrep.report.figures.plot import Plot
+from jbrep.report.figures.style import PAGE, Looks, ink, panel_grid, plain
+
+_MOST = 20  # units of a layer that are drawn
+_TITLE = 45  # characters on a line above a panel
+_BOX = 19  # characters on a line of a box
+
+
+class TaskRecord(TypedDict):
+    """What is drawn of a task's description."""
+
+    action_low: list[float]  # of each action
+    action_high: list[float]
+    timestep: float | None  # [s]
+
+
+class Settings(TypedDict):
+    """What runs that differ by seed alone share; settings that nothing here reads come beside."""
+
+    task: str
+    algorithm: str
+    preset: str
+    representation: str
+    encoder: str  # its SHA-256, or that runs have different encoders
+    encoder_code: NotRequired[str | None]  # module:Class, if it is code
+    hidden: list[int] | dict[str, list[int]]  # units of the agent's layers, or of its networks'
+    steps: int
+    evaluate_every: int
+    evaluation_episodes: int
+    environment: NotRequired[TaskRecord]
+
+
+class Training(TypedDict, total=False):
+    """How an encoder was trained."""
+
+    noise: float  # standard deviation of the corruption
+    scaling: str  # of the features, if not by their extrema
+    angles: bool  # whether each angle is encoded as its sine and cosine
+    keep: list[str]  # features that pass around the encoder
+
+
+class Data(TypedDict, total=False):
+    """What an encoder was trained on."""
+
+    train_rows: int
+
+
+class Metrics(TypedDict, total=False):
+    """What training measured."""
+
+    held_out_mse: float | None
+
+
+class EncoderRecord(TypedDict):
+    """An encoder, layer by layer: units and activation."""
+
+    name: str
+    kind: str
+    size: int  # of the observation
+    latent_size: NotRequired[int]
+    encoder: list[tuple[int, str]]
+    decoder: list[tuple[int, str]]
+    training: Training
+    data: Data
+    metrics: Metrics
+
+
+class LabelRecord(TypedDict):
+    """A label in runs.json."""
+
+    settings: Settings
+    encoder: EncoderRecord
+
+
+def diagrams(labels: Mapping[str, LabelRecord], looks: Looks) -> list[Plot]:
+    """The paper's Fig. 6 and Fig. 2; nothing of a study without reduced states."""
+    reduced = [shared for shared in labels.values() if shared["encoder"]["encoder"]]
+    drawn = [shared for shared in reduced if shared["encoder"]["kind"] == "dae"] or reduced
+    if not drawn:
+        return []
+    task = drawn[0]["settings"]["task"]
+    of_task = [shared for shared in drawn if shared["settings"]["task"] == task]
+    by_representation = {each["settings"]["representation"]: each["encoder"] for each in of_task}
+    return [system(drawn[0], looks), autoencoders(task, by_representation, looks)]
+
+
+def autoencoders(task: str, encoders: Mapping[str, EncoderRecord], looks: Looks) -> Plot:
+    """The encoders of a task with their decoders, unit by unit; by representation."""
+    rows = [
+        (name, part, i, *layer)
+        for name, encoder in encoders.items()
+        for part, layers in (("encoder", encoder["encoder"]), ("decoder", encoder["decoder"]))
+        for i, layer in enumerate(layers)
+    ]
+    return Plot(
+        "autoencoders",
+        f"The encoders of {task}",
+        "Layers with their units; agents see the latent, and the decoder only serves training and "
+        f"diagnosis. Of larger layers {_MOST} units are drawn.",
+        ("encoder", "part", "layer", "units", "activation"),
+        rows,
+        lambda: _draw_autoencoders(encoders, looks),
+    )
+
+
+def _draw_autoencoders(encoders: Mapping[str, EncoderRecord], looks: Looks) -> Figure:
+    figure, panels = panel_grid(len(encoders), 2.5)
+    look = looks()
+    for axes, (representation, encoder) in zip(panels, encoders.items(), strict=True):
+        axes.set_axis_off()
+        _draw_layers(axes, encoder, look[representation]["color"])
+        axes.set_title(plain(_title(representation, encoder["training"])), loc="center")
+    return figure
+
+
+def _title(representation: str, training: Training) -> str:
+    """The name, what it was trained with, and on a line below, what passes around it."""
+    noise, kept = training.get("noise"), training.get("keep")
+    corrupted = f", trained with noise N(0, {noise:g}²)" if noise else ""
+    beside = f"{', '.join(kept)} passed around" if kept else ""
+    return "\n".join(filter(None, (f"{representation}{corrupted}", fill(beside, _TITLE))))
+
+
+def _draw_layers(axes: Axes, encoder: EncoderRecord, colour: str) -> None:
+    """A column of units for each layer, joined to the next one's."""
+    sizes = [(encoder["size"], "scaled"), *encoder["encoder"], *encoder["decoder"]]
+    latent = len(encoder["encoder"])
+    columns = [_heights(units) for units, _ in sizes]
+    for x, (left, right) in enumerate(pairwise(columns)):
+        lines = [((x, a), (x + 1, b)) for a in left for b in right]
+        axes.add_collection(LineCollection(lines, color=ink(), linewidth=0.25, alpha=0.25))
+    for x, (heights, (units, words)) in enumerate(zip(columns, sizes, strict=True)):
+        shade = colour if x == latent else ink()
+        axes.plot(np.full(len(heights), x), heights, "o", ms=3.6, color=shade, zorder=3)
+        axes.text(x, -0.08, plain(f"{units} {words}"), ha="center", va="top", size=6.5)
+    names = {0: "observation", len(sizes) - 1: "reconstruction"} | {latent: "latent"}
+    for x, name in names.items():
+        shade = colour if x == latent else ink()
+        axes.text(x, -0.17, name, ha="center", va="top", size=6, color=shade, weight="bold")
+    axes.set(xlim=(-0.45, len(sizes) - 0.55), ylim=(-0.26, 1.04))
+
+
+def _heights(units: int) -> Any:
+    """Where a layer's units stand, around the middle."""
+    shown = min(units, _MOST)
+    return 0.5 + (np.arange(shown) - (shown - 1) / 2) / _MOST
+
+
+def _hidden(layers: list[int] | dict[str, list[int]]) -> str:
+    """Units of hidden layers: 64-64, or pi 64-64, qf 256-256."""
+    if isinstance(layers, dict):
+        return ", ".join(f"{name} {_hidden(units)}" for name, units in layers.items())
+    return "-".join(map(str, layers)) or "none"
+
+
+def system(shared: LabelRecord, looks: Looks) -> Plot:
+    """Robot, observation, encoder, agent, action."""
+    settings, encoder = shared["settings"], shared["encoder"]
+    latent = encoder.get("latent_size", encoder["encoder"][-1][0])
+    hidden = _hidden(settings["hidden"])
+    task = settings.get("environment")
+    action = _action(task) if task else ""
+    step = f" of {task['timestep']:g} s" if task and task["timestep"] else ""
+    boxes = [
+        ("robot", settings["task"] + (f"\nsteps{step}" if step else "")),
+        ("observation", f"{encoder['size']} features\n{_scaled(encoder['training'])}"),
+        ("encoder", f"{settings['representation']}\n{encoder['size']} to {latent}"),
+        ("latent", f"{latent} numbers"),
+        ("agent", f"{settings['algorithm'].upper()}\nhidden {hidden}"),
+    ]
+    return Plot(
+        "system",
+        "The system",
+        f"What an agent sees and does in each step{step}.",
+        ("part", "what"),
+        [(name, what.replace("\n", ", ")) for name, what in [*boxes, ("action", action)]],
+        lambda: _draw_system(boxes, action, looks()[settings["representation"]]["color"]),
+    )
+
+
+def _scaled(training: Training) -> str:
+    scaling = training.get("scaling", EXTREMA)
+    how = "scaled to [-1, 1]" if scaling == EXTREMA else f"{scaling} scaling"
+    return f"{how}, angles as sine and cosine" if training.get("angles") else how
+
+
+def _action(task: TaskRecord) -> str:
+    """Such as 6 numbers in [-1, 1]; without bounds where they differ."""
+    count = len(task["action_low"])
+    numbers = "1 number" if count == 1 else f"{count} numbers"
+    bounds = set(zip(task["action_low"], task["action_high"], strict=False))
+    return f"{numbers} in [{{:g}}, {{:g}}]".format(*bounds.pop()) if len(bounds) == 1 else numbers
+
+
+def _draw_system(boxes: Sequence[tuple[str, str]], action: str, reduced: str) -> Figure:
+    """Boxes in a row, the encoder and its latent in the colour of the representation."""
+    figure = Figure(figsize=(PAGE, 1.45))
+    axes: Axes = figure.subplots()
+    axes.set_axis_off()
+    axes.set(xlim=(-0.05, len(boxes) * 1.25 - 0.2), ylim=(-0.55, 1.05))
+    for i, (name, what) in enumerate(boxes):
+        x, colour = 1.25 * i, reduced if name in ("encoder", "latent") else ink()
+        box = FancyBboxPatch(
+            (x, 0.1), 1, 0.8, "round,pad=0,rounding_size=.08", fc="none", ec=colour
+        )
+        axes.add_patch(box)
+        axes.text(x + 0.5, 0.76, name, ha="center", va="center", weight="bold", color=colour)
+        parts = what.replace("/", "/\n").splitlines()
+        lines = "\n".join(fill(part, _BOX) for part in parts)
+        axes.text(x + 0.5, 0.4, plain(lines), ha="center", va="center", size=6.5)
+        if i:
+            _arrow(axes, (x - 0.25, 0.5), (x, 0.5))
+    last = 1.25 * (len(boxes) - 1) + 0.5
+    axes.plot([last, last, 0.5], [0.1, -0.3, -0.3], color=ink(), lw=0.8, solid_capstyle="butt")
+    _arrow(axes, (0.5, -0.3), (0.5, 0.1))
+    words = f"action: {action}" if action else "action"
+    axes.text((last + 0.5) / 2, -0.33, words, ha="center", va="top", size=6.5)
+    return figure
+
+
+def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float]) -> None:
+    shape: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 7, "shrinkA": 0, "shrinkB": 0}
+    axes.add_patch(FancyArrowPatch(start, end, color=ink(), lw=0.8, **shape))

@@ -1,0 +1,134 @@
+"""How well codes predict what comes next, given the actions: by feature and by horizon."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jbrep.encoders import FULL
+from jbrep.report.figures.curves import below
+from jbrep.report.figures.families import Encoders, line_styles
+from jbrep.report.figures.heat_map import MOST, heat_map, least
+from jbrep.report.figures.plot import Plot
+from jbrep.report.figures.style import PAGE, plain
+from jbrep.stats.bootstrap import Array
+
+_HORIZON = 10  # steps that the heat map looks ahead, if the evaluation has them
+_SUMS = {"mean": "mean of features", "reward": "reward"}  # keys of a horizon, in words
+_COLUMNS = ("encoder", "steps", "target", "r2", "low", "high")
+_LOWEST = -0.1  # R² on an axis
+
+
+def prediction_plots(task: str, encoders: Encoders) -> list[Plot]:
+    """Controlled forward prediction of those encoders that it was measured of; none if of none.
+
+    Args:
+        task: the name.
+        encoders: of evaluation.json, by label, the full observation among them.
+    """
+    measured = {label: e for label, e in encoders.items() if e.get("prediction")}
+    return [_by_feature(task, measured), _by_horizon(task, measured)] if measured else []
+
+
+def _by_feature(task: str, encoders: Encoders) -> Plot:
+    """R² of each feature's change and of the reward (rows) for each encoder (columns)."""
+    steps = _shown_horizon(encoders)
+    count = len(_features(encoders, steps))
+    part = f" Of {count} features the {MOST} that lose most are shown; all are in the table."
+    return Plot(
+        "prediction_by_feature",
+        f"{task}: what can be predicted {steps} steps ahead",
+        f"R² of each feature's change over {steps} steps and of the mean reward over them, "
+        "predicted from the code and the actions taken meanwhile, on held-out episodes. What a "
+        f"code can't predict but {FULL} can, an agent that sees the code can't control."
+        + (part if count > MOST else ""),
+        _COLUMNS,
+        list(_rows(encoders)),
+        lambda: _draw_features(task, encoders, steps),
+    )
+
+
+def _shown_horizon(encoders: Encoders) -> str:
+    horizons = next(iter(encoders.values()))["prediction"]
+    return min(horizons, key=lambda steps: abs(int(steps) - _HORIZON))
+
+
+def _features(encoders: Encoders, steps: str) -> list[str]:
+    return list(next(iter(encoders.values()))["prediction"][steps]["features"])
+
+
+def _rows(encoders: Encoders) -> Iterator[tuple[Any, ...]]:
+    for label, e in encoders.items():
+        for steps, scores in e["prediction"].items():
+            for name, values in scores["features"].items():
+                yield label, int(steps), name, *_three(values)
+            for key, words in _SUMS.items():
+                yield label, int(steps), words, *_three(scores[key])
+
+
+def _three(values: list[float | None] | None) -> list[float | None]:
+    """Value, low, high; None for each of what couldn't be measured."""
+    return values or [None, None, None]
+
+
+def _draw_features(task: str, encoders: Encoders, steps: str) -> Figure:
+    scores = [e["prediction"][steps] for e in encoders.values()]
+    features = _features(encoders, steps)
+    values = np.array([[_three(s["features"][f])[0] for f in features] for s in scores], float).T
+    sums = np.array([[_three(s[key])[0] for key in _SUMS] for s in scores], float).T
+    shown = least(_against_full(values, list(encoders)))
+    figure = heat_map(
+        np.concatenate((values[shown], sums)),
+        [*(features[i] for i in shown), *_SUMS.values()],
+        list(encoders),
+        f"{task}:\nprediction of changes and reward over {steps} steps",
+        "R² on held-out episodes",
+    )
+    figure.axes[0].axhline(len(shown) - 0.5, color="white", linewidth=1.5)
+    return figure
+
+
+def _against_full(values: Array, labels: list[str]) -> Array:
+    """The mean R² of each feature over encoders, less that of the full observation, (features,)."""
+    known = np.nan_to_num(values)
+    return known.mean(axis=1) - (known[:, labels.index(FULL)] if FULL in labels else 0)
+
+
+def _by_horizon(task: str, encoders: Encoders) -> Plot:
+    """R² against the steps ahead, a line for each encoder."""
+    return Plot(
+        "prediction_by_horizon",
+        f"{task}: prediction by steps ahead",
+        "R² of the changes over so many steps, meant over features, and of the mean reward over "
+        "them, predicted from the code and the actions taken meanwhile, on held-out episodes; "
+        "bars: 95 % intervals over episodes.",
+        _COLUMNS,
+        [row for row in _rows(encoders) if row[2] in _SUMS.values()],
+        lambda: _draw_horizons(task, encoders),
+    )
+
+
+def _draw_horizons(task: str, encoders: Encoders) -> Figure:
+    figure = Figure(figsize=(PAGE, 2.5 + 0.02 * len(encoders)))
+    panels = figure.subplots(1, len(_SUMS), sharey=True)
+    look = line_styles(encoders)
+    for axes, (key, words) in zip(panels, _SUMS.items(), strict=True):
+        for label, e in encoders.items():
+            values = np.array([_three(s[key]) for s in e["prediction"].values()], float)
+            _draw_line(axes, list(e["prediction"]), values, label=plain(label), **look[label])
+        axes.set(xlabel="steps ahead", title=words)
+    panels[0].set(
+        ylabel="R² on held-out episodes", ylim=(max(panels[0].get_ylim()[0], _LOWEST), None)
+    )
+    below(figure, panels)
+    figure.suptitle(plain(f"{task}: prediction by steps ahead"), size=8)
+    return figure
+
+
+def _draw_line(axes: Axes, steps: list[str], values: Array, **style: Any) -> None:
+    """A line through values with intervals, (steps, 3), at places that are equally far apart."""
+    value, low, high = values.T
+    spread = np.nan_to_num((value - low, high - value)).clip(0)
+    axes.errorbar(steps, value, spread, ms=3, lw=1.1, elinewidth=0.6, capsize=1.5, **style)

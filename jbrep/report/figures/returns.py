@@ -1,0 +1,211 @@
+"""Final returns, their spread, and learning speed: a point for each run, and intervals."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jbrep.report.figures.curves import Groups, below, cell, names_with_runs
+from jbrep.report.figures.limits import Limits, limits
+from jbrep.report.figures.plot import Plot
+from jbrep.report.figures.style import (
+    COLUMN,
+    PAGE,
+    Looks,
+    Styles,
+    mark_cut,
+    plain,
+    reference,
+    solved_line_style,
+)
+from jbrep.stats.analysis import Analysis, GroupAnalysis
+from jbrep.stats.bootstrap import Interval
+
+_LABEL = ("task", "algorithm", "representation")
+_JITTER = 0.16  # between the outermost runs and the middle of their representation
+_ROOM = 0.04  # of an axis, at its ends, for whole markers
+_DASHED = " Dashed: policies that don't learn, on the same starts."
+_INTERVALS = " Bars: 95 % intervals, from four runs on."
+_TILTED = 0.03  # height that a character of a tilted name takes [inches]
+_USUAL_NAME = 16  # characters, that panels have room for
+_CUT = " A triangle at an edge: the interval goes beyond it."
+
+
+def final_return(groups: Groups, looks: Looks) -> Plot:
+    """Final return and its spread by representation."""
+    return Plot(
+        "final_return",
+        "Final return and its spread",
+        "Left: mean return at the end of training, a point for each of n runs, and their mean. "
+        "Right: the standard deviation over runs." + _INTERVALS + _dashed(groups) + _CUT,
+        (
+            *(*_LABEL, "seed", "final_return", "mean", "mean_low", "mean_high"),
+            *("sd", "sd_low", "sd_high"),
+        ),
+        list(_by_run(groups, "final_return", ("final_return_mean", "final_return_sd"))),
+        lambda: _draw_final(groups, looks),
+    )
+
+
+def learning_rate(groups: Groups, looks: Looks) -> Plot:
+    """How fast each representation learns: the mean return over training."""
+    return Plot(
+        "learning_rate",
+        "How fast agents learn",
+        "Mean return over all of training (the area under the learning curve), a point for each of "
+        "n runs, and their mean." + _INTERVALS + _dashed(groups) + _CUT,
+        (*_LABEL, "seed", "mean_return", "mean", "mean_low", "mean_high"),
+        list(_by_run(groups, "mean_return", ("mean_return_mean",))),
+        lambda: _draw_learning(groups, looks),
+    )
+
+
+def profiles(analysis: Analysis, looks: Looks) -> Plot:
+    """The share of runs above each return."""
+    return Plot(
+        "profiles",
+        "Performance profiles",
+        "The share of n runs whose final return is above that on the axis, with its 95 % bootstrap "
+        "interval (Agarwal et al. 2021). Higher is better; steep is steady."
+        + _dashed(analysis.groups),
+        (*_LABEL, "final_return", "share", "low", "high"),
+        [
+            (group.task, group.algorithm, label.representation, *row)
+            for group in analysis.groups
+            for label in group.labels
+            for row in zip(group.profile_returns, *label.profile, strict=True)
+        ],
+        lambda: _draw_profiles(analysis, looks),
+    )
+
+
+def _by_run(groups: Groups, value: str, numbers: Sequence[str]) -> Iterator[tuple[Any, ...]]:
+    for group in groups:
+        for label in group.labels:
+            key = (group.task, group.algorithm, label.representation)
+            shared = [cell(part) for name in numbers for part in label.numbers[name]]
+            for seed, each in zip(label.seeds, label.by_run[value], strict=True):
+                yield (*key, seed, cell(each), *shared)
+
+
+def _dashed(groups: Groups) -> str:
+    return _DASHED if any(group.references for group in groups) else ""
+
+
+def _height(groups: Groups) -> float:
+    """Of a row of panels with the names of representations below, tilted if they are many."""
+    longest = max(map(len, names_with_runs(groups).values()))
+    return 1.7 + _TILTED * max(0, longest - _USUAL_NAME)
+
+
+def _panels(groups: Groups, columns: int, height: float) -> tuple[Figure, Any]:
+    """A row of panels for each group; two groups side by side where a row has one panel."""
+    across = 1 if columns > 1 or len(groups) == 1 else 2
+    rows = -(-len(groups) // across)
+    width = COLUMN if columns * across == 1 else PAGE
+    figure = Figure(figsize=(width, 0.3 + height * rows))
+    panels = figure.subplots(rows, columns * across, squeeze=False)
+    flat = panels.reshape(-1, columns)
+    for axes in flat[len(groups) :].ravel():
+        axes.set_axis_off()
+    return figure, flat[: len(groups)]
+
+
+def _draw_final(groups: Groups, looks: Looks) -> Figure:
+    figure, panels = _panels(groups, 2, _height(groups))
+    look = looks()
+    for (left, right), group in zip(panels, groups, strict=True):
+        extent = _extent(group, "final_return", group.solved)
+        if extent.contain(group.solved):
+            left.axhline(group.solved, **solved_line_style())
+        left.set(ylabel="final return", ylim=extent.with_room(_ROOM))
+        _draw_runs(left, group, look, "final_return")
+        deviations = [label.numbers["final_return_sd"] for label in group.labels]
+        _from_zero(right, deviations, extent.width / 2)  # more than of any such returns
+        right.set_ylabel("SD over runs")
+        _name_columns(right, group)
+        for i, (label, deviation) in enumerate(zip(group.labels, deviations, strict=True)):
+            _draw_interval(right, i, deviation, look[label.representation])
+    below(figure, panels.ravel())
+    return figure
+
+
+def _draw_learning(groups: Groups, looks: Looks) -> Figure:
+    figure, panels = _panels(groups, 1, _height(groups))
+    look = looks()
+    for (axes,), group in zip(panels, groups, strict=True):
+        extent = _extent(group, "mean_return")
+        axes.set(ylabel="mean return", ylim=extent.with_room(_ROOM))
+        _draw_runs(axes, group, look, "mean_return")
+    below(figure, panels.ravel())
+    return figure
+
+
+def _extent(group: GroupAnalysis, value: str, solved: float = np.nan) -> Limits:
+    """The limits of a number of all runs, and of the intervals of its means."""
+    runs = np.concatenate([label.by_run[value] for label in group.labels])
+    means = [label.numbers[f"{value}_mean"] for label in group.labels]
+    runs = np.append(runs, [each.value for each in group.references.values()])
+    return limits(runs, group.return_floor, solved).with_ends(means, group.return_floor)
+
+
+def _from_zero(axes: Axes, intervals: Sequence[Interval], limit: float) -> None:
+    """From zero to all values, and to the ends of their intervals as far as a limit."""
+    ends = [end for each in intervals for end in each if end <= limit]
+    cut = any(each.high > limit for each in intervals)
+    top = max([*ends, *(each.value for each in intervals), limit if cut else 0]) or 1
+    axes.set_ylim(Limits(0, top).with_room(_ROOM))
+
+
+def _draw_runs(axes: Axes, group: GroupAnalysis, look: Styles, value: str) -> None:
+    """A point for each run of each representation, and the mean with its interval."""
+    _name_columns(axes, group)
+    for i, (policy, each) in enumerate(group.references.items()):
+        axes.axhline(each.value, label=plain(policy), **reference(i))
+    for i, label in enumerate(group.labels):
+        style, runs = look[label.representation], label.by_run[value]
+        beside = i - 0.22 + np.linspace(-_JITTER, _JITTER, len(runs)) * (len(runs) > 1)
+        axes.plot(beside, runs, ".", color=style["color"], ms=4, alpha=0.6, mew=0)
+        _draw_interval(axes, i + 0.16, label.numbers[f"{value}_mean"], style)
+
+
+def _name_columns(axes: Axes, group: GroupAnalysis) -> None:
+    names = list(names_with_runs([group]).values())
+    axes.set_title(plain(group.name))
+    tilt: dict[str, Any] = {"rotation": 30, "ha": "right"} if len(names) > 3 else {}
+    axes.set_xticks(range(len(names)), names, **tilt)
+    axes.set_xlim(-0.6, len(names) - 0.4)
+    axes.grid(visible=False, axis="x")
+
+
+def _draw_interval(axes: Axes, at: float, values: Interval, style: dict[str, Any]) -> None:
+    """A value with its interval, upright; no bar where there is no interval."""
+    value, low, high = values
+    spread = None if np.isnan(low) else np.clip([[value - low], [high - value]], 0, None)
+    axes.errorbar([at], [value], spread, ms=4, lw=1.4, capsize=2.5, **style)
+    mark_cut(axes, "y", at, values, style["color"])
+
+
+def _draw_profiles(analysis: Analysis, looks: Looks) -> Figure:
+    groups = analysis.groups
+    figure, panels = _panels(groups, 1, 2.0)
+    look, names = looks(), names_with_runs(groups)
+    for (axes,), group in zip(panels, groups, strict=True):
+        for label in group.labels:
+            colour, returns = look[label.representation]["color"], group.profile_returns
+            share, low, high = label.profile
+            axes.fill_between(returns, low, high, step="post", color=colour, alpha=0.12, lw=0)
+            name = names[label.representation]
+            axes.step(returns, share, where="post", color=colour, label=name)
+        for i, (policy, each) in enumerate(group.references.items()):
+            axes.axvline(each.value, label=plain(policy), **reference(i))
+        extent = limits(group.profile_returns, solved=group.solved)
+        if extent.contain(group.solved):
+            axes.axvline(group.solved, **solved_line_style())
+        axes.set_title(plain(group.name))
+        axes.set(xlim=extent.with_room(0.02), ylim=(-0.02, 1.02))
+        axes.set(xlabel="final return", ylabel="share of runs above")
+    below(figure, panels.ravel())
+    return figure
