@@ -22,8 +22,8 @@ from jbrep.rl.cohort.learner import give_back, stacked
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.cohort.steps import Batch, set_rate
 from jbrep.rl.job import Job
+from jbrep.rl.overrides import used_settings
 from jbrep.rl.presets import PRESETS
-from jbrep.rl.settings import used_settings
 from jbrep.rl.trainers import train_all
 from jbrep.training.adam import allocate_adam_state
 

@@ -13,6 +13,8 @@ import pytest
 
 from jbrep.cli import main
 from jbrep.envs import describe
+from jbrep.records.keys import key_table
+from jbrep.rl.settings import TrainingSettings
 from jbrep.stats.rules import Rules
 from jbrep.study.config import Data, Study, as_study
 
@@ -84,6 +86,11 @@ def test_the_table_of_keys_has_those_that_a_study_takes():
         if field.name != "learners"  # the tables under algorithms
     )
     assert sorted(shown) == sorted(chain(*keys))
+
+
+@pytest.mark.parametrize(("page", "kind"), [("learning", TrainingSettings)])
+def test_the_tables_of_keys_are_those_of_the_records(page, kind):
+    assert key_table(kind) in (ROOT / f"docs/{page}.md").read_text()
 
 
 @pytest.mark.parametrize("line", found(r"^ {4}jbrep ([^\n]*)"))

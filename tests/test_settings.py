@@ -25,9 +25,9 @@ from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, statistics_of
 from jbrep.rl.files import EVALUATION_SEED, POLICY, RUN, read_evaluations, read_run
 from jbrep.rl.learner import Learner, read_preset, usual_name, write_preset
+from jbrep.rl.overrides import setting_names, used_settings
 from jbrep.rl.policy import load_run, load_untrained, load_zip
 from jbrep.rl.presets import ALGORITHMS
-from jbrep.rl.settings import setting_names, used_settings
 from jbrep.rl.weights import STATISTICS
 from jbrep.study.config import as_study, read_study
 from jbrep.study.plan import Plan, read_plan

@@ -13,7 +13,9 @@ import click
 
 from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, interval_of, on_stop, printable
 from jbrep.cli.environment import given_task, parse_arguments, task_options
-from jbrep.rl.names import CLASSES, CPU, FLOAT32
+from jbrep.cli.options import record_options
+from jbrep.rl.names import CLASSES
+from jbrep.rl.settings import TrainingSettings
 from jbrep.text import rounded
 
 if TYPE_CHECKING:
@@ -86,40 +88,8 @@ def given_settings(options: dict[str, Any]) -> dict[str, Any]:
 )
 @task_options()
 @learner_options
-@click.option(
-    "--trainer",
-    default="",
-    help="cohort, which is jbrep's own, or sb3, stable-baselines3 itself.  [default: cohort for "
-    "ddpg, td3 and sac, sb3 for the others]",
-)
-@click.option(
-    "--precision",
-    default=FLOAT32,
-    show_default=True,
-    help="Of a cohort's products of matrices: float32, or bfloat16, which some processors compute "
-    "several times as fast.",
-)
-@click.option(
-    "--device", default=CPU, show_default=True, help="That a cohort learns on: cpu, cuda or auto."
-)
-@click.option("--steps", default=100_000, show_default=True, type=COUNT, help="Of training.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
-@click.option(
-    "--evaluate-every", default=10_000, show_default=True, type=COUNT, help="In steps of training."
-)
-@click.option(
-    "--evaluation-episodes",
-    default=10,
-    show_default=True,
-    type=COUNT,
-    help="Of the deterministic policy, each time, from starts that training doesn't use.",
-)
-@click.option(
-    "--final-episodes",
-    type=COUNT,
-    default=0,
-    help="Of the last time.  [default: ten times as many]",
-)
+@record_options(TrainingSettings)
 @click.option(
     "--from",
     "begin_from",

@@ -7,7 +7,9 @@ import click
 
 from jbrep.cli.base import COUNT, POSITIVE, RESUMES, example
 from jbrep.cli.environment import given_task, task_options
+from jbrep.cli.options import record_options
 from jbrep.cli.rl import given_settings, learner_options, stop_signals
+from jbrep.rl.settings import TrainingSettings
 from jbrep.text import rounded
 
 
@@ -21,15 +23,8 @@ from jbrep.text import rounded
 @learner_options
 @click.option("--trials", default=20, show_default=True, type=POSITIVE, help="In all.")
 @click.option("--seeds", default=1, show_default=True, type=POSITIVE, help="Runs of each trial.")
-@click.option("--steps", default=20_000, show_default=True, type=COUNT, help="Of each run.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of the search and runs.")
-@click.option(
-    "--evaluation-episodes",
-    default=10,
-    show_default=True,
-    type=COUNT,
-    help="That a run is judged by.",
-)
+@record_options(TrainingSettings, "steps", "evaluation_episodes", steps=20_000)
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="A folder for this search."
 )

@@ -12,7 +12,7 @@ from jbrep.errors import InputError, differences
 from jbrep.records.storage import write_whole
 from jbrep.rl.files import BEGINNING, ENCODER, POLICY, read_finished
 from jbrep.rl.normalization import Statistics
-from jbrep.rl.settings import shaping
+from jbrep.rl.overrides import shaping
 from jbrep.rl.weights import fill, read_file, read_policy
 
 

@@ -12,8 +12,8 @@ from jbrep.errors import InputError, choose
 from jbrep.records.toml import read_toml
 from jbrep.rl.fields import LEARNER, MAX_NAME
 from jbrep.rl.names import PAPER, base_name
+from jbrep.rl.overrides import used_settings
 from jbrep.rl.presets import ALGORITHMS, PRESETS
-from jbrep.rl.settings import used_settings
 from jbrep.text import slug
 
 _SUFFIX = ".toml"

@@ -33,8 +33,8 @@ from jbrep.rl.files import (
     read_run,
 )
 from jbrep.rl.normalization import Statistics
+from jbrep.rl.overrides import check_shape, shaping
 from jbrep.rl.presets import ALGORITHMS, Preset
-from jbrep.rl.settings import check_shape, shaping
 from jbrep.rl.weights import fill, one_line, read_file, read_policy, statistics_in
 from jbrep.training.trainer import single_torch_thread
 

@@ -17,8 +17,8 @@ from jbrep.rl.cohort.settings import check as check_settings
 from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_SEED, MAX_STEPS, NAME
 from jbrep.rl.learner import Learner, is_file
 from jbrep.rl.names import COHORT, CPU, DEVICES, FLOAT32, PRECISIONS, TRAINERS, usual_trainer
+from jbrep.rl.overrides import used_settings
 from jbrep.rl.presets import Preset
-from jbrep.rl.settings import used_settings
 from jbrep.training.trainer import get_device, single_torch_thread
 
 _LIMITS = {

@@ -17,8 +17,8 @@ from jbrep.records.lock import exclusive
 from jbrep.records.storage import make_folder, write_whole
 from jbrep.rl.files import FINISHED, read_evaluations
 from jbrep.rl.learner import write_preset
+from jbrep.rl.overrides import setting_names
 from jbrep.rl.run import Run, plain
-from jbrep.rl.settings import setting_names
 from jbrep.rl.trainers import train_all
 
 JOURNAL, BEST = "optuna.journal", "best.toml"

@@ -1,0 +1,69 @@
+"""The keys that a record has, as its options on the command line and the docs tell of them."""
+
+from typing import Any, NamedTuple
+
+import msgspec
+from msgspec import NODEFAULT, inspect
+
+from jbrep.records.record import Record, default_of
+from jbrep.records.words import must_be, type_of
+
+
+class Key(NamedTuple):
+    """A key of a record in files, of the record's field."""
+
+    name: str  # in files
+    field: str  # in Python
+    kind: inspect.Type
+    default: Any  # NODEFAULT: it must be given
+    help: str  # what it means
+    default_in_words: str  # where the default stands for what other settings decide; often empty
+
+    @property
+    def default_shown(self) -> str:
+        """The default for a reader; empty where there is none, or it says nothing."""
+        if self.default_in_words or self.default in (NODEFAULT, None, ""):
+            return self.default_in_words
+        if isinstance(self.default, Record | dict | tuple | frozenset):
+            return ""
+        if isinstance(self.default, bool):
+            return str(self.default).lower()
+        return f"{self.default:,}" if isinstance(self.default, int) else str(self.default)
+
+
+def keys_of(kind: type[Record]) -> list[Key]:
+    """The keys of a record, in order.
+
+    A field says what its default stands for by `Meta(extra={"default": "ten times as many"})`.
+    """
+    node = type_of(kind)
+    assert isinstance(node, inspect.StructType)
+    return [
+        Key(each.encode_name, each.name, each.type, default_of(field), *_words(each.type))
+        for each, field in zip(node.fields, msgspec.structs.fields(kind), strict=True)
+    ]
+
+
+def _words(node: inspect.Type) -> tuple[str, str]:
+    """A field's help, and its default in words."""
+    if not isinstance(node, inspect.Metadata):
+        return "", ""
+    described, extra = node.extra_json_schema or {}, node.extra or {}
+    return str(described.get("description", "")), str(extra.get("default", ""))
+
+
+def key_table(kind: type[Record], *, of: str = "", without: tuple[str, ...] = ()) -> str:
+    """The keys as a table in Markdown, as the docs have it.
+
+    Args:
+        kind: the record's class.
+        of: the key that the record stands under: "data" for data.steps.
+        without: names of keys to leave out.
+    """
+    rows = [
+        f"| `{f'{of}.' if of else ''}{key.name}` | {must_be(key.kind)} | {key.default_shown} "
+        f"| {key.help} |"
+        for key in keys_of(kind)
+        if key.name not in without
+    ]
+    return "\n".join(["| key | must be | default | |", "|---|---|---|---|", *rows])
