@@ -17,6 +17,17 @@ class DamageError(InputError):
     """A file is not what jbrep wrote; the message names it."""
 
 
+def first_line(error: BaseException) -> str:
+    """The first line of an error's message; the name of its class where it has none."""
+    return str(error).strip().partition("\n")[0] or type(error).__name__
+
+
+def kind_and_line(error: BaseException) -> str:
+    """The same after the name of the error's class: KeyError: 'x'."""
+    kind, line = type(error).__name__, first_line(error)
+    return line if line == kind else f"{kind}: {line}"
+
+
 def check_version(path: object, version: Any, newest: int) -> None:
     """Make sure that a file's format version is one that this jbrep reads: 1 to the newest.
 

@@ -4,7 +4,7 @@ import os
 import sys
 from contextlib import suppress
 
-from jbrep.errors import InputError
+from jbrep.errors import InputError, first_line
 
 
 def has_display() -> bool:
@@ -44,7 +44,7 @@ def find_opengl() -> None:
 
 def no_opengl(error: Exception) -> InputError:
     """What to say when MuJoCo can't render."""
-    reason = str(error).strip().partition("\n")[0]
+    reason = first_line(error)
     return InputError(
         f"rendering needs EGL, and MuJoCo finds none ({reason}): apt-get install libegl1 libgl1, "
         "and set MUJOCO_GL=egl, or glfw where there is a display"

@@ -1,8 +1,28 @@
-"""What messages say of settings and versions."""
+"""What messages say of errors, settings and versions."""
 
 import pytest
 
-from jbrep.errors import DamageError, InputError, check_version, differences
+from jbrep.errors import (
+    DamageError,
+    InputError,
+    check_version,
+    differences,
+    first_line,
+    kind_and_line,
+)
+
+
+@pytest.mark.parametrize(
+    ("error", "line", "with_kind"),
+    [
+        (ValueError("\nno such joint\n  at line 3"), "no such joint", "ValueError: no such joint"),
+        (KeyError("x"), "'x'", "KeyError: 'x'"),
+        (RuntimeError(), "RuntimeError", "RuntimeError"),
+    ],
+)
+def test_an_error_of_others_is_one_line(error, line, with_kind):
+    assert first_line(error) == line
+    assert kind_and_line(error) == with_kind
 
 
 def test_at_most_three_settings_are_named_and_long_values_are_cut():

@@ -13,7 +13,7 @@ from jbrep.dataset.settings import Settings
 from jbrep.envs.make import is_batched
 from jbrep.envs.names import import_modules, imported_modules
 from jbrep.envs.recording import Tick
-from jbrep.errors import InputError, choose
+from jbrep.errors import InputError, choose, first_line
 from jbrep.pool import ATTEMPTS, Pool, stop_requested
 
 Backend = Callable[[Settings, Policy, int, int | None], Produce]
@@ -110,7 +110,7 @@ def on_ray(settings: Settings, policy: Policy, lanes: int, num_threads: int | No
                     started += 1
                 yield _columns(ray.get(made.pop(shard)))
         except ray.exceptions.RayError as error:
-            reason = str(error).strip().partition("\n")[0]
+            reason = first_line(error)
             raise InputError(f"the cluster could not make shard {shard}: {reason}") from error
         finally:
             for job in made.values():

@@ -8,7 +8,7 @@ from typing import Any
 from jbrep.envs.encoding import BaseEncoder, as_encoder
 from jbrep.envs.names import import_modules, imported
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, kind_and_line
 
 _CODE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", re.ASCII)
 
@@ -48,8 +48,7 @@ def make(name: str | Path, task: Task) -> BaseEncoder:
         if _makes(thing):
             thing = thing()
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise InputError(f"can't make the encoder {name}: {reason}") from error
+        raise InputError(f"can't make the encoder {name}: {kind_and_line(error)}") from error
     return as_encoder(thing, task)
 
 

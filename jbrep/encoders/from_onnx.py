@@ -15,7 +15,7 @@ from jbrep.encoders.fold import NOTHING, Action, Step, refusal
 from jbrep.encoders.imported import imported
 from jbrep.encoders.onnx_file import FLOATS, Constants, array, read
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, first_line
 
 LATENT, RECONSTRUCTION = "latent", "reconstruction"  # the outputs of a model that jbrep exported
 _MOST_LETTERS = 100  # of what a message says of a node
@@ -103,7 +103,7 @@ def _steps(model: onnx.ModelProto, start: str, constants: Constants) -> list[Ste
         except InputError as error:
             raise InputError(refusal(said, error)) from None
         except (IndexError, TypeError, ValueError, KeyError) as error:
-            raise InputError(refusal(said, str(error).partition("\n")[0])) from None
+            raise InputError(refusal(said, first_line(error))) from None
     return steps
 
 

@@ -18,7 +18,7 @@ from jbrep.encoders.fold import Step, refusal
 from jbrep.encoders.imported import imported
 from jbrep.encoders.torch_actions import BINARY, FUNCTIONS, MODULES, VALUE, arithmetic, as_array
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, kind_and_line
 
 _ROWS = 64  # on which the layers are compared with the module
 _PRECISION = 1e-3  # of the largest number: single precision, after many layers
@@ -67,8 +67,7 @@ def _layers(module: nn.Module, method: str, rows: Any) -> tuple[tuple[Layer, ...
     except InputError as error:
         raise InputError(f"{said}: {error}") from None
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise InputError(refusal(said, reason)) from error
+        raise InputError(refusal(said, kind_and_line(error))) from error
     given = run(layers, np.asarray(rows, np.float32))
     most = _PRECISION * (np.abs(expected).max() + _PRECISION)
     if given.shape != expected.shape or not (np.abs(given - expected) <= most).all():

@@ -9,7 +9,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 from onnx import TensorProto, numpy_helper
 
-from jbrep.errors import InputError
+from jbrep.errors import InputError, first_line
 from jbrep.records.storage import exists, read_file
 
 _MAX_BYTES = 1 << 26  # of a model, and of the file of its numbers
@@ -41,7 +41,7 @@ def read(path: Path) -> tuple[onnx.ModelProto, Constants]:
     except InputError:
         raise
     except _UNREADABLE as error:
-        reason = str(error).strip().partition("\n")[0]
+        reason = first_line(error)
         raise InputError(f"{path} is no ONNX model that can be read: {reason}") from None
 
 

@@ -14,10 +14,10 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatten, flatten_space
 from numpy.typing import NDArray
 
-from jbrep.envs.make import creator, make_env, one_line
+from jbrep.envs.make import creator, make_env
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import MAX_EPISODE_STEPS, SEED_BITS, Feature, Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, kind_and_line
 from jbrep.records.toml import read_toml
 
 _PROBE_STEPS = 200  # of each instance whose episodes are compared
@@ -80,7 +80,7 @@ def _describe(name: str, arguments: str, max_episode_steps: int | None) -> Task:
     except InputError:
         raise
     except Exception as error:  # whatever the environment raises
-        raise InputError(f"{spec.id} failed when it was tried: {one_line(error)}") from error
+        raise InputError(f"{spec.id} failed when it was tried: {kind_and_line(error)}") from error
 
 
 def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None) -> Task:
@@ -258,7 +258,7 @@ def _with_features(task: Task, path: Path) -> Task:
         changed = replace(task, features=tuple(features), **_known(given, _TASK_FIELDS))
         return type(task)(**{f: getattr(changed, f) for f in Task.__dataclass_fields__})
     except (ValueError, TypeError, OverflowError) as error:
-        raise InputError(f"{path} can't be used for {task.name}: {one_line(error)}") from None
+        raise InputError(f"{path} can't be used for {task.name}: {kind_and_line(error)}") from None
 
 
 def _known(row: Any, names: tuple[str, ...]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, kind_and_line
 
 Float32 = NDArray[np.float32]
 
@@ -287,7 +287,5 @@ def _as_array(result: Any) -> Float32:
 
 
 def _reason(error: Exception) -> str:
-    text = f"{type(error).__name__}: {error}".partition("\n")[0]
-    if "grad" in text:
-        text += " (an encoder runs without gradients)"
-    return text
+    text = kind_and_line(error)
+    return f"{text} (an encoder runs without gradients)" if "grad" in text else text

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from jbrep.envs.checks import check_actions, check_counts
 from jbrep.envs.flat import flattener
-from jbrep.envs.make import is_batched, make_batch, make_env, one_line
+from jbrep.envs.make import is_batched, make_batch, make_env
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, kind_and_line
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -317,7 +317,7 @@ class _Separate:
     def _failure(self, lane: int, error: Exception) -> EnvironmentFailedError:
         return EnvironmentFailedError(
             f"{self._task.name} failed at step {len(self._actions[lane])} of the episode with seed "
-            f"{self._seeds[lane]}: {one_line(error)}",
+            f"{self._seeds[lane]}: {kind_and_line(error)}",
             lane,
         )
 

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, kind_and_line
 
 
 def make_env(
@@ -38,7 +38,9 @@ def make_env(
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"can't make {env_id}{_with(arguments)}: {one_line(error)}") from error
+        raise InputError(
+            f"can't make {env_id}{_with(arguments)}: {kind_and_line(error)}"
+        ) from error
 
 
 def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:
@@ -70,12 +72,6 @@ def creator(spec: EnvSpec, vector: bool = False) -> Any:
     """The class or function that makes the environment; None if there is none."""
     entry_point = spec.vector_entry_point if vector else spec.entry_point
     return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
-
-
-def one_line(error: BaseException) -> str:
-    """An error's kind and the first line of its message."""
-    text = str(error).strip().partition("\n")[0]
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from jbrep.errors import InputError
+from jbrep.errors import InputError, kind_and_line
 
 _NAMESPACE = "Jitterbug"
 _REGISTERED_BY = {"dm_control": "shimmy"}  # the package whose import registers a namespace's ids
@@ -63,8 +63,7 @@ def import_modules(modules: Iterable[str]) -> None:
                 sys.path.append("")  # after all that is installed
             import_module(module)
         except Exception as error:
-            reason = f"{type(error).__name__}: {error}".partition("\n")[0]
-            raise InputError(f"can't import {module}: {reason}") from None
+            raise InputError(f"can't import {module}: {kind_and_line(error)}") from None
         if module not in _imported:
             _imported.append(module)
 

@@ -11,6 +11,8 @@ from typing import Any
 import wandb
 from stable_baselines3.common.logger import KVWriter
 
+from jbrep.errors import first_line
+
 TENSORBOARD = "tensorboard"  # what is kept from it is kept from here, too
 
 
@@ -47,7 +49,7 @@ class Tracker(KVWriter):
             self._run.log({**numbers, "step": step})
         except Exception as error:  # of its many kinds none may end a run
             self._failed = True
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            reason = first_line(error)
             print(f"Weights & Biases: {reason}; the run goes on without it", file=sys.stderr)
 
     def close(self) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jbrep.envs.names import import_modules
+from jbrep.errors import first_line
 from jbrep.records.storage import make_folder
 from jbrep.rl import Run, StoppedError
 from jbrep.rl.trainers import train_all
@@ -78,8 +79,7 @@ def _crashed(assigned: Assigned, error: Exception) -> Outcome:
     path = assigned.folder / ERROR
     with suppress(OSError):
         path.write_text("".join(traceback.format_exception(error)))
-    reason = str(error).partition("\n")[0] or type(error).__name__
-    return Outcome(assigned.name, CRASHED, f"{reason}; see {path}")
+    return Outcome(assigned.name, CRASHED, f"{first_line(error)}; see {path}")
 
 
 def read_progress(folder: Path) -> tuple[int, str]:

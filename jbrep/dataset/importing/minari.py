@@ -22,9 +22,8 @@ from jbrep.dataset.importing.episodes import (
 )
 from jbrep.dataset.schema import UNKNOWN_SEED
 from jbrep.envs.description import describe, features_of
-from jbrep.envs.make import one_line
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, kind_and_line
 from jbrep.records.storage import exists, read_regular
 
 Array = NDArray[Any]
@@ -104,7 +103,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
         metadata = json.loads(read_regular(path, _MAX_BYTES))
         spaces_of = [metadata["observation_space"], metadata["action_space"]]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{path} can't be read: {one_line(error)}") from None
+        raise InputError(f"{path} can't be read: {kind_and_line(error)}") from None
     if not all(isinstance(space, str) for space in spaces_of):
         raise InputError(f"{path} doesn't say what observations and actions are")
     return dict(metadata)
@@ -122,7 +121,7 @@ def _storage(given: str, folder: Path) -> storages.MinariStorage:
 
 
 def _unreadable(name: str, error: Exception) -> InputError:
-    return InputError(f"{name} can't be read as a Minari data set: {one_line(error)}")
+    return InputError(f"{name} can't be read as a Minari data set: {kind_and_line(error)}")
 
 
 def _environment(metadata: dict[str, Any]) -> tuple[str, dict[str, Any], int | None]:
@@ -144,7 +143,7 @@ def _describe(env_id: str, arguments: dict[str, Any], limit: int | None) -> tupl
     try:
         return describe(env_id, arguments, limit), ""
     except (InputError, ModuleNotFoundError) as error:
-        return None, one_line(error)
+        return None, kind_and_line(error)
 
 
 def _episodes(name: str, storage: storages.MinariStorage) -> Iterator[Incoming]:
@@ -211,4 +210,4 @@ def _flat(where: str, space: spaces.Space[Any], values: Any) -> Array:
         flat = [flatten(space, value) for value in array]
         return np.array(flat).reshape(len(array), spaces.utils.flatdim(space))
     except (ValueError, KeyError, IndexError, TypeError) as error:
-        raise InputError(f"{where} doesn't fit {space}: {one_line(error)}") from None
+        raise InputError(f"{where} doesn't fit {space}: {kind_and_line(error)}") from None

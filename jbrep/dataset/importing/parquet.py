@@ -24,7 +24,7 @@ from jbrep.dataset.importing.flat import (
     split,
 )
 from jbrep.envs.task import Feature, Task, read_task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, first_line
 from jbrep.records.storage import exists
 
 _ACTION = re.compile(r"actions?(_\d+)?")
@@ -73,8 +73,7 @@ def _schema(path: Path) -> pa.Schema:
 
 
 def _unreadable(path: Path, error: BaseException) -> InputError:
-    reason = str(error).partition("\n")[0]
-    return InputError(f"{path} can't be read as a Parquet file: {reason}")
+    return InputError(f"{path} can't be read as a Parquet file: {first_line(error)}")
 
 
 def _own_task(schema: pa.Schema) -> Task | None:

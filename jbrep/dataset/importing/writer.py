@@ -15,9 +15,8 @@ from jbrep.dataset.schema import EPISODES, Columns, episode_returns
 from jbrep.dataset.settings import IMPORTED, Settings
 from jbrep.dataset.verify import range_problems
 from jbrep.envs.description import features_of
-from jbrep.envs.make import one_line
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, kind_and_line
 from jbrep.progress import Progress
 from jbrep.records.publish import publish_folder, unfinished
 from jbrep.records.storage import check_space, make_folder
@@ -135,7 +134,7 @@ def _from_data(source: Source, survey: _Survey) -> Task:
             reproducible=False,
         )
     except ValueError as error:
-        raise InputError(f"{source.name} makes no task: {one_line(error)}") from None
+        raise InputError(f"{source.name} makes no task: {kind_and_line(error)}") from None
 
 
 def _action_bounds(source: Source, survey: _Survey) -> tuple[Array, Array]:
