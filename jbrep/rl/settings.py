@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from jbrep.records.record import Record
-from jbrep.rl.names import CPU, FLOAT32
 
 MAX_STEPS = 10**12  # of training
 MAX_EPISODES = 10_000  # of an evaluation
@@ -49,8 +48,8 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
             description="Of a cohort's products of matrices: float32, or bfloat16, which some "
             "processors compute several times as fast."
         ),
-    ] = FLOAT32
+    ] = "float32"
     device: Annotated[
         Literal["cpu", "cuda", "auto"],
         Meta(description="That a cohort learns on; auto is cuda where there is one."),
-    ] = CPU
+    ] = "cpu"
