@@ -17,7 +17,7 @@ from jbrep.dae.gradient import Gradient
 from jbrep.dae.network import ARCHITECTURES, stacks
 from jbrep.dae.objective import Reconstruction
 from jbrep.encoders import find
-from jbrep.encoders.encoder import run
+from jbrep.encoders.layers import run
 from jbrep.envs import describe
 from jbrep.methods.autoencoder import NOISE
 from jbrep.training.trainer import Schedule, Trainer

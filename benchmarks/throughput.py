@@ -21,8 +21,8 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from timing import show
 
 import jbrep.envs  # noqa: F401 (registers the environments)
-from jbrep import jitterbug
-from jbrep.envs import JitterbugVecEnv, environment_id
+from jbrep import JitterbugVecEnv, jitterbug
+from jbrep.jitterbug import environment_id
 from jbrep.jitterbug.model import PHYSICS_STEPS, fast_model, stop_profiling
 from jbrep.jitterbug.tasks import EPISODE_STEPS
 

@@ -26,8 +26,9 @@ from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.manifest import open_shard, read_manifest, write_manifest
 from jbrep.dataset.schema import episode_seed
 from jbrep.dataset.verify import find_problems
-from jbrep.envs import describe, environment_id
+from jbrep.envs import describe
 from jbrep.errors import InputError
+from jbrep.jitterbug import environment_id
 from jbrep.records.lock import exclusive
 
 

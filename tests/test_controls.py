@@ -9,7 +9,7 @@ from torch import nn
 from jbrep.dae.gradient import Gradient
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.scaled import Moments
-from jbrep.encoders.encoder import run
+from jbrep.encoders.layers import run
 from jbrep.methods import random
 from jbrep.methods.linear import linear_code, linear_denoiser, principal_code
 

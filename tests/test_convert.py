@@ -15,9 +15,9 @@ from torch.nn import functional
 
 from jbrep.dae.network import get_architecture
 from jbrep.encoders import ACTIVATIONS, Encoder, Layer, find, load, save
-from jbrep.encoders.activations import activate
 from jbrep.encoders.card import card
 from jbrep.encoders.from_onnx import convert
+from jbrep.encoders.layers import activate
 from jbrep.encoders.onnx import export
 from jbrep.envs import describe
 from jbrep.errors import InputError

@@ -10,7 +10,7 @@ from torch.nn.functional import mse_loss
 from jbrep.dae.gradient import Gradient
 from jbrep.dae.network import ARCHITECTURES, layers, stacks
 from jbrep.dae.objective import Reconstruction
-from jbrep.encoders.encoder import run
+from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.methods.autoencoder import AE, DAE
 from jbrep.records import container

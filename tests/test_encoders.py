@@ -17,13 +17,14 @@ import safetensors.numpy
 import torch
 from command import jbrep
 
+from jbrep import JitterbugVecEnv
 from jbrep.dataset import DamageError, Scaler
 from jbrep.encoders import Encoder, Layer, find, load, save, shipped
 from jbrep.encoders.card import card
 from jbrep.encoders.card import describe as described
 from jbrep.encoders.onnx import export
 from jbrep.encoders.shipped import names, source_of
-from jbrep.envs import Feature, JitterbugVecEnv, Task, describe
+from jbrep.envs import Feature, Task, describe
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.records import container

@@ -12,13 +12,15 @@ from gymnasium.envs.mujoco.utils import check_mujoco_reset_state
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-import jbrep.envs
-from jbrep.envs import JitterbugVectorEnv, environment_id
+import jbrep
+from jbrep import envs, jitterbug
 from jbrep.errors import InputError
+from jbrep.jitterbug import JitterbugVectorEnv, environment_id
 from jbrep.jitterbug.tasks import TASKS
 
 IDS = [environment_id(task) for task in TASKS]
 FACE = environment_id("face_direction")
+PACKAGES = (jbrep, envs, jitterbug)
 
 
 def test_the_ids():
@@ -43,11 +45,11 @@ def test_whatever_is_imported_first():
     code = f"""
 import mujoco, os, sys, torch
 assert not [name for name in sys.modules if name.startswith(("jbrep.", "gymnasium"))]
-for name in {jbrep.envs.__all__}:
+for package, name in {[(p.__name__, name) for p in PACKAGES for name in p.__all__]}:
     if os.fork() == 0:
-        exec(f"from jbrep.envs import {{name}}; import gymnasium; gymnasium.spec('{FACE}')")
+        exec(f"from {{package}} import {{name}}; import gymnasium; gymnasium.spec('{FACE}')")
         os._exit(0)
-    assert os.wait()[1] == 0, name
+    assert os.wait()[1] == 0, (package, name)
 """
     subprocess.run([sys.executable, "-c", code], check=True)
 

@@ -7,7 +7,7 @@ from torch.distributions import MultivariateNormal, Normal, kl_divergence
 
 from jbrep.dae.gradient import Gradient
 from jbrep.dataset import Dataset, ScaledDataset
-from jbrep.encoders.encoder import run
+from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.methods import lld_vae
 from jbrep.methods.fit import Fitter

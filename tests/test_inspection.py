@@ -16,8 +16,8 @@ from rerun.chunk import RrdReader
 
 from jbrep.dataset import Dataset
 from jbrep.encoders import find, save
+from jbrep.encoders.base import as_encoder
 from jbrep.envs import describe
-from jbrep.envs.encoding import as_encoder
 from jbrep.envs.physics import Motion
 from jbrep.errors import InputError
 from jbrep.evaluate.truth import state

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from jbrep.envs import Lanes, describe
-from jbrep.envs.checks import NonFiniteActionError
-from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
 from jbrep.envs.recording import open_loop, play, read_states, record
 from jbrep.errors import InputError
 

@@ -16,15 +16,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 from wide import wide
 
+from jbrep import Encoded, JitterbugVecEnv
 from jbrep.encoders import Encoder, find
+from jbrep.encoders.base import as_encoder
 from jbrep.encoders.card import card as describe_encoder
 from jbrep.encoders.code import import_code
-from jbrep.envs import Encoded, JitterbugEnv, TaskVecEnv, describe
-from jbrep.envs.encoding import as_encoder
+from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.evaluate import diagnose
 from jbrep.evaluate.summary import evaluation_text
 from jbrep.inspection import inspect
+from jbrep.jitterbug import JitterbugEnv
 from jbrep.report.figures import encoder_plots
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, ENCODER, RUN
@@ -423,7 +425,7 @@ def test_an_encoded_environment_shows_latents():
 
 @pytest.mark.parametrize("lanes", [1, 3])
 def test_latents_are_those_of_the_vec_env_to_the_bit(lanes):
-    ours = TaskVecEnv("face_direction", lanes, 3, find("dae-8", "face_direction"), 1, 10)
+    ours = JitterbugVecEnv("face_direction", lanes, 3, find("dae-8", "face_direction"), 1, 10)
     if lanes == 1:
         theirs = DummyVecEnv([lambda: Encoded(one(form="dict"), "dae-8")])
         theirs.seed(3)

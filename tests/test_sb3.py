@@ -9,9 +9,10 @@ from gymnasium import spaces
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
+from jbrep import JitterbugVecEnv
 from jbrep.encoders import find
-from jbrep.envs import JitterbugVecEnv, Lanes, TaskVecEnv, describe
-from jbrep.envs.checks import NonFiniteActionError
+from jbrep.envs import Lanes, describe
+from jbrep.envs.lanes import NonFiniteActionError
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 
@@ -49,7 +50,7 @@ def test_spaces_and_types(task):
 
 
 def test_actions_have_the_bounds_of_the_task():
-    environment = TaskVecEnv(cart.ID, 2)
+    environment = JitterbugVecEnv(cart.ID, 2)
     assert environment.action_space == cart.Cart.action_space
     assert environment.observation_space.shape == (2,)
 
@@ -57,7 +58,7 @@ def test_actions_have_the_bounds_of_the_task():
 @each_task
 def test_it_resets_in_the_step_that_ends_the_episode(task):
     """Each lane goes through the episodes of its seeds, as lanes do that are reset by hand."""
-    environment, lanes = TaskVecEnv(task, 3, seed=4), Lanes(task, 3)
+    environment, lanes = JitterbugVecEnv(task, 3, seed=4), Lanes(task, 3)
     scaled = lambda observation: task.scale(observation).astype(np.float32)  # noqa: E731
     np.testing.assert_array_equal(environment.reset(), scaled(lanes.reset(range(3), [4, 5, 6])))
     ends, counters = set(), [itertools.count(1) for _ in range(3)]
@@ -83,7 +84,7 @@ def test_it_resets_in_the_step_that_ends_the_episode(task):
 
 @each_task
 def test_the_middle_of_an_episode_is_restored_to_the_same_bits(task):
-    one, other = TaskVecEnv(task, 3, seed=1), TaskVecEnv(task, 3, seed=7)
+    one, other = JitterbugVecEnv(task, 3, seed=1), JitterbugVecEnv(task, 3, seed=7)
     one.reset()
     drive = actions(200, 3, task)
     for action in drive[:70]:
@@ -98,7 +99,7 @@ def test_the_middle_of_an_episode_is_restored_to_the_same_bits(task):
 def test_an_environment_that_is_not_reproducible_is_not_restored():
     task = describe(cart.ID, {"drifts": True})
     assert not task.reproducible
-    one, other = TaskVecEnv(task, 1), TaskVecEnv(task, 1)
+    one, other = JitterbugVecEnv(task, 1), JitterbugVecEnv(task, 1)
     one.reset()
     with pytest.raises(InputError, match=r"Test/Cart-v0 is not reproducible here"):
         other.restore(one.state)
@@ -129,8 +130,8 @@ def test_lane_i_has_the_episodes_of_seed_plus_i(lanes, threads):
 
     drive = actions(60, 1)[:, 0]
     task = describe("move_in_direction", max_episode_steps=40)
-    alone = TaskVecEnv(task, 1, seed=10 + lanes - 1, num_threads=1)
-    among = TaskVecEnv(task, lanes, seed=10, num_threads=threads)
+    alone = JitterbugVecEnv(task, 1, seed=10 + lanes - 1, num_threads=1)
+    among = JitterbugVecEnv(task, lanes, seed=10, num_threads=threads)
     np.testing.assert_array_equal(tape(alone, 0, drive), tape(among, lanes - 1, drive))
 
 
@@ -144,7 +145,7 @@ def test_seeds_count_once_and_again_when_set():
 
 
 def test_the_encoder_sees_observations_in_physical_units_also_terminal_ones():
-    plain, coded = TaskVecEnv(FACE, 2), TaskVecEnv(FACE, 2, encoder=Halves())
+    plain, coded = JitterbugVecEnv(FACE, 2), JitterbugVecEnv(FACE, 2, encoder=Halves())
     assert coded.observation_space.shape == (8,)
 
     def check(latent, scaled):
@@ -184,7 +185,7 @@ def test_a_lane_that_diverges_is_flagged_and_the_others_go_on():
 
 @each_task
 def test_vec_monitor_counts_returns(task):
-    environment = VecMonitor(TaskVecEnv(task, 2))
+    environment = VecMonitor(JitterbugVecEnv(task, 2))
     environment.reset()
     total, length, episodes = np.zeros(2), np.zeros(2), 0
     for action in actions(100, 2, task):
@@ -208,7 +209,7 @@ def test_an_agent_learns_on_it():
 
 def test_the_environment_gets_actions_within_its_bounds():
     """Scaled to them from [-1, 1], as SAC's are, they round to beyond; the cart refuses those."""
-    environment = TaskVecEnv(CART, 1)
+    environment = JitterbugVecEnv(CART, 1)
     agent = SAC("MlpPolicy", environment, device="cpu", buffer_size=10)
     largest = agent.policy.unscale_action(np.ones((1, 2), np.float32))
     assert not environment.action_space.contains(largest[0])
@@ -218,7 +219,7 @@ def test_the_environment_gets_actions_within_its_bounds():
 
 
 def test_attributes_are_shared_by_the_lanes():
-    environment = TaskVecEnv(FACE, 3)
+    environment = JitterbugVecEnv(FACE, 3)
     assert environment.get_attr("task", [0, 2]) == [FACE] * 2
     assert environment.get_attr("render_mode") == [None] * 3
     assert environment.env_is_wrapped(VecMonitor, 1) == [False]
@@ -234,9 +235,9 @@ def test_mistakes_are_named():
     with pytest.raises(InputError, match="the number of lanes is 0: it must be at least 1"):
         JitterbugVecEnv("face_direction", 0)
     with pytest.raises(InputError, match="is described with its time limit"):
-        TaskVecEnv(FACE, 1, max_episode_steps=7)
+        JitterbugVecEnv(FACE, 1, max_episode_steps=7)
     with pytest.raises(InputError, match="made for face_direction, not for Test/Cart-v0"):
-        TaskVecEnv(CART, 1, encoder=find("dae-8", FACE))
+        JitterbugVecEnv(CART, 1, encoder=find("dae-8", FACE))
 
     class Liar(Halves):
         latent_size = 7

@@ -6,7 +6,7 @@ import pytest
 from jbrep.dae.network import ARCHITECTURES, layers, stacks
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import Encoder
-from jbrep.encoders.encoder import run
+from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.methods.fit import Fitter
 from jbrep.methods.linear import dense

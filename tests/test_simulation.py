@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jbrep.envs.checks import NonFiniteActionError, check_actions
+from jbrep.envs.lanes import NonFiniteActionError, check_actions
 from jbrep.errors import InputError
 from jbrep.jitterbug.bodies import PUBLISHED, draw
 from jbrep.jitterbug.model import PHYSICS_STEPS, plain_model

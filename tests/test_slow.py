@@ -8,7 +8,7 @@ from deeptime.decomposition import TICA, VAMP
 from scipy.linalg import eigh, sqrtm
 
 from jbrep.dataset import Dataset, ScaledDataset
-from jbrep.encoders.encoder import run
+from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.methods import passes
 from jbrep.methods.fit import Fitter

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jbrep.encoders import FULL, Encoder, find, save
-from jbrep.encoders.encoder import IMPORTED, Layer
+from jbrep.encoders.encoder import IMPORTED
 from jbrep.encoders.file import SUFFIX
+from jbrep.encoders.layers import Layer
 from jbrep.envs import describe
 
 FEATURES = {

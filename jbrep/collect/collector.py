@@ -25,7 +25,7 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.schema import EPISODES, Columns
 from jbrep.dataset.settings import Settings
-from jbrep.envs.checks import check_counts
+from jbrep.envs.lanes import check_counts
 from jbrep.envs.make import is_batched
 from jbrep.errors import InputError, differences
 from jbrep.progress import Progress

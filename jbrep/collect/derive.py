@@ -15,7 +15,7 @@ from jbrep.collect.shards import Missing, Produce
 from jbrep.dataset import Dataset, Settings, version1
 from jbrep.dataset.manifest import new_manifest, open_shard
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns, episode_returns
-from jbrep.envs.checks import check_counts
+from jbrep.envs.lanes import check_counts
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, differences
 from jbrep.jitterbug.simulation import Simulation

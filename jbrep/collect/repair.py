@@ -24,7 +24,7 @@ from jbrep.dataset.manifest import (
     write_shard,
 )
 from jbrep.dataset.shard import column_hashes
-from jbrep.envs.checks import check_counts
+from jbrep.envs.lanes import check_counts
 from jbrep.errors import DamageError, InputError
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from jbrep.encoders import Layer
-from jbrep.encoders.activations import AVG_L1_NORM, activate
-from jbrep.encoders.encoder import MAX_UNITS
+from jbrep.encoders.layers import AVG_L1_NORM, MAX_UNITS, activate
 from jbrep.errors import InputError, choose
 from jbrep.records.container import MAX_BYTES
 

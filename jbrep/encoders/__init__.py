@@ -1,8 +1,8 @@
 """Encoders: from observations to latents and back, their file format, and those that ship."""
 
-from jbrep.encoders.activations import ACTIVATIONS
-from jbrep.encoders.encoder import FULL, Encoder, Layer
+from jbrep.encoders.encoder import FULL, Encoder
 from jbrep.encoders.file import load, save
+from jbrep.encoders.layers import ACTIVATIONS, Layer
 from jbrep.encoders.shipped import find
 
 __all__ = ["ACTIVATIONS", "FULL", "Encoder", "Layer", "find", "load", "save"]

@@ -4,9 +4,10 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jbrep.encoders.encoder import Encoder, Layer
+from jbrep.encoders.base import BaseEncoder
+from jbrep.encoders.encoder import Encoder
+from jbrep.encoders.layers import Layer
 from jbrep.encoders.shipped import Shipped
-from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task
 from jbrep.text import facts, r2_text, table
 

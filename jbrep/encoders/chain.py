@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.encoders.activations import EPSILON, LAYER_NORM
-from jbrep.encoders.encoder import MAX_UNITS, Layer
+from jbrep.encoders.layers import EPSILON, LAYER_NORM, MAX_UNITS, Layer
 from jbrep.errors import InputError
 
 Array = NDArray[np.float64]

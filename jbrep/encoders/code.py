@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from jbrep.envs.encoding import BaseEncoder, as_encoder
+from jbrep.encoders.base import BaseEncoder, as_encoder
 from jbrep.envs.names import import_modules, imported
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line

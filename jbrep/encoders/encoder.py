@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from jbrep.dataset import Scaler
 from jbrep.dataset.scaling import library_of
-from jbrep.encoders.activations import ACTIVATIONS, FIRST_ACTIVATIONS, activate
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
+from jbrep.encoders.layers import ACTIVATIONS, FIRST_ACTIVATIONS, MAX_UNITS, Layer, run
 from jbrep.envs.task import Task, check_same, read_task
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import get_task
@@ -26,24 +26,8 @@ FORMAT = "jbrep encoder"
 FORMAT_VERSION = 3  # the newest; see `Encoder.format_version`
 IDENTITY = "identity"  # the kind of encoder that leaves the scaled observation as it is
 IMPORTED = "imported"  # the kind of encoder that was trained elsewhere
-MAX_UNITS = 4096  # in a layer
 MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
 _SCALING = ("low", "high")  # tensors
-
-
-class Layer(NamedTuple):
-    """A dense layer: activation(values @ weight.T + bias)."""
-
-    weight: Any  # (out, in) float32
-    bias: Any  # (out,) float32
-    activation: str
-
-
-def run(layers: tuple[Layer, ...], values: Any) -> Any:
-    """Pass values (..., in) through the layers, giving (..., out)."""
-    for weight, bias, activation in layers:
-        values = activate(activation, values @ weight.T + bias)
-    return values
 
 
 class _Parts(NamedTuple):

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from jbrep.dataset import Scaler
-from jbrep.encoders.encoder import FORMAT, FORMAT_VERSION, IMPORTED, Encoder, Layer
+from jbrep.encoders.encoder import FORMAT, FORMAT_VERSION, IMPORTED, Encoder
+from jbrep.encoders.layers import Layer
 from jbrep.encoders.names import check_name
 from jbrep.errors import InputError, check_version
 from jbrep.records import container

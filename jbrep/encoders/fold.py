@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jbrep.encoders.activations import ACTIVATIONS, WHOLE
 from jbrep.encoders.chain import Array, Chain
-from jbrep.encoders.encoder import Layer
+from jbrep.encoders.layers import ACTIVATIONS, WHOLE, Layer
 from jbrep.errors import InputError
 
 _HALF = np.concatenate((np.linspace(0, 8, 65)[1:], np.geomspace(8, 100, 40)))

@@ -9,10 +9,10 @@ import onnx
 from onnx import helper
 
 from jbrep.encoders import fold
-from jbrep.encoders.activations import EPSILON
-from jbrep.encoders.encoder import Encoder, Layer
+from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.fold import NOTHING, Action, Step, refusal
 from jbrep.encoders.imported import imported
+from jbrep.encoders.layers import EPSILON, Layer
 from jbrep.encoders.onnx_file import FLOATS, Constants, array, read
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, first_line

@@ -13,9 +13,10 @@ from torch.nn import functional
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from jbrep.encoders import fold
-from jbrep.encoders.encoder import Encoder, Layer, run
+from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.fold import Step, refusal
 from jbrep.encoders.imported import imported
+from jbrep.encoders.layers import Layer, run
 from jbrep.encoders.torch_actions import BINARY, FUNCTIONS, MODULES, VALUE, arithmetic, as_array
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line

@@ -5,7 +5,8 @@ from importlib.metadata import version
 import numpy as np
 
 from jbrep.dataset import Scaler
-from jbrep.encoders.encoder import IMPORTED, Encoder, Layer
+from jbrep.encoders.encoder import IMPORTED, Encoder
+from jbrep.encoders.layers import Layer
 from jbrep.encoders.names import check_name
 from jbrep.envs.task import Task
 

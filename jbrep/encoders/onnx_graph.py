@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 from onnx import helper, numpy_helper
 
 from jbrep.dataset import Scaler
-from jbrep.encoders.activations import AVG_L1_NORM, EPSILON, LAYER_NORM, LEAST_NORM
-from jbrep.encoders.encoder import Layer
+from jbrep.encoders.layers import AVG_L1_NORM, EPSILON, LAYER_NORM, LEAST_NORM, Layer
 
 _OPERATORS: dict[str, tuple[str, dict[str, Any]]] = {
     "linear": ("Identity", {}),

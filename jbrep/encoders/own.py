@@ -3,8 +3,8 @@
 import re
 from dataclasses import replace
 
+from jbrep.encoders.base import BaseEncoder, OwnEncoder
 from jbrep.encoders.encoder import Encoder
-from jbrep.envs.encoding import BaseEncoder, OwnEncoder
 from jbrep.errors import InputError
 
 

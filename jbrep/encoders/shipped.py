@@ -4,13 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jbrep.encoders.base import BaseEncoder, as_encoder
 from jbrep.encoders.code import is_code, make
 from jbrep.encoders.diagnostics import DIAGNOSTICS, read_diagnostics
 from jbrep.encoders.encoder import FULL, IDENTITY, Encoder
 from jbrep.encoders.file import SUFFIX, load
 from jbrep.encoders.identity import SCALINGS, identity
 from jbrep.encoders.names import EncoderName
-from jbrep.envs.encoding import BaseEncoder, as_encoder
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.storage import exists
@@ -34,7 +34,7 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
     A shipped name takes precedence; write ./dae-8 for a file of that name. `full` is there for
     every task: where none ships, its features are scaled by their usual ranges, if they have any.
     A name such as mymodule:MyEncoder is of code (see `jbrep.encoders.code`); anything but a name is
-    an encoder itself, or a user's own (see `jbrep.envs.encoding.as_encoder`).
+    an encoder itself, or a user's own (see `jbrep.encoders.base.as_encoder`).
 
     Raises:
         InputError: there is none of these, the file can't be used, or it was made for another task.

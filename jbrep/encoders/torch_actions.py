@@ -7,8 +7,8 @@ import numpy as np
 from torch import Tensor, nn
 
 from jbrep.encoders import fold
-from jbrep.encoders.activations import EPSILON
 from jbrep.encoders.fold import Action
+from jbrep.encoders.layers import EPSILON
 from jbrep.errors import InputError
 
 _USUAL_THRESHOLD = 20  # of softplus, beyond which torch takes it as linear

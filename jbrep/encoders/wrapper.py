@@ -13,10 +13,10 @@ from gymnasium.vector import VectorEnv, VectorObservationWrapper, VectorWrapper
 from gymnasium.vector.utils import batch_space, iterate
 from numpy.typing import NDArray
 
+from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.shipped import find
 from jbrep.envs.description import as_task, describe
-from jbrep.envs.encoding import BaseEncoder
-from jbrep.envs.flat import flattener
+from jbrep.envs.make import flattener
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import Task
 from jbrep.errors import InputError

@@ -7,15 +7,17 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jbrep.envs.checks import check_actions, check_counts
-from jbrep.envs.flat import flattener
-from jbrep.envs.make import is_batched, make_batch, make_env
+from jbrep.envs.make import flattener, is_batched, make_batch, make_env
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 State = dict[str, NDArray[Any]]  # everything that decides how lanes continue; (n, ...) each
+
+
+class NonFiniteActionError(InputError):
+    """An action is NaN or infinite."""
 
 
 class EnvironmentFailedError(InputError):
@@ -28,6 +30,35 @@ class EnvironmentFailedError(InputError):
     def __init__(self, message: str, lane: int):
         super().__init__(message)
         self.lane = lane
+
+
+def check_counts(num_lanes: int, num_threads: int | None) -> None:
+    """Check the numbers of lanes and threads.
+
+    Raises:
+        InputError: a number below 1.
+    """
+    for count, what in ((num_lanes, "lanes"), (num_threads, "threads")):
+        if count is not None and count < 1:
+            raise InputError(f"the number of {what} is {count}: it must be at least 1")
+
+
+def check_actions(actions: ArrayLike, num_lanes: int, size: int) -> NDArray[np.float64]:
+    """The actions as (num_lanes, size) float64.
+
+    Raises:
+        InputError: another shape.
+        NonFiniteActionError: a value that is not finite.
+    """
+    checked: NDArray[np.float64] = np.asarray(actions, dtype=np.float64)
+    if checked.shape != (num_lanes, size):
+        raise InputError(
+            f"actions have shape {checked.shape}: it must be ({num_lanes}, {size}), one action for "
+            "each lane"
+        )
+    if not math.isfinite(checked.sum()) and not np.isfinite(checked).all():
+        raise NonFiniteActionError(f"actions are not finite: {checked.ravel()}")
+    return checked
 
 
 class Step(NamedTuple):

@@ -2,17 +2,23 @@
 
 import logging
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
+import numpy as np
+from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, load_env_creator
+from gymnasium.spaces.utils import flatten
 from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
 
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line
+
+Flatten = Callable[[Any], NDArray[Any]]
 
 
 def make_env(
@@ -72,6 +78,19 @@ def creator(spec: EnvSpec, vector: bool = False) -> Any:
     """The class or function that makes the environment; None if there is none."""
     entry_point = spec.vector_entry_point if vector else spec.entry_point
     return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+
+
+def flattener(space: spaces.Space[Any]) -> Flatten:
+    """What `gymnasium.spaces.utils.flatten` does for a space, made once instead of at each step."""
+    if isinstance(space, spaces.Box):
+        return np.ravel
+    if isinstance(space, spaces.Dict):
+        parts = [(key, flattener(part)) for key, part in space.spaces.items()]
+        return lambda given: np.concatenate([flat(given[key]) for key, flat in parts])
+    if isinstance(space, spaces.Tuple):
+        each = [flattener(part) for part in space.spaces]
+        return lambda given: np.concatenate([f(part) for f, part in zip(each, given, strict=True)])
+    return lambda given: np.asarray(flatten(space, given))
 
 
 @contextmanager

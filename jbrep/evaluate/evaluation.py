@@ -11,8 +11,8 @@ from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.dataset.settings import IMPORTED
 from jbrep.encoders import FULL, Encoder, find
+from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import IDENTITY
-from jbrep.envs.encoding import BaseEncoder
 from jbrep.errors import InputError
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.latent import latent

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.evaluate.held_out import HeldOut, sample_rows
 from jbrep.stats.bootstrap import without_nan
 

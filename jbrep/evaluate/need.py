@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.networks import networks
 from jbrep.evaluate.policy import GoodPolicy

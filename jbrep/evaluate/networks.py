@@ -4,7 +4,7 @@ from functools import lru_cache
 from itertools import chain
 from typing import NamedTuple
 
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.evaluate import policy, prediction, readout
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.policy import GoodPolicy

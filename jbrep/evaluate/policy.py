@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.scaled import sample
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.evaluate.explained import explained
 from jbrep.evaluate.held_out import HeldOut, Rows, sample_rows
 from jbrep.evaluate.readout import ridge

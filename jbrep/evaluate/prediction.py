@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset import Column, ScaledDataset
 from jbrep.dataset.scaling import wrapped
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Task
 from jbrep.evaluate.explained import explained
 from jbrep.evaluate.held_out import HeldOut, Rows, sample_rows

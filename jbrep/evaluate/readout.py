@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.scaled import sample
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Task
 from jbrep.evaluate.explained import explained
 from jbrep.evaluate.held_out import MAX_GROUPS, MAX_NUMBERS, HeldOut, Rows, sample_rows

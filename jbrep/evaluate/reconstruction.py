@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.evaluate.held_out import HeldOut, Rows
 from jbrep.methods.held_out import lost
 from jbrep.methods.linear import linear_denoiser, principal_code

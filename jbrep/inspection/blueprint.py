@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Array, Task
 from jbrep.inspection.ghost import ALIGNED
 from jbrep.inspection.latent import PATH

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.inspection.blueprint import episode_layout
 from jbrep.inspection.directions import direction_pages, name_directions, send_directions
 from jbrep.inspection.examples import Examples, from_rollout

@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Array
 from jbrep.inspection.recording import SKY, YELLOW, Recording
 from jbrep.inspection.signals import latent_panels, send_decoded, send_features

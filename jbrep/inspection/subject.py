@@ -8,10 +8,10 @@ from typing import Any
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import find
+from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import SUFFIX as ENCODER_SUFFIX
 from jbrep.encoders.shipped import find_alone, source_of
-from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.inspection.curves import record_curves

@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.physics import Motion
 from jbrep.envs.task import Array
 from jbrep.inspection.blueprint import TRAVERSE, traversal_layout

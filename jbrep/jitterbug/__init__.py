@@ -4,17 +4,24 @@
 dm_control's suite; `tasks`, `simulation` and `heuristics` are the parts below them.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from jbrep.lazy import exports
 
 if TYPE_CHECKING:
     from jbrep.jitterbug.domain import load, register_with_suite
+    from jbrep.jitterbug.gym import JitterbugEnv, JitterbugVectorEnv
+    from jbrep.jitterbug.tasks import environment_id
 
-__all__ = ["load", "register_with_suite"]
+__all__ = ["JitterbugEnv", "JitterbugVectorEnv", "environment_id", "load", "register_with_suite"]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from jbrep.jitterbug import domain  # importing the suite takes a second
-
-    return getattr(domain, name)
+__getattr__ = exports(
+    __name__,
+    {
+        "JitterbugEnv": "gym",
+        "JitterbugVectorEnv": "gym",
+        "environment_id": "tasks",
+        "load": "domain",
+        "register_with_suite": "domain",
+    },
+)

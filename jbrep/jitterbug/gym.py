@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from jbrep.envs.checks import check_actions
+from jbrep.envs.lanes import check_actions
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, choose
 from jbrep.jitterbug.bodies import check_body

@@ -7,7 +7,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import ArrayLike, NDArray
 
-from jbrep.envs.checks import check_counts
+from jbrep.envs.lanes import check_counts
 from jbrep.jitterbug import bodies, model
 from jbrep.jitterbug.tasks import QUATERNION, Array, JitterbugTask, Readings, yaw_direction
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import Encoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.file import HELD_OUT_MSE
-from jbrep.envs.encoding import BaseEncoder
 from jbrep.methods.linear import principal_code
 
 

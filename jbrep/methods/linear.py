@@ -6,7 +6,7 @@ import numpy as np
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
-from jbrep.encoders.encoder import Layer
+from jbrep.encoders.layers import Layer
 from jbrep.errors import InputError
 from jbrep.methods.method import Made, Settings
 from jbrep.methods.passes import Array

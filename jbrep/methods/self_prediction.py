@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from jbrep.dae.network import check_size, get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
-from jbrep.encoders.activations import AVG_L1_NORM
+from jbrep.encoders.layers import AVG_L1_NORM
 from jbrep.errors import InputError
 from jbrep.methods.method import Learned, Settings
 from jbrep.methods.predictors import HIDDEN

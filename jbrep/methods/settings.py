@@ -7,7 +7,7 @@ from typing import Any
 
 from jbrep.dae.network import get_architecture
 from jbrep.dataset.scaling import EXTREMA, SCALINGS
-from jbrep.encoders.encoder import MAX_UNITS
+from jbrep.encoders.layers import MAX_UNITS
 from jbrep.errors import InputError
 
 REQUIRED = object()  # stands for the default of a setting that has to be given

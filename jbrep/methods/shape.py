@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
-from jbrep.encoders.encoder import Layer, run
+from jbrep.encoders.layers import Layer, run
 from jbrep.methods.linear import DEVIATION, dense, inverse_root
 from jbrep.methods.method import Made, Settings
 from jbrep.methods.passes import Array

@@ -4,7 +4,7 @@ import numpy as np
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from jbrep.encoders.encoder import Layer
+from jbrep.encoders.layers import Layer
 from jbrep.training.objective import Layers
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from jbrep.dae.network import get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
-from jbrep.encoders.encoder import Layer
+from jbrep.encoders.layers import Layer
 from jbrep.methods.autoencoder import check, feature_weights
 from jbrep.methods.method import Learned, Settings
 from jbrep.methods.settings import REQUIRED

@@ -11,7 +11,7 @@ from jbrep.collect.policies import POLICIES, Policy, make_policy, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import FULL
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Actor, episode_returns

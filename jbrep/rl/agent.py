@@ -15,10 +15,10 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch.distributions import Distribution
 
-from jbrep.envs.encoding import BaseEncoder
+from jbrep.encoders.base import BaseEncoder
+from jbrep.encoders.vec_env import JitterbugVecEnv, agent_spaces
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import Actor, episode_returns
-from jbrep.envs.sb3 import TaskVecEnv, agent_spaces
 from jbrep.envs.task import Array, Task
 from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rl.normalization import Statistics, normalized
@@ -41,7 +41,7 @@ def make_env(
     task: Task, num_envs: int, seed: int, encoder: BaseEncoder, normalize: bool = False
 ) -> VecEnv:
     """Lanes of a task seen through an encoder, stepped on one thread."""
-    env = VecMonitor(TaskVecEnv(task, num_envs, seed, encoder, num_threads=1))
+    env = VecMonitor(JitterbugVecEnv(task, num_envs, seed, encoder, num_threads=1))
     return normalized(env) if normalize else env
 
 

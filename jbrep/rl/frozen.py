@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from jbrep.dataset.policy import MAX_LETTERS, TRAINED
+from jbrep.encoders.vec_env import agent_spaces
 from jbrep.envs.recording import Actor
-from jbrep.envs.sb3 import agent_spaces
 from jbrep.envs.task import Array, Task, check_same
 from jbrep.errors import DamageError, InputError
 from jbrep.records.storage import exists

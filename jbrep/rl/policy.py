@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
 from jbrep.encoders import find, load
+from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.code import make
 from jbrep.encoders.own import as_file
-from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.recording import Actor
 from jbrep.envs.task import Array, Task, read_task
 from jbrep.errors import DamageError, InputError, choose

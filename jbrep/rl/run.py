@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.encoders import FULL, Encoder, find
+from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.code import is_code
 from jbrep.encoders.own import as_file
 from jbrep.envs.description import as_task
-from jbrep.envs.encoding import BaseEncoder
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, choose
 from jbrep.rl.beginning import policy_to_begin_with

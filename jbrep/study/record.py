@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.encoders import FULL, load
-from jbrep.envs.encoding import OWN
+from jbrep.encoders.base import OWN
 from jbrep.envs.task import read_task
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from jbrep.encoders.encoder import Layer
+from jbrep.encoders.layers import Layer
 from jbrep.training.windows import Windows
 
 Layers = tuple[Layer, ...]

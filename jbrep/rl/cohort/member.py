@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from jbrep.envs.checks import NonFiniteActionError
-from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
 from jbrep.rl.agent import Evaluator, Spaces, make_agent, parameters
 from jbrep.rl.beginning import begin
 from jbrep.rl.checkpoint import COUNTERS, PARAMETERS, Snapshot, without

@@ -13,8 +13,8 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
 
+from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.lanes import EnvironmentFailedError
-from jbrep.envs.sb3 import TaskVecEnv
 from jbrep.errors import InputError
 from jbrep.records.container import Tensors
 from jbrep.rl.agent import parameters, statistics_of
@@ -159,12 +159,12 @@ def _state_dependent_noise(agent: BaseAlgorithm) -> StateDependentNoiseDistribut
     return distribution if is_one else None
 
 
-def _envs(agent: BaseAlgorithm) -> tuple[VecMonitor, TaskVecEnv]:
+def _envs(agent: BaseAlgorithm) -> tuple[VecMonitor, JitterbugVecEnv]:
     normalizer = agent.get_vec_normalize_env()
     monitor = normalizer.venv if normalizer else agent.env
     assert isinstance(monitor, VecMonitor)
     env = monitor.unwrapped
-    assert isinstance(env, TaskVecEnv)
+    assert isinstance(env, JitterbugVecEnv)
     return monitor, env
 
 

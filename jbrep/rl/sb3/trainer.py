@@ -8,8 +8,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from jbrep.envs.checks import NonFiniteActionError
-from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed, unchecked_distributions
 from jbrep.rl.beginning import begin
 from jbrep.rl.history import ACTIONS_NOT_FINITE, DivergedError

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from jbrep.envs.checks import check_actions
+from jbrep.encoders.base import BaseEncoder, as_encoder
 from jbrep.envs.description import describe
-from jbrep.envs.encoding import BaseEncoder, as_encoder
 from jbrep.envs.endless import Endless
-from jbrep.envs.lanes import State
+from jbrep.envs.lanes import State, check_actions
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 
@@ -27,7 +26,7 @@ def agent_spaces(task: Task, encoder: BaseEncoder | None) -> tuple[spaces.Box, s
     return spaces.Box(-np.inf, np.inf, (size,), np.float32), spaces.Box(low, high)
 
 
-class TaskVecEnv(VecEnv):
+class JitterbugVecEnv(VecEnv):
     """Many lanes of a task for stable-baselines3, stepped together where that is possible.
 
     Observations are float32, scaled by the task's usual ranges. With an encoder the agent sees
@@ -42,7 +41,7 @@ class TaskVecEnv(VecEnv):
         num_envs: the number of lanes.
         seed: of the first lane.
         encoder: a `jbrep.encoders.Encoder`, or a user's own: an object with `encode`, a function,
-            or a torch module (see `jbrep.envs.encoding.OwnEncoder`); None gives the full
+            or a torch module (see `jbrep.encoders.base.OwnEncoder`); None gives the full
             observation.
         num_threads: threads to step the lanes on; None takes one for each core.
         max_episode_steps: the time limit of a task given by its name [steps].
@@ -167,6 +166,3 @@ class TaskVecEnv(VecEnv):
         elif indices is not None:
             lanes = list(indices)
         return [value() for _ in lanes]
-
-
-JitterbugVecEnv = TaskVecEnv  # the name of the first release

@@ -1,11 +1,13 @@
-"""The activations of an encoder's layers, for NumPy arrays and torch tensors alike."""
+"""Dense layers and their activations, for NumPy arrays and torch tensors alike."""
 
 import math
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+
+MAX_UNITS = 4096  # in a layer
 
 LAYER_NORM = "layer-norm"
 AVG_L1_NORM = "avg-l1-norm"
@@ -13,6 +15,21 @@ WHOLE = frozenset((LAYER_NORM, AVG_L1_NORM))  # those that read all units of a l
 LEAST_NORM = 1e-8  # that an average magnitude counts as
 EPSILON = 1e-5  # added to the variance in a layer norm
 _SATURATED = 10.0  # from where tanh in the approximate GELU is 1 in float64
+
+
+class Layer(NamedTuple):
+    """A dense layer: activation(values @ weight.T + bias)."""
+
+    weight: Any  # (out, in) float32
+    bias: Any  # (out,) float32
+    activation: str
+
+
+def run(layers: tuple[Layer, ...], values: Any) -> Any:
+    """Pass values (..., in) through the layers, giving (..., out)."""
+    for weight, bias, activation in layers:
+        values = activate(activation, values @ weight.T + bias)
+    return values
 
 
 def activate(name: str, values: Any) -> Any:
