@@ -31,7 +31,7 @@ from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.weights import STATISTICS
 from jbrep.study.config import as_study, read_study
 from jbrep.study.plan import Plan, read_plan
-from jbrep.study.record import record
+from jbrep.study.record import runs_record
 from jbrep.study.results import read_results
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
@@ -443,11 +443,11 @@ def test_a_study_of_learners(tmp_path):
     written = json.loads((out / "study.json").read_text())
     assert (written["algorithms"], written["learners"]) == (["a2c-modern", *own], own)
     assert read_plan(out).study == read_study(path)
-    labels = record(out, read_results(out).ended, [])["labels"]
+    labels = runs_record(out, read_results(out).ended, []).labels
     assert [*labels] == [f"Pendulum-v1/{name}/full" for name in ("a2c-modern", *own)]
-    settings = labels["Pendulum-v1/tuned/full"]["settings"]
-    assert (settings["preset"], settings["hidden"]) == ("modern", [4])
-    assert settings["overrides"] == {"net_arch": [4], "gamma": 0.9}
+    settings = labels["Pendulum-v1/tuned/full"].settings
+    assert (settings.preset, settings.hidden) == ("modern", [4])
+    assert settings.overrides == {"net_arch": [4], "gamma": 0.9}
     assert as_study(tomllib.loads(_toml(written))) == read_study(path)
     before = (out / "study.json").read_bytes()
     (tmp_path / "mine.toml").write_text(write_preset("a2c", "modern", {"net_arch": [5]}))

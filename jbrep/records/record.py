@@ -88,7 +88,13 @@ def converted(value: Any, kind: Any, where: str) -> Any:
 
 def to_plain(record: Any) -> Any:
     """A record as plain JSON: its fields in order, tuples as lists."""
-    return msgspec.to_builtins(record)
+    return _with_lists(msgspec.to_builtins(record))
+
+
+def _with_lists(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _with_lists(each) for name, each in value.items()}
+    return [*map(_with_lists, value)] if isinstance(value, list | tuple) else value
 
 
 def _said(message: str, value: Any, kind: Any, where: str) -> str:

@@ -106,7 +106,7 @@ def _read_references(folder: Path) -> References:
 
 
 def _read_record(path: Path) -> Record:
-    value = read_json(_text(path), path, record.FORMAT, record.FORMAT_VERSION)
+    value = read_json(_text(path), path, record.RunsRecord.format, 1)
     try:
         checked: Record = typed(value, Record)
         _check(checked)

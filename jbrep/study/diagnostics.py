@@ -10,25 +10,16 @@ from jbrep.encoders import FULL
 from jbrep.encoders.diagnostics import DIAGNOSTICS, Diagnosed, read_diagnostics, write_diagnostics
 from jbrep.errors import DamageError, InputError
 from jbrep.evaluate.headline import headline
+from jbrep.records.document import read_document
 from jbrep.records.storage import exists, read_file
 from jbrep.records.typed import read_json, typed
-from jbrep.study import record
+from jbrep.study.record import RECORD, RunsRecord
 from jbrep.text import slug
 
 _TASK = "{task}"  # in an evaluation's path: the task's name as in folders
 _MAX_BYTES = 1 << 28
 _Values = Mapping[str, float | None]
 _Key = tuple[str, str]  # a task, and an encoder's SHA-256 or `full`
-
-
-class _Settings(TypedDict):
-    task: str
-    representation: str
-    encoder: str  # its SHA-256, or that runs have different encoders
-
-
-class _Shared(TypedDict):
-    settings: _Settings
 
 
 class _Data(TypedDict):
@@ -40,14 +31,6 @@ class _Evaluation(TypedDict):
 
     data: _Data
     encoders: dict[str, dict[str, Any]]
-
-
-class _Record(TypedDict):
-    """What is needed of runs.json."""
-
-    study: dict[str, Any] | None
-    labels: dict[str, _Shared]
-    runs: list[dict[str, Any]]
 
 
 def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
@@ -68,14 +51,14 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
         InputError: a given folder has no evaluation, or a file is of a newer jbrep.
         DamageError: a file is damaged.
     """
-    path, runs = folder / DIAGNOSTICS, folder / record.RECORD
+    path, runs = folder / DIAGNOSTICS, folder / RECORD
     if not exists(runs):
         return []
-    contents = _read(runs, record.FORMAT, record.FORMAT_VERSION, _Record)
-    named = (contents["study"] or {}).get("evaluations", [])
+    record = read_document(runs, RunsRecord)
+    named = (record.study or {}).get("evaluations", [])
     if not (given or named or exists(path)):
         return []
-    used = _encoders(contents)
+    used = _encoders(record)
     known: dict[_Key, _Values] = {}
     for pattern in dict.fromkeys((*given, *named)):
         files = _files(pattern, (row.task for row in used))
@@ -99,13 +82,13 @@ def _read(path: Path, kind: str, version: int, shape: Any) -> Any:
         raise DamageError(f"{path} is damaged: {error}") from None
 
 
-def _encoders(contents: _Record) -> list[Diagnosed]:
+def _encoders(record: RunsRecord) -> list[Diagnosed]:
     """A row without values for each encoder under each name in each task."""
-    rows: dict[tuple[str, str, str], None] = {}
-    for run in contents["runs"]:
-        settings = contents["labels"][run["label"]]["settings"]
-        encoder = run.get("encoder", settings["encoder"])  # the first release said only the latter
-        rows[settings["task"], settings["representation"], encoder] = None
+    rows = dict.fromkeys(
+        (settings.task, settings.representation, run.encoder)
+        for run in record.runs
+        for settings in [record.labels[run.label].settings]
+    )
     return [Diagnosed(*row, {}) for row in rows]
 
 

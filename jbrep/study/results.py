@@ -19,7 +19,7 @@ from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import STILL
 from jbrep.study.plan import STUDY, read_plan
-from jbrep.study.record import RECORD, as_json, learner, record, shared_settings
+from jbrep.study.record import RECORD, learner, runs_record, shared_settings
 from jbrep.study.references import References, read_references, write_references
 from jbrep.text import rounded, table
 
@@ -182,10 +182,10 @@ def write_results(results: Results, folder: Path) -> list[Path]:
     Raises:
         InputError: a file of a run is damaged, or a table can't be written.
     """
-    contents = record(folder, results.ended, results.left_out)
+    record = runs_record(folder, results.ended, results.left_out)
     paths = [folder / RETURNS, folder / RECORD]
     write_csv(paths[0], [*COLUMNS], _rows(results.runs))
-    write_whole(paths[1], as_json(contents))
+    record.write(paths[1])
     if results.analysis:
         paths.append(folder / STATISTICS)
         write_whole(paths[2], results.analysis.to_json().encode())
