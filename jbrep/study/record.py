@@ -14,7 +14,7 @@ from jbrep.encoders.base import OWN
 from jbrep.envs.task import read_task
 from jbrep.errors import InputError
 from jbrep.records.document import Document
-from jbrep.records.record import Record, from_plain
+from jbrep.records.record import Record, from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER
 from jbrep.rl.names import base_name
@@ -202,11 +202,10 @@ def runs_record(
 
 
 def _run(run: Mapping[str, Any]) -> RunFacts:
-    return RunFacts(
-        label=run_label(run["settings"]),
-        **{name: run["settings"][name] for name in ("seed", "encoder", "encoder_seed")},
-        **{name: run.get(name) for name in ("status", "reason", "steps", "seconds")},
-    )
+    own = {name: run["settings"][name] for name in ("seed", "encoder", "encoder_seed")}
+    ended = {name: run[name] for name in ("status", "steps", "seconds")}
+    label = run_label(run["settings"])
+    return RunFacts(label=label, reason=run.get("reason"), **own, **ended)
 
 
 def _sort_key(settings: Mapping[str, Any], order: list[str]) -> tuple[Any, ...]:
@@ -278,19 +277,14 @@ def _encoder(folder: Path, run: Mapping[str, Any]) -> EncoderFacts:
 
 def _common(encoders: Sequence[EncoderFacts]) -> EncoderFacts:
     """What is the same of all encoders; empty where nothing is."""
-    first, *others = encoders
-    common = {
-        name: _shared(getattr(first, name), [getattr(o, name) for o in others])
-        for name in EncoderFacts.__struct_fields__
-    }
-    return EncoderFacts(**common)
+    first, *others = map(to_plain, encoders)
+    return EncoderFacts(**{n: _shared(v, [o[n] for o in others]) for n, v in first.items()})
 
 
-def _shared(value: _Value, others: Sequence[_Value]) -> _Value:
+def _shared(value: Any, others: Sequence[Any]) -> Any:
     """A value if the others are equal; of a dict the items that they have, too; else nothing."""
     if isinstance(value, dict):
-        common = {n: v for n, v in value.items() if all(n in o and o[n] == v for o in others)}
-        return type(value)(common)
+        return {n: v for n, v in value.items() if all(n in o and o[n] == v for o in others)}
     return value if all(each == value for each in others) else type(value)()
 
 
