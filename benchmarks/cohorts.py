@@ -120,7 +120,7 @@ def milliseconds_together(learner: tuple[str, str], precision: str, device: str)
 
     def update() -> None:
         for index in range(UPDATES):
-            made._update(1e-4, index)
+            made.update(index)
         if device == "cuda":
             torch.cuda.synchronize()
 
@@ -132,7 +132,7 @@ def share_of_products(learner: tuple[str, str], device: str) -> float:
     made = cohort(learner, MEMBERS, FLOAT32, device)
     with torch.profiler.profile() as profile:
         for index in range(UPDATES):
-            made._update(1e-4, index)
+            made.update(index)
     taken = {each.key: each.self_cpu_time_total for each in profile.key_averages()}
     return float(sum(taken.get(name, 0) for name in PRODUCTS) / sum(taken.values()))
 

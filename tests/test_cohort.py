@@ -17,10 +17,11 @@ from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
 from jbrep.rl import Run, StoppedError
 from jbrep.rl.agent import make_agent, make_env, parameters, trained_parts, training_seed
+from jbrep.rl.cohort import get_algorithm
+from jbrep.rl.cohort.algorithm import Batch
 from jbrep.rl.cohort.cohort import Cohort
-from jbrep.rl.cohort.learner import give_back, stacked
 from jbrep.rl.cohort.member import Member
-from jbrep.rl.cohort.steps import Batch, set_rate
+from jbrep.rl.cohort.networks import Stack
 from jbrep.rl.job import Job
 from jbrep.rl.overrides import used_settings
 from jbrep.rl.presets import PRESETS
@@ -88,20 +89,22 @@ def test_gradient_steps_are_those_of_stable_baselines3(in_float64, algorithm, pr
     used = used_settings(algorithm, preset, small)
     alone = [precise(algorithm, used, code, seed) for seed, code in enumerate(CODES)]
     together = [precise(algorithm, used, code, seed) for seed, code in enumerate(CODES)]
-    learner = stacked(together, 16)
+    stack = Stack(together, 16)
+    learner = get_algorithm(algorithm)(stack)
+    stack.read_from_agents()
     for step in range(1, 11):
         batches, normals = [], []
         for member, agent in enumerate(alone):
-            batch, normal = drawn(agent, 100 * step + member, learner.draws_to_learn)
+            batch, normal = drawn(agent, 100 * step + member, learner.normals_to_learn)
             batches.append(batch)
             normals.append(normal)
             agent._current_progress_remaining = 1 - step / 100
             agent.train(1, ROWS)
-        set_rate(learner.optimizers, alone[0].lr_schedule(1 - step / 100))
+        stack.set_learning_rate(alone[0].lr_schedule(1 - step / 100))
         batch = Batch(*map(torch.stack, zip(*batches, strict=True)))
         normal = [torch.stack(each) for each in zip(*normals, strict=True)]
-        losses = learner.update(batch, normal, learner.is_due(step, 0))
-    give_back(learner, together, 16)
+        losses = learner.update(batch, normal, step, 0)
+    stack.write_to_agents()
     for member, (expected, agent) in enumerate(zip(alone, together, strict=True)):
         for (name, there), (_, here) in zip(parameters(expected), parameters(agent), strict=True):
             assert there.numpy() == pytest.approx(here.numpy(), rel=0, abs=1e-10), name
@@ -182,11 +185,11 @@ def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, t
         for _ in range(cohort.rollout):
             cohort.act()
         cohort.learn()
-    cohort.give_back()
+    cohort.write_to_agents()
     for number, run in enumerate(made):
         agent = alone(run)
         assert agent._n_updates == members[number].agent._n_updates > 0
-        buffer, rows = agent.replay_buffer, cohort._replay.of(number)
+        buffer, rows = agent.replay_buffer, cohort._replay.rows_of(number)
         steps, size = len(rows), run.find_encoder().latent_size
         first = slice(0, 100 // run.used.num_envs)
         np.testing.assert_array_equal(buffer.observations[first], rows[first, :, :size])

@@ -1,5 +1,7 @@
 """The names of algorithms and presets, known without importing what they are of."""
 
+from jbrep.rl.cohort import ALGORITHMS
+
 CLASSES = {  # by the names of algorithms
     "ddpg": "stable_baselines3.DDPG",
     "td3": "stable_baselines3.TD3",
@@ -12,7 +14,7 @@ CLASSES = {  # by the names of algorithms
 }
 DEVICES = CPU, CUDA = "cpu", "cuda"
 COHORT, SB3 = "cohort", "sb3"
-TRAINERS = {COHORT: ("ddpg", "td3", "sac"), SB3: tuple(CLASSES)}  # and the algorithms that each has
+TRAINERS = {COHORT: tuple(ALGORITHMS), SB3: tuple(CLASSES)}  # and the algorithms that each has
 FLOAT32, BFLOAT16 = "float32", "bfloat16"
 PRECISIONS = {FLOAT32: (COHORT, SB3), BFLOAT16: (COHORT,)}  # and the trainers that have each
 PAPER, MODERN = "paper", "modern"  # presets; the paper's unless another is named

@@ -13,7 +13,7 @@ from jbrep.envs.description import as_task
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, choose
 from jbrep.rl.beginning import policy_to_begin_with
-from jbrep.rl.cohort.settings import check as check_settings
+from jbrep.rl.cohort.algorithm import check as check_settings
 from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_SEED, MAX_STEPS, NAME
 from jbrep.rl.learner import Learner, is_file
 from jbrep.rl.names import COHORT, CPU, DEVICES, FLOAT32, PRECISIONS, TRAINERS, usual_trainer

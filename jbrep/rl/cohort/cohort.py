@@ -11,19 +11,20 @@ from torch import Tensor
 from jbrep.envs.endless import Endless
 from jbrep.rl.agent import training_seed
 from jbrep.rl.checkpoint import LANES, Snapshot, without
-from jbrep.rl.cohort.learner import Learner, give_back, stacked
+from jbrep.rl.cohort import get_algorithm
+from jbrep.rl.cohort.algorithm import Batch, Losses
 from jbrep.rl.cohort.member import Array, Float32, Member
-from jbrep.rl.cohort.replay import Replay, capacity_of
-from jbrep.rl.cohort.steps import Batch, set_rate
+from jbrep.rl.cohort.networks import Stack
+from jbrep.rl.cohort.replay import ReplayBuffer, capacity_of
 from jbrep.rl.history import ACTIONS_NOT_FINITE
 from jbrep.rl.job import Job
 
 
 class Cohort:
-    """The stack of n members: what they see, remember and learn.
+    """n members that act and learn at once.
 
     Args:
-        members: which can learn together, see `jbrep.rl.cohort.settings.shared_by`.
+        members: which can learn together, see `jbrep.rl.cohort.trainer`.
 
     Attributes:
         members: n.
@@ -31,25 +32,22 @@ class Cohort:
     """
 
     def __init__(self, members: Sequence[Member]):
-        run, agent = members[0].job.run, members[0].agent
-        self.members, self.step = members, 0
-        self._shared: Any = agent  # its settings are those of all
+        run = members[0].job.run
+        self.members, self.step, self._n_updates = members, 0, 0
+        self._shared: Any = members[0].agent  # its settings are those of all
         self._lanes, self._steps = run.used.num_envs, run.steps
-        self._low, self._high = agent.action_space.low, agent.action_space.high
-        self._size = filled_up(members[0].job)
-        numbers = self._size, run.task.action_size
-        self._replay = Replay(len(members), self._lanes, capacity_of(run), *numbers)
+        self._size = padded_size(members[0].job)
+        sizes = self._size, run.task.action_size
+        self._replay = ReplayBuffer(len(members), self._lanes, capacity_of(run), *sizes)
         self._endless = Endless(run.task, len(members) * self._lanes, run.physics_threads)
         self._device = torch.device(run.device)
-        self._learner = self._stacked()
-        self._updates = 0
+        agents = [member.agent for member in members]
+        self._stack = Stack(agents, self._size, run.precision, run.device)
+        self._algorithm = get_algorithm(run.algorithm)(self._stack)
+        self._stack.read_from_agents()
         seeds = [training_seed(m.job.run.seed) + i for m in members for i in range(self._lanes)]
-        self._look(self._see(self._endless.reset(seeds)))
-
-    @property
-    def is_evaluation_due(self) -> bool:
-        """Whether policies are to be evaluated at this step, which isn't the last."""
-        return self.members[0].job.run.is_evaluation_due(self.step, self._lanes)
+        self._observation = self._encode(self._endless.reset(seeds))
+        self._update_statistics()
 
     @property
     def rollout(self) -> int:
@@ -57,28 +55,27 @@ class Cohort:
         return int(self._shared.train_freq.frequency)
 
     def act(self) -> None:
-        """Step every lane, and remember what came of it.
+        """Step every lane, and add its transition to the replay buffer.
 
         Raises:
             EnvironmentFailedError: an environment fails; `member_of` its lane says whose it is.
         """
-        chosen = self._explore()
-        action = np.clip(self._unscaled(chosen), self._low, self._high)
+        scaled, space = self._choose_actions(), self._shared.action_space
+        action = self._shared.policy.unscale_action(scaled).clip(space.low, space.high)
         moved = self._endless.step(action.reshape(-1, action.shape[2]).astype(float))
         self.step += self._lanes
         ended, terminated = self._by_member(moved.ended), self._by_member(moved.terminated)
         reward = self._by_member(moved.reward).astype(np.float32)
-        after = self._see(moved.observation)
-        final = after
+        observation = final = self._encode(moved.observation)
         if ended.any():
-            final = np.where(ended[..., None], self._see(moved.final), after)
+            final = np.where(ended[..., None], self._encode(moved.final), observation)
         closed = (ended & terminated)[..., None]
-        self._replay.add(self._seen, chosen, final, reward[..., None], closed)
-        self._look(after)
+        self._replay.add(self._observation, scaled, final, reward[..., None], closed)
+        self._observation = observation
+        self._update_statistics()
         diverged = self._by_member(moved.diverged)
         for member, *own in zip(self.members, reward, ended, diverged, strict=True):
-            if member.record(*own):
-                member.log()
+            member.record(*own)
 
     def learn(self) -> None:
         """Take the gradient steps that follow a rollout."""
@@ -88,45 +85,104 @@ class Cohort:
         if steps < 0:  # as many as were collected
             steps = self.rollout * self._lanes
         rate = self._shared.lr_schedule(1 - self.step / self._steps)
-        told = [self._update(rate, index) for index in range(steps)]
-        names = dict.fromkeys(name for losses in told for name in losses)
-        means = [torch.stack([x[name] for x in told if name in x]).mean(0) for name in names]
-        rows = torch.stack([*means, self._learner.size_of_actors()], 1).tolist()
+        self._stack.set_learning_rate(rate)
+        self._log_losses([self.update(number) for number in range(steps)])
+
+    def update(self, gradient_step: int) -> Losses:
+        """Take a gradient step, by its number among those that follow a rollout, from 0."""
+        self._n_updates += 1
+        normals = self._normals(self._algorithm.normals_to_learn, self._shared.batch_size)
+        return self._algorithm.update(self._sample(), normals, self._n_updates, gradient_step)
+
+    def _sample(self) -> Batch:
+        """Transitions of each member, its observations normalised as it sees them now."""
+        filled, size = self._replay.filled, self._shared.batch_size
+        indices = [member.random.sample_indices(filled, size) for member in self.members]
+        steps, lanes = (np.stack(each) for each in zip(*indices, strict=True))
+        observation, action, next_observation, *rest = self._replay.sample(steps, lanes)
+        normalized = self._normalize(observation), action, self._normalize(next_observation)
+        return Batch(*map(self._tensor, (*normalized, *rest)))
+
+    def _choose_actions(self) -> Float32:
+        """Actions scaled to [-1, 1], (n, lanes, k), rounded as stable-baselines3 rounds them."""
+        policy = self._shared.policy
+        if self.step < self._shared.learning_starts:
+            actions = np.stack([member.random.actions() for member in self.members])
+        else:
+            normals = self._normals(self._algorithm.normals_to_explore, self._lanes)
+            observation = self._tensor(self._normalize(self._observation))
+            with torch.no_grad():
+                scaled = self._algorithm.explore(observation, normals)
+            actions = policy.unscale_action(scaled.numpy(force=True))
+            self._stop_at_non_finite(actions)
+        noise = np.stack([member.random.noise() for member in self.members])
+        return np.clip(policy.scale_action(actions) + noise, -1, 1)
+
+    def _normals(self, count: int, rows: int) -> list[Tensor]:
+        """So many draws of standard normal numbers, (n, rows, k) each."""
+        (size,) = self._shared.action_space.shape
+        draws = [[m.random.normal(rows, size) for _ in range(count)] for m in self.members]
+        return [torch.stack(each).to(self._device) for each in zip(*draws, strict=True)]
+
+    def _stop_at_non_finite(self, actions: Float32) -> None:
+        """Let members fail whose actions aren't finite; they do nothing in this step."""
+        wrong = ~np.isfinite(actions)
+        for number in np.flatnonzero(wrong.any((1, 2))).tolist():
+            self.members[number].fail(ACTIONS_NOT_FINITE)
+        actions[wrong] = 0
+
+    def _log_losses(self, losses: Sequence[Losses]) -> None:
+        """Log the means of gradient steps, and let members fail where one isn't finite."""
+        names = dict.fromkeys(name for each in losses for name in each)
+        means = [torch.stack([x[name] for x in losses if name in x]).mean(0) for name in names]
+        rows = torch.stack([*means, self._algorithm.actor_sum()], 1).tolist()
         for member, (*own, weights) in zip(self.members, rows, strict=True):
-            member.learnt(dict(zip(names, own, strict=True)), weights)
+            member.log_losses(dict(zip(names, own, strict=True)), weights)
 
-    def take(self, member: Member) -> Snapshot:
-        """Everything that decides how a member's training continues; `give_back` comes first.
+    def _encode(self, observation: Array) -> Float32:
+        """What each member's encoder shows of each lane, padded with zeros, (n, lanes, size)."""
+        encoded = np.zeros((len(self.members), self._lanes, self._size), np.float32)
+        own = self._by_member(observation)
+        for rows, member, each in zip(encoded, self.members, own, strict=True):
+            rows[:, : member.size] = member.encode(each)
+        return encoded
 
-        It is that of the member alone, whoever is beside it.
-        """
-        tensors, counters = member.take()
-        number = self.members.index(member)
-        own = slice(number * self._lanes, (number + 1) * self._lanes)
-        tensors |= {f"{LANES}{name}": each[own] for name, each in self._endless.state.items()}
-        tensors |= {"seen": self._seen[number], "replay": self._replay.of(number)}
-        return Snapshot(tensors, {**counters, "added": self._replay.added})
+    def _update_statistics(self) -> None:
+        """Take the observations of now into the statistics by which members normalise theirs."""
+        for rows, member in zip(self._observation, self.members, strict=True):
+            if member.normalizer:
+                member.normalizer.obs_rms.update(rows[:, : member.size])
 
-    def restore(self, snapshots: Sequence[Snapshot]) -> None:
-        """Continue from where snapshots of all members were taken, at the same step."""
-        for member, snapshot in zip(self.members, snapshots, strict=True):
-            member.restore(snapshot)
-        agent = self.members[0].agent
-        self._learner = self._stacked()
-        self.step, self._updates = agent.num_timesteps, agent._n_updates
-        tensors = [each.tensors for each in snapshots]
-        self._seen = np.stack([each["seen"] for each in tensors])
-        self._replay.refill([each["replay"] for each in tensors], snapshots[0].counters["added"])
-        lanes = [without(LANES, each) for each in tensors]
-        self._endless.restore({n: joined([each[n] for each in lanes]) for n in lanes[0]})
+    def _normalize(self, observation: Float32) -> Float32:
+        """Encoded observations, (n, rows, size), normalised where settings say so."""
+        if not self.members[0].normalizer:
+            return observation
+        normalized = observation.copy()
+        for rows, member in zip(normalized, self.members, strict=True):
+            if member.normalizer:
+                rows[:, : member.size] = member.normalizer.normalize_obs(rows[:, : member.size])
+        return normalized
 
-    def member_of(self, lane: int) -> Member:
-        """Whose lane of all it is."""
-        return self.members[lane // self._lanes]
+    def _by_member(self, values: NDArray[Any]) -> NDArray[Any]:
+        return values.reshape(len(self.members), self._lanes, *values.shape[1:])
+
+    def _tensor(self, values: Float32) -> Tensor:
+        return torch.from_numpy(values).to(self._device)
+
+    def write_to_agents(self) -> None:
+        """Write weights and moments into the members' agents."""
+        self._stack.write_to_agents()
+        for member in self.members:
+            member.agent._n_updates = self._n_updates
+
+    @property
+    def is_evaluation_due(self) -> bool:
+        """Whether policies are to be evaluated at this step, which isn't the last."""
+        return self.members[0].job.run.is_evaluation_due(self.step, self._lanes)
 
     def evaluate(self) -> None:
         """Let each member play its policy that hasn't failed."""
-        self.give_back()
+        self.write_to_agents()
         for member in self.members:
             if not member.failure:
                 member.evaluate()
@@ -141,102 +197,48 @@ class Cohort:
         """Whether there are steps to go, and members to take them."""
         return self.step < self._steps and len(self.failed) < len(self.members)
 
+    def member_of(self, lane: int) -> Member:
+        """Whose lane of all it is."""
+        return self.members[lane // self._lanes]
+
     def survivors(self) -> "Cohort":
         """Those that haven't failed, as far as they are."""
         if not self.failed:
             return self
-        self.give_back()
+        self.write_to_agents()
         going = [member for member in self.members if not member.failure]
         snapshots = [self.take(member) for member in going]
         others = Cohort(going)
         others.restore(snapshots)
         return others
 
-    def give_back(self) -> None:
-        """Write weights and moments into the members' agents."""
-        give_back(self._learner, [member.agent for member in self.members], self._size)
-        for member in self.members:
-            member.agent._n_updates = self._updates
+    def take(self, member: Member) -> Snapshot:
+        """Everything that decides how a member's training continues, whoever is beside it.
 
-    def _stacked(self) -> Learner:
-        run = self.members[0].job.run
-        agents = [member.agent for member in self.members]
-        return stacked(agents, self._size, run.precision, self._device)
+        `write_to_agents` comes first.
+        """
+        tensors, counters = member.take()
+        number = self.members.index(member)
+        own = slice(number * self._lanes, (number + 1) * self._lanes)
+        tensors |= {f"{LANES}{name}": each[own] for name, each in self._endless.state.items()}
+        tensors |= {"observation": self._observation[number]}
+        tensors |= {"replay": self._replay.rows_of(number)}
+        return Snapshot(tensors, {**counters, "added": self._replay.added})
 
-    def _update(self, rate: float, index: int) -> dict[str, Tensor]:
-        """Take a gradient step, at a learning rate."""
-        self._updates += 1
-        size, learner = self._shared.batch_size, self._learner
-        draws = [member.draws for member in self.members]
-        places = [each.places(self._replay.filled, size) for each in draws]
-        steps, lanes = (np.stack(each) for each in zip(*places, strict=True))
-        sampled = self._replay.sample(steps, lanes, self._shown)
-        batch = Batch(*(each.to(self._device) for each in sampled))
-        normals = self._normals(learner.draws_to_learn, size)
-        set_rate(learner.optimizers, rate)
-        return learner.update(batch, normals, learner.is_due(self._updates, index))
-
-    def _normals(self, count: int, rows: int) -> list[Tensor]:
-        """So many draws of standard normal numbers, (n, rows, k) each."""
-        size = len(self._low)
-        draws = [[m.draws.normal(rows, size) for _ in range(count)] for m in self.members]
-        return [torch.stack(each).to(self._device) for each in zip(*draws, strict=True)]
-
-    def _explore(self) -> Float32:
-        """Actions scaled to [-1, 1], (n, lanes, k), rounded as stable-baselines3 rounds them."""
-        draws = [member.draws for member in self.members]
-        if self.step < self._shared.learning_starts:
-            actions = np.stack([each.random_actions() for each in draws])
-        else:
-            normals = self._normals(self._learner.draws_to_explore, self._lanes)
-            with torch.no_grad():
-                shown = torch.from_numpy(self._shown(self._seen)).to(self._device)
-                chosen = self._learner.explore(shown, normals)
-            actions = self._unscaled(chosen.numpy(force=True))
-            self._stop_at_non_finite(actions)
-        scaled = 2 * ((actions - self._low) / (self._high - self._low)) - 1
-        noise = np.stack([each.noise() for each in draws])
-        return np.clip(scaled + noise, -1, 1)
-
-    def _stop_at_non_finite(self, actions: Float32) -> None:
-        """Let members fail whose actions aren't finite; they do nothing in this step."""
-        wrong = ~np.isfinite(actions)
-        for number in np.flatnonzero(wrong.any((1, 2))).tolist():
-            self.members[number].fail(ACTIONS_NOT_FINITE)
-        actions[wrong] = 0
-
-    def _unscaled(self, scaled: Float32) -> Float32:
-        return self._low + 0.5 * (scaled + 1) * (self._high - self._low)
-
-    def _look(self, seen: Float32) -> None:
-        """Take what is seen now, (n, lanes, size), into the statistics that normalise it."""
-        self._seen = seen
-        for rows, member in zip(seen, self.members, strict=True):
-            if member.normalizer:
-                member.normalizer.obs_rms.update(rows[:, : member.size])
-
-    def _see(self, observation: Array) -> Float32:
-        """What each member sees in each lane, filled up with zeros, (n, lanes, size)."""
-        seen = np.zeros((len(self.members), self._lanes, self._size), np.float32)
-        for rows, member, own in zip(seen, self.members, self._by_member(observation), strict=True):
-            rows[:, : member.size] = member.see(own)
-        return seen
-
-    def _shown(self, seen: Float32) -> Float32:
-        """What members see, (n, rows, size), normalised where that is asked for."""
-        if not self.members[0].normalizer:
-            return seen
-        shown = seen.copy()
-        for rows, member in zip(shown, self.members, strict=True):
-            if member.normalizer:
-                rows[:, : member.size] = member.normalizer.normalize_obs(rows[:, : member.size])
-        return shown
-
-    def _by_member(self, values: NDArray[Any]) -> NDArray[Any]:
-        return values.reshape(len(self.members), self._lanes, *values.shape[1:])
+    def restore(self, snapshots: Sequence[Snapshot]) -> None:
+        """Continue from where snapshots of all members were taken, at the same step."""
+        for member, snapshot in zip(self.members, snapshots, strict=True):
+            member.restore(snapshot)
+        self._stack.read_from_agents()
+        self.step, self._n_updates = self._shared.num_timesteps, self._shared._n_updates
+        tensors = [each.tensors for each in snapshots]
+        self._observation = np.stack([each["observation"] for each in tensors])
+        self._replay.restore([each["replay"] for each in tensors], snapshots[0].counters["added"])
+        lanes = [without(LANES, each) for each in tensors]
+        self._endless.restore({n: joined([each[n] for each in lanes]) for n in lanes[0]})
 
 
-def filled_up(job: Job) -> int:
+def padded_size(job: Job) -> int:
     """Numbers that each observation of a run has in a cohort, zeros among them."""
     return max(job.run.task.size, job.encoder.latent_size)
 

@@ -10,25 +10,29 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch import Tensor
 
 from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
+from jbrep.records.container import Tensors
 from jbrep.rl.agent import Evaluator, Spaces, make_agent, parameters
 from jbrep.rl.beginning import begin
 from jbrep.rl.checkpoint import COUNTERS, PARAMETERS, Snapshot, without
-from jbrep.rl.cohort.draws import Draws
 from jbrep.rl.files import Episode
 from jbrep.rl.history import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE
 from jbrep.rl.job import Job
 from jbrep.rl.normalization import Statistics, normalized
+from jbrep.rl.presets import NormalNoise, OrnsteinUhlenbeckNoise
 
 Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]
+Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 _LOG_EVERY = 4  # episodes, as in stable-baselines3
-_DRAWS = "draws."  # begins the names of what its random numbers come from
+_RANDOM = "random."  # begins the names of what its random numbers come from
 
 
 class Member:
@@ -44,18 +48,20 @@ class Member:
     Attributes:
         job: the run and its folder.
         agent: without a replay buffer.
-        draws: its random numbers.
+        random: its random numbers.
         failure: why it failed; empty while it hasn't.
+        mean: return of the last evaluation, once there was one.
     """
 
     def __init__(self, job: Job, writers: Sequence[KVWriter]):
         run, preset = job.run, job.run.used
         small = replace(preset, noise=None, settings={**preset.settings, "buffer_size": 1})
         self.job, self.failure = job, ""
+        self.mean: float | None = None
         env = DummyVecEnv([lambda: Spaces(run.task, job.encoder)])
-        shown = normalized(env) if preset.normalize else env
-        self.agent: Any = make_agent(run.algorithm, small, shown, run.seed)
-        self.draws = Draws(self.agent.action_space, preset.num_envs, preset.noise)
+        normalizing = normalized(env) if preset.normalize else env
+        self.agent: Any = make_agent(run.algorithm, small, normalizing, run.seed)
+        self.random = Random(self.agent.action_space, preset.num_envs, preset.noise)
         self.agent._total_timesteps = run.steps
         self.agent.ep_info_buffer = deque(maxlen=self.agent._stats_window_size)
         self.agent.ep_success_buffer = deque()
@@ -65,27 +71,26 @@ class Member:
         self._evaluator = Evaluator(
             run.task, job.encoder, run.evaluation_episodes, num_threads=run.physics_threads
         )
-        self.mean: float | None = None  # return of the last evaluation
         if run.begin_from:
             begin(self.agent, Path(run.begin_from), job.settings["from"], job.folder)
         self.agent.set_logger(job.logger(writers))
 
     @property
     def size(self) -> int:
-        """Numbers in what it sees."""
+        """Numbers in an encoded observation."""
         return self.job.encoder.latent_size
 
-    def see(self, observation: Array) -> Float32:
+    def encode(self, observation: Array) -> Float32:
         """Observations of its lanes as its encoder shows them, (lanes, l)."""
         return self.job.encoder.encode(observation.astype(np.float32))
 
     @property
     def normalizer(self) -> VecNormalize | None:
-        """What normalises what it sees, if its preset says so."""
+        """What normalises encoded observations, if its settings say so."""
         return self.agent.get_vec_normalize_env()
 
-    def record(self, reward: Float32, ended: Flags, diverged: Flags) -> bool:
-        """Record a step of its lanes, (lanes,) each; whether it is time to log."""
+    def record(self, reward: Float32, ended: Flags, diverged: Flags) -> None:
+        """Record a step of its lanes, (lanes,) each, and log every few episodes."""
         agent, before = self.agent, self.agent._episode_num // _LOG_EVERY
         agent.num_timesteps += len(reward)
         self._returns += reward
@@ -97,15 +102,47 @@ class Member:
             agent.ep_info_buffer.append({"r": total, "l": length})
             agent._episode_num += 1
             self._returns[lane] = self._lengths[lane] = 0
-            self.draws.episode_ended(lane)
-        return agent._episode_num // _LOG_EVERY > before
+            self.random.reset_noise(lane)
+        if agent._episode_num // _LOG_EVERY > before:
+            agent.dump_logs()
+
+    def log_losses(self, losses: Mapping[str, float], weights: float) -> None:
+        """Log the losses of its last gradient steps, and let it fail where one isn't finite.
+
+        Args:
+            losses: by stable-baselines3's names.
+            weights: the sum of its actor's, which isn't finite if one of them isn't.
+        """
+        for name, value in losses.items():
+            self.agent.logger.record(f"train/{name}", value)
+            if not math.isfinite(value):
+                self.fail(f"train/{name} is {value}")
+        if not math.isfinite(weights):
+            self.fail(WEIGHTS_NOT_FINITE)
+
+    def evaluate(self) -> None:
+        """Play its agent's policy, deterministically."""
+        step = self.agent.num_timesteps
+        try:
+            episodes = self.job.run.episodes_at(step)
+            returns = self._evaluator.returns(self.agent, episodes)
+        except NonFiniteActionError:
+            self.fail(ACTIONS_NOT_FINITE)
+        except EnvironmentFailedError as error:
+            self.fail(str(error))
+        else:
+            self.mean = self.job.history.evaluated(step, returns, self.agent.logger)
+
+    def fail(self, reason: str) -> None:
+        """Note why it can't go on; the first reason is kept."""
+        self.failure = self.failure or reason
 
     def take(self) -> Snapshot:
         """Everything of its own that decides how its training continues."""
         agent = self.agent
         tensors = {f"{PARAMETERS}{name}": each.numpy() for name, each in parameters(agent)}
-        drawn, counters = self.draws.state
-        tensors |= {f"{_DRAWS}{name}": values for name, values in drawn.items()}
+        random, counters = self.random.state
+        tensors |= {f"{_RANDOM}{name}": values for name, values in random.items()}
         tensors |= {"returns": self._returns, "lengths": self._lengths}
         if self.normalizer:
             tensors |= Statistics.of(self.normalizer).tensors
@@ -119,7 +156,7 @@ class Member:
         with torch.no_grad():
             for name, each in parameters(agent):
                 each.copy_(torch.from_numpy(tensors[f"{PARAMETERS}{name}"]))
-        self.draws.restore(without(_DRAWS, tensors), counters)
+        self.random.restore(without(_RANDOM, tensors), counters)
         self._returns, self._lengths = tensors["returns"].copy(), tensors["lengths"].copy()
         for name in COUNTERS:
             setattr(agent, name, counters[name])
@@ -129,39 +166,66 @@ class Member:
         if self.normalizer:
             Statistics.read(tensors, self.size, "the checkpoint").give(self.normalizer)
 
-    def learnt(self, losses: Mapping[str, float], weights: float) -> None:
-        """Note the losses of its last gradient steps, and whether it has failed.
 
-        Args:
-            losses: by stable-baselines3's names.
-            weights: the sum of its actor's, which isn't finite if one of them isn't.
-        """
-        for name, value in losses.items():
-            self.agent.logger.record(f"train/{name}", value)
-        told = {f"train/{name} is {value}": value for name, value in losses.items()}
-        told[WEIGHTS_NOT_FINITE] = weights
-        for words, value in told.items():
-            if not math.isfinite(value):
-                self.fail(words)
+class Random:
+    """A run's random numbers, from generators of its own, drawn in stable-baselines3's order.
 
-    def fail(self, reason: str) -> None:
-        """Note why it can't go on; the first reason is kept."""
-        self.failure = self.failure or reason
+    The generators begin as they are in this process just after the run's agent was made.
 
-    def log(self) -> None:
-        """Log its losses and what its last episodes returned."""
-        self.agent.dump_logs()
+    Args:
+        actions: the agent's space of actions, from which random ones are drawn.
+        lanes: of the run.
+        noise: on actions.
+    """
 
-    def evaluate(self) -> None:
-        """Play its agent's policy, deterministically."""
-        step = self.agent.num_timesteps
-        try:
-            episodes = self.job.run.episodes_at(step)
-            returns = self._evaluator.returns(self.agent, episodes)
-        except NonFiniteActionError:
-            self.fail(ACTIONS_NOT_FINITE)
-            return
-        except EnvironmentFailedError as error:
-            self.fail(str(error))
-            return
-        self.mean = self.job.history.evaluated(step, returns, self.agent.logger)
+    def __init__(
+        self,
+        actions: spaces.Space[Any],
+        lanes: int,
+        noise: NormalNoise | OrnsteinUhlenbeckNoise | None,
+    ):
+        self._actions, self._lanes, self._noise = actions, lanes, noise
+        self._numpy = np.random.RandomState()
+        self._numpy.set_state(np.random.get_state())  # noqa: NPY002 - stable-baselines3 seeded it
+        self._torch = torch.Generator()
+        self._torch.set_state(torch.get_rng_state())
+        self._last_noise = np.zeros((lanes, *(actions.shape or ())))
+
+    def actions(self) -> Float32:
+        """Uniformly distributed ones, (lanes, k)."""
+        return np.array([self._actions.sample() for _ in range(self._lanes)])
+
+    def noise(self) -> Float32:
+        """Noise on actions that are scaled to [-1, 1], (lanes, k)."""
+        if self._noise:
+            self._last_noise = self._noise.after(self._last_noise, self._numpy)
+        return self._last_noise.astype(np.float32)
+
+    def reset_noise(self, lane: int) -> None:
+        """Let a lane's noise start at zero again."""
+        self._last_noise[lane] = 0
+
+    def sample_indices(self, filled: int, size: int) -> tuple[Indices, Indices]:
+        """The steps and lanes of a batch from a replay buffer with so many steps, (size,) each."""
+        steps = self._numpy.randint(0, filled, size=size)
+        return steps, self._numpy.randint(0, high=self._lanes, size=size)
+
+    def normal(self, *shape: int) -> Tensor:
+        """Standard normal numbers."""
+        return torch.empty(shape).normal_(generator=self._torch)
+
+    @property
+    def state(self) -> tuple[Tensors, dict[str, Any]]:
+        """What `restore` takes: tensors, and plain JSON."""
+        kind, keys, *rest = self._numpy.get_state()
+        torchs, actions = self._torch.get_state(), self._actions.np_random.bit_generator.state
+        tensors = {"numpy": np.asarray(keys), "torch": torchs.numpy(), "noise": self._last_noise}
+        return tensors, {"numpy": (kind, *rest), "actions": actions}
+
+    def restore(self, tensors: Tensors, counters: Mapping[str, Any]) -> None:
+        """Continue from a state."""
+        kind, *rest = counters["numpy"]
+        self._numpy.set_state((kind, tensors["numpy"], *rest))
+        self._torch.set_state(torch.from_numpy(tensors["torch"]))
+        self._last_noise = tensors["noise"].copy()
+        self._actions.np_random.bit_generator.state = counters["actions"]

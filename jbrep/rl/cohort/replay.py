@@ -1,13 +1,11 @@
-"""Replay memory of n agents."""
+"""Replay buffers of n agents."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from jbrep.rl.cohort.steps import Batch
 from jbrep.rl.presets import ALGORITHMS
 from jbrep.rl.run import Run
 
@@ -15,7 +13,7 @@ Float32 = NDArray[np.float32]
 
 
 def capacity_of(run: Run) -> int:
-    """The most transitions that a run remembers: no more than it makes, in whole rollouts."""
+    """The most transitions that a run keeps: no more than it makes, in whole rollouts."""
     usual = inspect.signature(ALGORITHMS[run.algorithm]).parameters
     size, steps = (
         int(run.used.settings.get(name, usual[name].default))
@@ -26,7 +24,7 @@ def capacity_of(run: Run) -> int:
 
 
 def memory_of(run: Run, observed: int) -> int:
-    """Bytes of a run's replay memory, where each observation has so many numbers."""
+    """Bytes of a run's replay buffer, where each observation has so many numbers."""
     return 4 * capacity_of(run) * sum(_sizes(observed, run.task.action_size))
 
 
@@ -35,15 +33,15 @@ def _sizes(observation: int, action: int) -> tuple[int, ...]:
     return observation, action, observation, 1, 1
 
 
-class Replay:
-    """The last transitions of each member, as stable-baselines3's ReplayBuffer keeps them.
+class ReplayBuffer:
+    """The last transitions of each agent, as stable-baselines3's ReplayBuffer keeps them.
 
     All of a transition stands in one row, so that a sample touches memory once.
 
     Args:
-        members: n.
-        lanes: of each member.
-        capacity: transitions of each member.
+        agents: n.
+        lanes: of each agent.
+        capacity: transitions of each agent.
         observation: numbers in an observation.
         action: numbers in an action.
 
@@ -51,10 +49,10 @@ class Replay:
         added: steps since the start.
     """
 
-    def __init__(self, members: int, lanes: int, capacity: int, observation: int, action: int):
+    def __init__(self, agents: int, lanes: int, capacity: int, observation: int, action: int):
         self._sizes = _sizes(observation, action)
         self._steps = max(capacity // lanes, 1)
-        self._rows = np.empty((members, self._steps, lanes, sum(self._sizes)), np.float32)
+        self._rows = np.empty((agents, self._steps, lanes, sum(self._sizes)), np.float32)
         self.added = 0
 
     @property
@@ -62,42 +60,30 @@ class Replay:
         """Steps that are there."""
         return min(self.added, self._steps)
 
-    def of(self, member: int) -> Float32:
-        """What is there of a member, (filled, lanes, width); a view."""
-        return self._rows[member, : self.filled]
+    def rows_of(self, agent: int) -> Float32:
+        """What is there of an agent, (filled, lanes, width); a view."""
+        return self._rows[agent, : self.filled]
 
-    def refill(self, rows: Sequence[Float32], added: int) -> None:
-        """Put back what `of` gave of each member.
+    def restore(self, rows: Sequence[Float32], added: int) -> None:
+        """Put back what `rows_of` gave of each agent.
 
         Args:
-            rows: of each member.
+            rows: of each agent.
             added: steps that had been added.
         """
         self.added = added
-        for member, each in enumerate(rows):
-            self._rows[member, : len(each)] = each
+        for agent, each in enumerate(rows):
+            self._rows[agent, : len(each)] = each
 
     def add(self, *columns: Float32) -> None:
-        """Add a step of each lane: observation, action, next observation, reward, ended.
+        """Add a step of each lane: observation, action, next observation, reward, terminated.
 
         The shapes are (n, lanes, ...).
         """
         self._rows[:, self.added % self._steps] = np.concatenate(columns, axis=2)
         self.added += 1
 
-    def sample(
-        self,
-        rows: NDArray[np.int64],
-        lanes: NDArray[np.int64],
-        show: Callable[[Float32], Float32],
-    ) -> Batch:
-        """The transitions of those steps and lanes, (n, b) each.
-
-        Args:
-            rows: the steps.
-            lanes: the lanes.
-            show: observations (n, b, size) as agents see them now.
-        """
-        taken = self._rows[np.arange(len(rows))[:, None], rows, lanes]
-        seen, action, after, reward, ended = np.split(taken, np.cumsum(self._sizes)[:-1], axis=2)
-        return Batch(*map(torch.from_numpy, (show(seen), action, show(after), reward, ended)))
+    def sample(self, steps: NDArray[np.int64], lanes: NDArray[np.int64]) -> list[Float32]:
+        """Those that `add` was given in steps and lanes, (n, b) each; (n, b, ...) each."""
+        rows = self._rows[np.arange(len(steps))[:, None], steps, lanes]
+        return np.split(rows, np.cumsum(self._sizes)[:-1], axis=2)

@@ -1,128 +1,107 @@
-"""SAC for n agents at once, with the gradient steps of stable-baselines3."""
+"""SAC of n agents at once."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.optim import Optimizer
 
-from jbrep.rl.cohort.networks import Arithmetic, Network
-from jbrep.rl.cohort.steps import (
-    Batch,
-    Losses,
-    approach,
-    descend,
-    least,
-    squared_error,
-    sum_of,
-    target,
-    values,
-)
+from jbrep.rl.cohort.algorithm import Algorithm, Batch, Losses, min_q, optimizer_step, polyak_update
+from jbrep.rl.cohort.networks import Stack
 
 _LOG_STD = (-20.0, 2.0)  # the limits of stable-baselines3's actor
 _EPSILON = 1e-6  # in the density of its actions
 
 
-@dataclass(kw_only=True)
-class SAC:
+class SAC(Algorithm):
     """Soft actor-critic (Haarnoja et al. 2018).
 
-    Networks and optimisers have stable-baselines3's names.
+    The actor's outputs are means, then logarithms of standard deviations.
     """
 
-    compute: Arithmetic
-    actor: Network  # its outputs are means, then logarithms of standard deviations
-    critic: Sequence[Network]
-    critic_target: Sequence[Network]
-    log_ent_coef: Tensor  # of the entropy's weight, (n, 1, 1)
-    actor_optimizer: Optimizer
-    critic_optimizer: Optimizer
-    ent_coef_optimizer: Optimizer | None  # None: the weight is fixed
-    gamma: float
-    tau: float
-    target_entropy: float
-    target_update_interval: int
-    draws_to_explore: ClassVar = 1
-    draws_to_learn: ClassVar = 2  # of standard normal numbers, in the order in which they are used
+    settings: ClassVar = ("ent_coef", "target_entropy", "target_update_interval")
+    normals_to_explore: ClassVar = 1
+    normals_to_learn: ClassVar = 2
+
+    def __init__(self, stack: Stack):
+        super().__init__(stack)
+        agent = stack.agents[0]
+        self.target_entropy = float(agent.target_entropy)
+        self.target_update_interval: int = agent.target_update_interval
+        (self.actor,) = stack.networks(
+            lambda each: [[*each.actor.latent_pi, (each.actor.mu, each.actor.log_std)]]
+        )
+        self.critic = stack.networks(lambda each: each.critic.q_networks)
+        self.critic_target = stack.networks(lambda each: each.critic_target.q_networks)
+        self.actor_optimizer = stack.adam(self.actor, lambda each: each.actor.optimizer)
+        self.critic_optimizer = stack.adam(self.critic, lambda each: each.critic.optimizer)
+        self.ent_coef_optimizer = None  # the coefficient is fixed
+        if agent.ent_coef_optimizer is None:
+            self.log_ent_coef = stack.numbers(lambda each: each.ent_coef_tensor.log())
+        else:
+            self.log_ent_coef = stack.numbers(lambda each: each.log_ent_coef)
+            self.ent_coef_optimizer = stack.adam(
+                self.log_ent_coef, lambda each: each.ent_coef_optimizer
+            )
 
     def explore(self, observation: Tensor, normals: Sequence[Tensor]) -> Tensor:
-        """Actions at random, (n, lanes, k) in [-1, 1]."""
-        return self._sample(self.actor, observation, normals[0])[0]
+        """Actions drawn from the policy."""
+        return self.sample(observation, normals[0])[0]
 
-    def is_due(self, number: int, index: int) -> bool:
-        """Whether the targets follow in a gradient step.
-
-        Args:
-            number: of the step since the start, from 1.
-            index: of the step since the environments were stepped, from 0.
-        """
-        return index % self.target_update_interval == 0
-
-    @property
-    def optimizers(self) -> tuple[Optimizer | None, ...]:
-        """All that there are."""
-        return (self.actor_optimizer, self.critic_optimizer, self.ent_coef_optimizer)
-
-    def size_of_actors(self) -> Tensor:
-        """The sum of each actor's weights, (n,), which isn't finite if one of them isn't."""
-        return sum_of(self.actor)
-
-    def update(self, batch: Batch, normals: Sequence[Tensor], due: bool) -> Losses:
-        """Take a gradient step.
-
-        Args:
-            batch: to learn from.
-            normals: (n, b, k) each, of actions now and next.
-            due: what `is_due` said.
-        """
-        now, after = normals
-        weight = self.log_ent_coef.exp()
-        chosen, log_density = self._sample(self.actor, batch.next_observation, after)
-        told = values(self.compute, self.critic_target, batch.next_observation, chosen)
-        wanted = target(batch, self.gamma, least(told) - weight * log_density)
-        losses = {
-            "critic_loss": descend(
-                self._critic_loss, self.critic, self.critic_optimizer, batch, wanted
-            )
-        }
-        losses["actor_loss"], log_density = descend(
-            self._actor_loss, self.actor, self.actor_optimizer, batch.observation, now, weight
-        )
-        losses["ent_coef"] = weight[:, 0, 0]
-        if optimizer := self.ent_coef_optimizer:
-            excess = log_density + self.target_entropy
-            loss = descend(self._entropy_loss, self.log_ent_coef, optimizer, excess)
-            losses["ent_coef_loss"] = loss
-        if due:
-            approach(self.critic_target, self.critic, self.tau)
-        return losses
-
-    def _sample(self, actor: Network, observation: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions made of standard normal numbers, (n, b, k), and their log density, (n, b, 1)."""
-        mean, log_std = self.compute(actor, observation).chunk(2, 2)
+    def sample(self, observation: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions of the policy, (n, b, k), with their log density, (n, b, 1)."""
+        mean, log_std = self.mlp(self.actor, observation).chunk(2, 2)
         log_std = log_std.clamp(*_LOG_STD)
         action = torch.tanh(mean + log_std.exp() * normal)
-        log_density = -0.5 * normal**2 - log_std - 0.5 * math.log(2 * math.pi)
-        log_density = log_density - torch.log(1 - action**2 + _EPSILON)  # of the squashed action
-        return action, log_density.sum(2, keepdim=True)
+        log_prob = -0.5 * normal**2 - log_std - 0.5 * math.log(2 * math.pi)
+        log_prob = log_prob - torch.log(1 - action**2 + _EPSILON)  # of the squashed action
+        return action, log_prob.sum(2, keepdim=True)
 
-    def _critic_loss(
-        self, critic: Sequence[Network], batch: Batch, wanted: Tensor
+    def update(
+        self, batch: Batch, normals: Sequence[Tensor], n_updates: int, gradient_step: int
+    ) -> Losses:
+        """As in the class above; all losses are by the entropy coefficient of before."""
+        normal, next_normal = normals
+        ent_coef = self.log_ent_coef.exp()
+        critic_loss = self.update_critic(batch, next_normal, ent_coef)
+        actor_loss, log_prob = self.update_actor(batch.observation, normal, ent_coef)
+        losses = {
+            "critic_loss": critic_loss,
+            "actor_loss": actor_loss,
+            "ent_coef": ent_coef[:, 0, 0],
+            **self.update_ent_coef(log_prob),
+        }
+        if gradient_step % self.target_update_interval == 0:
+            polyak_update(self.critic, self.critic_target, self.tau)
+        return losses
+
+    def update_critic(self, batch: Batch, normal: Tensor, ent_coef: Tensor) -> Tensor:
+        """Take a step towards the smaller of the targets' values, and the entropy."""
+        next_action, next_log_prob = self.sample(batch.next_observation, normal)
+        next_q = min_q(self.q_values(self.critic_target, batch.next_observation, next_action))
+        target = self.td_target(batch, next_q - ent_coef * next_log_prob)
+        with optimizer_step(self.critic_optimizer):
+            loss = 0.5 * self.td_error(self.critic, batch, target)
+            loss.sum().backward()
+        return loss.detach()
+
+    def update_actor(
+        self, observation: Tensor, normal: Tensor, ent_coef: Tensor
     ) -> tuple[Tensor, Tensor]:
-        loss = 0.5 * squared_error(critic, self.compute, batch, wanted)
-        return loss.sum(), loss
+        """Take a step up value and entropy; also the actions' log density, (n, b, 1)."""
+        with optimizer_step(self.actor_optimizer):
+            action, log_prob = self.sample(observation, normal)
+            q_value = min_q(self.q_values(self.critic, observation, action))
+            loss = (ent_coef * log_prob - q_value).mean((1, 2))
+            loss.sum().backward()
+        return loss.detach(), log_prob.detach()
 
-    def _actor_loss(
-        self, actor: Network, observation: Tensor, normal: Tensor, weight: Tensor
-    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        action, log_density = self._sample(actor, observation, normal)
-        told = values(self.compute, self.critic, observation, action)
-        loss = (weight * log_density - least(told)).mean((1, 2))
-        return loss.sum(), (loss, log_density)
-
-    def _entropy_loss(self, log_weight: Tensor, excess: Tensor) -> tuple[Tensor, Tensor]:
-        loss = -(log_weight * excess).mean((1, 2))
-        return loss.sum(), loss
+    def update_ent_coef(self, log_prob: Tensor) -> Losses:
+        """Take a step of the coefficient towards the target entropy, unless it is fixed."""
+        if not self.ent_coef_optimizer:
+            return {}
+        with optimizer_step(self.ent_coef_optimizer):
+            loss = -(self.log_ent_coef * (log_prob + self.target_entropy)).mean((1, 2))
+            loss.sum().backward()
+        return {"ent_coef_loss": loss.detach()}

@@ -1,5 +1,6 @@
 """Training runs together, in cohorts."""
 
+import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
@@ -7,14 +8,14 @@ from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
 from jbrep.rl.agent import unchecked_distributions
 from jbrep.rl.checkpoint import MALFORMED, Snapshot, StoppedError
-from jbrep.rl.cohort.cohort import Cohort, filled_up
+from jbrep.rl.cohort.cohort import Cohort, padded_size
 from jbrep.rl.cohort.member import Member
-from jbrep.rl.cohort.settings import shared_by
 from jbrep.rl.job import Ended, Job, Session
 from jbrep.rl.policy_file import policy_zip
 
 _Begun = tuple[Job, Snapshot | None]
 _Kind = tuple[str, bool, int, int, str]
+_EACH_ITS_OWN = ("representation", "encoder", "encoder_code", "encoder_seed", "seed", "from")
 
 
 def train_together(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
@@ -46,8 +47,10 @@ def train_together(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
 
 def _kind(job: Job, snapshot: Snapshot | None) -> _Kind:
     """What is the same of all runs of a cohort; one that can't be continued is alone in its."""
+    shared = {n: value for n, value in job.settings.items() if n not in _EACH_ITS_OWN}
     alone = "" if job.run.task.reproducible else str(job.folder)
-    return shared_by(job.settings), snapshot is None, job.history.first_step, filled_up(job), alone
+    text, is_new = json.dumps(shared, sort_keys=True), snapshot is None
+    return text, is_new, job.history.first_step, padded_size(job), alone
 
 
 def _cohort(begun: Sequence[_Begun], session: Session) -> Cohort:
@@ -106,7 +109,7 @@ def _save(cohort: Cohort, session: Session) -> None:
     stopping = session.stop()
     first = cohort.members[0].job.checkpoint
     if stopping or first.is_due(session.save_every, len(cohort.members)):
-        cohort.give_back()
+        cohort.write_to_agents()
         for member in cohort.members:
             member.job.checkpoint.write(cohort.take(member))
     if stopping:
