@@ -107,7 +107,7 @@ def test_the_number_of_processes_changes_no_byte(workers, sledges, tmp_path):
 
 def test_shards_of_episodes_that_may_end_early_are_started_together():
     """Though 900 episodes could have more rows than are needed, had they their full length."""
-    task = replace(SLEDGE, max_episode_steps=1000)
+    task = SLEDGE.replace(max_episode_steps=1000)
     made = new_manifest(some(task, steps=200_000, shard_episodes=900))
     assert _Missing(made).wants(1)
     assert not _Missing(replace(made, settings=some(task, steps=900, shard_episodes=1))).wants(1)
@@ -251,7 +251,7 @@ def test_arrays_of_states_are_stored_and_compared(tmp_path):
         some(store_state=True)
     for name in ("reward", "length", "diverged", "final_heat"):
         with pytest.raises(InputError, match=f"has an array '{name}': data sets have such"):
-            some(replace(task, state={name: 1}))
+            some(task.replace(state={name: 1}))
 
 
 def test_an_unwrapped_time_limit_and_flattened_dictionaries(tmp_path):
@@ -295,7 +295,7 @@ def test_arguments_are_settings(sledges, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"task": replace(SLEDGE, seed_bits=31), "seed": 2047}, "seeds of 31 bits: the data set's"),
+        ({"task": SLEDGE.replace(seed_bits=31), "seed": 2047}, "seeds of 31 bits: the data set's"),
         ({"task": f"environments:{ID}"}, "names a module: importing it runs its code"),
         ({"task": "CartPole-v1"}, "only continuous ones are possible"),
         ({"policy": {"kind": "heuristic"}}, f"{ID} has no hand-written policy"),

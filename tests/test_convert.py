@@ -23,6 +23,7 @@ from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.methods.autoencoder import DAE
 from jbrep.methods.registry import name_of, read_name
+from jbrep.records.record import to_plain
 
 TASK = describe("face_direction")
 RANDOM = np.random.default_rng(0)
@@ -79,7 +80,7 @@ def layered(activations, **changes):
         for (size, out), a in zip(pairwise(sizes), activations, strict=True)
     ]
     like = find("dae-8", TASK)
-    header = {**like.header, "environment": TASK.as_json(), "name": "mine", **changes}
+    header = {**like.header, "environment": to_plain(TASK), "name": "mine", **changes}
     return Encoder(header, like.scaler, tuple(layers), ())
 
 
@@ -110,7 +111,7 @@ def test_what_an_older_jbrep_cannot_read_has_a_newer_version(activations, change
     assert layered(activations, **changes).file_header["format_version"] == version
     plain = find("dae-8", TASK)
     assert plain.file_header["format_version"] == 1
-    newer = Encoder({**plain.header, "environment": TASK.as_json()}, *_parts(plain))
+    newer = Encoder({**plain.header, "environment": to_plain(TASK)}, *_parts(plain))
     assert newer.file_header["format_version"] == 2
 
 

@@ -28,6 +28,7 @@ from jbrep.envs import Feature, Task, describe
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.records import container
+from jbrep.records.record import to_plain
 
 TASK = describe("face_direction")
 PENDULUM = describe("Pendulum-v1", {"g": 1.6})
@@ -40,7 +41,7 @@ def layer(inputs, outputs, activation):
 
 
 def header(task=TASK, **changes):
-    facts = {"kind": "dae", "name": "dae-3", "task": task.name, "environment": task.as_json()}
+    facts = {"kind": "dae", "name": "dae-3", "task": task.name, "environment": to_plain(task)}
     records = {"training": {"latent": 3}, "data": {"seed": 0}, "versions": {}}
     records["metrics"] = {"held_out_mse": 0.1}
     return {**facts, "features": list(task.feature_names), **records, **changes}
@@ -221,7 +222,7 @@ def nested(levels):
     deep = []
     for _ in range(levels):
         deep = [deep]
-    return {**TASK.as_json(), "arguments": {"deep": deep}}
+    return {**to_plain(TASK), "arguments": {"deep": deep}}
 
 
 @pytest.mark.parametrize(
@@ -335,14 +336,14 @@ def test_an_encoder_of_another_environment_or_other_features_is_refused(encoder)
     encoder.check_task(TASK)
     with pytest.raises(InputError, match="made for face_direction, not for move_to_pose"):
         encoder.check_task(describe("move_to_pose"))
-    one, other = numbered(3), replace(PENDULUM, name="other", id="other")
+    one, other = numbered(3), PENDULUM.replace(name="other", id="other")
     assert one.feature_names == PENDULUM.feature_names  # as of every robot of three features
     for task in (one, other):
         with pytest.raises(
             InputError, match=f"dae-3 was made for Pendulum-v1, not for {task.name}"
         ):
             make(task=PENDULUM).check_task(task)
-    renamed = replace(PENDULUM, features=(Feature("x"), Feature("y"), Feature("speed")))
+    renamed = PENDULUM.replace(features=(Feature("x"), Feature("y"), Feature("speed")))
     with pytest.raises(InputError, match="dae-3 was made for other features of Pendulum-v1"):
         make(task=PENDULUM).check_task(renamed)
     make(task=PENDULUM).check_task(describe("Pendulum-v1"))  # with other arguments
@@ -394,7 +395,7 @@ def test_onnx_gives_what_torch_gives(encoder, rows, tmp_path):
     np.testing.assert_allclose(latent, tensor.numpy(), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(back, encoder.decode(tensor).numpy(), rtol=1e-4, atol=1e-4)
     stored = session.get_modelmeta().custom_metadata_map["jbrep"]
-    assert json.loads(stored)["environment"] == TASK.as_json()
+    assert json.loads(stored)["environment"] == to_plain(TASK)
     with pytest.raises(InputError, match=r"it.onnx exists already"):
         export(encoder, tmp_path / "it.onnx")
 
@@ -471,7 +472,7 @@ def test_the_full_observation_goes_by_one_name(encoder):
         (numbered(3, low=-1e20, high=1e20), "full, unscaled", (1, 1, 1)),
         (numbered(3, low=1.0, high=1.0 + 1e-12), "full, unscaled", (1, 1, 1)),
         (
-            replace(numbered(2), features=(Feature("x", "m", -2.0, 4.0), Feature("y"))),
+            numbered(2).replace(features=(Feature("x", "m", -2.0, 4.0), Feature("y"))),
             "full, scaled by the usual ranges where they are known",
             (4, 1),
         ),

@@ -32,6 +32,7 @@ from jbrep.evaluate.truth import quantities, state
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods import random
 from jbrep.methods.linear import principal_code
+from jbrep.records.record import to_plain
 from jbrep.report.figures import encoder_plots
 from jbrep.stats.bootstrap import bootstrap, by_episode
 
@@ -56,7 +57,7 @@ def projection(data, latent, seed):
 
 def make(scaled, parts, name="it-4", **changes):
     task = changes.pop("task", scaled.task)
-    facts = {"kind": "test", "name": name, "task": task.name, "environment": task.as_json()}
+    facts = {"kind": "test", "name": name, "task": task.name, "environment": to_plain(task)}
     features = list(task.feature_names)
     return Encoder({**facts, "data": {}, "features": features, **changes}, scaled.scaler, *parts)
 
@@ -557,9 +558,9 @@ def test_whether_an_encoder_may_have_seen_the_episodes(data):
 
 
 def test_other_features_are_refused(data):
-    other = replace(data.task, id="Other-v0", name="Other-v0")
+    other = data.task.replace(id="Other-v0", name="Other-v0")
     with pytest.raises(InputError, match="it-4 was made for Other-v0, not for face_direction"):
         diagnose({"it": make(data, ((), ()), task=other)}, data)
-    permuted = replace(data.task, features=tuple(reversed(data.task.features)))
+    permuted = data.task.replace(features=tuple(reversed(data.task.features)))
     with pytest.raises(InputError, match="it-4 was made for other features of face_direction"):
         diagnose({"it": make(data, ((), ()), task=permuted)}, data)

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import warnings
 import zipfile
-from dataclasses import replace
 from types import SimpleNamespace
 
 import gymnasium
@@ -161,7 +160,7 @@ def test_what_is_exported_comes_back(to, collected, tmp_path):
     back = Dataset(tmp_path / "back")
     for name, values in table(dataset).items():
         np.testing.assert_array_equal(table(back)[name], values, err_msg=name)
-    assert back.task == replace(dataset.task, state={}, constants={})
+    assert back.task == dataset.task.replace(state={}, constants={})
     assert not list(find_problems(back.folder))
 
 

@@ -616,7 +616,7 @@ def test_a_time_step_that_is_not_known_leaves_the_steps(folder):
     from jbrep.inspection.episode import record_episode
 
     rollout = find_episode("uniform", 0, describe("Pendulum-v1", max_episode_steps=30))
-    rollout = replace(rollout, task=replace(rollout.task, timestep=None))
+    rollout = replace(rollout, task=rollout.task.replace(timestep=None))
     record_episode(rollout, folder / "steps.rrd", find("full", rollout.task))
     entity = read(folder / "steps.rrd")["/observation/obs"]
     assert entity["step"].to_pylist() == list(range(31))

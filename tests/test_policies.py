@@ -1,7 +1,5 @@
 """Policies: bounds, streams of their own, constants as people write them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -144,7 +142,7 @@ def test_actions_of_several_numbers_keep_to_the_bounds_of_each(policy):
 
 
 def test_standing_still_is_zero_or_what_is_next_to_it():
-    pushed = replace(ARM, action_low=(0.5, 0.0, -2.0))
+    pushed = ARM.replace(action_low=(0.5, 0.0, -2.0))
     for task, expected in ((ARM, [0, 0, 0]), (pushed, [0.5, 0, 0])):
         actions = drives(Still(), lanes=2, steps=3, task=task)
         np.testing.assert_array_equal(actions, np.broadcast_to(expected, (3, 2, 3)))
@@ -153,9 +151,9 @@ def test_standing_still_is_zero_or_what_is_next_to_it():
 def test_drives_are_not_rescaled_where_the_bounds_are_those_of_drives():
     """Scaling -1 + (x + 1) would change the last bits of most."""
     rough = OrnsteinUhlenbeck(theta=1, sigma=3)
-    own = drives(rough, lanes=2, task=replace(ARM, timestep=TASK.timestep))[:, :, :1]
+    own = drives(rough, lanes=2, task=ARM.replace(timestep=TASK.timestep))[:, :, :1]
     assert (own > -1).any()
-    wide = replace(ARM, action_low=(-1.0,), action_high=(1.0,), timestep=TASK.timestep, draws=6)
+    wide = ARM.replace(action_low=(-1.0,), action_high=(1.0,), timestep=TASK.timestep, draws=6)
     np.testing.assert_array_equal(drives(rough, lanes=2, task=wide), drives(rough, lanes=2))
     x = np.random.default_rng(0).uniform(-1, 1, (100, 1))
     assert within_bounds(wide, x) is x
@@ -175,7 +173,7 @@ def test_noise_needs_a_time_step_that_is_known_and_small_enough():
     with pytest.raises(InputError, match=r"theta is 101: with steps of 0.01 s .* in \[0, 100\]"):
         noise.begin(TASK, [0])
     with pytest.raises(InputError, match="the time step of Arm-v0 is not known, which ornstein"):
-        noise.begin(replace(ARM, timestep=None), [0])
+        noise.begin(ARM.replace(timestep=None), [0])
 
 
 MIXTURE = parse_policy("uniform:1+constant:drive=0.5:2+heuristic:1")

@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -35,6 +34,7 @@ from jbrep.evaluate.regression import Problem, beside, fit
 from jbrep.evaluate.summary import evaluation_text
 from jbrep.evaluate.truth import in_words
 from jbrep.play.good_policy import find_good_policy
+from jbrep.records.record import to_plain
 
 NAMES = ("place", "speed", "load", "idle")
 STEPS, EPISODES = 60, 200
@@ -53,7 +53,7 @@ class Cart:
     def __init__(self):
         features = [make_feature(name) for name in NAMES]
         task = make_task(features, "Cart-v0")
-        self.task = replace(task, action_low=(-1.0,), action_high=(1.0,))
+        self.task = task.replace(action_low=(-1.0,), action_high=(1.0,))
         self.episodes = {"length": np.full(EPISODES, STEPS), "seed": np.arange(EPISODES)}
         policy = SimpleNamespace(policy={"kind": "uniform"}, seed=0)
         self.manifest = SimpleNamespace(fingerprint="cart", settings=policy)
@@ -119,7 +119,7 @@ def code(data, *kept):
     """A code of these features alone."""
     weight = np.eye(4, dtype=np.float32)[[NAMES.index(name) for name in kept]]
     header = {"kind": "subset", "name": "subset", "task": data.task.name, "data": {}}
-    header |= {"environment": data.task.as_json(), "features": list(NAMES)}
+    header |= {"environment": to_plain(data.task), "features": list(NAMES)}
     header["metrics"] = {"spectrum": [3.0, 1.0]}
     there, back = (
         (Layer(each, np.zeros(len(each), np.float32), "linear"),)

@@ -157,7 +157,7 @@ def test_a_camera_that_follows_the_robot():
 def test_what_can_t_be_filmed(change, message, camera):
     episode = find_episode("uniform", 0, describe("Hopper-v5", max_episode_steps=3))
     if "task" in change:
-        change = {"task": replace(episode.task, **change["task"])}
+        change = {"task": episode.task.replace(**change["task"])}
     with pytest.raises(InputError, match=message):
         Film([replace(episode, **change)], camera, Pace())
 

@@ -15,6 +15,7 @@ from jbrep.envs import describe
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
 from jbrep.records import container
+from jbrep.records.record import to_plain
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.files import (
@@ -184,7 +185,7 @@ def test_arguments_and_time_limit_are_settings_of_a_run(tmp_path):
     assert "returns on full at the end: -" in told.output
     run = read_run(tmp_path / "run")
     task = describe("Pendulum-v1", {"g": 3.5}, 40)
-    assert run["settings"]["environment"] == task.as_json()
+    assert run["settings"]["environment"] == to_plain(task)
     assert {row["length"] for row in episodes_of(tmp_path / "run")} == {40}
     again = ("--steps", 400, "--episode-steps", 50, "--env", "g=3.5")
     told = jbrep("rl", "--task", "Pendulum-v1", *again, *made[7:])

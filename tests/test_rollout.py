@@ -219,7 +219,7 @@ def test_what_comes_out_differently_is_shown_as_stored(hopper):
 
 def test_what_can_t_be_simulated_here_is_shown_as_stored(hopper):
     elsewhere = Dataset(hopper.folder)
-    elsewhere.task = replace(elsewhere.task, id="Theirs/Hopper-v5")
+    elsewhere.task = elsewhere.task.replace(id="Theirs/Hopper-v5")
     rollout = replay(elsewhere, 0)
     assert rollout.motion is None
     assert "is shown without the robot: unknown task 'Theirs/Hopper-v5'" in rollout.note

@@ -25,6 +25,7 @@ from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.play.sources import find_player
 from jbrep.records import container
+from jbrep.records.record import to_plain
 from jbrep.rl import Run, train
 from jbrep.rl.agent import make_env
 from jbrep.rl.files import (
@@ -479,7 +480,7 @@ def test_another_encoder_is_not_the_run_s(run):
     assert "is not the encoder that the run in" in refused(load_run, run)
     settings = json.loads((run / RUN).read_text())["settings"]
     own = find("pca-8", TASK).fingerprint
-    pose = {"task": "move_to_pose", "environment": describe("move_to_pose").as_json()}
+    pose = {"task": "move_to_pose", "environment": to_plain(describe("move_to_pose"))}
     change(run, settings={**settings, "encoder": own, **pose})
     assert "was made for face_direction" in refused(load_run, run)
 

@@ -17,6 +17,7 @@ from jbrep.encoders.onnx import export
 from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.records import container
+from jbrep.records.record import to_plain
 
 RANDOM = np.random.default_rng(0)
 TASK = describe("face_direction")
@@ -83,7 +84,7 @@ def encoder(angles=ANGLES, clip=1.5, keep=("angle_to_target", "velocity_x"), lay
     high = np.float32([feature.high for feature in TASK.features])
     low[15] += 2  # so that the middle of an angle isn't 0
     scaler = Scaler(low, high, angles, clip)
-    header = {"kind": "dae", "name": "it-3", "task": TASK.name, "environment": TASK.as_json()}
+    header = {"kind": "dae", "name": "it-3", "task": TASK.name, "environment": to_plain(TASK)}
     header |= {"features": list(TASK.feature_names), "training": {}, "data": {}, "versions": {}}
     header["metrics"] = {"held_out_mse": 0.1}
     parts = (layer(scaler.size, 3, "tanh"),), (layer(3, scaler.size, "tanh"),)

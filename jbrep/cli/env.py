@@ -6,6 +6,7 @@ import click
 
 from jbrep.cli.base import as_json, echo_json, echo_text, example
 from jbrep.cli.environment import given_task, task_options
+from jbrep.records.record import to_plain
 from jbrep.text import terminal_width
 
 
@@ -26,6 +27,6 @@ def env(as_json: bool, **options: Any) -> None:
     task = given_task(options)
     assert task is not None
     if as_json:
-        echo_json(task.as_json())
+        echo_json(to_plain(task))
         return
     echo_text(card(task, terminal_width()))

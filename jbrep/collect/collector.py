@@ -30,6 +30,7 @@ from jbrep.envs.make import is_batched
 from jbrep.errors import InputError, differences
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
+from jbrep.records.record import to_plain
 from jbrep.records.storage import check_space, exists, make_folder, read_regular, write_whole
 
 _MAX_SHARDS = 10_000
@@ -242,7 +243,7 @@ def _flat(settings: Settings) -> dict[str, Any]:
     Whether it terminates is left out: it is what was seen of some episodes.
     """
     others = ("id", "name", "terminates")
-    task = {n: v for n, v in settings.task.as_json().items() if n not in others}
+    task = {n: v for n, v in to_plain(settings.task).items() if n not in others}
     return {n: v for n, v in settings.as_json().items() if n != "environment"} | task
 
 

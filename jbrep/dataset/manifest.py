@@ -22,9 +22,10 @@ from jbrep.dataset.shard import (
     map_file,
     shard_image,
 )
-from jbrep.envs.task import Task, read_task
+from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, check_version
 from jbrep.records.commit import are_commits, commits
+from jbrep.records.record import from_plain
 from jbrep.records.storage import exists, read_regular, write_whole
 
 MANIFEST = "manifest.json"
@@ -229,7 +230,7 @@ def _text(record: dict[str, Any]) -> bytes:
 
 def _parse(record: dict[str, Any]) -> Manifest:
     settings = dict(record["settings"])
-    task = read_task(settings.pop("environment"))
+    task = from_plain(settings.pop("environment"), Task)
     if settings.pop("task") != task.name:
         raise ValueError
     shards = tuple(Entry(**entry) for entry in record["shards"])

@@ -20,6 +20,7 @@ from jbrep.dataset.schema import (
 )
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
+from jbrep.records.record import to_plain
 
 _MAX_STEPS = 10**12
 _MAX_SHARD_EPISODES = 1_000_000
@@ -70,7 +71,7 @@ class Settings:
         """The settings as plain JSON."""
         return {
             "task": self.task.name,
-            "environment": self.task.as_json(),
+            "environment": to_plain(self.task),
             "policy": dict(self.policy),
             "steps": self.steps,
             "seed": self.seed,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.schema import EPISODES, Columns
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
+from jbrep.records.record import to_plain
 
 if TYPE_CHECKING:
     from jbrep.dataset.settings import Settings
@@ -26,7 +27,7 @@ def episodes(settings: "Settings") -> int:
 def mapped(record: dict[str, Any]) -> dict[str, Any]:
     """A manifest of version 1 with what the current version has besides."""
     settings = dict(record["settings"])
-    settings["environment"] = get_task(settings["task"]).describe().as_json()
+    settings["environment"] = to_plain(get_task(settings["task"]).describe())
     full, total = settings["shard_episodes"], -(-settings["steps"] // EPISODE_STEPS)
     shards = [
         {**entry, "episodes": min(full, total - full * shard)}

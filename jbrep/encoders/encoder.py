@@ -13,10 +13,11 @@ from jbrep.dataset import Scaler
 from jbrep.dataset.scaling import library_of
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.layers import ACTIVATIONS, FIRST_ACTIVATIONS, MAX_UNITS, Layer, run
-from jbrep.envs.task import Task, check_same, read_task
+from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import get_task
 from jbrep.records import container
+from jbrep.records.record import from_plain
 
 Float32 = NDArray[np.float32]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor
@@ -254,7 +255,7 @@ class Encoder(BaseEncoder):
 
     def _described_task(self) -> Task:
         if "environment" in self.header:
-            return read_task(self.header["environment"])
+            return from_plain(self.header["environment"], Task)
         return get_task(self.header["task"]).describe()  # version 1 knew the Jitterbug's alone
 
     @property

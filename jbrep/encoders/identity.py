@@ -7,6 +7,7 @@ from jbrep.dataset.scaling import usual_range
 from jbrep.encoders.encoder import IDENTITY, Encoder
 from jbrep.encoders.file import HELD_OUT_MSE
 from jbrep.envs.task import Task
+from jbrep.records.record import to_plain
 
 SCALINGS = {  # by the word for it in the header
     "ranges": "scaled by the usual ranges",
@@ -27,7 +28,7 @@ def identity(task: Task) -> Encoder:
         "kind": IDENTITY,
         "name": IDENTITY,
         "task": task.name,
-        "environment": task.as_json(),
+        "environment": to_plain(task),
         "features": list(task.feature_names),
         "training": {
             "scaling": "ranges" if known == task.size else "some ranges" if known else "none"

@@ -9,6 +9,7 @@ from jbrep.encoders.encoder import IMPORTED, Encoder
 from jbrep.encoders.layers import Layer
 from jbrep.encoders.names import check_name
 from jbrep.envs.task import Task
+from jbrep.records.record import to_plain
 
 
 def imported(
@@ -35,7 +36,7 @@ def imported(
         "kind": IMPORTED,
         "name": name,
         "task": task.name,
-        "environment": task.as_json(),
+        "environment": to_plain(task),
         "features": list(task.feature_names),
         "training": {},
         "data": {},

@@ -10,6 +10,7 @@ from onnx import TensorProto, helper
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.onnx_graph import Graph
 from jbrep.errors import InputError
+from jbrep.records.record import to_plain
 from jbrep.records.storage import exists, write_whole
 
 _OPSET, _IR_VERSION = 17, 8
@@ -53,7 +54,7 @@ def model(encoder: Encoder) -> onnx.ModelProto:
         ir_version=ir_version,
         producer_name="jbrep",
     )
-    header = {**encoder.header, "environment": encoder.task.as_json()}
+    header = {**encoder.header, "environment": to_plain(encoder.task)}
     helper.set_model_props(made, {"jbrep": json.dumps(header)})
     onnx.checker.check_model(made, full_check=True)
     return made

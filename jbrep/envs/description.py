@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,18 +11,26 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces.utils import flatten, flatten_space
+from msgspec.structs import asdict
 from numpy.typing import NDArray
 
 from jbrep.envs.make import creator, make_env
 from jbrep.envs.names import find_spec
-from jbrep.envs.task import MAX_EPISODE_STEPS, SEED_BITS, Feature, Task
+from jbrep.envs.task import (
+    NARROW_SEEDS,
+    WIDE_SEEDS,
+    EpisodeSteps,
+    Feature,
+    SeedBits,
+    Task,
+    Word,
+)
 from jbrep.errors import InputError, kind_and_line
+from jbrep.records.record import Finite, Record, converted, from_plain
 from jbrep.records.toml import read_toml
 
 _PROBE_STEPS = 200  # of each instance whose episodes are compared
 _LONGEST_PROBE = 10_000  # steps in search of a time limit
-_FEATURE_FIELDS = ("name", "unit", "low", "high", "group")
-_TASK_FIELDS = ("timestep", "reward_low", "reward_high", "solved_return")
 
 
 def describe(
@@ -67,11 +74,8 @@ def as_task(given: Task | str) -> Task:
 @lru_cache(maxsize=64)
 def _describe(name: str, arguments: str, max_episode_steps: int | None) -> Task:
     spec, given = find_spec(name), json.loads(arguments)
-    if max_episode_steps is not None and not 1 <= max_episode_steps <= MAX_EPISODE_STEPS:
-        raise InputError(
-            f"the number of steps in an episode is {max_episode_steps}: it must be at least 1 and "
-            f"at most {MAX_EPISODE_STEPS:,}"
-        )
+    if max_episode_steps is not None:
+        converted(max_episode_steps, EpisodeSteps, "the number of steps in an episode")
     try:
         if own := getattr(creator(spec), "describe", None):
             described: Task = own({**spec.kwargs, **given}, max_episode_steps)
@@ -203,14 +207,13 @@ def _is_positive(value: Any) -> bool:
     return isinstance(value, (int, float)) and math.isfinite(value) and value > 0
 
 
-def _seed_bits(env: gymnasium.Env[Any, Any]) -> int:
+def _seed_bits(env: gymnasium.Env[Any, Any]) -> SeedBits:
     """The size of the seeds that an environment takes."""
-    wide, narrow = SEED_BITS
     try:
-        env.reset(seed=(1 << wide) - 1)
+        env.reset(seed=(1 << WIDE_SEEDS) - 1)
     except Exception:
-        return narrow
-    return wide
+        return NARROW_SEEDS
+    return WIDE_SEEDS
 
 
 class _Played(NamedTuple):
@@ -240,6 +243,26 @@ def _bytes(env: gymnasium.Env[Any, Any], observation: Any, *others: Any) -> byte
     return flat.tobytes() + np.array(others, dtype=np.float64).tobytes()
 
 
+class _FeatureChanges(Record, frozen=True):
+    """What a TOML file says of a feature."""
+
+    name: Word | None = None
+    unit: str | None = None
+    low: Finite | None = None
+    high: Finite | None = None
+    group: Word | None = None
+
+
+class _TaskChanges(Record, frozen=True):
+    """What it says of a task."""
+
+    timestep: Finite | None = None
+    reward_low: Finite | None = None
+    reward_high: Finite | None = None
+    solved_return: Finite | None = None
+    features: tuple[_FeatureChanges, ...] | None = None
+
+
 def _with_features(task: Task, path: Path) -> Task:
     """The task with what a TOML file says of its features and rewards.
 
@@ -248,31 +271,18 @@ def _with_features(task: Task, path: Path) -> Task:
     """
     given = read_toml(path)
     try:
-        rows = given.pop("features", None)
-        if rows is not None and (not isinstance(rows, list) or len(rows) != task.size):
-            raise ValueError(f"it must have a [[features]] for each of the {task.size} features")
+        changes = from_plain(given, _TaskChanges)
+        rows = changes.features
+        if rows is not None and len(rows) != task.size:
+            raise InputError(f"it must have a [[features]] for each of the {task.size} features")
         features = [
-            replace(old, **_known(row, _FEATURE_FIELDS))
-            for old, row in zip(task.features, rows or [{}] * task.size, strict=True)
+            old.replace(**_said(row)) for old, row in zip(task.features, rows or (), strict=False)
         ]
-        changed = replace(task, features=tuple(features), **_known(given, _TASK_FIELDS))
-        return type(task)(**{f: getattr(changed, f) for f in Task.__dataclass_fields__})
-    except (ValueError, TypeError, OverflowError) as error:
-        raise InputError(f"{path} can't be used for {task.name}: {kind_and_line(error)}") from None
+        return task.replace(**{**_said(changes), "features": features or task.features})
+    except InputError as error:
+        raise InputError(f"{path} can't be used for {task.name}: {error}") from None
 
 
-def _known(row: Any, names: tuple[str, ...]) -> dict[str, Any]:
-    """The entries of a table, all of which must be known."""
-    if not isinstance(row, dict):
-        raise ValueError(f"{row!r} must be a table")
-    if unknown := set(row) - set(names):
-        raise ValueError(f"unknown {min(unknown)!r}: it must be one of {', '.join(names)}")
-    kinds = {name: (str,) if name in ("name", "unit", "group") else (int, float) for name in names}
-    for name, value in row.items():
-        if type(value) not in kinds[name]:
-            raise ValueError(
-                f"{name} is {value!r}: it must be {'text' if str in kinds[name] else 'a number'}"
-            )
-        if not isinstance(value, str) and not math.isfinite(value):
-            raise ValueError(f"{name} is {value!r}: it must be a finite number")
-    return {name: value if isinstance(value, str) else float(value) for name, value in row.items()}
+def _said(changes: Record) -> dict[str, Any]:
+    """The fields that a record has."""
+    return {name: value for name, value in asdict(changes).items() if value is not None}

@@ -2,41 +2,70 @@
 
 import json
 import math
-import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from jbrep.errors import InputError
-from jbrep.records.typed import typed
+from jbrep.records.record import Finite, Record
 from jbrep.text import slug
 
 Array = NDArray[np.float64]
 _Float = TypeVar("_Float", bound=np.floating[Any])
 
 MAX_EPISODE_STEPS = 1_000_000
-SEED_BITS = (63, 31)  # that an environment may take
+SeedBits = Literal[63, 31]
+WIDE_SEEDS: SeedBits = 63  # bits of the seeds that most environments take
+NARROW_SEEDS: SeedBits = 31  # and of those of others
 _MAX_FEATURES = 4096
 _MAX_ACTIONS = 1024
-_WORD = re.compile(r"[A-Za-z][\w.-]{0,99}", re.ASCII)
-_ID = re.compile(r"(\w[\w-]{0,99}/)?\w[\w.-]{0,99}", re.ASCII)  # no part of a path leads upwards
-_MAX_UNIT = 40  # letters
+EpisodeSteps = Annotated[int, Meta(ge=1, le=MAX_EPISODE_STEPS)]
+Word = Annotated[
+    str,
+    Meta(
+        pattern=r"(?a)\A[A-Za-z][\w.-]{0,99}\Z",
+        title="a letter, then letters, digits, '.', '_', '-'",
+    ),
+]
+Id = Annotated[  # no part of a path leads upwards
+    str,
+    Meta(
+        pattern=r"(?a)\A(\w[\w-]{0,99}/)?\w[\w.-]{0,99}\Z",
+        title="letters, digits, '.', '_', '-' as in Namespace/Name-v0",
+    ),
+]
+_Group = Annotated[
+    str,
+    Meta(
+        pattern=r"(?a)\A([A-Za-z][\w.-]{0,99})?\Z",
+        title="empty, or a letter, then letters, digits, '.', '_', '-'",
+    ),
+]
+_Unit = Annotated[str, Meta(max_length=40)]
+_Positive = Annotated[float, Meta(gt=0, le=1e12)]
+_Arrays = Mapping[Word, Annotated[int, Meta(ge=1, le=_MAX_FEATURES)]]
+_Bounds = Annotated[tuple[Finite, ...], Meta(min_length=1, max_length=_MAX_ACTIONS)]
 
 
-@dataclass(frozen=True)
-class Feature:
+class Feature(Record, frozen=True, array_like=True):
     """One number of an observation."""
 
-    name: str
-    unit: str = ""
-    low: float | None = None  # usual range, None where it isn't known
-    high: float | None = None
+    name: Word
+    unit: _Unit = ""
+    low: Finite | None = None  # usual range, None where it isn't known
+    high: Finite | None = None
     bounded: bool = False  # whether it never leaves that range
-    group: str = ""  # of the features that belong together
+    group: _Group = ""  # of the features that belong together
+
+    def check(self) -> None:
+        """As for `Record`."""
+        if not self.unit.isprintable():
+            raise InputError(f"the unit of {self.name} must be a word")
+        _check_range(self.name, self.low, self.high)
 
     def __str__(self) -> str:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
@@ -49,8 +78,7 @@ class Feature:
         return math.isclose(self.high - self.low, 2 * math.pi, rel_tol=0.01)
 
 
-@dataclass(frozen=True)
-class Task:
+class Task(Record, frozen=True):
     """An environment with its arguments and time limit, described without making it.
 
     Args:
@@ -72,78 +100,44 @@ class Task:
         constants: those that stay the same during an episode.
 
     Raises:
-        ValueError: a field that doesn't fit this description.
+        InputError: a field that doesn't fit this description.
     """
 
-    id: str
-    name: str
-    features: tuple[Feature, ...]
-    action_low: tuple[float, ...]
-    action_high: tuple[float, ...]
-    max_episode_steps: int
-    arguments: Mapping[str, Any] = field(default_factory=dict)
-    timestep: float | None = None
-    reward_low: float | None = None
-    reward_high: float | None = None
-    solved_return: float | None = None
+    id: Id
+    name: Id
+    features: Annotated[tuple[Feature, ...], Meta(min_length=1, max_length=_MAX_FEATURES)]
+    action_low: _Bounds
+    action_high: _Bounds
+    max_episode_steps: EpisodeSteps
+    arguments: Mapping[str, Any] = {}
+    timestep: _Positive | None = None
+    reward_low: Finite | None = None
+    reward_high: Finite | None = None
+    solved_return: Finite | None = None
     terminates: bool | None = None
     reproducible: bool = True
-    seed_bits: int = SEED_BITS[0]
-    draws: int | None = None
-    state: Mapping[str, int] = field(default_factory=dict)
-    constants: Mapping[str, int] = field(default_factory=dict)
+    seed_bits: SeedBits = WIDE_SEEDS
+    draws: Annotated[int, Meta(ge=0, lt=1 << 32)] | None = None
+    state: _Arrays = {}
+    constants: _Arrays = {}
 
-    def __post_init__(self) -> None:
-        for name, what in (("id", self.id), ("name", self.name)):
-            if not _ID.fullmatch(what):
-                raise ValueError(f"its {name} is {what!r}: it must be as in Namespace/Name-v0")
-        if not 1 <= self.max_episode_steps <= MAX_EPISODE_STEPS:
-            raise ValueError(
-                f"the number of steps in an episode is {self.max_episode_steps}: it must be at "
-                f"least 1 and at most {MAX_EPISODE_STEPS:,}"
-            )
-        if self.seed_bits not in SEED_BITS or not (self.draws is None or 0 <= self.draws < 1 << 32):
-            raise ValueError("its seeds or draws are out of range")
-        if self.timestep is not None and self.timestep <= 0:
-            raise ValueError(f"the time step is {self.timestep:g}: it must be above 0")
+    def check(self) -> None:
+        """As for `Record`."""
         try:
             json.dumps(self.arguments, allow_nan=False)
         except (TypeError, ValueError, RecursionError):
-            raise ValueError("its arguments must be plain JSON, all numbers finite") from None
-        self._check_features()
-        self._check_ranges()
-        self._check_actions()
-
-    def _check_features(self) -> None:
-        if not 1 <= self.size <= _MAX_FEATURES or len(set(self.feature_names)) < self.size:
-            raise ValueError(f"it must have 1 to {_MAX_FEATURES:,} features of different names")
+            raise InputError("its arguments must be plain JSON, all numbers finite") from None
+        if len(set(self.feature_names)) < self.size:
+            raise InputError("its features must have different names")
         if sum(place.stop - place.start for place in self.groups.values()) != self.size:
-            raise ValueError("features of a group must stand side by side")
-        for word in (*self.feature_names, *self.groups, *self.arrays):
-            if not _WORD.fullmatch(word):
-                raise ValueError(f"the name {word!r} must be a letter, then letters, digits or ._-")
+            raise InputError("features of a group must stand side by side")
         if self.state.keys() & self.constants.keys():
-            raise ValueError("the arrays that move and those that don't must have different names")
-        if any(not 1 <= width <= _MAX_FEATURES for width in self.arrays.values()):
-            raise ValueError(f"an array of its states must have 1 to {_MAX_FEATURES:,} numbers")
-
-    def _check_ranges(self) -> None:
-        for feature in self.features:
-            if len(feature.unit) > _MAX_UNIT or not feature.unit.isprintable():
-                raise ValueError(f"the unit of {feature.name} must be a word")
-        ranges = [(feature.name, feature.low, feature.high) for feature in self.features]
-        for name, low, high in (*ranges, ("a reward", self.reward_low, self.reward_high)):
-            if low is not None and high is not None and low > high:
-                raise ValueError(f"the range of {name} is from {low:g} to {high:g}: swap them")
-
-    def _check_actions(self) -> None:
-        bounds = list(zip(self.action_low, self.action_high, strict=False))
+            raise InputError("the arrays that move and those that don't must have different names")
+        _check_range("a reward", self.reward_low, self.reward_high)
         if len(self.action_low) != len(self.action_high):
-            raise ValueError("its actions must have as many lower bounds as upper ones")
-        if not 1 <= len(bounds) <= _MAX_ACTIONS or not all(
-            math.isfinite(low) and math.isfinite(high) and low < high for low, high in bounds
-        ):
-            raise ValueError(f"its actions must have 1 to {_MAX_ACTIONS:,} numbers, finite bounds")
+            raise InputError("its actions must have as many lower bounds as upper ones")
+        if not all(map(float.__lt__, self.action_low, self.action_high)):
+            raise InputError("each lower bound of its actions must be below the upper one")
 
     @property
     def slug(self) -> str:
@@ -213,31 +207,10 @@ class Task:
         """Split flat observations (..., d) by group; the parts are views."""
         return {name: observation[..., place] for name, place in self.groups.items()}
 
-    def as_json(self) -> dict[str, Any]:
-        """The description as plain JSON, which `read_task` takes."""
-        record = asdict(self)
-        record["features"] = [list(asdict(feature).values()) for feature in self.features]
-        return {n: list(v) if isinstance(v, tuple) else v for n, v in record.items()}
 
-
-def read_task(record: Any) -> Task:
-    """A task from plain JSON, perhaps a stranger's, every field checked.
-
-    Raises:
-        ValueError: it isn't a task's description; the message says why.
-    """
-    if not isinstance(record, dict) or not isinstance(record.get("features"), list):
-        raise ValueError("a task must be an object with features")
-    names = Feature.__dataclass_fields__
-    rows = record["features"]
-    if not all(isinstance(row, list) and len(row) == len(names) for row in rows):
-        raise ValueError(f"each feature must be a list of {len(names)}")
-    named = [dict(zip(names, row, strict=True)) for row in rows]
-    try:
-        task: Task = typed({**record, "features": named}, Task)
-    except RecursionError:
-        raise ValueError("its arguments are nested too deeply") from None
-    return task
+def _check_range(name: str, low: float | None, high: float | None) -> None:
+    if low is not None and high is not None and low > high:
+        raise InputError(f"the range of {name} is from {low:g} to {high:g}: swap them")
 
 
 def _ranged(feature: Feature) -> bool:

@@ -102,7 +102,7 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """
 
     describe = staticmethod(describe)
-    metadata = {  # noqa: RUF012 (Gymnasium's own convention)
+    metadata = {
         "render_modes": ["human", "rgb_array", "depth_array"],
         "render_fps": round(1 / CONTROL_TIMESTEP),
     }

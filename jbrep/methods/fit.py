@@ -22,6 +22,7 @@ from jbrep.methods.shape import complete
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
 from jbrep.records.lock import exclusive
+from jbrep.records.record import to_plain
 from jbrep.records.storage import exists, make_folder
 from jbrep.training import checkpoint
 from jbrep.training.objective import Objective
@@ -236,7 +237,7 @@ def _header(
         "kind": method.name,
         "name": name,
         "task": data.task.name,
-        "environment": data.task.as_json(),
+        "environment": to_plain(data.task),
         "features": list(data.task.feature_names),
         "training": _plain({**own, **shown}),
         "data": {

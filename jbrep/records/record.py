@@ -10,16 +10,20 @@ https://jcristharif.com/msgspec/constraints.html
 """
 
 import re
-from typing import Any, Self, TypeVar
+import sys
+from typing import Annotated, Any, Self, TypeVar
 
 import msgspec
-from msgspec import NODEFAULT
+from msgspec import NODEFAULT, Meta
 from msgspec.structs import force_setattr
 
 from jbrep.errors import InputError
 from jbrep.records.words import at, must_be
 
 _Kind = TypeVar("_Kind")
+
+_LARGEST = sys.float_info.max
+Finite = Annotated[float, Meta(ge=-_LARGEST, le=_LARGEST, title="a finite number")]
 
 _AT = re.compile(r"(?P<reason>.*?)(?: - at `\$(?P<path>.*)`)?", re.DOTALL)
 _MISSING = re.compile(r"Object missing required field `(.*)`")
@@ -86,15 +90,15 @@ def converted(value: Any, kind: Any, where: str) -> Any:
         raise InputError(f"{where or 'it'} must be nested less deeply") from None
 
 
-def to_plain(record: Any) -> Any:
-    """A record as plain JSON: its fields in order, tuples as lists."""
-    return _with_lists(msgspec.to_builtins(record))
+def to_plain(value: Any) -> Any:
+    """A record, or what holds some, as plain JSON: its fields in order, tuples as lists."""
+    return _with_lists(msgspec.to_builtins(value))
 
 
 def _with_lists(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _with_lists(each) for name, each in value.items()}
-    return [*map(_with_lists, value)] if isinstance(value, list | tuple) else value
+    return [_with_lists(each) for each in value] if isinstance(value, list | tuple) else value
 
 
 def _said(message: str, value: Any, kind: Any, where: str) -> str:

@@ -102,7 +102,8 @@ def must_be(node: inspect.Type) -> str:
         case inspect.Metadata(type=inner):
             return must_be(inner)
         case inspect.UnionType(types=types):
-            return " or ".join(dict.fromkeys(map(must_be, types)))
+            some = [each for each in types if not isinstance(each, inspect.NoneType)]
+            return " or ".join(dict.fromkeys(map(must_be, some)))
         case inspect.LiteralType(values=values):
             return f"one of {', '.join(map(str, values))}"
     return _scalar(node) or _collection(node) or "plain JSON"

@@ -7,8 +7,9 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from jbrep.encoders import load
-from jbrep.envs.task import read_task
+from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
+from jbrep.records.record import from_plain
 from jbrep.records.storage import write_whole
 from jbrep.rl.files import BEGINNING, ENCODER, POLICY, read_finished
 from jbrep.rl.normalization import Statistics
@@ -41,7 +42,7 @@ def policy_to_begin_with(folder: Path, settings: Mapping[str, Any], latent_size:
 
 def _sizes(settings: Mapping[str, Any], latent_size: int) -> dict[str, Any]:
     """What decides the names and shapes of a policy's weights."""
-    task = read_task(settings["environment"])
+    task = from_plain(settings["environment"], Task)
     return {
         "algorithm": settings["algorithm"],
         "hidden": settings["hidden"],

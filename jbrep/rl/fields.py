@@ -5,10 +5,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jbrep.envs.task import MAX_EPISODE_STEPS, read_task
+from jbrep.envs.task import MAX_EPISODE_STEPS, Task
 from jbrep.errors import DamageError
 from jbrep.jitterbug.tasks import EPISODE_STEPS, get_task
 from jbrep.records.commit import are_commits
+from jbrep.records.record import from_plain, to_plain
 from jbrep.rl.names import CPU, DEVICES, FLOAT32, PRECISIONS, SB3, TRAINERS, base_name
 
 FINISHED, FAILED = "finished", "failed"
@@ -180,7 +181,7 @@ def check_settings(path: Path, settings: Mapping[str, Any]) -> None:
     """
     _check(path, settings, _SETTINGS, "settings.")
     try:
-        task = read_task(settings["environment"])
+        task = from_plain(settings["environment"], Task)
     except ValueError as error:
         raise _damaged(path, f"settings.environment is invalid: {error}") from None
     if task.name != settings["task"]:
@@ -206,7 +207,7 @@ def from_version_1(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
     own = {"episode_steps": EPISODE_STEPS, **settings}
     _check(path, own, _VERSION_1, "settings.")
     task = get_task(own["task"]).describe(max_episode_steps=own.pop("episode_steps"))
-    return {**own, "environment": task.as_json(), "from": None}
+    return {**own, "environment": to_plain(task), "from": None}
 
 
 def _check(

@@ -15,9 +15,10 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.code import make
 from jbrep.encoders.own import as_file
 from jbrep.envs.recording import Actor
-from jbrep.envs.task import Array, Task, read_task
+from jbrep.envs.task import Array, Task
 from jbrep.errors import DamageError, InputError, choose
 from jbrep.records import container
+from jbrep.records.record import from_plain
 from jbrep.records.storage import exists
 from jbrep.rl.agent import Spaces, deterministic, make_agent
 from jbrep.rl.checkpoint import MAX_BYTES, PARAMETERS
@@ -226,7 +227,7 @@ def _load_checkpoint(folder: Path, encoder: Any) -> Trained:
 
 def _untrained(folder: Path, settings: Mapping[str, Any], given: Any) -> Trained:
     """What a run trains, as it begins unless another run's policy comes along."""
-    task = read_task(settings["environment"])
+    task = from_plain(settings["environment"], Task)
     with single_torch_thread():  # as in training, so that a module computes the same bits
         encoder = run_encoder(folder, settings) if given is None else as_file(find(given, task))
     return build(folder, settings, encoder)
@@ -243,7 +244,7 @@ def build(path: Path, settings: Mapping[str, Any], encoder: BaseEncoder) -> Trai
     Raises:
         InputError: the settings can't be those of a run, or the encoder isn't the run's.
     """
-    task, algorithm = read_task(settings["environment"]), settings["algorithm"]
+    task, algorithm = from_plain(settings["environment"], Task), settings["algorithm"]
     choose(algorithm, ALGORITHMS, "algorithm")
     if encoder.fingerprint != settings["encoder"]:
         raise InputError(f"{encoder.name} is not the encoder that the run in {path} was made with")
@@ -274,7 +275,7 @@ def run_encoder(folder: Path, settings: Mapping[str, Any]) -> BaseEncoder:
     if exists(folder / ENCODER):
         return load(folder / ENCODER)
     if code := settings["encoder_code"]:
-        return make(code, read_task(settings["environment"]))
+        return make(code, from_plain(settings["environment"], Task))
     raise InputError(
         f"no {ENCODER} in {folder}: a run on a Python object needs it again, as in "
         "load_run(folder, encoder)"

@@ -12,6 +12,7 @@ from jbrep.encoders.own import as_file
 from jbrep.envs.description import as_task
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, choose
+from jbrep.records.record import to_plain
 from jbrep.rl.beginning import policy_to_begin_with
 from jbrep.rl.cohort.algorithm import check as check_settings
 from jbrep.rl.fields import MAX_EVALUATION_EPISODES, MAX_SEED, MAX_STEPS, NAME
@@ -156,7 +157,7 @@ class Run:
         is_kept_as_code = is_code(self.encoder) and not isinstance(encoder, Encoder)
         settings = {
             "task": self.task.name,
-            "environment": self.task.as_json(),
+            "environment": to_plain(self.task),
             "algorithm": self.algorithm,
             "preset": self.preset,
             "overrides": self.settings,

@@ -11,7 +11,7 @@ from msgspec import Meta
 from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import FULL, load
 from jbrep.encoders.base import OWN
-from jbrep.envs.task import read_task
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.document import Document
 from jbrep.records.record import Record, from_plain, to_plain
@@ -68,7 +68,7 @@ class LabelSettings(TrainingSettings, frozen=True, kw_only=True):
         Raises:
             ValueError: it isn't one.
         """
-        read_task(self.environment)
+        from_plain(self.environment, Task)
 
 
 class ShownFacts(Record, frozen=True, kw_only=True, forbid_unknown_fields=False):
@@ -255,7 +255,7 @@ def _encoder(folder: Path, run: Mapping[str, Any]) -> EncoderFacts:
         return EncoderFacts(
             name=settings["encoder_code"] or "an object in Python",
             kind=OWN,
-            size=read_task(settings["environment"]).size,
+            size=from_plain(settings["environment"], Task).size,
             latent_size=run["latent_size"],
             encoder=[],
             decoder=[],

@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jbrep.encoders import FULL
-from jbrep.envs.task import Task, read_task
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
+from jbrep.records.record import from_plain
 from jbrep.records.storage import exists, write_whole
 from jbrep.records.tables import Columns, count, finite, write_csv
 from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, runs_below
@@ -142,7 +143,7 @@ def _tasks(runs: Iterable[Mapping[str, Any]]) -> Iterable[tuple[Task, int]]:
 
 def _task(run: Mapping[str, Any]) -> Task:
     """The task of a run, from the contents of its run.json."""
-    return read_task(run["settings"]["environment"])
+    return from_plain(run["settings"]["environment"], Task)
 
 
 def _curve(

@@ -23,8 +23,9 @@ from jbrep.dataset.importing.flat import (
     own_names,
     split,
 )
-from jbrep.envs.task import Feature, Task, read_task
+from jbrep.envs.task import Feature, Task
 from jbrep.errors import InputError, first_line
+from jbrep.records.record import from_plain
 from jbrep.records.storage import exists
 
 _ACTION = re.compile(r"actions?(_\d+)?")
@@ -79,7 +80,7 @@ def _unreadable(path: Path, error: BaseException) -> InputError:
 def _own_task(schema: pa.Schema) -> Task | None:
     """The task in what jbrep exported; None of any other file."""
     try:
-        task = read_task(json.loads((schema.metadata or {})[b"jbrep"])["environment"])
+        task = from_plain(json.loads((schema.metadata or {})[b"jbrep"])["environment"], Task)
     except (KeyError, ValueError, TypeError, RecursionError):
         return None
     return task if set(task.feature_names) <= set(schema.names) else None

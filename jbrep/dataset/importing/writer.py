@@ -1,6 +1,6 @@
 """Writing a data set of episodes that were made elsewhere: one pass to see them, one to write."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -112,7 +112,7 @@ def _fitting(source: Source, survey: _Survey, task: Task | None) -> Task:
             f"{source.name} has an episode of {survey.longest:,} steps, but {task.name} has at "
             f"most {task.max_episode_steps:,}: give --episode-steps {survey.longest}"
         )
-    return replace(task, state={}, constants={})
+    return task.replace(state={}, constants={})
 
 
 def _from_data(source: Source, survey: _Survey) -> Task:
