@@ -6,11 +6,12 @@ READY_DEMO := $(VENV)/.ready-$(VERSION)-for-the-demo
 READY := $(VENV)/.ready-$(VERSION)
 DEMO := demo
 DEMO_RUN := $(DEMO)/study/runs/face_direction/small-sac/forward-8/seed-0
+STUDIES := $(shell sed -n 's/^\([a-z-]*\) *;.*/\1/p' studies/judged.txt)
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded desk ddpg yaw codes ablation ablation-speed screen screen-normalized confirm confirm-move longer breadth cheetah trainers policies behaviour clean
+.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded $(STUDIES) trainers policies behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -66,7 +67,8 @@ pictures: $(READY) ## the pictures in docs/, drawn anew
 	rm -f docs/jitterbug.gif
 	$(BIN)/jbrep render uniform heuristic --task move_to_pose --episode 10 --seconds 3.5 --speed 0.7 --fps 10 --size 240x180 --out docs/jitterbug.gif
 	$(BIN)/jbrep inspect data/sample/face_direction --episode 1 --encoder dae-8 --out inspect/shown.rrd
-	$(BIN)/python tools/screenshots.py results/yaw/report.html inspect/shown.rrd docs
+	$(BIN)/jbrep report results/confirm-move
+	$(BIN)/python tools/screenshots.py results/confirm-move/report.html inspect/shown.rrd docs
 
 figures: $(READY) ## figures and reports in results/ anew, from the tables there
 	$(BIN)/python tools/figures.py
@@ -93,40 +95,32 @@ decoded: $(READY) ## results/decoded.txt anew: hand-written policies on what enc
 	done > results/decoded.txt
 	sed -i '/^encoder:/d' results/decoded.txt
 
-desk: ## results/desk/ anew: a night or two; goes on where it was stopped
-ddpg: ## results/ddpg/ anew: a night
-yaw: data ## results/yaw/ anew: hours
-codes: encoders ## results/codes/ anew: hours
-ablation: ## results/ablation/ anew: hours
+ablation: ## results/ablation/ anew: hours; goes on where it was stopped, as all studies do
 ablation-speed: ## results/ablation-speed/ anew: an hour
-ablation ablation-speed: %: encoders/% data/unseen
-ablation ablation-speed: JUDGED = forward-8 dae-8 encoders/$@/$$task/*.safetensors
-ablation-speed: JUDGED_TASKS = move_in_direction
 screen: ## results/screen/ anew: three hours; makes its own data sets and encoders
-confirm: screen ## results/confirm/ anew: an hour after the screen, on its encoders
-confirm-move: screen ## results/confirm-move/ anew: two hours after the screen, on its encoders
-longer: screen ## results/longer/ anew: half an hour after the screen, on its encoders
+screen-normalized: ## results/screen-normalized/ anew: an hour after the screen
+confirm: ## results/confirm/ anew: an hour after the screen, on its encoders
+confirm-move: ## results/confirm-move/ anew: two hours after the screen, on its encoders
+longer: ## results/longer/ anew: half an hour after the screen, on its encoders
 breadth: ## results/breadth/ anew: an hour
 cheetah: ## results/cheetah/ anew: half an hour
-screen-normalized: screen
-# the first encoder of each kind; identity, full-nominal and noise keep the whole observation, which is judged anyway
-screen: JUDGED = $$(ls runs/screen/encoders/$$task/*.safetensors | grep -v -e '-s[1-9]' -e identity -e full-nominal -e noise)
-screen: JUDGED_ON = runs/screen/data/$$task/set-1
-JUDGED_ON = data/unseen/$$task
-JUDGED_TASKS = face_direction move_in_direction
+# the columns of a study's line in studies/judged.txt
+column = $(shell sed -n 's/^$@ *;//p' studies/judged.txt | cut -d ';' -f $(1))
+.SECONDEXPANSION:
+$(STUDIES): $(READY) $$(call column,1)
+	$(BIN)/jbrep study studies/$@.toml --out runs/$@
+	mkdir -p results/$@
+	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json references.csv) results/$@/
+	$(if $(strip $(call column,4)),for task in $(call column,4); do \
+	  $(BIN)/jbrep evaluate --encoder $(call column,2) --data $(call column,3) --out results/$@/$$task || exit; \
+	done)
+	$(BIN)/jbrep report results/$@ $(if $(strip $(call column,4)),--evaluation 'results/$@/{task}')
+
 encoders/ablation encoders/ablation-speed: encoders/%: $(READY)
 	$(BIN)/python tools/ablate.py $* $@
 data/unseen: $(READY)
 	$(BIN)/jbrep collect --task face_direction --steps 500k --seed 100 --store-state --out $@/face_direction
 	$(BIN)/jbrep data derive $@/face_direction --task move_in_direction --out $@/move_in_direction
-desk ddpg yaw codes ablation ablation-speed screen screen-normalized confirm confirm-move longer breadth cheetah: $(READY)
-	$(BIN)/jbrep study studies/$@.toml --out runs/$@
-	mkdir -p results/$@
-	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json references.csv) results/$@/
-	$(if $(JUDGED),for task in $(JUDGED_TASKS); do \
-	  $(BIN)/jbrep evaluate --encoder $(JUDGED) --data $(JUDGED_ON) --out results/$@/$$task || exit; \
-	done)
-	$(BIN)/jbrep report results/$@ $(if $(JUDGED),--evaluation 'results/$@/{task}')
 
 trainers: $(READY) ## what results/trainers/ lacks: eight hours for all of it; goes on where it was stopped
 	for study in $(basename $(notdir $(wildcard studies/trainers/*.toml))); do \

@@ -85,7 +85,7 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
     assert re.search(r"4 runs to go, 0 done; [\d.]+ \w+ on one core, [\d.]+ \w+ with 2 ", told)
     for arguments, message in (
         (("studies/none.toml",), "no study at studies/none.toml"),
-        (("studies/desk.toml", "--backend", "slurm"), "unknown backend 'slurm'"),
+        (("studies/demo.toml", "--backend", "slurm"), "unknown backend 'slurm'"),
         (("README.md",), "README.md is not valid TOML"),
         (("studies/paper.toml", "--width", 0), "'--width': 0 is not in the range"),
         (("studies/paper.toml", "--width", 1000, "--workers", 9), "the width is 1000: 9 cohorts"),

@@ -26,7 +26,7 @@ def write_arm(folder, mean, spread, rng):
     """The tables of a study with such returns."""
     folder.mkdir()
     algorithm, _, _ = folder.name.partition("-")
-    shutil.copy(Path("results/desk") / RECORD, folder)
+    shutil.copy(Path("results/confirm") / RECORD, folder)
     runs = rng.standard_normal(SEEDS)
     of_runs = mean + spread * (runs - runs.mean()) / runs.std(ddof=1)
     with (folder / RETURNS).open("w", newline="") as file:
