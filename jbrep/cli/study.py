@@ -122,8 +122,8 @@ def report(
 ) -> None:
     """Show what a study found, as a page, tables and figures.
 
-    FOLDER holds a study, finished or not, or any runs. Where there are no runs, as in results/confirm,
-    the report is made from the tables alone.
+    FOLDER holds a study, finished or not, or any runs. Where there are no runs, as in
+    results/confirm, the report is made from the tables alone.
     """
     _conclude(folder, evaluation, across_trainers, out, as_json)
 
