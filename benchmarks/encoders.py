@@ -13,13 +13,12 @@ from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 from torch.utils.data import DataLoader, TensorDataset
 
+from jbrep.dae.autoencoder import DAE, NOISE, Reconstruction
 from jbrep.dae.gradient import Gradient
-from jbrep.dae.network import ARCHITECTURES, stacks
-from jbrep.dae.objective import Reconstruction
 from jbrep.encoders import find
 from jbrep.encoders.layers import run
 from jbrep.envs import describe
-from jbrep.methods.autoencoder import NOISE
+from jbrep.training.network import ARCHITECTURES, stacks
 from jbrep.training.trainer import Schedule, Trainer
 
 ROWS = 4_000_000
@@ -59,7 +58,7 @@ def usual_epoch(rows: torch.Tensor) -> None:
 
 
 def our_epoch(rows: torch.Tensor) -> None:
-    network = Reconstruction(ARCHITECTURES["paper"], SIZE, LATENT, seed=0, noise=NOISE)
+    network = Reconstruction(DAE(latent=LATENT), SIZE, noise=NOISE)
     how = Schedule(epochs=1, batch_size=BATCH, learning_rate=5e-4)
     next(Trainer(network.to(rows.device), how, Rows(rows), Rows(rows[:1])).epochs())
 

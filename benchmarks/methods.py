@@ -18,9 +18,8 @@ from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as Mapped
 
 from jbrep.dataset import ScaledDataset
-from jbrep.methods.method import ClosedForm, Learned, Method
 from jbrep.methods.registry import METHODS
-from jbrep.methods.settings import REQUIRED
+from jbrep.training.method import ClosedForm, Learned, Method
 from jbrep.training.objective import Objective
 from jbrep.training.trainer import Schedule, Trainer, default_batch_size
 from jbrep.training.windows import Windows, watched_windows
@@ -82,24 +81,23 @@ def usual_epoch(objective: Objective, batches: Iterable[Any], ready: Any) -> Non
         optimiser.step()
 
 
-def required(method: Method) -> dict[str, Any]:
-    """Its defaults, with what has to be given."""
-    given = {k: v for k, v in REQUIRED_ONES.items() if method.own.get(k) is REQUIRED}
-    return method.settings(given | ({"latent": PADDED} if method.name == "noise" else {}))
+def usual(method: type[Method]) -> Method:
+    """The method with its defaults, and what has to be given."""
+    given = {name: value for name, value in REQUIRED_ONES.items() if method.takes(name)}
+    return method.of(given | ({"latent": PADDED} if method.name == "noise" else {}))
 
 
 def compare(name: str, method: Learned, data: ScaledDataset) -> None:
     """An epoch of ours against the usual one, for a million rows each, and what bounds both."""
-    settings = required(method)
-    objective = method.objective(data, settings)
+    objective = method.objective(data)
     horizon = objective.horizon
     windows = Windows(data, data.train, horizon)
-    size = settings.get("batch_size") or default_batch_size(MILLION)
+    size = method.batch_size or default_batch_size(MILLION)
     schedule = Schedule(epochs=ROUNDS + 1, batch_size=size, learning_rate=1e-3)
     watched = watched_windows(data, horizon, torch.device("cpu"))
     epochs = Trainer(objective, schedule, windows, watched).epochs()
     next(epochs)  # loads the rows
-    horizons = tuple(settings.get("horizons", (1,))) if horizon else ()
+    horizons = getattr(method, "horizons", (1,)) if horizon else ()
     usual = UsualWindows(data, horizons, USUAL_ROWS // size * size)
     ready = objective.batch(windows, windows.numbers[:size])
     batches = DataLoader(usual, size, shuffle=True, drop_last=True)
@@ -119,10 +117,9 @@ def compare(name: str, method: Learned, data: ScaledDataset) -> None:
 
 def measure(name: str, method: ClosedForm, data: ScaledDataset) -> None:
     """The making of an encoder from a million rows."""
-    settings = required(method)
-    method.check(data, settings)
+    method.check_data(data)
     unread = [ScaledDataset(data.dataset) for _ in range(ROUNDS)]  # which keep no moments yet
-    seconds = [timed(partial(method.make, each, settings)) for each in unread]
+    seconds = [timed(partial(method.make, each)) for each in unread]
     show(f"{name}: made from a million rows [s]", MILLION / len(data.train) * np.array(seconds))
 
 
@@ -130,11 +127,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         data = make_data(Path(folder) / "rows")
         for name, method in METHODS.items():
-            match method:
-                case ClosedForm():
-                    measure(name, method, data)
-                case Learned():
-                    compare(name, method, data)
+            match usual(method):
+                case ClosedForm() as closed:
+                    measure(name, closed.resolved(data), data)
+                case Learned() as learned:
+                    compare(name, learned, data)
 
 
 if __name__ == "__main__":

@@ -182,7 +182,7 @@ def test_every_command_has_help_with_an_example(command):
                 "--out",
                 "x",
             ),
-            "pca takes no --seed: leave it out; it is for random, ",
+            "pca takes no --seed: leave it out; it is for noise, random, ",
         ),
         (
             ("train-encoder", "--kind", "fly", "--data", "x", "--out", "x"),
@@ -195,10 +195,16 @@ def test_every_command_has_help_with_an_example(command):
         *(
             (("train-encoder", "--data", "x", "--out", "x", "--kind", *given.split()), message)
             for given, message in (
-                ("slow --latent 8 --lags 5 0", "'--lags': '0' must be steps from 1 to 1000, such"),
-                ("dae --latent 8 --batch-size 0", "'--batch-size': '0' must be a whole number"),
-                ("dae --latent 8 --weights x", "'--weights': 'x' must be weights of features"),
-                ("dae --latent 12 8,x", "'--latent': '8,x' is not a list of sizes: wri"),
+                (
+                    "slow --latent 8 --lags 5 0",
+                    "lags[1] is '0': it must be a whole number from",
+                ),
+                (
+                    "dae --latent 8 --batch-size 0",
+                    "batch_size is '0': it must be a whole number from 1 to",
+                ),
+                ("dae --latent 8 --weights x", "weights is 'x': it must be weights of features"),
+                ("dae --latent 12 8,x", "latent is 'x': it must be a whole number from 1 to"),
                 ("slow --lags 5", "slow needs --latent, such as --latent 12 8 4"),
                 ("slow --latent 8 --preset authors", "slow has no presets: leave out --preset"),
                 ("dae --latent 8 --preset x", "unknown preset of dae 'x': choose one of authors"),
@@ -301,7 +307,7 @@ def test_help_says_which_kind_takes_which_setting_in_80_columns(monkeypatch):
     assert max(map(len, text.splitlines())) <= 80
     said = " ".join(text.split())
     for name, method in METHODS.items():
-        assert f"{'full' if name == 'identity' else name} {method.words}" in said
+        assert f"{'full' if name == 'identity' else name} {method.words()}" in said
     for line in ("--lags VALUE... Steps from now to later, one or several. [slow", "[all but full"):
         assert line in said
     assert "[default: extrema]" in said

@@ -26,7 +26,7 @@ from jbrep.rl.job import Job
 from jbrep.rl.overrides import used_settings
 from jbrep.rl.presets import PRESETS
 from jbrep.rl.trainers import train_all
-from jbrep.training.adam import allocate_adam_state
+from jbrep.training.trainer import allocate_adam_state
 
 TASK = describe("face_direction", max_episode_steps=50)
 CODES = ("full", "dae-8", "pca-12")  # of 16, 8 and 12 numbers

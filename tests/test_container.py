@@ -8,8 +8,8 @@ import safetensors.numpy
 import torch
 from tensors import TensorWindows
 
-from jbrep.dae.network import ARCHITECTURES
-from jbrep.dae.objective import Reconstruction
+from jbrep.dae import DAE
+from jbrep.dae.autoencoder import Reconstruction
 from jbrep.errors import DamageError, InputError
 from jbrep.records import container
 from jbrep.rl import Run, train
@@ -52,7 +52,7 @@ def test_what_is_written_is_read_back(tmp_path):
 
 def test_a_changed_bit_in_a_checkpoint_of_an_encoder_is_noticed(tmp_path):
     rows = TensorWindows(torch.from_numpy(RANDOM.normal(size=(60, 16)).astype(np.float32)))
-    network = Reconstruction(ARCHITECTURES["paper"], 16, 4, seed=0)
+    network = Reconstruction(DAE(latent=4), 16)
     how = Schedule(epochs=2, batch_size=30, learning_rate=1e-3)
     trainer = Trainer(network, how, rows, rows)
     next(trainer.epochs())

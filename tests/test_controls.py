@@ -10,7 +10,7 @@ from jbrep.dae.gradient import Gradient
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders.layers import run
-from jbrep.methods import random
+from jbrep.methods.controls import Random
 from jbrep.methods.linear import linear_code, linear_denoiser, principal_code
 
 
@@ -20,7 +20,7 @@ def data(collected):
 
 
 def projection(data, latent, seed):
-    return random.make(data, {"latent": latent, "seed": seed})[:2]
+    return Random(latent=latent, seed=seed).make(data)[:2]
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 from torch.nn import functional
 
-from jbrep.dae.network import get_architecture
+from jbrep.dae import DAE
 from jbrep.encoders import ACTIVATIONS, Encoder, Layer, find, load, save
 from jbrep.encoders.card import card
 from jbrep.encoders.from_onnx import convert
@@ -21,9 +21,9 @@ from jbrep.encoders.layers import activate
 from jbrep.encoders.onnx import export
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.methods.autoencoder import DAE
 from jbrep.methods.registry import name_of, read_name
 from jbrep.records.record import to_plain
+from jbrep.training.network import get_architecture
 
 TASK = describe("face_direction")
 RANDOM = np.random.default_rng(0)
@@ -476,10 +476,10 @@ def test_sizes_of_ones_own_are_an_architecture(tmp_path):
     sizes = get_architecture("64,32")
     assert sizes == get_architecture("64x32")
     assert (sizes.name, sizes.hidden, sizes.output) == ("64x32", (64, 32), "linear")
-    used = DAE.settings({"latent": 8, "architecture": "64,32"})
+    used = DAE.of({"latent": 8, "architecture": "64,32"})
     deep = get_architecture("deep")
-    assert (used["architecture"], used["epochs"]) == ("64x32", deep.epochs)
-    assert name_of(DAE, used) == "dae-64x32-8"
+    assert (used.architecture, used.epochs) == ("64x32", deep.epochs)
+    assert name_of(used) == "dae-64x32-8"
     assert read_name("dae-64x32-8").given == {"latent": 8, "architecture": "64x32"}
     data = ("--data", "data/sample/face_direction", "--out", tmp_path)
     command = ("train-encoder", "--kind", "untrained", "--latent", "8", *data, "--architecture")

@@ -7,15 +7,15 @@ from tensors import TensorWindows
 from torch import nn
 from torch.nn.functional import mse_loss
 
+from jbrep.dae import AE, DAE
+from jbrep.dae.autoencoder import Reconstruction
 from jbrep.dae.gradient import Gradient
-from jbrep.dae.network import ARCHITECTURES, layers, stacks
-from jbrep.dae.objective import Reconstruction
 from jbrep.encoders.layers import run
 from jbrep.errors import InputError
-from jbrep.methods.autoencoder import AE, DAE
 from jbrep.records import container
 from jbrep.training import checkpoint
-from jbrep.training.order import POOL, RUN, shuffled
+from jbrep.training.network import ARCHITECTURES, layers, stacks
+from jbrep.training.rows import POOL, RUN, shuffled
 from jbrep.training.trainer import Schedule, Trainer, default_batch_size, get_device, prefetch
 
 
@@ -30,9 +30,8 @@ def trainer(
     train=None, latent=4, architecture="paper", noise=0.1, seed=0, pool=POOL, weighed=None, **how
 ):
     train = rows() if train is None else train
-    objective = Reconstruction(
-        ARCHITECTURES[architecture], train.shape[1], latent, seed, noise=noise, weights=weighed
-    )
+    method = DAE(latent=latent, architecture=architecture, seed=seed)
+    objective = Reconstruction(method, train.shape[1], weighed, noise)
     schedule = {"epochs": 3, "batch_size": 100, "learning_rate": 3e-3, "seed": seed, **how}
     windows, watched = TensorWindows(train), TensorWindows(train[:50])
     return Trainer(objective, Schedule(**schedule), windows, watched, pool)
@@ -66,8 +65,9 @@ def test_the_papers_architecture_has_two_layers_with_tanh():
     parts = stacks(ARCHITECTURES["paper"], 16, 12, seed=0)
     shapes = [(layer.weight.shape, layer.activation) for part in parts for layer in layers(part)]
     assert shapes == [((12, 16), "tanh"), ((16, 12), "tanh")]
-    usual = {"epochs": 200, "learning_rate": 5e-4, "noise": 0.1, "seed": 0}
-    assert DAE.settings({"latent": 12}).items() >= usual.items()
+    usual = DAE(latent=12)
+    assert (usual.epochs, usual.learning_rate, usual.noise, usual.seed) == (200, 5e-4, 0.1, 0)
+    assert DAE.of({"latent": 12, "architecture": "deep"}).epochs == 12
 
 
 @pytest.mark.parametrize(
@@ -278,20 +278,20 @@ def test_prefetch_keeps_order_and_errors():
 def test_mistakes_are_named():
     def refused(message, **settings):
         with pytest.raises(InputError, match=message):
-            DAE.settings({"latent": 4, **settings})
+            DAE.of({"latent": 4, **settings})
 
     refused("unknown architecture 'wide': choose one of paper, deep", architecture="wide")
-    refused("batch size is 0: it must be a whole number from 1 to", batch_size=0)
+    refused("batch_size is 0: it must be a whole number from 1 to", batch_size=0)
     refused("epochs is -1: it must be a whole number from 1 to", epochs=-1)
-    refused(r"seed is 1000+: it must be .* from 0 to 9223372036854775807", seed=10**20)
+    refused(r"seed is 1000+: it must be .* from 0 to 9,223,372,036,854,775,807", seed=10**20)
     for rate in (0, np.nan, np.inf, 1e9):
-        refused("learning rate is .*: it must be a number above 0 and at most", learning_rate=rate)
+        refused("learning_rate is .*: it must be a number above 0 and at most", learning_rate=rate)
     for noise in (-1, np.nan, np.inf):
         refused("noise is .*: it must be a number from 0", noise=noise)
     with pytest.raises(InputError, match="ae takes no noise: leave it out"):
-        AE.settings({"latent": 4, "noise": 0.1})
+        AE.of({"latent": 4, "noise": 0.1})
     with pytest.raises(InputError, match="dae needs latent"):
-        DAE.settings({})
+        DAE.of({})
     for name in ("quantum", "meta"):
         with pytest.raises(InputError, match=f"no device '{name}' on this machine: choose auto"):
             get_device(name)

@@ -30,7 +30,7 @@ from jbrep.evaluate.reconstruction import NOISES, corruption, reconstruction
 from jbrep.evaluate.summary import evaluation_text
 from jbrep.evaluate.truth import quantities, state
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.methods import random
+from jbrep.methods.controls import Random
 from jbrep.methods.linear import principal_code
 from jbrep.records.record import to_plain
 from jbrep.report.figures import encoder_plots
@@ -52,7 +52,7 @@ def held_out(data):
 
 
 def projection(data, latent, seed):
-    return random.make(data, {"latent": latent, "seed": seed})[:2]
+    return Random(latent=latent, seed=seed).make(data)[:2]
 
 
 def make(scaled, parts, name="it-4", **changes):

@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal, Normal, kl_divergence
 
+from jbrep.dae import DAE
 from jbrep.dae.gradient import Gradient
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders.layers import run
@@ -12,8 +13,7 @@ from jbrep.errors import InputError
 from jbrep.methods import lld_vae
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import METHODS, name_of, read_name
-from jbrep.methods.sigmoid import cross_entropy
-from jbrep.methods.vae import divergence, posterior
+from jbrep.methods.vae import cross_entropy, divergence, posterior
 from jbrep.training import checkpoint
 from jbrep.training.trainer import Schedule, Trainer
 from jbrep.training.windows import Windows
@@ -28,8 +28,7 @@ def data(collected):
 
 
 def objective(data, kind, **changes):
-    method = METHODS[kind]
-    return method.objective(data, method.settings({"latent": 8, **changes}))
+    return METHODS[kind].of({"latent": 8, **changes}).objective(data)
 
 
 def trainer(data, kind, epochs=2, learning_rate=1e-3, batch_size=250, **changes):
@@ -185,14 +184,12 @@ def test_weights_that_are_all_zero_are_refused(data, tmp_path):
 
 
 def test_the_authors_begin_with_normal_weights_and_shake_a_batch_as_one(data):
-    method = METHODS["dae"]
-    preset = method.presets["authors"]
-    used = method.settings({"latent": 12, **preset})
-    assert name_of(method, used) == "dae-authors-12"
+    preset = DAE.presets["authors"]
+    used = DAE(latent=12, **preset)
+    assert name_of(used) == "dae-authors-12"
     for change in ("initial", "shared_noise"):  # each alone is another encoder than both
-        alone = method.settings({"latent": 12, change: preset[change]})
-        assert name_of(method, alone) == "dae-12"
-    it = method.objective(data, used)
+        assert name_of(DAE(latent=12, **{change: preset[change]})) == "dae-12"
+    it = used.objective(data)
     weights = torch.cat([stack[0].weight.detach().flatten() for stack in (it.encoder, it.decoder)])
     assert len(weights) == 2 * 12 * 16
     assert abs(weights.mean()) < 0.15

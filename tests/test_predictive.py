@@ -8,13 +8,13 @@ import pytest
 import torch
 from wide import WideDataset, make_feature, make_task
 
-from jbrep.dae.network import stack
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.errors import InputError
 from jbrep.methods.fit import Fitter
+from jbrep.methods.forward import Forward, Predictors
 from jbrep.methods.linear import principal_code
-from jbrep.methods.predictors import Predictors
 from jbrep.methods.registry import get_method
+from jbrep.training.network import stack
 from jbrep.training.trainer import Schedule, Trainer
 from jbrep.training.windows import Windows
 
@@ -62,11 +62,10 @@ def hidden():
 
 def train(data, kind, epochs, **settings):
     """A trained objective and the history of its losses."""
-    method = get_method(kind)
-    used = method.settings({"latent": 2, "learning_rate": 5e-3, **settings})
-    objective = method.objective(data, used)
+    method = get_method(kind).of({"latent": 2, "learning_rate": 5e-3, **settings})
+    objective = method.objective(data)
     windows, watched = (Windows(data, r, objective.horizon) for r in (data.train, data.test))
-    schedule = Schedule(epochs=epochs, batch_size=200, learning_rate=used["learning_rate"])
+    schedule = Schedule(epochs=epochs, batch_size=200, learning_rate=method.learning_rate)
     trainer = Trainer(objective, schedule, windows, watched)
     for _ in trainer.epochs():
         pass
@@ -102,8 +101,7 @@ def test_same_seed_same_bytes(data, kind, tmp_path):
 
 
 def test_targets_of_the_forward_code_stay_within_an_episode(data):
-    method = get_method("forward")
-    objective = method.objective(data, method.settings({"latent": 2, "horizons": (2, 7)}))
+    objective = Forward(latent=2, horizons=(2, 7)).objective(data)
     windows = Windows(data, data.train, 7)
     batch = objective.batch(windows, windows.numbers)  # not yet standardised
     length = data.dataset.episodes["length"][0]

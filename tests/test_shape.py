@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from jbrep.dae.network import ARCHITECTURES, layers, stacks
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import Encoder
 from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.methods.fit import Fitter
 from jbrep.methods.linear import dense
-from jbrep.methods.method import Made
 from jbrep.methods.shape import complete
+from jbrep.training.method import Made
+from jbrep.training.network import ARCHITECTURES, layers, stacks
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def made(data):
 
 @pytest.mark.parametrize("codes", ["standard", "white"])
 def test_units_have_the_deviation_that_they_say_and_decode_alike(data, rows, made, codes):
-    encoder, decoder = complete(made, data, {"codes": codes}).layers
+    encoder, decoder = complete(made, data, codes).layers
     code = run(encoder, rows).astype(float)
     np.testing.assert_allclose(code.mean(axis=0), 0, atol=1e-4)
     covariance = np.cov(code.T, bias=True)
@@ -44,7 +44,7 @@ def test_units_have_the_deviation_that_they_say_and_decode_alike(data, rows, mad
 
 
 def test_the_linear_decoder_is_the_best(data, rows, made):
-    encoder, decoder = complete(Made(made.encoder), data, {}).layers
+    encoder, decoder = complete(Made(made.encoder), data).layers
     assert encoder is made.encoder
     code = run(encoder, rows)
     wide = np.column_stack((code, np.ones(len(rows)))).astype(float)
@@ -56,13 +56,13 @@ def test_a_unit_that_says_nothing_can_be_scaled_but_not_whitened(data, rows, mad
     weight = np.random.default_rng(0).normal(size=(3, data.size))
     weight[1] = 0
     dead = Made((dense(weight, np.ones(3)),))
-    encoder, decoder = complete(dead, data, {"codes": "standard"}).layers
+    encoder, decoder = complete(dead, data, "standard").layers
     code = run(encoder, rows)
     np.testing.assert_allclose(code[:, 1], 0, atol=1e-6)
     np.testing.assert_allclose(code.std(axis=0)[[0, 2]], 1 / 3, rtol=1e-3)
     assert np.isfinite(run(decoder, code)).all()
     with pytest.raises(InputError, match="the covariance of the code is singular") as refused:
-        complete(dead, data, {"codes": "white"})
+        complete(dead, data, "white")
     assert "\n" not in str(refused.value)
 
 

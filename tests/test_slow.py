@@ -52,10 +52,9 @@ def face(collected):
 
 
 def made(data, kind, **settings):
-    method = get_method(kind)
-    full = method.settings({"latent": data.size, **settings})
-    method.check(data, full)
-    return method.make(data, full)
+    method = get_method(kind).of({"latent": data.size, **settings})
+    method.check_data(data)
+    return method.make(data)
 
 
 def episodes(data):

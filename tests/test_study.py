@@ -188,7 +188,7 @@ def test_a_study_from_toml(tmp_path):
             for training, message in [
                 ("{depth = 3}", "unknown training.depth: it must be one of epochs, "),
                 ("{latent = 3}", "unknown training.latent"),
-                ("{epochs = 'many'}", "training.epochs is many: it must be a whole number"),
+                ("{epochs = 'many'}", "training.epochs is 'many': it must be a whole number"),
                 ("{epochs = 0}", "epochs"),
                 ("7", "training is 7: it must be a table"),
             ]

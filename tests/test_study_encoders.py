@@ -478,7 +478,7 @@ def test_own_encoders_are_checked_before_the_first_run(own, message, home, tmp_p
         ([{"name": "a", "file": "{seed}{encoder}", "encoders": 2}], r"unknown \{seed\} in its"),
         ([{"name": "A", "kind": "pca", "latent": 8}], "A: invalid encoder name 'A'"),
         ([{"name": "a", "kind": "fly"}], "a: unknown kind 'fly'"),
-        ([{"name": "a", "kind": "slow", "latent": 8, "lags": [0]}], r"a: lags is \[0\]: it must"),
+        ([{"name": "a", "kind": "slow", "latent": 8, "lags": [0]}], r"a: lags\[0\] is 0: it must"),
         ([{"name": "a", "kind": "slow", "latent": 8, "noise": 1}], "a: slow takes no noise"),
         ([{"name": "a", "kind": "slow"}], "a: slow needs latent"),
     ],

@@ -58,8 +58,7 @@ def names_and_settings(kinds: list[str]) -> dict[str, tuple[str, Any]]:
         for latent in sizes
         if not kinds or kind in kinds
     ]
-    methods = [(get_method(kind), settings) for kind, settings in made]
-    names = [name_of(method, method.settings(settings)) for method, settings in methods]
+    names = [name_of(get_method(kind).of(settings)) for kind, settings in made]
     return dict(zip(names, made, strict=True))
 
 

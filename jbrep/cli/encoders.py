@@ -158,7 +158,7 @@ def list_shipped(task: str | None, as_json: bool) -> None:
     for name, encoders in ships.items():
         click.echo(f"{name}\n{listed(encoders, _COLUMNS, width)}\n")
     kinds = dict.fromkeys(each.encoder.kind for encoders in ships.values() for each in encoders)
-    words = {FULL if kind == IDENTITY else kind: METHODS[kind].words for kind in kinds}
+    words = {FULL if kind == IDENTITY else kind: METHODS[kind].words() for kind in kinds}
     columns = {title: SCALARS[name].words for name, title in _COLUMNS.items()}
     columns["error"] = "squared error of the reconstruction, as a multiple of PCA's"
     click.echo(f"columns\n{facts({'l': 'size of the code', **columns}, width)}\n")

@@ -9,6 +9,7 @@ from msgspec import NODEFAULT, inspect
 from jbrep.cli.base import COUNT
 from jbrep.records.keys import Key, keys_of
 from jbrep.records.record import Record
+from jbrep.records.words import bare
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -42,32 +43,22 @@ def _changed(key: Key, defaults: dict[str, Any]) -> dict[str, Any]:
 
 
 def _option(key: Key) -> Callable[[_Command], _Command]:
-    bare = _bare(key.kind)
-    is_list = isinstance(bare, inspect.CollectionType)
+    node = bare(key.kind)
+    is_list = isinstance(node, inspect.CollectionType)
     default = f"  [default: {key.default_in_words}]" if key.default_in_words else ""
     has_default = key.default is not NODEFAULT
     return click.option(
         f"--{key.name.replace('_', '-')}",
         key.field,
-        type=_type(_bare(bare.item_type) if isinstance(bare, inspect.CollectionType) else bare),
-        is_flag=isinstance(bare, inspect.BoolType),
+        type=_type(bare(node.item_type) if isinstance(node, inspect.CollectionType) else node),
+        is_flag=isinstance(node, inspect.BoolType),
         multiple=is_list,
-        metavar=_choices(bare),
+        metavar=_choices(node),
         required=not has_default,
         default=key.default if has_default else None,
         show_default=bool(key.default_shown and not default and key.default is not False),
         help=key.help + default,
     )
-
-
-def _bare(node: inspect.Type) -> inspect.Type:
-    """A type without its description, and without null."""
-    if isinstance(node, inspect.Metadata):
-        return _bare(node.type)
-    if isinstance(node, inspect.UnionType):
-        (node,) = (each for each in node.types if not isinstance(each, inspect.NoneType))
-        return _bare(node)
-    return node
 
 
 def _choices(node: inspect.Type) -> str | None:

@@ -1,24 +1,142 @@
-"""Making encoders."""
+"""Making encoders, with options from the settings of the methods."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from msgspec import inspect
 
-from jbrep.cli.base import POSITIVE, RESUMES, data_option, example, stoppable
-from jbrep.cli.making import Making, read_options
-from jbrep.errors import InputError
+from jbrep.cli.base import POSITIVE, RESUMES, Variadic, data_option, example, stoppable
+from jbrep.errors import InputError, choose
+from jbrep.records.keys import Key, keys_of
+from jbrep.records.words import bare
 
 if TYPE_CHECKING:
     from jbrep.dataset import ScaledDataset
     from jbrep.methods.fit import Fitted
+    from jbrep.training.method import Method
 
+_FEW = 3  # kinds: where only so many don't take a setting, help names those
 _POOR = 1.5  # times PCA's error, from which a trained autoencoder deserves a warning
 _RECONSTRUCTING = ("ae", "dae")
 
 
-class _Dae(Making):
+class _Making(Variadic):
+    """A command with an option for each setting of the methods that it offers."""
+
+    kinds: tuple[str, ...] = ()  # all of them if empty
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """The command's own options, those of its methods, and --help."""
+        *own, last = super().get_params(ctx)
+        return [*own, *self._settings, last]
+
+    @cached_property
+    def _methods(self) -> "dict[str, type[Method]]":
+        from jbrep.methods.registry import METHODS  # imports torch
+
+        return {_shown_kind(kind): METHODS[kind] for kind in self.kinds or METHODS}
+
+    @cached_property
+    def _settings(self) -> list[click.Option]:
+        """An option for each setting, those of most kinds first."""
+        taking: dict[str, dict[str, Key]] = {}  # by setting and kind
+        for kind, method in self._methods.items():
+            for key in keys_of(method):
+                taking.setdefault(key.name, {})[kind] = key
+        by_use = sorted(taking.items(), key=lambda setting: -len(setting[1]))
+        return [self._made(name, keys) for name, keys in by_use]
+
+    def _made(self, name: str, taking: Mapping[str, Key]) -> click.Option:
+        key = next(iter(taking.values()))
+        kind, words = bare(key.kind), f"{key.help}{self._use(taking)}"
+        if isinstance(kind, inspect.BoolType):
+            return click.Option([_option(name)], is_flag=True, default=None, help=words)
+        several = name == "latent" or isinstance(kind, inspect.CollectionType | inspect.DictType)
+        metavar = "VALUE..." if several else "VALUE"
+        return click.Option([_option(name)], multiple=several, metavar=metavar, help=words)
+
+    def _use(self, taking: Mapping[str, Key]) -> str:
+        """Which kinds take a setting, and its default: [slow: 10; forward: 1,5,10,20]."""
+        kinds: dict[str, list[str]] = {}  # by default
+        for kind, key in taking.items():
+            kinds.setdefault(_shown(key), []).append(kind)
+        others = [kind for kind in self._methods if kind not in taking]
+        if list(kinds) == [""] and not others:
+            return ""  # all take it, and none has a default
+        said = {", ".join(each): default for default, each in kinds.items()}
+        if len(kinds) == 1 and len(others) <= _FEW:
+            said = {f"all but {', '.join(others)}" if others else "default": next(iter(kinds))}
+        parts = [f"{who}: {default}" if default else who for who, default in said.items()]
+        return f"  [{'; '.join(parts)}]"
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the command's options, the kinds, and the settings."""
+        own = [each for each in self.get_params(ctx) if each not in self._settings]
+        sections = {
+            "Options": _help_of(own, ctx),
+            "Kinds": [(kind, method.words()) for kind, method in self._methods.items()],
+            "Settings": _help_of(self._settings, ctx),
+        }
+        if len(self._methods) == 1:
+            del sections["Kinds"]
+        for title, rows in sections.items():
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+
+def _option(setting: str) -> str:
+    """The option that gives a setting: --batch-size."""
+    return f"--{setting.replace('_', '-')}"
+
+
+def _help_of(options: Sequence[click.Parameter], ctx: click.Context) -> list[tuple[str, str]]:
+    return [record for each in options if (record := each.get_help_record(ctx))]
+
+
+def _shown_kind(kind: str) -> str:
+    from jbrep.encoders.encoder import FULL, IDENTITY
+
+    return FULL if kind == IDENTITY else kind
+
+
+def _shown(key: Key) -> str:
+    """A default as help shows it; empty if there is none, or nothing to say."""
+    if isinstance(key.default, tuple):
+        return ",".join(map(str, key.default))
+    return "" if key.default is False else key.default_shown
+
+
+def _given(kind: str, options: Mapping[str, Any], preset: str | None) -> dict[str, Any]:
+    """The settings of a method that options and a preset give, most as text.
+
+    Raises:
+        InputError: the method doesn't take one, or needs another, or has no such preset.
+    """
+    from jbrep.methods.registry import METHODS, get_method
+
+    method = get_method(kind)
+    given = {
+        name: ",".join(value) if isinstance(value, tuple) else value
+        for name, value in options.items()
+        if value not in (None, ())
+    }
+    for name in given:
+        if not method.takes(name):
+            kinds = ", ".join(_shown_kind(each) for each, m in METHODS.items() if m.takes(name))
+            raise InputError(f"{kind} takes no {_option(name)}: leave it out; it is for {kinds}")
+    if method.takes("latent") and "latent" not in given:
+        raise InputError(f"{kind} needs --latent, such as --latent 12 8 4")
+    if preset is None:
+        return given
+    if not method.presets:
+        raise InputError(f"{kind} has no presets: leave out --preset")
+    return {**choose(preset, method.presets, f"preset of {kind}"), **given}
+
+
+class _Dae(_Making):
     """For the denoising autoencoder alone."""
 
     kinds = ("dae",)
@@ -63,7 +181,7 @@ def train_dae(**options: Any) -> None:
 
 
 @click.command(
-    cls=Making,
+    cls=_Making,
     epilog=example(
         "jbrep train-encoder --kind slow --data data/face --latent 8 --out encoders/face"
     ),
@@ -91,12 +209,7 @@ def _fit(
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.methods.fit import Fitter
 
-    given = read_options(kind, options, preset)
-    sizes = given.pop("latent", ())
-    if name and len(sizes) > 1:
-        raise InputError("one --name is for one latent size: give each its own")
-    each: list[dict[str, Any]] = [{**given, "latent": size} for size in sizes] or [given]
-    named = [pair for settings in each for pair in _of_seeds(kind, name, settings, seeds)]
+    named = _named(kind, name, _given(kind, options, preset), seeds)
     scaled = ScaledDataset(Dataset(data))
     for constant in scaled.constant_features:
         click.echo(f"{constant} is constant in the training part: it is scaled to 0", err=True)
@@ -108,22 +221,30 @@ def _fit(
             _report(fitter.fit(kind, name=called, **settings), scaled)
 
 
-def _of_seeds(
-    kind: str, name: str | None, settings: dict[str, Any], seeds: int | None
-) -> list[tuple[str | None, dict[str, Any]]]:
-    """The name and settings of the encoder of each seed, or of the one if there are no seeds."""
+def _named(
+    kind: str, name: str | None, given: Mapping[str, Any], seeds: int | None
+) -> list[tuple[str | None, Mapping[str, Any]]]:
+    """The name and settings of each encoder: one of each latent size and seed."""
     from jbrep.encoders.names import of_seed
     from jbrep.methods.registry import get_method, name_of
 
-    if seeds is None:
-        return [(name, settings)]
     method = get_method(kind)
-    if "seed" not in method.own:
+    sizes = given["latent"].rstrip(",").split(",") if "latent" in given else []
+    if name and len(sizes) > 1:
+        raise InputError("one --name is for one latent size: give each its own")
+    each: list[Mapping[str, Any]] = [{**given, "latent": size} for size in sizes] or [given]
+    names = [name or name_of(method.of(settings)) for settings in each]
+    if seeds is None:
+        return [(name, settings) for settings in each]
+    if not method.takes("seed"):
         raise InputError(f"{kind} has no seed, so all its encoders are the same: leave out --seeds")
-    if "seed" in settings:
+    if "seed" in given:
         raise InputError("--seed is for one encoder: leave it out, or --seeds")
-    name = name or name_of(method, method.settings(settings))
-    return [(of_seed(name, seed), {**settings, "seed": seed}) for seed in range(seeds)]
+    return [
+        (of_seed(called, seed), {**settings, "seed": seed})
+        for called, settings in zip(names, each, strict=True)
+        for seed in range(seeds)
+    ]
 
 
 def _report(fitted: "Fitted", data: "ScaledDataset") -> None:

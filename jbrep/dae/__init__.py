@@ -1,1 +1,12 @@
-"""The autoencoder: its network, its gradient, what it learns."""
+"""The paper's autoencoder: its settings, its loss and its gradient."""
+
+from typing import TYPE_CHECKING
+
+from jbrep.lazy import exports
+
+if TYPE_CHECKING:
+    from jbrep.dae.autoencoder import AE, DAE
+
+__all__ = ["AE", "DAE"]
+
+__getattr__ = exports(__name__, {"AE": "autoencoder", "DAE": "autoencoder"})

@@ -4,44 +4,70 @@ Theirs took cross-entropies of unscaled data, which have no least value, and tar
 episode; here targets lie in [0, 1] and in the same episode. Theirs saw 128,000 rows, ours all.
 """
 
+from typing import Annotated, ClassVar
+
 import torch
+from msgspec import Meta, field
 from torch import Tensor, nn
 
-from jbrep.dae.network import layers, seeded, stack
 from jbrep.dataset import ScaledDataset
-from jbrep.methods.autoencoder import feature_weights
-from jbrep.methods.method import Learned, Settings
-from jbrep.methods.settings import REQUIRED
-from jbrep.methods.sigmoid import cross_entropy, sigmoid_layers
-from jbrep.training.objective import Layers, Objective
+from jbrep.methods.vae import cross_entropy, sigmoid_layers
+from jbrep.training.method import Reconstructing
+from jbrep.training.network import layers, seeded, stack
+from jbrep.training.objective import Layers, Objective, feature_weights
+from jbrep.training.settings import (
+    MAX_HORIZON,
+    BatchSize,
+    Epochs,
+    FeatureWeights,
+    LearningRate,
+    Seed,
+    Weight,
+)
 from jbrep.training.windows import Windows
 
 _DECAY, _DECAY_STEPS = 0.96, 1000  # of the learning rate, and how often
 
 
-class Ddae(Objective):
-    """The mean cross-entropy of a row `ahead` steps later, and half the weights' squares.
+class Ddae(Reconstructing, frozen=True, kw_only=True):
+    """The authors' DDAE: ReLU units, from which a sigmoid gives this row or one ahead."""
 
-    Args:
-        data: scaled.
-        settings: of the method.
-    """
+    name: ClassVar[str] = "ddae"
+
+    ahead: Annotated[
+        int,
+        Meta(ge=0, le=MAX_HORIZON, description="Steps ahead of the row that is reconstructed."),
+    ] = 0
+    epochs: Epochs = 5
+    batch_size: BatchSize = 256
+    learning_rate: LearningRate = 1e-3
+    weight_decay: Annotated[Weight, Meta(description="Weight of half the squared weights.")] = 1e-5
+    seed: Seed = 0
+    weights: FeatureWeights = field(default_factory=dict)
+
+    def objective(self, data: ScaledDataset) -> Objective:
+        """As for `Learned`."""
+        return DdaeObjective(self, data)
+
+
+class DdaeObjective(Objective):
+    """The mean cross-entropy of a row `ahead` steps later, and half the weights' squares."""
 
     _weights: Tensor | None
 
-    def __init__(self, data: ScaledDataset, settings: Settings):
+    def __init__(self, method: Ddae, data: ScaledDataset):
         super().__init__()
-        self.horizon = settings["ahead"]
-        self._decay = settings["weight_decay"]
-        size, latent = data.size, settings["latent"]
-        with seeded(settings["seed"]):
+        self.horizon = method.ahead
+        self._decay = method.weight_decay
+        size, latent = data.size, method.latent
+        with seeded(method.seed):
             self.encoder = nn.Sequential(nn.Linear(size, latent), nn.ReLU())
             self.decoder = stack((latent, size), "linear")
             for parameter in self.parameters():
                 nn.init.zeros_(parameter)
             for weight in self._matrices:
                 nn.init.kaiming_normal_(weight)  # He et al. 2015
-        weights = feature_weights(data, settings["weights"])
+        weights = feature_weights(data, method.weights)
         self.register_buffer("_weights", weights, persistent=False)
 
     @property
@@ -69,25 +95,3 @@ class Ddae(Objective):
         """As for `Objective`; what gives a later row is no decoder of this one."""
         decoder = None if self.horizon else sigmoid_layers(layers(self.decoder))
         return layers(self.encoder), decoder
-
-
-def _check(data: ScaledDataset, settings: Settings) -> None:
-    feature_weights(data, settings["weights"])
-
-
-METHOD = Learned(
-    name="ddae",
-    words="the authors' DDAE: ReLU units, from which a sigmoid gives this row or one ahead",
-    own={
-        "latent": REQUIRED,
-        "ahead": 0,
-        "epochs": 5,
-        "batch_size": 256,
-        "learning_rate": 1e-3,
-        "weight_decay": 1e-5,
-        "seed": 0,
-        "weights": {},
-    },
-    check=_check,
-    objective=Ddae,
-)

@@ -1,23 +1,63 @@
 """DeepMDP: a code that is itself the state of a smooth decision process with the same rewards."""
 
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import torch
+from msgspec import Meta
 from torch import Tensor, nn
 
-from jbrep.dae.network import check_size, get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
 from jbrep.errors import InputError
-from jbrep.methods.method import Learned, Settings
-from jbrep.methods.predictors import HIDDEN
-from jbrep.methods.settings import REQUIRED
-from jbrep.training.objective import Layers, Objective
+from jbrep.training.method import Learned, Network
+from jbrep.training.network import HIDDEN, get_architecture, seeded, stack
+from jbrep.training.objective import Objective
+from jbrep.training.settings import (
+    BatchSize,
+    Epochs,
+    LearningRate,
+    RewardWeight,
+    Seed,
+    TransitionWeight,
+    Weight,
+)
 from jbrep.training.windows import Windows
 
 _SMALL = 1e-6  # standard deviation of a reward that says nothing
 
 
-class DeepMDP(Objective):
+class DeepMDP(Network, Learned, frozen=True, kw_only=True):
+    """A code from which reward and next code follow smoothly, with the action."""
+
+    name: ClassVar[str] = "deepmdp"
+
+    reward: RewardWeight = 1.0
+    transition: TransitionWeight = 1.0
+    lipschitz: Annotated[Weight, Meta(description="Weight of the Lipschitz penalty.")] = 0.1
+    epochs: Epochs = 12
+    batch_size: BatchSize = None
+    learning_rate: LearningRate = 2e-3
+    seed: Seed = 0
+
+    def check_data(self, data: ScaledDataset) -> None:
+        """As for `Method`."""
+        super().check_data(data)
+        if not self.reward:
+            raise InputError(
+                "deepmdp without reward makes a constant code, which is easy to predict: give the "
+                "reward a weight above 0"
+            )
+        if not data.reward_varies:
+            raise InputError(
+                f"the reward is constant in {data.dataset.folder}, with which deepmdp makes a "
+                "constant code: use data in which it varies"
+            )
+
+    def objective(self, data: ScaledDataset) -> Objective:
+        """As for `Learned`."""
+        return DeepMDPObjective(self, data)
+
+
+class DeepMDPObjective(Objective):
     """Reward and next code from the code and the action, by smooth functions.
 
     With the code z = f(x), the standardised reward r and the networks R and G (Gelada et al. 2019,
@@ -30,23 +70,23 @@ class DeepMDP(Objective):
     bounds how fast the network varies with the code; so R is kept to a constant of 1, and the
     transition to 2. A code that shrinks would make the transition easy: as R may not be steep, the
     reward keeps it wide. Gradients flow through both codes, so losses of epochs can be compared.
-
-    Args:
-        data: scaled.
-        settings: of the method.
     """
 
     horizon = 1
     _mean: Tensor
     _deviation: Tensor
 
-    def __init__(self, data: ScaledDataset, settings: Settings):
+    def __init__(self, method: DeepMDP, data: ScaledDataset):
         super().__init__()
-        architecture = get_architecture(settings["architecture"])
-        size, self._latent = data.size, settings["latent"]
+        architecture = get_architecture(method.architecture)
+        size, self._latent = data.size, method.latent
         inputs = self._latent + data.task.action_size
-        self._weights = {name: settings[name] for name in ("reward", "transition", "lipschitz")}
-        with seeded(settings["seed"]):
+        self._weights = {
+            "reward": method.reward,
+            "transition": method.transition,
+            "lipschitz": method.lipschitz,
+        }
+        with seeded(method.seed):
             self.encoder = stack((size, *architecture.hidden, self._latent), architecture.code)
             self.reward = stack((inputs, HIDDEN, HIDDEN, 1), "linear")
             self.change = stack((inputs, HIDDEN, HIDDEN, self._latent), "linear")
@@ -90,45 +130,7 @@ class DeepMDP(Objective):
         errors = self._errors(batch)
         return torch.stack([weight * errors[name] for name, weight in self._weights.items()]).sum()
 
-    def layers(self) -> tuple[Layers, Layers | None]:
-        """As for `Objective`; there is no decoder."""
-        return layers(self.encoder), None
-
     def report(self, windows: Windows) -> dict[str, Any]:
         """The terms of the loss, unweighted: `reward` is 1 for no prediction."""
         errors = self._errors(self.batch(windows, windows.numbers))
         return {"loss_by_term": {name: float(error) for name, error in errors.items()}}
-
-
-def _check(data: ScaledDataset, settings: Settings) -> None:
-    check_size(settings["architecture"], data.size, settings["latent"])
-    if not settings["reward"]:
-        raise InputError(
-            "deepmdp without reward makes a constant code, which is easy to predict: give the "
-            "reward a weight above 0"
-        )
-    if not data.reward_varies:
-        raise InputError(
-            f"the reward is constant in {data.dataset.folder}, with which deepmdp makes a constant "
-            "code: use data in which it varies"
-        )
-
-
-METHOD = Learned(
-    name="deepmdp",
-    words="a code from which reward and next code follow smoothly, with the action",
-    source="Gelada et al. 2019",
-    own={
-        "latent": REQUIRED,
-        "architecture": "deep",
-        "reward": 1.0,
-        "transition": 1.0,
-        "lipschitz": 0.1,
-        "epochs": 12,
-        "batch_size": None,
-        "learning_rate": 2e-3,
-        "seed": 0,
-    },
-    check=_check,
-    objective=DeepMDP,
-)

@@ -10,14 +10,12 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.dataset import ScaledDataset
-from jbrep.encoders import FULL, Encoder, load, save
+from jbrep.encoders import Encoder, load, save
 from jbrep.encoders.file import HELD_OUT_MSE, SUFFIX
 from jbrep.encoders.names import check_name
 from jbrep.errors import InputError, differences
 from jbrep.methods.held_out import held_out_error
-from jbrep.methods.method import ClosedForm, Learned, Made, Method
 from jbrep.methods.registry import get_method, name_of
-from jbrep.methods.settings import CODED, SCALED
 from jbrep.methods.shape import complete
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
@@ -25,7 +23,7 @@ from jbrep.records.lock import exclusive
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists, make_folder
 from jbrep.training import checkpoint
-from jbrep.training.objective import Objective
+from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method
 from jbrep.training.trainer import (
     Epoch,
     Schedule,
@@ -35,8 +33,6 @@ from jbrep.training.trainer import (
     single_torch_thread,
 )
 from jbrep.training.windows import Windows, count_windows, watched_windows
-
-_USUAL = {**SCALED, **CODED}  # not in a header unless they are set otherwise
 
 
 class Fitted(NamedTuple):
@@ -51,27 +47,35 @@ class Plan(NamedTuple):
     """An encoder that can be made: its settings have been checked."""
 
     method: Method
-    settings: dict[str, Any]
-    data: ScaledDataset  # scaled as the settings say
+    data: ScaledDataset  # scaled as the method says
     header: dict[str, Any]  # without metrics
     path: Path
 
-    @property
-    def is_complete(self) -> bool:
-        """Whether the file holds this encoder, trained to the end; False if there is no file.
+    def find(self) -> Encoder | None:
+        """The encoder in the file, perhaps not yet trained to the end; None if there is no file.
 
         Raises:
             InputError: the file was made with other settings or from other data.
         """
         if not exists(self.path):
-            return False
-        there, wanted = load(self.path).header, self.header
-        if differing := differences(_origin(there), _origin(wanted)):
+            return None
+        encoder = load(self.path)
+        if differing := differences(_origin(encoder.header), _origin(self.header)):
             raise InputError(
                 f"{self.path} was made with other settings: {differing}; choose another folder or "
                 "another name, or delete it"
             )
-        return there["metrics"].get("epochs") == self.settings.get("epochs")
+        return encoder
+
+    def is_complete(self) -> bool:
+        """Whether the file holds this encoder, trained to the end.
+
+        Raises:
+            InputError: as `find`.
+        """
+        encoder = self.find()
+        epochs = self.method.epochs if isinstance(self.method, Learned) else None
+        return encoder is not None and encoder.header["metrics"].get("epochs") == epochs
 
 
 class Fitter:
@@ -100,7 +104,7 @@ class Fitter:
         self._device = get_device(device)
         self._memory = memory
         self._scaled: dict[Any, ScaledDataset] = {}
-        self._windows: dict[Any, tuple[Windows, Windows]] = {}
+        self._windows: dict[tuple[ScaledDataset, int], tuple[Windows, Windows]] = {}
 
     def fit(self, kind: str, *, name: str | None = None, **settings: Any) -> Fitted:
         """Make an encoder, unless its file is complete already.
@@ -117,14 +121,14 @@ class Fitter:
             InputError: as `plan`, or the files can't be written.
         """
         plan = self.plan(kind, name=name, **settings)
-        is_complete = plan.is_complete
+        is_complete = plan.is_complete()
         if not is_complete:
             make_folder(self._folder)
             match plan.method:
-                case ClosedForm(make=make):
-                    self._save(plan, make(plan.data, plan.settings))
-                case Learned(objective=objective):
-                    is_complete = self._train_alone(plan, objective(plan.data, plan.settings))
+                case ClosedForm() as method:
+                    self._save(plan, method.make(plan.data))
+                case Learned() as method:
+                    is_complete = self._train_alone(plan, method)
         return Fitted(load(plan.path), plan.path, not is_complete)
 
     def plan(self, kind: str, *, name: str | None = None, **settings: Any) -> Plan:
@@ -135,48 +139,54 @@ class Fitter:
                 can't be used with the data; or a file that was made with other settings or from
                 other data.
         """
-        method = get_method(kind)
-        used = method.settings(settings)
-        data = self._scaled_data(method, used)
-        used = method.resolve(data, used)
-        name = name or name_of(method, used)
+        method = get_method(kind).of(settings)
+        data = self._scaled_data(method)
+        method = method.resolved(data)
+        name = name or name_of(method)
         check_name(name)
-        method.check(data, used)
-        if isinstance(method, Learned) and not used["batch_size"]:
-            horizon = method.objective(data, used).horizon
-            used["batch_size"] = default_batch_size(count_windows(data, horizon))
-        path = self._folder / f"{name}{SUFFIX}"
-        plan = Plan(method, used, data, _header(method, name, used, data), path)
-        plan.is_complete  # noqa: B018  may find another encoder there
+        method.check_data(data)
+        if isinstance(method, Learned) and not method.batch_size:
+            windows = count_windows(data, method.objective(data).horizon)
+            method = method.replace(batch_size=default_batch_size(windows))
+        plan = Plan(method, data, _header(method, name, data), self._folder / f"{name}{SUFFIX}")
+        plan.find()  # another encoder there is a mistake
         return plan
 
-    def _scaled_data(self, method: Method, settings: Mapping[str, Any]) -> ScaledDataset:
+    def _scaled_data(self, method: Method) -> ScaledDataset:
         """The data as a method sees them."""
-        keep = settings.get("keep", ())
-        key = settings["scaling"], settings["angles"], settings["clip"], keep
+        key = method.scaling, method.angles, method.clip, method.keep
         if key not in self._scaled:
-            usual = {**SCALED, "keep": ()}
-            same = dict(zip(usual, key, strict=True)) == usual
-            self._scaled[key] = self._data if same else self._data.rescaled(*key)
+            usual = ("extrema", False, None, ())
+            self._scaled[key] = self._data if key == usual else self._data.rescaled(*key)
         data = self._scaled[key]
-        _check(method, settings, data)
+        try:
+            Encoder({"name": method.name, "features": []}, data.scaler, (), ())
+        except InputError as error:
+            raise InputError(
+                f"the observations in {data.dataset.folder} are too large to be encoded: {error}"
+            ) from None
         return data
 
-    def _train_alone(self, plan: Plan, objective: Objective) -> bool:
+    def _train_alone(self, plan: Plan, method: Learned) -> bool:
         """Train while no other process does, unless one has finished it; whether one has."""
         work = plan.path.with_suffix(".training")
         make_folder(work)
         with exclusive(work):
-            is_complete = plan.is_complete
+            is_complete = plan.is_complete()
             if not is_complete:
-                self._train(plan, objective.to(self._device), work)
+                self._train(plan, method, work)
         return is_complete
 
-    def _train(self, plan: Plan, objective: Objective, work: Path) -> None:
+    def _train(self, plan: Plan, method: Learned, work: Path) -> None:
         """Train from the checkpoint, if there is one, or from the start."""
-        header = plan.header
+        header, objective = plan.header, method.objective(plan.data).to(self._device)
         windows, watched = self._windows_of(plan.data, objective.horizon)
-        schedule = Schedule(**{name: plan.settings[name] for name in Schedule.__dataclass_fields__})
+        schedule = Schedule(
+            epochs=method.epochs,
+            batch_size=method.batch_size,
+            learning_rate=method.learning_rate,
+            seed=method.seed,
+        )
         trainer = Trainer(objective, schedule, windows, watched)
         versions = {"device": self._device.type, "torch": header["versions"]["torch"]}
         identity = {**_origin(header), **versions}
@@ -196,7 +206,7 @@ class Fitter:
 
     def _windows_of(self, data: ScaledDataset, horizon: int) -> tuple[Windows, Windows]:
         """Windows to train on, and to watch the loss on; those of the last encoder, if they fit."""
-        key = id(data), horizon
+        key = data, horizon
         if key not in self._windows:
             train = Windows(data, data.train, horizon, self._device, self._memory)
             self._windows = {key: (train, watched_windows(data, horizon, self._device))}
@@ -219,27 +229,23 @@ class Fitter:
 
     def _save(self, plan: Plan, made: Made) -> None:
         """Write the file, with the error on all held-out rows among its metrics."""
-        data, settings = plan.data, plan.settings
-        parts, keep = complete(made, data, settings)
+        method, data = plan.method, plan.data
+        parts, keep = complete(made, data, method.codes, method.keep)
         encoder = Encoder(plan.header, data.scaler, *parts, keep)
         metrics = {**made.metrics, HELD_OUT_MSE: held_out_error(encoder, self._data)}
         save(replace(encoder, header={**plan.header, "metrics": metrics}), plan.path)
 
 
-def _header(
-    method: Method, name: str, settings: Mapping[str, Any], data: ScaledDataset
-) -> dict[str, Any]:
+def _header(method: Method, name: str, data: ScaledDataset) -> dict[str, Any]:
     """The header of an encoder, without its metrics."""
     manifest = data.dataset.manifest
-    shown = {key: value for key, value in settings.items() if value != _USUAL.get(key, value)}
-    own = {key: settings[key] for key in method.own}
     return {
         "kind": method.name,
         "name": name,
         "task": data.task.name,
         "environment": to_plain(data.task),
         "features": list(data.task.feature_names),
-        "training": _plain({**own, **shown}),
+        "training": method.training,
         "data": {
             "fingerprint": manifest.fingerprint,
             "policy": dict(manifest.settings.policy),
@@ -252,42 +258,11 @@ def _header(
     }
 
 
-def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as plain JSON."""
-    return {name: list(v) if isinstance(v, tuple) else v for name, v in settings.items()}
-
-
-def _check(method: Method, settings: Mapping[str, Any], data: ScaledDataset) -> None:
-    """Make sure that an encoder of that kind and size can be made from the data.
-
-    Raises:
-        InputError: it can't.
-    """
-    size = data.size
-    try:
-        Encoder({"name": method.name, "features": []}, data.scaler, (), ())
-    except InputError as error:
-        raise InputError(
-            f"the observations in {data.dataset.folder} are too large to be encoded: {error}"
-        ) from None
-    if "latent" not in settings or not method.reduces:
-        return
-    latent = settings["latent"]
-    if size <= 1:
-        raise InputError(
-            f"{data.task.name} has {size or 'no'} feature to reduce, which can't be: use {FULL}"
-        )
-    if latent >= size:
-        raise InputError(
-            f"latent size is {latent}: with {size} features it must be from 1 to {size - 1}"
-        )
-
-
 def _origin(header: Mapping[str, Any]) -> dict[str, Any]:
     """What must be equal for two encoders of one name to be the same."""
     method = get_method(header["kind"])
     data = header["data"].get("fingerprint")
-    training = {**_plain(method.defaults), **header["training"]}
+    training = {**to_plain(method.defaults()), **USUAL, **header["training"]}
     return {**training, "kind": header["kind"], "task": header["task"], "data": data}
 
 

@@ -2,22 +2,72 @@
 
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import torch
-from torch import Tensor
+from msgspec import Meta
+from torch import Tensor, nn
 
-from jbrep.dae.network import check_size, get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
-from jbrep.methods.method import Learned, Settings
-from jbrep.methods.predictors import HIDDEN, Predictors
-from jbrep.methods.settings import REQUIRED, STANDARD
-from jbrep.methods.targets import PARTS, check_targets, turns
-from jbrep.training.objective import Layers, Objective
+from jbrep.methods.linear_forward import (
+    PARTS,
+    ChangesWeight,
+    Horizons,
+    ValuesWeight,
+    check_targets,
+    turns,
+)
+from jbrep.training.method import Learned, Network
+from jbrep.training.network import HIDDEN, get_architecture, seeded, stack
+from jbrep.training.objective import Objective
+from jbrep.training.settings import (
+    BatchSize,
+    Codes,
+    Epochs,
+    LearningRate,
+    RewardWeight,
+    Seed,
+    Weight,
+)
 from jbrep.training.windows import Windows
 
 _FITTED = 200_000  # windows to which targets are standardised
 _SMALL = 1e-6  # standard deviation of a target that says nothing
+
+
+class Forward(Network, Learned, frozen=True, kw_only=True):
+    """What a network needs, beside the actions, to predict changes and rewards to come.
+
+    S-RL Toolbox, Raffin et al. 2018; OFENet, Ota et al. 2020. The scale of a code says nothing to
+    its predictors, so it is made standard.
+    """
+
+    name: ClassVar[str] = "forward"
+
+    codes: Codes = "standard"
+    horizons: Horizons = (1, 5, 10, 20)
+    changes: ChangesWeight = 1.0
+    values: ValuesWeight = 1.0
+    reward: RewardWeight = 1.0
+    inverse: Annotated[Weight, Meta(description="Weight of the action, from now and later.")] = 0.0
+    epochs: Epochs = 12
+    batch_size: BatchSize = None
+    learning_rate: LearningRate = 2e-3
+    seed: Seed = 0
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Of the targets of a horizon."""
+        return {"changes": self.changes, "values": self.values, "reward": self.reward}
+
+    def check_data(self, data: ScaledDataset) -> None:
+        """As for `Method`."""
+        super().check_data(data)
+        check_targets(data, self.name, {**self.weights, "inverse": self.inverse})
+
+    def objective(self, data: ScaledDataset) -> Objective:
+        """As for `Learned`."""
+        return ForwardObjective(self, data)
 
 
 class _Batch(NamedTuple):
@@ -29,7 +79,42 @@ class _Batch(NamedTuple):
     targets: Tensor  # standardised, (horizons, 2 * size + 1, n)
 
 
-class Forward(Objective):
+class Predictors(nn.Module):
+    """Networks of one shape, of which each reads the first of some shared inputs.
+
+    Each has two hidden layers of ReLU. Features come first and rows last, and all networks are
+    multiplied at once: with so few units, a step of separate ones is bound by calls and by memory.
+
+    Args:
+        reads: for each network, how many of the inputs it reads.
+        outputs: numbers that each gives.
+    """
+
+    _read: Tensor
+
+    def __init__(self, reads: tuple[int, ...], outputs: int):
+        super().__init__()
+        count, most = len(reads), max(reads)
+        fan_in = torch.tensor(reads), *(torch.full((count,), HIDDEN) for _ in range(2))
+        shapes = (HIDDEN, most), (HIDDEN, HIDDEN), (outputs, HIDDEN)
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for (width, inputs), fan in zip(shapes, fan_in, strict=True):
+            limit = fan.rsqrt()[:, None, None]  # as nn.Linear
+            self.weights.append((2 * torch.rand(count, width, inputs) - 1) * limit)
+            self.biases.append((2 * torch.rand(count, width, 1) - 1) * limit)
+        read = torch.arange(most) < torch.tensor(reads)[:, None, None]
+        self.register_buffer("_read", read.float(), persistent=False)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """What each network gives, (networks, outputs, n), of inputs (most, n)."""
+        first = (self.weights[0] * self._read).flatten(0, 1)
+        hidden = torch.addmm(self.biases[0].flatten(0, 1), first, inputs).relu_()
+        hidden = hidden.view(len(self._read), HIDDEN, -1)
+        hidden = torch.baddbmm(self.biases[1], self.weights[1], hidden).relu_()
+        return torch.baddbmm(self.biases[2], self.weights[2], hidden)
+
+
+class ForwardObjective(Objective):
     """Predictions from the code and the actions, at several horizons, and of actions from codes.
 
     At each horizon k a network of its own takes the code and the next k actions, and gives the
@@ -39,10 +124,6 @@ class Forward(Objective):
 
     Units of the code are linear, whatever the architecture: with tanh, some saturate early in the
     training and stay constant.
-
-    Args:
-        data: scaled.
-        settings: of the method.
     """
 
     _turn: Tensor
@@ -51,21 +132,21 @@ class Forward(Objective):
     _mean: Tensor
     _deviation: Tensor
 
-    def __init__(self, data: ScaledDataset, settings: Settings):
+    def __init__(self, method: Forward, data: ScaledDataset):
         super().__init__()
-        self._horizons: tuple[int, ...] = settings["horizons"]
+        self._horizons = method.horizons
         self.horizon = max(self._horizons)
-        hidden = get_architecture(settings["architecture"]).hidden
-        size, latent = data.size, settings["latent"]
+        hidden = get_architecture(method.architecture).hidden
+        size, latent = data.size, method.latent
         self._action_size, self._sizes = data.task.action_size, (size, size, 1)
         reads = tuple(latent + k * self._action_size for k in self._horizons)
-        self._inverse_weight = settings["inverse"]
-        with seeded(settings["seed"]):
+        self._inverse_weight = method.inverse
+        with seeded(method.seed):
             self.encoder = stack((size, *hidden, latent), "linear")
             self.predictors = Predictors(reads, sum(self._sizes))
             if self._inverse_weight:
                 self.inverse = stack((2 * latent, HIDDEN, self._action_size), "linear")
-        each = [settings[name] / n for name, n in zip(PARTS, self._sizes, strict=True)]
+        each = [w / n for w, n in zip(method.weights.values(), self._sizes, strict=True)]
         turn = torch.from_numpy(turns(data)).float()[:, None]  # infinite for what is no angle
         for name, buffer in (
             ("_turn", turn.nan_to_num(posinf=0)),
@@ -124,10 +205,6 @@ class Forward(Objective):
             loss = loss + self._inverse_weight * error.square().mean()
         return loss
 
-    def layers(self) -> tuple[Layers, Layers | None]:
-        """As for `Objective`; there is no decoder."""
-        return layers(self.encoder), None
-
     def report(self, windows: Windows) -> dict[str, Any]:
         """The loss by horizon: of changes, values and reward, unweighted; 1 for no prediction."""
         batch = self.batch(windows, windows.numbers)
@@ -139,38 +216,3 @@ class Forward(Objective):
                 for k, losses in zip(self._horizons, zip(*by_part, strict=True), strict=True)
             }
         }
-
-
-def _check(data: ScaledDataset, settings: Settings) -> None:
-    check_size(settings["architecture"], data.size, settings["latent"])
-    check_targets(data, settings, "forward", ("inverse",))
-
-
-class _Forward(Learned):
-    """The scale of a code says nothing to its predictors, so it is made standard."""
-
-    def fill(self, given: Settings) -> dict[str, Any]:
-        """As for `Method`."""
-        return {**self.defaults, "codes": STANDARD}
-
-
-METHOD = _Forward(
-    name="forward",
-    words="what a network needs, beside the actions, to predict changes and rewards to come",
-    source="S-RL Toolbox, Raffin et al. 2018; OFENet, Ota et al. 2020",
-    own={
-        "latent": REQUIRED,
-        "architecture": "deep",
-        "horizons": (1, 5, 10, 20),
-        "changes": 1.0,
-        "values": 1.0,
-        "reward": 1.0,
-        "inverse": 0.0,
-        "epochs": 12,
-        "batch_size": None,
-        "learning_rate": 2e-3,
-        "seed": 0,
-    },
-    check=_check,
-    objective=Forward,
-)

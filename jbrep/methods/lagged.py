@@ -1,17 +1,27 @@
-"""Covariances of what is now with the rows some steps later, at several lags, in one pass."""
+"""Slow features and VAMP: linear codes from covariances of now with some steps later."""
 
 from collections.abc import Callable
+from typing import Annotated, ClassVar
 
 import numpy as np
+from msgspec import Meta
 
 from jbrep.dataset import ScaledDataset
+from jbrep.dataset.scaled import Moments
+from jbrep.methods.linear import Directions, direction_code, whitening
 from jbrep.methods.passes import Array, Block, blocks
+from jbrep.training.method import Made
+from jbrep.training.settings import Steps
 
-LAGS = (1, 2, 5, 10, 20, 50, 100)  # of the spectra that the file keeps, beside those asked for
+LAGS = (1, 2, 5, 10, 20, 50, 100)  # of the spectra that files keep, beside those asked for
+
+Lags = Annotated[Steps, Meta(description="Steps from now to later, one or several.")]
 
 
 class Lagged:
-    """Second moments over all windows as long as the longest lag.
+    """Second moments of what is now and the rows some steps later, at several lags, in one pass.
+
+    They are over all windows as long as the longest lag.
 
     Args:
         data: scaled.
@@ -62,3 +72,107 @@ class Lagged:
     def places(self, lags: tuple[int, ...]) -> list[int]:
         """Where these lags are among all."""
         return [self.lags.index(lag) for lag in lags]
+
+
+class Slow(Directions, frozen=True, kw_only=True):
+    """Slow features: the l linear directions that change least over a lag (TICA).
+
+    They are the generalised eigenvectors of the lagged covariance with the largest eigenvalues.
+    Over all pairs of a row and the one `lags` steps later in its episode, and the same pairs in
+    reverse, C is the covariance of the rows and T that of the first with the second of a pair: T w
+    = a C w. Of several lags, C and T are those of all their pairs together. Units are uncorrelated,
+    with standard deviation 1/3.
+
+    Wiskott and Sejnowski 2002; Molgedey and Schuster 1994; Perez-Hernandez et al. 2013.
+    """
+
+    name: ClassVar[str] = "slow"
+
+    lags: Lags = (10,)
+
+    def make(self, data: ScaledDataset) -> Made:
+        """As for `ClosedForm`."""
+        lagged = Lagged(data, self.lags, data.size, lambda block: block.later(0))
+        eigenvalues, directions, moments = _slowest(lagged, self.lags, data)
+        spectra = {str(lag): _slowest(lagged, (lag,), data)[0].tolist() for lag in lagged.lags}
+        return direction_code(directions[: self.latent], moments, eigenvalues, spectra=spectra)
+
+
+def _slowest(
+    lagged: Lagged, lags: tuple[int, ...], data: ScaledDataset
+) -> tuple[Array, Array, Moments]:
+    """Eigenvalues, the largest first, and directions (size, size), with the moments of the rows."""
+    places = lagged.places(lags)
+    mean = (lagged.now_mean + lagged.later_mean[places].mean(axis=0)) / 2
+    outer = np.outer(mean, mean)
+    covariance = (lagged.now + lagged.later[places].mean(axis=0)) / 2 - outer
+    across = lagged.across[places].mean(axis=0)
+    whiten = whitening(covariance, data)
+    eigenvalues, vectors = np.linalg.eigh(whiten @ ((across + across.T) / 2 - outer) @ whiten.T)
+    return eigenvalues[::-1], vectors[:, ::-1].T @ whiten, Moments(mean, covariance)
+
+
+class Vamp(Directions, frozen=True, kw_only=True):
+    """The linear code most correlated with the state a lag later, given the actions (VAMP).
+
+    They are the first partial canonical directions of now and later, given the actions between.
+    With covariances C of the rows x now and y a lag later after their linear regression on the
+    actions a of all steps between has been taken off both,
+
+        C_xy.a = C_xy - C_xa C_aa^+ C_ay,  and C_xx.a and C_yy.a alike,
+
+    the spectrum is that of the singular values of K = C_xx.a^(-1/2) C_xy.a C_yy.a^(-1/2), the
+    partial canonical correlations (Rao 1969; without actions Hotelling's of 1936, which are VAMP's,
+    Wu and Noe 2020). The code is U' C_xx.a^(-1/2) (x - mean), of the first left singular vectors U,
+    with standard deviation 1/3 in each unit.
+
+    Of several lags, the directions have the largest mean of squared correlations over the lags, and
+    the spectrum is its root; the actions are those up to the longest lag.
+    """
+
+    name: ClassVar[str] = "vamp"
+
+    lags: Lags = (10,)
+
+    def make(self, data: ScaledDataset) -> Made:
+        """As for `ClosedForm`."""
+        lags, size = self.lags, data.size
+        longest = max(lags)
+
+        def now(block: Block) -> Array:
+            return np.hstack((block.later(0), block.next_actions(longest)))
+
+        lagged = Lagged(data, lags, size + longest * data.task.action_size, now)
+        whiten, correlations = _partial(lagged, data)
+        chosen = np.concatenate(correlations[lagged.places(lags)], axis=1) / np.sqrt(len(lags))
+        left, singular, _ = np.linalg.svd(chosen, full_matrices=False)
+        mean = lagged.now_mean[:size]
+        covariance = lagged.now[:size, :size] - np.outer(mean, mean)
+        spectra = np.linalg.svd(correlations, compute_uv=False).tolist()
+        return direction_code(
+            left[:, : self.latent].T @ whiten,
+            Moments(mean, covariance),
+            singular,
+            spectra=dict(zip(map(str, lagged.lags), spectra, strict=True)),
+        )
+
+
+def _partial(lagged: Lagged, data: ScaledDataset) -> tuple[Array, Array]:
+    """C_xx.a^(-1/2), (size, size), and K at each lag, (lags, size, size)."""
+    size = data.size
+    now = lagged.now - np.outer(lagged.now_mean, lagged.now_mean)
+    shared = now[:size, size:]
+    inverse = np.linalg.pinv(now[size:, size:], hermitian=True)
+    effect = shared @ inverse
+    whiten = whitening(
+        now[:size, :size] - effect @ shared.T, data, np.diag(now)[:size], "the actions"
+    )
+    correlations = []
+    for mean, later, across in zip(lagged.later_mean, lagged.later, lagged.across, strict=True):
+        both = across - np.outer(lagged.now_mean, mean)
+        whole = later - np.outer(mean, mean)
+        rest = whole - both[size:].T @ inverse @ both[size:]
+        joint = both[:size] - effect @ both[size:]
+        after = whitening(rest, data, np.diag(whole), "the actions")
+        correlations.append(whiten @ joint @ after.T)
+    return whiten, np.array(correlations)

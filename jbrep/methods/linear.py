@@ -1,6 +1,6 @@
-"""Linear codes: their layers, and the linear maps of least error between two sets of numbers."""
+"""Linear codes: principal components, and what every method that finds directions needs."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -8,8 +8,8 @@ from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders.layers import Layer
 from jbrep.errors import InputError
-from jbrep.methods.method import Made, Settings
 from jbrep.methods.passes import Array
+from jbrep.training.method import ClosedForm, Coded, Made
 from jbrep.training.objective import Layers
 
 DEVIATION = 1 / 3  # of a unit of a scaled code, so that most of its values lie in [-1, 1]
@@ -122,19 +122,30 @@ def whitening(
     return whiten
 
 
-def check_directions(data: ScaledDataset, settings: Settings) -> None:
-    """Make sure that all features vary, and that there are as many directions as units.
+class PCA(Coded, ClosedForm, frozen=True, kw_only=True):
+    """The first l principal components: of all linear codes, the least error."""
 
-    Raises:
-        InputError: they don't, or there aren't.
-    """
-    if constant := [name for name in data.constant_features if name in data.names]:
-        raise InputError(
-            f"{constant[0]} is constant in {data.dataset.folder}: let it pass around the encoder, "
-            f"with --keep {constant[0]}"
-        )
-    if settings["latent"] > data.size:
-        raise InputError(
-            f"latent size is {settings['latent']}: with {data.size} features it must be from 1 to "
-            f"{data.size}"
-        )
+    name: ClassVar[str] = "pca"
+
+    def make(self, data: ScaledDataset) -> Made:
+        """As for `ClosedForm`."""
+        return Made(*principal_code(data, self.latent))
+
+
+class Directions(Coded, ClosedForm, frozen=True, kw_only=True):
+    """A method whose units are directions: of features that vary, at most as many as those."""
+
+    reduces: ClassVar[bool] = False
+
+    def check_data(self, data: ScaledDataset) -> None:
+        """As for `Method`."""
+        if constant := [name for name in data.constant_features if name in data.names]:
+            raise InputError(
+                f"{constant[0]} is constant in {data.dataset.folder}: let it pass around the "
+                f"encoder, with --keep {constant[0]}"
+            )
+        if self.latent > data.size:
+            raise InputError(
+                f"latent size is {self.latent}: with {data.size} features it must be from 1 to "
+                f"{data.size}"
+            )

@@ -6,42 +6,70 @@ one episode, with the action between them.
 """
 
 import math
+from typing import ClassVar
 
+from msgspec import field
 from torch import Tensor
 
-from jbrep.dae.network import layers, stack
 from jbrep.dataset import ScaledDataset
-from jbrep.methods.autoencoder import check
-from jbrep.methods.method import Learned, Settings
-from jbrep.methods.settings import REQUIRED
-from jbrep.methods.vae import Variational, divergence, first_half, posterior
-from jbrep.training.objective import Layers
+from jbrep.methods.vae import (
+    Beta,
+    Variational,
+    VariationalObjective,
+    divergence,
+    first_half,
+    posterior,
+)
+from jbrep.training.network import layers, stack
+from jbrep.training.objective import Layers, Objective
+from jbrep.training.settings import (
+    BatchSize,
+    Epochs,
+    FeatureWeights,
+    LearningRate,
+    Seed,
+    TransitionWeight,
+)
 from jbrep.training.windows import Windows
 
 _LEAST, _MOST = math.log(0.01), math.log(10)  # log standard deviation of a reconstruction
 _SINGULAR = 1e-6  # least |1 + v' r|
 
 
-class LldVae(Variational):
+class LldVae(Variational, frozen=True, kw_only=True):
+    """The authors' LLD-VAE (E2C): a variational code that moves linearly with the action."""
+
+    name: ClassVar[str] = "lld-vae"
+
+    beta: Beta = 1.0
+    transition: TransitionWeight = 0.1
+    epochs: Epochs = 12
+    batch_size: BatchSize = 1000
+    learning_rate: LearningRate = 1e-3
+    seed: Seed = 0
+    weights: FeatureWeights = field(default_factory=dict)
+
+    def objective(self, data: ScaledDataset) -> Objective:
+        """As for `Learned`."""
+        return LldVaeObjective(self, data)
+
+
+class LldVaeObjective(VariationalObjective):
     """The likelihoods of a row and the next one, with the divergences of the code and its move.
 
     The transition network gives v, r, B and o of the step z' = A z + B u + o with A = I + v r'. To
     the negative log-likelihoods come `beta` times the divergence of the code from N(0, 1) and
     `transition` times that of the moved code from the next row's.
-
-    Args:
-        data: scaled.
-        settings: of the method.
     """
 
     horizon = 1
 
-    def __init__(self, data: ScaledDataset, settings: Settings):
-        super().__init__(data, settings)
-        self._transition_weight = settings["transition"]
+    def __init__(self, method: LldVae, data: ScaledDataset):
+        super().__init__(method, data)
+        self._transition_weight = method.transition
 
     def build(self, data: ScaledDataset) -> None:
-        """As for `Variational`."""
+        """As for `VariationalObjective`."""
         count = self._latent
         self.decoder = stack((count, *reversed(self._hidden), 2 * data.size), "linear")
         self.transition = stack((count, count, count * (3 + data.task.action_size)), "linear")
@@ -122,23 +150,3 @@ def transition_divergence(
     determinant = (1 + (left * right).sum(1)).abs().clamp_min(_SINGULAR)
     each = (precision * (diagonal + distance) - 1) / 2 + next_log_deviation - log_deviation
     return each.sum(1) - determinant.log()
-
-
-METHOD = Learned(
-    name="lld-vae",
-    words="the authors' LLD-VAE (E2C): a variational code that moves linearly with the action",
-    source="Watter et al. 2015",
-    own={
-        "latent": REQUIRED,
-        "architecture": "deep",
-        "beta": 1.0,
-        "transition": 0.1,
-        "epochs": 12,
-        "batch_size": 1000,
-        "learning_rate": 1e-3,
-        "seed": 0,
-        "weights": {},
-    },
-    check=check,
-    objective=LldVae,
-)

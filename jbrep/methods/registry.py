@@ -1,63 +1,50 @@
 """Every way of making an encoder, and how names say which."""
 
+from collections.abc import Iterator
+from importlib import import_module
 from typing import Any, NamedTuple
+
+from msgspec.structs import asdict
 
 from jbrep.dataset.scaling import EXTREMA, SCALINGS
 from jbrep.encoders.encoder import FULL, IDENTITY
 from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose
-from jbrep.methods import (
-    autoencoder,
-    ddae,
-    deepmdp,
-    forward,
-    identity,
-    linear_forward,
-    lld_vae,
-    noise,
-    pca,
-    random,
-    self_prediction,
-    slow,
-    subset,
-    untrained,
-    vae,
-    vamp,
-)
-from jbrep.methods.method import Method, Settings
-from jbrep.methods.settings import RAW, STANDARD, WHITE
+from jbrep.training.method import Method
 
-METHODS: dict[str, Method] = {
-    method.name: method
-    for method in (
-        identity.METHOD,
-        pca.METHOD,
-        random.METHOD,
-        subset.METHOD,
-        noise.METHOD,
-        untrained.METHOD,
-        autoencoder.AE,
-        autoencoder.DAE,
-        ddae.METHOD,
-        vae.METHOD,
-        lld_vae.METHOD,
-        slow.METHOD,
-        vamp.METHOD,
-        linear_forward.METHOD,
-        forward.METHOD,
-        self_prediction.METHOD,
-        deepmdp.METHOD,
-    )
-}
+_FILES = (  # of methods; each may have several
+    "jbrep.methods.controls",
+    "jbrep.methods.linear",
+    "jbrep.dae.autoencoder",
+    "jbrep.methods.ddae",
+    "jbrep.methods.vae",
+    "jbrep.methods.lld_vae",
+    "jbrep.methods.lagged",
+    "jbrep.methods.linear_forward",
+    "jbrep.methods.forward",
+    "jbrep.methods.self_prediction",
+    "jbrep.methods.deepmdp",
+)
+
+
+def _methods(file: str) -> Iterator[type[Method]]:
+    """The methods of a file, which are its classes with names of their own."""
+    for each in vars(import_module(file)).values():
+        if isinstance(each, type) and issubclass(each, Method) and "name" in vars(each):
+            yield each
+
+
+METHODS: dict[str, type[Method]] = {each.name: each for file in _FILES for each in _methods(file)}
 _Meanings = dict[str, dict[str, Any]]
 _UNUSUAL: _Meanings = {  # settings that a name says where they aren't the usual, by word
     "scaling": {name: name for name in SCALINGS if name != EXTREMA},
     "angles": {"angles": True},
-    "codes": {"raw": RAW, "unit": STANDARD, "white": WHITE},
+    "codes": {"raw": "raw", "unit": "standard", "white": "white"},
 }
+_EXAMPLES = "it must be full, or a method and a latent size, such as dae-8, dae-deep-8 or slow-8"
 
 
-def get_method(name: str) -> Method:
+def get_method(name: str) -> type[Method]:
     """The method of that name; `full` is another one for the identity.
 
     Raises:
@@ -69,24 +56,22 @@ def get_method(name: str) -> Method:
 class Recipe(NamedTuple):
     """A method with the settings that a name says."""
 
-    method: Method
+    method: type[Method]
     given: dict[str, Any]
 
 
-def name_of(method: Method, settings: Settings) -> str:
+def name_of(method: Method) -> str:
     """What an encoder is called: method, what is unusual about it, and latent size."""
-    words, usual = [method.name], method.fill({})
-    if settings.get("architecture") != method.own.get("architecture"):
-        words.append(str(settings["architecture"]))
+    words, settings, usual = [method.name], asdict(method), method.defaults()
+    if settings.get("architecture") != usual.get("architecture"):
+        words.append(settings["architecture"])
     words += [
         word
         for name, meanings in _UNUSUAL.items()
         for word, value in meanings.items()
         if settings.get(name) == value != usual.get(name)
     ]
-    for name, preset in method.presets.items():
-        if all(settings[key] == value for key, value in preset.items()):
-            words.append(name)
+    words += [name for name, preset in method.presets.items() if preset.items() <= settings.items()]
     if len(words) > 1 and method.name == IDENTITY:
         words[0] = FULL
     size = len(settings["features"]) if "features" in settings else settings.get("latent")
@@ -101,16 +86,15 @@ def read_name(name: str) -> Recipe:
     """
     stem, latent, _ = EncoderName.parse(name)
     known = {FULL: METHODS[IDENTITY], **METHODS}
-    starts = [each for each in known if f"{stem}-".startswith(f"{each}-")]
-    if not starts:
+    start = max((each for each in known if f"{stem}-".startswith(f"{each}-")), key=len, default="")
+    if not start:
         raise InputError(f"unknown representation {name!r}: {_EXAMPLES}")
-    method = known[max(starts, key=len)]
+    method = known[start]
     given: dict[str, Any] = {} if latent is None else {"latent": latent}
-    rest = stem[len(max(starts, key=len)) + 1 :]
-    for word in rest.split("-") if rest else ():
+    for word in stem[len(start) :].split("-")[1:]:
         given |= _meaning(word, method)
     try:
-        named = name_of(method, method.settings(given))
+        named = name_of(method.of(given))
     except InputError:
         named = ""
     if named not in (name, IDENTITY if name == FULL else name):
@@ -118,10 +102,7 @@ def read_name(name: str) -> Recipe:
     return Recipe(method, given)
 
 
-_EXAMPLES = "it must be full, or a method and a latent size, such as dae-8, dae-deep-8 or slow-8"
-
-
-def _meaning(word: str, method: Method) -> dict[str, Any]:
+def _meaning(word: str, method: type[Method]) -> dict[str, Any]:
     """The settings that a word in a name stands for."""
     for name, meanings in _UNUSUAL.items():
         if word in meanings:

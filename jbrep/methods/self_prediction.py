@@ -1,22 +1,46 @@
 """Latent self-prediction: a code from which, with the action, the next code can be told."""
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from jbrep.dae.network import check_size, get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders.layers import AVG_L1_NORM
 from jbrep.errors import InputError
-from jbrep.methods.method import Learned, Settings
-from jbrep.methods.predictors import HIDDEN
-from jbrep.methods.settings import REQUIRED
-from jbrep.training.objective import Layers, Objective
+from jbrep.training.method import Learned, Network
+from jbrep.training.network import HIDDEN, get_architecture, seeded, stack
+from jbrep.training.objective import Objective
+from jbrep.training.settings import BatchSize, Epochs, LearningRate, Seed
 from jbrep.training.windows import Windows
 
 
-class SelfPrediction(Objective):
+class SelfPrediction(Network, Learned, frozen=True, kw_only=True):
+    """A code that tells, with the action, the next code; on a mean magnitude of 1 (SALE)."""
+
+    name: ClassVar[str] = "self-prediction"
+
+    epochs: Epochs = 12
+    batch_size: BatchSize = None
+    learning_rate: LearningRate = 2e-3
+    seed: Seed = 0
+
+    def check_data(self, data: ScaledDataset) -> None:
+        """As for `Method`."""
+        super().check_data(data)
+        if self.latent == 1:
+            raise InputError(
+                "self-prediction divides a code by its average magnitude, which leaves a single "
+                "unit only its sign: use a latent size of at least 2"
+            )
+
+    def objective(self, data: ScaledDataset) -> Objective:
+        """As for `Learned`."""
+        return SelfPredictionObjective(self, data)
+
+
+class SelfPredictionObjective(Objective):
     """The mean squared error of the next code, as in SALE of TD7 (Fujimoto et al. 2023).
 
     The code z = f(x) / mean |f(x)| is predicted from the one before it and the action:
@@ -24,20 +48,16 @@ class SelfPrediction(Objective):
     from shrinking to 0; nothing in the loss keeps them from becoming constant. What a code begins
     with it mostly keeps, so its layers begin orthogonal and without biases: from torch's own
     initial weights, biases outweigh the rows and half of the units repeat the others.
-
-    Args:
-        data: scaled.
-        settings: of the method.
     """
 
     horizon = 1
     moves = True
 
-    def __init__(self, data: ScaledDataset, settings: Settings):
+    def __init__(self, method: SelfPrediction, data: ScaledDataset):
         super().__init__()
-        hidden = get_architecture(settings["architecture"]).hidden
-        size, latent, actions = data.size, settings["latent"], data.task.action_size
-        with seeded(settings["seed"]):
+        hidden = get_architecture(method.architecture).hidden
+        size, latent, actions = data.size, method.latent, data.task.action_size
+        with seeded(method.seed):
             self.encoder = stack((size, *hidden, latent), AVG_L1_NORM)
             for parameter in self.encoder.parameters():
                 if parameter.ndim == 2:
@@ -58,33 +78,3 @@ class SelfPrediction(Objective):
         with torch.no_grad():
             target = self.encoder(after)
         return (predicted - target).square().mean()
-
-    def layers(self) -> tuple[Layers, Layers | None]:
-        """As for `Objective`; there is no decoder."""
-        return layers(self.encoder), None
-
-
-def _check(data: ScaledDataset, settings: Settings) -> None:
-    check_size(settings["architecture"], data.size, settings["latent"])
-    if settings["latent"] == 1:
-        raise InputError(
-            "self-prediction divides a code by its average magnitude, which leaves a single unit "
-            "only its sign: use a latent size of at least 2"
-        )
-
-
-METHOD = Learned(
-    name="self-prediction",
-    words="a code that tells, with the action, the code of the next step; on a mean magnitude of 1",
-    source="SALE of TD7, Fujimoto et al. 2023",
-    own={
-        "latent": REQUIRED,
-        "architecture": "deep",
-        "epochs": 12,
-        "batch_size": None,
-        "learning_rate": 2e-3,
-        "seed": 0,
-    },
-    check=_check,
-    objective=SelfPrediction,
-)

@@ -9,9 +9,8 @@ from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders.layers import Layer, run
 from jbrep.methods.linear import DEVIATION, dense, inverse_root
-from jbrep.methods.method import Made, Settings
 from jbrep.methods.passes import Array
-from jbrep.methods.settings import RAW, WHITE
+from jbrep.training.method import Made
 from jbrep.training.objective import Layers
 
 _NEGLIGIBLE = 1e-12  # variance of a unit that says nothing
@@ -24,8 +23,16 @@ class Complete(NamedTuple):
     keep: tuple[str, ...]
 
 
-def complete(made: Made, data: ScaledDataset, settings: Settings) -> Complete:
-    """What a method made, with everything else that its settings ask for.
+def complete(
+    made: Made, data: ScaledDataset, codes: str = "raw", keep: tuple[str, ...] = ()
+) -> Complete:
+    """What a method made, with the scale of its code, a decoder, and what passes around them.
+
+    Args:
+        made: by the method.
+        data: scaled.
+        codes: raw, standard or white.
+        keep: features that pass around the layers, unless the method says which.
 
     Raises:
         InputError: the code can't be whitened.
@@ -33,14 +40,13 @@ def complete(made: Made, data: ScaledDataset, settings: Settings) -> Complete:
     encoder, decoder = made.encoder, made.decoder
     if not encoder:
         return Complete((encoder, ()), ())
-    codes, keep = settings.get("codes", RAW), made.keep or tuple(settings.get("keep", ()))
-    if codes != RAW or decoder is None:
+    if codes != "raw" or decoder is None:
         moments, shared = _code_moments(encoder, data)
         if decoder is None:
             decoder = (_best_decoder(moments, shared, data),)
-        if codes != RAW:
+        if codes != "raw":
             encoder, decoder = _rescaled(encoder, decoder, moments, codes)
-    return Complete((_widened(encoder, data, 1), _widened(decoder, data, 0)), keep)
+    return Complete((_widened(encoder, data, 1), _widened(decoder, data, 0)), made.keep or keep)
 
 
 def _code_moments(layers: Layers, data: ScaledDataset) -> tuple[Moments, Array]:
@@ -68,7 +74,7 @@ def _rescaled(
 ) -> tuple[Layers, Layers]:
     """The same code with standard deviation 1/3 in each unit, uncorrelated if it is to be white."""
     mean, covariance = moments
-    if codes == WHITE:
+    if codes == "white":
         scale = DEVIATION * inverse_root(covariance, "the code")
     else:
         variance = np.diag(covariance)

@@ -7,22 +7,52 @@ the divergence weighs less, for cross-entropy hardly sees features of small spre
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+import numpy as np
 import torch
+from msgspec import Meta, field
 from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
 
-from jbrep.dae.network import get_architecture, layers, seeded, stack
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders.layers import Layer
-from jbrep.methods.autoencoder import check, feature_weights
-from jbrep.methods.method import Learned, Settings
-from jbrep.methods.settings import REQUIRED
-from jbrep.methods.sigmoid import cross_entropy, sigmoid_layers
-from jbrep.training.objective import Layers, Objective
+from jbrep.training.method import Network, Reconstructing
+from jbrep.training.network import get_architecture, layers, seeded, stack
+from jbrep.training.objective import Layers, Objective, feature_weights
+from jbrep.training.settings import BatchSize, Epochs, FeatureWeights, LearningRate, Seed, Weight
 from jbrep.training.windows import Windows
 
 _LEAST, _MOST = -7.0, 7.0  # log standard deviation of a posterior
+
+Beta = Annotated[Weight, Meta(description="Weight of the divergence from the prior.")]
+
+
+class Variational(Network, Reconstructing, frozen=True, kw_only=True):
+    """A method whose code has a distribution."""
+
+    if TYPE_CHECKING:
+        beta: float
+
+
+class Vae(Variational, frozen=True, kw_only=True):
+    """Variational autoencoder with a sigmoid decoder; the code is the mean.
+
+    Kingma and Welling 2014; Higgins et al. 2017.
+    """
+
+    name: ClassVar[str] = "vae"
+
+    beta: Beta = 0.001
+    epochs: Epochs = 5
+    batch_size: BatchSize = 256
+    learning_rate: LearningRate = 1e-3
+    seed: Seed = 0
+    weights: FeatureWeights = field(default_factory=dict)
+
+    def objective(self, data: ScaledDataset) -> Objective:
+        """As for `Learned`."""
+        return VaeObjective(self, data)
 
 
 def posterior(values: Tensor) -> tuple[Tensor, Tensor]:
@@ -43,27 +73,22 @@ def first_half(layers: Layers) -> Layers:
     return (*layers[:-1], Layer(weight[:count].copy(), bias[:count].copy(), activation))
 
 
-class Variational(Objective):
+class VariationalObjective(Objective):
     """A code with a distribution: drawn from in training, its mean in evaluation and in the file.
 
     Batches end with the noise of the codes, (n, l), 0 in evaluation.
-
-    Args:
-        data: scaled.
-        settings: of the method.
     """
 
     _weights: Tensor | None
 
-    def __init__(self, data: ScaledDataset, settings: Settings):
+    def __init__(self, method: Variational, data: ScaledDataset):
         super().__init__()
-        self._latent = settings["latent"]
-        self._beta = settings["beta"]
-        self._hidden = get_architecture(settings["architecture"]).hidden
-        with seeded(settings["seed"]):
+        self._latent, self._beta = method.latent, method.beta
+        self._hidden = get_architecture(method.architecture).hidden
+        with seeded(method.seed):
             self.encoder = stack((data.size, *self._hidden, 2 * self._latent), "linear")
             self.build(data)
-        weights = feature_weights(data, settings["weights"])
+        weights = feature_weights(data, method.weights)
         self.register_buffer("_weights", weights, persistent=False)
 
     @abstractmethod
@@ -93,11 +118,11 @@ class Variational(Objective):
         return {"divergence": divergence(*posterior(self.encoder(rows))).mean(0).tolist()}
 
 
-class Vae(Variational):
+class VaeObjective(VariationalObjective):
     """The cross-entropy of a row, summed over its numbers, and `beta` times the divergence."""
 
     def build(self, data: ScaledDataset) -> None:
-        """As for `Variational`."""
+        """As for `VariationalObjective`."""
         self.decoder = stack((self._latent, *reversed(self._hidden), data.size), "linear")
 
     def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
@@ -113,20 +138,24 @@ class Vae(Variational):
         return first_half(layers(self.encoder)), sigmoid_layers(layers(self.decoder))
 
 
-METHOD = Learned(
-    name="vae",
-    words="variational autoencoder with a sigmoid decoder; the code is the mean",
-    source="Kingma and Welling 2014; Higgins et al. 2017",
-    own={
-        "latent": REQUIRED,
-        "architecture": "deep",
-        "beta": 0.001,
-        "epochs": 5,
-        "batch_size": 256,
-        "learning_rate": 1e-3,
-        "seed": 0,
-        "weights": {},
-    },
-    check=check,
-    objective=Vae,
-)
+def cross_entropy(logits: Tensor, rows: Tensor, weights: Tensor | None) -> Tensor:
+    """The binary cross-entropy of each number, (n, d).
+
+    Scaled values beyond [-1, 1], which held-out rows and scalings other than by extrema have, count
+    as its ends: no sigmoid gives more, and beyond them the cross-entropy has no least value.
+
+    Args:
+        logits: of the reconstruction, (n, d).
+        rows: scaled, (n, d).
+        weights: of each number, (d,); None for 1.
+    """
+    target = ((rows + 1) / 2).clamp(0, 1)
+    return binary_cross_entropy_with_logits(logits, target, weights, reduction="none")
+
+
+def sigmoid_layers(layers: Layers) -> Layers:
+    """Layers that give logits, followed by what makes them scaled numbers, 2 sigmoid - 1."""
+    weight, bias, _ = layers[-1]
+    size = len(bias)
+    back = Layer(2 * np.eye(size, dtype=np.float32), -np.ones(size, np.float32), "linear")
+    return (*layers[:-1], Layer(weight, bias, "sigmoid"), back)

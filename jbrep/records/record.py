@@ -14,11 +14,11 @@ import sys
 from typing import Annotated, Any, Self, TypeVar
 
 import msgspec
-from msgspec import NODEFAULT, Meta
+from msgspec import NODEFAULT, Meta, inspect
 from msgspec.structs import force_setattr
 
 from jbrep.errors import InputError
-from jbrep.records.words import at, must_be
+from jbrep.records.words import at, bare, must_be, type_of
 
 _Kind = TypeVar("_Kind")
 
@@ -80,10 +80,26 @@ def from_plain(value: Any, kind: type[_Kind], where: str = "") -> _Kind:
     return converted(value, kind, where)
 
 
-def converted(value: Any, kind: Any, where: str) -> Any:
-    """The same for types that aren't classes."""
+def from_text(text: str, kind: Any, where: str) -> Any:
+    """A value of a type from text, as people write it: 0.5, or 1,5,10, or size=2,mass=0.5.
+
+    Raises:
+        InputError: as `from_plain`.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    match bare(type_of(kind)):
+        case inspect.CollectionType():
+            return converted(parts, kind, where, strict=False)
+        case inspect.DictType() if all("=" in part for part in parts):
+            pairs = dict(part.split("=", 1) for part in parts)
+            return converted(pairs, kind, where, strict=False)
+    return converted(text, kind, where, strict=False)
+
+
+def converted(value: Any, kind: Any, where: str, strict: bool = True) -> Any:
+    """As `from_plain`, for types that aren't classes; not strict of numbers that are text."""
     try:
-        return msgspec.convert(value, kind)
+        return msgspec.convert(value, kind, strict=strict)
     except msgspec.ValidationError as error:
         raise InputError(_said(str(error), value, kind, where)) from None
     except RecursionError:

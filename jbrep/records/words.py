@@ -34,17 +34,17 @@ def at(value: Any, kind: Any, path: str) -> Part:
         name += _name(node, step)
         node = _inner(node, step)
         value = _value(value, step)
-    plain = _bare(node)
+    plain = bare(node)
     fields = plain.fields if isinstance(plain, inspect.StructType) else ()
     return Part(name, value, node, tuple(each.encode_name for each in fields))
 
 
-def _bare(node: inspect.Type) -> inspect.Type:
+def bare(node: inspect.Type) -> inspect.Type:
     """A type without its description; of a union, the part that has parts."""
     while isinstance(node, inspect.Metadata):
         node = node.type
     if isinstance(node, inspect.UnionType):
-        inner = [_bare(each) for each in node.types]
+        inner = [bare(each) for each in node.types]
         return next((each for each in inner if _has_parts(each)), inner[0])
     return node
 
@@ -56,7 +56,7 @@ def _has_parts(node: inspect.Type) -> bool:
 
 def _inner(node: inspect.Type, step: str) -> inspect.Type:
     """The type of a part."""
-    match _bare(node):
+    match bare(node):
         case inspect.StructType(fields=fields, array_like=True) if step.isdecimal():
             return fields[int(step)].type
         case inspect.StructType(fields=fields):
@@ -71,7 +71,7 @@ def _inner(node: inspect.Type, step: str) -> inspect.Type:
 
 
 def _name(node: inspect.Type, step: str) -> str:
-    match _bare(node):
+    match bare(node):
         case inspect.StructType(fields=fields, array_like=True) if step.isdecimal():
             return f".{fields[int(step)].encode_name}"
         case inspect.StructType():

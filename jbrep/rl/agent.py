@@ -24,8 +24,7 @@ from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rl.normalization import Statistics, normalized
 from jbrep.rl.presets import ALGORITHMS, Hidden, Preset
 from jbrep.rl.values import linear_from
-from jbrep.training.adam import allocate_adam_state
-from jbrep.training.trainer import single_torch_thread
+from jbrep.training.trainer import allocate_adam_state, single_torch_thread
 
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     "relu": torch.nn.ReLU,

@@ -56,8 +56,8 @@ def _by_name(plan: Plan) -> list[ByName]:
 
 
 def _is_too_large(representation: ByName, task: Task) -> bool:
-    reduces = get_method(representation.kind).reduces
-    return reduces and int(representation.training.get("latent", 0)) >= task.size
+    method = get_method(representation.kind)
+    return method.reduces and int(representation.training.get("latent", 0)) >= task.size
 
 
 def _check_own(plan: Plan) -> None:

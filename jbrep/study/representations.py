@@ -15,15 +15,25 @@ from jbrep.encoders.file import SUFFIX
 from jbrep.encoders.names import check_name, of_seed
 from jbrep.errors import InputError
 from jbrep.methods.registry import Recipe, get_method, read_name
-from jbrep.methods.settings import read_setting
+from jbrep.records.record import Record, from_plain
 from jbrep.text import slug
+from jbrep.training.settings import BatchSize, Epochs, LearningRate, NoiseDeviation, Seed
 
 Given = str | Mapping[str, Any]  # a representation in a study's file: a name or a table
 
 MAX_ENCODERS = 1000  # of one representation
 _NAME = re.compile(r"[\w.-]{1,100}", re.ASCII)
-_TRAINING = ("epochs", "batch_size", "learning_rate", "noise", "seed")  # settings of encoders
 _TASK, _SEED, _ENCODER = "{task}", "{seed}", "{encoder}"  # in a file's path, see ByFile
+
+
+class _Training(Record, frozen=True, kw_only=True):
+    """What a study may set of all encoders that it trains."""
+
+    epochs: Epochs | None = None
+    batch_size: BatchSize = None
+    learning_rate: LearningRate | None = None
+    noise: NoiseDeviation | None = None
+    seed: Seed | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +116,7 @@ class ByName(Representation):
     @property
     def is_drawn(self) -> bool:
         """Whether an encoder depends on a seed, and not on the data alone."""
-        return "seed" in get_method(self.kind).own
+        return get_method(self.kind).takes("seed")
 
     def _stem(self, number: int | None) -> str:
         name = IDENTITY if self.name == FULL else self.name
@@ -205,14 +215,8 @@ def name_of(given: Given) -> Any:
 
 def _training(recipe: Recipe, training: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of an encoder: what all encoders of a study share, as far as it takes them."""
-    for key, value in training.items():
-        if key not in _TRAINING:
-            raise InputError(f"unknown training.{key}: it must be one of {', '.join(_TRAINING)}")
-        try:
-            read_setting(key, value)
-        except InputError as error:
-            raise InputError(f"training.{error}") from None
-    taken = {key: value for key, value in training.items() if key in recipe.method.defaults}
+    from_plain(training, _Training, "training")
+    taken = {key: value for key, value in training.items() if recipe.method.takes(key)}
     return {**taken, **recipe.given}
 
 
@@ -255,7 +259,7 @@ def _trained(
     """Encoders that the study trains, with settings of their own."""
     check_name(name)
     method, settings = recipe.method, _training(recipe, training)
-    method.settings(settings)
+    method.of(settings)
     if encoders is not None and "seed" in settings:
         raise InputError(f"its encoders have the seeds 0 to {encoders - 1}: leave out seed")
     return ByName(name=name, encoders=encoders, kind=method.name, training=settings)

@@ -2,13 +2,16 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from jbrep.dataset import ScaledDataset
 from jbrep.encoders.layers import Layer
+from jbrep.errors import InputError
+from jbrep.training.network import layers
 from jbrep.training.windows import Windows
 
 Layers = tuple[Layer, ...]
@@ -18,11 +21,13 @@ class Objective(nn.Module, ABC):
     """A network with its loss, and how an encoder is taken from it.
 
     Attributes:
+        encoder: gives the code.
         horizon: steps that a window reaches ahead.
         moves: whether the loss is against a target that learns as well, so that losses of different
             epochs can't be compared: the last epoch is kept then, not the one of least loss.
     """
 
+    encoder: nn.Sequential
     horizon: int = 0
     moves: bool = False
 
@@ -71,10 +76,29 @@ class Objective(nn.Module, ABC):
     def after_step(self) -> None:
         """What follows a step of the optimiser, such as moving a target network."""
 
-    @abstractmethod
     def layers(self) -> tuple[Layers, Layers | None]:
         """The layers of encoder and decoder; None where no decoder is learned."""
+        return layers(self.encoder), None
 
     def report(self, windows: Windows) -> dict[str, Any]:
         """What it says of itself on some held-out windows, as plain JSON for the file's header."""
         return {}
+
+
+def feature_weights(data: ScaledDataset, weights: Mapping[str, float]) -> Tensor | None:
+    """A weight for each number of a scaled row, (size,); None where all are 1.
+
+    Raises:
+        InputError: a weight of an unknown feature or one that isn't encoded, or none above 0.
+    """
+    if unknown := [name for name in weights if name not in data.names]:
+        if unknown[0] in data.task.feature_names:
+            raise InputError(
+                f"{unknown[0]} passes around the encoder unchanged: it can't have a weight"
+            )
+        known = ", ".join(dict.fromkeys(data.names))  # angles come twice
+        raise InputError(f"a weight of {unknown[0]!r}, which is no feature: there are {known}")
+    values = torch.tensor([float(weights.get(name, 1)) for name in data.names])
+    if not values.any():
+        raise InputError("all weights of features are 0: give at least one above 0")
+    return values if weights else None

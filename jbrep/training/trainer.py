@@ -10,12 +10,11 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
-from torch.optim import Adam
+from torch.optim import Adam, Optimizer
 
 from jbrep.errors import InputError
-from jbrep.training.adam import allocate_adam_state
 from jbrep.training.objective import Objective
-from jbrep.training.order import POOL, shuffled
+from jbrep.training.rows import POOL, shuffled
 from jbrep.training.windows import Windows
 
 _MIN_BATCH, _MAX_BATCH = 128, 8192
@@ -77,7 +76,7 @@ class Trainer:
         schedule: how long and how fast.
         windows: to train on.
         watched: to report the loss on.
-        pool: bytes of rows that are shuffled together; see `jbrep.training.order.shuffled`.
+        pool: bytes of rows that are shuffled together; see `jbrep.training.rows.shuffled`.
 
     Attributes:
         objective: after the last epoch.
@@ -174,6 +173,17 @@ class Trainer:
 
 def _copy(objective: Objective) -> dict[str, Tensor]:
     return {name: p.clone() for name, p in objective.state_dict().items()}
+
+
+def allocate_adam_state(optimizer: Optimizer) -> None:
+    """Create now the state that Adam would create in its first step, for a checkpoint to fill."""
+    for group in optimizer.param_groups:
+        for parameter in group["params"]:
+            optimizer.state[parameter] = {
+                "step": torch.zeros((), device=parameter.device),
+                "exp_avg": torch.zeros_like(parameter),
+                "exp_avg_sq": torch.zeros_like(parameter),
+            }
 
 
 def prefetch(items: Iterable[_Item]) -> Iterator[_Item]:

@@ -28,6 +28,7 @@ class AvgL1Norm(nn.Module):
 _MODULES = {"relu": nn.ReLU, "tanh": nn.Tanh, AVG_L1_NORM: AvgL1Norm}
 _SIZES = re.compile(r"[1-9][0-9]{0,8}([x,][1-9][0-9]{0,8})*")
 _BYTES = 4  # of a number in float32
+HIDDEN = 64  # units of each of a predictor's two hidden layers
 _NAMES = {module: name for name, module in _MODULES.items()}
 
 

@@ -1,0 +1,119 @@
+"""Controls, which learn nothing: the whole observation, some of it, noise, random networks."""
+
+from fnmatch import fnmatchcase
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+from msgspec import Meta
+
+from jbrep.dataset import ScaledDataset
+from jbrep.encoders.encoder import IDENTITY
+from jbrep.errors import InputError
+from jbrep.methods.linear import dense, linear_code
+from jbrep.training.method import ClosedForm, Coded, Made, Network
+from jbrep.training.network import get_architecture, layers, stacks
+from jbrep.training.settings import Architecture, Names, Seed
+
+_FREQUENCY = 1000  # [rad] that a phase turns while a scaled feature goes from 0 to 1
+
+
+class Full(ClosedForm, frozen=True, kw_only=True):
+    """The scaled observation itself."""
+
+    name: ClassVar[str] = IDENTITY
+
+    def make(self, data: ScaledDataset) -> Made:
+        """As for `ClosedForm`."""
+        return Made((), ())
+
+
+class Subset(ClosedForm, frozen=True, kw_only=True):
+    """Some of the features themselves, scaled, in the observation's order."""
+
+    name: ClassVar[str] = "subset"
+
+    features: Annotated[
+        Names, Meta(description="Names of features, or patterns such as velocity_*.")
+    ]
+
+    def resolved(self, data: ScaledDataset) -> Self:
+        """With the names of the features that match the patterns."""
+        names, chosen = data.task.feature_names, set()
+        for pattern in self.features:
+            matching = [name for name in names if fnmatchcase(name, pattern)]
+            if not matching:
+                raise InputError(
+                    f"no feature {pattern!r}: {data.task.name} has {', '.join(names)}; "
+                    "patterns such as velocity_* are understood"
+                )
+            chosen.update(matching)
+        return self.replace(features=tuple(name for name in names if name in chosen))
+
+    def make(self, data: ScaledDataset) -> Made:
+        """As for `ClosedForm`."""
+        chosen = [i for i, name in enumerate(data.names) if name in self.features]
+        return Made((dense(np.eye(data.size)[chosen], np.zeros(len(chosen))),))
+
+
+class Noise(Coded, ClosedForm, frozen=True, kw_only=True):
+    """The scaled observation, padded to l units with noise.
+
+    All features pass around the layers; each unit beside them is the sine of a fast phase. An
+    encoder draws nothing, so that the noise is of the observation itself: sin(W x + b), with W of
+    N(0, 1000^2) and b uniform. From one step to the next, phases turn many times over, so that
+    neighbouring values are unrelated. In float32 they are known to about 0.001 only, by which
+    libraries may differ.
+    """
+
+    name: ClassVar[str] = "noise"
+    reduces: ClassVar[bool] = False
+
+    seed: Seed = 0
+
+    def check_data(self, data: ScaledDataset) -> None:
+        """As for `Method`."""
+        if self.keep:
+            raise InputError("noise keeps all features as they are: leave keep out")
+        if self.latent <= data.size:
+            raise InputError(
+                f"latent size is {self.latent}: with {data.size} features and noise beside them "
+                f"it must be at least {data.size + 1}"
+            )
+
+    def make(self, data: ScaledDataset) -> Made:
+        """As for `ClosedForm`."""
+        generator = np.random.default_rng(self.seed)
+        shape = self.latent - data.size, data.size
+        weight = _FREQUENCY * generator.normal(size=shape)
+        phase = generator.uniform(-np.pi, np.pi, size=len(weight))
+        nothing = dense(np.zeros(shape[::-1]), np.zeros(data.size))
+        return Made((dense(weight, phase, "sin"),), (nothing,), keep=data.task.feature_names)
+
+
+class Random(Coded, ClosedForm, frozen=True, kw_only=True):
+    """Random orthonormal directions, l of them."""
+
+    name: ClassVar[str] = "random"
+
+    seed: Seed = 0
+
+    def make(self, data: ScaledDataset) -> Made:
+        """As for `ClosedForm`."""
+        drawn = np.random.default_rng(self.seed).normal(size=(data.size, self.latent))
+        directions, triangle = np.linalg.qr(drawn)
+        return Made(*linear_code((directions * np.sign(np.diag(triangle))).T, data.moments))
+
+
+class Untrained(Network, ClosedForm, frozen=True, kw_only=True):
+    """The autoencoder's network as it was initialised."""
+
+    name: ClassVar[str] = "untrained"
+
+    architecture: Architecture = "paper"
+    seed: Seed = 0
+
+    def make(self, data: ScaledDataset) -> Made:
+        """As for `ClosedForm`."""
+        architecture = get_architecture(self.architecture)
+        encoder, decoder = stacks(architecture, data.size, self.latent, self.seed)
+        return Made(layers(encoder), layers(decoder))

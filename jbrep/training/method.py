@@ -1,0 +1,202 @@
+"""What a method of making encoders is: a record of its settings, which makes an encoder of data."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+
+from msgspec import NODEFAULT, inspect
+from msgspec.structs import asdict, fields, force_setattr
+
+from jbrep.dataset import ScaledDataset
+from jbrep.encoders import FULL
+from jbrep.errors import InputError
+from jbrep.records.record import Record, default_of, from_text, to_plain
+from jbrep.records.words import bare, type_of
+from jbrep.training.network import check_size, get_architecture
+from jbrep.training.objective import Layers, Objective, feature_weights
+from jbrep.training.settings import Angles, Architecture, Clip, Codes, Keep, Latent, Scaling
+
+
+class Made(NamedTuple):
+    """What a method makes: layers between scaled rows and codes, and what it says of them."""
+
+    encoder: Layers
+    decoder: Layers | None = None  # None for the linear one of least squared error
+    metrics: Mapping[str, Any] = MappingProxyType({})  # plain JSON, for the file's header
+    keep: tuple[str, ...] = ()  # features that pass around the layers, beside those it is told of
+
+
+class Method(Record, frozen=True, kw_only=True):
+    """A way of making encoders from a data set; its fields are its settings.
+
+    A class says its `name`, which commands and files use, and in the first line of its docstring
+    what it makes. From its fields follow the options of the command line, their help, and the
+    encoder's header.
+    """
+
+    name: ClassVar[str]
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # named sets of settings
+    reduces: ClassVar[bool] = False  # whether its code must be smaller than the observation
+
+    scaling: Scaling = "extrema"
+    angles: Angles = False
+    clip: Clip = None
+
+    @property
+    def keep(self) -> tuple[str, ...]:
+        """Features that pass around the layers; of those with a code, a setting."""
+        return ()
+
+    @property
+    def codes(self) -> str:
+        """The scale of the code; of those with a code, a setting."""
+        return "raw"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, value in asdict(self).items():
+            if isinstance(value, tuple):  # different ones, numbers in order
+                once = dict.fromkeys(value)
+                ordered = sorted(once) if all(isinstance(v, int) for v in once) else once
+                force_setattr(self, name, tuple(ordered))
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> Self:
+        """The method with settings as text, such as 1,5,10, or as values; None for the default.
+
+        Raises:
+            InputError: it doesn't take one, one can't have that value, or one is missing.
+        """
+        kinds = {field.name: field.type for field in fields(cls)}
+        if unknown := [name for name in given if name not in kinds]:
+            raise InputError(f"{cls.name} takes no {unknown[0]}: leave it out")
+        read = {n: _read(v, kinds[n], n) for n, v in given.items() if v is not None}
+        settings = {**cls.defaults(read), **read}
+        if missing := [name for name in kinds if name not in settings]:
+            raise InputError(f"{cls.name} needs {missing[0]}: there is no default")
+        return cls(**settings)
+
+    @classmethod
+    def words(cls) -> str:
+        """What it makes, in a line."""
+        return (cls.__doc__ or "").partition("\n")[0].removesuffix(".")
+
+    @classmethod
+    def takes(cls, setting: str) -> bool:
+        """Whether it has that setting."""
+        return setting in cls.__struct_fields__
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
+        """The defaults of all settings that have one; they may depend on what is given."""
+        each = {field.name: default_of(field) for field in fields(cls)}
+        return {name: default for name, default in each.items() if default is not NODEFAULT}
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """Its settings as plain JSON; of those that every method has, only what is unusual."""
+        plain = to_plain(self)
+        unusual = {n: plain[n] for n in USUAL if n in plain and plain[n] != USUAL[n]}
+        return {name: value for name, value in plain.items() if name not in USUAL} | unusual
+
+    def resolved(self, data: ScaledDataset) -> Self:
+        """The method as the data need it, such as with names of features in place of a pattern.
+
+        Raises:
+            InputError: a setting means nothing there.
+        """
+        return self
+
+    def check_data(self, data: ScaledDataset) -> None:
+        """Check, before anything is made, that an encoder can be made from the data.
+
+        Raises:
+            InputError: it can't.
+        """
+
+
+class Coded(Method, frozen=True, kw_only=True):
+    """A method with a code of its own size."""
+
+    reduces: ClassVar[bool] = True
+
+    latent: Latent
+    keep: Keep = ()
+    codes: Codes = "raw"
+
+    def check_data(self, data: ScaledDataset) -> None:
+        """As for `Method`."""
+        if self.reduces and data.size <= 1:
+            raise InputError(
+                f"{data.task.name} has {data.size or 'no'} feature to reduce, which can't be: use "
+                f"{FULL}"
+            )
+        if self.reduces and self.latent >= data.size:
+            raise InputError(
+                f"latent size is {self.latent}: with {data.size} features it must be from 1 to "
+                f"{data.size - 1}"
+            )
+
+
+USUAL: dict[str, Any] = to_plain(Coded.defaults())  # settings of all methods with a code
+
+
+class Network(Coded, frozen=True, kw_only=True):
+    """A method with a network of chosen layers."""
+
+    architecture: Architecture = "deep"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        force_setattr(self, "architecture", get_architecture(self.architecture).name)
+
+    def check_data(self, data: ScaledDataset) -> None:
+        """As for `Method`."""
+        super().check_data(data)
+        check_size(self.architecture, data.size, self.latent)
+
+
+class ClosedForm(Method, frozen=True, kw_only=True):
+    """A method without training."""
+
+    def make(self, data: ScaledDataset) -> Made:
+        """What it makes of scaled data.
+
+        Raises:
+            InputError: the data don't suffice.
+        """
+        raise NotImplementedError
+
+
+class Learned(Coded, frozen=True, kw_only=True):
+    """A method that trains a network by gradients; the fields named here are in every class."""
+
+    if TYPE_CHECKING:  # where the others are, for the order of the header
+        epochs: int
+        batch_size: int | None
+        learning_rate: float
+        seed: int
+
+    def objective(self, data: ScaledDataset) -> Objective:
+        """What it trains, on scaled data."""
+        raise NotImplementedError
+
+
+class Reconstructing(Learned, frozen=True, kw_only=True):
+    """A method that learns to reconstruct rows, with weights of their features."""
+
+    if TYPE_CHECKING:
+        weights: dict[str, float]
+
+    def check_data(self, data: ScaledDataset) -> None:
+        """As for `Method`."""
+        super().check_data(data)
+        feature_weights(data, self.weights)
+
+
+def _read(value: Any, kind: Any, name: str) -> Any:
+    """A setting from text, or one value where several can be."""
+    if isinstance(value, str):
+        return from_text(value, kind, name)
+    is_list = isinstance(bare(type_of(kind)), inspect.CollectionType)
+    return [value] if is_list and not isinstance(value, list | tuple) else value

@@ -1,0 +1,66 @@
+"""The settings that several methods have: what each may be, and what it is for."""
+
+import sys
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from jbrep.encoders.layers import MAX_UNITS
+
+MAX_HORIZON = 1000  # steps ahead
+_MAX_SEED = (1 << 63) - 1  # that torch accepts
+
+Scaling = Annotated[
+    Literal["extrema", "nominal", "standard", "robust"],
+    Meta(description="What becomes -1 and 1: extrema, nominal, standard or robust."),
+]
+Angles = Annotated[bool, Meta(description="Take angles as sine and cosine.")]
+Clip = Annotated[
+    Annotated[float, Meta(ge=1, le=10**6)] | None,
+    Meta(title="a number from 1 to 1,000,000", description="Limit of scaled values, at least 1."),
+]
+Latent = Annotated[int, Meta(ge=1, le=MAX_UNITS, description="Latent units l.")]
+Names = tuple[Annotated[str, Meta(min_length=1, title="a name, such as velocity_x")], ...]
+Keep = Annotated[Names, Meta(description="Features that pass around the encoder.")]
+Codes = Annotated[
+    Literal["raw", "standard", "white"],
+    Meta(
+        description="Scale of the code: raw, as the method gives it; standard, mean 0 and standard "
+        "deviation 1/3 of each unit; or white, uncorrelated as well."
+    ),
+]
+Architecture = Annotated[
+    str,
+    Meta(
+        description="Layers of the network: paper, deep, linear, or sizes of your own, such as "
+        "64,64."
+    ),
+]
+Epochs = Annotated[int, Meta(ge=1, le=_MAX_SEED, description="Passes over the data.")]
+BatchSize = Annotated[
+    Annotated[int, Meta(ge=1, le=_MAX_SEED)] | None,
+    Meta(
+        title=f"a whole number from 1 to {_MAX_SEED:,}",
+        description="Rows in a batch; by default 128 to 8192, from the rows, unless the method has "
+        "its own.",
+    ),
+]
+LearningRate = Annotated[float, Meta(gt=0, le=1, description="Of Adam.")]
+Seed = Annotated[int, Meta(ge=0, le=_MAX_SEED, description="Of everything random.")]
+NoiseDeviation = Annotated[
+    float, Meta(ge=0, le=sys.float_info.max, description="Standard deviation of the corruption.")
+]
+Steps = Annotated[
+    tuple[Annotated[int, Meta(ge=1, le=MAX_HORIZON)], ...],
+    Meta(min_length=1, title=f"steps from 1 to {MAX_HORIZON:,}, such as 10 or 1,5,10"),
+]
+Weight = Annotated[float, Meta(ge=0, le=10**6)]  # of a part of a loss
+FeatureWeights = Annotated[
+    dict[str, Weight],
+    Meta(
+        title="weights of features, such as angle_to_target=4,velocity_x=0.5",
+        description="Weights of features in the error; 1 otherwise.",
+    ),
+]
+RewardWeight = Annotated[Weight, Meta(description="Weight of the reward.")]
+TransitionWeight = Annotated[Weight, Meta(description="Weight of the error of the next code.")]
