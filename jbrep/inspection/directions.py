@@ -62,7 +62,7 @@ class Named(NamedTuple):
 def slow_to_fast(latents: Sequence[Array], lag: int) -> Directions:
     """The generalised eigenvectors of lagged covariance and covariance (TICA).
 
-    As jbrep.methods.slow, of codes; directions in which the code doesn't vary are left out.
+    As jbrep.methods.lagged.Slow, of codes; directions in which the code doesn't vary are left out.
 
     Args:
         latents: codes (n, l) of parts of episodes.

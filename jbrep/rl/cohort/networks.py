@@ -15,7 +15,7 @@ from torch.optim import Adam
 from torch.utils._pytree import tree_leaves
 
 from jbrep.rl.names import CPU, FLOAT32
-from jbrep.training.adam import allocate_adam_state
+from jbrep.training.trainer import allocate_adam_state
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam
 
