@@ -17,7 +17,7 @@ from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
 from jbrep.rl import Run, StoppedError
 from jbrep.rl.agent import make_agent, make_env, parameters, trained_parts, training_seed
-from jbrep.rl.cohort import get_algorithm
+from jbrep.rl.cohort import ALGORITHMS, get_algorithm
 from jbrep.rl.cohort.algorithm import Batch
 from jbrep.rl.cohort.cohort import Cohort
 from jbrep.rl.cohort.member import Member
@@ -75,7 +75,7 @@ def drawn(agent, seed, draws):
 
 
 VARIANTS = [
-    *((algorithm, preset, {}) for preset in PRESETS for algorithm in ("ddpg", "td3", "sac")),
+    *((algorithm, preset, {}) for preset in PRESETS for algorithm in ALGORITHMS),
     ("sac", "modern", {"ent_coef": 0.1}),
     ("sac", "modern", {"ent_coef": "auto_0.2", "target_entropy": -0.5}),
     ("td3", "modern", {"policy_delay": 3, "activation_fn": "elu", "net_arch": [20, 10]}),
@@ -114,19 +114,11 @@ def test_gradient_steps_are_those_of_stable_baselines3(in_float64, algorithm, pr
             )
 
 
-def runs(steps, **settings):
+def runs(steps, preset="modern", **settings):
     """Three runs of one learner on different codes."""
+    shared = {"task": TASK, "preset": preset, "evaluate_every": 100, "evaluation_episodes": 2}
     return [
-        Run(
-            task=TASK,
-            preset="modern",
-            encoder=code,
-            seed=seed,
-            steps=steps,
-            evaluate_every=100,
-            evaluation_episodes=2,
-            **settings,
-        )
+        Run(encoder=code, seed=seed, steps=steps, **shared, **settings)
         for seed, code in enumerate(CODES)
     ]
 
@@ -157,28 +149,17 @@ def done(tmp_path_factory):
 
 
 FOLLOWED = [
-    ("ddpg", "paper", {}, 1e-5),
-    ("td3", "modern", {}, 1e-5),
-    ("sac", "modern", {"num_envs": 2, "normalize": True}, 1e-5),
+    ("ddpg", "paper", {}),
+    ("td3", "modern", {}),
+    ("sac", "modern", {"num_envs": 2, "normalize": True}),
 ]
 
 
-@pytest.mark.parametrize(("algorithm", "preset", "overrides", "tolerance"), FOLLOWED)
-def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, tolerance, tmp_path):
+@pytest.mark.parametrize(("algorithm", "preset", "overrides"), FOLLOWED)
+def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, tmp_path):
     """The same bits until the first gradient step; ten steps later, the same weights nearly."""
     settings = {"learning_starts": 100, **overrides}
-    made = [
-        Run(
-            task=TASK,
-            algorithm=algorithm,
-            preset=preset,
-            encoder=c,
-            seed=s,
-            steps=110,
-            settings=settings,
-        )
-        for s, c in enumerate(CODES)
-    ]
+    made = runs(110, preset, algorithm=algorithm, settings=settings)
     members = [Member(Job(run, tmp_path / str(run.seed)), []) for run in made]
     cohort = Cohort(members)
     while cohort.goes_on:
@@ -194,11 +175,11 @@ def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, t
         first = slice(0, 100 // run.used.num_envs)
         np.testing.assert_array_equal(buffer.observations[first], rows[first, :, :size])
         np.testing.assert_array_equal(buffer.rewards[first], rows[first, :, -2])
-        np.testing.assert_allclose(buffer.rewards[:steps], rows[..., -2], atol=tolerance)
+        np.testing.assert_allclose(buffer.rewards[:steps], rows[..., -2], atol=1e-5)
         for (name, there), (_, here) in zip(
             parameters(agent), parameters(members[number].agent), strict=True
         ):
-            np.testing.assert_allclose(here, there, rtol=0, atol=tolerance, err_msg=name)
+            np.testing.assert_allclose(here, there, rtol=0, atol=1e-5, err_msg=name)
 
 
 def alone(run):

@@ -1,24 +1,31 @@
 """The checkpoint of a run, in a file that can't run code when it is read."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import DamageError, InputError
 from jbrep.records import container
 from jbrep.records.container import Tensors
 from jbrep.records.storage import exists
+from jbrep.rl.agent import parameters, statistics_of
 from jbrep.rl.fields import completed
 from jbrep.rl.files import differing
 from jbrep.rl.history import History
+from jbrep.rl.normalization import Statistics
 
 MAX_BYTES = 1 << 34
 PARAMETERS = "parameters."  # begins the names of what gradient steps change
 LANES = "lanes."  # likewise, of what decides how the lanes continue
-COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")  # of an agent
+_COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")  # of an agent
 _QUICK = 2.0  # seconds of writing that don't matter
-MALFORMED = (KeyError, TypeError, ValueError, RuntimeError, IndexError, AttributeError)
+_MALFORMED = (KeyError, TypeError, ValueError, RuntimeError, IndexError, AttributeError)
 
 
 class StoppedError(Exception):
@@ -38,6 +45,32 @@ class Snapshot(NamedTuple):
 
     tensors: Tensors
     counters: dict[str, Any]  # plain JSON
+
+
+def take(agent: BaseAlgorithm) -> Snapshot:
+    """What an agent itself continues from, whatever trains it; tensors share its memory."""
+    tensors = {f"{PARAMETERS}{name}": tensor.numpy() for name, tensor in parameters(agent)}
+    if statistics := statistics_of(agent):
+        tensors |= statistics.tensors
+    counters = {name: getattr(agent, name) for name in _COUNTERS}
+    episodes = [{k: float(v) for k, v in e.items()} for e in agent.ep_info_buffer or ()]
+    return Snapshot(tensors, {**counters, "episodes": episodes})
+
+
+def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
+    """Bring an agent that is set up to learn to where `take` was."""
+    tensors, counters = snapshot
+    with torch.no_grad():
+        for name, tensor in parameters(agent):
+            tensor.copy_(torch.from_numpy(tensors[f"{PARAMETERS}{name}"]))
+    if normalizer := agent.get_vec_normalize_env():
+        (size,) = agent.observation_space.shape or ()
+        Statistics.read(tensors, size, "the checkpoint").give(normalizer)
+    for name in _COUNTERS:
+        setattr(agent, name, counters[name])
+    agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that TensorBoard shows
+    assert agent.ep_info_buffer is not None
+    agent.ep_info_buffer.extend(counters["episodes"])
 
 
 def without(prefix: str, tensors: Tensors) -> Tensors:
@@ -88,8 +121,8 @@ class CheckpointFile:
                 counters = dict(header["counters"])
                 self._history.resume(header["record"], int(counters["num_timesteps"]))
                 return Snapshot(tensors, counters)
-        except MALFORMED:
-            raise self.damaged() from None
+        except _MALFORMED:
+            raise self._damaged() from None
         raise InputError(
             f"{self.path} {objection}; choose another folder, or delete the file to start over"
         )
@@ -107,8 +140,23 @@ class CheckpointFile:
         self._saved = time.monotonic()
         self._took = self._saved - begun
 
-    def damaged(self) -> DamageError:
-        """What to raise if the snapshot can't be continued from."""
+    @contextmanager
+    def resuming(self) -> Iterator[None]:
+        """Name the file where training can't continue from its snapshot.
+
+        Raises:
+            InputError: for what a damaged snapshot or a failing environment raises.
+        """
+        try:
+            yield
+        except EnvironmentFailedError as error:
+            raise InputError(f"{self.path} can't be resumed: {error}") from None
+        except InputError:
+            raise
+        except _MALFORMED:
+            raise self._damaged() from None
+
+    def _damaged(self) -> DamageError:
         return DamageError(f"{self.path} is damaged: delete it to start over")
 
     def _objection(self, identity: Mapping[str, Any]) -> str:

@@ -1,6 +1,6 @@
 """Runs of one task and algorithm that learn side by side, each as it would alone."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -143,25 +143,25 @@ class Cohort:
         """What each member's encoder shows of each lane, padded with zeros, (n, lanes, size)."""
         encoded = np.zeros((len(self.members), self._lanes, self._size), np.float32)
         own = self._by_member(observation)
-        for rows, member, each in zip(encoded, self.members, own, strict=True):
-            rows[:, : member.size] = member.encode(each)
+        for (member, rows), each in zip(self._unpadded(encoded), own, strict=True):
+            rows[:] = member.encode(each)
         return encoded
 
     def _update_statistics(self) -> None:
-        """Take the observations of now into the statistics by which members normalise theirs."""
-        for rows, member in zip(self._observation, self.members, strict=True):
-            if member.normalizer:
-                member.normalizer.obs_rms.update(rows[:, : member.size])
+        """Take the observations of now into the statistics that normalise."""
+        for member, rows in self._unpadded(self._observation):
+            member.update_statistics(rows)
 
     def _normalize(self, observation: Float32) -> Float32:
         """Encoded observations, (n, rows, size), normalised where settings say so."""
-        if not self.members[0].normalizer:
-            return observation
-        normalized = observation.copy()
-        for rows, member in zip(normalized, self.members, strict=True):
-            if member.normalizer:
-                rows[:, : member.size] = member.normalizer.normalize_obs(rows[:, : member.size])
+        normalized = observation.copy() if self._shared.get_vec_normalize_env() else observation
+        for member, rows in self._unpadded(normalized):
+            rows[:] = member.normalize(rows)
         return normalized
+
+    def _unpadded(self, observation: Float32) -> Iterator[tuple[Member, Float32]]:
+        """Each member, with its rows of encoded observations; views."""
+        return ((m, o[:, : m.size]) for m, o in zip(self.members, observation, strict=True))
 
     def _by_member(self, values: NDArray[Any]) -> NDArray[Any]:
         return values.reshape(len(self.members), self._lanes, *values.shape[1:])

@@ -18,13 +18,14 @@ from torch import Tensor
 
 from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
 from jbrep.records.container import Tensors
-from jbrep.rl.agent import Evaluator, Spaces, make_agent, parameters
+from jbrep.rl import checkpoint
+from jbrep.rl.agent import Evaluator, Spaces, make_agent
 from jbrep.rl.beginning import begin
-from jbrep.rl.checkpoint import COUNTERS, PARAMETERS, Snapshot, without
+from jbrep.rl.checkpoint import Snapshot, without
 from jbrep.rl.files import Episode
 from jbrep.rl.history import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE
 from jbrep.rl.job import Job
-from jbrep.rl.normalization import Statistics, normalized
+from jbrep.rl.normalization import normalized
 from jbrep.rl.presets import NormalNoise, OrnsteinUhlenbeckNoise
 
 Array = NDArray[np.float64]
@@ -61,6 +62,7 @@ class Member:
         env = DummyVecEnv([lambda: Spaces(run.task, job.encoder)])
         normalizing = normalized(env) if preset.normalize else env
         self.agent: Any = make_agent(run.algorithm, small, normalizing, run.seed)
+        self._normalizer: VecNormalize | None = self.agent.get_vec_normalize_env()
         self.random = Random(self.agent.action_space, preset.num_envs, preset.noise)
         self.agent._total_timesteps = run.steps
         self.agent.ep_info_buffer = deque(maxlen=self.agent._stats_window_size)
@@ -84,10 +86,16 @@ class Member:
         """Observations of its lanes as its encoder shows them, (lanes, l)."""
         return self.job.encoder.encode(observation.astype(np.float32))
 
-    @property
-    def normalizer(self) -> VecNormalize | None:
-        """What normalises encoded observations, if its settings say so."""
-        return self.agent.get_vec_normalize_env()
+    def update_statistics(self, observation: Float32) -> None:
+        """Take encoded observations into the statistics that normalise, if any do."""
+        if self._normalizer:
+            self._normalizer.obs_rms.update(observation)
+
+    def normalize(self, observation: Float32) -> Float32:
+        """Encoded observations as its agent sees them."""
+        if not self._normalizer:
+            return observation
+        return np.asarray(self._normalizer.normalize_obs(observation))
 
     def record(self, reward: Float32, ended: Flags, diverged: Flags) -> None:
         """Record a step of its lanes, (lanes,) each, and log every few episodes."""
@@ -139,32 +147,19 @@ class Member:
 
     def take(self) -> Snapshot:
         """Everything of its own that decides how its training continues."""
-        agent = self.agent
-        tensors = {f"{PARAMETERS}{name}": each.numpy() for name, each in parameters(agent)}
-        random, counters = self.random.state
+        tensors, counters = checkpoint.take(self.agent)
+        random, states = self.random.state
         tensors |= {f"{_RANDOM}{name}": values for name, values in random.items()}
         tensors |= {"returns": self._returns, "lengths": self._lengths}
-        if self.normalizer:
-            tensors |= Statistics.of(self.normalizer).tensors
-        counters |= {name: getattr(agent, name) for name in COUNTERS}
-        counters |= {"mean": self.mean, "episodes": list(agent.ep_info_buffer)}
-        return Snapshot(tensors, counters)
+        return Snapshot(tensors, {**counters, **states, "mean": self.mean})
 
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from where a snapshot was taken."""
-        (tensors, counters), agent = snapshot, self.agent
-        with torch.no_grad():
-            for name, each in parameters(agent):
-                each.copy_(torch.from_numpy(tensors[f"{PARAMETERS}{name}"]))
+        checkpoint.restore(self.agent, snapshot)
+        tensors, counters = snapshot
         self.random.restore(without(_RANDOM, tensors), counters)
         self._returns, self._lengths = tensors["returns"].copy(), tensors["lengths"].copy()
-        for name in COUNTERS:
-            setattr(agent, name, counters[name])
-        agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that is logged
-        agent.ep_info_buffer.extend(counters["episodes"])
         self.mean = counters["mean"]
-        if self.normalizer:
-            Statistics.read(tensors, self.size, "the checkpoint").give(self.normalizer)
 
 
 class Random:

@@ -174,7 +174,7 @@ class Stack:
             own.copy_(stacked[place])
 
     def _places(self) -> Iterator[tuple[Tensor, Any, Tensor]]:
-        """All that the stack has of agents: its tensor, the place there, and the agent's own."""
+        """All that the stack has of agents: its tensor, a place in that, and the agent's own."""
         for stacked, parts in self._parts.items():
             for parameter, place in parts:
                 yield stacked, place, _matrix(parameter)
@@ -189,7 +189,7 @@ class Stack:
     def _layer(
         self, modules: Sequence[Sequence[Linear]], sizes: Sequence[int], padded: int
     ) -> Layer:
-        """A layer of all agents; so many of their first inputs are padded."""
+        """A layer of all agents, whose first inputs, `sizes` of each, are padded to so many."""
         weights, biases = list[_Part](), list[_Part]()
         inputs = modules[0][0].in_features - sizes[0] + padded
         for agent, (own, size) in enumerate(zip(modules, sizes, strict=True)):

@@ -50,10 +50,9 @@ class ReplayBuffer:
     """
 
     def __init__(self, agents: int, lanes: int, capacity: int, observation: int, action: int):
-        self._sizes = _sizes(observation, action)
+        self._sizes, self.added = _sizes(observation, action), 0
         self._steps = max(capacity // lanes, 1)
         self._rows = np.empty((agents, self._steps, lanes, sum(self._sizes)), np.float32)
-        self.added = 0
 
     @property
     def filled(self) -> int:
@@ -65,12 +64,7 @@ class ReplayBuffer:
         return self._rows[agent, : self.filled]
 
     def restore(self, rows: Sequence[Float32], added: int) -> None:
-        """Put back what `rows_of` gave of each agent.
-
-        Args:
-            rows: of each agent.
-            added: steps that had been added.
-        """
+        """Put back what `rows_of` gave of each agent, after so many steps had been added."""
         self.added = added
         for agent, each in enumerate(rows):
             self._rows[agent, : len(each)] = each

@@ -5,9 +5,8 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
 from jbrep.envs.lanes import EnvironmentFailedError
-from jbrep.errors import InputError
 from jbrep.rl.agent import unchecked_distributions
-from jbrep.rl.checkpoint import MALFORMED, Snapshot, StoppedError
+from jbrep.rl.checkpoint import Snapshot, StoppedError
 from jbrep.rl.cohort.cohort import Cohort, padded_size
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.job import Ended, Job, Session
@@ -56,17 +55,9 @@ def _kind(job: Job, snapshot: Snapshot | None) -> _Kind:
 def _cohort(begun: Sequence[_Begun], session: Session) -> Cohort:
     """A cohort at its start, or where its members' snapshots were taken."""
     cohort = Cohort([Member(job, session.writers) for job, _ in begun])
-    snapshots = [snapshot for _, snapshot in begun if snapshot]
-    if snapshots:
-        checkpoint = begun[0][0].checkpoint
-        try:
+    if snapshots := [snapshot for _, snapshot in begun if snapshot]:
+        with begun[0][0].checkpoint.resuming():
             cohort.restore(snapshots)
-        except EnvironmentFailedError as error:
-            raise InputError(f"{checkpoint.path} can't be resumed: {error}") from None
-        except InputError:
-            raise
-        except MALFORMED:
-            raise checkpoint.damaged() from None
     return cohort
 
 

@@ -14,21 +14,9 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, Vectori
 from stable_baselines3.common.vec_env import VecMonitor
 
 from jbrep.encoders.vec_env import JitterbugVecEnv
-from jbrep.envs.lanes import EnvironmentFailedError
-from jbrep.errors import InputError
 from jbrep.records.container import Tensors
-from jbrep.rl.agent import parameters, statistics_of
-from jbrep.rl.checkpoint import (
-    COUNTERS,
-    LANES,
-    MALFORMED,
-    PARAMETERS,
-    CheckpointFile,
-    Snapshot,
-    StoppedError,
-    without,
-)
-from jbrep.rl.normalization import Statistics
+from jbrep.rl import checkpoint
+from jbrep.rl.checkpoint import LANES, CheckpointFile, Snapshot, StoppedError, without
 from jbrep.rl.weights import acting
 
 _ROLLOUT = ("_last_obs", "_last_episode_starts")
@@ -62,14 +50,8 @@ class Checkpointer(BaseCallback):
     def _on_training_start(self) -> None:
         if self._snapshot:
             self._draws = self._snapshot.tensors
-            try:
+            with self._file.resuming():
                 restore(self.model, self._snapshot)
-            except EnvironmentFailedError as error:
-                raise InputError(f"{self._file.path} can't be resumed: {error}") from None
-            except InputError:
-                raise
-            except MALFORMED:
-                raise self._file.damaged() from None
             self._snapshot = None  # a replay buffer can be large
 
     def _on_rollout_start(self) -> None:
@@ -90,21 +72,19 @@ def take(agent: BaseAlgorithm) -> Snapshot:
     """Take a snapshot of an agent between two rollouts; its tensors share the agent's memory."""
     monitor, env = _envs(agent)
     kind, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 draws there
-    tensors = {f"{PARAMETERS}{name}": tensor.numpy() for name, tensor in parameters(agent)}
+    tensors, counters = checkpoint.take(agent)
     tensors |= {f"{LANES}{name}": values for name, values in env.state.items()}
     tensors |= {f"noise.{i}": n.noise_prev for i, n in enumerate(_drifting_noises(agent))}
     tensors |= {f"rollout.{name}": getattr(agent, name) for name in _ROLLOUT}
-    if statistics := statistics_of(agent):
-        tensors |= {**statistics.tensors, _UNSCALED: getattr(agent, _UNSCALED)}
+    if agent.get_vec_normalize_env():
+        tensors |= {_UNSCALED: getattr(agent, _UNSCALED)}
     tensors |= {"returns": monitor.episode_returns, "lengths": monitor.episode_lengths}
     tensors |= {"torch": torch.get_rng_state().numpy(), "numpy": np.asarray(keys)}
     if noise := _state_dependent_noise(agent):
         tensors |= {name: getattr(noise, name).detach().numpy() for name in _EXPLORATION}
-    counters = {name: getattr(agent, name) for name in COUNTERS}
     counters |= {
         "numpy": (kind, position, has_gauss, gauss),
         "action_space": agent.action_space.np_random.bit_generator.state,
-        "episodes": [{k: float(v) for k, v in e.items()} for e in agent.ep_info_buffer or ()],
     }
     if buffer := _buffer(agent):
         counters["buffer"] = (buffer.pos, buffer.full)
@@ -114,30 +94,21 @@ def take(agent: BaseAlgorithm) -> Snapshot:
 
 def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
     """Bring an agent that is set up to learn to where the snapshot was taken."""
+    checkpoint.restore(agent, snapshot)
     tensors, counters = snapshot
     monitor, env = _envs(agent)
     if buffer := _buffer(agent):
         buffer.pos, buffer.full = counters["buffer"]
         for name, values in _transitions(buffer).items():
             values[:] = tensors[f"buffer.{name}"]
-    with torch.no_grad():
-        for name, tensor in parameters(agent):
-            tensor.copy_(torch.from_numpy(tensors[f"{PARAMETERS}{name}"]))
     for i, noise in enumerate(_drifting_noises(agent)):
         noise.noise_prev = tensors[f"noise.{i}"]
     for name in _ROLLOUT:
         setattr(agent, name, tensors[f"rollout.{name}"])
-    if normalizer := agent.get_vec_normalize_env():
-        (size,) = agent.observation_space.shape or ()
-        Statistics.read(tensors, size, "the checkpoint").give(normalizer)
+    if agent.get_vec_normalize_env():
         setattr(agent, _UNSCALED, tensors[_UNSCALED])
-    for name in COUNTERS:
-        setattr(agent, name, counters[name])
-    agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that TensorBoard shows
     monitor.episode_returns, monitor.episode_lengths = tensors["returns"], tensors["lengths"]
     env.restore(without(LANES, tensors))
-    assert agent.ep_info_buffer is not None
-    agent.ep_info_buffer.extend(counters["episodes"])
     agent.action_space.np_random.bit_generator.state = counters["action_space"]
     _restore_draws(agent, tensors)
     kind, *rest = counters["numpy"]
