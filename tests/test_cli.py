@@ -16,9 +16,9 @@ from test_study import TOML
 from jbrep.cli import main
 from jbrep.cli.base import COUNT
 from jbrep.encoders import find, load, save
-from jbrep.encoders.diagnostics import Diagnosed, write_diagnostics
 from jbrep.encoders.identity import identity
 from jbrep.envs import describe
+from jbrep.evaluate.table import SCALARS, Diagnosed, write_diagnostics
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.registry import METHODS
 
@@ -295,7 +295,7 @@ def test_the_encoders_that_ship_are_listed(monkeypatch, tmp_path):
     ]
     listed = json.loads(jbrep("encoder", "list", "--task", "face_direction", "--json").output)
     assert [each["latent_size"] for each in listed["face_direction"]] == [16, 8, 4]
-    assert listed["face_direction"][1]["diagnostics"] == given
+    assert listed["face_direction"][1]["diagnostics"] == dict.fromkeys(SCALARS) | given
     refused = jbrep("encoder", "list", "--task", "Hopper-v5")
     assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
     assert "no encoder ships for Hopper-v5: only for move_from_origin" in refused.output

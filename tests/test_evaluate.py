@@ -16,23 +16,25 @@ from sklearn.metrics import r2_score
 from sklearn.preprocessing import StandardScaler
 from wide import make_feature, make_task, wide
 
-from jbrep import figures
 from jbrep.dataset import Dataset, ScaledDataset, Scaler
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder, Layer, find, save
 from jbrep.errors import InputError
-from jbrep.evaluate import diagnose, files
-from jbrep.evaluate.files import EVALUATION, write
+from jbrep.evaluate import diagnose, diagnosis
+from jbrep.evaluate.diagnosis import write
+from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.held_out import MAX_NUMBERS, HeldOut, sample_rows
-from jbrep.evaluate.latent import intrinsic_dimension, latent
+from jbrep.evaluate.latent import intrinsic_dimension, latent_units
 from jbrep.evaluate.readout import correlation, dynamics, neighbours, probes
 from jbrep.evaluate.reconstruction import NOISES, corruption, reconstruction
-from jbrep.evaluate.summary import evaluation_text
 from jbrep.evaluate.truth import quantities, state
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.controls import Random
 from jbrep.methods.linear import principal_code
+from jbrep.records.document import read_document
 from jbrep.records.record import to_plain
+from jbrep.report import figures
+from jbrep.report.evaluation import evaluation_text
 from jbrep.report.figures import encoder_plots
 from jbrep.stats.bootstrap import bootstrap, by_episode
 
@@ -130,10 +132,10 @@ def test_of_very_many_episodes_groups_are_resampled():
     assert {len(np.unique(episodes)) for episodes in place} == {2, 3}
     np.testing.assert_array_equal(np.concatenate(place), it.place(rows))
     assert it.row_counts.ravel().tolist() == [len(episodes) for episodes in place]
-    worst = reconstruction(make(it.data, principal_code(it.data, 1)), it)["worst_episodes"]
-    errors = [episode["mse"] for episode in worst]
+    worst = reconstruction(make(it.data, principal_code(it.data, 1)), it).worst_episodes
+    errors = [episode.mse for episode in worst]
     assert errors == sorted(errors, reverse=True)
-    assert all(lengths[episode["episode"]] for episode in worst)
+    assert all(lengths[episode.episode] for episode in worst)
 
 
 def test_sums_of_parts_are_those_of_the_whole(held_out):
@@ -180,33 +182,33 @@ def test_errors_are_those_of_encode_and_decode(held_out, coder):
     rows = observed(held_out, "test")
     lost = coder.decode(coder.encode(rows)).astype(float) - rows
     scaled = lost / held_out.data.scaler.half_width
-    assert result["mse"][0] == pytest.approx(np.mean(scaled**2), rel=1e-5)
-    assert result["mse"][1] < result["mse"][0] < result["mse"][2]
-    for i, feature in enumerate(result["features"]):
-        assert feature["name"] == held_out.data.task.feature_names[i]
-        assert feature["mse"][0] == pytest.approx(np.mean(scaled[:, i] ** 2), rel=1e-4)
+    assert result.mse[0] == pytest.approx(np.mean(scaled**2), rel=1e-5)
+    assert result.mse[1] < result.mse[0] < result.mse[2]
+    for i, feature in enumerate(result.features):
+        assert feature.name == held_out.data.task.feature_names[i]
+        assert feature.mse[0] == pytest.approx(np.mean(scaled[:, i] ** 2), rel=1e-4)
         rmse = np.sqrt(np.mean(lost[:, i] ** 2))
-        assert feature["rmse_physical"][0] == pytest.approx(rmse, rel=1e-4)
+        assert feature.rmse_physical[0] == pytest.approx(rmse, rel=1e-4)
         r2 = r2_score(rows[:, i].astype(float), rows[:, i] + lost[:, i])
-        assert feature["r2"][0] == pytest.approx(r2, rel=1e-3, abs=1e-4)
+        assert feature.r2[0] == pytest.approx(r2, rel=1e-3, abs=1e-4)
     by_row = (scaled**2).mean(axis=1)
-    assert result["quantiles"]["0.9"] == pytest.approx(np.quantile(by_row, 0.9), rel=1e-3)
-    assert result["quantiles"]["1"] == pytest.approx(by_row.max(), rel=1e-3)
-    worst = result["worst_episodes"][0]
+    assert result.quantiles["0.9"] == pytest.approx(np.quantile(by_row, 0.9), rel=1e-3)
+    assert result.quantiles["1"] == pytest.approx(by_row.max(), rel=1e-3)
+    worst = result.worst_episodes[0]
     errors = by_row.reshape(3, 1000).mean(axis=1)
-    assert worst["episode"] == held_out.numbers[errors.argmax()]
-    assert worst["mse"] == pytest.approx(errors.max(), rel=1e-4)
-    assert worst["seed"] == held_out.data.dataset.episodes["seed"][worst["episode"]]
+    assert worst.episode == held_out.numbers[errors.argmax()]
+    assert worst.mse == pytest.approx(errors.max(), rel=1e-4)
+    assert worst.seed == held_out.data.dataset.episodes["seed"][worst.episode]
 
 
 def test_pca_is_its_own_reference_and_the_identity_loses_nothing(held_out, coder, everything):
     same = reconstruction(make(held_out.data, principal_code(held_out.data, 4)), held_out)
-    np.testing.assert_allclose(same["ratio_to_pca"], 1, rtol=1e-4)
-    assert same["mse"] == pytest.approx(same["pca_mse"], rel=1e-4)
-    assert reconstruction(coder, held_out)["ratio_to_pca"][0] > 1
+    np.testing.assert_allclose(same.ratio_to_pca, 1, rtol=1e-4)
+    assert same.mse == pytest.approx(same.pca_mse, rel=1e-4)
+    assert reconstruction(coder, held_out).ratio_to_pca[0] > 1
     nothing = reconstruction(everything, held_out)
-    assert nothing["mse"][0] < 1e-10
-    assert nothing["ratio_to_pca"] is None
+    assert nothing.mse[0] < 1e-10
+    assert nothing.ratio_to_pca is None
 
 
 def test_errors_are_scaled_by_the_data_not_by_the_encoder(held_out, coder):
@@ -214,18 +216,18 @@ def test_errors_are_scaled_by_the_data_not_by_the_encoder(held_out, coder):
     stretched = Encoder(coder.header, wider, (), ())
     moved = Layer(np.eye(16, dtype=np.float32), np.full(16, 0.01, np.float32), "linear")
     shifted = Encoder(coder.header, wider, (), (moved,))
-    assert reconstruction(stretched, held_out)["mse"][0] < 1e-10
+    assert reconstruction(stretched, held_out).mse[0] < 1e-10
     expected = np.mean((0.01 * wider.half_width / held_out.data.scaler.half_width) ** 2)
-    assert reconstruction(shifted, held_out)["mse"][0] == pytest.approx(expected, rel=1e-3)
+    assert reconstruction(shifted, held_out).mse[0] == pytest.approx(expected, rel=1e-3)
 
 
 def test_corruption_of_the_identity_stays_and_the_linear_denoiser_is_better(data, everything):
     levels = corruption(everything, HeldOut(train_as_test(data)))
-    assert [level["noise"] for level in levels] == list(NOISES)
+    assert [level.noise for level in levels] == list(NOISES)
     for level in levels[1:]:
-        assert level["mse"][0] == pytest.approx(level["noise"] ** 2, rel=0.03)
-        assert level["input_mse"] == level["noise"] ** 2
-        assert level["linear_mse"][0] < level["mse"][0]
+        assert level.mse[0] == pytest.approx(level.noise**2, rel=0.03)
+        assert level.input_mse == level.noise**2
+        assert level.linear_mse[0] < level.mse[0]
 
 
 def test_dead_and_saturated_units_are_found(held_out):
@@ -235,13 +237,13 @@ def test_dead_and_saturated_units_are_found(held_out):
         (Layer(weight, np.zeros(4, np.float32), "tanh"),),
         (Layer(weight.T, np.zeros(16, np.float32), "linear"),),
     )
-    result = latent(make(held_out.data, parts), held_out)
-    assert result["dead"] == [2, 3]
-    assert result["saturation"][1] > 0.9
-    assert result["saturation"][0] == 0
-    assert result["correlation"][2] == [None] * 4
-    assert result["correlation"][0][0] == pytest.approx(1)
-    assert 1 < result["participation_ratio"] < 2
+    result = latent_units(make(held_out.data, parts), held_out)
+    assert result.dead == (2, 3)
+    assert result.saturation[1] > 0.9
+    assert result.saturation[0] == 0
+    assert result.correlation[2] == (None,) * 4
+    assert result.correlation[0][0] == pytest.approx(1)
+    assert 1 < result.participation_ratio < 2
 
 
 def test_the_participation_ratio_counts_equal_variances(held_out):
@@ -250,10 +252,10 @@ def test_the_participation_ratio_counts_equal_variances(held_out):
     weight = (vectors[:, -5:] / np.sqrt(values[-5:])).T.astype(np.float32)
     whitened = (Layer(weight, np.zeros(5, np.float32), "linear"),)
     back = (Layer(weight.T.copy(), np.zeros(16, np.float32), "linear"),)
-    result = latent(make(data, (whitened, back)), HeldOut(train_as_test(data)))
-    assert result["participation_ratio"] == pytest.approx(5, rel=1e-3)
-    np.testing.assert_allclose(result["variance"], 1, rtol=1e-3)
-    assert result["saturation"] is None
+    result = latent_units(make(data, (whitened, back)), HeldOut(train_as_test(data)))
+    assert result.participation_ratio == pytest.approx(5, rel=1e-3)
+    np.testing.assert_allclose(result.variance, 1, rtol=1e-3)
+    assert result.saturation is None
 
 
 def train_as_test(data):
@@ -267,13 +269,13 @@ def train_as_test(data):
 def test_intrinsic_dimensions_of_what_is_known():
     random = np.random.default_rng(0)
     plane = random.normal(size=(3000, 3)) @ random.normal(size=(3, 10))
-    for estimate in intrinsic_dimension(plane).values():
-        assert estimate == pytest.approx(3, abs=0.3)
+    estimated = intrinsic_dimension(plane)
+    assert (estimated.two_nn, estimated.mle) == pytest.approx((3, 3), abs=0.3)
     angle = random.uniform(0, 2 * np.pi, 3000)
     circle = np.stack((np.cos(angle), np.sin(angle)), axis=1)
-    for estimate in intrinsic_dimension(circle).values():
-        assert estimate == pytest.approx(1, abs=0.1)
-    assert intrinsic_dimension(np.zeros((3000, 4))) == {"two_nn": None, "mle": None}
+    estimated = intrinsic_dimension(circle)
+    assert (estimated.two_nn, estimated.mle) == pytest.approx((1, 1), abs=0.1)
+    assert intrinsic_dimension(np.zeros((3000, 4))).mle is None
 
 
 def test_quantities_are_those_of_the_simulated_body():
@@ -334,14 +336,14 @@ def test_a_wide_robot_can_be_judged(tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.evaluate.readout.MAX_NUMBERS", 1 << 19)
     data = wide([1, 300, 2, 1, 250, 99, 1, 180], features=70)
     evaluation = write({"r-20": make(data, projection(data, 20, 0))}, data, tmp_path)
-    everything, ours = evaluation["encoders"].values()
+    everything, ours = evaluation.encoders.values()
     for result in everything, ours:
-        gtc = result["correlation"]
-        assert gtc["state_dimensions"] == 70
-        assert len(gtc["dimensions"]) == 2 * (1 << 19) // (1000 * 70)
-        assert result["probes"]["obs_0"] == [None, None, None]  # it is constant
-    assert gtc["dimensions"].keys() == everything["correlation"]["dimensions"].keys()
-    assert all(everything["probes"][f"obs_{i}"][0] > 0.8 for i in range(1, 70))
+        gtc = result.correlation
+        assert gtc.state_dimensions == 70
+        assert len(gtc.dimensions) == 2 * (1 << 19) // (1000 * 70)
+        assert set(result.probes["obs_0"]) == {None}  # it is constant
+    assert gtc.dimensions.keys() == everything.correlation.dimensions.keys()
+    assert all(everything.probes[f"obs_{i}"][0] > 0.8 for i in range(1, 70))
     shown = evaluation_text(evaluation, 100)
     assert "14 of its 70 dimensions" in " ".join(shown.split())
     assert re.search(r"probes, mean +worst probe", shown)
@@ -351,18 +353,18 @@ def test_a_wide_robot_can_be_judged(tmp_path, monkeypatch):
 def test_episodes_of_one_row_have_no_dynamics(tmp_path):
     data = wide([1] * 20, features=6)
     result = write({"r-2": make(data, projection(data, 2, 0))}, data, tmp_path)
-    for judged in result["encoders"].values():
-        assert set(map(tuple, judged["dynamics"].values())) == {(None, None, None)}
-        assert judged["reconstruction"]["mse"][0] is not None
+    for judged in result.encoders.values():
+        assert {judged.dynamics.linear, judged.dynamics.change} == {(None, None, None)}
+        assert judged.reconstruction.mse[0] is not None
     assert " nan" not in evaluation_text(result)
 
 
 def test_a_feature_that_is_constant_where_it_is_judged_has_no_r2(tmp_path):
     data = wide([50] * 10, features=6)
     data.dataset.arrays["observation"][data.test, 3] = 1.7
-    features = reconstruction(make(data, principal_code(data, 2)), HeldOut(data))["features"]
-    assert features[3]["r2"][0] is None
-    assert features[4]["r2"][0] is not None
+    features = reconstruction(make(data, principal_code(data, 2)), HeldOut(data)).features
+    assert features[3].r2[0] is None
+    assert features[4].r2[0] is not None
 
 
 def test_probes_are_ridge_regressions(held_out, coder):
@@ -392,10 +394,10 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     predicted = Ridge(1.0).fit(scaler.transform(known), after).predict(scaler.transform(unseen))
     result = dynamics(coder, held_out)
     expected = r2_score(true, predicted, multioutput="variance_weighted")
-    assert result["linear"][0] == pytest.approx(expected, abs=1e-3)
+    assert result.linear[0] == pytest.approx(expected, abs=1e-3)
     still = r2_score(true, unseen[:, :4], multioutput="variance_weighted")
-    assert result["persistence"][0] == pytest.approx(still, abs=1e-3)
-    assert result["linear"][0] > result["persistence"][0]
+    assert result.persistence[0] == pytest.approx(still, abs=1e-3)
+    assert result.linear[0] > result.persistence[0]
     changes = []
     for rows in (held_out.data.train, held_out.data.test):
         kept = rows[dataset["step"][rows] < 999]
@@ -405,7 +407,7 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
         Ridge(1.0).fit(scaler.transform(known), changes[0]).predict(scaler.transform(unseen))
     )
     expected = r2_score(changes[1], predicted, multioutput="variance_weighted")
-    assert result["change"][0] == pytest.approx(expected, abs=1e-3)
+    assert result.change[0] == pytest.approx(expected, abs=1e-3)
 
 
 def test_mixing_the_units_does_not_change_how_well_the_next_is_read(held_out, coder):
@@ -416,8 +418,9 @@ def test_mixing_the_units_does_not_change_how_well_the_next_is_read(held_out, co
         bias=(mixed @ layer.bias).astype(np.float32),
     )
     other = replace(coder, encoder=(stirred,))
-    for name, values in dynamics(coder, held_out).items():
-        assert values == pytest.approx(dynamics(other, held_out)[name], abs=1e-3)
+    one, two = dynamics(coder, held_out), dynamics(other, held_out)
+    for name in ("linear", "persistence", "change"):
+        assert getattr(one, name) == pytest.approx(getattr(two, name), abs=1e-3)
 
 
 def test_neighbours_come_from_training_episodes(held_out, coder, everything):
@@ -428,9 +431,9 @@ def test_neighbours_come_from_training_episodes(held_out, coder, everything):
     nearest = np.argsort((apart**2).sum(axis=-1), axis=1)[:, :5]
     expected = (((true[nearest] - wanted[:, None]) / true.std(axis=0)) ** 2).mean()
     result = neighbours(coder, held_out)
-    assert result["mse"][0] == pytest.approx(expected, rel=1e-2)
-    assert np.mean([v[0] for v in result["dimensions"].values()]) == pytest.approx(result["mse"][0])
-    assert neighbours(everything, held_out)["mse"][0] < result["mse"][0]
+    assert result.mse[0] == pytest.approx(expected, rel=1e-2)
+    assert np.mean([v[0] for v in result.dimensions.values()]) == pytest.approx(result.mse[0])
+    assert neighbours(everything, held_out).mse[0] < result.mse[0]
 
 
 def test_correlation_takes_units_alone_as_candidates(held_out, coder, everything):
@@ -440,8 +443,8 @@ def test_correlation_takes_units_alone_as_candidates(held_out, coder, everything
     result = correlation(coder, held_out)
     for name, values in truth.items():
         expected = max(abs(np.corrcoef(unit, values)[0, 1]) for unit in latents.T)
-        assert result["dimensions"][name][0] == pytest.approx(expected, abs=1e-4)
-    shown = correlation(everything, held_out)["dimensions"]
+        assert result.dimensions[name][0] == pytest.approx(expected, abs=1e-4)
+    shown = correlation(everything, held_out).dimensions
     assert shown["motor_velocity"][0] == pytest.approx(1)
     assert shown["uprightness"][0] < 0.99  # though other dimensions of the state are related
 
@@ -458,11 +461,11 @@ def still(units, weight=0.0):
 
 @pytest.mark.parametrize("parts", [still(3), still(3, 1.0), still(1), still(1, 1.0)])
 def test_dead_and_single_units_can_be_judged(held_out, parts, tmp_path):
-    result = write({"it": make(held_out.data, parts)}, held_out.data, tmp_path)["encoders"]["it"]
-    gtc = result["correlation"]
-    assert all(0 <= value[0] <= 1 + 1e-9 for value in gtc["dimensions"].values())
-    units = len(result["latent_units"]["variance"])
-    assert len(result["latent_units"]["dead"]) in (units, units - 1)
+    result = write({"it": make(held_out.data, parts)}, held_out.data, tmp_path).encoders["it"]
+    gtc = result.correlation
+    assert all(0 <= value[0] <= 1 + 1e-9 for value in gtc.dimensions.values())
+    units = len(result.latent_units.variance)
+    assert len(result.latent_units.dead) in (units, units - 1)
 
 
 def test_the_observation_alone_can_be_judged(held_out, everything, tmp_path):
@@ -479,10 +482,10 @@ def test_a_constant_feature_can_be_judged(data):
         np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.low),
         np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.high),
     )
-    result = diagnose({"pca-4": make(flat, principal_code(flat, 4))}, flat)["encoders"]["pca-4"]
-    assert result["reconstruction"]["features"][2]["r2"] == [None, None, None]
-    assert result["corruption"][0]["linear_mse"][0] == pytest.approx(
-        result["reconstruction"]["mse"][0], rel=1e-3
+    result = diagnose({"pca-4": make(flat, principal_code(flat, 4))}, flat).encoders["pca-4"]
+    assert set(result.reconstruction.features[2].r2) == {None}
+    assert result.corruption[0].linear_mse[0] == pytest.approx(
+        result.reconstruction.mse[0], rel=1e-3
     )
 
 
@@ -500,22 +503,22 @@ def test_labels_and_numbers_that_cannot_be_judged(data):
         diagnose({"it": make(data, ((), (huge,) * 4))}, data)
 
 
-def test_an_evaluation_is_plain_json_and_repeats(data, tmp_path):
+def test_an_evaluation_is_one_file_and_repeats(data, tmp_path):
     encoders = {
         "pca-4": make(data, principal_code(data, 4)),
         "r-4": make(data, projection(data, 4, 0)),
     }
-    one = write(encoders, data, tmp_path / "it")
-    text = (tmp_path / "it" / EVALUATION).read_text()
-    assert list(json.loads(text)["encoders"]) == ["full", "pca-4", "r-4"]
+    one, path = write(encoders, data, tmp_path / "it"), tmp_path / "it" / EVALUATION
+    text, there = path.read_text(), read_document(path, Evaluation)
+    assert list(there.encoders) == ["full", "pca-4", "r-4"]
+    assert there.text() == text == one.text()
+    assert there.hashes == {name: each.fingerprint for name, each in encoders.items()}
     assert write(encoders, data, tmp_path / "it") == one
-    assert (tmp_path / "it" / EVALUATION).read_text() == text
+    assert path.read_text() == text
     with pytest.raises(InputError, match="is not an evaluation of these encoders"):
         write({"r-4": encoders["r-4"]}, data, tmp_path / "it")
-    assert (tmp_path / "it" / EVALUATION).read_text() == text
-    shown = evaluation_text(json.loads(text))
-    assert "pca-4" in shown
-    assert "nan" not in shown
+    assert path.read_text() == text
+    assert "nan" not in evaluation_text(there)
 
 
 def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
@@ -531,15 +534,15 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
     shown = jbrep(*command).stdout
     assert shown.startswith("dae-4, shipped\n./dae-4\nfull, shipped\n\nWhether a controller")
     assert max(map(len, shown.splitlines())) <= 80
-    evaluation = json.loads((tmp_path / "judged" / EVALUATION).read_text())
+    evaluation = read_document(Path("judged", EVALUATION), Evaluation)
     whole = evaluation_text(evaluation)
     assert set(whole.split()) < set(shown.split())
     assert max(map(len, whole.splitlines())) > 80
-    monkeypatch.setattr(files, "diagnose", lambda encoders, data, policy: evaluation)
+    monkeypatch.setattr(diagnosis, "diagnose", lambda encoders, data, policy: evaluation)
     again = jbrep(*command, "--json")
-    assert json.loads(again.stdout) == evaluation
+    assert json.loads(again.stdout) == json.loads(Path("judged", EVALUATION).read_text())
     labels = ["full", "dae-4, shipped", "./dae-4", "full, shipped"]
-    assert list(evaluation["encoders"]) == labels
+    assert list(evaluation.encoders) == labels
     assert "dae-4, shipped\n./dae-4\nfull, shipped\n" in again.stderr
 
 
@@ -553,7 +556,7 @@ def test_whether_an_encoder_may_have_seen_the_episodes(data):
     encoders = {
         n: make(data, principal_code(data, 2), data=source) for n, source in sources.items()
     }
-    result = diagnose(encoders, data)["seen"]
+    result = diagnose(encoders, data).seen
     assert result == {"same": "no test row", "overlaps": "maybe", "apart": "none"}
 
 

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -10,12 +9,21 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 import pytest
+from judged import NOTHING, diagnostics, evaluation
 from matplotlib.text import Text
 from PIL import Image
 
 from jbrep.envs import describe
 from jbrep.errors import InputError
+from jbrep.evaluate.evaluation import (
+    Evaluation,
+    FeatureError,
+    Prediction,
+    Reconstruction,
+    Score,
+)
 from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
+from jbrep.records.document import read_document
 from jbrep.report.figures import behaviour_plots, encoder_plots, study_plots, write
 from jbrep.report.figures.claims import claims
 from jbrep.report.figures.curves import Return, every_run
@@ -384,44 +392,38 @@ def test_names_with_dollar_signs_are_no_formulas(returns):
 
 
 def test_figures_of_encoders_come_from_their_evaluation(tmp_path):
-    path = "results/encoders/face_direction/evaluation.json"
-    with open(path) as file:  # noqa: PTH123
-        evaluation = json.load(file)
-    few = ("full", "dae-12", "dae-8", "pca-8")
-    evaluation["encoders"] = {name: evaluation["encoders"][name] for name in few}
-    found = {plot.name: plot for plot in encoder_plots(evaluation)}
-    of_losses = ["error_by_feature", "error_by_latent", "error_by_corruption", "latent_correlation"]
-    assert list(found) == ["prediction_by_feature", "prediction_by_horizon", *of_losses]
-    known = evaluation["encoders"].items()
-    early = {n: {k: v for k, v in e.items() if k != "prediction"} for n, e in known}  # version 1
-    plots = encoder_plots({**evaluation, "encoders": early})
-    assert [plot.name for plot in plots] == of_losses
-    error = evaluation["encoders"]["dae-8"]["reconstruction"]["mse"]
+    whole = read_document(Path("results/encoders/face_direction/evaluation.json"), Evaluation)
+    encoders = {name: whole.encoders[name] for name in ("full", "dae-12", "dae-8", "pca-8")}
+    found = {plot.name: plot for plot in encoder_plots(whole.replace(encoders=encoders))}
+    assert list(found) == [
+        *("prediction_by_feature", "prediction_by_horizon"),
+        *("error_by_feature", "error_by_latent", "error_by_corruption", "latent_correlation"),
+    ]
+    error = encoders["dae-8"].reconstruction.mse
     (row,) = [row for row in found["error_by_latent"].rows if row[0] == "dae-8"]
-    assert list(row[2:5]) == error
+    assert row[2:5] == error
     axes = drawn(found["error_by_latent"]).axes[0]
-    assert any(error[0] in container.lines[0].get_ydata() for container in axes.containers)
+    assert any(error.value in container.lines[0].get_ydata() for container in axes.containers)
     matrix = drawn(found["latent_correlation"]).axes[0].images[0].get_array()
-    expected = evaluation["encoders"]["dae-12"]["latent_units"]["correlation"]
+    expected = encoders["dae-12"].latent_units.correlation
     np.testing.assert_array_equal(matrix, np.array(expected, float))
     assert len(write(found.values(), tmp_path)) == 6
 
 
 def test_of_a_wide_robot_the_worst_features_are_shown():
     """Humanoid's 348 would make a figure of 14,000 pixels, with names that nobody can read."""
-    features = [{"name": f"obs_{i}", "r2": [1 - i / 348, None, None]} for i in range(348)]
-    features[347]["r2"][0] = None  # a feature that never varies isn't the worst
-    correlation = np.eye(348).tolist()
+    r2 = [*(Score(1 - i / 348, None, None) for i in range(347)), NOTHING]  # the last is constant
+    features = [
+        FeatureError(name=f"obs_{i}", unit="", mse=NOTHING, rmse_physical=NOTHING, r2=each)
+        for i, each in enumerate(r2)
+    ]
+    loses = {"mse": NOTHING, "pca_mse": NOTHING, "ratio_to_pca": None, "features": features}
+    lost = Reconstruction(**loses, quantiles={}, worst_episodes=[])
     encoders = {
-        name: {
-            **{"kind": kind, "latent": 348, "corruption": []},
-            "reconstruction": {"features": features, "mse": [0.1, 0.1, 0.1], "pca_mse": [0.1]},
-            "latent_units": {"correlation": correlation},
-        }
+        name: diagnostics(348, kind=kind, reconstruction=lost, corruption=[])
         for name, kind in (("dae-348", "dae"), ("raw", "identity"))
     }
-    evaluation = {"data": {"task": "Humanoid-v5"}, "encoders": encoders}
-    by_feature, correlations = encoder_plots(evaluation)
+    by_feature, correlations = encoder_plots(evaluation(encoders, "Humanoid-v5"))
     assert len(by_feature.rows) == 2 * 348
     assert "Of 348 features the 40 worst are shown; all are in the table." in by_feature.caption
     figure = drawn(by_feature)
@@ -523,17 +525,11 @@ def test_the_task_of_a_policy_is_needed_and_no_data_set():
 
 
 def scores(quality):
-    """Diagnostics of an encoder's predictions, as evaluation.json has them."""
-    three = [quality, quality - 0.02, quality + 0.02]
-    nothing = [None, None, None]
-    return {
-        steps: {
-            "features": {"yaw": three, "still": nothing},
-            "mean": three,
-            "reward": [quality / 2, None, None],
-        }
-        for steps in ("1", "5", "20")
-    }
+    """How well an encoder predicts, by the steps ahead."""
+    three = Score(quality, quality - 0.02, quality + 0.02)
+    known = {"features": {"yaw": three, "still": NOTHING}, "mean": three}
+    reward = Score(quality / 2, None, None)
+    return {steps: Prediction(**known, reward=reward, rewarded=None) for steps in ("1", "5", "20")}
 
 
 @pytest.fixture(scope="module")
@@ -551,14 +547,10 @@ def of_methods():
         "forward-2-s1": ("forward", 2, 0.7, {**losses, "loss_by_horizon": parts}),
     }
     encoders = {
-        label: {
-            **{"kind": kind, "latent": latent, "reconstruction": None, "method": method},
-            "latent_units": {"correlation": np.eye(latent).tolist()},
-            "prediction": scores(quality),
-        }
+        label: diagnostics(latent, kind=kind, method=method, prediction=scores(quality))
         for label, (kind, latent, quality, method) in methods.items()
     }
-    return {p.name: p for p in encoder_plots({"data": {"task": "x"}, "encoders": encoders})}
+    return {plot.name: plot for plot in encoder_plots(evaluation(encoders))}
 
 
 def test_methods_and_predictions_have_figures(of_methods):
@@ -614,7 +606,7 @@ def test_losses_stand_by_term_and_divergences_by_unit():
         "deepmdp-8": {"loss_by_term": {"reward": 0.3, "transition": 0.01}},
         "vae-2": {"divergence": [0.1, 2.0]},
     }
-    terms, units = method_plots("x", {n: {"latent": 2, "method": m} for n, m in methods.items()})
+    terms, units = method_plots("x", {n: diagnostics(2, method=m) for n, m in methods.items()})
     assert terms.rows == [("deepmdp-8", "reward", 0.3), ("deepmdp-8", "transition", 0.01)]
     assert units.rows == [("vae-2", "1", 2.0), ("vae-2", "2", 0.1)]
     (line,) = drawn(units).axes[0].lines

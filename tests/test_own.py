@@ -11,6 +11,7 @@ import torch
 from command import jbrep
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from judged import diagnostics
 from rerun.chunk import RrdReader
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
@@ -24,9 +25,9 @@ from jbrep.encoders.code import import_code
 from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.evaluate import diagnose
-from jbrep.evaluate.summary import evaluation_text
 from jbrep.inspection import inspect
 from jbrep.jitterbug import JitterbugEnv
+from jbrep.report.evaluation import evaluation_text
 from jbrep.report.figures import encoder_plots
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, ENCODER, RUN
@@ -291,15 +292,14 @@ def test_code_is_shown_as_far_as_it_is_known_and_not_exported(tmp_path):
 def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
     data = wide([300, 250, 99, 180], features=4)
     evaluation = diagnose({"half": Half(), "whole": Whole(), "module": nn.Linear(4, 6)}, data)
-    json.dumps(evaluation, allow_nan=False)
-    assert evaluation["seen"] == dict.fromkeys(("half", "whole", "module"), "maybe")
-    own = evaluation["encoders"]
-    assert [own["half"][name] for name in ("reconstruction", "corruption")] == [None, None]
-    assert all(own["half"][n] for n in ("latent_units", "probes", "neighbours", "dynamics"))
-    assert own["whole"]["reconstruction"]["mse"][0] < 1e-9
-    probe = own["whole"]["probes"]["obs_1"][0]
-    assert probe == pytest.approx(own["full"]["probes"]["obs_1"][0], rel=1e-6)
-    assert (own["module"]["kind"], own["module"]["latent"]) == ("own", 6)
+    assert evaluation.seen == dict.fromkeys(("half", "whole", "module"), "maybe")
+    own = evaluation.encoders
+    assert own["half"].reconstruction is own["half"].corruption is None
+    assert own["half"].dynamics.linear.value is not None
+    assert own["whole"].reconstruction.mse.value < 1e-9
+    probe = own["whole"].probes["obs_1"].value
+    assert probe == pytest.approx(own["full"].probes["obs_1"].value, rel=1e-6)
+    assert (own["module"].kind, own["module"].latent) == ("own", 6)
     shown = evaluation_text(evaluation)
     assert re.search(r"^half +2( +-){5} *$", shown.partition("\n\n")[2], re.MULTILINE)
     plots = {plot.name: plot for plot in encoder_plots(evaluation)}
@@ -307,7 +307,7 @@ def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
     assert {row[0] for row in plots["latent_correlation"].rows} == {"half", "whole", "module"}
     for plot in plots.values():
         plot.draw()
-    alone = {**evaluation, "encoders": {n: own[n] for n in ("full", "half")}}
+    alone = evaluation.replace(encoders={n: own[n] for n in ("full", "half")})
     assert [plot.name for plot in encoder_plots(alone)] == [
         "prediction_by_feature",
         "prediction_by_horizon",
@@ -316,9 +316,10 @@ def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
 
 
 def test_evaluate_takes_code(tmp_path, monkeypatch):
-    probes = {"nonlinear_probes": lambda encoder, held_out: {}}
-    monkeypatch.setattr("jbrep.evaluate.evaluation._DIAGNOSTICS", probes)
-    monkeypatch.setattr("jbrep.evaluate.summary.evaluation_text", lambda *given: "")
+    monkeypatch.setattr(
+        "jbrep.evaluate.diagnosis._side_by_side",
+        lambda encoders, *given: ({name: diagnostics() for name in encoders}, {}),
+    )
     monkeypatch.setattr("jbrep.report.figures.encoder_plots", lambda evaluation: [])
     chosen = ("--encoder", "test_own:Half", "test_own:make_half", "dae-8")
     command = ("evaluate", "--data", "data/sample/face_direction", "--out", tmp_path, *chosen)

@@ -1,6 +1,5 @@
 """Whether codes serve a controller: on a made-up robot of which all is known."""
 
-import json
 import re
 from types import SimpleNamespace
 
@@ -15,12 +14,10 @@ from jbrep.dataset.scaling import wrapped
 from jbrep.encoders import Encoder, Layer
 from jbrep.errors import InputError
 from jbrep.evaluate import diagnose, regression
-from jbrep.evaluate.explained import explained
-from jbrep.evaluate.headline import SCALARS, headline
-from jbrep.evaluate.held_out import HeldOut
-from jbrep.evaluate.need import lost, needs
-from jbrep.evaluate.networks import networks
-from jbrep.evaluate.policy import GoodPolicy, PlayedEpisode, returns_to_go
+from jbrep.evaluate.control import GoodPolicy, PlayedEpisode, lost, needs, returns_to_go
+from jbrep.evaluate.diagnosis import networks
+from jbrep.evaluate.evaluation import Lost, Score
+from jbrep.evaluate.held_out import HeldOut, explained
 from jbrep.evaluate.prediction import (
     Steps,
     changes,
@@ -31,10 +28,10 @@ from jbrep.evaluate.prediction import (
 )
 from jbrep.evaluate.readout import nonlinear_probes, probes
 from jbrep.evaluate.regression import Problem, beside, fit
-from jbrep.evaluate.summary import evaluation_text
-from jbrep.evaluate.truth import in_words
+from jbrep.evaluate.table import headline
 from jbrep.play.good_policy import find_good_policy
 from jbrep.records.record import to_plain
+from jbrep.report.evaluation import evaluation_text, in_words
 
 NAMES = ("place", "speed", "load", "idle")
 STEPS, EPISODES = 60, 200
@@ -99,7 +96,7 @@ def learning():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jbrep.evaluate.prediction.HORIZONS", (1, 5, 10))
         patch.setattr(regression, "_STEPS", 400)
-        patch.setattr("jbrep.evaluate.policy._SHARE", 1.0)
+        patch.setattr("jbrep.evaluate.control._SHARE", 1.0)
         yield
 
 
@@ -139,65 +136,55 @@ def evaluation(held_out, policy):
 
 
 def test_a_code_loses_the_feature_that_it_drops_by_name(evaluation):
-    lost_by = {n: [e["name"] for e in d["loses"]] for n, d in evaluation["encoders"].items()}
+    lost_by = {n: [e.name for e in d.loses] for n, d in evaluation.encoders.items()}
     assert lost_by["full"] == lost_by["without idle"] == []
     assert lost_by["without load"] == ["load"]
     assert set(lost_by["noise"]) == set(NAMES[:3])
-    assert evaluation["needs"]["idle"] < 0.1
+    assert evaluation.needs["idle"] < 0.1
 
 
 def test_what_is_dropped_shows_where_it_matters(evaluation):
-    everything = {n: headline(d) for n, d in evaluation["encoders"].items()}
+    everything = {n: headline(d) for n, d in evaluation.encoders.items()}
     full = everything.pop("full")
     for scalars in everything.values():
         for name in ("forward", "reward", "value", "action"):
-            assert scalars[name][0] < full[name][0] + 0.03, name
+            assert scalars[name] < full[name] + 0.03, name
     for name in ("reward", "value", "action"):
-        assert everything["without idle"][name][0] > full[name][0] - 0.03
-        assert abs(everything["noise"][name][0]) < 0.1
-    assert everything["without load"]["action"][0] < 0.1 < 0.9 < full["action"][0]
-    changes = evaluation["encoders"]["without idle"]["prediction"]["10"]["features"]
+        assert everything["without idle"][name] > full[name] - 0.03
+        assert abs(everything["noise"][name]) < 0.1
+    assert everything["without load"]["action"] < 0.1 < 0.9 < full["action"]
+    changes = evaluation.encoders["without idle"].prediction["10"].features
     assert changes["idle"][0] < 0.1 < changes["speed"][0]
     assert full["times_pca"] is None
-    assert full["value"][1] < full["value"][0] < full["value"][2]
+    value, low, high = evaluation.encoders["full"].value
+    assert low < value < high
 
 
 def test_what_the_reward_depends_on_counts_by_how_much_it_does(evaluation, held_out, policy):
     full = Encoder({"kind": "identity", "name": "full"}, held_out.data.scaler, (), ())
-    weights = dict(zip(NAMES, needs(full, held_out, policy).reward, strict=True))
+    learnt = networks(full, held_out, policy)
+    weights = dict(zip(NAMES, needs(full, held_out, policy, learnt).reward, strict=True))
     assert max(weights, key=weights.get) == "place"
-    for entry in evaluation["encoders"].values():
-        told = entry["prediction"]["10"]
-        expected = sum(weights[n] * told["features"][n][0] for n in NAMES) / sum(weights.values())
-        assert told["rewarded"][0] == pytest.approx(expected, rel=1e-4)
+    for entry in evaluation.encoders.values():
+        told = entry.prediction["10"]
+        expected = sum(weights[n] * told.features[n][0] for n in NAMES) / sum(weights.values())
+        assert told.rewarded[0] == pytest.approx(expected, rel=1e-4)
 
 
-def test_an_evaluation_is_told_in_one_screen_and_in_older_files_as_before(evaluation):
-    evaluation = json.loads(json.dumps(evaluation))
+def test_an_evaluation_is_told_in_one_screen(evaluation):
     shown = evaluation_text(evaluation, 80)
     first = shown.partition("Error on")[0]
     assert max(map(len, shown.splitlines())) <= 80
     assert len(first.splitlines()) < 30
     assert re.search(r"without load +load \((<0|0\.\d\d)\)\nwithout idle +nothing", first)
-    assert evaluation["encoders"]["without load"]["method"] == {"spectrum": [3.0, 1.0]}
-    assert evaluation["format_version"] == 2
-    del evaluation["needs"], evaluation["policy"]
-    added = "prediction", "value", "action", "nonlinear_probes", "loses", "method"
-    for diagnostics in evaluation["encoders"].values():
-        for name in added:
-            del diagnostics[name]
-    assert evaluation_text(evaluation, 80) == shown[len(first) :]
-    old = headline(evaluation["encoders"]["without load"])
-    assert old.keys() == SCALARS.keys()
-    assert old["forward"] is None
-    assert old["gtc"][0] > 0
+    assert evaluation.encoders["without load"].method == {"spectrum": [3.0, 1.0]}
 
 
 def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkeypatch):
     monkeypatch.setattr(regression, "_STEPS", 2)
     result = diagnose({"it": code(held_out.data, "place")}, held_out.data)
-    assert result["policy"] is None
-    assert all(d["value"] is d["action"] is None for d in result["encoders"].values())
+    assert result.policy is None
+    assert all(d.value is d.action is None for d in result.encoders.values())
     assert "return to go" not in evaluation_text(result)
     assert find_good_policy(None, held_out.data.task) is None
     cut = [PlayedEpisode(np.zeros((101, 4), np.float32), np.ones(100), False)] * 5
@@ -242,9 +229,7 @@ def test_r_squared_and_interval_by_episode(held_out):
     rows = held_out.data.test
     true = held_out.data.dataset["observation"][rows]
     predicted = true + np.random.default_rng(0).normal(size=true.shape) * [0.1, 1, 2, 0]
-    *parts, mean = explained(
-        predicted, true, rows, held_out, [1, 1, 2], [np.array([1, 1, 0])]
-    ).tolist()
+    *parts, mean = explained(predicted, true, rows, held_out, [1, 1, 2], [np.array([1, 1, 0])])
     expected = [r2_score(true[:, i].astype(float), predicted[:, i]) for i in (0, 1)]
     assert [part[0] for part in parts[:2]] == pytest.approx(expected)
     assert mean[0] == pytest.approx(np.mean(expected))
@@ -330,12 +315,12 @@ def test_nonlinear_probes_read_what_linear_ones_cannot(held_out):
 
 def test_needs_pass_from_what_is_rewarded_to_what_moves_it(held_out):
     full = code(held_out.data, *NAMES)
-    needed = needs(full, held_out, None).controller
+    needed = needs(full, held_out, None, networks(full, held_out)).controller
     assert min(needed[name] for name in NAMES[:3]) > 0.1 > needed["idle"]
-    assert lost({"a": 0.5, "b": 0.9, "c": 0.05}, {n: [0.2, 0, 1] for n in "abc"}) == [
-        {"name": "b", "kept": 0.2, "need": 0.9},
-        {"name": "a", "kept": 0.2, "need": 0.5},
-    ]
+    assert lost({"a": 0.5, "b": 0.9, "c": 0.05}, dict.fromkeys("abc", Score(0.2, 0, 1))) == (
+        Lost(name="b", kept=0.2, need=0.9),
+        Lost(name="a", kept=0.2, need=0.5),
+    )
 
 
 def test_features_have_names_for_readers():

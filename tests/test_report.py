@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from jbrep.encoders import find, save
-from jbrep.encoders.diagnostics import DIAGNOSTICS, Diagnosed, write_diagnostics
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.evaluate.headline import SCALARS
+from jbrep.evaluate.table import DIAGNOSTICS, SCALARS, Diagnosed, write_diagnostics
 from jbrep.play.sources import find_episode
 from jbrep.records.tables import write_csv
 from jbrep.report import report, write_report
@@ -322,8 +321,7 @@ def test_diagnostics_are_set_against_returns_where_they_are_known(whole, tmp_pat
     """As a table of the page and of the summary, and as a figure."""
     named_otherwise(whole, tmp_path / "study", "dae-8")
     rows = [
-        Diagnosed("face_direction", name, "0", {"forward": 0.1 * i, "unknown": 1.0})
-        for i, name in enumerate(FINAL)
+        Diagnosed("face_direction", name, "0", {"forward": 0.1 * i}) for i, name in enumerate(FINAL)
     ]
     write_diagnostics(tmp_path / "study" / DIAGNOSTICS, rows)
     plots = []
@@ -335,7 +333,6 @@ def test_diagnostics_are_set_against_returns_where_they_are_known(whole, tmp_pat
     row = ("forward", SCALARS["forward"].words, "-", "3")  # three codes are too few to correlate
     assert f"| {' | '.join(row)} |" in text.read_text()
     assert "do diagnostics predict learning?" in page.read_text()
-    assert "unknown" not in page.read_text()
     assert "do diagnostics predict learning?" not in (whole / PAGE).read_text()
 
 

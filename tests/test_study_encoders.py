@@ -5,23 +5,24 @@ import json
 import shutil
 import tomllib
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import onnx
 import pytest
 import torch
 from command import jbrep
+from judged import diagnostics, evaluation, prediction
 from my_encoders import LATENT, SIZE, FirstFeatures, dense
 from onnx import helper, numpy_helper
 
 from jbrep.dataset import Dataset
 from jbrep.encoders import find, load, save
-from jbrep.encoders.diagnostics import DIAGNOSTICS, read_diagnostics
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
 from jbrep.errors import DamageError, InputError
-from jbrep.evaluate.files import write
+from jbrep.evaluate.diagnosis import hashes
+from jbrep.evaluate.evaluation import EVALUATION
+from jbrep.evaluate.table import DIAGNOSTICS, read_diagnostics
 from jbrep.report.facts import encoder_rows, outline, reproduce
 from jbrep.report.figures.diagrams import autoencoders
 from jbrep.report.figures.style import styles
@@ -218,32 +219,28 @@ def test_diagnostics_are_matched_by_the_encoders(done, tmp_path):
     assert add_diagnostics(folder) == lines
     with pytest.raises(InputError, match=r"no evaluation in .*none: jbrep evaluate makes one"):
         add_diagnostics(folder, [str(tmp_path / "none")])
-    write_evaluation(tmp_path / "bad", {"a": (shas["mine"][0], "many")})
-    with pytest.raises(DamageError, match=r"bad/evaluation\.json is damaged: 'many' is no number"):
-        add_diagnostics(folder, [str(tmp_path / "bad")])
+    damaged = tmp_path / "later" / EVALUATION
+    damaged.write_text(damaged.read_text().replace("0.25", '"many"'))
+    with pytest.raises(DamageError, match=r"encoders\[a\].prediction\[10\].mean.* is 'many'"):
+        add_diagnostics(folder, [str(tmp_path / "later")])
 
 
-def test_an_evaluation_knows_code_by_the_hash_of_its_runs(done, tmp_path, monkeypatch):
-    empty = {"encoders": {"dense": {}, "net": {}}}
-    monkeypatch.setattr("jbrep.evaluate.files.diagnose", lambda *_: empty)
+def test_an_evaluation_knows_code_by_the_hash_of_its_runs(done):
     own = {"dense": DENSE["code"], "net": CODE["code"]}  # kept as a file, and not
-    evaluation = write(own, SimpleNamespace(task=SHARED["task"]), tmp_path)
+    known = hashes({name: find(code, SHARED["task"]) for name, code in own.items()})
     for cell in done.cells:
         if (name := cell.representation.name) in own:
-            used = read_run(done.folder_of(cell))["settings"]["encoder"]
-            assert evaluation["encoders"][name]["sha256"] == used
+            assert read_run(done.folder_of(cell))["settings"]["encoder"] == known[name]
 
 
 def write_evaluation(folder, forward):
     """An evaluation of encoders, by label: their SHA-256, and one number."""
     folder.mkdir()
-    entries = {
-        label: {"prediction": {"10": {"mean": [each, None, None]}}}
-        | ({"sha256": sha} if sha else {})
+    encoders = {
+        label: diagnostics(prediction={"10": prediction(each)}, sha256=sha)
         for label, (sha, each) in forward.items()
     }
-    header = {"format": "jbrep evaluation", "format_version": 1, "data": {"task": TASK}}
-    (folder / "evaluation.json").write_text(json.dumps({**header, "encoders": entries}))
+    evaluation(encoders, TASK).write(folder / EVALUATION)
 
 
 def test_a_study_names_evaluations(done, tmp_path):

@@ -6,7 +6,6 @@ resumes. Without a task it only prints the overview of RESULTS. See --help.
 """
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
@@ -16,16 +15,16 @@ from typing import Any
 
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import FULL, load
-from jbrep.encoders.diagnostics import DIAGNOSTICS, Diagnosed, write_diagnostics
 from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import SUFFIX
 from jbrep.envs.task import Task
-from jbrep.evaluate.evaluation import FORMAT_VERSION
-from jbrep.evaluate.files import EVALUATION
-from jbrep.evaluate.headline import headline
-from jbrep.evaluate.summary import evaluation_text
+from jbrep.errors import InputError
+from jbrep.evaluate.evaluation import EVALUATION, Diagnostics, Evaluation
+from jbrep.evaluate.table import DIAGNOSTICS, Diagnosed, headline, write_diagnostics
 from jbrep.methods.fit import Fitter
 from jbrep.methods.registry import get_method, name_of
+from jbrep.records.document import read_document
+from jbrep.report.evaluation import evaluation_text
 from jbrep.study.diagnostics import evaluated
 
 SHIPPED = Path(__file__).parent.parent / "jbrep" / "encoders" / "shipped"
@@ -82,17 +81,16 @@ def evaluate(files: list[Path], data: Path, results: Path) -> None:
         (results / EVALUATION).unlink(missing_ok=True)
         options = ("--encoder", *map(str, files), "--data", str(data), "--out", str(results))
         subprocess.run([sys.executable, "-m", "jbrep", "evaluate", *options], check=True)
-    text = evaluation_text(json.loads((results / EVALUATION).read_text()))
+    text = evaluation_text(read_document(results / EVALUATION, Evaluation))
     (results / "tables.txt").write_text(text + "\n")
 
 
 def is_current(path: Path, hashes: set[str]) -> bool:
     """Whether an evaluation is of these encoders, by all diagnostics that there are now."""
-    if not path.exists():
+    try:
+        return {*read_document(path, Evaluation).hashes.values()} == hashes
+    except InputError:
         return False
-    there = json.loads(path.read_text())
-    judged = {entry.get("sha256") for label, entry in there["encoders"].items() if label != FULL}
-    return there["format_version"] == FORMAT_VERSION and judged == hashes
 
 
 def ship(task: Task, files: list[Path], kinds: list[str], results: Path) -> None:
@@ -119,7 +117,7 @@ def ship(task: Task, files: list[Path], kinds: list[str], results: Path) -> None
 def overview(results: Path) -> str:
     """A table by task: R² of the change of what is rewarded, and error over PCA's."""
     files = sorted(results.glob(f"*/{EVALUATION}"))
-    tasks = {file.parent.name: json.loads(file.read_text())["encoders"] for file in files}
+    tasks = {file.parent.name: read_document(file, Evaluation).encoders for file in files}
     lines = [f"| | {' | '.join(tasks)} |", "|---" * (len(tasks) + 1) + "|"]
     for name in dict.fromkeys(name for encoders in tasks.values() for name in encoders):
         cells = [_cell(encoders[name]) if name in encoders else "-" for encoders in tasks.values()]
@@ -127,10 +125,10 @@ def overview(results: Path) -> str:
     return "\n".join(lines)
 
 
-def _cell(encoder: dict[str, Any]) -> str:
-    told = headline(encoder)
-    known = [told[name][0] for name in ("rewarded", "times_pca") if told[name]]
-    return ", ".join(f"{value:.2f}" for value in known) or "-"
+def _cell(known: Diagnostics) -> str:
+    told = headline(known)
+    shown = [told[name] for name in ("rewarded", "times_pca")]
+    return ", ".join(f"{value:.2f}" for value in shown if value is not None) or "-"
 
 
 def main() -> None:

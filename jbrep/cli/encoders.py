@@ -1,5 +1,6 @@
 """Judging and looking at encoders."""
 
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -62,9 +63,10 @@ def evaluate(
     from jbrep.encoders.card import arguments_of
     from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import source_of
-    from jbrep.evaluate.files import EVALUATION, write
-    from jbrep.evaluate.summary import evaluation_text
+    from jbrep.evaluate.diagnosis import write
+    from jbrep.evaluate.evaluation import EVALUATION
     from jbrep.play.good_policy import find_good_policy
+    from jbrep.report.evaluation import evaluation_text
     from jbrep.report.figures import encoder_plots
     from jbrep.report.figures import write as write_plots
 
@@ -84,7 +86,7 @@ def evaluate(
         line = source if source.startswith(label) else f"{label}: {source}"
         arguments = arguments_of(labelled[label].task)
         click.echo(printable(f"{line}, made with {arguments}" if arguments else line), err=as_json)
-    for label, seen in evaluation["seen"].items():
+    for label, seen in evaluation.seen.items():
         if seen == "maybe":
             click.echo(
                 printable(
@@ -94,7 +96,7 @@ def evaluate(
                 err=as_json,
             )
     if as_json:
-        return echo_json(evaluation)
+        return echo_json(evaluation.as_json())
     click.echo(f"\n{evaluation_text(evaluation, terminal_width())}")
     return echo_paths((out / EVALUATION, *pictures))
 
@@ -128,17 +130,21 @@ def list_shipped(task: str | None, as_json: bool) -> None:
 
     A dash stands for what isn't known; jbrep evaluate finds out.
     """
-    from jbrep.encoders.card import listed
     from jbrep.encoders.encoder import FULL, IDENTITY
-    from jbrep.encoders.shipped import shipped
-    from jbrep.evaluate.headline import SCALARS
+    from jbrep.encoders.shipped import shipped, shipped_folder
+    from jbrep.evaluate.table import DIAGNOSTICS, SCALARS, read_diagnostics
     from jbrep.jitterbug.tasks import TASKS
     from jbrep.methods.registry import METHODS
-    from jbrep.text import facts
+    from jbrep.text import facts, r2_text, table
 
     if task is not None and task not in TASKS:
         raise InputError(f"no encoder ships for {task}: only for {', '.join(TASKS)}")
-    ships = {name: shipped(TASKS[name].describe()) for name in ([task] if task else TASKS)}
+    tasks = {name: TASKS[name].describe() for name in ([task] if task else TASKS)}
+    ships = {name: shipped(each) for name, each in tasks.items()}
+    rows = chain.from_iterable(
+        read_diagnostics(shipped_folder(each) / DIAGNOSTICS) for each in tasks.values()
+    )
+    known = {row.sha256: row.values for row in rows}
     if as_json:
         return echo_json(
             {
@@ -147,17 +153,22 @@ def list_shipped(task: str | None, as_json: bool) -> None:
                         "name": called,
                         **{key: getattr(each, key) for key in ("kind", "size", "latent_size")},
                         "sha256": each.fingerprint,
-                        "diagnostics": dict(told),
+                        "diagnostics": dict(known.get(each.fingerprint, {})),
                     }
-                    for called, each, told in encoders
+                    for called, each in encoders.items()
                 ]
                 for name, encoders in ships.items()
             }
         )
     width = terminal_width()
     for name, encoders in ships.items():
-        click.echo(f"{name}\n{listed(encoders, _COLUMNS, width)}\n")
-    kinds = dict.fromkeys(each.encoder.kind for encoders in ships.values() for each in encoders)
+        lines = [
+            (called, str(each.latent_size), *(r2_text(numbers.get(n)) for n in _COLUMNS))
+            for called, each in encoders.items()
+            for numbers in [known.get(each.fingerprint, {})]
+        ]
+        click.echo(f"{name}\n{table(('encoder', 'l', *_COLUMNS.values()), lines, width)}\n")
+    kinds = dict.fromkeys(each.kind for encoders in ships.values() for each in encoders.values())
     words = {FULL if kind == IDENTITY else kind: METHODS[kind].words() for kind in kinds}
     columns = {title: SCALARS[name].words for name, title in _COLUMNS.items()}
     columns["error"] = "squared error of the reconstruction, as a multiple of PCA's"

@@ -1,15 +1,14 @@
 """An encoder's card: what it is, where it comes from, what it reads."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.layers import Layer
-from jbrep.encoders.shipped import Shipped
 from jbrep.envs.task import Task
-from jbrep.text import facts, r2_text, table
+from jbrep.text import facts, table
 
 _RECORDS = ("training", "data", "metrics", "versions")
 
@@ -77,21 +76,6 @@ def card(encoder: BaseEncoder, source: str, width: int) -> str:
         for feature, f in zip(encoder.task.features, told["features"], strict=True)
     ]
     return f"{encoder.name}\n{facts(lines, width)}\n\n{table(('feature', 'low', 'high'), rows)}"
-
-
-def listed(ships: Sequence[Shipped], columns: Mapping[str, str], width: int) -> str:
-    """A line for each encoder that ships for a task: its size, and numbers of its evaluation.
-
-    Args:
-        ships: the encoders.
-        columns: titles of the numbers that are shown, by their names.
-        width: to fit [columns].
-    """
-    rows = [
-        (name, str(encoder.latent_size), *(r2_text(told.get(each)) for each in columns))
-        for name, encoder, told in ships
-    ]
-    return table(("encoder", "l", *columns.values()), rows, width)
 
 
 def arguments_of(task: Task) -> str:

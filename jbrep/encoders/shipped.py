@@ -1,12 +1,10 @@
 """Encoders by name: those that ship with the package, and the whole observation of any task."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from jbrep.encoders.base import BaseEncoder, as_encoder
 from jbrep.encoders.code import is_code, make
-from jbrep.encoders.diagnostics import DIAGNOSTICS, read_diagnostics
 from jbrep.encoders.encoder import FULL, IDENTITY, Encoder
 from jbrep.encoders.file import SUFFIX, load
 from jbrep.encoders.identity import SCALINGS, identity
@@ -23,7 +21,7 @@ def names(task: Task) -> tuple[str, ...]:
 
     `full` is the identity, whose file is called after its kind.
     """
-    stems = (path.name.removesuffix(SUFFIX) for path in (_FOLDER / task.slug).glob(f"*{SUFFIX}"))
+    stems = (path.name.removesuffix(SUFFIX) for path in shipped_folder(task).glob(f"*{SUFFIX}"))
     shown = (FULL if stem == IDENTITY else stem for stem in stems)
     return tuple(sorted(shown, key=lambda name: EncoderName.parse(name).order))
 
@@ -93,26 +91,19 @@ def source_of(name: str | Path, task: Task | None) -> str:
     return f"{name}, shipped" if task and _shipped(name, task) else str(name)
 
 
-class Shipped(NamedTuple):
-    """An encoder that ships."""
-
-    name: str
-    encoder: Encoder
-    diagnostics: Mapping[str, float | None]  # see `jbrep.encoders.diagnostics`; empty if unknown
-
-
-def shipped(task: Task) -> list[Shipped]:
-    """The encoders that ship for a task, the whole observation first.
+def shipped(task: Task) -> dict[str, Encoder]:
+    """The encoders that ship for a task, by their names, the whole observation first.
 
     Raises:
         DamageError: a file is damaged.
     """
-    table = _FOLDER / task.slug / DIAGNOSTICS
-    rows = read_diagnostics(table) if exists(table) else []
-    known = {row.sha256: row.values for row in rows}
     ordered = sorted(names(task), key=lambda name: name != FULL)
-    loaded = {name: load(_file(name, task)) for name in ordered}
-    return [Shipped(name, e, known.get(e.fingerprint, {})) for name, e in loaded.items()]
+    return {name: load(_file(name, task)) for name in ordered}
+
+
+def shipped_folder(task: Task) -> Path:
+    """Where those files are, if any ships."""
+    return _FOLDER / task.slug
 
 
 def _is_made(name: str | Path, task: Task) -> bool:
@@ -127,4 +118,4 @@ def _shipped(name: str | Path, task: Task) -> Path | None:
 
 
 def _file(name: str, task: Task) -> Path:
-    return _FOLDER / task.slug / f"{IDENTITY if name == FULL else name}{SUFFIX}"
+    return shipped_folder(task) / f"{IDENTITY if name == FULL else name}{SUFFIX}"

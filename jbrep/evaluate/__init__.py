@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jbrep.evaluate.evaluation import diagnose
+    from jbrep.evaluate.diagnosis import diagnose
 
 __all__ = ["diagnose"]
 
@@ -11,6 +11,6 @@ __all__ = ["diagnose"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from jbrep.evaluate import evaluation  # imports scikit-learn, which statistics do without
+    from jbrep.evaluate import diagnosis  # imports scikit-learn, which statistics do without
 
-    return getattr(evaluation, name)
+    return getattr(diagnosis, name)

@@ -1,184 +1,207 @@
-"""Encoders side by side on the held-out part of a data set."""
+"""What is known of encoders from held-out episodes: the file evaluation.json."""
 
-import os
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+import json
+import re
+from typing import Any, ClassVar, Literal, NamedTuple
 
-import numpy as np
+from jbrep.records.document import Document
+from jbrep.records.record import Record
+from jbrep.stats.bootstrap import Interval
 
-from jbrep.dataset import ScaledDataset
-from jbrep.dataset.scaled import sample
-from jbrep.dataset.settings import IMPORTED
-from jbrep.encoders import FULL, Encoder, find
-from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.encoder import IDENTITY
-from jbrep.errors import InputError
-from jbrep.evaluate.held_out import HeldOut
-from jbrep.evaluate.latent import latent
-from jbrep.evaluate.need import Needs, lost, needs
-from jbrep.evaluate.networks import Networks, networks
-from jbrep.evaluate.policy import GoodPolicy, action, value
-from jbrep.evaluate.prediction import prediction
-from jbrep.evaluate.readout import correlation, dynamics, neighbours, nonlinear_probes, probes
-from jbrep.evaluate.reconstruction import corruption, reconstruction
-from jbrep.progress import Progress
-from jbrep.stats.bootstrap import RESAMPLES
-from jbrep.training.trainer import single_torch_thread
-
-FORMAT = "jbrep evaluation"
-FORMAT_VERSION = 2
-_Diagnostic = Callable[[BaseEncoder, HeldOut], Any]
-_DIAGNOSTICS: dict[str, _Diagnostic] = {
-    "reconstruction": reconstruction,
-    "corruption": corruption,
-    "latent_units": latent,
-    "probes": probes,
-    "neighbours": neighbours,
-    "correlation": correlation,
-    "dynamics": dynamics,
-}
-_DECODING = ("reconstruction", "corruption")  # None of an encoder that doesn't decode
+EVALUATION = "evaluation.json"
+_DIGITS = 6
 
 
-def diagnose(
-    encoders: Mapping[str, Any], data: ScaledDataset, policy: GoodPolicy | None = None
-) -> dict[str, Any]:
-    """Every diagnostic of every encoder, as plain JSON; docs/encoders.md describes each.
+class Score(NamedTuple):
+    """A value with its 95 % bootstrap interval over episodes; None where it isn't defined."""
 
-    The full observation comes first, as the upper limit of what can be kept. A value with an
-    interval is [value, low, high], a 95 % bootstrap interval over episodes. Errors are those of
-    features scaled by this data set's extrema, whatever the encoder's own scaling. What needs
-    decoding is None for an encoder that can't decode.
-
-    Args:
-        encoders: by the label to show; whatever `jbrep.encoders.find` takes, such as a torch
-            module.
-        data: to judge them on; encoders that were trained on this data set haven't seen its test
-            part.
-        policy: that does the task well; what encoders say of its actions and its value is None
-            without one.
-
-    Raises:
-        InputError: an encoder made for other features, or whose numbers overflow; or as `find`.
-    """
-    held_out = HeldOut(data)
-    judged = {label: find(each, data.task) for label, each in encoders.items()}
-    for label, encoder in judged.items():
-        _check(label, encoder, data)
-    full = Encoder({"kind": IDENTITY, "name": FULL}, data.scaler, (), ())
-    everything: dict[str, BaseEncoder] = {FULL: full, **judged}
-    results, needed = _side_by_side(everything, held_out, policy)
-    return {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "data": _describe(held_out),
-        "resamples": RESAMPLES,
-        "seen": {label: seen(encoder, data) for label, encoder in judged.items()},
-        "policy": policy and policy.name,
-        "needs": needed,
-        "encoders": results,
-    }
+    value: float | None
+    low: float | None
+    high: float | None
 
 
-def _side_by_side(
-    encoders: Mapping[str, BaseEncoder], held_out: HeldOut, policy: GoodPolicy | None
-) -> tuple[dict[str, dict[str, Any]], dict[str, float]]:
-    """What is said of each encoder, as many at a time as there are cores, and what is needed.
-
-    What is needed comes first, the full observation last: they share its networks.
-    """
-    with single_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        needed = pool.submit(needs, encoders[FULL], held_out, policy)
-        diagnostics = _diagnostics(policy, needed)
-        with Progress(total=len(encoders) * len(diagnostics), unit="diagnostic") as progress:
-
-            def judge(label: str) -> dict[str, Any]:
-                encoder = encoders[label]
-                told: dict[str, Any] = {"kind": encoder.kind, "latent": encoder.latent_size}
-                for name, diagnostic in diagnostics.items():
-                    progress.set_description_str(f"{label} {name.replace('_', ' ')}", refresh=False)
-                    possible = encoder.can_decode or name not in _DECODING
-                    told[name] = diagnostic(encoder, held_out) if possible else None
-                    progress.update()
-                loses = lost(needed.result().controller, told["nonlinear_probes"])
-                return {**told, "loses": loses, "method": _made(encoder)}
-
-            futures = {label: pool.submit(judge, label) for label in reversed([*encoders])}
-            try:
-                results = {label: futures[label].result() for label in encoders}
-                return results, needed.result().controller
-            finally:
-                pool.shutdown(cancel_futures=True)
-                networks.cache_clear()  # it holds the data set
+Scores = dict[str, Score]  # by name
 
 
-def _diagnostics(policy: GoodPolicy | None, needed: Future[Needs]) -> dict[str, _Diagnostic]:
-    """All of them by name; those of a policy give None where nothing was learnt of it.
-
-    What has to wait for what is needed comes last.
-    """
-
-    def learnt(encoder: BaseEncoder, held_out: HeldOut) -> Networks:
-        return networks(encoder, held_out, policy)
-
-    def controlled(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
-        forward = learnt(encoder, held_out).forward
-        return prediction(encoder, held_out, forward, needed.result().reward)
-
-    def of_policy(name: str, judge: Callable[..., Any]) -> _Diagnostic:
-        def judged(encoder: BaseEncoder, held_out: HeldOut) -> Any:
-            predict = learnt(encoder, held_out).of_policy.get(name)
-            return predict and judge(encoder, held_out, policy, predict)
-
-        return judged
-
-    return {
-        "nonlinear_probes": lambda e, data: nonlinear_probes(e, data, learnt(e, data).probe),
-        **_DIAGNOSTICS,
-        "value": of_policy("value", value),
-        "action": of_policy("action", action),
-        "prediction": controlled,
-    }
+def score(interval: Interval) -> Score:
+    """The score that a bootstrap of one number gives."""
+    return Score(*interval.tolist())
 
 
-def _made(encoder: BaseEncoder) -> dict[str, Any]:
-    """What the method says of its own fit, such as its spectrum."""
-    return dict(encoder.header.get("metrics", {})) if isinstance(encoder, Encoder) else {}
+def scores(interval: Interval) -> list[Score]:
+    """The scores that a bootstrap of n numbers gives."""
+    return [Score(*values) for values in interval.tolist()]
 
 
-def _check(label: str, encoder: BaseEncoder, data: ScaledDataset) -> None:
-    if label == FULL:
-        raise InputError(f"the label {FULL} is reserved for the observation itself: choose another")
-    rows = data.dataset["observation"][sample(data.test, 1000)]
-    with np.errstate(over="ignore", invalid="ignore"):
-        latent = encoder.encode(rows)
-        back = encoder.decode(latent) if encoder.can_decode else latent
-    if not np.isfinite(back).all():
-        raise InputError(f"{label} gives numbers that are not finite: train it again")
+class FeatureError(Record, frozen=True, kw_only=True):
+    """What the reconstruction loses of a feature."""
+
+    name: str
+    unit: str
+    mse: Score  # scaled to [-1, 1]
+    rmse_physical: Score  # in its unit
+    r2: Score
 
 
-def seen(encoder: BaseEncoder, data: ScaledDataset) -> str:
-    """Which of these rows an encoder saw in training: "no test row", "none" or "maybe"."""
-    source = encoder.header["data"] if isinstance(encoder, Encoder) else {}
-    manifest = data.dataset.manifest
-    if source.get("fingerprint") == manifest.fingerprint:
-        return "no test row"
-    kinds = {source.get("policy", {}).get("kind"), manifest.settings.policy["kind"]}
-    if "seed" not in source or IMPORTED in kinds:
-        return "maybe"
-    return "none" if source["seed"] != manifest.settings.seed else "maybe"
+class EpisodeError(Record, frozen=True, kw_only=True):
+    """The mean squared error over an episode, by its number and seed."""
+
+    episode: int
+    seed: int
+    mse: float
 
 
-def _describe(held_out: HeldOut) -> dict[str, Any]:
-    data = held_out.data
-    return {
-        "task": data.task.name,
-        "fingerprint": data.dataset.manifest.fingerprint,
-        "policy": dict(data.dataset.manifest.settings.policy),
-        "seed": data.dataset.manifest.settings.seed,
-        "train_rows": len(data.train),
-        "test_rows": len(data.test),
-        "test_episodes": len(held_out),
-        "constant_features": list(data.constant_features),
-    }
+class Reconstruction(Record, frozen=True, kw_only=True):
+    """Squared errors over all held-out rows, of features scaled to [-1, 1]."""
+
+    mse: Score
+    pca_mse: Score  # of PCA with as many components, fitted on the training part
+    ratio_to_pca: Score | None  # of the errors; None where the latent is as large as the state
+    features: tuple[FeatureError, ...]
+    quantiles: dict[str, float]  # of rows' errors
+    worst_episodes: tuple[EpisodeError, ...]
+
+
+class Corruption(Record, frozen=True, kw_only=True):
+    """Squared errors of clean rows reconstructed from rows with noise."""
+
+    noise: float  # standard deviation, of features scaled to [-1, 1]
+    mse: Score
+    input_mse: float  # of the rows with noise themselves
+    linear_mse: Score  # of the best linear denoiser of the same latent size
+
+
+class IntrinsicDimension(Record, frozen=True, kw_only=True):
+    """How many dimensions a latent fills locally; None where it has too few distinct points."""
+
+    two_nn: float | None
+    mle: float | None
+
+
+class LatentUnits(Record, frozen=True, kw_only=True):
+    """The l units of a latent."""
+
+    mean: tuple[float, ...]
+    variance: tuple[float, ...]
+    dead: tuple[int, ...]  # numbers of units that hardly vary
+    saturation: tuple[float, ...] | None  # share of rows in which a tanh unit is saturated
+    correlation: tuple[tuple[float | None, ...], ...]  # Pearson's, (l, l); None for dead units
+    participation_ratio: float | None
+    intrinsic_dimension: IntrinsicDimension
+
+
+class Neighbours(Record, frozen=True, kw_only=True):
+    """How unlike the states of nearest neighbours in the latent are: 0 to 2, KNN-MSE."""
+
+    mse: Score
+    dimensions: Scores  # of the state
+
+
+class Correlation(Record, frozen=True, kw_only=True):
+    """How directly single units show the state: 0 to 1, the ground-truth correlation (GTC)."""
+
+    mean: Score
+    dimensions: Scores  # of the state, or of a sample of its dimensions
+    state_dimensions: int  # how many there are
+
+
+class Dynamics(Record, frozen=True, kw_only=True):
+    """R^2 of what comes next, by ridge regressions on latent and action."""
+
+    linear: Score  # of the next latent, whitened
+    persistence: Score  # of the next latent, predicted to be this one
+    change: Score  # of the observation's change
+
+
+class Action(Record, frozen=True, kw_only=True):
+    """R^2 of a good policy's action, from the latent."""
+
+    linear: Score
+    nonlinear: Score
+
+
+class Prediction(Record, frozen=True, kw_only=True):
+    """R^2 of what comes so many steps later, from the latent and the actions until then."""
+
+    features: Scores  # of each feature's change
+    reward: Score  # of the mean reward on the way
+    mean: Score  # over the features that change
+    rewarded: Score | None  # the same, weighted by how much the reward depends on each
+
+
+class Lost(Record, frozen=True, kw_only=True):
+    """A feature that a controller needs and that can't be read from the latent."""
+
+    name: str
+    kept: float  # R^2
+    need: float  # 0 to 1
+
+
+class Diagnostics(Record, frozen=True, kw_only=True):
+    """All that is known of an encoder; docs/encoders.md describes each part."""
+
+    kind: str
+    latent: int
+    nonlinear_probes: Scores  # R^2 of each quantity and feature
+    reconstruction: Reconstruction | None  # None of an encoder that doesn't decode
+    corruption: tuple[Corruption, ...] | None  # likewise
+    latent_units: LatentUnits
+    probes: Scores  # R^2 of each quantity, linear
+    neighbours: Neighbours
+    correlation: Correlation
+    dynamics: Dynamics
+    value: Score | None  # R^2 of a good policy's return to go; None if it isn't known
+    action: Action | None  # None without a policy
+    prediction: dict[str, Prediction]  # by the number of steps ahead
+    loses: tuple[Lost, ...]  # the most needed first
+    method: dict[str, Any]  # what the method says of its own fit, such as its spectrum
+    sha256: str | None = None  # of the encoder; None of the full observation
+
+
+class JudgedOn(Record, frozen=True, kw_only=True):
+    """The data set that encoders were judged on, and its parts."""
+
+    task: str
+    fingerprint: str
+    policy: dict[str, Any]
+    seed: int | None
+    train_rows: int
+    test_rows: int
+    test_episodes: int
+    constant_features: tuple[str, ...]
+
+
+class Evaluation(Document, frozen=True, kw_only=True):
+    """Encoders side by side, the full observation first."""
+
+    format: ClassVar[str] = "jbrep evaluation"
+    format_version: ClassVar[int] = 2
+    max_bytes: ClassVar[int] = 1 << 28
+    indent: ClassVar[int] = 1
+
+    data: JudgedOn
+    resamples: int  # of the bootstrap
+    seen: dict[str, Literal["no test row", "none", "maybe"]]  # of these rows in training, by label
+    policy: str | None  # the name of the good policy
+    needs: dict[str, float]  # how much a controller needs each feature, 0 to 1
+    encoders: dict[str, Diagnostics]  # by label
+
+    @property
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of the encoders, by label."""
+        return {name: each.sha256 for name, each in self.encoders.items() if each.sha256}
+
+    def text(self) -> str:
+        """As JSON, with numbers of six digits and each list of numbers on one line."""
+        text = json.dumps(_rounded(self.as_json()), indent=self.indent, allow_nan=False)
+        one_line = re.compile(r"\[[-+.,\deEnul\s]*\]")
+        return one_line.sub(lambda match: " ".join(match[0].split()), text) + "\n"
+
+
+def _rounded(value: Any) -> Any:
+    """Plain JSON with all numbers that have a point in six digits."""
+    if isinstance(value, float):
+        return float(f"{value:.{_DIGITS}g}")
+    if isinstance(value, dict):
+        return {name: _rounded(each) for name, each in value.items()}
+    return [_rounded(each) for each in value] if isinstance(value, list | tuple) else value

@@ -1,16 +1,17 @@
-"""The held-out episodes that encoders are judged on."""
+"""The held-out episodes that encoders are judged on, and R^2 with intervals over episodes."""
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
-from jbrep.stats.bootstrap import Array, by_episode
+from jbrep.evaluate.evaluation import Score, scores
+from jbrep.stats.bootstrap import Array, bootstrap, by_episode, r_squared, variation
 
 Rows = NDArray[np.int64]
 
@@ -89,3 +90,50 @@ class HeldOut:
         """Sums of scaled features and of their squares over each group, (groups, d)."""
         scaled = (chunk.astype(np.float64) for chunk in self.data.chunks(self.data.test))
         return self.sums_of_parts(self.data.test, ((chunk, chunk**2) for chunk in scaled))
+
+
+class Episodes(Protocol):
+    """Rows by episode."""
+
+    def sums(self, rows: NDArray[np.int64], *values: NDArray[Any]) -> list[Array]:
+        """Sums of each array (n, k) over the rows of each episode, (episodes, k)."""
+
+
+def explained(
+    predicted: NDArray[Any],
+    true: NDArray[Any],
+    rows: NDArray[np.int64],
+    episodes: Episodes,
+    widths: Sequence[int] | None = None,
+    means: Sequence[NDArray[Any]] = (),
+) -> list[Score]:
+    """R^2 of each part of predicted columns (n, k); the columns of a part count together.
+
+    Args:
+        predicted: the columns.
+        true: what they should be, (n, k).
+        rows: their rows, (n,).
+        episodes: of the rows, to resample.
+        widths: of the parts; None for all columns as one part.
+        means: weights of the parts, (parts,), in weighted means of those that vary, which come as
+            further parts at the end.
+    """
+    true = np.asarray(true, np.float64)
+    shifted = true - true.mean(axis=0)  # keeps the digits of a small variation
+    sums = episodes.sums(
+        rows, (predicted - true) ** 2, shifted, shifted**2, np.ones((len(rows), 1))
+    )
+    starts = np.cumsum([0, *(widths or [true.shape[1]])])[:-1]
+
+    def statistic(residual: Array, total: Array, squares: Array, n: Array) -> Array:
+        about_mean = variation(total, squares, n)
+        parts = r_squared(*(np.add.reduceat(v, starts, axis=-1) for v in (residual, about_mean)))
+        known = np.isfinite(parts)
+        filled = np.where(known, parts, 0)
+        for weights in means:
+            weight = known @ weights
+            mean = np.where(weight > 0, filled @ weights / np.where(weight > 0, weight, 1), np.nan)
+            parts = np.append(parts, mean[..., None], axis=-1)
+        return parts
+
+    return scores(bootstrap(statistic, *sums))

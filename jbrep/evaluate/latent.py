@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
 from jbrep.encoders.base import BaseEncoder
+from jbrep.evaluate.evaluation import IntrinsicDimension, LatentUnits
 from jbrep.evaluate.held_out import HeldOut, sample_rows
 from jbrep.stats.bootstrap import without_nan
 
@@ -19,7 +20,7 @@ _ROUNDING = 1e-6  # standard deviation that rounding alone can cause
 _NEIGHBOURS = 20  # of the maximum-likelihood estimator
 
 
-def latent(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
+def latent_units(encoder: BaseEncoder, held_out: HeldOut) -> LatentUnits:
     """Units, their correlations, and dimensions of the latent, over a sample of held-out rows.
 
     At most 200,000 rows, fewer where the latent has more than 41 units; for the intrinsic dimension
@@ -30,15 +31,15 @@ def latent(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
     values = encode(encoder, held_out, rows).astype(np.float64)
     deviation = values.std(axis=0)
     live = deviation > max(_DEAD * deviation.max(), _ROUNDING)
-    return {
-        "mean": values.mean(axis=0).tolist(),
-        "variance": (deviation**2).tolist(),
-        "dead": np.flatnonzero(~live).tolist(),
-        "saturation": _saturation(encoder, values),
-        "correlation": _correlation(values, live),
-        "participation_ratio": _participation(values) if live.any() else None,
-        "intrinsic_dimension": intrinsic_dimension(sample(values, _POINTS)),
-    }
+    return LatentUnits(
+        mean=values.mean(axis=0).tolist(),
+        variance=(deviation**2).tolist(),
+        dead=tuple(np.flatnonzero(~live).tolist()),
+        saturation=_saturation(encoder, values),
+        correlation=_correlation(values, live),
+        participation_ratio=_participation(values) if live.any() else None,
+        intrinsic_dimension=intrinsic_dimension(sample(values, _POINTS)),
+    )
 
 
 def encode(encoder: BaseEncoder, held_out: HeldOut, rows: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -51,22 +52,22 @@ def _participation(values: NDArray[np.float64]) -> float:
     return float(spectrum.sum() ** 2 / np.square(spectrum).sum())
 
 
-def _saturation(encoder: BaseEncoder, values: NDArray[np.float64]) -> list[float] | None:
+def _saturation(encoder: BaseEncoder, values: NDArray[np.float64]) -> tuple[float, ...] | None:
     """The share of rows in which each tanh unit is saturated; None for another latent."""
     layers = encoder.encoder if isinstance(encoder, Encoder) else ()
     if not layers or layers[-1].activation != "tanh":
         return None
-    return (np.abs(values) > _SATURATED).mean(axis=0).tolist()
+    return tuple((np.abs(values) > _SATURATED).mean(axis=0).tolist())
 
 
-def _correlation(values: NDArray[np.float64], live: NDArray[np.bool_]) -> list[list[float | None]]:
+def _correlation(values: NDArray[np.float64], live: NDArray[np.bool_]) -> Any:
     """Pearson's correlation of the units, (l, l); None for dead ones."""
     matrix = np.full((len(live), len(live)), np.nan)
     matrix[np.ix_(live, live)] = np.corrcoef(values[:, live].T)
     return without_nan(matrix.tolist())
 
 
-def intrinsic_dimension(values: NDArray[Any]) -> dict[str, float | None]:
+def intrinsic_dimension(values: NDArray[Any]) -> IntrinsicDimension:
     """Estimates of how many dimensions points (n, k) fill locally, from scikit-dimension.
 
     TwoNN (Facco et al. 2017) and the maximum likelihood of Levina and Bickel (2005). None where
@@ -76,8 +77,8 @@ def intrinsic_dimension(values: NDArray[Any]) -> dict[str, float | None]:
 
     points = np.unique(values, axis=0)
     if len(points) <= 2 * _NEIGHBOURS:
-        return {"two_nn": None, "mle": None}
+        return IntrinsicDimension(two_nn=None, mle=None)
     points = np.pad(points, ((0, 0), (0, 1)))  # the library refuses a single column
     estimates = TwoNN().fit(points).dimension_, MLE(K=_NEIGHBOURS).fit(points).dimension_
     two_nn, mle = without_nan([float(estimate) for estimate in estimates])
-    return {"two_nn": two_nn, "mle": mle}
+    return IntrinsicDimension(two_nn=two_nn, mle=mle)

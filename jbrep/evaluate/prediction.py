@@ -12,8 +12,8 @@ from jbrep.dataset import Column, ScaledDataset
 from jbrep.dataset.scaling import wrapped
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Task
-from jbrep.evaluate.explained import explained
-from jbrep.evaluate.held_out import HeldOut, Rows, sample_rows
+from jbrep.evaluate.evaluation import Prediction
+from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
 from jbrep.evaluate.regression import Predictor, Problem
 from jbrep.training.windows import first_rows
 
@@ -51,7 +51,7 @@ def prediction(
     held_out: HeldOut,
     predictors: Mapping[int, Predictor],
     matters: Matters = None,
-) -> dict[str, Any]:
+) -> dict[str, Prediction]:
     """R^2 of each feature's change over k steps, and of the mean reward over them.
 
     Predicted nonlinearly from the latent and the next k actions, and no later ones; fitted to a
@@ -78,13 +78,13 @@ def prediction(
             held_out,
             widths=[1] * (len(names) + 1),
             means=means,
-        ).tolist()
-        results[str(ahead)] = {
-            "features": dict(zip(names, each, strict=False)),
-            "reward": each[len(names)],
-            "mean": each[len(names) + 1],
-            "rewarded": None if matters is None else each[-1],
-        }
+        )
+        results[str(ahead)] = Prediction(
+            features=dict(zip(names, each, strict=False)),
+            reward=each[len(names)],
+            mean=each[len(names) + 1],
+            rewarded=None if matters is None else each[-1],
+        )
     return results
 
 

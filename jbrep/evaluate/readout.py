@@ -13,8 +13,23 @@ from numpy.typing import NDArray
 from jbrep.dataset.scaled import sample
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Task
-from jbrep.evaluate.explained import explained
-from jbrep.evaluate.held_out import MAX_GROUPS, MAX_NUMBERS, HeldOut, Rows, sample_rows
+from jbrep.evaluate.evaluation import (
+    Correlation,
+    Dynamics,
+    Neighbours,
+    Score,
+    Scores,
+    score,
+    scores,
+)
+from jbrep.evaluate.held_out import (
+    MAX_GROUPS,
+    MAX_NUMBERS,
+    HeldOut,
+    Rows,
+    explained,
+    sample_rows,
+)
 from jbrep.evaluate.regression import Predictor, Problem
 from jbrep.evaluate.truth import Columns, quantities, quantities_and_features, state
 from jbrep.stats.bootstrap import Array, bootstrap, variation
@@ -27,9 +42,10 @@ _NEIGHBOURS = 5
 _NEGLIGIBLE = 1e-6  # variance, as a share of the largest
 _ROUNDING = 1e-12  # variance that rounding alone can cause
 _PENALTY = 1.0  # of the ridge, on standardised latents
+_UNKNOWN = Score(None, None, None)
 
 
-def probes(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
+def probes(encoder: BaseEncoder, held_out: HeldOut) -> Scores:
     """R^2 of a ridge regression of each quantity on the latent, fitted on training rows.
 
     The cosine and sine of an angle count together. At most 100,000 rows are fitted to, and as many
@@ -44,9 +60,7 @@ def problem(encoder: BaseEncoder, held_out: HeldOut) -> Problem:
     return Problem(*_readable(encoder, held_out, quantities_and_features))
 
 
-def nonlinear_probes(
-    encoder: BaseEncoder, held_out: HeldOut, predict: Predictor
-) -> dict[str, list[Any]]:
+def nonlinear_probes(encoder: BaseEncoder, held_out: HeldOut, predict: Predictor) -> Scores:
     """R^2 as `probes`, by what was fitted to `problem`."""
     return _probes(encoder, held_out, quantities_and_features, predict)
 
@@ -64,21 +78,14 @@ def _readable(
     return encoder.encode(seen), np.hstack(list(truth(data.task, seen).values()))
 
 
-def _probes(
-    encoder: BaseEncoder, held_out: HeldOut, truth: _Truth, predict: Predictor
-) -> dict[str, list[Any]]:
+def _probes(encoder: BaseEncoder, held_out: HeldOut, truth: _Truth, predict: Predictor) -> Scores:
     data = held_out.data
     rows = sample_rows(data.test, _ROWS, data.task.size)
     unseen = data.dataset["observation"][rows]
     true = truth(data.task, unseen)
-    scores = explained(
-        predict(encoder.encode(unseen)),
-        np.hstack(list(true.values())),
-        rows,
-        held_out,
-        [values.shape[1] for values in true.values()],
-    )
-    return dict(zip(true, scores.tolist(), strict=True))
+    widths = [values.shape[1] for values in true.values()]
+    predicted, wanted = predict(encoder.encode(unseen)), np.hstack(list(true.values()))
+    return dict(zip(true, explained(predicted, wanted, rows, held_out, widths), strict=True))
 
 
 class _Steps(NamedTuple):
@@ -91,7 +98,7 @@ class _Steps(NamedTuple):
     change: NDArray[Any]  # of the observation to the next one, (n, d)
 
 
-def dynamics(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
+def dynamics(encoder: BaseEncoder, held_out: HeldOut) -> Dynamics:
     """How well latent and action predict, by a ridge regression, what comes next.
 
     R^2 of the next latent, predicted from latent and action, and predicted as unchanged; and R^2 of
@@ -105,7 +112,7 @@ def dynamics(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
     data = held_out.data
     seen, unseen = (_steps(encoder, held_out, rows) for rows in (data.train, data.test))
     if min(len(seen.rows), len(unseen.rows)) < 2:
-        return dict.fromkeys(("linear", "persistence", "change"), [None] * 3)
+        return Dynamics(linear=_UNKNOWN, persistence=_UNKNOWN, change=_UNKNOWN)
     whitened = _whitening(seen.latent)
     spread = seen.change.std(axis=0, dtype=np.float64)
     spread[spread == 0] = 1
@@ -113,15 +120,15 @@ def dynamics(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, list[Any]]:
     after, then = whitened(seen.next_latent), whitened(unseen.next_latent)
     width = after.shape[1]
     fitted = ridge(before, np.hstack((after, seen.change / spread)))(now)
-    results = {
-        "linear": (fitted[:, :width], then),
-        "persistence": (now[:, :width], then),
-        "change": (fitted[:, width:], unseen.change / spread),
-    }
-    return {
-        name: explained(predicted, true, unseen.rows, held_out).tolist()[0]
-        for name, (predicted, true) in results.items()
-    }
+
+    def judged(predicted: Array, true: Array) -> Score:
+        return explained(predicted, true, unseen.rows, held_out)[0]
+
+    return Dynamics(
+        linear=judged(fitted[:, :width], then),
+        persistence=judged(now[:, :width], then),
+        change=judged(fitted[:, width:], unseen.change / spread),
+    )
 
 
 def _steps(encoder: BaseEncoder, held_out: HeldOut, rows: Rows) -> _Steps:
@@ -156,7 +163,7 @@ def ridge(values: NDArray[Any], wanted: NDArray[Any]) -> Predictor:
     return lambda others: model.predict(others.astype(np.float64)).reshape(len(others), -1)
 
 
-def neighbours(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
+def neighbours(encoder: BaseEncoder, held_out: HeldOut) -> Neighbours:
     """How similar the states of nearest neighbours in the latent are (KNN-MSE).
 
     The mean squared difference between a held-out row's state and those of its 5 nearest
@@ -185,15 +192,15 @@ def neighbours(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
     differences = (reference_states[nearest] - query_states[:, None])[..., varying] / scale[varying]
     squares = np.square(differences).mean(axis=1)
     sums, counts = held_out.sums(test, squares, np.ones((len(test), 1)))
-    by_name = bootstrap(lambda s, n: s / n, sums, counts).tolist()
+    by_name = scores(bootstrap(lambda s, n: s / n, sums, counts))
     names = np.array(list(state(data.task, references[:1])))[varying].tolist()
-    return {
-        "mse": bootstrap(lambda s, n: s.mean(axis=-1) / n[..., 0], sums, counts).tolist(),
-        "dimensions": dict(zip(names, by_name, strict=True)),
-    }
+    return Neighbours(
+        mse=score(bootstrap(lambda s, n: s.mean(axis=-1) / n[..., 0], sums, counts)),
+        dimensions=dict(zip(names, by_name, strict=True)),
+    )
 
 
-def correlation(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
+def correlation(encoder: BaseEncoder, held_out: HeldOut) -> Correlation:
     """How directly single units show the state: the ground-truth correlation (GTC).
 
     For each dimension of the state, the largest absolute correlation with a unit of the latent; as
@@ -221,9 +228,9 @@ def correlation(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
         by_name = np.where(spread > 0, np.abs(shared) / spread, 0).max(axis=-2)
         return np.append(by_name, by_name.mean(axis=-1, keepdims=True), axis=-1)
 
-    *by_name, mean = bootstrap(largest, *sums, products).tolist()
-    return {
-        "mean": mean,
-        "dimensions": dict(zip(names, by_name, strict=True)),
-        "state_dimensions": len(truth),
-    }
+    *by_name, mean = scores(bootstrap(largest, *sums, products))
+    return Correlation(
+        mean=mean,
+        dimensions=dict(zip(names, by_name, strict=True)),
+        state_dimensions=len(truth),
+    )

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,14 @@ from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
 from jbrep.encoders.base import BaseEncoder
+from jbrep.evaluate.evaluation import (
+    Corruption,
+    EpisodeError,
+    FeatureError,
+    Reconstruction,
+    score,
+    scores,
+)
 from jbrep.evaluate.held_out import HeldOut, Rows
 from jbrep.methods.held_out import lost
 from jbrep.methods.linear import linear_denoiser, principal_code
@@ -35,23 +43,26 @@ class _Losses(NamedTuple):
         return self.sums.mean(axis=1, keepdims=True)
 
 
-def reconstruction(encoder: BaseEncoder, held_out: HeldOut) -> dict[str, Any]:
+def reconstruction(encoder: BaseEncoder, held_out: HeldOut) -> Reconstruction:
     """Errors over all held-out rows, of features scaled to [-1, 1] and in physical units.
 
     They come with the error of PCA with as many components, fitted on the training part.
     """
     losses = _losses(encoder, held_out, held_out.data.test)
     quantiles = np.quantile(losses.by_row, _QUANTILES).tolist()
-    return {
-        "mse": bootstrap(_mean, losses.means, held_out.row_counts).tolist(),
-        **_compared_with_pca(encoder.latent_size, losses.means, held_out),
-        "features": _by_feature(losses.sums, held_out),
-        "quantiles": dict(zip(map(str, _QUANTILES), quantiles, strict=True)),
-        "worst_episodes": _worst(losses.by_row, held_out),
-    }
+    pca = _pca(held_out, encoder.latent_size)
+    is_smaller = encoder.latent_size < held_out.data.task.size
+    return Reconstruction(
+        mse=score(bootstrap(_mean, losses.means, held_out.row_counts)),
+        pca_mse=score(bootstrap(_mean, pca, held_out.row_counts)),
+        ratio_to_pca=score(bootstrap(_mean, losses.means, pca)) if is_smaller else None,
+        features=_by_feature(losses.sums, held_out),
+        quantiles=dict(zip(map(str, _QUANTILES), quantiles, strict=True)),
+        worst_episodes=_worst(losses.by_row, held_out),
+    )
 
 
-def corruption(encoder: BaseEncoder, held_out: HeldOut) -> list[dict[str, Any]]:
+def corruption(encoder: BaseEncoder, held_out: HeldOut) -> tuple[Corruption, ...]:
     """Errors of reconstructing clean rows from corrupted ones, at each noise level.
 
     They come with the error of the corrupted rows themselves, and with that of the best linear
@@ -64,14 +75,14 @@ def corruption(encoder: BaseEncoder, held_out: HeldOut) -> list[dict[str, Any]]:
         ours = _losses(encoder, held_out, rows, noise).means
         best = _best_linear(held_out, encoder.latent_size, noise)
         levels.append(
-            {
-                "noise": noise,
-                "mse": bootstrap(_mean, ours, counts).tolist(),
-                "input_mse": noise**2,
-                "linear_mse": bootstrap(_mean, best, counts).tolist(),
-            }
+            Corruption(
+                noise=noise,
+                mse=score(bootstrap(_mean, ours, counts)),
+                input_mse=noise**2,
+                linear_mse=score(bootstrap(_mean, best, counts)),
+            )
         )
-    return levels
+    return tuple(levels)
 
 
 def _mean(total: Array, rows: Array) -> Array:
@@ -122,31 +133,22 @@ def _linear(data: ScaledDataset, layers: tuple[Layers, Layers]) -> Encoder:
     return Encoder({"name": "linear"}, data.scaler, *layers)
 
 
-def _compared_with_pca(latent: int, means: Array, held_out: HeldOut) -> dict[str, Any]:
-    linear = _pca(held_out, latent)
-    ratio = bootstrap(_mean, means, linear)
-    return {
-        "pca_mse": bootstrap(_mean, linear, held_out.row_counts).tolist(),
-        "ratio_to_pca": ratio.tolist() if latent < held_out.data.task.size else None,
-    }
-
-
-def _by_feature(sums: Array, held_out: HeldOut) -> list[dict[str, Any]]:
+def _by_feature(sums: Array, held_out: HeldOut) -> tuple[FeatureError, ...]:
     data, rows = held_out.data, held_out.row_counts
     total, squares = held_out.variation
     width = data.scaler.half_width.astype(float)
-    mse = bootstrap(lambda e, n: e / n, sums, rows).tolist()
-    rmse = bootstrap(lambda e, n: np.sqrt(e / n) * width, sums, rows).tolist()
-    r2 = bootstrap(
-        lambda e, t, s, n: r_squared(e, variation(t, s, n)), sums, total, squares, rows
-    ).tolist()
-    return [
-        {"name": f.name, "unit": f.unit, "mse": mse[i], "rmse_physical": rmse[i], "r2": r2[i]}
+    mse = scores(bootstrap(lambda e, n: e / n, sums, rows))
+    rmse = scores(bootstrap(lambda e, n: np.sqrt(e / n) * width, sums, rows))
+    r2 = scores(
+        bootstrap(lambda e, t, s, n: r_squared(e, variation(t, s, n)), sums, total, squares, rows)
+    )
+    return tuple(
+        FeatureError(name=f.name, unit=f.unit, mse=mse[i], rmse_physical=rmse[i], r2=r2[i])
         for i, f in enumerate(data.task.features)
-    ]
+    )
 
 
-def _worst(by_row: NDArray[np.float32], held_out: HeldOut) -> list[dict[str, Any]]:
+def _worst(by_row: NDArray[np.float32], held_out: HeldOut) -> tuple[EpisodeError, ...]:
     """The episodes with the largest mean errors."""
     place = held_out.place(held_out.data.test)
     both = np.stack((by_row, np.ones_like(by_row)), axis=1)
@@ -154,11 +156,7 @@ def _worst(by_row: NDArray[np.float32], held_out: HeldOut) -> list[dict[str, Any
     errors = total / rows
     order = np.argsort(-errors, kind="stable")[:_WORST]
     seeds = held_out.data.dataset.episodes["seed"]
-    return [
-        {
-            "episode": int(held_out.numbers[i]),
-            "seed": int(seeds[held_out.numbers[i]]),
-            "mse": float(errors[i]),
-        }
-        for i in order
-    ]
+    return tuple(
+        EpisodeError(episode=number, seed=seeds[number], mse=mse)
+        for number, mse in zip(held_out.numbers[order], errors[order], strict=True)
+    )

@@ -43,6 +43,21 @@ class Problem(NamedTuple):
     share: float = 1.0
 
 
+class Networks(NamedTuple):
+    """What was learnt from the latents of an encoder.
+
+    Attributes:
+        forward: what comes next, by the number of steps ahead.
+        probe: the state.
+        of_policy: a good policy's `action` and, unless its episodes are too few, its `value`;
+            nothing without one.
+    """
+
+    forward: dict[int, Predictor]
+    probe: Predictor
+    of_policy: dict[str, Predictor]
+
+
 def fit(problems: Sequence[Problem]) -> list[Predictor]:
     """Fit a network to each problem: three hidden layers of 64 ReLU units, by Adam.
 

@@ -10,17 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from jbrep.envs.task import Task
 from jbrep.jitterbug.tasks import TASKS
 
-_WORDS = {
-    "orientation_w": "yaw",
-    "orientation_x": "tilt",
-    "orientation_y": "tilt",
-    "orientation_z": "yaw",
-    "velocity_z": "vertical speed",
-    "angular_velocity_x": "rate of tilt",
-    "angular_velocity_y": "rate of tilt",
-    "angular_velocity_z": "rate of yaw",
-}
-
 Array = NDArray[np.float64]
 Columns = dict[str, Array]
 
@@ -56,12 +45,6 @@ def quantities_and_features(task: Task, observation: ArrayLike) -> Columns:
     known = quantities(task, observation)
     every = _every(_features(task, observation), _angles(task))
     return known | {name: every[name] for name in every if name not in known}
-
-
-def in_words(task_name: str, feature: str) -> str:
-    """What to call a feature to a reader; several of the Jitterbug's share their words."""
-    words = _WORDS if task_name in TASKS else {}
-    return words.get(feature, feature.replace("_", " "))
 
 
 def state(task: Task, observation: ArrayLike) -> Columns:

@@ -9,7 +9,7 @@ from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import record
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.evaluate.policy import GoodPolicy, PlayedEpisode
+from jbrep.evaluate.control import GoodPolicy, PlayedEpisode
 from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.sources import Player, find_player
 from jbrep.progress import Progress

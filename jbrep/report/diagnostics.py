@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from jbrep.evaluate.headline import SCALARS
+from jbrep.evaluate.table import SCALARS
 from jbrep.report.tables import Tables
 from jbrep.stats.association import Association, Diagnostic, associations
 from jbrep.stats.summary import Rows, shown

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
 
-from jbrep.encoders.diagnostics import DIAGNOSTICS, by_label, read_diagnostics
 from jbrep.errors import DamageError, InputError
+from jbrep.evaluate.table import DIAGNOSTICS, by_label, read_diagnostics
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP, TASKS
 from jbrep.records.storage import exists
 from jbrep.records.tables import Columns, count, finite, read_csv

@@ -1,36 +1,27 @@
 """What evaluations say of the encoders of a study's runs, in its diagnostics.csv."""
 
-import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypedDict
 
 from jbrep.encoders import FULL
-from jbrep.encoders.diagnostics import DIAGNOSTICS, Diagnosed, read_diagnostics, write_diagnostics
-from jbrep.errors import DamageError, InputError
-from jbrep.evaluate.headline import headline
+from jbrep.errors import InputError
+from jbrep.evaluate.evaluation import EVALUATION, Evaluation
+from jbrep.evaluate.table import (
+    DIAGNOSTICS,
+    Diagnosed,
+    Values,
+    headline,
+    read_diagnostics,
+    write_diagnostics,
+)
 from jbrep.records.document import read_document
-from jbrep.records.storage import exists, read_file
-from jbrep.records.typed import read_json, typed
+from jbrep.records.storage import exists
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.text import slug
 
 _TASK = "{task}"  # in an evaluation's path: the task's name as in folders
-_MAX_BYTES = 1 << 28
-_Values = Mapping[str, float | None]
 _Key = tuple[str, str]  # a task, and an encoder's SHA-256 or `full`
-
-
-class _Data(TypedDict):
-    task: str
-
-
-class _Evaluation(TypedDict):
-    """What is needed of evaluation.json."""
-
-    data: _Data
-    encoders: dict[str, dict[str, Any]]
 
 
 def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
@@ -59,7 +50,7 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
     if not (given or named or exists(path)):
         return []
     used = _encoders(record)
-    known: dict[_Key, _Values] = {}
+    known: dict[_Key, Values] = {}
     for pattern in dict.fromkeys((*given, *named)):
         files = _files(pattern, (row.task for row in used))
         if pattern in given and not files:
@@ -71,15 +62,6 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
     rows = [row._replace(values=known[_key(row)]) for row in used if _key(row) in known]
     write_diagnostics(path, rows)
     return list(_unknown(used, known))
-
-
-def _read(path: Path, kind: str, version: int, shape: Any) -> Any:
-    """The contents of a JSON file, checked."""
-    try:
-        text = read_file(path, _MAX_BYTES).decode()
-        return typed(read_json(text, path, kind, version), shape)
-    except ValueError as error:
-        raise DamageError(f"{path} is damaged: {error}") from None
 
 
 def _encoders(record: RunsRecord) -> list[Diagnosed]:
@@ -95,35 +77,25 @@ def _encoders(record: RunsRecord) -> list[Diagnosed]:
 def _files(pattern: str, tasks: Iterable[str]) -> list[Path]:
     """The evaluations that a folder's path stands for, as far as they are there."""
     folders = dict.fromkeys(Path(pattern.replace(_TASK, slug(task))) for task in tasks)
-    return [file for folder in folders if exists(file := folder / "evaluation.json")]
+    return [file for folder in folders if exists(file := folder / EVALUATION)]
 
 
-def evaluated(path: Path) -> dict[_Key, _Values]:
+def evaluated(path: Path) -> dict[_Key, Values]:
     """The headline numbers in an evaluation."""
-    from jbrep.evaluate.evaluation import FORMAT, FORMAT_VERSION  # imports scikit-learn
-
-    contents = _read(path, FORMAT, FORMAT_VERSION, _Evaluation)
-    task = contents["data"]["task"]
+    evaluation = read_document(path, Evaluation)
+    task = evaluation.data.task
     return {
-        (task, entry.get("sha256", label)): _numbers(entry, path)
-        for label, entry in contents["encoders"].items()
-        if label == FULL or "sha256" in entry
+        (task, known.sha256 or label): headline(known)
+        for label, known in evaluation.encoders.items()
+        if label == FULL or known.sha256
     }
-
-
-def _numbers(entry: Mapping[str, Any], path: Path) -> _Values:
-    values = {name: each[0] if each else None for name, each in headline(entry).items()}
-    for value in values.values():
-        if value is not None and (type(value) not in (int, float) or not math.isfinite(value)):
-            raise DamageError(f"{path} is damaged: {value!r} is no number")
-    return values
 
 
 def _key(row: Diagnosed) -> _Key:
     return row.task, FULL if row.representation == FULL else row.sha256
 
 
-def _unknown(used: Sequence[Diagnosed], known: Mapping[_Key, _Values]) -> Iterator[str]:
+def _unknown(used: Sequence[Diagnosed], known: Mapping[_Key, Values]) -> Iterator[str]:
     """What to do about the representations of each task without numbers."""
     encoders = Counter(row[:2] for row in used)
     missing = Counter(row[:2] for row in used if _key(row) not in known)

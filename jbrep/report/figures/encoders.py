@@ -1,7 +1,7 @@
 """Figures of encoders, from their evaluation."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,6 +10,14 @@ from matplotlib.ticker import NullFormatter
 
 from jbrep.encoders import FULL
 from jbrep.encoders.encoder import IDENTITY
+from jbrep.evaluate.evaluation import (
+    Corruption,
+    Diagnostics,
+    Evaluation,
+    FeatureError,
+    Reconstruction,
+    Score,
+)
 from jbrep.report.figures.curves import below
 from jbrep.report.figures.families import Encoders, family, family_styles
 from jbrep.report.figures.heat_map import MOST, bare, heat_map, least
@@ -19,22 +27,23 @@ from jbrep.report.figures.prediction import prediction_plots
 from jbrep.report.figures.style import COLUMN, PAGE, ink, plain, reference
 
 _ERROR = ("mse", "low", "high")
+_Encoders = Mapping[str, "_Decoding"]  # by label
 
 
-def encoder_plots(evaluation: Mapping[str, Any]) -> list[Plot]:
+def encoder_plots(evaluation: Evaluation) -> list[Plot]:
     """What codes predict, what encoders lose, how their latent units correlate, what methods say.
 
     What encoders lose is drawn of those that decode; errors against latent size and against noise
-    are drawn if one of their latents is smaller than the observation. What an evaluation by an
-    earlier version lacks isn't drawn.
-
-    Args:
-        evaluation: what jbrep.evaluate.diagnose returned, or its JSON.
+    are drawn if one of their latents is smaller than the observation.
     """
-    task = evaluation["data"]["task"]
-    everything = evaluation["encoders"]
+    task = evaluation.data.task
+    everything = evaluation.encoders
     encoders = {label: e for label, e in everything.items() if label != FULL}
-    decoding = {label: e for label, e in encoders.items() if e["reconstruction"]}
+    decoding = {
+        label: _Decoding(e.latent, e.reconstruction, e.corruption or ())
+        for label, e in encoders.items()
+        if e.reconstruction
+    }
     plots = prediction_plots(task, everything)
     plots += [_error_by_feature(task, decoding)] if decoding else []
     if decoding and _sizes(decoding):
@@ -42,15 +51,28 @@ def encoder_plots(evaluation: Mapping[str, Any]) -> list[Plot]:
     return [*plots, _latent_correlation(task, encoders), *method_plots(task, encoders)]
 
 
-def _sizes(encoders: Encoders) -> list[int]:
+class _Decoding(NamedTuple):
+    """What is drawn of an encoder that decodes."""
+
+    latent: int
+    error: Reconstruction
+    corruption: tuple[Corruption, ...]
+
+
+def _sizes(encoders: _Encoders) -> list[int]:
     """The latent sizes that are smaller than the observation."""
-    size = len(next(iter(encoders.values()))["reconstruction"]["features"])
-    return sorted({e["latent"] for e in encoders.values() if e["latent"] < size})
+    size = len(_features(encoders))
+    return sorted({e.latent for e in encoders.values() if e.latent < size})
 
 
-def _error_by_feature(task: str, encoders: Encoders) -> Plot:
+def _features(encoders: _Encoders) -> tuple[FeatureError, ...]:
+    """The features, as the first of the encoders loses them."""
+    return next(iter(encoders.values())).error.features
+
+
+def _error_by_feature(task: str, encoders: _Encoders) -> Plot:
     """R^2 of each feature (rows) for each encoder (columns)."""
-    count = len(next(iter(encoders.values()))["reconstruction"]["features"])
+    count = len(_features(encoders))
     part = f" Of {count} features the {MOST} worst are shown; all are in the table."
     return Plot(
         "error_by_feature",
@@ -59,21 +81,19 @@ def _error_by_feature(task: str, encoders: Encoders) -> Plot:
         + (part if count > MOST else ""),
         ("encoder", "feature", "r2", "low", "high"),
         [
-            (label, feature["name"], *feature["r2"])
+            (label, feature.name, *feature.r2)
             for label, e in encoders.items()
-            for feature in e["reconstruction"]["features"]
+            for feature in e.error.features
         ],
         lambda: _draw_features(task, encoders),
     )
 
 
-def _draw_features(task: str, encoders: Encoders) -> Figure:
-    features = next(iter(encoders.values()))["reconstruction"]["features"]
-    values = np.array(
-        [[f["r2"][0] for f in e["reconstruction"]["features"]] for e in encoders.values()], float
-    ).T
+def _draw_features(task: str, encoders: _Encoders) -> Figure:
+    features = _features(encoders)
+    values = np.array([[f.r2.value for f in e.error.features] for e in encoders.values()], float).T
     worst = least(np.nan_to_num(values, nan=1).mean(axis=1))  # what never varies isn't the worst
-    names = [features[i]["name"] for i in worst]
+    names = [features[i].name for i in worst]
     which = (
         "each feature"
         if len(names) == len(features)
@@ -83,7 +103,7 @@ def _draw_features(task: str, encoders: Encoders) -> Figure:
     return heat_map(values[worst], names, list(encoders), title, "R² on held-out episodes")
 
 
-def _error_by_latent(task: str, encoders: Encoders) -> Plot:
+def _error_by_latent(task: str, encoders: _Encoders) -> Plot:
     """Error against latent size, a line for each family of encoders, and PCA's."""
     return Plot(
         "error_by_latent",
@@ -91,24 +111,21 @@ def _error_by_latent(task: str, encoders: Encoders) -> Plot:
         "Mean squared error of the reconstruction on held-out episodes, features scaled to "
         "[-1, 1]; bars: 95 % intervals over episodes. Dashed: PCA with as many components.",
         ("encoder", "latent", *_ERROR, "pca_mse"),
-        [
-            (label, e["latent"], *e["reconstruction"]["mse"], e["reconstruction"]["pca_mse"][0])
-            for label, e in encoders.items()
-        ],
+        [(label, e.latent, *e.error.mse, e.error.pca_mse.value) for label, e in encoders.items()],
         lambda: _draw_sizes(task, encoders),
     )
 
 
-def _draw_sizes(task: str, encoders: Encoders) -> Figure:
+def _draw_sizes(task: str, encoders: _Encoders) -> Figure:
     figure = Figure(figsize=(COLUMN, 2.9))
     axes: Axes = figure.subplots()
     sizes = _sizes(encoders)
     families = _families(encoders)
     for name, style in family_styles(families).items():
-        points = {size: e["reconstruction"]["mse"] for size, e in sorted(families[name].items())}
+        points = {size: e.error.mse for size, e in sorted(families[name].items())}
         _draw_errors(axes, points, label=plain(name), **style)
-    pca = {e["latent"]: e["reconstruction"]["pca_mse"][0] for e in encoders.values()}
-    axes.plot(sizes, [pca[size] for size in sizes], label="PCA", **reference())
+    pca = {e.latent: e.error.pca_mse.value for e in encoders.values()}
+    axes.plot(sizes, np.array([pca[size] for size in sizes], float), label="PCA", **reference())
     axes.set(xlabel="latent size l", ylabel="mean squared error", yscale="log", xticks=sizes)
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_title(f"{task}: error on held-out episodes")
@@ -116,7 +133,7 @@ def _draw_sizes(task: str, encoders: Encoders) -> Figure:
     return figure
 
 
-def _error_by_corruption(task: str, encoders: Encoders) -> Plot:
+def _error_by_corruption(task: str, encoders: _Encoders) -> Plot:
     """Error in restoring clean rows from corrupted ones, a panel for each latent size."""
     return Plot(
         "error_by_corruption",
@@ -126,15 +143,15 @@ def _error_by_corruption(task: str, encoders: Encoders) -> Plot:
         "the corrupted input itself.",
         ("encoder", "latent", "noise", *_ERROR, "linear_mse", "input_mse"),
         [
-            (label, e["latent"], c["noise"], *c["mse"], c["linear_mse"][0], c["input_mse"])
+            (label, e.latent, c.noise, *c.mse, c.linear_mse.value, c.input_mse)
             for label, e in encoders.items()
-            for c in e["corruption"]
+            for c in e.corruption
         ],
         lambda: _draw_corruption(task, encoders),
     )
 
 
-def _draw_corruption(task: str, encoders: Encoders) -> Figure:
+def _draw_corruption(task: str, encoders: _Encoders) -> Figure:
     sizes = _sizes(encoders)
     figure = Figure(figsize=(COLUMN if len(sizes) == 1 else PAGE, 2.6))
     panels = figure.subplots(1, len(sizes), sharey=True, squeeze=False)[0]
@@ -142,12 +159,12 @@ def _draw_corruption(task: str, encoders: Encoders) -> Figure:
     for axes, size in zip(panels, sizes, strict=True):
         for name, style in family_styles(families).items():
             if size in families[name]:
-                levels = families[name][size]["corruption"]
-                points = {level["noise"]: level["mse"] for level in levels}
+                levels = families[name][size].corruption
+                points = {level.noise: level.mse for level in levels}
                 _draw_errors(axes, points, label=plain(name), **style)
-        levels = next(e["corruption"] for e in encoders.values() if e["latent"] == size)
-        noise = np.array([level["noise"] for level in levels])
-        best = [level["linear_mse"][0] for level in levels]
+        levels = next(e.corruption for e in encoders.values() if e.latent == size)
+        noise = np.array([level.noise for level in levels])
+        best = [level.linear_mse.value for level in levels]
         axes.plot(noise, best, label="best linear denoiser", **reference())
         axes.plot(noise[1:], noise[1:] ** 2, ":", color=ink(), alpha=0.65, label="corrupted input")
         axes.set(title=f"latent size {size}", xlabel="noise (standard deviation)", yscale="log")
@@ -169,18 +186,18 @@ def _latent_correlation(task: str, encoders: Encoders) -> Plot:
             (label, names[i], names[j], value)
             for label, e in encoders.items()
             for names in (_unit_names(e),)
-            for i, row in enumerate(e["latent_units"]["correlation"])
+            for i, row in enumerate(e.latent_units.correlation)
             for j, value in enumerate(row)
         ],
         lambda: _draw_correlation(task, encoders),
     )
 
 
-def _unit_names(encoder: Mapping[str, Any]) -> list[str]:
+def _unit_names(encoder: Diagnostics) -> list[str]:
     """Numbers of the latent units from 0; for the identity, names of the features."""
-    if encoder["kind"] == IDENTITY:
-        return [feature["name"] for feature in encoder["reconstruction"]["features"]]
-    return [str(i) for i in range(encoder["latent"])]
+    if encoder.kind == IDENTITY and encoder.reconstruction:
+        return [feature.name for feature in encoder.reconstruction.features]
+    return [str(i) for i in range(encoder.latent)]
 
 
 def _draw_correlation(task: str, encoders: Encoders) -> Figure:
@@ -191,10 +208,10 @@ def _draw_correlation(task: str, encoders: Encoders) -> Figure:
     for axes in panels[len(encoders) :]:
         axes.set_axis_off()
     for axes, (label, e) in zip(panels, encoders.items(), strict=False):
-        values = np.array(e["latent_units"]["correlation"], float)
+        values = np.array(e.latent_units.correlation, float)
         picture = axes.imshow(values, cmap="RdBu_r", vmin=-1, vmax=1)
         names = _unit_names(e)
-        unit, size, angle = ("feature", 5, 90) if e["kind"] == IDENTITY else ("latent unit", 6.5, 0)
+        unit, size, angle = ("feature", 5, 90) if e.kind == IDENTITY else ("latent unit", 6.5, 0)
         if len(names) <= MOST:  # otherwise some numbers
             axes.set_xticks(range(len(names)), names, size=size, rotation=angle)
             axes.set_yticks(range(len(names)), names, size=size)
@@ -205,18 +222,18 @@ def _draw_correlation(task: str, encoders: Encoders) -> Figure:
     return figure
 
 
-def _families(encoders: Encoders) -> dict[str, dict[int, Mapping[str, Any]]]:
+def _families(encoders: _Encoders) -> dict[str, dict[int, _Decoding]]:
     """Encoders that differ in latent size only, by that size; PCA is the reference, drawn apart."""
-    families: dict[str, dict[int, Mapping[str, Any]]] = {}
+    families: dict[str, dict[int, _Decoding]] = {}
     sizes = _sizes(encoders)
     for label, e in encoders.items():
-        name = family(label, e["latent"])
-        if name != "pca" and e["latent"] in sizes:
-            families.setdefault(name, {})[e["latent"]] = e
+        name = family(label, e.latent)
+        if name != "pca" and e.latent in sizes:
+            families.setdefault(name, {})[e.latent] = e
     return families
 
 
-def _draw_errors(axes: Axes, points: dict[Any, list[float]], **style: Any) -> None:
+def _draw_errors(axes: Axes, points: Mapping[Any, Score], **style: Any) -> None:
     """A line through values with intervals."""
     if points:
         mse, low, high = np.array(list(points.values()), float).T

@@ -1,13 +1,13 @@
 """Encoders that differ in latent size only, which figures draw alike."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from jbrep.encoders import FULL
 from jbrep.encoders.names import EncoderName
+from jbrep.evaluate.evaluation import Diagnostics
 from jbrep.report.figures.style import Styles, styles
 
-Encoders = Mapping[str, Mapping[str, Any]]  # of evaluation.json, by label
+Encoders = Mapping[str, Diagnostics]  # of an evaluation, by label
 
 _LINES = ("-", "--", ":", "-.")  # from the largest latent to the smallest
 
@@ -35,16 +35,16 @@ def family_styles(families: Iterable[str]) -> Styles:
 
 def line_styles(encoders: Encoders) -> Styles:
     """Of each encoder: colour and marker of its family, and a line that says its latent size."""
-    families = {label: family(label, e["latent"]) for label, e in encoders.items()}
+    families = {label: family(label, e.latent) for label, e in encoders.items()}
     look = family_styles(families.values())
     sizes: dict[str, list[int]] = {}
     for label, e in encoders.items():
-        sizes.setdefault(families[label], []).append(e["latent"])
+        sizes.setdefault(families[label], []).append(e.latent)
     return {
         label: {
             **look[families[label]],
             "linestyle": _LINES[
-                sorted(sizes[families[label]], reverse=True).index(e["latent"]) % len(_LINES)
+                sorted(sizes[families[label]], reverse=True).index(e.latent) % len(_LINES)
             ],
         }
         for label, e in encoders.items()

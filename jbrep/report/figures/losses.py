@@ -1,12 +1,12 @@
 """Losses that methods report of their own training, from their encoders' files."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jbrep.evaluate.evaluation import Diagnostics
 from jbrep.report.figures.curves import below
 from jbrep.report.figures.families import Encoders, line_styles
 from jbrep.report.figures.plot import Plot
@@ -27,7 +27,7 @@ def loss_by_horizon(task: str, encoders: Encoders) -> Plot:
         [
             (label, int(steps), part, loss)
             for label, e in encoders.items()
-            for steps, losses in e["method"]["loss_by_horizon"].items()
+            for steps, losses in e.method["loss_by_horizon"].items()
             for part, loss in losses.items()
         ],
         lambda: _draw_loss_by_horizon(task, encoders),
@@ -35,7 +35,7 @@ def loss_by_horizon(task: str, encoders: Encoders) -> Plot:
 
 
 def _draw_loss_by_horizon(task: str, encoders: Encoders) -> Figure:
-    by_horizon = [e["method"]["loss_by_horizon"] for e in encoders.values()]
+    by_horizon = [e.method["loss_by_horizon"] for e in encoders.values()]
     parts = list(
         dict.fromkeys(p for each in by_horizon for losses in each.values() for p in losses)
     )
@@ -54,9 +54,9 @@ def _draw_loss_by_horizon(task: str, encoders: Encoders) -> Figure:
     return figure
 
 
-def _losses_of(encoder: Mapping[str, Any], part: str) -> dict[str, float]:
+def _losses_of(encoder: Diagnostics, part: str) -> dict[str, float]:
     """A part of the loss, by horizon as text, so that horizons stand equally far apart."""
-    by_horizon = encoder["method"]["loss_by_horizon"]
+    by_horizon = encoder.method["loss_by_horizon"]
     return {steps: losses[part] for steps, losses in by_horizon.items() if part in losses}
 
 
@@ -69,7 +69,7 @@ def loss_by_term(task: str, encoders: Encoders) -> Plot:
         "Terms of the loss on held-out windows, unweighted: the squared error of the standardised "
         "reward, 1 for no prediction; that of the next code; and by how much the networks are "
         "steeper than they may be.",
-        {label: _terms(e["method"]["loss_by_term"]) for label, e in encoders.items()},
+        {label: _terms(e.method["loss_by_term"]) for label, e in encoders.items()},
         ("term", "loss on held-out windows"),
         lambda: {name: {**look, "linestyle": ""} for name, look in line_styles(encoders).items()},
     )
@@ -82,7 +82,7 @@ def _terms(losses: Mapping[str, float]) -> dict[str, float]:
 
 def divergence(task: str, encoders: Encoders) -> Plot:
     """How much each unit of variational codes says."""
-    units = {label: sorted(e["method"]["divergence"])[::-1] for label, e in encoders.items()}
+    units = {label: sorted(e.method["divergence"])[::-1] for label, e in encoders.items()}
     return _by_name(
         task,
         "divergence",
@@ -133,7 +133,7 @@ def losses(task: str, encoders: Encoders) -> Plot:
         "of different methods can't be compared.",
         ("encoder", *LOSSES),
         [
-            (label, *(encoder["method"][loss] for loss in LOSSES))
+            (label, *(encoder.method[loss] for loss in LOSSES))
             for label, encoder in encoders.items()
         ],
         lambda: _draw_losses(task, encoders),
@@ -144,7 +144,7 @@ def _draw_losses(task: str, encoders: Encoders) -> Figure:
     figure = Figure(figsize=(COLUMN, 0.75 + 0.16 * len(encoders)))
     axes: Axes = figure.subplots()
     look = line_styles(encoders)
-    values = np.array([[e["method"][loss] for loss in LOSSES] for e in encoders.values()])
+    values = np.array([[e.method[loss] for loss in LOSSES] for e in encoders.values()])
     for row, (label, (train, test)) in enumerate(zip(encoders, values, strict=True)):
         colour = look[label]["color"]
         axes.plot((train, test), (row, row), color=colour, lw=0.9)

@@ -1,6 +1,6 @@
 """What each method says of itself: spectra and timescales, from its encoders' files."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
+from jbrep.evaluate.evaluation import Diagnostics
 from jbrep.report.figures.families import Encoders, family, family_styles
 from jbrep.report.figures.losses import LOSSES, divergence, loss_by_horizon, loss_by_term, losses
 from jbrep.report.figures.plot import Plot
@@ -22,7 +23,7 @@ def method_plots(task: str, encoders: Encoders) -> list[Plot]:
 
     Args:
         task: the name.
-        encoders: of evaluation.json, by label.
+        encoders: of an evaluation, by label.
     """
     drawn: dict[tuple[str, ...], Callable[[str, Encoders], Plot]] = {
         ("spectrum",): _spectrum,
@@ -37,7 +38,7 @@ def method_plots(task: str, encoders: Encoders) -> list[Plot]:
         having = {
             label: e
             for label, e in encoders.items()
-            if all((e.get("method") or {}).get(key) is not None for key in keys)
+            if all(e.method.get(key) is not None for key in keys)
         }
         if having:
             plots.append(plot(task, having))
@@ -54,25 +55,25 @@ def _spectrum(task: str, encoders: Encoders) -> Plot:
         "Where the values fall to nothing, a larger code keeps no more.",
         ("encoder", "latent", "unit", "value"),
         [
-            (label, e["latent"], i, value)
+            (label, e.latent, i, value)
             for label, e in encoders.items()
-            for i, value in enumerate(e["method"]["spectrum"], 1)
+            for i, value in enumerate(e.method["spectrum"], 1)
         ],
         lambda: _draw_spectra(task, encoders),
     )
 
 
 def _draw_spectra(task: str, encoders: Encoders) -> Figure:
-    kinds: dict[str, dict[str, Mapping[str, Any]]] = {}
+    kinds: dict[str, dict[str, Diagnostics]] = {}
     for label, e in encoders.items():
-        kinds.setdefault(e["kind"], {})[label] = e
+        kinds.setdefault(e.kind, {})[label] = e
     figure, panels = panel_grid(len(kinds), 2.1, _ABOVE)
-    look = family_styles(family(label, e["latent"]) for label, e in encoders.items())
+    look = family_styles(family(label, e.latent) for label, e in encoders.items())
     for axes, (kind, members) in zip(panels, kinds.items(), strict=True):
         sizes: dict[tuple[str, tuple[float, ...]], list[int]] = {}
         for label, e in members.items():
-            curve = family(label, e["latent"]), tuple(e["method"]["spectrum"])
-            sizes.setdefault(curve, []).append(e["latent"])
+            curve = family(label, e.latent), tuple(e.method["spectrum"])
+            sizes.setdefault(curve, []).append(e.latent)
         for (name, spectrum), kept in sizes.items():
             _draw_spectrum(axes, name, spectrum, kept, look[name])
         axes.set(title=plain(kind), xlabel="unit")
@@ -112,8 +113,8 @@ def _timescales(task: str, encoders: Encoders) -> Plot:
     )
 
 
-def _timescale_rows(label: str, encoder: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
-    for lag, spectrum in encoder["method"]["spectra"].items():
+def _timescale_rows(label: str, encoder: Diagnostics) -> Iterator[tuple[Any, ...]]:
+    for lag, spectrum in encoder.method["spectra"].items():
         steps = timescales(np.array(spectrum, float), int(lag))
         for i, (value, each) in enumerate(zip(spectrum, steps, strict=True), 1):
             yield label, int(lag), i, value, f"{each:.6g}" if np.isfinite(each) else ""
@@ -133,13 +134,13 @@ def timescales(eigenvalues: Array, lag: int) -> Array:
 
 
 def _draw_timescales(task: str, encoders: Encoders) -> Figure:
-    distinct: dict[str, Mapping[str, Any]] = {}  # codes of one family keep the same spectra
+    distinct: dict[str, Diagnostics] = {}  # codes of one family keep the same spectra
     for label, e in encoders.items():
-        if all(e["method"]["spectra"] != other["method"]["spectra"] for other in distinct.values()):
-            distinct[family(label, e["latent"])] = e
+        if all(e.method["spectra"] != other.method["spectra"] for other in distinct.values()):
+            distinct[family(label, e.latent)] = e
     figure, panels = panel_grid(len(distinct), 2.4, _ABOVE)
     for axes, (name, e) in zip(panels, distinct.items(), strict=True):
-        spectra = {int(lag): np.array(each) for lag, each in e["method"]["spectra"].items()}
+        spectra = {int(lag): np.array(each) for lag, each in e.method["spectra"].items()}
         lags = np.array(sorted(spectra))
         steps = np.array([timescales(spectra[lag], lag) for lag in lags])
         for i, line in enumerate(steps.T):

@@ -16,7 +16,7 @@ from jbrep.report.figures.style import PAGE, plain
 from jbrep.stats.bootstrap import Array
 
 _HORIZON = 10  # steps that the heat map looks ahead, if the evaluation has them
-_SUMS = {"mean": "mean of features", "reward": "reward"}  # keys of a horizon, in words
+_SUMS = {"mean": "mean of features", "reward": "reward"}  # of a prediction, in words
 _COLUMNS = ("encoder", "steps", "target", "r2", "low", "high")
 _LOWEST = -0.1  # R² on an axis
 
@@ -26,9 +26,9 @@ def prediction_plots(task: str, encoders: Encoders) -> list[Plot]:
 
     Args:
         task: the name.
-        encoders: of evaluation.json, by label, the full observation among them.
+        encoders: of an evaluation, by label, the full observation among them.
     """
-    measured = {label: e for label, e in encoders.items() if e.get("prediction")}
+    measured = {label: e for label, e in encoders.items() if e.prediction}
     return [_by_feature(task, measured), _by_horizon(task, measured)] if measured else []
 
 
@@ -51,33 +51,28 @@ def _by_feature(task: str, encoders: Encoders) -> Plot:
 
 
 def _shown_horizon(encoders: Encoders) -> str:
-    horizons = next(iter(encoders.values()))["prediction"]
+    horizons = next(iter(encoders.values())).prediction
     return min(horizons, key=lambda steps: abs(int(steps) - _HORIZON))
 
 
 def _features(encoders: Encoders, steps: str) -> list[str]:
-    return list(next(iter(encoders.values()))["prediction"][steps]["features"])
+    return list(next(iter(encoders.values())).prediction[steps].features)
 
 
 def _rows(encoders: Encoders) -> Iterator[tuple[Any, ...]]:
     for label, e in encoders.items():
-        for steps, scores in e["prediction"].items():
-            for name, values in scores["features"].items():
-                yield label, int(steps), name, *_three(values)
+        for steps, scores in e.prediction.items():
+            for name, values in scores.features.items():
+                yield label, int(steps), name, *values
             for key, words in _SUMS.items():
-                yield label, int(steps), words, *_three(scores[key])
-
-
-def _three(values: list[float | None] | None) -> list[float | None]:
-    """Value, low, high; None for each of what couldn't be measured."""
-    return values or [None, None, None]
+                yield label, int(steps), words, *getattr(scores, key)
 
 
 def _draw_features(task: str, encoders: Encoders, steps: str) -> Figure:
-    scores = [e["prediction"][steps] for e in encoders.values()]
+    scores = [e.prediction[steps] for e in encoders.values()]
     features = _features(encoders, steps)
-    values = np.array([[_three(s["features"][f])[0] for f in features] for s in scores], float).T
-    sums = np.array([[_three(s[key])[0] for key in _SUMS] for s in scores], float).T
+    values = np.array([[s.features[f].value for f in features] for s in scores], float).T
+    sums = np.array([[getattr(s, key).value for key in _SUMS] for s in scores], float).T
     shown = least(_against_full(values, list(encoders)))
     figure = heat_map(
         np.concatenate((values[shown], sums)),
@@ -116,8 +111,8 @@ def _draw_horizons(task: str, encoders: Encoders) -> Figure:
     look = line_styles(encoders)
     for axes, (key, words) in zip(panels, _SUMS.items(), strict=True):
         for label, e in encoders.items():
-            values = np.array([_three(s[key]) for s in e["prediction"].values()], float)
-            _draw_line(axes, list(e["prediction"]), values, label=plain(label), **look[label])
+            values = np.array([getattr(s, key) for s in e.prediction.values()], float)
+            _draw_line(axes, list(e.prediction), values, label=plain(label), **look[label])
         axes.set(xlabel="steps ahead", title=words)
     panels[0].set(
         ylabel="R² on held-out episodes", ylim=(max(panels[0].get_ylim()[0], _LOWEST), None)

@@ -1,0 +1,288 @@
+"""What a controller needs of the state: a good policy's action and value, and what a code loses."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property, lru_cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.dataset.scaled import sample
+from jbrep.encoders.base import BaseEncoder
+from jbrep.evaluate.evaluation import Action, Lost, Score, Scores
+from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
+from jbrep.evaluate.prediction import Matters, following
+from jbrep.evaluate.readout import ridge
+from jbrep.evaluate.regression import Networks, Predictor, Problem
+from jbrep.stats.bootstrap import Array, by_episode
+
+GAMMA = 0.99
+_UNKNOWN = 300  # last steps of an episode cut short, whose return to go isn't known: .99^300 = .05
+_EVERY = 3  # one of three episodes is judged on
+_SHARE = 0.1  # of the usual steps of training
+_ROWS = 50_000  # at most, to fit on and to judge on
+_HORIZON = 10  # steps ahead
+_NEEDED = 0.1  # need from which a feature is needed
+_KEPT = 0.5  # R^2 from which it is kept
+_PREDICTABLE = 0.1  # R^2 below which nothing can be learnt about what a prediction needs
+_NUMBERS = 1 << 18  # rows times features, at most, in which features are shuffled
+
+
+class PlayedEpisode(NamedTuple):
+    """An episode of n steps under a policy.
+
+    Attributes:
+        observation: before each step and at the end, in physical units, (n + 1, d).
+        reward: of each step, (n,).
+        terminated: whether a state ended it, so that nothing more could be earned.
+    """
+
+    observation: NDArray[np.float32]
+    reward: NDArray[Any]
+    terminated: bool
+
+
+class GoodPolicy:
+    """A policy, and what it did in some episodes.
+
+    Args:
+        name: of the policy.
+        act: its actions (n, k) from observations (n, d) in physical units.
+        episodes: that it played.
+
+    Attributes:
+        name: as given.
+        act: as given.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        act: Callable[[NDArray[Any]], NDArray[Any]],
+        episodes: Sequence[PlayedEpisode],
+    ):
+        self.name, self.act = name, act
+        self._episodes = [episode for episode in episodes if _known(episode)]
+
+    @cached_property
+    def fitted_on(self) -> "States":
+        """States of two thirds of the episodes."""
+        return States([e for i, e in enumerate(self._episodes) if i % _EVERY])
+
+    @cached_property
+    def judged_on(self) -> "States":
+        """States of the others."""
+        return States(self._episodes[::_EVERY])
+
+    @property
+    def has_value(self) -> bool:
+        """Whether there are episodes to fit to and to judge on."""
+        return len(self._episodes) > 1
+
+
+class States:
+    """A sample of the steps of some episodes, with their returns to go.
+
+    Attributes:
+        rows: numbers of the steps, (n,).
+        observation: (n, d).
+        value: their discounted returns to go, (n, 1).
+    """
+
+    def __init__(self, episodes: Sequence[PlayedEpisode]):
+        known = [_known(e) for e in episodes]
+        episode = np.repeat(np.arange(len(episodes)), known)
+        self.rows = sample(np.arange(len(episode)), _ROWS)
+        self._episode, self._count = episode, len(episodes)
+        together = [e.observation[:n] for e, n in zip(episodes, known, strict=True)]
+        self.observation = np.concatenate(together)[self.rows]
+        values = [returns_to_go(e.reward)[:n] for e, n in zip(episodes, known, strict=True)]
+        self.value = np.concatenate(values)[self.rows, None]
+
+    def sums(self, rows: Rows, *values: NDArray[Any]) -> list[Array]:
+        """Sums of each array (n, k) over the rows of each episode, (episodes, k)."""
+        return [by_episode(v, self._episode[rows], self._count) for v in values]
+
+
+def _known(episode: PlayedEpisode) -> int:
+    """Steps whose return to go is known."""
+    steps = len(episode.reward)
+    return steps if episode.terminated else max(0, steps - _UNKNOWN)
+
+
+def returns_to_go(reward: NDArray[Any]) -> Array:
+    """Discounted sums of the rewards from each step on, (n,)."""
+    values = np.zeros(len(reward) + 1)
+    for step in reversed(range(len(reward))):
+        values[step] = reward[step] + GAMMA * values[step + 1]
+    return values[:-1]
+
+
+def problems(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> dict[str, Problem]:
+    """The policy's `action` and `value`, its return to go, from the latent.
+
+    No value where too few episodes are left to fit to and to judge on.
+    """
+    seen, taken, _ = _acting(held_out, policy, "train")
+    told = {"action": Problem(encoder.encode(seen), taken)}
+    if policy.has_value:
+        states = policy.fitted_on
+        told["value"] = Problem(encoder.encode(states.observation), states.value, share=_SHARE)
+    return told
+
+
+def value(
+    encoder: BaseEncoder, policy: GoodPolicy | None, predictors: Mapping[str, Predictor]
+) -> Score | None:
+    """R^2 of the policy's return to go, discounted by .99, from the latent, nonlinearly.
+
+    Fitted on two thirds of its episodes, judged on the others; None without them. The last 300
+    steps of an episode are left out unless a state ended it.
+    """
+    if policy is None or "value" not in predictors:
+        return None
+    states = policy.judged_on
+    predicted = predictors["value"](encoder.encode(states.observation))
+    return explained(predicted, states.value, states.rows, states)[0]
+
+
+def action(
+    encoder: BaseEncoder,
+    held_out: HeldOut,
+    policy: GoodPolicy | None,
+    predictors: Mapping[str, Predictor],
+) -> Action | None:
+    """R^2 of what the policy would do in held-out rows, from the latent: linear and nonlinear."""
+    if policy is None:
+        return None
+    seen, taken, _ = _acting(held_out, policy, "train")
+    unseen, true, rows = _acting(held_out, policy, "test")
+    latent = encoder.encode(unseen)
+    linear, nonlinear = ridge(encoder.encode(seen), taken)(latent), predictors["action"](latent)
+    return Action(
+        linear=explained(linear, true, rows, held_out)[0],
+        nonlinear=explained(nonlinear, true, rows, held_out)[0],
+    )
+
+
+@lru_cache(2)  # since all encoders share them
+def _acting(
+    held_out: HeldOut, policy: GoodPolicy, part: str
+) -> tuple[NDArray[np.float32], Array, Rows]:
+    """A sample of observations (n, d), what the policy would do (n, k), and their rows (n,)."""
+    data = held_out.data
+    rows = sample_rows(getattr(data, part), _ROWS, data.task.size)
+    observation = data.dataset["observation"][rows]
+    return observation, np.asarray(policy.act(observation), np.float64), rows
+
+
+class Needs(NamedTuple):
+    """How much each feature is needed, from 0 to 1.
+
+    Attributes:
+        reward: for the mean reward of the next 10 steps, (d,); None where episodes are too short,
+            or it can't be predicted.
+        controller: for that, directly or not, or for what a policy does, by the feature's name;
+            empty where episodes are too short.
+    """
+
+    reward: Matters
+    controller: dict[str, float]
+
+
+def needs(
+    full: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None, learnt: Networks
+) -> Needs:
+    """What reward and controller need of the state.
+
+    A feature is needed for a prediction by the share of the explained variance that is lost when
+    its values are shuffled among held-out rows (permutation importance; Breiman 2001). A controller
+    needs it directly as much as the mean reward of the next 10 steps or, if there is a policy, its
+    action or value, whichever needs it most. It needs it indirectly for the change over 10 steps
+    of another feature, times how much that one is needed directly.
+
+    Args:
+        full: the observation itself.
+        held_out: to judge on.
+        policy: that does the task well, if one is known.
+        learnt: from the observation.
+    """
+    if not learnt.forward:
+        return Needs(None, {})
+    ahead = min(learnt.forward, key=lambda steps: abs(steps - _HORIZON))
+    count = max(2, _NUMBERS // held_out.data.task.size)  # rows in which features are shuffled
+    steps = following(held_out, "test", ahead)
+    seen, told = steps.observation[:count], learnt.forward[ahead]
+    inputs = steps.action[:count]
+    shares = _shares(
+        lambda seen: told(np.hstack((full.encode(seen), inputs))), seen, steps.wanted[:count]
+    )
+    moving, reward = shares[:, :-1], shares[:, -1]
+    of_policy = _of_policy(full, policy, learnt.of_policy, seen) if policy else ()
+    direct = np.max([reward, *of_policy], axis=0)
+    need = np.maximum(direct, (moving * direct).max(axis=1)).tolist()
+    names = held_out.data.task.feature_names
+    return Needs(reward if reward.any() else None, dict(zip(names, need, strict=True)))
+
+
+def _of_policy(
+    full: BaseEncoder,
+    policy: GoodPolicy,
+    predictors: Mapping[str, Predictor],
+    seen: NDArray[Any],
+) -> Iterator[Array]:
+    """How much each of what predictors say of a policy depends on each feature, (d,)."""
+    count = len(seen)
+    asked = {"action": (seen, policy.act(seen))}
+    if policy.has_value:
+        states = policy.judged_on
+        asked["value"] = states.observation[:count], states.value[:count]
+    for name, (observation, wanted) in asked.items():
+        told = partial(_predict, full, predictors[name])
+        yield _shares(told, observation, wanted).max(axis=1)
+
+
+def _predict(full: BaseEncoder, predict: Predictor, observation: NDArray[Any]) -> Array:
+    return predict(full.encode(observation))
+
+
+def _shares(
+    predict: Callable[[NDArray[Any]], Array], observation: NDArray[Any], wanted: NDArray[Any]
+) -> Array:
+    """The share of what is explained of each target that shuffling each feature loses, (d, q).
+
+    Args:
+        predict: the targets (n, q) from observations (n, d).
+        observation: to shuffle, (n, d).
+        wanted: the targets, (n, q).
+    """
+    random = np.random.default_rng(0)
+    variance = np.var(wanted, axis=0, dtype=np.float64)
+
+    def error(seen: NDArray[Any]) -> Array:
+        return np.square(predict(seen) - wanted).mean(axis=0)
+
+    least = error(observation)
+    explained = variance - least
+    shares = np.zeros((observation.shape[1], wanted.shape[1]))
+    predicted = explained > _PREDICTABLE * variance
+    for feature, column in enumerate(observation.T):
+        shuffled = observation.copy()
+        shuffled[:, feature] = random.permutation(column)
+        more = error(shuffled) - least
+        shares[feature, predicted] = more[predicted] / explained[predicted]
+    return shares.clip(0, 1)
+
+
+def lost(needed: Mapping[str, float], probes: Scores) -> tuple[Lost, ...]:
+    """The features that are needed and can't be read from a code, the most needed first.
+
+    Args:
+        needed: how much a controller needs each feature.
+        probes: of the code, nonlinear.
+    """
+    return tuple(
+        Lost(name=name, kept=kept, need=need)
+        for name, need in sorted(needed.items(), key=lambda item: -item[1])
+        if need >= _NEEDED and (kept := probes[name].value) is not None and kept < _KEPT
+    )

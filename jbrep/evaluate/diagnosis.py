@@ -1,0 +1,241 @@
+"""Encoders side by side on the held-out part of a data set."""
+
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import chain
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from jbrep.dataset import ScaledDataset
+from jbrep.dataset.scaled import sample
+from jbrep.dataset.settings import IMPORTED
+from jbrep.encoders import FULL, Encoder, find
+from jbrep.encoders.base import BaseEncoder
+from jbrep.encoders.encoder import IDENTITY
+from jbrep.encoders.own import as_file
+from jbrep.errors import InputError
+from jbrep.evaluate import control, prediction, readout
+from jbrep.evaluate.control import GoodPolicy, Needs, lost, needs
+from jbrep.evaluate.evaluation import EVALUATION, Diagnostics, Evaluation, JudgedOn
+from jbrep.evaluate.held_out import HeldOut
+from jbrep.evaluate.latent import latent_units
+from jbrep.evaluate.reconstruction import corruption, reconstruction
+from jbrep.evaluate.regression import Networks, beside, fit
+from jbrep.progress import Progress
+from jbrep.records.document import read_document
+from jbrep.records.storage import exists, make_folder
+from jbrep.stats.bootstrap import RESAMPLES
+from jbrep.training.trainer import single_torch_thread
+
+
+def write(
+    encoders: Mapping[str, Any],
+    data: ScaledDataset,
+    folder: Path,
+    policy: GoodPolicy | None = None,
+) -> Evaluation:
+    """Judge encoders as `diagnose`, and write evaluation.json into a folder, made if needed.
+
+    Raises:
+        InputError: as `diagnose`, or the folder holds the evaluation of other encoders or data, or
+            with another policy.
+    """
+    path = folder / EVALUATION
+    judged = {label: find(each, data.task) for label, each in encoders.items()}
+    if exists(path) and not _is_same(path, data, hashes(judged), policy):
+        raise InputError(
+            f"{path} is not an evaluation of these encoders on this data: choose another --out"
+        )
+    make_folder(folder)
+    evaluation = diagnose(judged, data, policy)
+    evaluation.write(path)
+    return evaluation
+
+
+def _is_same(
+    path: Path, data: ScaledDataset, encoders: dict[str, str], policy: GoodPolicy | None
+) -> bool:
+    """Whether a repeated evaluation would replace one of the same."""
+    try:
+        there = read_document(path, Evaluation)
+    except InputError:
+        return False
+    wanted = data.dataset.manifest.fingerprint, encoders, policy.name if policy else None
+    return (there.data.fingerprint, there.hashes, there.policy) == wanted
+
+
+def diagnose(
+    encoders: Mapping[str, Any], data: ScaledDataset, policy: GoodPolicy | None = None
+) -> Evaluation:
+    """Every diagnostic of every encoder; docs/encoders.md describes each.
+
+    The full observation comes first, as the upper limit of what can be kept. Errors are those of
+    features scaled by this data set's extrema, whatever the encoder's own scaling.
+
+    Args:
+        encoders: by the label to show; whatever `jbrep.encoders.find` takes, such as a torch
+            module.
+        data: to judge them on; encoders that were trained on this data set haven't seen its test
+            part.
+        policy: that does the task well; what encoders say of its actions and its value is None
+            without one.
+
+    Raises:
+        InputError: an encoder made for other features, or whose numbers overflow; or as `find`.
+    """
+    held_out = HeldOut(data)
+    judged = {label: find(each, data.task) for label, each in encoders.items()}
+    for label, encoder in judged.items():
+        _check(label, encoder, data)
+    full = Encoder({"kind": IDENTITY, "name": FULL}, data.scaler, (), ())
+    results, needed = _side_by_side({FULL: full, **judged}, held_out, policy)
+    sha256 = hashes(judged)
+    return Evaluation(
+        data=_judged_on(held_out),
+        resamples=RESAMPLES,
+        seen={label: seen(encoder, data) for label, encoder in judged.items()},
+        policy=policy.name if policy else None,
+        needs=needed,
+        encoders={name: each.replace(sha256=sha256.get(name)) for name, each in results.items()},
+    )
+
+
+def hashes(encoders: Mapping[str, BaseEncoder]) -> dict[str, str]:
+    """SHA-256 of encoders by label; of a module, that of the file that a run keeps of it."""
+    with single_torch_thread():
+        return {label: as_file(encoder).fingerprint for label, encoder in encoders.items()}
+
+
+def _side_by_side(
+    encoders: Mapping[str, BaseEncoder], held_out: HeldOut, policy: GoodPolicy | None
+) -> tuple[dict[str, Diagnostics], dict[str, float]]:
+    """What is said of each encoder, as many at a time as there are cores, and what is needed.
+
+    What is needed comes first, the full observation last: they share its networks.
+    """
+    full = encoders[FULL]
+
+    def begin() -> tuple[Networks, Needs]:
+        learnt = networks(full, held_out, policy)
+        return learnt, needs(full, held_out, policy, learnt)
+
+    with single_torch_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        begun = pool.submit(begin)
+        total = len(encoders) * len(_DIAGNOSTICS)
+        with Progress(total=total, unit="diagnostic") as progress:
+
+            def judge(label: str) -> Diagnostics:
+                encoder, known = encoders[label], dict[str, Any]()
+                is_full = encoder is full
+                learnt = begun.result()[0] if is_full else networks(encoder, held_out, policy)
+                judged = _Judged(encoder, held_out, policy, learnt, begun)
+                for name, diagnostic in _DIAGNOSTICS.items():
+                    progress.set_description_str(f"{label} {name.replace('_', ' ')}", refresh=False)
+                    known[name] = diagnostic(judged)
+                    progress.update()
+                return Diagnostics(
+                    kind=encoder.kind,
+                    latent=encoder.latent_size,
+                    loses=lost(judged.needs.controller, known["nonlinear_probes"]),
+                    method=_said_by_method(encoder),
+                    **known,
+                )
+
+            futures = {label: pool.submit(judge, label) for label in reversed([*encoders])}
+            try:
+                results = {label: futures[label].result() for label in encoders}
+                return results, begun.result()[1].controller
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+
+class _Judged(NamedTuple):
+    """An encoder with what its diagnostics share."""
+
+    encoder: BaseEncoder
+    held_out: HeldOut
+    policy: GoodPolicy | None
+    learnt: Networks
+    begun: "Future[tuple[Networks, Needs]]"
+
+    @property
+    def needs(self) -> Needs:
+        """What is needed, once that is known."""
+        return self.begun.result()[1]
+
+
+_DIAGNOSTICS: dict[str, Callable[[_Judged], Any]] = {
+    "nonlinear_probes": lambda e: readout.nonlinear_probes(e.encoder, e.held_out, e.learnt.probe),
+    "reconstruction": lambda e: (
+        reconstruction(e.encoder, e.held_out) if e.encoder.can_decode else None
+    ),
+    "corruption": lambda e: corruption(e.encoder, e.held_out) if e.encoder.can_decode else None,
+    "latent_units": lambda e: latent_units(e.encoder, e.held_out),
+    "probes": lambda e: readout.probes(e.encoder, e.held_out),
+    "neighbours": lambda e: readout.neighbours(e.encoder, e.held_out),
+    "correlation": lambda e: readout.correlation(e.encoder, e.held_out),
+    "dynamics": lambda e: readout.dynamics(e.encoder, e.held_out),
+    "value": lambda e: control.value(e.encoder, e.policy, e.learnt.of_policy),
+    "action": lambda e: control.action(e.encoder, e.held_out, e.policy, e.learnt.of_policy),
+    "prediction": lambda e: prediction.prediction(  # waits for what is needed
+        e.encoder, e.held_out, e.learnt.forward, e.needs.reward
+    ),
+}
+
+
+def networks(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None = None) -> Networks:
+    """All that diagnostics learn from an encoder's latents.
+
+    Fitted at once: one after the other they would take nearly twice as long.
+    """
+    ahead = prediction.problems(encoder, held_out)
+    of_policy = control.problems(encoder, held_out, policy) if policy else {}
+    pairs = chain.from_iterable(ahead.values())
+    fitted = iter(fit([*pairs, readout.problem(encoder, held_out), *of_policy.values()]))
+    forward = {steps: beside(next(fitted), next(fitted)) for steps in ahead}
+    return Networks(forward, next(fitted), dict(zip(of_policy, fitted, strict=True)))
+
+
+def _said_by_method(encoder: BaseEncoder) -> dict[str, Any]:
+    """What the method says of its own fit, such as its spectrum."""
+    return dict(encoder.header.get("metrics", {})) if isinstance(encoder, Encoder) else {}
+
+
+def _check(label: str, encoder: BaseEncoder, data: ScaledDataset) -> None:
+    if label == FULL:
+        raise InputError(f"the label {FULL} is reserved for the observation itself: choose another")
+    rows = data.dataset["observation"][sample(data.test, 1000)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        latent = encoder.encode(rows)
+        back = encoder.decode(latent) if encoder.can_decode else latent
+    if not np.isfinite(back).all():
+        raise InputError(f"{label} gives numbers that are not finite: train it again")
+
+
+def seen(encoder: BaseEncoder, data: ScaledDataset) -> Literal["no test row", "none", "maybe"]:
+    """Which of these rows an encoder saw in training."""
+    source = encoder.header["data"] if isinstance(encoder, Encoder) else {}
+    manifest = data.dataset.manifest
+    if source.get("fingerprint") == manifest.fingerprint:
+        return "no test row"
+    kinds = {source.get("policy", {}).get("kind"), manifest.settings.policy["kind"]}
+    if "seed" not in source or IMPORTED in kinds:
+        return "maybe"
+    return "none" if source["seed"] != manifest.settings.seed else "maybe"
+
+
+def _judged_on(held_out: HeldOut) -> JudgedOn:
+    data, manifest = held_out.data, held_out.data.dataset.manifest
+    return JudgedOn(
+        task=data.task.name,
+        fingerprint=manifest.fingerprint,
+        policy=dict(manifest.settings.policy),
+        seed=manifest.settings.seed,
+        train_rows=len(data.train),
+        test_rows=len(data.test),
+        test_episodes=len(held_out),
+        constant_features=data.constant_features,
+    )

@@ -1,0 +1,178 @@
+"""An evaluation of encoders as tables to read on a screen."""
+
+import sys
+import textwrap
+from collections.abc import Mapping
+
+from jbrep.encoders import FULL
+from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Scores
+from jbrep.evaluate.table import headline
+from jbrep.jitterbug.tasks import TASKS
+from jbrep.text import facts, interval, number, r2_text, table
+
+_Encoders = Mapping[str, Diagnostics]  # by label
+
+_WORDS = {
+    "orientation_w": "yaw",
+    "orientation_x": "tilt",
+    "orientation_y": "tilt",
+    "orientation_z": "yaw",
+    "velocity_z": "vertical speed",
+    "angular_velocity_x": "rate of tilt",
+    "angular_velocity_y": "rate of tilt",
+    "angular_velocity_z": "rate of yaw",
+}
+
+_SERVES = {  # of the headline
+    "forward": "the features' change over 10 steps, from code and actions",
+    "rewarded": "of that, what the reward depends on",
+    "reward": "the mean reward of these steps",
+    "value": "the discounted return to go",
+    "action": "the action",
+}
+_OF_POLICY = ("value", "action")
+_NOISE = 0.1  # the level of corruption that is shown
+_MANY = 8  # quantities from which probes are summed up
+
+
+def evaluation_text(evaluation: Evaluation, width: int | None = None) -> str:
+    """What encoders lose and what their latents keep, a line for each encoder.
+
+    Args:
+        evaluation: of encoders.
+        width: columns to fit; None for lines as long as they come.
+    """
+    data, encoders = evaluation.data, evaluation.encoders
+    parts = (
+        *_headline(evaluation, width),
+        f"Error on {data.test_episodes:,} held-out episodes of {data.task} "
+        f"({data.test_rows:,} rows), features scaled to [-1, 1], with 95 % intervals over "
+        "episodes",
+        _losses(encoders, width),
+        "What can be read from the latent: R² of linear probes; KNN-MSE (2: nothing); GTC (1: the "
+        f"units are the state itself{_drawn(encoders)}); R² of the next latent, whitened",
+        _readings(encoders, width),
+        "Latent units: dead ones, the most saturated one, participation ratio, intrinsic dimension",
+        _units(encoders, width),
+    )
+    texts, tables = parts[::2], parts[1::2]
+    wrapped = texts if width is None else [textwrap.fill(text, width) for text in texts]
+    return "\n\n".join(part for pair in zip(wrapped, tables, strict=True) for part in pair)
+
+
+def _headline(evaluation: Evaluation, width: int | None) -> tuple[str, ...]:
+    """What tells codes that serve from others, and a line on what each loses."""
+    policy = evaluation.policy
+    shown = {name: words for name, words in _SERVES.items() if policy or name not in _OF_POLICY}
+    rows = []
+    for label, known in evaluation.encoders.items():
+        numbers = headline(known)
+        rows.append((label, str(known.latent), *(r2_text(numbers[name]) for name in shown)))
+    explained = "; ".join(f"{name}: {words}" for name, words in shown.items())
+    return (
+        f"Whether a controller can work with the code: held-out R², nonlinear (1: all, 0: nothing)."
+        f" {explained[0].upper()}{explained[1:]}{f' of {policy}' if policy else ''}",
+        table(("encoder", "l", *shown), rows, width),
+        "What a controller needs and the code loses (R² of reading it below .5), the most needed "
+        "first",
+        _lost(evaluation, width),
+    )
+
+
+def _lost(evaluation: Evaluation, width: int | None) -> str:
+    lines = {}
+    for label, known in evaluation.encoders.items():
+        lost: dict[str, float] = {}
+        for each in known.loses:
+            lost.setdefault(in_words(evaluation.data.task, each.name), each.kept)
+        more = len(lost) - _MANY
+        some = [f"{words} ({r2_text(kept)})" for words, kept in list(lost.items())[:_MANY]]
+        lines[label] = ", ".join(some) + (f" and {more} more" if more > 0 else "") or "nothing"
+    return facts(lines, width or sys.maxsize, indent=0)
+
+
+def in_words(task: str, feature: str) -> str:
+    """What to call a feature to a reader; several of the Jitterbug's share their words."""
+    words = _WORDS if task in TASKS else {}
+    return words.get(feature, feature.replace("_", " "))
+
+
+def _losses(encoders: _Encoders, width: int | None) -> str:
+    header = ("encoder", "l", "error", "times PCA's", f"from noise {_NOISE}", "best linear")
+    rows = []
+    for label, known in encoders.items():
+        error = known.reconstruction
+        if label == FULL:
+            continue
+        if error is None or known.corruption is None:
+            rows.append((label, str(known.latent), *["-"] * (len(header) - 1)))
+            continue
+        noisy = next(each for each in known.corruption if each.noise == _NOISE)
+        worst = min(error.features, key=lambda f: (f.r2.value is None, f.r2.value))
+        rows.append(
+            (
+                label,
+                str(known.latent),
+                interval(error.mse, ".5f"),
+                interval(error.ratio_to_pca, ".3f") if error.ratio_to_pca else "-",
+                number(noisy.mse.value, ".5f"),
+                number(noisy.linear_mse.value, ".5f"),
+                f"{worst.name} {r2_text(worst.r2.value)}",
+            )
+        )
+    return table((*header, "worst feature, R²"), rows, width)
+
+
+def _drawn(encoders: _Encoders) -> str:
+    """How many dimensions of the state the GTC looks at, if not at all."""
+    gtc = encoders[FULL].correlation
+    judged, whole = len(gtc.dimensions), gtc.state_dimensions
+    return f"; {judged} of its {whole} dimensions" if judged < whole else ""
+
+
+def _readings(encoders: _Encoders, width: int | None) -> str:
+    probes = {label: _probes(known.probes) for label, known in encoders.items()}
+    header = ("encoder", *probes[FULL], "KNN-MSE", "GTC", "next")
+    rows = [
+        (
+            label,
+            *probes[label].values(),
+            number(known.neighbours.mse.value, ".2f"),
+            number(known.correlation.mean.value, ".2f"),
+            r2_text(known.dynamics.linear.value),
+        )
+        for label, known in encoders.items()
+    ]
+    return table(header, rows, width)
+
+
+def _probes(scores: Scores) -> dict[str, str]:
+    """R² of each quantity; of many, of those that vary, the mean and the least."""
+    if len(scores) <= _MANY:
+        return {name.replace("_", " "): r2_text(score.value) for name, score in scores.items()}
+    known = {name: score.value for name, score in scores.items() if score.value is not None}
+    if not known:
+        return {"probes, mean": "-", "worst probe": "-"}
+    worst = min(known, key=known.__getitem__)
+    return {
+        "probes, mean": r2_text(sum(known.values()) / len(known)),
+        "worst probe": f"{worst} {r2_text(known[worst])}",
+    }
+
+
+def _units(encoders: _Encoders, width: int | None) -> str:
+    rows = []
+    for label, known in encoders.items():
+        units = known.latent_units
+        rows.append(
+            (
+                label,
+                str(len(units.dead)),
+                number(max(units.saturation) if units.saturation else None, ".0%"),
+                number(units.participation_ratio, ".1f"),
+                number(units.intrinsic_dimension.two_nn, ".1f"),
+                number(units.intrinsic_dimension.mle, ".1f"),
+            )
+        )
+    header = ("encoder", "dead", "saturated", "participation", "TwoNN", "max. likelihood")
+    return table(header, rows, width)
