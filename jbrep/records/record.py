@@ -14,7 +14,7 @@ import sys
 from typing import Annotated, Any, Self, TypeVar
 
 import msgspec
-from msgspec import NODEFAULT, Meta, inspect
+from msgspec import NODEFAULT, UNSET, Meta, inspect
 from msgspec.structs import force_setattr
 
 from jbrep.errors import InputError
@@ -129,6 +129,8 @@ def _said(message: str, value: Any, kind: Any, where: str) -> str:
         return f"unknown {_inside(name, unknown[1])}: it must be one of {', '.join(part.names)}"
     if not _OF_MSGSPEC.match(reason):  # what `check` said
         return f"{name}: {reason}" if name else reason
+    if part.value is UNSET:
+        return f"{name} must be {must_be(part.kind)}"
     return f"{name or 'it'} is {shown(part.value)}: it must be {must_be(part.kind)}"
 
 

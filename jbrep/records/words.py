@@ -5,7 +5,7 @@ import sys
 from functools import cache
 from typing import Any, NamedTuple
 
-from msgspec import inspect
+from msgspec import UNSET, inspect
 
 _STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+|\.\.\.)\]")
 _LARGEST = sys.float_info.max
@@ -15,7 +15,7 @@ class Part(NamedTuple):
     """A part of a value."""
 
     name: str  # as in settings.steps
-    value: Any
+    value: Any  # UNSET of a part of a table that msgspec doesn't name
     kind: inspect.Type
     names: tuple[str, ...] = ()  # of the fields that it may have
 
@@ -50,14 +50,17 @@ def bare(node: inspect.Type) -> inspect.Type:
 
 
 def _has_parts(node: inspect.Type) -> bool:
-    kinds = inspect.StructType, inspect.CollectionType, inspect.TupleType, inspect.DictType
-    return isinstance(node, kinds)
+    structs = inspect.StructType, inspect.NamedTupleType
+    return isinstance(node, (*structs, inspect.CollectionType, inspect.TupleType, inspect.DictType))
 
 
 def _inner(node: inspect.Type, step: str) -> inspect.Type:
     """The type of a part."""
     match bare(node):
-        case inspect.StructType(fields=fields, array_like=True) if step.isdecimal():
+        case (
+            inspect.StructType(fields=fields, array_like=True)
+            | inspect.NamedTupleType(fields=fields)
+        ) if step.isdecimal():
             return fields[int(step)].type
         case inspect.StructType(fields=fields):
             return next((f.type for f in fields if f.encode_name == step), inspect.AnyType())
@@ -72,7 +75,10 @@ def _inner(node: inspect.Type, step: str) -> inspect.Type:
 
 def _name(node: inspect.Type, step: str) -> str:
     match bare(node):
-        case inspect.StructType(fields=fields, array_like=True) if step.isdecimal():
+        case (
+            inspect.StructType(fields=fields, array_like=True)
+            | inspect.NamedTupleType(fields=fields)
+        ) if step.isdecimal():
             return f".{fields[int(step)].encode_name}"
         case inspect.StructType():
             return f".{step}"
@@ -81,6 +87,8 @@ def _name(node: inspect.Type, step: str) -> str:
 
 def _value(value: Any, step: str) -> Any:
     """A part of a value; the value itself where the path doesn't say which part."""
+    if step == "...":
+        return UNSET
     try:
         if isinstance(value, dict):
             return value[step]
@@ -126,7 +134,10 @@ def _scalar(node: inspect.Type) -> str:
 
 def _collection(node: inspect.Type) -> str:
     match node:
-        case inspect.StructType(array_like=True, fields=fields):
+        case (
+            inspect.StructType(array_like=True, fields=fields)
+            | inspect.NamedTupleType(fields=fields)
+        ):
             return f"a list of {', '.join(each.encode_name for each in fields)}"
         case inspect.StructType() | inspect.DictType():
             return "a table"
