@@ -42,7 +42,7 @@ def quick_evaluations():
     """Nonlinear regressions that learn little; test_prediction.py has them learn."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jbrep.evaluate.regression._STEPS", 2)
-        patch.setattr("jbrep.play.good_policy._EPISODES", 2)
+        patch.setattr("jbrep.play.sources._GOOD_EPISODES", 2)
         yield
 
 

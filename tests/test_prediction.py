@@ -29,7 +29,7 @@ from jbrep.evaluate.prediction import (
 from jbrep.evaluate.readout import nonlinear_probes, probes
 from jbrep.evaluate.regression import Problem, beside, fit
 from jbrep.evaluate.table import headline
-from jbrep.play.good_policy import find_good_policy
+from jbrep.play.sources import find_good_policy
 from jbrep.records.record import to_plain
 from jbrep.report.evaluation import evaluation_text, in_words
 

@@ -18,8 +18,7 @@ from jbrep.envs.make import make_env
 from jbrep.envs.physics import Motion, physics_of
 from jbrep.errors import InputError
 from jbrep.jitterbug.model import plain_model
-from jbrep.play.film import Film, Pace
-from jbrep.play.formats import encode_gif, encode_mp4, get_format
+from jbrep.play.film import Film, Pace, encode_gif, encode_mp4, get_format
 from jbrep.play.pictures import Camera, add_caption, band_height, find_camera
 from jbrep.play.sources import find_episode
 

@@ -65,7 +65,7 @@ def evaluate(
     from jbrep.encoders.shipped import source_of
     from jbrep.evaluate.diagnosis import write
     from jbrep.evaluate.evaluation import EVALUATION
-    from jbrep.play.good_policy import find_good_policy
+    from jbrep.play.sources import find_good_policy
     from jbrep.report.evaluation import evaluation_text
     from jbrep.report.figures import encoder_plots
     from jbrep.report.figures import write as write_plots

@@ -22,7 +22,7 @@ from jbrep.errors import InputError
 
 if TYPE_CHECKING:
     from jbrep.envs.task import Task
-    from jbrep.play.sources import Player
+    from jbrep.play.player import Player
 
 _TASK = "face_direction"
 

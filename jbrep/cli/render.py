@@ -67,8 +67,7 @@ def render(
     from jbrep.opengl import find_opengl
 
     find_opengl()
-    from jbrep.play.film import Film, Pace
-    from jbrep.play.formats import get_format
+    from jbrep.play.film import Film, Pace, get_format
     from jbrep.play.pictures import Camera
     from jbrep.play.sources import find_episode
 

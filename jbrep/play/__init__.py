@@ -1,1 +1,1 @@
-"""Single episodes: where they come from, and what policies do in them."""
+"""Episodes to look at: where they come from, what policies do in them, and films of them."""

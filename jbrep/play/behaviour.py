@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 from jbrep.play.jitterbug import jitterbug_task
-from jbrep.play.sources import Player, find_player, find_untrained, is_by_name, run_folder
+from jbrep.play.player import Player
+from jbrep.play.sources import find_player, find_untrained, is_by_name, run_folder
 from jbrep.rl.files import runs_below
 
 SPEEDS = np.linspace(-180, 180, 73)  # edges of the bins of the motor's velocity [rad/s]

@@ -11,7 +11,7 @@ from jbrep.dataset import Dataset, Episode
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.physics import Motion, MotionReader
 from jbrep.envs.recording import Actor, Recording, record
-from jbrep.envs.task import Array, Task
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.play.jitterbug import hold_diverged, turn_targets
 from jbrep.progress import Progress
@@ -73,13 +73,6 @@ class Rollout:
     def episode_return(self) -> float:
         """Sum of the rewards."""
         return float(self.reward.sum(dtype=np.float64))
-
-    @property
-    def time(self) -> Array | None:
-        """Time of each state [s], (n + 1,); None where the task's time step isn't known."""
-        if self.task.timestep is None:
-            return None
-        return self.task.timestep * np.arange(len(self) + 1, dtype=np.float64)
 
 
 def replay(dataset: Dataset, episode: int) -> Rollout:
