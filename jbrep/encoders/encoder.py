@@ -47,7 +47,7 @@ class Encoder(BaseEncoder):
     its own scaling. All arithmetic is float32.
 
     Attributes:
-        header: its kind, name and origin as plain JSON, see docs/encoders.md.
+        header: its kind, name and origin as plain JSON, see docs/encoder-file.md.
         scaler: fitted on the training part of its data.
         encoder: layers from the scaled numbers of an observation to the code; empty for the
             identity.

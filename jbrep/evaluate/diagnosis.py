@@ -70,7 +70,7 @@ def _is_same(
 def diagnose(
     encoders: Mapping[str, Any], data: ScaledDataset, policy: GoodPolicy | None = None
 ) -> Evaluation:
-    """Every diagnostic of every encoder; docs/encoders.md describes each.
+    """Every diagnostic of every encoder; docs/diagnostics.md describes each.
 
     The full observation comes first, as the upper limit of what can be kept. Errors are those of
     features scaled by this data set's extrema, whatever the encoder's own scaling.

@@ -138,7 +138,7 @@ class Lost(Record, frozen=True, kw_only=True):
 
 
 class Diagnostics(Record, frozen=True, kw_only=True):
-    """All that is known of an encoder; docs/encoders.md describes each part."""
+    """All that is known of an encoder; docs/diagnostics.md describes each part."""
 
     kind: str
     latent: int
