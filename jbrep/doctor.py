@@ -15,14 +15,20 @@ from packaging.requirements import Requirement
 EXTRAS = {  # what each extra is for; the empty name stands for the core
     "": "the robot and its environments, collect, data",
     "learn": "train-dae, train-encoder, evaluate, rl, study, report",
-    "export": "data import and export, encoder import and export",
     "cluster": "collect and study --backend ray",
     "render": "render",
+    "export": "data import and export, encoder import and export",
     "suite": "--task dm_control/...",
     "tune": "tune",
     "view": "inspect",
     "wandb": "rl --wandb",
     "dev": "make check, test and bench",
+}
+_DISTRIBUTIONS = {  # that are called otherwise than the module they bring
+    "PIL": "pillow",
+    "rerun": "rerun-sdk",
+    "skdim": "scikit-dimension",
+    "sklearn": "scikit-learn",
 }
 _RENDER = """
 from jbrep.opengl import find_opengl
@@ -108,10 +114,22 @@ def _fits(requirement: Requirement, found: str) -> bool:
 
 def _requirements(extra: str) -> Iterator[tuple[Requirement, str]]:
     """The requirements of an extra, each with the installed version, empty if there is none."""
+    for requirement in _required(extra):
+        try:
+            yield requirement, version(requirement.name)
+        except PackageNotFoundError:
+            yield requirement, ""
+
+
+def _required(extra: str) -> Iterator[Requirement]:
     for requirement in map(Requirement, requires("jbrep") or ()):
         marker = requirement.marker
         if marker.evaluate({"extra": extra}) if marker else not extra:
-            try:
-                yield requirement, version(requirement.name)
-            except PackageNotFoundError:
-                yield requirement, ""
+            yield requirement
+
+
+def extra_with(module: str) -> str | None:
+    """The first extra that brings a module, for what to install; None if no extra does."""
+    name = _DISTRIBUTIONS.get(module, module.replace("_", "-"))
+    extras = (extra for extra in EXTRAS if extra)
+    return next((e for e in extras if name in (r.name for r in _required(e))), None)

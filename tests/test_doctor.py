@@ -65,6 +65,12 @@ def test_every_extra_is_examined():
         assert f"{name} {version(name)}" in text
 
 
+def test_a_module_is_known_by_the_extra_that_brings_it():
+    modules = ("PIL", "sklearn", "rerun", "torch", "ray", "numpy", "fly")
+    extras = ["render", "learn", "view", "learn", "cluster", None, None]
+    assert [doctor.extra_with(module) for module in modules] == extras
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_an_extra_left_out_is_named_with_what_it_is_for(monkeypatch):
     have(monkeypatch, rerun_sdk=None)

@@ -19,21 +19,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-_EXTRAS = {  # the extra that installs a missing package
-    **dict.fromkeys(
-        ("jinja2", "joblib", "matplotlib", "rich", "safetensors", "sb3_contrib"), "learn"
-    ),
-    **dict.fromkeys(("scipy", "skdim", "sklearn", "stable_baselines3"), "learn"),
-    **dict.fromkeys(("tensorboard", "torch"), "learn"),
-    **dict.fromkeys(("minari", "onnx", "pyarrow"), "export"),
-    **dict.fromkeys(("PIL", "av"), "render"),
-    "optuna": "tune",
-    "ray": "cluster",
-    "rerun": "view",
-    "shimmy": "suite",
-    "wandb": "wandb",
-}
-
 
 class _Count(click.ParamType[int]):
     """A whole number as people write it: 5000000, 5_000_000, 5e6, 5M, 5k."""
@@ -135,9 +120,11 @@ class Cli(click.Group):
             stop = "" if message.endswith((".", "?")) else "."
             raise _Mistake(f"{message}{stop} See {command} --help.") from None
         except ModuleNotFoundError as error:
-            if error.name not in _EXTRAS:
+            from jbrep.doctor import extra_with
+
+            extra = extra_with(error.name or "")
+            if extra is None:
                 raise
-            extra = _EXTRAS[error.name]
             raise _Mistake(f"this needs {error.name}: pip install 'jbrep[{extra}]'") from None
 
 

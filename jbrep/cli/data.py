@@ -21,7 +21,7 @@ from jbrep.cli.base import (
     printable,
     stoppable,
 )
-from jbrep.cli.environment import given_task, import_option, task_options
+from jbrep.cli.environment import given_task, import_option, needed_task, task_options
 from jbrep.text import terminal_width
 
 _threads = click.option(
@@ -90,8 +90,7 @@ def collect(
     from jbrep.dataset import Settings
     from jbrep.play.sources import find_policy
 
-    task = given_task(options)
-    assert task is not None
+    task = needed_task(options)
     if not task.reproducible:
         click.echo(
             f"{task.name} is not reproducible: no episode can be simulated again, to verify or to "
@@ -267,7 +266,7 @@ def import_(source: str, out: Path, **options: Any) -> None:
     """
     from jbrep.dataset.importing import open_source, write
 
-    task = given_task(options, required=False)
+    task = given_task(options)
     with stoppable("nothing was imported"):
         with _deferred_stop():
             opened = open_source(source)

@@ -17,7 +17,7 @@ from jbrep.cli.base import (
     printable,
     stoppable,
 )
-from jbrep.cli.environment import given_task, task_options
+from jbrep.cli.environment import given_task, needed_task, task_options
 from jbrep.errors import InputError
 from jbrep.text import terminal_width
 
@@ -194,7 +194,7 @@ def info(encoder: str, as_json: bool, **options: Any) -> None:
     from jbrep.encoders.shipped import find_alone, source_of
 
     import_code(encoder)
-    task = given_task(options, required=False)
+    task = given_task(options)
     shown, source = find_alone(encoder, task), source_of(encoder, task)
     if as_json:
         return echo_json(describe(shown, source))
@@ -220,7 +220,7 @@ def export(encoder: str, out: Path, **options: Any) -> None:
     from jbrep.encoders.shipped import find_alone, source_of
 
     import_code(encoder)
-    task = given_task(options, required=False)
+    task = given_task(options)
     exported = find_alone(encoder, task)
     if not isinstance(exported, Encoder):
         raise InputError(
@@ -260,8 +260,7 @@ def import_model(
     from jbrep.encoders.from_onnx import convert
     from jbrep.records.storage import exists
 
-    task = given_task(options)
-    assert task is not None
+    task = needed_task(options)
     if exists(out):
         raise InputError(f"{out} exists already: choose another file")
     made = convert(model, task, decoder, name or out.name.removesuffix(SUFFIX))

@@ -5,7 +5,7 @@ from typing import Any
 import click
 
 from jbrep.cli.base import as_json, echo_json, echo_text, example
-from jbrep.cli.environment import given_task, task_options
+from jbrep.cli.environment import needed_task, task_options
 from jbrep.records.record import to_plain
 from jbrep.text import terminal_width
 
@@ -24,8 +24,7 @@ def env(as_json: bool, **options: Any) -> None:
     """
     from jbrep.envs.card import card
 
-    task = given_task(options)
-    assert task is not None
+    task = needed_task(options)
     if as_json:
         echo_json(to_plain(task))
         return

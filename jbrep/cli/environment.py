@@ -71,23 +71,29 @@ def task_options(named: bool = True) -> Callable[[_Command], _Command]:
     return decorate
 
 
-def given_task(options: dict[str, Any], required: bool = True) -> "Task | None":
+def needed_task(options: dict[str, Any]) -> "Task":
     """The task that a command's options name; they are taken out of the options.
 
     Raises:
-        InputError: there is none though it is required, or options without a task; or as
-            `jbrep.envs.describe`.
+        InputError: there is none; or as `jbrep.envs.describe`.
     """
     name = options.pop("task")
     env, steps, features = (options.pop(option) for option in _ARGUMENTS)
     if name is None:
-        if required or env or steps or features:
-            raise InputError("give the --task: one of the Jitterbug's, or a Gymnasium id")
-        return None
+        raise InputError("give the --task: one of the Jitterbug's, or a Gymnasium id")
     from jbrep.envs.description import describe
     from jbrep.envs.names import name_given
 
     return describe(name_given(name), parse_arguments(env), steps, features)
+
+
+def given_task(options: dict[str, Any]) -> "Task | None":
+    """The same where a task may be left out, with all that would be said of it."""
+    if any(options[option] for option in ("task", *_ARGUMENTS)):
+        return needed_task(options)
+    for option in ("task", *_ARGUMENTS):
+        del options[option]
+    return None
 
 
 def parse_arguments(given: tuple[str, ...], option: str = "--env") -> dict[str, Any]:

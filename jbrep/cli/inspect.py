@@ -72,7 +72,7 @@ def inspect(
         click.echo(printable(line))
 
     import_code(encoder)
-    task = given_task(options, required=False)
+    task = given_task(options)
     path = record(source, episode, task, encoder, traverse, out, data, tell)
     click.echo(printable(f"{path}" if view or serve else f"{path}; open it with: rerun {path}"))
     if view:

@@ -63,7 +63,7 @@ def evaluate_policy(
     from jbrep.encoders.shipped import source_of
 
     import_code(encoder)
-    player = _find(policy, given_task(options, required=False), algorithm, encoder, trust)
+    player = _find(policy, given_task(options), algorithm, encoder, trust)
     source = None if encoder is None else source_of(encoder, player.task)
     returns = player.returns(episodes)
     if as_json:
@@ -206,7 +206,7 @@ def behaviour(
     from jbrep.report.figures import behaviour_plots, write
     from jbrep.text import table, terminal_width
 
-    yaw, task = np.deg2rad(target_yaw), given_task(options, required=False)
+    yaw, task = np.deg2rad(target_yaw), given_task(options)
     with stoppable("the same command starts again"):
         shared_task, behaviours = observe(policies, task, episodes, yaw)
     header = (

@@ -73,7 +73,7 @@ def render(
 
     form = get_format(out)
     pace = Pace(form.fps if fps is None else fps, speed, seconds)
-    task = given_task(options, required=False)
+    task = given_task(options)
     with stoppable("no video was written"), Camera(camera, *(size or form.size)) as seen_by:
         rollouts = [find_episode(source, episode, task) for source in sources]
         film = Film(rollouts, seen_by, pace)

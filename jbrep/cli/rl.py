@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, interval_of, on_stop, printable
-from jbrep.cli.environment import given_task, parse_arguments, task_options
+from jbrep.cli.environment import needed_task, parse_arguments, task_options
 from jbrep.cli.options import record_options
 from jbrep.rl.names import CLASSES
 from jbrep.rl.settings import TrainingSettings
@@ -121,7 +121,7 @@ def rl(context: click.Context, /, out: Path, project: str | None, **settings: An
         from jbrep.rl import Run, StoppedError, train
         from jbrep.rl.files import EVALUATIONS, RUN, read_evaluations
 
-        settings |= {"task": given_task(settings), "settings": given_settings(settings)}
+        settings |= {"task": needed_task(settings), "settings": given_settings(settings)}
         import_code(settings["encoder"])
         run = Run(**settings)
         run.check()

@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from jbrep.cli.base import COUNT, POSITIVE, RESUMES, example
-from jbrep.cli.environment import given_task, task_options
+from jbrep.cli.environment import needed_task, task_options
 from jbrep.cli.options import record_options
 from jbrep.cli.rl import given_settings, learner_options, stop_signals
 from jbrep.rl.settings import TrainingSettings
@@ -47,7 +47,7 @@ def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **settin
             score = "failed" if trial.value is None else rounded(trial.value)[0]
             click.echo(f"trial {trial.number + 1} of {trials}: {score}  {_shown(trial.settings)}")
 
-        settings |= {"task": given_task(settings), "settings": given_settings(settings)}
+        settings |= {"task": needed_task(settings), "settings": given_settings(settings)}
         import_code(settings["encoder"])
         episodes = settings["evaluation_episodes"]
         run = Run(**settings, evaluate_every=settings["steps"], final_episodes=episodes)
