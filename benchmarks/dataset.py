@@ -24,7 +24,8 @@ from torch.utils.data import DataLoader, TensorDataset
 
 from jbrep import jitterbug
 from jbrep.collect import collect
-from jbrep.dataset import Dataset, Settings
+from jbrep.dataset import Dataset, DataSettings
+from jbrep.envs import describe
 from jbrep.jitterbug.model import PHYSICS_STEPS, fast_model, stop_profiling
 from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS
 
@@ -80,7 +81,7 @@ def dm_control_loop(folder: Path) -> float:
 
 def collected_rate(folder: Path) -> float:
     """Control steps per second of collecting a shard to the disk."""
-    settings = Settings(task=TASK, steps=LANES * EPISODE_STEPS, shard_episodes=LANES)
+    settings = DataSettings(task=describe(TASK), steps=LANES * EPISODE_STEPS, shard_episodes=LANES)
 
     return settings.steps / timed(lambda: collect(settings, folder, LANES))
 

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jbrep.dataset import Dataset, Settings
+from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import commit, new_manifest
 from jbrep.dataset.schema import EPISODES
+from jbrep.envs import describe
 
 
 def make_rows(
@@ -21,7 +22,7 @@ def make_rows(
         steps: of all episodes.
         draw: the values of a column, from its name and shape.
     """
-    settings = Settings(task=task, steps=steps)
+    settings = DataSettings(task=describe(task), steps=steps)
     manifest = new_manifest(settings)
     length, episodes = settings.task.max_episode_steps, settings.shard_episodes
     folder.mkdir()

@@ -1,27 +1,26 @@
 """Small data sets, and shards without the wait for physics."""
 
 from jbrep.collect import write_shards
-from jbrep.dataset import Settings
+from jbrep.dataset import DataSettings
 from jbrep.dataset.manifest import open_shard, read_manifest
 from jbrep.envs import describe
 
 
-def settings(**changes):
+def settings(task="face_direction", **changes):
     small = {
-        "task": "face_direction",
+        "task": describe(task) if isinstance(task, str) else task,
         "policy": {"kind": "uniform"},
         "steps": 5000,
         "seed": 3,
         "shard_episodes": 1,
         "store_state": True,
     }
-    return Settings(**{**small, **changes})
+    return DataSettings(**{**small, **changes})
 
 
-def brief(**changes):
+def brief(task="face_direction", **changes):
     """Five episodes of 100 steps, each in a shard."""
-    task = describe(changes.pop("task", "face_direction"), max_episode_steps=100)
-    return settings(**{"task": task, "steps": 500, **changes})
+    return settings(describe(task, max_episode_steps=100), **{"steps": 500, **changes})
 
 
 def write_again(source, folder):

@@ -6,7 +6,6 @@ import shutil
 import signal
 import sys
 import time
-from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -27,7 +26,7 @@ from jbrep.collect.policies import Uniform
 from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
 from jbrep.dataset import DamageError, Dataset
-from jbrep.dataset.export import FORMATS, export
+from jbrep.dataset.formats import FORMATS, export
 from jbrep.dataset.manifest import new_manifest, read_manifest
 from jbrep.dataset.schema import episode_seed
 from jbrep.dataset.verify import find_problems
@@ -110,7 +109,7 @@ def test_shards_of_episodes_that_may_end_early_are_started_together():
     task = SLEDGE.replace(max_episode_steps=1000)
     made = new_manifest(some(task, steps=200_000, shard_episodes=900))
     assert _Missing(made).wants(1)
-    assert not _Missing(replace(made, settings=some(task, steps=900, shard_episodes=1))).wants(1)
+    assert not _Missing(made.replace(settings=some(task, steps=900, shard_episodes=1))).wants(1)
 
 
 def test_another_division_into_shards_has_the_same_rows(sledges, tmp_path):
@@ -249,7 +248,7 @@ def test_arrays_of_states_are_stored_and_compared(tmp_path):
         derive(tmp_path / "data", "face_direction", tmp_path / "derived")
     with pytest.raises(InputError, match=f"{ID} has no states to store"):
         some(store_state=True)
-    for name in ("reward", "length", "diverged", "final_heat"):
+    for name in ("reward", "length", "policy", "final_heat"):
         with pytest.raises(InputError, match=f"has an array '{name}': data sets have such"):
             some(task.replace(state={name: 1}))
 
@@ -390,7 +389,9 @@ def test_a_stranger_s_task_goes_nowhere(sledges, tmp_path, nothing_is_made):
             changed["settings"]["task"] = change["name"]
         if "seed_bits" in change:
             changed["settings"]["seed"] = 5000
-        (folder / "manifest.json").write_bytes(manifest._text(changed))
-        with pytest.raises(DamageError, match=r"manifest\.json is damaged: it isn't what jbrep"):
+        (folder / "manifest.json").write_text(manifest._hashed(changed))
+        with pytest.raises(
+            DamageError, match=r"manifest\.json is damaged,? or not a jbrep data set file: "
+        ):
             Dataset(folder)
         assert jbrep("data", "info", folder).exit_code == 2

@@ -130,7 +130,7 @@ def test_every_command_has_help_with_an_example(command):
         (("collect", "--task", "fly", "--steps", "1k", "--out", "x"), "unknown task 'fly'"),
         (
             ("collect", "--task", "face_direction", "--steps", "-1", "--out", "x"),
-            "must be from 1 to",
+            "must be a whole number from 1 to",
         ),
         (("train-dae", "--data", "none", "--latent", "8", "--out", "x"), "no data set in none"),
         (("data", "info", "none"), "no data set in none"),
@@ -371,7 +371,7 @@ def test_a_missing_extra_is_named(monkeypatch, tmp_path):
 
 def test_a_missing_package_for_an_export_is_named(monkeypatch, tmp_path, collected):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    monkeypatch.delitem(sys.modules, "jbrep.dataset.export.parquet", raising=False)
+    monkeypatch.delitem(sys.modules, "jbrep.dataset.formats.parquet", raising=False)
     result = jbrep("data", "export", collected, "--to", "parquet", "--out", tmp_path / "x")
     assert (result.exit_code, result.output) == (
         2,

@@ -1,7 +1,5 @@
 """Replaying, repairing and deriving data sets."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import small
@@ -14,7 +12,6 @@ from jbrep.collect.replay import replay_problems
 from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.manifest import (
     MANIFEST,
-    Entry,
     commit,
     open_shard,
     read_manifest,
@@ -53,7 +50,7 @@ def test_replayed_episodes_are_equal_bit_for_bit(collected):
 def test_replay_finds_one_bit_of_difference(name, row, brief, tmp_path):
     """As another machine's rounding would make it: all hashes hold."""
     manifest = read_manifest(brief)
-    spoiled = replace(manifest, shards=())
+    spoiled = manifest.replace(shards=())
     write_manifest(tmp_path, spoiled)
     for shard in range(2):
         columns = dict(open_shard(brief, manifest, shard))
@@ -81,7 +78,7 @@ def test_so_it_is_for_other_policies_and_wider_shards(tmp_path):
     some = small.brief(steps=300, shard_episodes=2, policy=policy)
     collect(some, tmp_path / "source")
     position = describe("move_to_position", max_episode_steps=100)
-    collect(replace(some, task=position, store_state=False), tmp_path / "collected")
+    collect(some.replace(task=position, store_state=False), tmp_path / "collected")
     derive(tmp_path / "source", "move_to_position", tmp_path / "derived")
     assert contents(tmp_path / "derived") == contents(tmp_path / "collected")
 
@@ -90,7 +87,7 @@ def test_a_derivation_goes_on_and_leaves_a_finished_one_alone(collected, tmp_pat
     derive(collected, "move_to_pose", tmp_path / "whole")
     manifest = read_manifest(tmp_path / "whole")
     folder = tmp_path / "begun"
-    begun = replace(manifest, shards=())
+    begun = manifest.replace(shards=())
     folder.mkdir()
     for shard in range(2):
         begun = commit(folder, begun, open_shard(tmp_path / "whole", manifest, shard))
@@ -112,7 +109,7 @@ def test_what_can_t_be_derived(collected, copied, tmp_path):
         derive(tmp_path / "heuristic", "move_to_pose", tmp_path / "x")
     manifest = read_manifest(copied)
     (copied / "shard-00004.h5").unlink()
-    write_manifest(copied, replace(manifest, shards=manifest.shards[:4]))
+    write_manifest(copied, manifest.replace(shards=manifest.shards[:4]))
     with pytest.raises(InputError, match="is unfinished"):
         derive(copied, "move_to_pose", tmp_path / "x")
     assert not (tmp_path / "x").exists()
@@ -173,9 +170,9 @@ def test_what_can_t_be_repaired(copied, tmp_path):
         list(repair(tmp_path))
     manifest = read_manifest(copied)
     hashes = {**manifest.shards[2].sha256, "reward": 64 * "0"}  # of another machine, say
-    entry = Entry(**{**vars(manifest.shards[2]), "sha256": hashes})
+    entry = manifest.shards[2].replace(sha256=hashes)
     shards = (*manifest.shards[:2], entry, *manifest.shards[3:])
-    write_manifest(copied, replace(manifest, shards=shards))
+    write_manifest(copied, manifest.replace(shards=shards))
     (copied / "shard-00002.h5").unlink()
     with pytest.raises(InputError, match=r"00002\.h5 can't be restored here.*'mujoco'"):
         list(repair(copied))
@@ -191,7 +188,7 @@ def test_what_can_t_be_repaired(copied, tmp_path):
 def test_other_versions_are_not_passed_off_as_these(copied, tmp_path):
     manifest = read_manifest(copied)
     older = {**manifest.versions, "mujoco": "3.16.9"}
-    write_manifest(copied, replace(manifest, versions=older))
+    write_manifest(copied, manifest.replace(versions=older))
     with pytest.raises(InputError, match="a derived data set needs the same"):
         derive(copied, "move_to_pose", tmp_path / "derived")
     assert not (tmp_path / "derived").exists()
@@ -201,7 +198,7 @@ def test_states_of_an_earlier_jbrep_are_derived_from_if_the_robot_is_the_same(
     copied, tmp_path, monkeypatch
 ):
     manifest = read_manifest(copied)
-    write_manifest(copied, replace(manifest, versions={**manifest.versions, "jbrep": "0.0.9"}))
+    write_manifest(copied, manifest.replace(versions={**manifest.versions, "jbrep": "0.0.9"}))
     heavier = model.read_xml().replace('density="7700"', 'density="7701"')
     with monkeypatch.context() as changed:
         changed.setattr(model, "read_xml", lambda: heavier)
@@ -214,9 +211,9 @@ def test_states_of_an_earlier_jbrep_are_derived_from_if_the_robot_is_the_same(
 
 def test_a_shard_written_by_another_hdf5_is_adopted_if_its_columns_are_the_same(copied):
     manifest = read_manifest(copied)
-    entry = Entry(**{**vars(manifest.shards[2]), "xxh3": 32 * "0"})
+    entry = manifest.shards[2].replace(xxh3=32 * "0")
     shards = (*manifest.shards[:2], entry, *manifest.shards[3:])
-    write_manifest(copied, replace(manifest, shards=shards))
+    write_manifest(copied, manifest.replace(shards=shards))
     assert list(find_problems(copied))
     assert len(list(repair(copied))) == 2
     assert read_manifest(copied) == manifest

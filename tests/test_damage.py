@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import threading
-from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -15,10 +14,9 @@ from small import write_again
 from jbrep.collect.derive import derive
 from jbrep.collect.repair import repair
 from jbrep.dataset import DamageError, Dataset
-from jbrep.dataset.export import export
+from jbrep.dataset.formats import export
 from jbrep.dataset.manifest import (
     MANIFEST,
-    Entry,
     read_manifest,
     shard_name,
     write_manifest,
@@ -180,7 +178,7 @@ def test_a_file_that_is_left_over_or_not_a_shard_is_named(copied, collected):
     (copied / "notes.txt").write_text("collected on a Tuesday")
     (copied / "manifest.json.partial").write_text("{")
     read_all(copied)
-    write_manifest(copied, replace(read_manifest(copied), shards=()))
+    write_manifest(copied, read_manifest(copied).replace(shards=()))
     with pytest.raises(DamageError, match=r"shard-00001\.h5 is not one of the 0 shards"):
         Dataset(copied)
 
@@ -207,11 +205,18 @@ def entry_of(**changes):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (manifest_of(format_version=3), "has format version 3: this jbrep reads up to 2"),
+        (
+            manifest_of(format_version=1),
+            "has version 1 of the jbrep data set format: this jbrep reads",
+        ),
+        (
+            manifest_of(format_version=3),
+            "has version 3 of the jbrep data set format: this jbrep reads",
+        ),
         (manifest_of(format_version=0), "its format version is 0"),
         (manifest_of(format_version=-1), "its format version is -1"),
         (manifest_of(format="other"), "is damaged"),
-        (manifest_of(shards={}), "is not one of the 0 shards"),
+        (manifest_of(shards={}), "is damaged .*: shards is {}: it must be a list of tables"),
         (manifest_of(shards=[[]]), "is damaged"),
         (manifest_of(versions=[]), "is damaged"),
         (settings_of(task="fly"), "is damaged"),
@@ -251,7 +256,7 @@ def test_a_manifest_that_means_harm(change, message, copied):
 
     record = json.loads((copied / MANIFEST).read_bytes())
     change(record)
-    (copied / MANIFEST).write_bytes(manifest._text(record))
+    (copied / MANIFEST).write_text(manifest._hashed(record))
     with pytest.raises(InputError, match=message):
         read_all(copied)
 
@@ -426,8 +431,8 @@ def adopt(folder, path):
     """Make the manifest name a changed first shard."""
     content, manifest = path.read_bytes(), read_manifest(folder)
     first = manifest.shards[0]
-    entry = replace(first, bytes=len(content), xxh3=file_hash(content))
-    write_manifest(folder, replace(manifest, shards=(entry, *manifest.shards[1:])))
+    entry = first.replace(bytes=len(content), xxh3=file_hash(content))
+    write_manifest(folder, manifest.replace(shards=(entry, *manifest.shards[1:])))
 
 
 def test_a_manifest_that_is_no_file_is_not_opened(copied):
@@ -456,7 +461,7 @@ def test_lengths_that_rows_can_t_be_found_by_are_refused(length, copied, tmp_pat
 
 def test_a_backup_of_nothing_calls_for_collecting_again(collected, tmp_path):
     """As a collector leaves it that is killed before its first manifest is there."""
-    write_manifest(tmp_path, replace(read_manifest(collected), shards=()))
+    write_manifest(tmp_path, read_manifest(collected).replace(shards=()))
     (tmp_path / MANIFEST).unlink()
     for use in (Dataset, lambda folder: list(find_problems(folder)), lambda f: list(repair(f))):
         with pytest.raises(InputError, match="run the same jbrep collect again"):
@@ -485,7 +490,7 @@ def test_the_backup_of_the_manifest_is_looked_after(copied, collected):
         read_all(copied)
         assert len(list(repair(copied))) == 1
         assert backup.read_bytes() == (copied / MANIFEST).read_bytes()
-    write_manifest(copied, replace(read_manifest(collected), shards=()))
+    write_manifest(copied, read_manifest(collected).replace(shards=()))
     shutil.copy(collected / MANIFEST, copied)
     (problem,) = find_problems(copied)
     assert "manifest.backup.json is of another data set" in problem
@@ -522,8 +527,8 @@ def forge(folder, change):
     hashes = column_hashes(columns)
     image = shard_image(columns, hashes, manifest.attributes(0, 1000))
     (folder / shard_name(0)).write_bytes(image)
-    entry = Entry(len(image), 1000, 1, file_hash(image), hashes)
-    write_manifest(folder, replace(manifest, shards=(entry, *manifest.shards[1:])))
+    entry = manifest.shards[0].replace(bytes=len(image), xxh3=file_hash(image), sha256=hashes)
+    write_manifest(folder, manifest.replace(shards=(entry, *manifest.shards[1:])))
 
 
 def spoil(name, place, value):
@@ -544,16 +549,16 @@ def spoil(name, place, value):
         (spoil("observation", (5, 13), 4), "motor_angle ranges from"),
         (spoil("observation", (5, 3), 2), "orientation_w ranges from"),
         (spoil("episodes/final_observation", (0, 15), 9), "angle_to_target ranges from"),
-        (spoil("episode", 5, 1), "the rows' episode"),
-        (spoil("step", 5, 6), "the rows' step"),
-        (spoil("reward", 5, 0.123), "returns: inconsistent with"),
-        (spoil("episodes/seed", 0, 5), "seeds: inconsistent with"),
+        (spoil("episode", 5, 1), ": episode: inconsistent with"),
+        (spoil("step", 5, 6), ": step: inconsistent with"),
+        (spoil("reward", 5, 0.123), "episodes/return: inconsistent with"),
+        (spoil("episodes/seed", 0, 5), "episodes/seed: inconsistent with"),
         (spoil("episodes/length", 0, 999), "lengths of its episodes don't add up to 1,000 rows"),
         (spoil("episodes/length", 0, -1), "lengths of its episodes don't add up to 1,000 rows"),
-        (spoil("episodes/episode", 0, 7), "episode numbers"),
+        (spoil("episodes/episode", 0, 7), "episodes/episode: inconsistent with"),
         (spoil("episodes/truncated", 0, 0), "ends of episodes"),
         (spoil("episodes/truncated", 0, 7), "ends of episodes"),
-        (spoil("episodes/return", 0, 1), "returns"),
+        (spoil("episodes/return", 0, 1), "episodes/return"),
     ],
 )
 def test_verify_finds_numbers_that_can_t_be(change, message, copied):

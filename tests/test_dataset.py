@@ -2,7 +2,6 @@
 
 import json
 import pickle
-from dataclasses import replace
 from itertools import accumulate
 
 import h5py
@@ -314,7 +313,7 @@ def test_data_sets_are_shown_on_one_line(dataset):
 
 def test_an_unfinished_data_set_is_called_so(collected, tmp_path):
     whole = manifest.read_manifest(collected)
-    manifest.write_manifest(tmp_path, replace(whole, shards=()))
+    manifest.write_manifest(tmp_path, whole.replace(shards=()))
     empty = Dataset(tmp_path)
     assert len(empty) == len(empty["observation"][:]) == 0
     assert "0 shards, 0.0 MB; unfinished, 5,000 rows were asked for" in card(empty)
@@ -363,18 +362,20 @@ def test_mistakes_are_named(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"task": 3}, "the task is 3: it must be a name or a Task"),
-        ({"seed": -1}, "the seed is -1: it must be from 0 to 2,147,483,646"),
-        ({"seed": "one"}, "the seed is 'one': it must be a whole number"),
-        ({"steps": 1.5}, "the number of steps is 1.5: it must be a whole number"),
-        ({"shard_episodes": None}, "episodes in a shard is None: it must be a whole number"),
+        ({"task": 3}, "environment is 3: it must be a table"),
+        ({"seed": -1}, "seed is -1: it must be a whole number from 0 to 2,147,483,646"),
+        ({"seed": "one"}, "seed is 'one': it must be a whole number"),
+        ({"steps": 1.5}, "steps is 1.5: it must be a whole number"),
+        ({"shard_episodes": None}, "shard_episodes is None: it must be a whole number"),
         ({"store_state": "yes"}, "store_state is 'yes': it must be true or false"),
-        ({"policy": "uniform"}, "the policy is 'uniform': it must be a kind and its constants"),
-        ({"policy": {"kind": "constant", "drive": None}}, "it must be a kind and its constants"),
-        ({"policy": {"kind": "imported", "source": "a" * 201}}, "it must be a kind and its const"),
-        ({"policy": {"kind": "imported", "source": [1] * 1001}}, "it must be a kind and its const"),
-        ({"policy": {"kind": "mixture", "parts": [[1, "uniform"]] * 2}}, "it must be a kind and"),
-        ({"policy": {"kind": "mixture", "parts": [[0, {"kind": "a"}]] * 2}}, "it must be a kind"),
+        ({"policy": "uniform"}, "policy is 'uniform': it must be a kind and its constants"),
+        ({"policy": {"kind": "constant", "drive": None}}, "it must be a number or text of at most"),
+        ({"policy": {"kind": "imported", "source": "a" * 201}}, "text of at most 200 letters"),
+        ({"policy": {"kind": "imported", "source": "\x1b[2J"}}, "text that can't be printed"),
+        ({"policy": {"kind": "imported", "source": ["\x1b"]}}, "text that can't be printed"),
+        ({"policy": {"kind": "imported", "source": [1] * 1001}}, "it must be a number or text"),
+        ({"policy": {"kind": "mixture", "parts": [[1, "uniform"]] * 2}}, "it must be a table"),
+        ({"policy": {"kind": "mixture", "parts": [[0, {"kind": "a"}]] * 2}}, "number above 0"),
         ({"policy": {"kind": "imported", 1: 1}}, "it must be a kind and its constants"),
     ],
 )
@@ -387,3 +388,9 @@ def test_the_constants_of_a_policy_are_numbers_and_text_in_lists_and_tables():
     parts = [[0.5, {"kind": "uniform"}], [0.5, {"kind": "imported", "source": "a"}]]
     policy = {"kind": "mixture", "parts": parts}
     assert settings(policy=policy).as_json()["policy"] == policy
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_samples_are_verified(task):
+    told = jbrep("data", "verify", f"data/sample/{task}", "--replay", 1)
+    assert (told.exit_code, "no problems in 4,000 rows, 1 shard" in told.output) == (0, True)

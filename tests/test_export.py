@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from jbrep.dataset import Dataset
-from jbrep.dataset.export import FORMATS, export
+from jbrep.dataset.formats import FORMATS, export
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.records.lock import exclusive_file
@@ -128,7 +128,7 @@ def exported(to, folder):
 @pytest.mark.parametrize("to", FORMATS)
 def test_what_came_after_the_check_is_not_overwritten(to, dataset, tmp_path, monkeypatch):
     path = exported(to, tmp_path)
-    publish = f"jbrep.dataset.export.{to}.publish_{'folder' if to == 'minari' else 'file'}"
+    publish = f"jbrep.dataset.formats.{to}.publish_{'folder' if to == 'minari' else 'file'}"
     original = pydoc.locate(publish)
 
     def come_first(partial, name):
@@ -151,7 +151,7 @@ import os, sys
 from pathlib import Path
 from jbrep.dataset import Dataset
 from jbrep.dataset.columns import Column
-from jbrep.dataset.export import export
+from jbrep.dataset.formats import export
 for method in ("chunks", "__getitem__"):
     def die(*arguments, left=[3], call=getattr(Column, method)):
         left[0] -= 1

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from jbrep.collect import collect
 from jbrep.collect.derive import derive
 from jbrep.collect.repair import repair
 from jbrep.dataset import Dataset
-from jbrep.dataset.manifest import BACKUP, MANIFEST, Manifest, read_manifest, write_manifest
+from jbrep.dataset.manifest import BACKUP, MANIFEST, read_manifest, write_manifest
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
 from jbrep.envs.names import import_modules
@@ -116,7 +115,7 @@ def test_what_can_t_be_extended_is_left_as_it_is(short, tmp_path):
     with pytest.raises(InputError, match=r"other settings: steps 300 \(now: 400\), seed 3"):
         collect(two_by_two(400, seed=4), folder)
     manifest = read_manifest(folder)
-    changed = replace(manifest, versions={**manifest.versions, "mujoco": "3.0"})
+    changed = manifest.replace(versions={**manifest.versions, "mujoco": "3.0"})
     write_manifest(folder, changed)
     with pytest.raises(InputError, match=r"mujoco 3\.0"):
         collect(two_by_two(400), folder)
@@ -127,17 +126,3 @@ def test_what_can_t_be_extended_is_left_as_it_is(short, tmp_path):
         MANIFEST,
         BACKUP,
     }
-
-
-def test_a_data_set_of_the_first_release_can_t_be_extended(copied):
-    changed = as_version_1(read_manifest(copied))
-    write_manifest(copied, changed)
-    with pytest.raises(InputError, match="format version 1, which can't be extended: collect anew"):
-        collect(settings(steps=6000), copied)
-    assert read_manifest(copied) == changed
-
-
-def as_version_1(manifest: Manifest) -> Manifest:
-    named = replace(manifest, format_version=1)
-    shards = [replace(e, sha256=dict.fromkeys(named.specs(), "")) for e in manifest.shards]
-    return replace(named, shards=tuple(shards))

@@ -23,8 +23,8 @@ from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
 from jbrep.dataset import Dataset
 from jbrep.dataset.card import card
-from jbrep.dataset.export import export
-from jbrep.dataset.importing import open_source, write
+from jbrep.dataset.formats import export, open_source
+from jbrep.dataset.formats.writer import write
 from jbrep.dataset.manifest import shard_name
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
@@ -442,7 +442,7 @@ def test_it_replaces_nothing(written):
 KILLED = """
 import os, sys
 from pathlib import Path
-from jbrep.dataset.importing import open_source, writer
+from jbrep.dataset.formats import open_source, writer
 def die(*arguments):
     os.kill(os.getpid(), 9)
 writer.publish_folder = die

@@ -10,7 +10,7 @@ from jbrep.collect.derive import derive
 from jbrep.collect.policies import parse_policy
 from jbrep.collect.repair import repair
 from jbrep.dataset import Dataset
-from jbrep.dataset.export import export
+from jbrep.dataset.formats import export
 from jbrep.dataset.manifest import open_shard, read_manifest
 from jbrep.dataset.schema import EPISODES
 from jbrep.dataset.verify import _episode_problems, find_problems
@@ -57,7 +57,7 @@ def test_a_column_that_says_something_else_is_a_problem(mixture):
     columns = dict(open_shard(mixture, manifest, 0))
     columns[EPISODES + "policy"] = (columns[EPISODES + "policy"] + 1) % 3
     assert [*_episode_problems(manifest, 0, columns)] == [
-        "the episodes' policies: inconsistent with the settings, or with other columns"
+        "episodes/policy: inconsistent with the settings, or with other columns"
     ]
 
 

@@ -11,7 +11,7 @@ from command import jbrep
 
 from jbrep.collect import collect
 from jbrep.collect.policies import Heuristic
-from jbrep.dataset import Dataset, Settings
+from jbrep.dataset import Dataset, DataSettings
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
 from jbrep.envs.make import make_env
@@ -55,7 +55,7 @@ def run(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def hopper(tmp_path_factory):
     folder = tmp_path_factory.mktemp("hopper")
-    collect(Settings(task=SHORT["Hopper-v5"], policy={"kind": "uniform"}, steps=90), folder)
+    collect(DataSettings(task=SHORT["Hopper-v5"], policy={"kind": "uniform"}, steps=90), folder)
     return Dataset(folder)
 
 
@@ -250,7 +250,7 @@ def test_episodes_may_be_shorter():
         ("heuristic", 0, None, "policy heuristic needs a --task"),
         ("heuristic", -1, "face_direction", "there is no episode -1"),
         ("heuristic", 0, "Pendulum-v1", "Pendulum-v1 has no hand-written policy"),
-        ("constant:drive=2", 0, "face_direction", "the constant drive is 2.0"),
+        ("constant:drive=2", 0, "face_direction", "constant.drive is 2.0"),
         ("data/sample/face_direction", 4, None, "has no episode 4: it has 4, numbered from 0"),
         ("data/sample/face_direction", -1, None, "has no episode -1"),
         ("data/sample/face_direction", 0, "move_to_pose", "is of face_direction, not of move_to"),

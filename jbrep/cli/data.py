@@ -3,15 +3,12 @@
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
 from jbrep.cli.base import (
-    COUNT,
-    POSITIVE,
     RESUMES,
     as_json,
     echo_json,
@@ -22,6 +19,8 @@ from jbrep.cli.base import (
     stoppable,
 )
 from jbrep.cli.environment import given_task, import_option, needed_task, task_options
+from jbrep.cli.options import record_options
+from jbrep.dataset.settings import TRAINED, CollectSettings, parts_of
 from jbrep.text import terminal_width
 
 _threads = click.option(
@@ -41,8 +40,7 @@ _data = click.argument("data", type=click.Path(path_type=Path))
 
 @click.command(epilog=example("jbrep collect --task face_direction --steps 5M --out data/face"))
 @task_options()
-@click.option("--steps", required=True, type=COUNT, help="How many; the last episode is completed.")
-@click.option("--seed", default=0, show_default=True, help="Root of every episode's seed.")
+@record_options(CollectSettings, shard_episodes=None)
 @click.option(
     "--policy",
     default="uniform",
@@ -50,17 +48,6 @@ _data = click.argument("data", type=click.Path(path_type=Path))
     help="uniform, constant:drive=0.5, ornstein-uhlenbeck:mu=0,theta=0.15,sigma=0.3, for the "
     "Jitterbug heuristic and trained (see jbrep policies); the folder of a run; or several with "
     "weights, of which each episode has one: uniform:0.5+runs/a:0.5.",
-)
-@click.option(
-    "--store-state",
-    is_flag=True,
-    help="Store the Jitterbug's qpos and qvel, for jbrep data derive.",
-)
-@click.option(
-    "--shard-episodes",
-    type=POSITIVE,
-    help="Episodes in a shard; by default so many that a shard has 100,000 steps in a batch of the "
-    "Jitterbug, 20,000 in others.",
 )
 @_lanes
 @_threads
@@ -87,7 +74,7 @@ def collect(
     """
     from jbrep.collect import collect as run
     from jbrep.collect.collector import usual_shard_episodes
-    from jbrep.dataset import Settings
+    from jbrep.dataset import DataSettings
     from jbrep.play.sources import find_policy
 
     task = needed_task(options)
@@ -98,15 +85,12 @@ def collect(
             err=True,
         )
     actor = find_policy(policy, out, task)
-    settings = Settings(
-        task=task,
-        policy=actor.settings(),
-        steps=steps,
-        seed=seed,
-        store_state=store_state,
+    settings = DataSettings(
+        task=task, policy=actor.settings(), steps=steps, seed=seed, store_state=store_state
     )
-    shard_episodes = shard_episodes or usual_shard_episodes(settings, out, actor)
-    settings = replace(settings, shard_episodes=shard_episodes)
+    if shard_episodes is None:
+        shard_episodes = usual_shard_episodes(settings, out, actor)
+    settings = settings.replace(shard_episodes=shard_episodes)
     _tell_kept(out, settings.policy)
     with stoppable(RESUMES):
         _report(out, run(settings, out, lanes, threads, backend, actor))
@@ -114,8 +98,6 @@ def collect(
 
 def _tell_kept(out: Path, policy: Mapping[str, Any]) -> None:
     """Say which policies of runs the data set has already, as they were then."""
-    from jbrep.dataset.policy import TRAINED, parts_of
-
     for part in parts_of(policy):
         if part["kind"] == TRAINED and (out / part["file"]).exists():
             known = f"{part['run']} acts as it did at step {part['step']:,}"
@@ -217,7 +199,7 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
 )
 @_data
 @click.option("--task", required=True, help="The task to observe and reward.")
-@click.option("--store-state", is_flag=True, help="Store qpos and qvel.")
+@record_options(CollectSettings, "store_state")
 @_threads
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="A folder.")
 def derive(data: Path, task: str, store_state: bool, threads: int | None, out: Path) -> None:
@@ -244,8 +226,8 @@ def export(data: Path, to: str, out: Path) -> None:
     For minari, --out is a folder of Minari data sets, as MINARI_DATASETS_PATH names it.
     """
     from jbrep.dataset import Dataset
-    from jbrep.dataset.export import export as run
-    from jbrep.dataset.export import load_format
+    from jbrep.dataset.formats import export as run
+    from jbrep.dataset.formats import load_format
 
     with stoppable("the export was discarded"):
         with _deferred_stop():
@@ -264,7 +246,8 @@ def import_(source: str, out: Path, **options: Any) -> None:
     MINARI_DATASETS_PATH. Without --task, the task is the one that the source names, or is made from
     the data alone. See docs/data-format.md for the columns that a file must have.
     """
-    from jbrep.dataset.importing import open_source, write
+    from jbrep.dataset.formats import open_source
+    from jbrep.dataset.formats.writer import write
 
     task = given_task(options)
     with stoppable("nothing was imported"):

@@ -8,18 +8,17 @@ from typing import Any
 from jbrep.cluster import on_cluster
 from jbrep.collect.policies import Policy
 from jbrep.collect.shards import Missing, Produce, shards_in_turn, simulate_shard
-from jbrep.dataset.schema import Columns
-from jbrep.dataset.settings import Settings
+from jbrep.dataset.schema import Columns, DataSettings
 from jbrep.envs.make import is_batched
 from jbrep.envs.names import import_modules, imported_modules
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, choose, first_line
 from jbrep.pool import ATTEMPTS, Pool, stop_requested
 
-Backend = Callable[[Settings, Policy, int, int | None], Produce]
+Backend = Callable[[DataSettings, Policy, int, int | None], Produce]
 
 
-def local(settings: Settings, policy: Policy, lanes: int, num_threads: int | None) -> Produce:
+def local(settings: DataSettings, policy: Policy, lanes: int, num_threads: int | None) -> Produce:
     """A batch's shards in turn on threads; other environments' side by side in processes."""
     workers = num_threads or os.cpu_count() or 1
     if is_batched(settings.task) or workers == 1:
@@ -27,7 +26,7 @@ def local(settings: Settings, policy: Policy, lanes: int, num_threads: int | Non
     return _in_processes(settings, policy, workers)
 
 
-def _in_processes(settings: Settings, policy: Policy, workers: int) -> Produce:
+def _in_processes(settings: DataSettings, policy: Policy, workers: int) -> Produce:
     """Shards made side by side, given in order; one whose worker is killed is made again."""
 
     def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
@@ -66,7 +65,7 @@ def _in_processes(settings: Settings, policy: Policy, workers: int) -> Produce:
 
 
 def make_shard(
-    modules: tuple[str, ...], settings: Settings, policy: Policy, shard: int, rows: int
+    modules: tuple[str, ...], settings: DataSettings, policy: Policy, shard: int, rows: int
 ) -> Columns | str:
     """A shard, in a process of its own; the message of an error that a user can mend."""
     try:
@@ -88,7 +87,7 @@ def _stop_on_request(steps: int) -> None:
         raise SystemExit
 
 
-def on_ray(settings: Settings, policy: Policy, lanes: int, num_threads: int | None) -> Produce:
+def on_ray(settings: DataSettings, policy: Policy, lanes: int, num_threads: int | None) -> Produce:
     """Shards made side by side on the Ray cluster that RAY_ADDRESS names, or else on a local one.
 
     Only this process writes to the data set's folder. The shards of a node that dies are made

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Generator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -23,8 +22,7 @@ from jbrep.dataset.manifest import (
     read_manifest,
     write_manifest,
 )
-from jbrep.dataset.schema import EPISODES, Columns
-from jbrep.dataset.settings import Settings
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.make import is_batched
 from jbrep.errors import InputError, differences
@@ -49,7 +47,7 @@ class Written(NamedTuple):
 
 
 def collect(
-    settings: Settings,
+    settings: DataSettings,
     folder: Path,
     lanes: int = LANES,
     num_threads: int | None = None,
@@ -76,14 +74,14 @@ def collect(
     """
     policy = policy or make_policy(settings.policy)
     policy.begin(settings.task, [0])  # may refuse the task
-    settings = replace(settings, policy=policy.settings())
+    settings = settings.replace(policy=policy.settings())
     check_counts(lanes, num_threads)
     produce = get_backend(backend)(settings, policy, lanes, num_threads)
     return write_shards(settings, folder, produce, policy.files())
 
 
 def write_shards(
-    settings: Settings,
+    settings: DataSettings,
     folder: Path,
     produce: Produce,
     files: Mapping[str, bytes] = MappingProxyType({}),
@@ -180,7 +178,7 @@ def _cut(columns: Columns, rows: int) -> Columns:
     }
 
 
-def _begin(settings: Settings, folder: Path, files: Mapping[str, bytes]) -> Manifest:
+def _begin(settings: DataSettings, folder: Path, files: Mapping[str, bytes]) -> Manifest:
     """The manifest to go on from, new if there is none."""
     shards = hdf5_files(folder)
     if (folder / MANIFEST).exists() or shards:
@@ -221,15 +219,7 @@ def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
             f"{folder} was collected with {own:,} steps and has {there.rows:,} rows so far: it is "
             f"left as it is; ask for at least as many steps, or choose another folder for {steps:,}"
         )
-    if steps > own and there.format_version != wanted.format_version:
-        raise InputError(
-            f"{folder} has format version {there.format_version}, which can't be extended: collect "
-            "anew in another folder"
-        )
-    differing = differences(
-        {**there.versions, "format": there.format_version},
-        {**wanted.versions, "format": wanted.format_version},
-    )
+    differing = differences(there.versions, wanted.versions)
     if differing and not (there.complete and steps == own):
         raise InputError(
             f"{folder} was started with other versions: {differing}; "
@@ -237,7 +227,7 @@ def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
         )
 
 
-def _flat(settings: Settings) -> dict[str, Any]:
+def _flat(settings: DataSettings) -> dict[str, Any]:
     """The settings with those of the environment beside them; equal names mean equal features.
 
     Whether it terminates is left out: it is what was seen of some episodes.
@@ -247,7 +237,7 @@ def _flat(settings: Settings) -> dict[str, Any]:
     return {n: v for n, v in settings.as_json().items() if n != "environment"} | task
 
 
-def usual_shard_episodes(settings: Settings, folder: Path, policy: Policy | None = None) -> int:
+def usual_shard_episodes(settings: DataSettings, folder: Path, policy: Policy | None = None) -> int:
     """Episodes in a shard of the usual size, judging by the data set's first few.
 
     A batch's shards have 100,000 steps, each with all threads; other environments' 20,000, since
@@ -262,7 +252,7 @@ def usual_shard_episodes(settings: Settings, folder: Path, policy: Policy | None
     length = float(task.max_episode_steps)
     if task.terminates is not False:
         policy = policy or make_policy(settings.policy)
-        pilot = replace(settings, shard_episodes=_PILOT)
+        pilot = settings.replace(shard_episodes=_PILOT)
         columns = simulate_shard(pilot, policy, 0, lambda steps: None)
         length = columns[EPISODES + "length"].mean()
     return max(1, round((_BATCH_ROWS if is_batched(task) else _SHARD_ROWS) / length))

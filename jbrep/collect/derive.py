@@ -1,7 +1,6 @@
 """Deriving another task's data set: the same motion, with its observations and rewards."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,9 @@ from jbrep.collect.collector import Written, write_shards
 from jbrep.collect.policies import acts_on_observations
 from jbrep.collect.replay import replay_problems
 from jbrep.collect.shards import Missing, Produce
-from jbrep.dataset import Dataset, Settings, version1
+from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import new_manifest, open_shard
-from jbrep.dataset.schema import EPISODES, Columns, episode_columns, episode_returns
+from jbrep.dataset.schema import EPISODES, Columns, Frame, episode_columns
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, differences
@@ -24,7 +23,6 @@ from jbrep.jitterbug.tasks import TASKS, JitterbugTask, get_task
 _LANES = 500
 
 Array = NDArray[Any]
-Body = Mapping[str, Any]  # arguments of `Simulation` that choose the robots' bodies
 
 
 def derive(
@@ -67,7 +65,7 @@ def derive(
     check_counts(1, num_threads)
     task, before = get_task(task_name), dataset.task
     described = task.describe(before.arguments, before.max_episode_steps)
-    settings = replace(settings, task=described, store_state=store_state)
+    settings = settings.replace(task=described, store_state=store_state)
     versions = new_manifest(settings).versions
     _check_versions(dataset, versions, num_threads)
     if (dataset.episodes["length"] < before.max_episode_steps).any():
@@ -93,15 +91,14 @@ def _check_versions(dataset: Dataset, versions: Mapping[str, str], num_threads: 
 
 
 def _deriving(
-    dataset: Dataset, task: JitterbugTask, settings: Settings, num_threads: int | None
+    dataset: Dataset, task: JitterbugTask, settings: DataSettings, num_threads: int | None
 ) -> Produce:
     """Make the shards of a data set as another task observes and rewards them."""
 
     def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
-        names = settings.specs()
         for shard in range(first, len(dataset.manifest.shards)):
-            columns = version1.with_ends(open_shard(dataset.folder, dataset.manifest, shard))
-            yield _as_task(columns, task, names, settings.task.arguments, tick, num_threads)
+            columns = open_shard(dataset.folder, dataset.manifest, shard)
+            yield _as_task(columns, task, settings, tick, num_threads)
 
     return produce
 
@@ -109,8 +106,7 @@ def _deriving(
 def _as_task(
     columns: Columns,
     task: JitterbugTask,
-    names: Iterable[str],
-    body: Body,
+    settings: DataSettings,
     tick: Tick,
     num_threads: int | None,
 ) -> Columns:
@@ -131,21 +127,28 @@ def _as_task(
         **{n: np.insert(columns[n], ends, own[f"final_{n}"], axis=0) for n in ("qpos", "qvel")},
         **{name: np.repeat(values, length + 1, axis=0) for name, values in constants.items()},
     }
-    observation, reward = _read(states, task, body, num_threads)
+    observation, reward = _read(states, task, settings.task.arguments, num_threads)
     tick(len(row))
     changed = {
         "observation": observation[row],
         "reward": reward[row + 1],
         EPISODES + "final_observation": observation[final],
-        EPISODES + "return": episode_returns(reward[row + 1], length),
-    } | {EPISODES + name: values for name, values in target.items()}
-    return {name: changed.get(name, columns[name]) for name in names}
+        **{EPISODES + name: values for name, values in target.items()},
+    }
+    frame = Frame(own["episode"], own["seed"], length, changed["reward"], settings.weights)
+    return settings.columns({**columns, **changed}, frame)
 
 
 def _read(
-    states: Mapping[str, Array], task: JitterbugTask, body: Body, num_threads: int | None
+    states: Mapping[str, Array],
+    task: JitterbugTask,
+    body: Mapping[str, Any],
+    num_threads: int | None,
 ) -> tuple[Array, Array]:
-    """Observations (n, d) and rewards (n,) of the states, as `Simulation.restore` takes them."""
+    """Observations (n, d) and rewards (n,) of the states, as `Simulation.restore` takes them.
+
+    The body is what chooses it of the arguments of `Simulation`.
+    """
     n = len(states["qpos"])
     lanes = min(_LANES, n)
     simulation = Simulation(task, lanes, num_threads, **body)

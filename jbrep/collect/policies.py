@@ -3,21 +3,23 @@
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar, Protocol
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from jbrep.collect.mixture import Mixture
-from jbrep.dataset.policy import MIXTURE, TRAINED, parts_of
+from jbrep.dataset.schema import episode_part
+from jbrep.dataset.settings import MIXTURE, TRAINED, parts_of
 from jbrep.envs.recording import Actor as Actor
 from jbrep.envs.recording import open_loop
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError, choose
 from jbrep.jitterbug.heuristics import HEURISTICS
+from jbrep.records.record import Record, from_plain, to_plain
 
-_MAX_SIGMA = 1e6  # far beyond what alternates between the bounds
+_Drive = Annotated[float, Meta(ge=-1, le=1)]  # from the lower bound to the upper
 _BLOCK = 1000  # steps that actions are drawn for at a time
 
 
@@ -58,8 +60,8 @@ def within_bounds(task: Task, drives: Array) -> Array:
     return np.clip((low + high) / 2 + drives * (high - low) / 2, low, high)
 
 
-class Constants:
-    """The base of policies that are frozen dataclasses of their constants."""
+class Constants(Record, frozen=True):
+    """The base of policies that are records of their constants."""
 
     kind: ClassVar[str]
     open_loop: ClassVar[bool]  # whether actions don't depend on what is observed
@@ -70,11 +72,10 @@ class Constants:
 
     def settings(self) -> dict[str, Any]:
         """The settings that `make_policy` takes."""
-        return {"kind": self.kind, **asdict(self)}  # type: ignore[call-overload]
+        return {"kind": self.kind, **to_plain(self)}
 
 
-@dataclass(frozen=True)
-class Uniform(Constants):
+class Uniform(Constants, frozen=True):
     """Uniformly random actions within the bounds, a new one for each step."""
 
     kind: ClassVar[str] = "uniform"
@@ -93,17 +94,12 @@ class Uniform(Constants):
         return _one_by_one(blocks())
 
 
-@dataclass(frozen=True)
-class Constant(Constants):
+class Constant(Constants, frozen=True):
     """The same action throughout."""
 
     kind: ClassVar[str] = "constant"
     open_loop: ClassVar[bool] = True
-    drive: float = 1.0  # in [-1, 1], from the lower bound to the upper
-
-    def __post_init__(self) -> None:
-        if not -1 <= self.drive <= 1:
-            raise InputError(f"the constant drive is {self.drive}: it must be in [-1, 1]")
+    drive: _Drive = 1.0
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Nothing is drawn."""
@@ -111,8 +107,7 @@ class Constant(Constants):
         return lambda observation: actions
 
 
-@dataclass(frozen=True)
-class Still(Constants):
+class Still(Constants, frozen=True):
     """No action at all: zero, or what the bounds have next to it."""
 
     kind: ClassVar[str] = "still"
@@ -124,8 +119,7 @@ class Still(Constants):
         return lambda observation: actions
 
 
-@dataclass(frozen=True)
-class OrnsteinUhlenbeck(Constants):
+class OrnsteinUhlenbeck(Constants, frozen=True):
     """An Ornstein-Uhlenbeck process for each action, from its mean on, clipped to [-1, 1].
 
     dx = theta (mu - x) dt + sigma dW, in steps of the task's time step (Uhlenbeck and Ornstein,
@@ -134,15 +128,9 @@ class OrnsteinUhlenbeck(Constants):
 
     kind: ClassVar[str] = "ornstein-uhlenbeck"
     open_loop: ClassVar[bool] = True
-    mu: float = 0.0
-    theta: float = 0.15  # [1/s]
-    sigma: float = 0.3  # [1/sqrt(s)]
-
-    def __post_init__(self) -> None:
-        if not (-1 <= self.mu <= 1 and self.theta >= 0 and 0 <= self.sigma <= _MAX_SIGMA):
-            raise InputError(
-                f"{self}: mu must be in [-1, 1], theta at least 0, sigma in [0, {_MAX_SIGMA:g}]"
-            )
+    mu: _Drive = 0.0
+    theta: Annotated[float, Meta(ge=0)] = 0.15  # [1/s]
+    sigma: Annotated[float, Meta(ge=0, le=1e6)] = 0.3  # [1/sqrt(s)]
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Draw the actions of the episodes, some steps at a time."""
@@ -173,8 +161,7 @@ class OrnsteinUhlenbeck(Constants):
             yield within_bounds(task, np.clip(drives, -1, 1))
 
 
-@dataclass(frozen=True)
-class Heuristic(Constants):
+class Heuristic(Constants, frozen=True):
     """The task's hand-written policy."""
 
     kind: ClassVar[str] = "heuristic"
@@ -195,7 +182,44 @@ def _one_by_one(blocks: Iterator[NDArray[Any]]) -> Actor:
     return open_loop(action for block in blocks for action in block)
 
 
-POLICIES = {
+@dataclass(frozen=True)
+class Mixture:
+    """A policy for each episode, drawn from several with the given weights."""
+
+    parts: tuple[tuple[float, Policy], ...]  # weights, which are positive, and policies
+
+    def files(self) -> dict[str, bytes]:
+        """Those of its parts."""
+        return {name: file for _, policy in self.parts for name, file in policy.files().items()}
+
+    def settings(self) -> dict[str, Any]:
+        """The settings that `make_policy` takes."""
+        return {"kind": MIXTURE, "parts": [[w, policy.settings()] for w, policy in self.parts]}
+
+    def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
+        """Act with the part that is drawn for each episode.
+
+        Raises:
+            InputError: a part can't act in this task.
+        """
+        weights = [weight for weight, _ in self.parts]
+        drawn = np.array([episode_part(seed, weights) for seed in seeds], int)
+        actors: list[tuple[NDArray[np.intp], Actor]] = []
+        for part, (_, policy) in enumerate(self.parts):
+            lanes = np.flatnonzero(drawn == part)
+            actors.append((lanes, policy.begin(task, [seeds[int(lane)] for lane in lanes])))
+
+        def act(observation: Array) -> NDArray[Any]:
+            actions = np.empty((len(observation), task.action_size))
+            for lanes, part in actors:
+                if len(lanes):
+                    actions[lanes] = part(observation[lanes])
+            return actions
+
+        return act
+
+
+POLICIES: dict[str, type[Uniform | Still | Heuristic | Constant | OrnsteinUhlenbeck]] = {
     policy.kind: policy for policy in (Uniform, Still, Heuristic, Constant, OrnsteinUhlenbeck)
 }
 _WEIGHT = re.compile(r":([\d.]+(?:e-?\d+)?)\+")  # between the parts of a mixture
@@ -275,20 +299,14 @@ def make_policy(
     return _make(settings["kind"], constants)
 
 
-def _make(kind: str, constants: dict[str, Any]) -> Policy:
+def _make(kind: str, constants: Mapping[str, Any]) -> Policy:
     policy = choose(kind, POLICIES, "policy")
-    known = [field.name for field in fields(policy)]
-    for name, value in constants.items():
-        if name not in known:
-            raise InputError(
-                f"policy {kind} has no constant {name!r}: "
-                f"{'it has ' + ', '.join(known) if known else 'it has none'}"
-            )
-        try:
-            constants[name] = float(value) + 0.0  # -0 is 0
-        except (TypeError, ValueError, OverflowError):
-            raise InputError(
-                f"policy {kind}: {name} is {value!r}, but must be a number, as in "
-                "constant:drive=0.5"
-            ) from None
-    return policy(**constants)
+    return from_plain({name: _number(value) for name, value in constants.items()}, policy, kind)
+
+
+def _number(constant: Any) -> Any:
+    """A constant as a number where it is one, or text that stands for one; -0 is 0."""
+    try:
+        return float(constant) + 0.0
+    except (TypeError, ValueError, OverflowError):
+        return constant

@@ -2,14 +2,12 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 from jbrep.collect.policies import Policy, make_policy
 from jbrep.collect.shards import LANES, simulate_shard
-from jbrep.dataset import version1
 from jbrep.dataset.manifest import (
     BACKUP,
     MANIFEST,
@@ -66,7 +64,7 @@ def repair(
                 continue
             entry = _restore(folder, manifest, shard, lanes, num_threads, make)
             shards = (*manifest.shards[:shard], entry, *manifest.shards[shard + 1 :])
-            manifest = replace(manifest, shards=shards)
+            manifest = manifest.replace(shards=shards)
             yield f"{folder / shard_name(shard)} restored"
         if manifest != before or not _is_backed_up(folder, manifest):
             write_manifest(folder, manifest)
@@ -140,8 +138,6 @@ def _restore(
             num_threads,
             most_episodes=entry.episodes,
         )
-    if manifest.format_version == 1:
-        columns = version1.columns(columns)
     if column_hashes(columns) != entry.sha256:
         raise InputError(
             f"{path} can't be restored here: it comes out differently; use the machine it was made "

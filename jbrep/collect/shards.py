@@ -1,7 +1,7 @@
 """Simulating the shards of a data set, each a function of its number and the settings."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from itertools import count
 from typing import Any, Protocol
 
@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.collect.policies import Policy
-from jbrep.dataset.schema import EPISODES, Columns, episode_part, episode_returns, episode_seed
-from jbrep.dataset.settings import Settings
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings, Frame, episode_seed
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Recording, Tick, read_nothing, read_states, record
@@ -35,7 +34,7 @@ Produce = Callable[[int, Missing, Tick], Iterator[Columns]]  # shards in order, 
 
 
 def shards_in_turn(
-    settings: Settings, policy: Policy, lanes: int, num_threads: int | None
+    settings: DataSettings, policy: Policy, lanes: int, num_threads: int | None
 ) -> Produce:
     """Make one shard after the other, each with all threads."""
 
@@ -48,7 +47,7 @@ def shards_in_turn(
 
 
 def simulate_shard(
-    settings: Settings,
+    settings: DataSettings,
     policy: Policy,
     shard: int,
     tick: Tick,
@@ -78,7 +77,7 @@ def simulate_shard(
     return {name: np.concatenate([block[name] for block in blocks]) for name in settings.specs()}
 
 
-def _lanes_in_block(settings: Settings, lanes: int) -> int:
+def _lanes_in_block(settings: DataSettings, lanes: int) -> int:
     """Episodes played side by side: those that would wait for the longest one cost time."""
     if not is_batched(settings.task):
         return 1
@@ -86,7 +85,7 @@ def _lanes_in_block(settings: Settings, lanes: int) -> int:
 
 
 def _blocks(
-    settings: Settings,
+    settings: DataSettings,
     policy: Policy,
     episodes: Array,
     size: int,
@@ -109,7 +108,7 @@ def _blocks(
 
 
 def _simulate(
-    settings: Settings, policy: Policy, episodes: Array, lanes: Lanes, tick: Tick
+    settings: DataSettings, policy: Policy, episodes: Array, lanes: Lanes, tick: Tick
 ) -> Columns:
     """The columns of some episodes, one in each lane."""
     task = settings.task
@@ -122,50 +121,25 @@ def _simulate(
         tick,
         read_states if settings.store_state else read_nothing,
     )
-    rows = _rows(recording, episodes)
-    return rows | {
-        EPISODES + name: column
-        for name, column in _ends(settings, recording, episodes, seeds, rows["reward"])
+    return _columns(settings, recording, episodes, np.array(seeds))
+
+
+def _columns(
+    settings: DataSettings, recording: Recording, episodes: Array, seeds: Array
+) -> Columns:
+    """The columns of what was recorded, one episode after the other."""
+    length, lanes = recording.length, np.arange(len(episodes))
+    seen: dict[str, Array] = {"observation": recording.observation, **recording.arrays}
+    steps: dict[str, Array] = {"action": recording.action, "reward": recording.reward, **seen}
+    kept = np.arange(len(recording.reward)) < length[:, None]
+    known = {name: each[: kept.shape[1]].swapaxes(0, 1)[kept] for name, each in steps.items()}
+    once: dict[str, Array] = {
+        "terminated": recording.terminated,
+        "truncated": recording.truncated,
+        **{f"initial_{name}": recording.start[name] for name in settings.task.state},
+        **{name: recording.start[name] for name in settings.task.constants},
+        **{f"final_{name}": values[length, lanes] for name, values in seen.items()},
     }
-
-
-def _rows(recording: Recording, episodes: Array) -> dict[str, Array]:
-    """Columns with a row for each step, one episode after the other."""
-    steps = len(recording.reward)
-    step = np.arange(steps, dtype=np.int32)
-    kept = step < recording.length[:, None]
-    values: dict[str, Array] = {
-        "observation": recording.observation,
-        **recording.arrays,
-        "action": recording.action.astype(np.float32),
-        "reward": recording.reward,
-    }
-    rows: dict[str, Array] = {
-        "episode": np.repeat(episodes.astype(np.int32), recording.length),
-        "step": np.broadcast_to(step, kept.shape)[kept],
-    }
-    return rows | {name: each[:steps].swapaxes(0, 1)[kept] for name, each in values.items()}
-
-
-def _ends(
-    settings: Settings,
-    recording: Recording,
-    episodes: Array,
-    seeds: Sequence[int],
-    reward: Array,
-) -> Iterator[tuple[str, Array]]:
-    """Columns with a row for each episode; the reward is the column with a row for each step."""
-    length, task = recording.length, settings.task
-    yield "episode", episodes.astype(np.int32)
-    yield "seed", np.array(seeds, np.int64)
-    yield "length", length
-    yield "return", episode_returns(reward, length)
-    yield "terminated", recording.terminated.astype(np.uint8)
-    yield "truncated", recording.truncated.astype(np.uint8)
-    yield from ((f"initial_{name}", recording.start[name]) for name in task.state)
-    yield from ((name, recording.start[name]) for name in task.constants)
-    lanes = np.arange(len(episodes))
-    final: dict[str, Array] = {"observation": recording.observation, **recording.arrays}
-    yield from ((f"final_{name}", values[length, lanes]) for name, values in final.items())
-    if weights := settings.weights:
-        yield "policy", np.array([episode_part(seed, weights) for seed in seeds], np.int32)
+    known |= {EPISODES + name: values for name, values in once.items()}
+    frame = Frame(episodes, seeds, length, known["reward"], settings.weights)
+    return settings.columns(known, frame)

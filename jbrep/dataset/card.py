@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from jbrep.dataset.policy import policy_text
 from jbrep.dataset.reader import Dataset
+from jbrep.dataset.settings import policy_text
 from jbrep.envs.task import Task
 from jbrep.text import facts, number, table
 

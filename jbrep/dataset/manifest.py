@@ -2,16 +2,14 @@
 
 import hashlib
 import json
-import operator
-import re
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
-from jbrep.dataset import version1
-from jbrep.dataset.schema import EPISODES, FORMAT, FORMAT_VERSION, Columns, Spec
-from jbrep.dataset.settings import Settings
+from msgspec import Meta
+
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings, Spec
+from jbrep.dataset.settings import Digest
 from jbrep.dataset.shard import (
     REPAIR,
     FileState,
@@ -23,38 +21,57 @@ from jbrep.dataset.shard import (
     shard_image,
 )
 from jbrep.envs.task import Task
-from jbrep.errors import DamageError, InputError, check_version
-from jbrep.records.commit import are_commits, commits
-from jbrep.records.record import from_plain
+from jbrep.errors import DamageError, InputError
+from jbrep.records.commit import Commits, commits
+from jbrep.records.document import Document, document_from, parse_json
+from jbrep.records.record import Record
 from jbrep.records.storage import exists, read_regular, write_whole
 
 MANIFEST = "manifest.json"
 BACKUP = "manifest.backup.json"
 _PACKAGES = ("jbrep", "mujoco", "numpy", "h5py")
 _HASH = "sha256"  # of the rest of the manifest
-_MAX_BYTES = 1 << 25  # of a manifest; each shard takes 1.5 kB of it
+
+_Count = Annotated[int, Meta(ge=1, le=1 << 62)]
+_Version = Annotated[str, Meta(pattern=r"(?a)\A[\w.+!-]+\Z", title="a version, as of a package")]
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(Record, frozen=True, kw_only=True):
     """A committed shard."""
 
-    bytes: int
-    rows: int
-    episodes: int
-    xxh3: str  # of the file
-    sha256: Mapping[str, str]  # of each column
+    bytes: _Count
+    rows: _Count
+    episodes: _Count
+    xxh3: Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z", title="an XXH3")]  # of the file
+    sha256: Mapping[str, Digest]  # of each column
 
 
-@dataclass(frozen=True)
-class Manifest:
+class Manifest(Document, frozen=True, kw_only=True):
     """What has been committed to a data set's folder."""
 
-    settings: Settings
-    versions: Mapping[str, str]  # of the packages that made it
+    format: ClassVar[str] = "jbrep data set"
+    format_version: ClassVar[int] = 2
+    max_bytes: ClassVar[int] = 1 << 25  # each shard takes 1.5 kB of it
+    indent: ClassVar[int] = 1
+
+    settings: DataSettings
+    versions: Mapping[_Version, _Version]  # of the packages that made it
+    commits: Commits = {}
     shards: tuple[Entry, ...] = ()
-    format_version: int = FORMAT_VERSION
-    commits: Mapping[str, str] = field(default_factory=dict)  # as `jbrep.records.commit` gives them
+
+    def check(self) -> None:
+        """As for `Record`: the shards' numbers are possible, all but the last one full."""
+        if missing := set(_PACKAGES) - set(self.versions):
+            raise InputError(f"versions.{min(missing)} is missing")
+        columns, full = set(self.specs()), self.settings.shard_episodes
+        for shard, entry in enumerate(self.shards):
+            is_last = shard == len(self.shards) - 1
+            if not (entry.episodes == full or (is_last and entry.episodes < full)):
+                raise InputError(f"shard {shard} has {entry.episodes:,} episodes, not {full:,}")
+            if not entry.episodes <= entry.rows <= self.task.max_episode_steps * entry.episodes:
+                raise InputError(f"shard {shard} can't have {entry.rows:,} rows")
+            if entry.sha256.keys() != columns:
+                raise InputError(f"shard {shard} has other columns than the settings ask for")
 
     @property
     def task(self) -> Task:
@@ -74,8 +91,6 @@ class Manifest:
     @property
     def complete(self) -> bool:
         """Whether all that the settings ask for has been committed."""
-        if self.format_version == 1:
-            return self.episodes == version1.episodes(self.settings)
         return self.rows >= self.settings.steps
 
     @property
@@ -86,7 +101,7 @@ class Manifest:
 
     def specs(self) -> dict[str, Spec]:
         """The columns of each shard."""
-        return self.settings.specs(self.format_version)
+        return self.settings.specs()
 
     def episode_range(self, shard: int) -> range:
         """Numbers of the episodes in a committed shard."""
@@ -104,49 +119,50 @@ class Manifest:
         If there aren't enough rows, a last shard that isn't full is left out: it has to be made
         again, with more episodes.
         """
-        longer = replace(self, settings=replace(self.settings, steps=steps))
+        longer = self.replace(settings=self.settings.replace(steps=steps))
         full = self.episodes == len(self.shards) * self.settings.shard_episodes
-        return longer if longer.complete or full else replace(longer, shards=self.shards[:-1])
+        return longer if longer.complete or full else longer.replace(shards=self.shards[:-1])
 
     def is_next(self, other: "Manifest") -> bool:
         """Whether a collector writes the other manifest after this one."""
         more = other.settings.steps > self.settings.steps
         expected = self.extended(other.settings.steps) if more else self
         begun = other.shards in (expected.shards, (*expected.shards, *other.shards[-1:]))
-        return begun and other == replace(expected, shards=other.shards)
+        return begun and other == expected.replace(shards=other.shards)
 
     def attributes(self, shard: int, rows: int) -> dict[str, Any]:
         """The HDF5 attributes of a shard's file."""
         settings = self.settings.as_json()
-        if self.format_version == 1:
-            del settings["environment"]
-        else:
-            settings["environment"] = json.dumps(settings["environment"])
-            del settings["steps"]  # a data set with more of them has the same full shards
+        del settings["steps"]  # a data set with more of them has the same full shards
         return {
-            "format": FORMAT,
+            "format": self.format,
             "format_version": self.format_version,
             "shard": shard,
             "rows": rows,
             "feature_names": list(self.task.feature_names),
             "feature_units": [feature.unit for feature in self.task.features],
             **settings,
-            "policy": json.dumps(self.settings.policy),
+            "environment": json.dumps(settings["environment"]),
+            "policy": json.dumps(settings["policy"]),
             "store_state": int(self.settings.store_state),  # booleans are rare in HDF5
-            "versions": json.dumps(self.versions),
+            "versions": json.dumps(dict(self.versions)),
         }
 
     def as_json(self) -> dict[str, Any]:
-        """The manifest as plain JSON, in the version of its format."""
-        record = {
-            "format": FORMAT,
-            "format_version": self.format_version,
-            "settings": self.settings.as_json(),
-            "versions": dict(self.versions),
-            **({"commits": dict(self.commits)} if self.commits else {}),
-            "shards": [asdict(entry) for entry in self.shards],
-        }
-        return version1.record(record) if self.format_version == 1 else record
+        """The manifest as plain JSON, with the name of the task and only commits that there are."""
+        plain = {**super().as_json(), "settings": self.settings.as_json()}
+        return plain if self.commits else {n: v for n, v in plain.items() if n != "commits"}
+
+    def text(self) -> str:
+        """The text of its file, with a hash of all the rest."""
+        return _hashed(self.as_json())
+
+
+def _hashed(plain: dict[str, Any]) -> str:
+    """The text of a manifest's file as jbrep writes it; any other byte is damage."""
+    body = {key: value for key, value in plain.items() if key != _HASH}
+    digest = hashlib.sha256(json.dumps(body).encode()).hexdigest()
+    return json.dumps({**body, _HASH: digest}, indent=Manifest.indent) + "\n"
 
 
 def shard_name(shard: int) -> str:
@@ -154,7 +170,7 @@ def shard_name(shard: int) -> str:
     return f"shard-{shard:05d}.h5"
 
 
-def new_manifest(settings: Settings) -> Manifest:
+def new_manifest(settings: DataSettings) -> Manifest:
     """A manifest without shards, of the installed versions of jbrep's and the environment's."""
     from importlib.metadata import version  # slow to import, and readers don't need it
 
@@ -163,36 +179,40 @@ def new_manifest(settings: Settings) -> Manifest:
     versions = {name: version(name) for name in _PACKAGES}
     if not settings.is_imported:  # or else they come from an environment that may not be here
         versions |= environment_versions(settings.task.id)
-    return Manifest(settings, versions, commits=dict(commits()))
+    return Manifest(settings=settings, versions=versions, commits=dict(commits()))
 
 
 def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
     """Read the manifest of a data set, or its backup, and check every byte of it.
 
     Raises:
-        InputError: there is no data set, or a newer jbrep wrote it.
+        InputError: there is no data set, or it has another version of the format.
         DamageError: it isn't what jbrep wrote.
     """
     path = folder / name
     try:
-        raw = read_regular(path, _MAX_BYTES)
+        raw = read_regular(path, Manifest.max_bytes)
     except (FileNotFoundError, NotADirectoryError):
         raise _explain_missing(path) from None
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error
-    damage = DamageError(f"{path} is damaged: it isn't what jbrep wrote; {REPAIR}")
     try:
-        record = json.loads(raw)
-        if raw != _text(record) or record["format"] != FORMAT:
-            raise damage
-        version = operator.index(record["format_version"])
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise damage from None
-    check_version(path, version, FORMAT_VERSION)
-    try:
-        return _parse(version1.mapped(record) if version == 1 else record)
-    except (ValueError, KeyError, TypeError, AttributeError):
-        raise damage from None
+        return _manifest_from(raw, path)
+    except DamageError as error:
+        raise DamageError(f"{error}; {REPAIR}") from None
+
+
+def _manifest_from(raw: bytes, path: Path) -> Manifest:
+    plain = parse_json(raw, path, Manifest.format)
+    if raw != _hashed(plain).encode():
+        raise DamageError(f"{path} is damaged: it isn't what jbrep wrote")
+    del plain[_HASH]
+    settings = plain.get("settings")
+    name = settings.pop("task", None) if isinstance(settings, dict) else None
+    manifest = document_from(plain, path, Manifest)
+    if name != manifest.task.name:
+        raise DamageError(f"{path} is damaged: its task has two names")
+    return manifest
 
 
 def _explain_missing(path: Path) -> InputError:
@@ -219,48 +239,6 @@ def _is_empty_backup(folder: Path) -> bool:
         return not read_manifest(folder, BACKUP).shards
     except InputError:
         return False
-
-
-def _text(record: dict[str, Any]) -> bytes:
-    """The bytes of a record as jbrep writes it; any other byte is damage."""
-    body = {key: value for key, value in record.items() if key != _HASH}
-    digest = hashlib.sha256(json.dumps(body).encode()).hexdigest()
-    return (json.dumps({**body, _HASH: digest}, indent=1) + "\n").encode()
-
-
-def _parse(record: dict[str, Any]) -> Manifest:
-    settings = dict(record["settings"])
-    task = from_plain(settings.pop("environment"), Task)
-    if settings.pop("task") != task.name:
-        raise ValueError
-    shards = tuple(Entry(**entry) for entry in record["shards"])
-    versions = record["versions"]
-    if not set(_PACKAGES) <= set(versions):
-        raise ValueError
-    if not all(
-        re.fullmatch(r"[\w.+!-]+", word, re.ASCII) for each in versions.items() for word in each
-    ):
-        raise ValueError
-    version, known = record["format_version"], record.get("commits", {})
-    if not are_commits(known):
-        raise ValueError
-    manifest = Manifest(Settings(task=task, **settings), versions, shards, version, known)
-    _check_shards(manifest)
-    return manifest
-
-
-def _check_shards(manifest: Manifest) -> None:
-    """Make sure that the shards' numbers are possible, all but the last one full."""
-    columns, full = set(manifest.specs()), manifest.settings.shard_episodes
-    for shard, entry in enumerate(manifest.shards):
-        episodes, last = operator.index(entry.episodes), shard == len(manifest.shards) - 1
-        most = manifest.task.max_episode_steps * episodes
-        if not (episodes == full or (last and 1 <= episodes <= full)):
-            raise ValueError
-        if operator.index(entry.bytes) < 0 or not 0 <= operator.index(entry.rows) <= most:
-            raise ValueError
-        if entry.sha256.keys() != columns:
-            raise ValueError
 
 
 def open_shard(
@@ -346,7 +324,7 @@ def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
     """
     shard = len(manifest.shards)
     entry = write_shard(folder, manifest, shard, columns)
-    manifest = replace(manifest, shards=(*manifest.shards, entry))
+    manifest = manifest.replace(shards=(*manifest.shards, entry))
     write_manifest(folder, manifest)
     return manifest
 
@@ -361,7 +339,9 @@ def write_shard(folder: Path, manifest: Manifest, shard: int, columns: Columns) 
     hashes = column_hashes(columns)
     image = shard_image(columns, hashes, manifest.attributes(shard, rows))
     write_whole(folder / shard_name(shard), image)
-    return Entry(len(image), rows, episodes, file_hash(image), hashes)
+    return Entry(
+        bytes=len(image), rows=rows, episodes=episodes, xxh3=file_hash(image), sha256=hashes
+    )
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
@@ -371,4 +351,4 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
         InputError: it can't be written.
     """
     for name in (BACKUP, MANIFEST):
-        write_whole(folder / name, _text(manifest.as_json()))
+        manifest.write(folder / name)

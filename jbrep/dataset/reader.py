@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.dataset import version1
 from jbrep.dataset.columns import Batches, Column
 from jbrep.dataset.manifest import (
     check_files,
@@ -20,7 +19,7 @@ from jbrep.dataset.manifest import (
     shard_name,
 )
 from jbrep.dataset.scaling import EXTREMA, Scaler, fit_scaler
-from jbrep.dataset.schema import EPISODES, episode_bounds, step_specs
+from jbrep.dataset.schema import EPISODES, episode_bounds, episode_columns
 from jbrep.dataset.shard import FileState, Shard, file_state
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
@@ -98,7 +97,7 @@ class Dataset:
         self._checked: set[FileState] = set()
         self._opened = lru_cache(_OPEN_SHARDS)(self._open)
         self._ends = list(accumulate(entry.rows for entry in self.manifest.shards))
-        self._specs = step_specs(self.task, self.manifest.settings.store_state)
+        self._specs = self.manifest.settings.step_specs()
 
     @staticmethod
     def write(
@@ -140,8 +139,8 @@ class Dataset:
         Raises:
             InputError: the folder exists already, or the arrays can't be used.
         """
-        from jbrep.dataset.importing.arrays import source_of  # imports Gymnasium, as below
-        from jbrep.dataset.importing.writer import write
+        from jbrep.dataset.formats.flat import source_of  # imports Gymnasium, as below
+        from jbrep.dataset.formats.writer import write
         from jbrep.envs.description import as_task
 
         columns = {"observation": observations, "action": actions, "reward": rewards}
@@ -196,14 +195,12 @@ class Dataset:
     def episodes(self) -> dict[str, NDArray[Any]]:
         """Columns with a row for each episode: seed, length, return, terminated and more."""
         shards = [self._shard(k) for k in range(len(self.manifest.shards))]
-        columns = {
-            name.removeprefix(EPISODES): np.concatenate(
-                [np.empty(spec.shape(0), spec.dtype), *(shard[name] for shard in shards)]
+        return {
+            name: np.concatenate(
+                [np.empty(spec.shape(0), spec.dtype), *(shard[EPISODES + name] for shard in shards)]
             )
-            for name, spec in self.manifest.specs().items()
-            if name.startswith(EPISODES)
+            for name, spec in episode_columns(self.manifest.specs()).items()
         }
-        return dict(version1.with_ends(columns))
 
     @cached_property
     def _bounds(self) -> NDArray[np.int64]:
@@ -231,19 +228,16 @@ class Dataset:
             seed: of the draw.
 
         Raises:
-            InputError: fewer than two episodes with rows, or a share out of range.
+            InputError: fewer than two episodes, or a share out of range.
         """
         if not 0 < test < 1:
             raise InputError(f"the share to hold out is {test}: it must be between 0 and 1")
         lengths = self.episodes["length"]
-        filled = np.flatnonzero(lengths)
-        if len(filled) < 2:
-            raise InputError(
-                f"a split needs at least 2 episodes with rows: {self.folder} has {len(filled)}"
-            )
-        count = min(max(1, round(test * len(filled))), len(filled) - 1)
+        if len(lengths) < 2:
+            raise InputError(f"a split needs at least 2 episodes: {self.folder} has {len(lengths)}")
+        count = min(max(1, round(test * len(lengths))), len(lengths) - 1)
         held_out = np.zeros(len(lengths), dtype=bool)
-        held_out[np.random.default_rng(seed).permutation(filled)[:count]] = True
+        held_out[np.random.default_rng(seed).permutation(len(lengths))[:count]] = True
         is_test = np.repeat(held_out, lengths)
         return Split(np.flatnonzero(~is_test), np.flatnonzero(is_test))
 

@@ -1,106 +1,187 @@
-"""The columns of a data set, and how an episode's seed and policy are determined."""
+"""What determines a data set, and the columns that follow from it."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any, NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from jbrep.dataset.settings import IMPORTED, MIXTURE, CollectSettings, check_policy
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
+from jbrep.records.record import to_plain
 
 Columns = Mapping[str, NDArray[Any]]
 
-FORMAT = "jbrep data set"
-FORMAT_VERSION = 2
 EPISODES = "episodes/"  # the HDF5 group of the columns with one row for each episode
-
 UNKNOWN_SEED = -1  # of an imported episode
-MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
 _PART_STREAM = 0x6D6978  # beside an episode's seed: nothing else is drawn from that stream
 _EPISODE_BITS = {63: 32, 31: 20}  # of a seed, for the number of the episode
-_COLUMNS = {  # of every data set
-    *("observation", "action", "reward", "episode", "step"),
-    *("seed", "length", "return", "terminated", "truncated", "diverged", "policy"),
-}
+
+
+class Frame(NamedTuple):
+    """Some episodes of a data set, one after the other: what decides the columns that follow.
+
+    Attributes:
+        numbers: of the episodes, (n,).
+        seeds: of the episodes, (n,).
+        lengths: of the episodes [steps], (n,).
+        reward: of all their steps, (N,).
+        weights: of a mixture's policies; of another policy, none.
+    """
+
+    numbers: NDArray[Any]
+    seeds: NDArray[Any]
+    lengths: NDArray[Any]
+    reward: NDArray[np.float32]
+    weights: Sequence[float] = ()
 
 
 @dataclass(frozen=True)
 class Spec:
-    """Type of a column and shape of one of its rows."""
+    """Type of a column and shape of one of its rows; how it follows from a frame, if it does."""
 
     dtype: np.dtype[Any]
     row: tuple[int, ...] = ()
+    follows: Callable[[Frame], NDArray[Any]] | None = field(default=None, compare=False)
 
     def shape(self, rows: int) -> tuple[int, ...]:
         """Shape of the whole column."""
         return (rows, *self.row)
 
 
-def _spec(dtype: str, *row: int) -> Spec:
-    return Spec(np.dtype(dtype), row)
+def _spec(dtype: str, *row: int, follows: Callable[[Frame], NDArray[Any]] | None = None) -> Spec:
+    return Spec(np.dtype(dtype), row, follows)
 
 
-def step_specs(task: Task, store_state: bool) -> dict[str, Spec]:
-    """Columns with a row for each step, in the order of episode, then step."""
-    specs = {
+def _specs(task: Task, store_state: bool, is_mixture: bool) -> dict[str, Spec]:
+    """The columns of each shard, by their paths in the file.
+
+    Raises:
+        InputError: an array of the task's states has the name of another column.
+    """
+    moving = {name: _spec("<f8", width) for name, width in task.state.items()}
+    steps = {  # a row for each step, in the order of episode, then step
         "observation": _spec("<f4", task.size),  # before the action, in physical units
         "action": _spec("<f4", task.action_size),  # within the task's bounds
         "reward": _spec("<f4"),  # of the state that the action led to; 0 if the physics diverged
-        "episode": _spec("<i4"),  # from 0 in the data set
-        "step": _spec("<i4"),  # from 0 in the episode
+        "episode": _spec("<i4", follows=lambda frame: np.repeat(frame.numbers, frame.lengths)),
+        "step": _spec("<i4", follows=_steps),  # from 0 in the episode
     }
-    if store_state:  # with the observation
-        specs |= {name: _spec("<f8", width) for name, width in task.state.items()}
-    return specs
-
-
-def episode_specs(task: Task, store_state: bool, version: int = FORMAT_VERSION) -> dict[str, Spec]:
-    """Columns with a row for each episode.
-
-    In format version 1, an episode whose physics diverged lacks its last row.
-    """
-    ends = ("diverged",) if version == 1 else ("terminated", "truncated")
-    specs = {
-        "episode": _spec("<i4"),
-        "seed": _spec("<i8"),
-        "length": _spec("<i4"),  # rows stored
-        "return": _spec("<f8"),  # sum of the rewards stored
-        **{name: _spec("|u1") for name in ends},
-        **{f"initial_{name}": _spec("<f8", width) for name, width in task.state.items()},
+    begins = {  # a row for each episode, as those below
+        "episode": _spec("<i4", follows=lambda frame: frame.numbers),  # from 0 in the data set
+        "seed": _spec("<i8", follows=lambda frame: frame.seeds),
+        "length": _spec("<i4", follows=lambda frame: frame.lengths),  # rows stored
+        "return": _spec("<f8", follows=lambda frame: episode_returns(frame.reward, frame.lengths)),
+        "terminated": _spec("|u1"),
+        "truncated": _spec("|u1"),
+    }
+    ends = {"final_observation": _spec("<f4", task.size)}  # after the last action
+    policy = {"policy": _spec("<i4", follows=_parts)}  # the number of the part of a mixture
+    for name in task.arrays:
+        if name in {**steps, **begins, **policy} or name.startswith(("initial_", "final_")):
+            raise InputError(f"{task.name} has an array {name!r}: data sets have such a column")
+    once = {
+        **begins,
+        **{f"initial_{name}": spec for name, spec in moving.items()},
         **{name: _spec("<f8", width) for name, width in task.constants.items()},
-        "final_observation": _spec("<f4", task.size),  # after the last action
+        **ends,
+        **({f"final_{name}": spec for name, spec in moving.items()} if store_state else {}),
+        **(policy if is_mixture else {}),
     }
-    if store_state:
-        specs |= {f"final_{name}": _spec("<f8", width) for name, width in task.state.items()}
-    return {EPISODES + name: spec for name, spec in specs.items()}
+    by_step = steps | (moving if store_state else {})  # states with the observation
+    return by_step | {EPISODES + name: spec for name, spec in once.items()}
 
 
-MIXTURE_SPECS = {EPISODES + "policy": _spec("<i4")}  # the number of the part of a mixture
+def _steps(frame: Frame) -> NDArray[np.int64]:
+    firsts = episode_bounds(frame.lengths)[:-1]
+    return np.arange(frame.lengths.sum()) - np.repeat(firsts, frame.lengths)
 
 
-def check_names(task: Task) -> None:
-    """Make sure that no array of the task's states would be stored in the place of a column.
+def _parts(frame: Frame) -> NDArray[np.int64]:
+    return np.array([episode_part(int(seed), frame.weights) for seed in frame.seeds], np.int64)
+
+
+class DataSettings(CollectSettings, frozen=True, kw_only=True):
+    """What determines the data, and how they are divided into shards.
 
     Raises:
-        InputError: one has the name of a column.
+        InputError: a field that doesn't fit; a task whose arrays have the names of other columns,
+            or without states that are to be stored; a seed that is too large for it.
     """
-    for name in task.arrays:
-        if name in _COLUMNS or name.startswith(("initial_", "final_")):
-            raise InputError(f"{task.name} has an array {name!r}: data sets have such a column")
+
+    task: Task = msgspec.field(name="environment")
+    policy: Annotated[  # its kind and constants
+        Mapping[str, Any],
+        Meta(title="a kind and its constants, such as {'kind': 'constant', 'drive': 0.5}"),
+    ] = msgspec.field(default_factory=lambda: {"kind": "uniform"})
+
+    def check(self) -> None:
+        """As for `Record`."""
+        check_policy(self.policy)
+        self.specs()
+        episode_seed(self.task, self.seed, 0)
+        if self.store_state and not self.task.state:
+            raise InputError(f"{self.task.name} has no states to store: its observations are all")
+
+    def as_json(self) -> dict[str, Any]:
+        """The settings as plain JSON, with the task's name."""
+        plain = to_plain(self)
+        about = {name: plain.pop(name) for name in ("environment", "policy")}
+        return {"task": self.task.name, **about, **plain}
+
+    @property
+    def weights(self) -> list[float]:
+        """The weights of a mixture's parts; of another policy, none."""
+        parts = self.policy["parts"] if self.policy["kind"] == MIXTURE else ()
+        return [weight for weight, _ in parts]
+
+    @property
+    def is_imported(self) -> bool:
+        """Whether the data were made elsewhere: no episode can be simulated again."""
+        return bool(self.policy["kind"] == IMPORTED)
+
+    def specs(self) -> dict[str, Spec]:
+        """The columns of each shard, by their paths in the file."""
+        return _specs(self.task, self.store_state, bool(self.weights))
+
+    def step_specs(self) -> dict[str, Spec]:
+        """Those with a row for each step."""
+        return {n: spec for n, spec in self.specs().items() if not n.startswith(EPISODES)}
+
+    def columns(self, known: Columns, frame: Frame) -> Columns:
+        """All columns of some episodes, in order.
+
+        Args:
+            known: those that don't follow from the frame; of any type that fits the column's.
+            frame: of the episodes.
+        """
+        return {
+            name: np.asarray(spec.follows(frame) if spec.follows else known[name], spec.dtype)
+            for name, spec in self.specs().items()
+        }
+
+    def wrong_columns(self, columns: Columns, frame: Frame) -> Iterator[str]:
+        """The names of those that don't follow from the frame as they should."""
+        for name, spec in self.specs().items():
+            if spec.follows and not np.array_equal(columns[name], spec.follows(frame)):
+                yield name
+
+    def row_bytes(self) -> int:
+        """Bytes for each step."""
+        specs = self.step_specs().values()
+        return sum(spec.dtype.itemsize * math.prod(spec.row) for spec in specs)
 
 
-def all_specs(task: Task, store_state: bool, version: int = FORMAT_VERSION) -> dict[str, Spec]:
-    """All columns of a shard, by their paths in the file."""
-    return step_specs(task, store_state) | episode_specs(task, store_state, version)
-
-
-def episode_columns(columns: Columns) -> dict[str, NDArray[Any]]:
-    """The columns of a shard with a row for each episode, by their names in the group."""
+def episode_columns(columns: Mapping[str, Any]) -> dict[str, Any]:
+    """What has a row for each episode, of columns or specs, by the names in the group."""
     return {
-        name.removeprefix(EPISODES): column
-        for name, column in columns.items()
+        name.removeprefix(EPISODES): each
+        for name, each in columns.items()
         if name.startswith(EPISODES)
     }
 

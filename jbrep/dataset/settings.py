@@ -1,113 +1,122 @@
-"""The settings that determine a data set."""
+"""What a user chooses of a data set besides its task: how much of it, and the policy that acts."""
 
-import math
-import operator
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Annotated, Any, Literal
 
-from jbrep.dataset.policy import IMPORTED as IMPORTED
-from jbrep.dataset.policy import MAX_LETTERS, MIXTURE, is_policy
-from jbrep.dataset.schema import (
-    FORMAT_VERSION,
-    MAX_ROOT_SEED,
-    MIXTURE_SPECS,
-    Spec,
-    all_specs,
-    check_names,
-    episode_seed,
-    step_specs,
-)
-from jbrep.envs.task import Task
+from msgspec import Meta
+
 from jbrep.errors import InputError
-from jbrep.records.record import to_plain
+from jbrep.records.record import Record, converted
 
-_MAX_STEPS = 10**12
-_MAX_SHARD_EPISODES = 1_000_000
-_LIMITS = {  # least, most, and what it is
-    "steps": (1, _MAX_STEPS, "the number of steps"),
-    "seed": (0, MAX_ROOT_SEED, "the seed"),
-    "shard_episodes": (1, _MAX_SHARD_EPISODES, "the number of episodes in a shard"),
-}
+IMPORTED = "imported"  # data that were made elsewhere
+MIXTURE = "mixture"  # a policy for each episode, by weights
+TRAINED = "trained"  # of a run, kept in a file beside the shards
+MAX_LETTERS = 200  # of a text
+MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
+
+_MAX_CONSTANTS = 1000
+_OF_FILE = ("file", "sha256")  # of a trained policy: nothing to read for people
+
+Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", title="a SHA-256")]
+_Line = Annotated[str, Meta(max_length=MAX_LETTERS)]
+_Number = Annotated[float, Meta(gt=-(10**12), lt=10**12, title="a number")]
+_List = Annotated[tuple[_Number | _Line, ...], Meta(max_length=_MAX_CONSTANTS)]
+_Constants = Annotated[
+    Mapping[_Line, _Number | _Line | _List],
+    Meta(
+        max_length=_MAX_CONSTANTS,
+        title="a kind and its constants, such as {'kind': 'constant', 'drive': 0.5}",
+    ),
+]
+_Kind = Annotated[str, Meta(pattern=r"\A[a-z-]+\Z", title="a word of small letters")]
+_Weight = Annotated[float, Meta(gt=0, lt=10**12)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What determines the data, and how they are divided into shards.
+class CollectSettings(Record, frozen=True, kw_only=True):
+    """How much is collected, and how it is stored."""
+
+    steps: Annotated[
+        int, Meta(ge=1, le=10**12, description="How many; the last episode is completed.")
+    ]
+    seed: Annotated[
+        int, Meta(ge=0, le=MAX_ROOT_SEED, description="Root of every episode's seed.")
+    ] = 0
+    shard_episodes: Annotated[
+        int,
+        Meta(
+            ge=1,
+            le=1_000_000,
+            description="Episodes in a shard.",
+            extra={
+                "default": "so many that a shard has 100,000 steps in a batch of the Jitterbug, "
+                "20,000 in others"
+            },
+        ),
+    ] = 100
+    store_state: Annotated[
+        bool, Meta(description="Store the Jitterbug's qpos and qvel, for jbrep data derive.")
+    ] = False
+
+
+class _Mixture(Record, frozen=True, kw_only=True):
+    """Policies that are no mixtures, each with its weight."""
+
+    kind: Literal["mixture"]
+    parts: Annotated[
+        tuple[tuple[_Weight, Mapping[str, Any]], ...],
+        Meta(min_length=2, max_length=_MAX_CONSTANTS),
+    ]
+
+    def check(self) -> None:
+        """As for `Record`."""
+        for _, part in self.parts:
+            check_policy(part)
+            if part["kind"] == MIXTURE:
+                raise InputError("the parts of a mixture must be other policies")
+
+
+class _Trained(Record, frozen=True, kw_only=True):
+    """The policy of a run, in a file beside the shards and nowhere else."""
+
+    kind: Literal["trained"]
+    file: Annotated[
+        str, Meta(pattern=r"(?a)\Apolicy-\d{1,3}\.safetensors\Z", title="policy-0.safetensors")
+    ]
+    sha256: Digest
+    run: _Line
+    step: Annotated[int, Meta(ge=0, lt=10**12)]
+
+
+def check_policy(policy: Mapping[str, Any]) -> None:
+    """Make sure that a policy is a kind and constants that fit it: numbers and short text.
 
     Raises:
-        InputError: an unknown task, or one whose arrays have the names of other columns; a number
-            out of range, or a value of the wrong type.
+        InputError: it is something else.
     """
-
-    task: Task  # or the name of one, which is described then
-    policy: Mapping[str, Any] = field(default_factory=lambda: {"kind": "uniform"})  # and constants
-    steps: int  # the data set has the fewest whole episodes with as many
-    seed: int = 0  # the root of all episodes' seeds
-    shard_episodes: int = 100
-    store_state: bool = False
-
-    def __post_init__(self) -> None:
-        given: Any = self.task
-        if not isinstance(given, Task):
-            from jbrep.envs.description import as_task  # imports Gymnasium
-
-            object.__setattr__(self, "task", as_task(given))
-        for name in _LIMITS:
-            object.__setattr__(self, name, _checked_number(name, getattr(self, name)))
-        check_names(self.task)
-        episode_seed(self.task, self.seed, 0)  # may be too large
-        if not isinstance(self.store_state, bool):
-            raise InputError(f"store_state is {self.store_state!r}: it must be true or false")
-        if self.store_state and not self.task.state:
-            raise InputError(f"{self.task.name} has no states to store: its observations are all")
-        if not is_policy(self.policy):
-            raise InputError(
-                f"the policy is {str(self.policy)[:MAX_LETTERS]!r}: it must be a kind and its "
-                "constants, such as {'kind': 'constant', 'drive': 0.5}"
-            )
-
-    def as_json(self) -> dict[str, Any]:
-        """The settings as plain JSON."""
-        return {
-            "task": self.task.name,
-            "environment": to_plain(self.task),
-            "policy": dict(self.policy),
-            "steps": self.steps,
-            "seed": self.seed,
-            "shard_episodes": self.shard_episodes,
-            "store_state": self.store_state,
-        }
-
-    @property
-    def weights(self) -> list[float]:
-        """The weights of a mixture's parts; of another policy, none."""
-        parts = self.policy["parts"] if self.policy["kind"] == MIXTURE else ()
-        return [weight for weight, _ in parts]
-
-    def specs(self, version: int = FORMAT_VERSION) -> dict[str, Spec]:
-        """The columns of each shard, by their paths in the file."""
-        mixture = MIXTURE_SPECS if self.weights else {}
-        return all_specs(self.task, self.store_state, version) | mixture
-
-    @property
-    def is_imported(self) -> bool:
-        """Whether the data were made elsewhere: no episode can be simulated again."""
-        return self.policy["kind"] == IMPORTED
-
-    def row_bytes(self) -> int:
-        """Bytes for each step."""
-        specs = step_specs(self.task, self.store_state).values()
-        return sum(spec.dtype.itemsize * math.prod(spec.row) for spec in specs)
+    kind = policy.get("kind")
+    converted(kind, _Kind, "the kind of a policy")
+    converted(policy, {MIXTURE: _Mixture, TRAINED: _Trained}.get(str(kind), _Constants), "policy")
+    if not all(text.isprintable() for text in _texts([*policy.items()])):
+        raise InputError("the policy has text that can't be printed")
 
 
-def _checked_number(name: str, value: Any) -> int:
-    """A plain Python int (JSON doesn't take NumPy's) within the limits."""
-    least, most, what = _LIMITS[name]
-    try:
-        number = operator.index(value)
-    except TypeError:
-        raise InputError(f"{what} is {value!r}: it must be a whole number") from None
-    if not least <= number <= most:
-        raise InputError(f"{what} is {number}: it must be from {least} to {most:,}")
-    return number
+def _texts(values: Iterable[Any]) -> Iterator[str]:
+    for value in values:
+        if isinstance(value, str):
+            yield value
+        elif isinstance(value, list | tuple):
+            yield from _texts(value)
+
+
+def parts_of(policy: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """The policies of a mixture, or else the policy itself."""
+    yield from (part for _, part in policy["parts"]) if policy["kind"] == MIXTURE else (policy,)
+
+
+def policy_text(policy: Mapping[str, Any]) -> str:
+    """A policy's kind and constants for people: "constant, drive 0.5"."""
+    if policy["kind"] == MIXTURE:
+        return "; ".join(f"{weight:.3g} of {policy_text(part)}" for weight, part in policy["parts"])
+    hidden = ("kind", *_OF_FILE)
+    constants = (f"{name} {value}" for name, value in policy.items() if name not in hidden)
+    return ", ".join([policy["kind"], *constants])

@@ -136,7 +136,7 @@ class Shard(Mapping[str, NDArray[Any]]):
     def _check_lengths(self, lengths: NDArray[Any]) -> None:
         """Check that the episodes have as many rows as the shard: they locate its rows."""
         rows = self._rows["step"]
-        if lengths.min() < 0 or lengths.max() > self._max_length or lengths.sum() != rows:
+        if lengths.min() < 1 or lengths.max() > self._max_length or lengths.sum() != rows:
             raise self._damage(f"the lengths of its episodes don't add up to {rows:,} rows")
 
     def _damage(self, what: str) -> DamageError:

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from jbrep.dataset import version1
 from jbrep.dataset.manifest import (
     BACKUP,
     Manifest,
@@ -19,17 +18,8 @@ from jbrep.dataset.manifest import (
     read_manifest,
     shard_name,
 )
-from jbrep.dataset.policy import TRAINED, parts_of
-from jbrep.dataset.schema import (
-    EPISODES,
-    UNKNOWN_SEED,
-    Columns,
-    episode_bounds,
-    episode_columns,
-    episode_part,
-    episode_returns,
-    episode_seed,
-)
+from jbrep.dataset.schema import EPISODES, UNKNOWN_SEED, Columns, Frame, episode_seed
+from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.dataset.shard import REPAIR, column_hash
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError
@@ -133,27 +123,16 @@ def range_problems(task: Task, columns: Columns) -> Iterator[str]:
 
 
 def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
-    """Episode columns that are inconsistent with the settings or with each other."""
-    rows = manifest.shards[shard].rows
-    own = version1.with_ends(episode_columns(columns))
+    """Columns that are inconsistent with the settings or with each other."""
     numbers = np.array(manifest.episode_range(shard))
-    lengths = own["length"]
-    first = episode_bounds(lengths)[:-1]
-    seeds = _seeds(manifest, numbers, own["seed"])
-    checks: dict[str, tuple[ArrayLike, ArrayLike]] = {
-        "episode numbers": (own["episode"], numbers),
-        "seeds": (own["seed"], seeds),
-        "ends of episodes": (own["terminated"] | own["truncated"], np.ones_like(own["truncated"])),
-        "the rows' episode": (columns["episode"], np.repeat(numbers, lengths)),
-        "the rows' step": (columns["step"], np.arange(rows) - np.repeat(first, lengths)),
-        "returns": (own["return"], episode_returns(columns["reward"], lengths)),
-    }
-    if weights := manifest.settings.weights:
-        parts = [episode_part(int(seed), weights) for seed in seeds]
-        checks["the episodes' policies"] = own["policy"], np.array(parts)
-    for what, (stored, expected) in checks.items():
-        if not np.array_equal(stored, expected):
-            yield f"{what}: inconsistent with the settings, or with other columns"
+    seeds = _seeds(manifest, numbers, columns[EPISODES + "seed"])
+    lengths, settings = columns[EPISODES + "length"], manifest.settings
+    frame = Frame(numbers, seeds, lengths, columns["reward"], settings.weights)
+    wrong = [*settings.wrong_columns(columns, frame)]
+    if not ((columns[EPISODES + "terminated"] | columns[EPISODES + "truncated"]) == 1).all():
+        wrong.append("the ends of episodes")
+    for what in wrong:
+        yield f"{what}: inconsistent with the settings, or with other columns"
 
 
 def _seeds(manifest: Manifest, numbers: NDArray[Any], stored: NDArray[Any]) -> NDArray[Any]:

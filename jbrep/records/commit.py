@@ -2,17 +2,26 @@
 
 import re
 import subprocess
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 _SECONDS = 5
 _CHANGES = "+changes"
+Commits = Mapping[
+    Annotated[str, Meta(pattern=r"\A(jbrep|work)\Z", title="jbrep or work")],
+    Annotated[
+        str, Meta(pattern=rf"\A[0-9a-f]{{40,64}}({re.escape(_CHANGES)})?\Z", title="a git commit")
+    ],
+]
 
 
 @cache
-def commits() -> MappingProxyType[str, str]:
+def commits() -> Commits:
     """The commits of jbrep and of the working directory, each where it is in a git repository.
 
     A commit is 40 hexadecimal digits (64 with SHA-256), with "+changes" after them if files that

@@ -126,7 +126,8 @@ def _said(message: str, value: Any, kind: Any, where: str) -> str:
     if missing := _MISSING.fullmatch(reason):
         return f"{_inside(name, missing[1])} is missing"
     if unknown := _UNKNOWN.fullmatch(reason):
-        return f"unknown {_inside(name, unknown[1])}: it must be one of {', '.join(part.names)}"
+        names = f"it must be one of {', '.join(part.names)}" if part.names else "there are none"
+        return f"unknown {_inside(name, unknown[1])}: {names}"
     if not _OF_MSGSPEC.match(reason):  # what `check` said
         return f"{name}: {reason}" if name else reason
     if part.value is UNSET:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from jbrep.dataset.policy import MAX_LETTERS, TRAINED
+from jbrep.dataset.settings import MAX_LETTERS, TRAINED
 from jbrep.encoders.vec_env import agent_spaces
 from jbrep.envs.recording import Actor
 from jbrep.envs.task import Array, Task, check_same

@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, get_origin
 
-from jbrep.dataset import Settings
+from jbrep.dataset.settings import CollectSettings
 from jbrep.encoders import FULL
 from jbrep.envs.names import find_spec, short_names
 from jbrep.envs.task import MAX_EPISODE_STEPS
@@ -120,7 +120,7 @@ class Study:
             )
         if self.data and self.data.steps:
             for seed in (self.data.seed, self.data.seed + self.data.sets - 1):
-                Settings(task=_ANY_TASK, steps=self.data.steps, seed=seed)  # checks the numbers
+                CollectSettings(steps=self.data.steps, seed=seed)  # checks the numbers
         if self.training and not self.data:
             raise InputError("training is for encoders made by the study: [data] is missing")
         for given, representation in zip(self.representations, self.observed, strict=True):

@@ -1,14 +1,13 @@
 """The data sets and encoders that a study's runs need."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from jbrep.collect import collect
 from jbrep.collect.collector import usual_shard_episodes
 from jbrep.collect.derive import derive
-from jbrep.dataset import Dataset, ScaledDataset, Settings
+from jbrep.dataset import Dataset, DataSettings, ScaledDataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
@@ -140,11 +139,11 @@ def _collect(plan: Plan, data: Data, task: str, number: int) -> Path:
     else:
         described = plan.task(task)
         with_state = bool(described.state)
-        settings = Settings(
+        settings = DataSettings(
             task=described, steps=data.steps, seed=data.seed + number, store_state=with_state
         )
         episodes = usual_shard_episodes(settings, folder)
-        collect(replace(settings, shard_episodes=episodes), folder)
+        collect(settings.replace(shard_episodes=episodes), folder)
     return folder
 
 

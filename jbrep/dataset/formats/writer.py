@@ -9,10 +9,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from jbrep.dataset.importing.episodes import Incoming, Source
+from jbrep.dataset.formats.episodes import Incoming, Source
 from jbrep.dataset.manifest import Manifest, commit, new_manifest, write_manifest
-from jbrep.dataset.schema import EPISODES, Columns, episode_returns
-from jbrep.dataset.settings import IMPORTED, Settings
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings, Frame
+from jbrep.dataset.settings import IMPORTED, MAX_LETTERS
 from jbrep.dataset.verify import range_problems
 from jbrep.envs.description import features_of
 from jbrep.envs.task import Task
@@ -23,7 +23,6 @@ from jbrep.records.storage import check_space, make_folder
 
 _SHARD_ROWS = 20_000
 _MOST_SHARDS = 5_000
-_MOST_LETTERS = 200  # of the source, in the settings
 
 Array = NDArray[Any]
 
@@ -150,24 +149,24 @@ def _action_bounds(source: Source, survey: _Survey) -> tuple[Array, Array]:
     )
 
 
-def _settings(source: Source, survey: _Survey, task: Task) -> Settings:
+def _settings(source: Source, survey: _Survey, task: Task) -> DataSettings:
     rows = max(_SHARD_ROWS, survey.rows // _MOST_SHARDS)
     name = "".join(c if c.isprintable() else "?" for c in source.name)
-    return Settings(
+    return DataSettings(
         task=task,
-        policy={"kind": IMPORTED, "source": name[-_MOST_LETTERS:]},
+        policy={"kind": IMPORTED, "source": name[-MAX_LETTERS:]},
         steps=survey.rows,
         shard_episodes=max(1, rows * survey.episodes // survey.rows),
     )
 
 
-def _fill(source: Source, settings: Settings, folder: Path) -> Manifest:
+def _fill(source: Source, settings: DataSettings, folder: Path) -> Manifest:
     manifest = new_manifest(settings)
     write_manifest(folder, manifest)
     episodes = source.episodes()
     with Progress(total=settings.steps, unit="step", unit_scale=True, desc="write") as progress:
         while some := list(islice(episodes, settings.shard_episodes)):
-            columns = _columns(settings.task, some, manifest.episodes)
+            columns = _columns(settings, some, manifest.episodes)
             for problem in range_problems(settings.task, columns):
                 raise InputError(
                     f"{source.name} doesn't fit {settings.task.name}: {problem}; correct the data, "
@@ -180,29 +179,22 @@ def _fill(source: Source, settings: Settings, folder: Path) -> Manifest:
     return manifest
 
 
-def _columns(task: Task, episodes: list[Incoming], first: int) -> Columns:
-    """The columns of a shard, in the order of the schema."""
-    lengths = np.array([len(episode.reward) for episode in episodes], "<i4")
-    numbers = np.arange(first, first + len(episodes), dtype="<i4")
-    terminated = np.array([episode.terminated for episode in episodes], "|u1")
-    reward = np.concatenate([episode.reward for episode in episodes])
-    once = {
-        "episode": numbers,
-        "seed": np.array([episode.seed for episode in episodes], "<i8"),
-        "length": lengths,
-        "return": episode_returns(reward, lengths),
-        "terminated": terminated,
-        "truncated": 1 - terminated,
-        "final_observation": np.stack([episode.final for episode in episodes]),
-    }
-    return {
+def _columns(settings: DataSettings, episodes: list[Incoming], first: int) -> Columns:
+    """The columns of a shard."""
+    action = np.concatenate([episode.action for episode in episodes])
+    terminated = np.array([episode.terminated for episode in episodes])
+    known = {
         "observation": np.concatenate([episode.observation for episode in episodes]),
-        "action": _bounded(task, np.concatenate([episode.action for episode in episodes])),
-        "reward": reward,
-        "episode": np.repeat(numbers, lengths),
-        "step": np.concatenate([np.arange(length, dtype="<i4") for length in lengths]),
-        **{EPISODES + name: values for name, values in once.items()},
+        "action": _bounded(settings.task, action),
+        "reward": np.concatenate([episode.reward for episode in episodes]),
+        EPISODES + "terminated": terminated,
+        EPISODES + "truncated": ~terminated,
+        EPISODES + "final_observation": np.stack([episode.final for episode in episodes]),
     }
+    lengths = np.array([len(episode.reward) for episode in episodes])
+    seeds = np.array([episode.seed for episode in episodes])
+    numbers = np.arange(first, first + len(episodes))
+    return settings.columns(known, Frame(numbers, seeds, lengths, known["reward"]))
 
 
 def _bounded(task: Task, action: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Importing an npz file with arrays as Gymnasium's users name them, or as jbrep exports them."""
+"""One npz file: arrays as Gymnasium's users name them, or all columns as jbrep writes them."""
 
 import zipfile
 import zlib
@@ -10,18 +10,21 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.dataset.importing.arrays import check_lengths, label, plain
-from jbrep.dataset.importing.episodes import Incoming, Source, check_kinds
-from jbrep.dataset.importing.flat import (
-    CHUNK,
-    PerEpisode,
+from jbrep.dataset.formats.episodes import (
+    Incoming,
     Rows,
-    check_columns,
-    own_names,
-    split,
+    Source,
+    check_kind,
+    check_lengths,
+    check_names,
+    label,
 )
+from jbrep.dataset.formats.flat import CHUNK, PerEpisode, own_names, split
+from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Feature
 from jbrep.errors import InputError
+from jbrep.progress import Progress
+from jbrep.records.publish import publish_file, unfinished
 
 Array = NDArray[Any]
 _SUFFIX = ".npy"
@@ -49,13 +52,13 @@ class _Header(NamedTuple):
         return self.shape[0] if self.shape else 0
 
 
-def open_file(path: Path) -> Source:
+def open_source(given: str) -> Source:
     """Open an npz file; its large arrays are read some rows at a time.
 
     Raises:
         InputError: it isn't one, or can't be used; nothing in it is unpickled.
     """
-    name = str(path)
+    name, path = given, Path(given)
     with _archive(path) as archive:
         headers = {
             member.removesuffix(_SUFFIX): _header(path, archive, member)
@@ -63,10 +66,11 @@ def open_file(path: Path) -> Source:
             if member.endswith(_SUFFIX)
         }
         own = own_names(name, headers)
-        check_columns(name, own)
-        given = {column: headers[own[column]] for column in own}
-        check_lengths(name, {column: header.rows for column, header in given.items()})
-        check_kinds(name, {n: (header.dtype, header.shape[1:]) for n, header in given.items()})
+        check_names(name, own)
+        chosen = {column: headers[own[column]] for column in own}
+        check_lengths(name, {column: header.rows for column, header in chosen.items()})
+        for column, header in chosen.items():
+            check_kind(name, column, header.dtype, header.shape[1:])
         known = _once(path, archive, headers)
         features = _features(path, archive, headers)
     members = {column: f"{own[column]}{_SUFFIX}" for column in own}
@@ -167,16 +171,12 @@ def _read(path: Path, member: str, file: IO[bytes], size: int) -> bytes:
 
 
 def _once(path: Path, archive: zipfile.ZipFile, headers: dict[str, _Header]) -> PerEpisode:
-    """What is known once for each episode; jbrep's format version 1 may have some without rows."""
+    """What is known once for each episode."""
     arrays: dict[str, Array] = {}
     for column, aliases in _ONCE.items():
         for alias in aliases:
             if alias in headers:
-                arrays[column] = plain(str(path), column, _whole(path, archive, alias))
-    if "episodes/length" in headers:
-        filled = _whole(path, archive, "episodes/length") > 0
-        check_lengths(str(path), {"episode": len(filled)} | {n: len(v) for n, v in arrays.items()})
-        arrays = {column: values[filled] for column, values in arrays.items()}
+                arrays[column] = _whole(path, archive, alias)
     return PerEpisode.of(str(path), arrays)
 
 
@@ -201,3 +201,28 @@ def _whole(path: Path, archive: zipfile.ZipFile, name: str) -> Array:
             return np.lib.format.read_array(file, allow_pickle=False)
         except _DAMAGE:
             raise _cut_short(path, name) from None
+
+
+def write(dataset: Dataset, out: Path) -> str:
+    """Stream the columns to an uncompressed zip; returns how to open it."""
+    with unfinished(out) as partial:
+        _write_zip(dataset, partial, out.name)
+        publish_file(partial, out)
+    return f"numpy.load({str(out)!r})"
+
+
+def _write_zip(dataset: Dataset, path: Path, name: str) -> None:
+    arrays = {f"episodes/{name}": values for name, values in dataset.episodes.items()}
+    arrays["feature_names"] = np.array(dataset.task.feature_names)
+    arrays["feature_units"] = np.array([feature.unit for feature in dataset.task.features])
+    with zipfile.ZipFile(path, "w", allowZip64=True) as archive:
+        for column_name in Progress(dataset.columns, unit="column", desc=name):
+            column = dataset[column_name]
+            with archive.open(f"{column_name}.npy", "w", force_zip64=True) as file:
+                header = {"descr": column.dtype.str, "fortran_order": False, "shape": column.shape}
+                np.lib.format.write_array_header_1_0(file, header)
+                for chunk in column.chunks():
+                    file.write(np.ascontiguousarray(chunk).data)
+        for array_name, values in arrays.items():
+            with archive.open(f"{array_name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, values, allow_pickle=False)

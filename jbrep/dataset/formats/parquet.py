@@ -1,4 +1,4 @@
-"""Importing a Parquet table: a row for each step, a column for each feature."""
+"""Parquet tables: a row for each step, a column for each feature."""
 
 import json
 import re
@@ -8,23 +8,23 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from jbrep.dataset.importing.arrays import label
-from jbrep.dataset.importing.episodes import Incoming, Source, check_kinds
-from jbrep.dataset.importing.flat import (
-    ALIASES,
-    CHUNK,
-    PerEpisode,
+from jbrep.dataset.formats.episodes import (
+    Incoming,
     Rows,
-    check_columns,
-    own_names,
-    split,
+    Source,
+    check_kind,
+    check_names,
+    label,
 )
+from jbrep.dataset.formats.flat import CHUNK, PerEpisode, own_names, split
+from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Feature, Task
 from jbrep.errors import InputError, first_line
+from jbrep.progress import Progress
+from jbrep.records.publish import publish_file, unfinished
 from jbrep.records.record import from_plain
 from jbrep.records.storage import exists
 
@@ -32,13 +32,13 @@ _ACTION = re.compile(r"actions?(_\d+)?")
 _NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former
 
 
-def open_file(path: Path) -> Source:
+def open_source(given: str) -> Source:
     """Open a Parquet file, and the one of its episodes if it stands beside it.
 
     Raises:
         InputError: it can't be read, or has no columns that can be used.
     """
-    name = str(path)
+    name, path = given, Path(given)
     schema = _schema(path)
     task = _own_task(schema)
     own = own_names(name, schema.names)
@@ -48,13 +48,9 @@ def open_file(path: Path) -> Source:
     else:
         others = {*own.values(), *actions}
         features = [n for n in schema.names if n not in others and not _NOT_FEATURES.fullmatch(n)]
-    scalars = {n: c for n, c in own.items() if n in ALIASES and n not in ("observation", "action")}
-    check_columns(
-        name,
-        [*scalars, *(["observation"] if features else []), *(["action"] if actions else [])],
-    )
-    columns = {"observation": features, "action": actions}
-    columns |= {column: [given] for column, given in scalars.items()}
+    columns = {column: [given] for column, given in own.items()}
+    columns |= {"observation": features, "action": actions}
+    check_names(name, [column for column, given in columns.items() if given])
     _check_types(name, schema, columns)
     once = _once(path)
 
@@ -98,7 +94,7 @@ def _check_types(name: str, schema: pa.Schema, columns: dict[str, list[str]]) ->
                     f"{name} has {schema.field(column).type} in the column {column!r}: it must be "
                     "plain numbers"
                 )
-            check_kinds(name, {what: (dtype, ())})
+            check_kind(name, what, dtype)
 
 
 def _chunks(path: Path, columns: dict[str, list[str]]) -> Iterator[Rows]:
@@ -133,7 +129,6 @@ def _once(path: Path) -> PerEpisode:
         return PerEpisode()
     try:
         table = pq.read_table(beside)
-        table = table.filter(pc.greater(table["length"], 0))
         final = np.stack(table["final_observation"].to_numpy())
         once = {name: table[name].to_numpy() for name in ("terminated", "seed")}
         return PerEpisode.of(str(beside), {"final_observation": final, **once})
@@ -145,3 +140,55 @@ def _word(column: str) -> str:
     """The name of a column as a feature's."""
     word = re.sub(r"[^A-Za-z0-9_.-]", "_", column)
     return word if word[:1].isalpha() else f"obs_{word}"
+
+
+def write(dataset: Dataset, out: Path) -> str:
+    """Write a file of steps, and beside it one of episodes; returns how to open them."""
+    episodes = out.with_stem(f"{out.stem}-episodes")
+    with unfinished(out) as partial, unfinished(episodes) as partial_episodes:
+        _write_steps(dataset, partial, out.name)
+        columns = {name: list(values) for name, values in dataset.episodes.items()}
+        pq.write_table(pa.table(columns), partial_episodes)
+        publish_file(partial_episodes, episodes)
+        try:
+            publish_file(partial, out)
+        except BaseException:
+            episodes.unlink()
+            raise
+    return f"pandas.read_parquet({str(out)!r}), and {episodes.name} for the episodes"
+
+
+def _write_steps(dataset: Dataset, path: Path, name: str) -> None:
+    """The settings are in the file's metadata, the units in the columns'."""
+    schema = pa.schema(
+        [
+            pa.field(name, pa.from_numpy_dtype(dtype), nullable=False, metadata={"unit": unit})
+            for name, dtype, unit in _numeric_columns(dataset)
+        ],
+        metadata={"jbrep": json.dumps(dataset.manifest.settings.as_json())},
+    )
+    coding = {"compression": "zstd", "use_dictionary": False, "use_byte_stream_split": True}
+    with pq.ParquetWriter(path, schema, **coding) as writer:
+        chunks = zip(*(dataset[name].chunks() for name in dataset.columns), strict=True)
+        for chunk in Progress(chunks, unit="chunk", desc=name, leave=False):
+            arrays = [column for values in chunk for column in _flat(values)]
+            writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+
+
+def _numeric_columns(dataset: Dataset) -> Iterator[tuple[str, np.dtype[Any], str]]:
+    """Name, type and unit of each column of numbers, in the order of the data set's columns."""
+    for name in dataset.columns:
+        column = dataset[name]
+        if name == "observation":
+            for feature in dataset.task.features:
+                yield feature.name, column.dtype, feature.unit
+        elif column.shape[1:] in ((), (1,)):
+            yield name, column.dtype, "1"
+        else:
+            for i in range(column.shape[1]):
+                yield f"{name}_{i}", column.dtype, ""
+
+
+def _flat(values: NDArray[Any]) -> list[NDArray[Any]]:
+    """The columns of (n,) or (n, k)."""
+    return list(values.reshape(len(values), -1).T)

@@ -1,39 +1,51 @@
-"""Importing a Minari data set, from its folder or by its id."""
+"""Data sets in Minari's HDF5 storage, with the environment that it recovers."""
 
+import copy
 import json
 import os
+import re
 import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import minari
 import minari.dataset.minari_storage as storages
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces.utils import flatten
+from minari.data_collector import EpisodeBuffer
+from minari.namespace import NAMESPACE_METADATA_FILENAME
 from numpy.typing import NDArray
 
-from jbrep.dataset.importing.arrays import check_ends, check_lengths, label
-from jbrep.dataset.importing.episodes import (
+import jbrep.jitterbug.simulation  # noqa: F401  Minari makes the environment: load MuJoCo before
+from jbrep.dataset.formats.episodes import (
     Incoming,
     Source,
-    check_kinds,
-    incoming,
+    check_kind,
+    label,
+    whole_episode,
 )
-from jbrep.dataset.schema import UNKNOWN_SEED
+from jbrep.dataset.reader import Dataset
+from jbrep.dataset.schema import UNKNOWN_SEED, DataSettings
 from jbrep.envs.description import describe, features_of
+from jbrep.envs.names import find_spec
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line
-from jbrep.records.storage import exists, read_regular
+from jbrep.progress import Progress
+from jbrep.records.publish import publish_folder, unfinished
+from jbrep.records.storage import exists, read_regular, write_whole
 
 Array = NDArray[Any]
-_ROOT = "MINARI_DATASETS_PATH"
+_ROOT = "MINARI_DATASETS_PATH"  # Minari takes the folder of its data sets from there only
 _METADATA = "metadata.json"
 _MAX_BYTES = 1 << 24  # of the metadata
 _MOST_SHOWN = 10  # ids of data sets
 
 
-def open_data_set(given: str) -> Source:
+def open_source(given: str) -> Source:
     """Open a Minari data set.
 
     Args:
@@ -72,7 +84,7 @@ def open_data_set(given: str) -> Source:
 def _continuous(name: str, space: spaces.Space[Any]) -> spaces.Box:
     if not isinstance(space, spaces.Box):
         raise InputError(f"{name} has actions in {space}: only continuous ones are possible")
-    check_kinds(name, {"action": (space.dtype, space.shape)})
+    check_kind(name, "action", space.dtype, space.shape)
     return space
 
 
@@ -147,13 +159,16 @@ def _describe(env_id: str, arguments: dict[str, Any], limit: int | None) -> tupl
 
 
 def _episodes(name: str, storage: storages.MinariStorage) -> Iterator[Incoming]:
-    numbers = range(storage.total_episodes)
-    given = zip(numbers, _read(name, storage), strict=True)
-    for number, (episode, seed) in given:
+    for number, (episode, seed) in enumerate(_read(name, storage)):
         where = f"{name}: episode {number}"
-        checked = _checked(where, episode, storage, seed)
-        if checked is not None:
-            yield checked
+        given = {
+            "action": _flat(where, storage.action_space, episode["actions"]),
+            "observation": _flat(where, storage.observation_space, episode["observations"]),
+            "reward": episode["rewards"],
+            "terminated": episode["terminations"],
+            "truncated": episode["truncations"],
+        }
+        yield from whole_episode(where, given, seed=seed)
 
 
 def _read(name: str, storage: storages.MinariStorage) -> Iterator[tuple[dict[str, Any], int]]:
@@ -168,31 +183,6 @@ def _read(name: str, storage: storages.MinariStorage) -> Iterator[tuple[dict[str
             yield episode, UNKNOWN_SEED if seed is None else int(seed)
     except Exception as error:  # whatever Minari and HDF5 raise at damaged files
         raise _unreadable(name, error) from None
-
-
-def _checked(
-    where: str, episode: dict[str, Any], storage: storages.MinariStorage, seed: int
-) -> Incoming | None:
-    observation = _flat(where, storage.observation_space, episode["observations"])
-    action = _flat(where, storage.action_space, episode["actions"])
-    arrays = {n: np.asarray(episode[f"{n}s"]) for n in ("reward", "termination", "truncation")}
-    check_lengths(where, {"action": len(action), **{n: len(v) for n, v in arrays.items()}})
-    if len(observation) not in (len(action), len(action) + 1):
-        raise InputError(
-            f"{where} has {len(observation):,} observations and {len(action):,} actions: there "
-            "must be one more, the final one"
-        )
-    check_ends(where, arrays["termination"], arrays["truncation"])
-    steps = len(action)
-    return incoming(
-        where,
-        observation[:steps],
-        action,
-        arrays["reward"],
-        observation[steps] if len(observation) > steps else None,
-        bool(arrays["termination"][-1:].any()),
-        seed,
-    )
 
 
 def _flat(where: str, space: spaces.Space[Any], values: Any) -> Array:
@@ -211,3 +201,95 @@ def _flat(where: str, space: spaces.Space[Any], values: Any) -> Array:
         return np.array(flat).reshape(len(array), spaces.utils.flatdim(space))
     except (ValueError, KeyError, IndexError, TypeError) as error:
         raise InputError(f"{where} doesn't fit {space}: {kind_and_line(error)}") from None
+
+
+def write(dataset: Dataset, out: Path) -> str:
+    """Add a data set to a folder of Minari data sets; returns how to open it."""
+    settings = dataset.manifest.settings
+    name = f"{_namespace(settings.task)}/{settings.policy['kind']}-v0"
+    path = out / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with unfinished(path) as root:  # Minari ignores hidden folders
+        root.mkdir()
+        with _datasets_in(root.resolve()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on the missing author and address
+            _create(dataset, name)
+        for namespace in Path(name).parents[:-1]:
+            metadata = namespace / NAMESPACE_METADATA_FILENAME
+            if not exists(out / metadata):
+                write_whole(out / metadata, (root / metadata).read_bytes())
+        publish_folder(root / name, path)
+    return f"{_ROOT}={out} and minari.load_dataset({name!r})"
+
+
+def _namespace(task: Task) -> str:
+    """Jitterbug's tasks stand together; another's id has no version there."""
+    if task.id.startswith("Jitterbug/"):
+        return f"jitterbug/{task.slug}"
+    name = re.sub(r"[^A-Za-z0-9_/-]+", "-", task.id)
+    return name if len(name) > 1 else f"task-{name}"  # Minari takes no single letter
+
+
+def _create(dataset: Dataset, name: str) -> None:
+    settings, versions = dataset.manifest.settings, dataset.manifest.versions
+    minari.create_dataset_from_buffers(
+        name,
+        _buffers(dataset),
+        env=_env_spec(settings),
+        observation_space=spaces.Box(-np.inf, np.inf, (settings.task.size,), np.float32),
+        action_space=_actions(settings.task),
+        algorithm_name=settings.policy["kind"],
+        description=f"{json.dumps(settings.as_json())} {dataset.manifest.fingerprint}",
+        requirements=[f"{package}=={versions[package]}" for package in ("jbrep", "mujoco")],
+    )
+
+
+def _actions(task: Task) -> spaces.Box:
+    low, high = (np.array(ends, np.float32) for ends in (task.action_low, task.action_high))
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def _env_spec(settings: DataSettings) -> EnvSpec | None:
+    """What Minari recovers the environment from: with the arguments and the time limit.
+
+    None for one that was registered with a class or function: only a name can be written down.
+    None, too, for imported data of one that isn't there.
+    """
+    task = settings.task
+    try:
+        spec = copy.deepcopy(find_spec(task.id))
+    except (InputError, ModuleNotFoundError):
+        if settings.is_imported:
+            return None
+        raise
+    spec.kwargs.update(task.arguments)
+    spec.max_episode_steps = task.max_episode_steps
+    return None if callable(spec.entry_point) else spec
+
+
+@contextmanager
+def _datasets_in(folder: Path) -> Iterator[None]:
+    before = os.environ.get(_ROOT)
+    os.environ[_ROOT] = str(folder)
+    try:
+        yield
+    finally:
+        del os.environ[_ROOT]
+        if before is not None:
+            os.environ[_ROOT] = before
+
+
+def _buffers(dataset: Dataset) -> Iterator[EpisodeBuffer]:
+    for number in Progress(range(len(dataset.episodes["length"])), unit="episode", desc="minari"):
+        episode = dataset.episode(number)
+        ends, is_last = episode.record, np.arange(len(episode)) == len(episode) - 1
+        seed = int(ends["seed"])
+        yield EpisodeBuffer(
+            seed=None if seed == UNKNOWN_SEED else seed,
+            observations=np.append(episode["observation"], ends["final_observation"][None], axis=0),
+            actions=episode["action"],
+            rewards=episode["reward"].astype(np.float64),
+            terminations=is_last & bool(ends["terminated"]),
+            truncations=is_last & bool(ends["truncated"]),
+            infos={},
+        )

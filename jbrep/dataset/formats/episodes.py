@@ -1,0 +1,291 @@
+"""Episodes that were made elsewhere, one by one, each checked."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jbrep.dataset.schema import UNKNOWN_SEED
+from jbrep.envs.task import Feature, Task
+from jbrep.errors import InputError
+from jbrep.text import slug
+
+Array = NDArray[Any]
+Rows = Mapping[str, Array]  # arrays with a row for each step, by the names of ALIASES
+
+ALIASES = {  # what others call the columns
+    "observation": ("observation", "observations"),
+    "action": ("action", "actions"),
+    "reward": ("reward", "rewards"),
+    "terminated": ("terminated", "terminations", "terminals"),
+    "truncated": ("truncated", "truncations", "timeouts"),
+    "next_observation": ("next_observation", "next_observations"),
+    "episode": ("episode",),
+    "step": ("step",),
+}
+ENDS = ("terminated", "truncated")
+WIDE = ("observation", "action", "next_observation", "final_observation")  # with many numbers a row
+_WHOLE = ("episode", "step", "seed")
+_IMAGE_AXES = 3  # height, width, colour
+
+
+class Incoming(NamedTuple):
+    """An episode of n steps."""
+
+    observation: NDArray[np.float32]  # (n, d), before each action
+    action: NDArray[np.float32]  # (n, k)
+    reward: NDArray[np.float32]  # (n,)
+    final: NDArray[np.float32]  # (d,), after the last action
+    terminated: bool
+    seed: int
+
+
+@dataclass(frozen=True)
+class Source:
+    """Data that were made elsewhere.
+
+    Attributes:
+        name: for messages and provenance.
+        label: for a task made from the data alone: its id.
+        episodes: reads them, from the first one on at each call.
+        task: that the source names; None if it names none that is known here.
+        features: for a task made from the data alone; numbered if there are none.
+        action_bounds: lower and upper ones, (k,) each; infinite where there are none.
+        max_episode_steps: for a task made from the data alone; the longest episode if None.
+        why_no_task: for the user.
+        rows: how many there are, if that is known.
+    """
+
+    name: str
+    label: str
+    episodes: Callable[[], Iterator[Incoming]]
+    task: Task | None = None
+    features: tuple[Feature, ...] = ()
+    action_bounds: tuple[Array, Array] | None = None
+    max_episode_steps: int | None = None
+    why_no_task: str = "it names no environment"
+    rows: int | None = None
+
+
+def label(name: str) -> str:
+    """A name as the id of a task: of letters, digits, '.', '_' and '-'."""
+    return slug(name).strip("-.")[:100] or "imported"
+
+
+def whole_episode(where: str, given: Mapping[str, ArrayLike], **once: Any) -> Iterator[Incoming]:
+    """An episode from arrays of all its steps; none if no step is left.
+
+    Args:
+        where: it is, for messages.
+        given: by the names of ALIASES; observations may have one row more than the rest: the final
+            one.
+        once: the final observation and the seed, where they are known.
+
+    Raises:
+        InputError: other lengths or types, an end before the last step, or as `checked`.
+    """
+    arrays = {name: plain(where, name, values) for name, values in given.items()}
+    observation = arrays["observation"]
+    if len(observation) == len(arrays["reward"]) + 1 and "final_observation" not in once:
+        arrays["observation"], once["final_observation"] = observation[:-1], observation[-1]
+    check_lengths(where, {name: len(values) for name, values in arrays.items()})
+    check_arrays(where, arrays)
+    if "final_observation" in once:
+        check_arrays(where, {"final_observation": np.asarray(once["final_observation"])[None]})
+    for name in ENDS:
+        is_end = flags(where, name, arrays[name]) if name in arrays else np.zeros(0, bool)
+        if is_end[:-1].any():
+            step = np.flatnonzero(is_end)[0]
+            raise InputError(f"{where} goes on after its end at step {step}: divide it there")
+    yield from checked(where, arrays, once)
+
+
+def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incoming]:
+    """An episode, its numbers checked; none if no step is left.
+
+    Without the observation after its last action, the last step is left out, so that the
+    observation before that becomes the final one: nothing is made up. What ended the episode came
+    after it, so the episode counts as truncated then.
+
+    Args:
+        where: it is, for messages.
+        rows: of its steps.
+        once: its final observation, whether it was terminated and its seed, where they are known.
+
+    Raises:
+        InputError: gaps, or numbers that aren't finite or too large for 32 bits.
+    """
+    if not len(rows["reward"]):
+        return
+    _check_steps(where, rows)
+    following = _following(where, rows)
+    final = once.get("final_observation", following)
+    observation = _single(where, "observation", rows["observation"])
+    by_row = bool(rows["terminated"][-1]) if "terminated" in rows else False
+    terminated = bool(once.get("terminated", by_row))
+    if final is None:
+        observation, last, terminated = observation[:-1], observation[-1], False
+    else:
+        last = _single(where, "final observation", np.asarray(final)[None])[0]
+    steps = len(observation)
+    if not steps:
+        return
+    if len(last) != observation.shape[1]:
+        raise InputError(
+            f"{where} has {observation.shape[1]} numbers in an observation, and {len(last)} in its "
+            "final one: they must be as many"
+        )
+    seed = int(once.get("seed", UNKNOWN_SEED))
+    if not UNKNOWN_SEED <= seed < 1 << 63:
+        raise InputError(f"{where} has the seed {seed}: it must be from 0 to 2**63 - 1, or -1")
+    action = _single(where, "action", rows["action"][:steps])
+    reward = _single(where, "reward", rows["reward"][:steps])[:, 0]
+    yield Incoming(observation, action, reward, last, terminated, seed)
+
+
+def _check_steps(where: str, rows: Rows) -> None:
+    """The steps of an episode are numbered without a gap, from 0."""
+    if "step" not in rows:
+        return
+    wrong = np.flatnonzero(rows["step"] != np.arange(len(rows["step"])))
+    if len(wrong):
+        first = wrong[0]
+        raise InputError(
+            f"{where} has step {rows['step'][first]} where step {first} was expected: its steps "
+            "must be numbered from 0 without a gap"
+        )
+
+
+def _following(where: str, rows: Rows) -> Array | None:
+    """The observation after the last action, if that is known.
+
+    Raises:
+        InputError: an observation after an action isn't the one before the next.
+    """
+    if "next_observation" not in rows:
+        return None
+    after, before = rows["next_observation"][:-1], rows["observation"][1:]
+    apart = after.astype(np.float32) != before.astype(np.float32)
+    if apart.any():
+        step = np.argwhere(apart)[0, 0]
+        raise InputError(
+            f"{where} has a gap after step {step}: the observation after that step isn't the one "
+            "before the next"
+        )
+    last: Array = rows["next_observation"][-1]
+    return last
+
+
+def _single(where: str, what: str, values: Array) -> NDArray[np.float32]:
+    """Flat rows of single precision, (n, ...) to (n, m)."""
+    with np.errstate(over="ignore"):
+        single = values.reshape(len(values), math.prod(values.shape[1:])).astype(np.float32)
+    if not np.isfinite(single).all():
+        step = np.flatnonzero(~np.isfinite(single).all(axis=1))[0]
+        raise InputError(
+            f"{where} has a number in its {what} that isn't finite, or beyond 32 bits, at step "
+            f"{step}: correct the data, or leave the episode out"
+        )
+    return single
+
+
+def plain(name: str, what: str, values: ArrayLike) -> Array:
+    """An array with rows.
+
+    Raises:
+        InputError: no such array.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise InputError(
+            f"{name} has {what}s of different sizes: they must make one array"
+        ) from None
+    if not array.ndim:
+        raise InputError(f"{name} has a single {what}: it must be an array")
+    return array
+
+
+def flags(where: str, name: str, values: Array) -> NDArray[np.bool_]:
+    """Whether each row is such an end.
+
+    Raises:
+        InputError: a value is neither 0 nor 1.
+    """
+    if not np.isin(values, (0, 1)).all():
+        raise InputError(f"{where} has a {name} that is neither true nor false, 0 nor 1")
+    return values.astype(bool)
+
+
+def check_names(name: str, columns: Iterable[str]) -> None:
+    """Make sure that there is what every data set needs.
+
+    Raises:
+        InputError: a column is missing, or nothing tells where an episode ends.
+    """
+    columns = set(columns)
+    for needed in ("observation", "action", "reward"):
+        if needed not in columns:
+            raise InputError(
+                f"{name} has no {needed}s: it must have observations, actions and rewards"
+            )
+    if not columns & {*ENDS, "episode", "step"}:
+        raise InputError(
+            f"{name} doesn't tell where an episode ends: give it terminations and truncations, or "
+            "the number of the episode in each row"
+        )
+
+
+def check_lengths(name: str, lengths: Mapping[str, int], unit: str = "rows") -> None:
+    """Make sure that all columns are equally long.
+
+    Raises:
+        InputError: two differ.
+    """
+    (first, expected), *others = lengths.items()
+    for what, length in others:
+        if length != expected:
+            raise InputError(
+                f"{name} has {expected:,} {unit} of {first}s, and {length:,} of {what}s: they must "
+                "be as many"
+            )
+
+
+def check_arrays(name: str, arrays: Mapping[str, Array]) -> None:
+    """`check_kind` of arrays with rows."""
+    for what, values in arrays.items():
+        check_kind(name, what, values.dtype, values.shape[1:])
+
+
+def check_kind(name: str, what: str, dtype: np.dtype[Any], row: Sequence[int] = ()) -> None:
+    """Make sure that a column holds what can be imported.
+
+    Args:
+        name: of the source.
+        what: the column.
+        dtype: of its values.
+        row: shape of one of its rows.
+
+    Raises:
+        InputError: objects, text, images, discrete actions, or several numbers where one belongs.
+    """
+    shape = f"{what}s of shape {tuple(row)}"
+    if dtype.kind not in "fiub":
+        raise InputError(
+            f"{name} has {what}s of type {dtype}: they must be arrays of plain numbers"
+        )
+    if what not in WIDE and math.prod(row) != 1:
+        raise InputError(f"{name} has {shape} in each row: it must be one number")
+    if len(row) >= _IMAGE_AXES or (len(row) > 1 and dtype == np.uint8):
+        raise InputError(f"{name} has images, {shape}: only features are possible")
+    if math.prod(row) == 0:
+        raise InputError(f"{name} has {shape}: there must be at least one number")
+    if what in _WHOLE and dtype.kind not in "iu":
+        raise InputError(f"{name} has {what}s of type {dtype}: they must be whole numbers")
+    if what == "action" and dtype.kind != "f":
+        raise InputError(
+            f"{name} has actions of type {dtype}: only continuous ones are possible, floats"
+        )

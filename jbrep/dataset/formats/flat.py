@@ -1,0 +1,201 @@
+"""Rows of many episodes, one after the other, divided into episodes; and arrays in Python."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.dataset.formats.episodes import (
+    ALIASES,
+    ENDS,
+    WIDE,
+    Incoming,
+    Rows,
+    Source,
+    check_arrays,
+    check_lengths,
+    check_names,
+    checked,
+    flags,
+    label,
+    plain,
+    whole_episode,
+)
+from jbrep.envs.task import MAX_EPISODE_STEPS
+from jbrep.errors import InputError
+
+Array = NDArray[Any]
+
+CHUNK = 1 << 14  # rows read at a time
+
+
+@dataclass(frozen=True)
+class PerEpisode:
+    """What is known once for each episode; None where it isn't."""
+
+    final_observation: Array | None = None  # (episodes, ...)
+    terminated: Array | None = None  # (episodes,)
+    seed: Array | None = None  # (episodes,)
+
+    @classmethod
+    def of(cls, name: str, given: Mapping[str, Any]) -> "PerEpisode":
+        """Check the arrays of a source.
+
+        Raises:
+            InputError: one holds what can't be imported.
+        """
+        arrays = {what: plain(name, what, values) for what, values in given.items()}
+        check_arrays(name, arrays)
+        return cls(**{what: narrow(what, values) for what, values in arrays.items()})
+
+    def known(self) -> dict[str, Array]:
+        """The arrays that there are."""
+        return {name: values for name, values in vars(self).items() if values is not None}
+
+
+def own_names(name: str, names: Iterable[str]) -> dict[str, str]:
+    """Which of a source's names stand for which column.
+
+    Args:
+        name: of the source.
+        names: that it has.
+
+    Raises:
+        InputError: two names for one column.
+    """
+    own: dict[str, str] = {}
+    names = set(names)
+    for column, aliases in ALIASES.items():
+        present = [alias for alias in aliases if alias in names]
+        if len(present) > 1:
+            raise InputError(f"{name} has {' and '.join(present)}: keep one of them")
+        if present:
+            own[column] = present[0]
+    return own
+
+
+def split(name: str, chunks: Iterable[Rows], once: PerEpisode) -> Iterator[Incoming]:
+    """Divide rows into episodes, in bounded memory.
+
+    An episode ends where it is terminated or truncated, before another episode's number or a
+    step 0, and at the end of the rows.
+
+    Args:
+        name: of the source.
+        chunks: of rows, in order.
+        once: what is known once for each episode.
+
+    Raises:
+        InputError: gaps in an episode, one that is too long or in two parts, as many episodes as
+            `once` doesn't have, or as `checked`.
+    """
+    count, numbers, known = 0, set[int](), once.known()
+    for rows in _divided(name, chunks):
+        number = int(rows["episode"][0]) if "episode" in rows else count
+        if number in numbers:
+            raise InputError(
+                f"{name}: episode {number} goes on after its end, or comes in two parts: the "
+                "rows of an episode must stand together, and only its last one be an end"
+            )
+        numbers.add(number)
+        if few := [what for what, values in known.items() if count >= len(values)]:
+            raise InputError(
+                f"{name} has a {few[0]} for {len(known[few[0]]):,} episodes, and more episodes"
+            )
+        of_episode = {what: values[count] for what, values in known.items()}
+        yield from checked(f"{name}: episode {number}", rows, of_episode)
+        count += 1
+    for what, values in known.items():
+        if len(values) != count:
+            raise InputError(
+                f"{name} has a {what} for {len(values):,} episodes, but {count:,} episodes: they "
+                "must be as many"
+            )
+
+
+def _divided(name: str, chunks: Iterable[Rows]) -> Iterator[Rows]:
+    """The rows of each episode."""
+    rest: Rows = {}
+    for given in chunks:
+        chunk = {n: narrow(n, values) for n, values in given.items()}
+        rest = {n: np.concatenate((rest[n], chunk[n])) for n in rest} if rest else chunk
+        begin = 0
+        for end in _ends(name, rest):
+            yield {n: values[begin:end] for n, values in rest.items()}
+            begin = end
+        rest = {n: values[begin:] for n, values in rest.items()}
+        if len(rest["reward"]) > MAX_EPISODE_STEPS:
+            raise InputError(
+                f"{name} has an episode of more than {MAX_EPISODE_STEPS:,} steps: does something "
+                "tell where it ends?"
+            )
+    if rest and len(rest["reward"]):
+        yield rest
+
+
+def narrow(name: str, values: Array) -> Array:
+    """A column without the axis of width 1 that some give to what is one number a row."""
+    return values if name in WIDE else values.reshape(len(values))
+
+
+def _ends(name: str, rows: Rows) -> list[int]:
+    """Where episodes end: after which rows, but the last one unless it says so itself."""
+    is_end = np.zeros(len(rows["reward"]), dtype=bool)
+    for flag in ENDS:
+        if flag in rows:
+            is_end |= flags(name, flag, rows[flag])
+    if "episode" in rows:
+        is_end[:-1] |= rows["episode"][1:] != rows["episode"][:-1]
+    elif "step" in rows:
+        is_end[:-1] |= rows["step"][1:] == 0
+    return [int(row) + 1 for row in np.flatnonzero(is_end)]
+
+
+def source_of(columns: Mapping[str, Any], once: Mapping[str, Any], name: str) -> Source:
+    """Arrays in Python, see `Dataset.write`.
+
+    Args:
+        columns: by their names in `ALIASES`: a row for each step of all episodes, or a list with
+            such an array for each episode; those that are None aren't there.
+        once: what `PerEpisode` takes, likewise.
+        name: of the source.
+
+    Raises:
+        InputError: arrays of different lengths, or of a kind that can't be imported.
+    """
+    given = {what: values for what, values in columns.items() if values is not None}
+    known = {what: values for what, values in once.items() if values is not None}
+    check_names(name, given)
+    reward = given["reward"]
+    if isinstance(reward, list | tuple) and len(reward) and np.ndim(reward[0]) == 1:
+        return _listed(name, given, known)
+    arrays = {what: plain(name, what, values) for what, values in given.items()}
+    rows = len(arrays["reward"])
+    check_lengths(name, {what: len(values) for what, values in arrays.items()})
+    check_arrays(name, arrays)
+    per_episode = PerEpisode.of(name, known)
+
+    def episodes() -> Iterator[Incoming]:
+        starts = range(0, rows, CHUNK)
+        chunks = ({n: v[start : start + CHUNK] for n, v in arrays.items()} for start in starts)
+        return split(name, chunks, per_episode)
+
+    return Source(name, label(name), episodes, rows=rows)
+
+
+def _listed(name: str, columns: Mapping[str, Any], once: dict[str, Any]) -> Source:
+    """Lists of arrays, one for each episode."""
+    check_lengths(name, {n: len(values) for n, values in {**columns, **once}.items()}, "episodes")
+    if "seed" in once:
+        once["seed"] = PerEpisode.of(name, {"seed": once["seed"]}).seed
+
+    def episodes() -> Iterator[Incoming]:
+        for number in range(len(columns["reward"])):
+            own, ends = (
+                {what: values[number] for what, values in each.items()} for each in (columns, once)
+            )
+            yield from whole_episode(f"{name}: episode {number}", own, **ends)
+
+    return Source(name, label(name), episodes, rows=sum(map(len, columns["reward"])))
