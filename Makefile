@@ -63,12 +63,11 @@ bench: $(READY) ## speed as ratios in one run, and what the hand-written policie
 	$(BIN)/python benchmarks/environments.py
 
 pictures: $(READY) ## the pictures in docs/, drawn anew
-	MUJOCO_GL=egl $(BIN)/python tools/pictures.py docs
 	rm -f docs/jitterbug.gif
 	$(BIN)/jbrep render uniform heuristic --task move_to_pose --episode 10 --seconds 3.5 --speed 0.7 --fps 10 --size 240x180 --out docs/jitterbug.gif
 	$(BIN)/jbrep inspect data/sample/face_direction --episode 1 --encoder dae-8 --out inspect/shown.rrd
 	$(BIN)/jbrep report results/confirm-move
-	$(BIN)/python tools/screenshots.py results/confirm-move/report.html inspect/shown.rrd docs
+	MUJOCO_GL=egl $(BIN)/python tools/pictures.py results/confirm-move/report.html inspect/shown.rrd docs
 
 figures: $(READY) ## figures and reports in results/ anew, from the tables there
 	$(BIN)/python tools/figures.py
