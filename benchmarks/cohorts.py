@@ -10,7 +10,6 @@ import tempfile
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -185,7 +184,7 @@ def compare_learning(learner: tuple[str, str], device: str) -> None:
 
 def compare_studies(steps: int, device: str) -> None:
     def measured(trainer: str, **changes: str) -> tuple[float, float]:
-        study = replace(STUDY, steps=steps, trainer=trainer, **changes)
+        study = STUDY.replace(steps=steps, trainer=trainer, **changes)
         with tempfile.TemporaryDirectory() as folder:
             plan, before = Plan(study, Path(folder) / "study"), sum(os.times()[:4])
             seconds = timed(lambda: run_study(plan, on_this_machine, usual_workers(plan)))

@@ -24,7 +24,7 @@ STUDY = Study(
 
 def packs_of(tmp_path, workers, width=None, **changes):
     """The packs of a study."""
-    plan = Plan(replace(STUDY, **changes), tmp_path)
+    plan = Plan(STUDY.replace(**changes), tmp_path)
     packs = packed(plan, plan.cells, workers, width)
     assert sorted(c.name for pack in packs for c in pack) == sorted(c.name for c in plan.cells)
     for pack in packs:
@@ -62,7 +62,7 @@ def test_a_width_is_not_passed_and_what_has_no_cohort_goes_alone(tmp_path):
 
 
 def test_memory_limits_the_width(tmp_path, monkeypatch):
-    plan = Plan(replace(STUDY, algorithms=("sac-modern",), steps=1_000_000), tmp_path)
+    plan = Plan(STUDY.replace(algorithms=("sac-modern",), steps=1_000_000), tmp_path)
     bytes_of_one = memory_of(plan.run(plan.cells[0]), 16)
     assert bytes_of_one == 1_000_000 * (16 + 1 + 16 + 1 + 1) * 4
     gib = 1 << 30
@@ -80,7 +80,7 @@ def test_the_last_worker_decides():
 
 
 def test_a_gpu_has_one_wide_cohort_at_a_time(tmp_path, monkeypatch):
-    plan = Plan(replace(STUDY, algorithms=("sac-modern",), seeds=tuple(range(20))), tmp_path)
+    plan = Plan(STUDY.replace(algorithms=("sac-modern",), seeds=tuple(range(20))), tmp_path)
     assert usual_workers(plan) == cpu_count()
     monkeypatch.setattr(Plan, "device", "cuda")
     assert usual_workers(plan) == 1
@@ -101,10 +101,10 @@ def test_trials_take_rollouts_as_short_as_can_be(algorithm, short):
 
 def test_codes_that_are_larger_than_the_observation_take_more_memory(tmp_path, monkeypatch):
     data = Data(steps=1000)
-    study = replace(STUDY, algorithms=("sac-modern",), steps=1_000_000, data=data)
+    study = STUDY.replace(algorithms=("sac-modern",), steps=1_000_000, data=data)
     gib = 1 << 30
     monkeypatch.setattr(os, "sysconf", {"SC_PHYS_PAGES": 4, "SC_PAGE_SIZE": gib}.__getitem__)
-    wide = Plan(replace(study, representations=("full", "noise-64")), tmp_path)
+    wide = Plan(study.replace(representations=("full", "noise-64")), tmp_path)
     assert max(map(len, packed(wide, wide.cells, 2))) == 1  # 0.5 GiB each, of 0.9
 
 

@@ -357,7 +357,7 @@ def test_what_is_not_primary_gets_no_verdict():
 @pytest.mark.parametrize(
     ("rules", "message"),
     [
-        ({"margin": 0}, "margin is 0: it must be between 0 and 1"),
+        ({"margin": 0}, "margin is 0: it must be a number above 0 and below 1"),
         ({"failing": 1.0}, "failing is 1.0"),
         ({"looks": (0.5,)}, r"looks are \[0.5\]: they must be shares of the seeds that ascend to"),
         ({"looks": (0.5, 0.5, 1.0)}, "ascend to 1"),

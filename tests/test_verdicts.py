@@ -1,8 +1,6 @@
 """A study of known truth, registered, looked at twice, and extended; and what can't be decided."""
 
-import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +9,7 @@ from command import jbrep
 from made_up import SEEDS, STUDY, make_runs
 
 from jbrep.errors import InputError
+from jbrep.records.record import to_plain
 from jbrep.report import report
 from jbrep.report.report import write_report
 from jbrep.stats.power import Arms, Prospect, prospects
@@ -33,7 +32,7 @@ def looks(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "study_plots", lambda *_: [])
         for seeds in (5, 8, SEEDS, SEEDS + 2):
-            plan = Plan(replace(STUDY, seeds=tuple(range(max(seeds, SEEDS)))), folder)
+            plan = Plan(STUDY.replace(seeds=tuple(range(max(seeds, SEEDS)))), folder)
             plan.write()
             make_runs(plan, range(seeds))
             results, _ = conclude(folder)
@@ -154,21 +153,14 @@ def test_a_reader_gets_the_numbers_with_numpy_alone(looks, monkeypatch, capsys):
     ],
 )
 def test_rules_that_do_not_fit_the_study(changes, message):
-    given = json.loads(json.dumps(Plan(STUDY, Path()).as_json()))
-    given = {name: value for name, value in given.items() if value is not None}
     with pytest.raises(InputError, match=message) as raised:
-        as_study({**given, **changes})
+        as_study({**to_plain(STUDY), **changes})
     assert "\n" not in str(raised.value)
 
 
 def test_a_dry_run_tells_what_could_be_found(tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.study.study.estimate", lambda runs: 60)
-    settings = Plan(STUDY, Path()).as_json()
-    lines = [f"{name} = {json.dumps(settings[name])}" for name in ("tasks", "algorithms", "seeds")]
-    lines += [f"steps = 10_000\nrepresentations = {json.dumps(settings['representations'])}"]
-    primary = json.dumps(settings["verdicts"]["primary"])
-    lines += [f"[verdicts]\nprimary = {primary}\nfailing = 0.25"]
-    (tmp_path / "it.toml").write_text("\n".join(lines))
+    (tmp_path / "it.toml").write_text(STUDY.toml)
     told = jbrep("study", tmp_path / "it.toml", "--dry-run", "--out", tmp_path / "out")
     assert told.exit_code == 0, told.output
     words = " ".join(told.output.split())

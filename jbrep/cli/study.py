@@ -67,14 +67,14 @@ def study(
     """
     from jbrep.study.config import read_study
     from jbrep.study.packing import usual_workers
-    from jbrep.study.plan import plan_for
+    from jbrep.study.plan import Plan
     from jbrep.study.registration import REGISTRATION
     from jbrep.study.runner import get_backend
     from jbrep.study.study import dry_run as dry_run_text
     from jbrep.study.study import register_study, run_study
     from jbrep.text import terminal_width
 
-    plan = plan_for(read_study(study), out or Path("runs") / study.stem)
+    plan = Plan(read_study(study), out or Path("runs") / study.stem)
     run, count = get_backend(backend), workers or usual_workers(plan)
     text = dry_run_text(plan, count, width, terminal_width()) if dry_run else ""
     for notice in plan.study.notices:
@@ -84,7 +84,7 @@ def study(
         return
     if register:
         registered = register_study(plan)
-        click.echo(f"registered on {registered['date']} (SHA-256 {registered['sha256']})")
+        click.echo(f"registered on {registered.date} (SHA-256 {registered.sha256})")
         echo_paths([plan.folder / REGISTRATION])
         return
     with stoppable(RESUMES):

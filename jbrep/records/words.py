@@ -121,8 +121,9 @@ def _scalar(node: inspect.Type) -> str:
     match node:
         case inspect.IntType(ge=least, le=most):
             return f"a whole number{_range(least, most)}"
-        case inspect.FloatType(gt=above, ge=least, le=most):
-            return f"a number{_range(least, most, above)}"
+        case inspect.FloatType(gt=above, ge=least, le=most, lt=below):
+            beyond = "" if below is None else f" and below {below:,}"
+            return f"a number{_range(least, most, above)}{beyond}"
         case inspect.StrType(max_length=most):
             return f"text of at most {most:,} letters" if most else "text"
         case inspect.BoolType():

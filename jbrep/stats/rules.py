@@ -12,11 +12,14 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from scipy.stats import binomtest
 
 from jbrep.errors import InputError
+from jbrep.records.record import Record
 from jbrep.stats.arms import FEWEST, Arm, Frame, learns, measure
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.claims import CLAIMS, NOT_WORSE, Claim, kept_gain
@@ -42,34 +45,40 @@ NONE_PRIMARY = (
 )
 ERROR = 0.05  # the probability that any of a study's verdicts is wrong, two-sided
 _USUAL_LOOKS = (0.5, 1.0)
+_Share = Annotated[float, Meta(gt=0, lt=1)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rules:
-    """What is tested, and how strictly.
-
-    Args:
-        primary: the cells that get verdicts, TASK/ALGORITHM/REPRESENTATION each.
-        claims: names, in the order in which they are tested.
-        margin: the share of the gain that "not worse" may lose.
-        failing: the share of runs that may fail to learn where it is supported, at most.
-        looks: shares of the seeds after which there may be verdicts, ascending to 1; none for
-            half of them and all, or all alone where half are too few for a verdict.
+class Rules(Record, frozen=True, kw_only=True):
+    """What is tested, and how strictly: the table `verdicts` of a study's file.
 
     Raises:
-        InputError: they contradict one another.
+        InputError: a field is out of its range, or they contradict one another.
     """
 
-    primary: tuple[str, ...] = ()
-    claims: tuple[str, ...] = tuple(CLAIMS)
-    margin: float = 0.1
-    failing: float = 0.2
-    looks: tuple[float, ...] = ()
+    primary: Annotated[
+        tuple[str, ...],
+        Meta(description="The cells that get verdicts, TASK/ALGORITHM/REPRESENTATION each."),
+    ] = ()
+    claims: Annotated[
+        tuple[str, ...], Meta(description="In the order in which they are tested.")
+    ] = tuple(CLAIMS)
+    margin: Annotated[
+        _Share, Meta(description='The share of the gain that "not worse" may lose.')
+    ] = 0.1
+    failing: Annotated[
+        _Share,
+        Meta(description="The share of runs that may fail to learn in what is supported, at most."),
+    ] = 0.2
+    looks: Annotated[
+        tuple[float, ...],
+        Meta(
+            description="Shares of the seeds after which there may be verdicts, ascending to 1; by "
+            "default half of them and all, or all alone where half are too few for a verdict."
+        ),
+    ] = ()
 
-    def __post_init__(self) -> None:
-        for name in ("margin", "failing"):
-            if not 0 < getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}: it must be between 0 and 1")
+    def check(self) -> None:
+        """Check what no field can say alone."""
         if len({*self.primary}) < len(self.primary):
             raise InputError(f"primary is {list(self.primary)}: each cell may be there once")
         looks = (0.0, *self.looks)
@@ -95,7 +104,7 @@ class Planned:
         seeds: of the planned runs, in their order.
     """
 
-    rules: Rules = Rules()
+    rules: Rules = field(default_factory=Rules)
     seeds: tuple[int, ...] = ()
 
     @cached_property

@@ -1,23 +1,27 @@
-"""What a study is: a TOML file, checked."""
+"""What a study is: a TOML file, or the same in Python."""
 
 import json
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_origin
+from typing import Annotated, Any
 
-from jbrep.dataset.settings import CollectSettings
+from msgspec import Meta
+
+from jbrep.dataset.schema import MAX_ROOT_SEED
 from jbrep.encoders import FULL
 from jbrep.envs.names import find_spec, short_names
 from jbrep.envs.task import MAX_EPISODE_STEPS
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
+from jbrep.records.document import Document
+from jbrep.records.record import Record, from_plain, to_plain
 from jbrep.records.storage import exists
-from jbrep.records.toml import read_toml
+from jbrep.records.toml import read_toml, toml_text
+from jbrep.rl.fields import MAX_SEED
 from jbrep.rl.learner import Learner
-from jbrep.rl.names import CPU, FLOAT32
 from jbrep.rl.run import Run
+from jbrep.rl.settings import MAX_STEPS, TrainingSettings
 from jbrep.stats.arms import FEWEST
 from jbrep.stats.power import Arms, obstacle
 from jbrep.stats.rules import Planned, Rules
@@ -32,67 +36,98 @@ from jbrep.study.representations import (
 from jbrep.text import slug
 
 _MOST_SEEDS = (1 << 16) - 1
-_RUN_SETTINGS = (
-    *("steps", "evaluate_every", "evaluation_episodes", "final_episodes"),
-    *("trainer", "precision", "device"),
-)
-_ITEMS: dict[Any, tuple[type, ...]] = {  # of lists, by the type of the field
-    tuple[str, ...]: (str,),
-    tuple[int, ...]: (int,),
-    tuple[float, ...]: (float, int),
-    tuple[Given, ...]: (str, dict),
-}
 _ANY_TASK = TASKS["face_direction"].describe()
 
 
-@dataclass(frozen=True)
-class Data:
+class Data(Record, frozen=True, kw_only=True):
     """The data set that encoders are trained on: collected for the study, or an existing one."""
 
-    steps: int = 0
-    seed: int = 0
-    sets: int = 1  # to collect, of seed, seed + 1, ...; encoder i of several learns from set i
-    folder: str = ""  # a data set, or a folder with one for each task
+    steps: Annotated[int, Meta(ge=0, le=MAX_STEPS, description="To collect for each task.")] = 0
+    seed: Annotated[
+        int, Meta(ge=0, le=MAX_ROOT_SEED - MAX_ENCODERS, description="Of the data.")
+    ] = 0
+    sets: Annotated[
+        int,
+        Meta(
+            ge=1,
+            le=MAX_ENCODERS,
+            description="To collect, of seed, seed + 1, ...; encoder i of several learns from set "
+            "i.",
+        ),
+    ] = 1
+    folder: Annotated[
+        str, Meta(description="A data set, or a folder with one for each task, instead.")
+    ] = ""
+
+    def check(self) -> None:
+        """As for `Record`."""
+        if bool(self.steps) == bool(self.folder):
+            raise InputError("it must have either steps, to collect, or the folder of a data set")
+        if self.folder and self.sets != 1:
+            raise InputError(f"sets is {self.sets}: it is left out where there is a folder")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Study:
+class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     """Tasks x algorithms x representations x seeds, and the settings that all runs share.
 
     No environment is made: `jbrep.study.prepare.check` finds out what that shows.
     """
 
-    tasks: tuple[str, ...]  # the Jitterbug's by their names, others by their ids
-    algorithms: tuple[str, ...]
-    representations: tuple[Given, ...]  # names, and tables of users' own encoders
-    seeds: tuple[int, ...]
-    steps: int
-    evaluate_every: int = 10_000
-    evaluation_episodes: int = 10
-    final_episodes: int = 0  # of the last evaluation; 0: ten times as many as of the others
-    trainer: str = ""  # cohort or sb3; by default cohort, for the algorithms that it has
-    precision: str = FLOAT32  # of products of matrices: float32 or bfloat16
-    device: str = CPU  # of gradient steps: cpu, cuda, or auto, which is cuda if there is one
-    episode_steps: int | None = None  # time limit; None: each task's own
-    environment: Mapping[str, Any] = field(default_factory=dict)  # arguments of environments
-    data: Data | None = None  # None: the shipped encoders
-    training: Mapping[str, Any] = field(default_factory=dict)  # of encoders, other than the usual
-    learners: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # with own settings
-    evaluations: tuple[str, ...] = ()  # folders from jbrep evaluate; {task} is each task's name
-    verdicts: Mapping[str, Any] = field(default_factory=dict)  # arguments of Rules
+    format = "jbrep study"
+    format_version = 1
 
-    def __post_init__(self) -> None:
+    tasks: Annotated[
+        tuple[str, ...],
+        Meta(min_length=1, description="The Jitterbug's by their names, others by their ids."),
+    ]
+    algorithms: Annotated[
+        tuple[str, ...],
+        Meta(min_length=1, description="With presets, or tables of hyperparameters by a name."),
+    ]
+    representations: Annotated[
+        tuple[Given, ...],
+        Meta(min_length=1, description="Names, and tables of users' own encoders."),
+    ]
+    seeds: Annotated[
+        tuple[Annotated[int, Meta(ge=0, le=MAX_SEED)], ...],
+        Meta(
+            min_length=1,
+            title=f"a list of whole numbers, or how many (1 to {_MOST_SEEDS:,})",
+            description="Of runs.",
+        ),
+    ]
+    episode_steps: Annotated[
+        Annotated[int, Meta(ge=1, le=MAX_EPISODE_STEPS)] | None,
+        Meta(description="The time limit.", extra={"default": "each task's own"}),
+    ] = None
+    environment: Annotated[
+        Mapping[str, Any], Meta(description="A table of arguments of the environments.")
+    ] = {}
+    data: Annotated[
+        Data | None,
+        Meta(description="What encoders are trained on.", extra={"default": "those that ship"}),
+    ] = None
+    training: Annotated[
+        Mapping[str, Any], Meta(description="Settings of the encoders, other than the usual.")
+    ] = {}
+    learners: Mapping[str, Mapping[str, Any]] = {}  # the tables of algorithms, by name
+    evaluations: Annotated[
+        tuple[str, ...],
+        Meta(description="Folders from jbrep evaluate; {task} is each task's name."),
+    ] = ()
+    verdicts: Annotated[Mapping[str, Any], Meta(description="A table of rules.")] = {}
+
+    def check(self) -> None:
+        """As for `Record`."""
         for name in ("tasks", "algorithms", "representations", "seeds"):
             values = list(getattr(self, name))
             names = map(name_of, values) if name == "representations" else values
-            if not values or len(set(map(repr, names))) < len(values):
-                raise InputError(f"{name} is {values}: it must have one or more, each once")
+            if len(set(map(repr, names))) < len(values):
+                raise InputError(f"{name} is {values}: it must have each once")
         self._check_tasks()
         for algorithm in self.algorithms:
             settings = self.learner(algorithm).run_settings
             Run(task=_ANY_TASK, **settings, **self.run_settings).check_trainer()
-        for seed in self.seeds:
-            Run(task=_ANY_TASK, seed=seed)  # checks the number
         self._check_data()
         self._check_verdicts()
 
@@ -102,25 +137,11 @@ class Study:
         Raises:
             InputError: a name or setting is unknown, or a value isn't allowed.
         """
-        if name not in self.learners:
-            return Learner.of(name)
-        try:
-            return Learner.of_table(name, self.learners[name])
-        except InputError as error:
-            raise InputError(f"[algorithms.{name}]: {error}") from None
+        own = self.learners.get(name)
+        return _learner(name, own) if own else Learner.of(name)
 
     def _check_data(self) -> None:
         """Check where data come from, and that the study can make its encoders of them."""
-        if self.data and bool(self.data.steps) == bool(self.data.folder):
-            raise InputError("data must have either steps, to collect, or the folder of a data set")
-        if self.data and not 1 <= self.data.sets <= (1 if self.data.folder else MAX_ENCODERS):
-            raise InputError(
-                f"data.sets is {self.data.sets}: it must be from 1 to {MAX_ENCODERS:,} where data "
-                "are collected, and is left out where there is a folder"
-            )
-        if self.data and self.data.steps:
-            for seed in (self.data.seed, self.data.seed + self.data.sets - 1):
-                CollectSettings(steps=self.data.steps, seed=seed)  # checks the numbers
         if self.training and not self.data:
             raise InputError("training is for encoders made by the study: [data] is missing")
         for given, representation in zip(self.representations, self.observed, strict=True):
@@ -148,11 +169,6 @@ class Study:
                 raise InputError(f"unknown task {task!r}: it must be a name or a Gymnasium id")
             if (other := folders.setdefault(folder, task)) != task:
                 raise InputError(f"{other} and {task} would share a folder: study one of them here")
-        steps = self.episode_steps
-        if steps is not None and not 1 <= steps <= MAX_EPISODE_STEPS:
-            raise InputError(
-                f"episode_steps is {steps}: it must be between 1 and {MAX_EPISODE_STEPS:,}"
-            )
         try:
             json.dumps(self.environment, allow_nan=False)
         except (TypeError, ValueError):
@@ -208,7 +224,7 @@ class Study:
     @cached_property
     def rules(self) -> Rules:
         """How verdicts are reached."""
-        return Rules(**_checked(Rules, dict(self.verdicts), "verdicts."))
+        return from_plain(dict(self.verdicts), Rules, "verdicts")
 
     @cached_property
     def observed(self) -> tuple[Representation, ...]:
@@ -218,7 +234,7 @@ class Study:
     @property
     def run_settings(self) -> dict[str, Any]:
         """The settings of a Run that all runs share."""
-        return {name: getattr(self, name) for name in _RUN_SETTINGS}
+        return {name: getattr(self, name) for name in TrainingSettings.__struct_fields__}
 
     @property
     def comparisons(self) -> int:
@@ -226,6 +242,18 @@ class Study:
         if FULL not in self.representations:
             return 0
         return len(self.tasks) * len(self.algorithms) * (len(self.representations) - 1)
+
+    @property
+    def toml(self) -> str:
+        """The file that describes it."""
+        given = {
+            name: value for name, value in to_plain(self).items() if value not in (None, [], {})
+        }
+        if learners := given.pop("learners", {}):
+            given["algorithms"] = {name: learners.get(name, {}) for name in self.algorithms}
+        if self.data:  # either steps or a folder is given there
+            given["data"] = {n: value for n, value in given["data"].items() if value not in ("", 0)}
+        return toml_text(given)
 
     @property
     def notices(self) -> list[str]:
@@ -277,50 +305,24 @@ def as_study(given: Mapping[str, Any]) -> Study:
         InputError: a name or value is unknown, missing or out of range.
     """
     given = dict(given)
-    if "data" in given:
-        given["data"] = Data(**_checked(Data, given["data"], "data."))
     if type(given.get("seeds")) is int and 0 < given["seeds"] <= _MOST_SEEDS:
-        given["seeds"] = list(range(given["seeds"]))
+        given["seeds"] = [*range(given["seeds"])]
     if isinstance(tables := given.get("algorithms"), dict):
-        given |= {"algorithms": list(tables), "learners": tables}
-    study = Study(**_checked(Study, given, ""))
-    named = ((name, study.learner(name).table) for name in study.algorithms)
-    return replace(study, learners={name: table for name, table in named if table})
+        learners = {name: _learner(name, table).table for name, table in tables.items()}
+        given["algorithms"] = [*tables]
+        given["learners"] = {name: table for name, table in learners.items() if table}
+    return from_plain(given, Study)
 
 
-def known(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a study that its JSON says, which has null where there is nothing."""
-    return {name: value for name, value in settings.items() if value is not None}
+def _learner(name: str, table: Any) -> Learner:
+    """The learner that a table of algorithms describes.
 
-
-def _checked(kind: Any, given: Any, where: str) -> dict[str, Any]:
-    """The given values, if each is known and of its field's type, and none is missing."""
-    known = {f.name: f for f in fields(kind)}
-    if not isinstance(given, dict):
-        raise InputError(f"{where.rstrip('.')} is {given!r}: it must be a table")
-    if unknown := [name for name in given if name not in known]:
-        raise InputError(f"unknown {where}{unknown[0]}: it must be one of {', '.join(known)}")
-    needed = [n for n, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
-    if missing := [name for name in needed if name not in given]:
-        raise InputError(f"{where}{missing[0]} is missing")
-    return {name: _typed(known[name].type, value, where + name) for name, value in given.items()}
-
-
-def _typed(kind: Any, value: Any, name: str) -> Any:
-    """A list as a tuple; anything else as it is."""
-    inner = _ITEMS.get(kind)
-    if inner:
-        items = value if isinstance(value, list) else [None]
-        if not all(type(item) in inner for item in items):
-            number = f", or how many (1 to {_MOST_SEEDS})" if name == "seeds" else ""
-            words = " and ".join(each.__name__ for each in inner)
-            raise InputError(f"{name} is {value!r}: it must be a list of {words}{number}")
-        return tuple(items)
-    scalar = {int: (int,), int | None: (int,), str: (str,), float: (float, int)}.get(kind)
-    if scalar and type(value) not in scalar:
-        raise InputError(f"{name} is {value!r}: it must be of type {scalar[0].__name__}")
-    if get_origin(kind) is Mapping and not isinstance(value, dict):
-        raise InputError(f"{name} is {value!r}: it must be a table")
-    if name == "learners" and (bad := [n for n, each in value.items() if type(each) is not dict]):
-        raise InputError(f"algorithms.{bad[0]} is {value[bad[0]]!r}: it must be a table")
-    return value
+    Raises:
+        InputError: as `Learner.of_table`.
+    """
+    if not isinstance(table, dict):
+        raise InputError(f"algorithms.{name} is {table!r}: it must be a table")
+    try:
+        return Learner.of_table(name, table)
+    except InputError as error:
+        raise InputError(f"[algorithms.{name}]: {error}") from None

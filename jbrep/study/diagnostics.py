@@ -46,7 +46,7 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
     if not exists(runs):
         return []
     record = read_document(runs, RunsRecord)
-    named = (record.study or {}).get("evaluations", [])
+    named = record.study.evaluations if record.study else ()
     if not (given or named or exists(path)):
         return []
     used = _encoders(record)

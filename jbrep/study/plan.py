@@ -1,24 +1,23 @@
 """A study's folder: where its files are, and which runs it has."""
 
-import json
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from jbrep.envs.description import describe
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
-from jbrep.records.storage import exists, make_folder, read_regular, write_whole
+from jbrep.records.document import read_document
+from jbrep.records.record import to_plain
+from jbrep.records.storage import exists, make_folder
 from jbrep.rl import Run
 from jbrep.rl.files import RUN
 from jbrep.rl.learner import Learner
-from jbrep.rl.names import SB3, usual_trainer
-from jbrep.rl.run import plain
+from jbrep.rl.names import usual_trainer
 from jbrep.stats.rules import Planned
-from jbrep.study.config import Study, as_study, known
+from jbrep.study.config import Study
 from jbrep.study.registration import Registration, check_registered, read_registration
 from jbrep.study.representations import Representation
 from jbrep.study.work import Assigned
@@ -27,7 +26,6 @@ from jbrep.training.trainer import get_device
 
 STUDY = "study.json"
 _GRID = ("tasks", "algorithms", "representations", "seeds", "learners", "evaluations")  # may change
-_MAX_BYTES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -88,10 +86,7 @@ class Plan:
     @property
     def judge(self) -> Planned:
         """What reaches verdicts: the rules that were registered, on the seeds that were."""
-        if not self.registration:
-            return Planned()
-        registered = as_study(known(self.registration["study"]))
-        return Planned(registered.rules, registered.seeds)
+        return self.registration.planned if self.registration else Planned()
 
     def trainer(self, cell: Cell) -> str:
         """What trains a run."""
@@ -138,9 +133,10 @@ class Plan:
             task=self.task(cell.task),
             **cell.learner.run_settings,
             encoder=cell.representation.encoder(cell.task, cell.seed, made),
+            encoder_seed=cell.representation.encoder_seed(cell.seed),
+            representation=cell.representation.name,
             seed=cell.seed,
-            registration=self.registration["sha256"] if self.registration else "",
-            **cell.representation.settings(cell.seed),
+            registration=self.registration.sha256 if self.registration else "",
             **self.study.run_settings,
         )
 
@@ -179,63 +175,30 @@ class Plan:
                 seeds may change, of a registered study only seeds be added.
         """
         make_folder(self.folder)
-        settings = self.as_json()
         if self.registration:
-            check_registered(self.registration, settings, self.folder)
-        if there := read_plan(self.folder):
-            fixed = {name: value for name, value in settings.items() if name not in _GRID}
-            if self._has_limits_of(there):
-                del fixed["episode_steps"]
-            before, now = there.as_json()["learners"], settings["learners"]
-            fixed |= {f"learner {name}": now[name] for name in now if name in before}
-            known = {f"learner {name}": table for name, table in before.items()}
-            if differing := differences({**there.as_json(), **known}, fixed):
-                raise InputError(
-                    f"{self.folder} holds another study: {differing}; choose another --out"
-                )
-        write_whole(self.folder / STUDY, (json.dumps(settings, indent=2) + "\n").encode())
-
-    def _has_limits_of(self, other: "Plan") -> bool:
-        """Whether both give all tasks of this one the same time limit, said or not."""
-        steps = other.study.episode_steps
-        return steps == self.study.episode_steps or all(
-            steps in (None, task.max_episode_steps) for task in map(self.task, self.study.tasks)
-        )
-
-    def as_json(self) -> dict[str, Any]:
-        """The study as plain JSON."""
-        return dict(plain(asdict(self.study)))
+            check_registered(self.registration, self.study, self.folder)
+        if (there := read_plan(self.folder)) and (differing := _differing(there.study, self.study)):
+            raise InputError(
+                f"{self.folder} holds another study: {differing}; choose another --out"
+            )
+        self.study.write(self.folder / STUDY)
 
 
-def plan_for(study: Study, folder: Path) -> Plan:
-    """A study in its folder; one that names no trainer goes on with that which it began with.
-
-    Raises:
-        InputError: as `read_plan`.
-    """
-    if not study.trainer and (there := read_plan(folder)):
-        study = replace(study, trainer=there.study.trainer)
-    return Plan(study, folder)
+def _differing(there: Study, study: Study) -> str:
+    """What differs of two studies besides their grids; empty if nothing does."""
+    before, now = (
+        {name: value for name, value in to_plain(each).items() if name not in _GRID}
+        | {f"learner {name}": table for name, table in each.learners.items()}
+        for each in (there, study)
+    )
+    return differences(before, {name: value for name, value in now.items() if name in before})
 
 
 def read_plan(folder: Path) -> Plan | None:
     """The study in a folder; None if there is none, but at most runs.
 
     Raises:
-        InputError: its file is damaged or of a newer jbrep.
+        InputError: its file is damaged, or of another jbrep.
     """
     path = folder / STUDY
-    if not exists(path):
-        return None
-    try:
-        given = _completed(json.loads(read_regular(path, _MAX_BYTES)))
-        return Plan(as_study(known(given)), folder)
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
-        raise InputError(
-            f"{path} is damaged, or of a newer jbrep ({error}): choose another folder"
-        ) from None
-
-
-def _completed(study: dict[str, Any]) -> dict[str, Any]:
-    """A study's settings, with what the files of earlier versions leave unsaid."""
-    return {"trainer": SB3, "final_episodes": study["evaluation_episodes"], **study}
+    return Plan(read_document(path, Study), folder) if exists(path) else None

@@ -21,7 +21,7 @@ from jbrep.records.storage import exists
 from jbrep.rl import Run
 from jbrep.study.config import Data
 from jbrep.study.plan import Plan
-from jbrep.study.representations import ByName, Own
+from jbrep.study.representations import ByName
 from jbrep.text import slug
 
 
@@ -63,7 +63,7 @@ def _check_own(plan: Plan) -> None:
     """Check the user's own encoders, each once for each task."""
     checked = set()
     for cell in plan.cells:
-        if not isinstance(cell.representation, Own):
+        if isinstance(cell.representation, ByName):
             continue
         try:
             run = plan.run(cell)

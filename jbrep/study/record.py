@@ -20,6 +20,7 @@ from jbrep.rl.files import ENCODER
 from jbrep.rl.names import base_name
 from jbrep.rl.settings import TrainingSettings
 from jbrep.stats.runs import in_order
+from jbrep.study.config import Study
 from jbrep.study.plan import Plan, read_plan
 from jbrep.study.registration import deviations
 from jbrep.study.work import read_progress
@@ -145,7 +146,7 @@ class RunsRecord(Document, frozen=True, kw_only=True):
     max_bytes = 1 << 28
     indent = 1
 
-    study: dict[str, Any] | None  # its settings; None for runs without a study
+    study: Study | None  # None for runs without one
     registration: RegistrationFacts | None
     missing: dict[str, Count]  # unfinished runs: training steps done
     left_out: list[str]  # what has no statistics, and why
@@ -188,7 +189,7 @@ def runs_record(
         labels.setdefault(run_label(run["settings"]), {})[each] = run
     plan = read_plan(folder)
     return RunsRecord(
-        study=plan.as_json() if plan else None,
+        study=plan.study if plan else None,
         registration=_registration(plan, runs.values()) if plan else None,
         missing={c.name: read_progress(plan.folder_of(c))[0] for c in plan.unfinished}
         if plan
@@ -294,9 +295,9 @@ def _registration(plan: Plan, runs: Iterable[Mapping[str, Any]]) -> Registration
         return None
     named = {run_name(run["settings"]): run for run in runs}
     return RegistrationFacts(
-        sha256=plan.registration["sha256"],
-        date=plan.registration["date"],
-        deviations=deviations(plan.registration, plan.as_json(), named),
+        sha256=plan.registration.sha256,
+        date=plan.registration.date,
+        deviations=deviations(plan.registration, plan.study, named),
     )
 
 

@@ -4,41 +4,69 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
-from jbrep.errors import DamageError, InputError, differences
+from jbrep.errors import InputError, differences
 from jbrep.records.commit import commits
-from jbrep.records.storage import exists, read_regular, write_whole
-from jbrep.records.typed import read_json, typed
+from jbrep.records.document import Document, read_document
+from jbrep.records.record import from_plain, to_plain
+from jbrep.records.storage import exists
 from jbrep.rl.job import packages
-from jbrep.study.config import as_study, known
+from jbrep.stats.rules import Planned
+from jbrep.study.config import Study
 
 REGISTRATION = "registration.json"
-FORMAT = "jbrep registration"
-FORMAT_VERSION = 1
-_MAX_BYTES = 1 << 24
-_HASHED = ("study", "encoders", "date", "versions", "commits")
-_MAY_GROW = ("seeds",)  # after registration; what was added is exploratory
 
 
-class Registration(TypedDict):
+class Registration(Document, frozen=True, kw_only=True):
     """registration.json."""
 
-    study: dict[str, Any]  # its settings
-    encoders: dict[str, str]  # of those that were there: SHA-256 by the name of the run
+    format = "jbrep registration"
+    format_version = 1
+
     sha256: str  # of all else
+    study: dict[str, Any]  # as it was written, which the hash is of
+    encoders: dict[str, str]  # of those that were there: SHA-256 by the name of the run
     date: str  # ISO 8601, in UTC
     versions: dict[str, str]  # by package
     commits: dict[str, str]
 
+    def check(self) -> None:
+        """Check the hash, and that a study was registered.
 
-def register(folder: Path, study: Mapping[str, Any], encoders: Mapping[str, str]) -> Registration:
+        Raises:
+            InputError: the file was changed, or there is no study in it.
+        """
+        if _hash(to_plain(self)) != self.sha256:
+            raise InputError(
+                "it was changed after it was written: restore it, or choose another folder"
+            )
+        _ = self.registered
+
+    @cached_property
+    def registered(self) -> Study:
+        """The study."""
+        return from_plain(self.study, Study, "study")
+
+    @property
+    def planned(self) -> Planned:
+        """What reaches verdicts: the rules that were registered, on the seeds that were."""
+        return Planned(self.registered.rules, self.registered.seeds)
+
+    def differences(self, study: Study) -> str:
+        """How a study differs from the registered one, but for seeds that were added."""
+        kept = [seed for seed in study.seeds if seed in self.registered.seeds]
+        return differences(to_plain(self.registered), {**to_plain(study), "seeds": kept})
+
+
+def register(folder: Path, study: Study, encoders: Mapping[str, str]) -> Registration:
     """Write a study's plan into its folder; one that is registered stays as it is.
 
     Args:
         folder: of the study.
-        study: its settings as plain JSON.
+        study: its settings.
         encoders: the SHA-256 of those that are there, by the name of the run.
 
     Raises:
@@ -49,17 +77,15 @@ def register(folder: Path, study: Mapping[str, Any], encoders: Mapping[str, str]
         return there
     if has_begun(folder):
         raise InputError(f"{folder} has runs: a study is registered before its first run")
-    now = datetime.now(UTC).isoformat(timespec="seconds")
     facts = {
-        "study": dict(study),
+        "study": to_plain(study),
         "encoders": dict(encoders),
-        "date": now,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": packages(),
         "commits": dict(commits()),
     }
-    made = Registration(sha256=_hash(facts), **facts)  # type: ignore[typeddict-item]
-    record = {"format": FORMAT, "format_version": FORMAT_VERSION, **made}
-    write_whole(folder / REGISTRATION, (json.dumps(record, indent=2) + "\n").encode())
+    made = Registration(sha256=_hash(facts), **facts)
+    made.write(folder / REGISTRATION)
     return made
 
 
@@ -73,41 +99,27 @@ def read_registration(folder: Path) -> Registration | None:
 
     Raises:
         DamageError: the file was changed since, or is damaged.
-        InputError: it is of a newer jbrep.
+        InputError: it is of another jbrep.
     """
     path = folder / REGISTRATION
-    if not exists(path):
-        return None
-    try:
-        text = read_regular(path, _MAX_BYTES).decode()
-        record = read_json(text, path, FORMAT, FORMAT_VERSION)
-        registration: Registration = typed(record, Registration)
-        as_study(known(registration["study"]))
-    except (OSError, ValueError) as error:
-        raise DamageError(f"{path} is damaged: {error}") from None
-    facts = {name: value for name, value in registration.items() if name in _HASHED}
-    if _hash(facts) != registration["sha256"]:
-        raise DamageError(
-            f"{path} was changed after it was written: restore it, or choose another folder"
-        )
-    return registration
+    return read_document(path, Registration) if exists(path) else None
 
 
-def check_registered(registration: Registration, study: Mapping[str, Any], folder: Path) -> None:
+def check_registered(registration: Registration, study: Study, folder: Path) -> None:
     """Check that a study is the one that was registered, but for seeds that were added.
 
     Raises:
         InputError: it isn't.
     """
-    if differing := differences(registration["study"], _fixed(registration, study)):
+    if differing := registration.differences(study):
         raise InputError(
-            f"{folder} holds the study registered on {registration['date'][:10]}, and its file "
-            f"was changed: {differing}; put it back, or choose another --out"
+            f"{folder} holds the study registered on {registration.date[:10]}, and its file was "
+            f"changed: {differing}; put it back, or choose another --out"
         )
 
 
 def deviations(
-    registration: Registration, study: Mapping[str, Any], runs: Mapping[str, Mapping[str, Any]]
+    registration: Registration, study: Study, runs: Mapping[str, Mapping[str, Any]]
 ) -> list[str]:
     """How what ran differs from what was registered, in sentences.
 
@@ -117,38 +129,26 @@ def deviations(
         runs: contents of run.json, of all that have ended, by label and seed.
     """
     found = []
-    if differing := differences(registration["study"], _fixed(registration, study)):
+    if differing := registration.differences(study):
         found.append(f"settings differ: {differing}")
-    registered = registration["study"]["seeds"]
-    if added := [seed for seed in study["seeds"] if seed not in registered]:
+    if added := [seed for seed in study.seeds if seed not in registration.registered.seeds]:
         found.append(f"seeds were added, whose runs are exploratory: {_listed(added)}")
     every = list(runs.values())
-    if strays := [
-        run for run in every if run["settings"]["registration"] != registration["sha256"]
-    ]:
+    if strays := [run for run in every if run["settings"]["registration"] != registration.sha256]:
         found.append(f"{len(strays)} of its runs weren't made under this registration")
-    known = registration["encoders"]
+    known = registration.encoders
     used = {name: run["settings"]["encoder"] for name, run in runs.items()}
     if other := [name for name, encoder in used.items() if known.get(name, encoder) != encoder]:
         found.append(f"{len(other)} of its runs have other encoders than there were")
-    for name, version in registration["versions"].items():
+    for name, version in registration.versions.items():
         others = {run["versions"].get(name, "none") for run in every} - {version}
         if others:
             found.append(f"{name} was {_listed(sorted(others))}, not {version}")
-    registered_commit = registration["commits"].get("jbrep")
+    registered_commit = registration.commits.get("jbrep")
     others = {run.get("commits", {}).get("jbrep") for run in every} - {registered_commit, None}
     if others:
         found.append("some runs were made by other commits of jbrep's code")
     return found
-
-
-def _fixed(registration: Registration, study: Mapping[str, Any]) -> dict[str, Any]:
-    """A study's settings, without what was added to what may grow."""
-    kept = {
-        name: [each for each in study[name] if each in registration["study"][name]]
-        for name in _MAY_GROW
-    }
-    return {**study, **kept}
 
 
 def _listed(values: Iterable[object]) -> str:
@@ -156,5 +156,7 @@ def _listed(values: Iterable[object]) -> str:
 
 
 def _hash(facts: Mapping[str, Any]) -> str:
-    canonical = json.dumps(facts, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    """SHA-256 of all but the hash itself, as canonical JSON."""
+    hashed = {name: value for name, value in facts.items() if name != "sha256"}
+    canonical = json.dumps(hashed, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(canonical.encode()).hexdigest()

@@ -1,12 +1,13 @@
 """What the agents of a study observe: encoders by name, and the user's own, from files or code."""
 
 import re
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
+
+from msgspec import Meta
 
 from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
@@ -15,15 +16,22 @@ from jbrep.encoders.file import SUFFIX
 from jbrep.encoders.names import check_name, of_seed
 from jbrep.errors import InputError
 from jbrep.methods.registry import Recipe, get_method, read_name
-from jbrep.records.record import Record, from_plain
+from jbrep.records.record import Record, converted, from_plain
 from jbrep.text import slug
 from jbrep.training.settings import BatchSize, Epochs, LearningRate, NoiseDeviation, Seed
 
-Given = str | Mapping[str, Any]  # a representation in a study's file: a name or a table
+Given = str | dict[str, Any]  # a representation in a study's file: a name or a table
 
 MAX_ENCODERS = 1000  # of one representation
-_NAME = re.compile(r"[\w.-]{1,100}", re.ASCII)
 _TASK, _SEED, _ENCODER = "{task}", "{seed}", "{encoder}"  # in a file's path, see ByFile
+_Path = Annotated[str, Meta(min_length=1, title="a path")]
+_OwnName = Annotated[
+    str,
+    Meta(
+        pattern=rf"\A(?!{FULL}\Z)(?=.*[^.])[A-Za-z0-9_.-]{{1,100}}\Z",
+        title=f"a name of letters, digits, dots, hyphens and underscores, and not {FULL}",
+    ),
+]
 
 
 class _Training(Record, frozen=True, kw_only=True):
@@ -36,8 +44,7 @@ class _Training(Record, frozen=True, kw_only=True):
     seed: Seed | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Representation(ABC):
+class Representation(Record, frozen=True, kw_only=True):
     """What an agent observes.
 
     Attributes:
@@ -47,7 +54,7 @@ class Representation(ABC):
     """
 
     name: str
-    encoders: int | None = None
+    encoders: Annotated[int, Meta(ge=1, le=MAX_ENCODERS)] | None = None
 
     @abstractmethod
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
@@ -62,18 +69,13 @@ class Representation(ABC):
             InputError: there is none for that task.
         """
 
-    def settings(self, seed: int) -> dict[str, Any]:
-        """What else a Run with that seed is told of its encoder."""
-        number = self.number(seed)
-        return {} if number is None else {"representation": self.name, "encoder_seed": number}
-
-    def number(self, seed: int) -> int | None:
-        """Which of several encoders a run with that seed has; None if there is one."""
+    def encoder_seed(self, seed: int) -> int | None:
+        """Which of several encoders a run with that seed has; None if all runs have the same."""
         return None if self.encoders is None else seed % self.encoders
 
     def shares(self, seeds: Iterable[int]) -> list[int]:
         """How many of the runs with these seeds each of its encoders serves."""
-        counts = Counter(self.settings(seed).get("encoder_seed") for seed in seeds)
+        counts = Counter(map(self.encoder_seed, seeds))
         return [counts[i] for i in range(self.encoders)] if self.encoders else [*counts.values()]
 
 
@@ -84,8 +86,7 @@ class Fit(NamedTuple):
     settings: Mapping[str, Any]  # of its method
 
 
-@dataclass(frozen=True, kw_only=True)
-class ByName(Representation):
+class ByName(Representation, frozen=True, kw_only=True):
     """The whole observation, or an encoder that ships or that the study trains.
 
     Attributes:
@@ -94,11 +95,11 @@ class ByName(Representation):
     """
 
     kind: str
-    training: Mapping[str, Any]
+    training: dict[str, Any]
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
         """As for `Representation`."""
-        stem = self._stem(self.number(seed))
+        stem = self._stem(self.encoder_seed(seed))
         return self.name if made is None else str(made / f"{stem}{SUFFIX}")
 
     @property
@@ -123,33 +124,45 @@ class ByName(Representation):
         return name if number is None else of_seed(name, number)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Own(Representation):
-    """An encoder of the user's, which tables call by a name of the user's."""
-
-    def settings(self, seed: int) -> dict[str, Any]:
-        """As for `Representation`."""
-        return {"representation": self.name, **super().settings(seed)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class ByFile(Own):
-    """An encoder in a file.
+class ByFile(Representation, frozen=True, kw_only=True):
+    """An encoder of the user's in a file.
 
     A path may contain {task}, the task's name as in folders, and either {seed}, a run's seed, or
     {encoder}, the number of the run's encoder. It may be a folder, which then holds
     TASK/NAME.safetensors or NAME.safetensors. Relative ones begin at the working directory.
 
     Attributes:
-        paths: pairs of a task's name and its path; a name of None is of any task.
+        file: its path, or a path for each task.
     """
 
-    paths: tuple[tuple[str | None, str], ...]
+    file: Annotated[_Path | dict[str, _Path], Meta(title="a path, or a table of paths by task")]
+
+    def check(self) -> None:
+        """As for `Record`: check the words in braces."""
+        for path in self._paths:
+            words = set(re.findall(r"\{.*?\}", path))
+            if _ENCODER in words and not self.encoders:
+                raise InputError(f"say how many files {path} stands for, such as encoders = 5")
+            known = (_TASK, _ENCODER if self.encoders else _SEED)
+            if unknown := words - {*known}:
+                raise InputError(
+                    f"unknown {min(unknown)} in its file {path}: only {' and '.join(known)} are "
+                    "known"
+                )
+            if self.encoders and _ENCODER not in words:
+                raise InputError(f"its file {path} must contain {_ENCODER}, as there are several")
+
+    @property
+    def _paths(self) -> Iterable[str]:
+        return (self.file,) if isinstance(self.file, str) else self.file.values()
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
         """As for `Representation`."""
-        filled = self._pattern(task).replace(_TASK, slug(task)).replace(_SEED, str(seed))
-        filled = filled.replace(_ENCODER, str(self.number(seed)))
+        pattern = self.file if isinstance(self.file, str) else self.file.get(task)
+        if pattern is None:
+            raise InputError(f"representation {self.name} has no file for {task}")
+        filled = pattern.replace(_TASK, slug(task)).replace(_SEED, str(seed))
+        filled = filled.replace(_ENCODER, str(self.encoder_seed(seed)))
         path = Path(filled).absolute()  # workers may have another working directory
         if not path.is_dir():
             return str(path)
@@ -157,27 +170,26 @@ class ByFile(Own):
         of_task = path / slug(task) / name
         return str(of_task if of_task.exists() else path / name)
 
-    def settings(self, seed: int) -> dict[str, Any]:
+    def encoder_seed(self, seed: int) -> int | None:
         """As for `Representation`."""
-        own = any(_SEED in path for _, path in self.paths)
-        return super().settings(seed) | ({"encoder_seed": seed} if own else {})
-
-    def _pattern(self, task: str) -> str:
-        known = dict(self.paths)
-        if not known.keys() & {task, None}:
-            raise InputError(f"representation {self.name} has no file for {task}")
-        return known.get(task) or known[None]
+        return seed if any(_SEED in path for path in self._paths) else super().encoder_seed(seed)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ByCode(Own):
-    """An encoder that code makes, named as module:Class.
+class ByCode(Representation, frozen=True, kw_only=True):
+    """An encoder that the user's code makes.
 
     Attributes:
-        code: its name.
+        code: its name, module:Class.
     """
 
     code: str
+
+    def check(self) -> None:
+        """As for `Record`."""
+        if not is_code(self.code):
+            raise InputError(f"its code is {self.code!r}, it must be as in mymodule:MyEncoder")
+        if self.encoders is not None:
+            raise InputError("code makes one encoder: leave out encoders")
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
         """As for `Representation`."""
@@ -197,15 +209,12 @@ def read_representation(given: Given, training: Mapping[str, Any]) -> Representa
         InputError: no such representation, or invalid settings.
     """
     if isinstance(given, str):
-        method, said = read_name(given)
-        return ByName(
-            name=given, kind=method.name, training=_training(Recipe(method, said), training)
-        )
-    name = _name(given)
+        recipe = read_name(given)
+        return ByName(name=given, kind=recipe.method.name, training=_training(recipe, training))
     try:
-        return _of_table(name, {n: value for n, value in given.items() if n != "name"}, training)
+        return _of_table(given, training)
     except InputError as error:
-        raise InputError(f"representation {name}: {error}") from None
+        raise InputError(f"representation {given.get('name', 'without a name')}: {error}") from None
 
 
 def name_of(given: Given) -> Any:
@@ -213,74 +222,38 @@ def name_of(given: Given) -> Any:
     return given if isinstance(given, str) else given.get("name")
 
 
+def _of_table(given: Mapping[str, Any], training: Mapping[str, Any]) -> Representation:
+    name: str = converted(given.get("name"), _OwnName, "name")
+    settings = {key: value for key, value in given.items() if key not in ("name", "encoders")}
+    match settings:
+        case {"file": _}:
+            return from_plain(given, ByFile)
+        case {"code": _}:
+            return from_plain(given, ByCode)
+        case {"kind": str(kind), **own}:
+            recipe = Recipe(get_method(kind), own)
+        case _ if "encoders" in given and not settings:
+            recipe = read_name(name)
+        case _:
+            raise InputError(
+                "it must have a name and one of file, code, kind (with settings) or encoders (a "
+                "number)"
+            )
+    check_name(name)
+    fitted = _training(recipe, training)
+    recipe.method.of(fitted)
+    representation = ByName(
+        name=name, encoders=given.get("encoders"), kind=recipe.method.name, training=fitted
+    )
+    if representation.encoders is not None and "seed" in fitted:
+        raise InputError(
+            f"its encoders have the seeds 0 to {representation.encoders - 1}: leave out seed"
+        )
+    return representation
+
+
 def _training(recipe: Recipe, training: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of an encoder: what all encoders of a study share, as far as it takes them."""
     from_plain(training, _Training, "training")
     taken = {key: value for key, value in training.items() if recipe.method.takes(key)}
     return {**taken, **recipe.given}
-
-
-def _name(given: Mapping[str, Any]) -> str:
-    name = given.get("name")
-    is_name = isinstance(name, str) and _NAME.fullmatch(name) and name.strip(".")
-    if not is_name or name == FULL:
-        raise InputError(
-            f"a representation's name is {name!r}: it must be of letters, digits, dots, hyphens "
-            f"and underscores, and not {FULL}"
-        )
-    return str(name)
-
-
-def _of_table(name: str, given: Mapping[str, Any], training: Mapping[str, Any]) -> Representation:
-    encoders = given.get("encoders")
-    if "encoders" in given and (type(encoders) is not int or not 1 <= encoders <= MAX_ENCODERS):
-        raise InputError(f"encoders is {encoders!r}: it must be from 1 to {MAX_ENCODERS:,}")
-    match {key: value for key, value in given.items() if key != "encoders"}:
-        case {"file": file, **others} if not others:
-            return ByFile(name=name, encoders=encoders, paths=_paths(file, encoders is not None))
-        case {"code": code, **others} if not others and encoders is None:
-            if not is_code(code):
-                raise InputError(
-                    f"its code is {code!r}, it must be text such as mymodule:MyEncoder"
-                )
-            return ByCode(name=name, code=code)
-        case {"kind": kind, **settings} if "file" not in settings and "code" not in settings:
-            return _trained(name, Recipe(get_method(kind), settings), encoders, training)
-        case {**nothing} if not nothing and encoders is not None:
-            return _trained(name, read_name(name), encoders, training)
-    raise InputError(
-        "it must have a name and one of file, code, kind (with settings) or encoders (a number)"
-    )
-
-
-def _trained(
-    name: str, recipe: Recipe, encoders: int | None, training: Mapping[str, Any]
-) -> ByName:
-    """Encoders that the study trains, with settings of their own."""
-    check_name(name)
-    method, settings = recipe.method, _training(recipe, training)
-    method.of(settings)
-    if encoders is not None and "seed" in settings:
-        raise InputError(f"its encoders have the seeds 0 to {encoders - 1}: leave out seed")
-    return ByName(name=name, encoders=encoders, kind=method.name, training=settings)
-
-
-def _paths(file: Any, are_several: bool) -> tuple[tuple[str | None, str], ...]:
-    """The paths in the file of a representation: one, or a table of one for each task."""
-    paths = tuple(file.items()) if isinstance(file, Mapping) else ((None, file),)
-    for _, path in paths:
-        if not isinstance(path, str) or not path:
-            raise InputError(
-                f"its file is {path!r}, it must be a path, or a table of paths by task"
-            )
-        known = (_TASK, _ENCODER if are_several else _SEED)
-        words = re.findall(r"\{.*?\}", path)
-        if _ENCODER in words and not are_several:
-            raise InputError(f"say how many files {path} stands for, such as encoders = 5")
-        if unknown := [word for word in words if word not in known]:
-            raise InputError(
-                f"unknown {unknown[0]} in its file {path}: only {' and '.join(known)} are known"
-            )
-        if are_several and _ENCODER not in words:
-            raise InputError(f"its file {path} must contain {_ENCODER}, as there are several")
-    return paths

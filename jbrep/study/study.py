@@ -54,7 +54,7 @@ def run_study(plan: Plan, backend: Backend, workers: int, width: int | None = No
     with exclusive(plan.folder):
         plan.write()
         if plan.study.rules.primary and not has_begun(plan.folder):
-            register(plan.folder, plan.as_json(), plan.fingerprints)
+            register(plan.folder, plan.study, plan.fingerprints)
             plan = Plan(plan.study, plan.folder)  # its runs name the registration
         prepare(plan)
         for cell in plan.cells:  # so that any mistake shows before the first run
@@ -80,7 +80,7 @@ def register_study(plan: Plan) -> Registration:
     """
     check(plan)
     plan.write()
-    return register(plan.folder, plan.as_json(), plan.fingerprints)
+    return register(plan.folder, plan.study, plan.fingerprints)
 
 
 def dry_run(plan: Plan, workers: int, width: int | None = None, columns: int | None = None) -> str:
