@@ -453,10 +453,7 @@ def test_own_encoders_are_checked_before_the_first_run(own, message, home, tmp_p
         ([{"name": "a", "file": "x", "code": NET}], "a: unknown code: it must be one of name, enc"),
         ([{"name": "a", "file": "x", "kind": "dae"}], "a: unknown kind: it must be one of name"),
         ([{"name": "a", "code": NET, "encoders": 2}], "a: code makes one encoder: leave out enc"),
-        *(
-            ([{"name": "a", "file": f}], "a: file is .*: it must be a path")
-            for f in (7, "", {"": 7})
-        ),
+        *(([{"name": "a", "file": f}], "a: file.* must be a path") for f in (7, "", {"": 7})),
         ([{"name": "a", "file": "{sed}"}], r"unknown \{sed\} in its file"),
         *(([{"name": "a", "code": code}], "a: .*code is") for code in ("Net", 7)),
         *(
