@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from jbrep.dataset.schema import MAX_ROOT_SEED
+from jbrep.dataset.settings import MAX_ROOT_SEED
 from jbrep.encoders import FULL
 from jbrep.envs.names import find_spec, short_names
 from jbrep.envs.task import MAX_EPISODE_STEPS
