@@ -69,6 +69,14 @@ def collected(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def data(collected):
+    """The same, scaled and split."""
+    from jbrep.dataset import Dataset, ScaledDataset
+
+    return ScaledDataset(Dataset(collected))
+
+
+@pytest.fixture(scope="session")
 def brief(tmp_path_factory):
     """The same with episodes of 100 steps."""
     import small

@@ -7,16 +7,10 @@ from sklearn.decomposition import PCA
 from torch import nn
 
 from jbrep.dae.gradient import Gradient
-from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.scaled import Moments
 from jbrep.encoders.layers import run
 from jbrep.methods.controls import Random
 from jbrep.methods.linear import linear_code, linear_denoiser, principal_code
-
-
-@pytest.fixture(scope="module")
-def data(collected):
-    return ScaledDataset(Dataset(collected))
 
 
 def projection(data, latent, seed):

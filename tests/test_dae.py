@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from tensors import TensorWindows
-from torch import nn
 from torch.nn.functional import mse_loss
 
 from jbrep.dae import AE, DAE
@@ -26,12 +25,10 @@ def rows(count=600, size=16, seed=0):
     return torch.from_numpy((random.normal(size=(count, 4)) @ plane).astype(np.float32))
 
 
-def trainer(
-    train=None, latent=4, architecture="paper", noise=0.1, seed=0, pool=POOL, weighed=None, **how
-):
+def trainer(train=None, latent=4, architecture="paper", noise=0.1, seed=0, pool=POOL, **how):
     train = rows() if train is None else train
     method = DAE(latent=latent, architecture=architecture, seed=seed)
-    objective = Reconstruction(method, train.shape[1], weighed, noise)
+    objective = Reconstruction(method, train.shape[1], noise=noise)
     schedule = {"epochs": 3, "batch_size": 100, "learning_rate": 3e-3, "seed": seed, **how}
     windows, watched = TensorWindows(train), TensorWindows(train[:50])
     return Trainer(objective, Schedule(**schedule), windows, watched, pool)
@@ -48,16 +45,18 @@ def weights(it):
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
-@pytest.mark.parametrize("count", [64, 37])
-def test_the_gradient_is_autograds(architecture, count):
-    network = nn.Sequential(*stacks(ARCHITECTURES[architecture], 16, 5, seed=1))
-    values, target = rows(count, seed=1), rows(count, seed=2)
-    loss = mse_loss(network(values), target)
-    expected = torch.autograd.grad(loss, list(network.parameters()))
-    gradient = Gradient((*network[0], *network[1]), 64)
+@pytest.mark.parametrize(("count", "weights"), [(64, None), (37, None), (64, torch.arange(16.0))])
+def test_the_gradient_is_autograds(architecture, count, weights):
+    it = Reconstruction(DAE(latent=5, architecture=architecture), 16, weights)
+    batch = rows(count, seed=1).T, rows(count, seed=2).T
+    loss = it.loss(batch)
+    if weights is None:
+        torch.testing.assert_close(loss, mse_loss(it.decoder(it.encoder(batch[0].T)), batch[1].T))
+    expected = torch.autograd.grad(loss, list(it.parameters()))
+    gradient = Gradient((*it.encoder, *it.decoder), 64, weights)
     for _ in range(2):  # nothing is left over from the first
-        assert gradient(values.T, target.T).item() == pytest.approx(loss.item(), rel=1e-5)
-        for parameter, wanted in zip(network.parameters(), expected, strict=True):
+        assert gradient(*batch).item() == pytest.approx(loss.item(), rel=1e-5)
+        for parameter, wanted in zip(it.parameters(), expected, strict=True):
             torch.testing.assert_close(parameter.grad, wanted, rtol=1e-4, atol=1e-6)
 
 
@@ -306,7 +305,3 @@ def test_losses_that_overflow_end_the_training_and_leave_the_best():
 
 def test_a_batch_larger_than_the_data_takes_it_whole():
     assert torch.equal(weights(trained(batch_size=600)), weights(trained(batch_size=10**15)))
-
-
-def test_auto_is_the_gpu_where_there_is_one():
-    assert get_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")

@@ -16,7 +16,7 @@ from sklearn.metrics import r2_score
 from sklearn.preprocessing import StandardScaler
 from wide import make_feature, make_task, wide
 
-from jbrep.dataset import Dataset, ScaledDataset, Scaler
+from jbrep.dataset import ScaledDataset, Scaler
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder, Layer, find, save
 from jbrep.errors import InputError
@@ -37,11 +37,6 @@ from jbrep.report import figures
 from jbrep.report.evaluation import evaluation_text
 from jbrep.report.figures import encoder_plots
 from jbrep.stats.bootstrap import bootstrap, by_episode
-
-
-@pytest.fixture(scope="module")
-def data(collected):
-    return ScaledDataset(Dataset(collected))
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import Encoder
 from jbrep.encoders.layers import run
 from jbrep.errors import InputError
@@ -12,11 +11,6 @@ from jbrep.methods.linear import dense
 from jbrep.methods.shape import complete
 from jbrep.training.method import Made
 from jbrep.training.network import ARCHITECTURES, layers, stacks
-
-
-@pytest.fixture(scope="module")
-def data(collected):
-    return ScaledDataset(Dataset(collected))
 
 
 @pytest.fixture(scope="module")

@@ -46,11 +46,6 @@ def still(tmp_path_factory):
     return system(tmp_path_factory.mktemp("closed") / "still", actions=lambda state: 0)
 
 
-@pytest.fixture(scope="module")
-def face(collected):
-    return ScaledDataset(Dataset(collected))
-
-
 def made(data, kind, **settings):
     method = get_method(kind).of({"latent": data.size, **settings})
     method.check_data(data)
@@ -86,10 +81,10 @@ def test_one_lag_is_deeptimes(still, kind, theirs, lag):
     assert ours.metrics["spectra"][str(lag)] == pytest.approx(spectrum, abs=1e-9)
 
 
-def test_slow_features_of_a_robot_are_deeptimes(face):
-    ours = made(face, "slow", latent=6)
+def test_slow_features_of_a_robot_are_deeptimes(data):
+    ours = made(data, "slow", latent=6)
     estimator = TICA(lagtime=10, epsilon=1e-12, scaling=None)
-    model = estimator.fit_from_timeseries([rows for rows, _, _ in episodes(face)]).fetch_model()
+    model = estimator.fit_from_timeseries([rows for rows, _, _ in episodes(data)]).fetch_model()
     np.testing.assert_allclose(ours.metrics["spectrum"][:6], model.singular_values[:6], atol=1e-9)
     assert same_space(ours.encoder[0].weight, model.singular_vectors_left[:, :6].T)
     assert all(max(spectrum) <= 1 for spectrum in ours.metrics["spectra"].values())
@@ -144,13 +139,13 @@ def test_vamp_of_several_lags_has_the_mean_of_squares(moved):
 
 
 @pytest.mark.parametrize("weights", [{"values": 0}, {"changes": 2, "reward": 0.5}])
-def test_the_linear_forward_code_is_reduced_rank_regression(face, weights):
+def test_the_linear_forward_code_is_reduced_rank_regression(data, weights):
     horizons, regressors, targets = (1, 4), [], []
-    turn = 2 * math.pi / face.scaler.half_width
-    angles = np.array([feature.is_angle for feature in face.task.features])
+    turn = 2 * math.pi / data.scaler.half_width
+    angles = np.array([feature.is_angle for feature in data.task.features])
     changes, values, reward = (weights.get(w, 1) for w in ("changes", "values", "reward"))
     scale = np.sqrt(np.tile(np.repeat([changes, values, 16 * reward], (16, 16, 1)), 2))
-    for rows, taken, reward in episodes(face):
+    for rows, taken, reward in episodes(data):
         for start in range(0, len(rows) - 4):
             regressors.append(np.concatenate((rows[start], taken[start : start + 4].ravel())))
             parts = []
@@ -165,19 +160,19 @@ def test_the_linear_forward_code_is_reduced_rank_regression(face, weights):
     block = np.linalg.lstsq(regressors, standard, rcond=None)[0][:16]
     root = sqrtm(np.cov(regressors[:, :16].T, bias=True)).real
     left, singular, _ = np.linalg.svd(root @ block)
-    ours = made(face, "linear-forward", horizons=horizons, latent=5, **weights)
+    ours = made(data, "linear-forward", horizons=horizons, latent=5, **weights)
     assert ours.metrics["spectrum"] == pytest.approx(singular, rel=1e-4, abs=1e-4)
     assert same_space(ours.encoder[0].weight, np.linalg.solve(root, left[:, :5]).T)
 
 
 @pytest.mark.parametrize("kind", ["slow", "vamp", "linear-forward"])
-def test_the_file_has_the_spectrum(face, kind, tmp_path):
-    encoder = Fitter(face, tmp_path).fit(kind, latent=4, angles=True).encoder
+def test_the_file_has_the_spectrum(data, kind, tmp_path):
+    encoder = Fitter(data, tmp_path).fit(kind, latent=4, angles=True).encoder
     spectrum = encoder.header["metrics"]["spectrum"]
     assert encoder.name == f"{kind}-angles-4"
     assert len(spectrum) == 18
     assert spectrum == sorted(spectrum, reverse=True)
-    code = encoder.encode(face.dataset["observation"][face.train])
+    code = encoder.encode(data.dataset["observation"][data.train])
     np.testing.assert_allclose(code.std(axis=0), 1 / 3, rtol=0.05)
 
 

@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.errors import InputError
 from jbrep.methods.fit import Fitter
-
-
-@pytest.fixture(scope="module")
-def data(collected):
-    return ScaledDataset(Dataset(collected))
 
 
 @pytest.fixture(scope="module")

@@ -260,10 +260,8 @@ def _header(method: Method, name: str, data: ScaledDataset) -> dict[str, Any]:
 
 def _origin(header: Mapping[str, Any]) -> dict[str, Any]:
     """What must be equal for two encoders of one name to be the same."""
-    method = get_method(header["kind"])
-    data = header["data"].get("fingerprint")
-    training = {**to_plain(method.defaults()), **USUAL, **header["training"]}
-    return {**training, "kind": header["kind"], "task": header["task"], "data": data}
+    of = {"kind": header["kind"], "task": header["task"]}
+    return {**USUAL, **header["training"], **of, "data": header["data"].get("fingerprint")}
 
 
 def _with_progress(trainer: Trainer, name: str) -> Iterator[Epoch]:

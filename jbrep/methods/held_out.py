@@ -55,14 +55,8 @@ def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
     Returns:
         The ratio; None where PCA loses nothing.
     """
-    error = _pca_error(data, encoder.latent_size)
+    if encoder.latent_size >= data.task.size:
+        return None
+    layers = principal_code(data, encoder.latent_size)
+    error = held_out_error(Encoder({"name": "pca"}, data.scaler, *layers), data)
     return encoder.header["metrics"][HELD_OUT_MSE] / error if error else None
-
-
-def _pca_error(data: ScaledDataset, latent: int) -> float:
-    """PCA's held-out error with that many components; 0 with as many as there are features."""
-    if latent >= data.task.size:
-        return 0.0
-    return held_out_error(
-        Encoder({"name": "pca"}, data.scaler, *principal_code(data, latent)), data
-    )

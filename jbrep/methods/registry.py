@@ -35,11 +35,12 @@ def _methods(file: str) -> Iterator[type[Method]]:
 
 
 METHODS: dict[str, type[Method]] = {each.name: each for file in _FILES for each in _methods(file)}
-_Meanings = dict[str, dict[str, Any]]
-_UNUSUAL: _Meanings = {  # settings that a name says where they aren't the usual, by word
-    "scaling": {name: name for name in SCALINGS if name != EXTREMA},
-    "angles": {"angles": True},
-    "codes": {"raw": "raw", "unit": "standard", "white": "white"},
+_WORDS: dict[str, tuple[str, Any]] = {  # in names, of settings that aren't the usual ones
+    **{name: ("scaling", name) for name in SCALINGS if name != EXTREMA},
+    "angles": ("angles", True),
+    "raw": ("codes", "raw"),
+    "unit": ("codes", "standard"),
+    "white": ("codes", "white"),
 }
 _EXAMPLES = "it must be full, or a method and a latent size, such as dae-8, dae-deep-8 or slow-8"
 
@@ -67,8 +68,7 @@ def name_of(method: Method) -> str:
         words.append(settings["architecture"])
     words += [
         word
-        for name, meanings in _UNUSUAL.items()
-        for word, value in meanings.items()
+        for word, (name, value) in _WORDS.items()
         if settings.get(name) == value != usual.get(name)
     ]
     words += [name for name, preset in method.presets.items() if preset.items() <= settings.items()]
@@ -92,7 +92,8 @@ def read_name(name: str) -> Recipe:
     method = known[start]
     given: dict[str, Any] = {} if latent is None else {"latent": latent}
     for word in stem[len(start) :].split("-")[1:]:
-        given |= _meaning(word, method)
+        setting, value = _WORDS.get(word, ("architecture", word))
+        given |= method.presets.get(word, {setting: value})
     try:
         named = name_of(method.of(given))
     except InputError:
@@ -100,13 +101,3 @@ def read_name(name: str) -> Recipe:
     if named not in (name, IDENTITY if name == FULL else name):
         raise InputError(f"unknown representation {name!r}: {_EXAMPLES}")
     return Recipe(method, given)
-
-
-def _meaning(word: str, method: type[Method]) -> dict[str, Any]:
-    """The settings that a word in a name stands for."""
-    for name, meanings in _UNUSUAL.items():
-        if word in meanings:
-            return {name: meanings[word]}
-    if word in method.presets:
-        return dict(method.presets[word])
-    return {"architecture": word}

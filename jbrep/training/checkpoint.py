@@ -1,16 +1,22 @@
 """Checkpoints of training, in a file that runs nothing when it is read."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from msgspec import Meta
 from torch import Tensor
 
 from jbrep.errors import DamageError, InputError, differences
 from jbrep.records import container
+from jbrep.records.record import Record, from_plain, to_plain
 from jbrep.training.trainer import Epoch, Trainer
+
+
+class _Header(Record, frozen=True, kw_only=True):
+    identity: dict[str, Any]  # what must be equal for training to resume
+    history: Annotated[tuple[Epoch, ...], Meta(min_length=1)]
 
 
 def save(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
@@ -22,7 +28,8 @@ def save(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
         path: the file.
     """
     tensors = {name: tensor.cpu().numpy() for name, tensor in _state(trainer).items()}
-    container.write(path, tensors, {"identity": identity, "history": trainer.history})
+    header = _Header(identity=dict(identity), history=tuple(trainer.history))
+    container.write(path, tensors, to_plain(header))
 
 
 def restore(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
@@ -33,24 +40,21 @@ def restore(trainer: Trainer, identity: Mapping[str, Any], path: Path) -> None:
     """
     tensors, header = container.read(path, "checkpoint")
     try:
-        differing = differences(dict(header["identity"]), identity)
-        history = [Epoch(*map(float, epoch)) for epoch in header["history"]]
-    except (KeyError, TypeError, ValueError, ArithmeticError):
+        saved = from_plain(header, _Header)
+    except InputError:
         raise _damaged(path) from None
-    if differing:
+    if differing := differences(saved.identity, identity):
         raise InputError(
             f"{path} belongs to another configuration: {differing}; choose another folder, or "
             "delete it to start over"
         )
-    if not history or not all(math.isfinite(loss) for epoch in history for loss in epoch):
-        raise _damaged(path)
     state = _state(trainer)
     given = {name: torch.from_numpy(tensor) for name, tensor in tensors.items()}
     if _shapes(given) != _shapes(state):
         raise _damaged(path)
     for name, tensor in given.items():
         state[name].copy_(tensor)
-    trainer.history = history
+    trainer.history = list(saved.history)
 
 
 def _state(trainer: Trainer) -> dict[str, Tensor]:

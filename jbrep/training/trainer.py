@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.optim import Adam, Optimizer
 
 from jbrep.errors import InputError
+from jbrep.records.record import Finite
 from jbrep.training.objective import Objective
 from jbrep.training.rows import POOL, shuffled
 from jbrep.training.windows import Windows
@@ -46,8 +47,8 @@ def default_batch_size(rows: int) -> int:
 class Epoch(NamedTuple):
     """The losses of an epoch, as its objective defines them."""
 
-    train_loss: float  # mean over the epoch, of parameters as they were then, with noise
-    test_loss: float  # after the epoch, from clean held-out rows
+    train_loss: Finite  # mean over the epoch, of parameters as they were then, with noise
+    test_loss: Finite  # after the epoch, from clean held-out rows
 
 
 def get_device(name: str) -> torch.device:
