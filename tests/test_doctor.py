@@ -5,16 +5,15 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from command import jbrep
 from conftest import needs_egl
 
 from jbrep import doctor
-from jbrep.cli import main
 
 
 def told():
     """The command's exit code, and its text in one line."""
-    result = CliRunner().invoke(main, ["doctor"])
+    result = jbrep("doctor")
     return result.exit_code, " ".join(result.output.split())
 
 
@@ -52,7 +51,7 @@ def test_it_draws_something_to_see_whether_it_can(monkeypatch):
 @pytest.mark.parametrize("width", [60, 80])
 def test_it_fits_the_terminal(width, monkeypatch):
     monkeypatch.setenv("COLUMNS", str(width))
-    lines = CliRunner().invoke(main, ["doctor"]).output.splitlines()
+    lines = jbrep("doctor").output.splitlines()
     assert max(map(len, lines)) <= width
 
 

@@ -8,11 +8,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import jbrep
 from conftest import needs_egl
 from PIL import Image
 
-from jbrep.cli import main
 from jbrep.envs import describe
 from jbrep.envs.make import make_env
 from jbrep.envs.physics import Motion, physics_of
@@ -39,9 +38,7 @@ def camera():
 
 def render(*arguments):
     small = ("--size", "x".join(map(str, SIZE)), "--seconds", 0.2)
-    result = CliRunner().invoke(main, ["render", *map(str, (*small, *arguments))])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result
+    return jbrep("render", *small, *arguments)
 
 
 def read_mp4(path):
@@ -171,12 +168,7 @@ def test_a_robot_without_mujoco_is_one_line(tmp_path):
 @needs_egl
 @pytest.mark.parametrize(
     ("pace", "frames", "last"),
-    [
-        (Pace(), 250, 996),
-        (Pace(speed=0.5), 500, 998),
-        (Pace(speed=2), 125, 992),
-        (Pace(50), 500, 998),
-    ],
+    [(Pace(), 250, 996), (Pace(speed=2), 125, 992), (Pace(50, 0.5), 1000, 999)],
 )
 def test_speed_and_frames(pace, frames, last, episode, camera):
     film = Film([episode], camera, pace)
@@ -251,7 +243,7 @@ def test_an_mp4_keeps_what_it_is_given(tmp_path):
         (("--size", "3840x64", *["uniform"] * 2), "are 11,520 pixels wide: at most 7,680"),
         (
             ("--out", "a.gif", "--size", "1920x1080", "--seconds", 10),
-            "a.gif would have 259,200,000 pixels: at most 200,000,000 fit into a .gif",
+            "at most 200,000,000 fit",
         ),
     ],
 )

@@ -40,15 +40,8 @@ SHORT = {
 def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     task = describe("face_direction", max_episode_steps=200)
-    settings = Run(
-        task=task,
-        algorithm="a2c",
-        encoder="dae-8",
-        steps=64,
-        evaluation_episodes=2,
-        final_episodes=2,
-    )
-    train(settings, folder)
+    short = {"steps": 64, "evaluation_episodes": 2, "final_episodes": 2}
+    train(Run(task=task, algorithm="a2c", encoder="dae-8", **short), folder)
     return folder
 
 
@@ -59,11 +52,13 @@ def hopper(tmp_path_factory):
     return Dataset(folder)
 
 
-def stored(dataset, episode):
-    """What a data set has of an episode's observations, actions and rewards."""
+def assert_stored(rollout, dataset, episode):
+    """Whether it is what the data set has of an episode."""
     part = dataset.episode(episode)
-    last = part.record["final_observation"][None]
-    return np.concatenate((part["observation"], last)), part["action"], part["reward"]
+    seen = np.concatenate((part["observation"], part.record["final_observation"][None]))
+    np.testing.assert_array_equal(rollout.observation, seen)
+    np.testing.assert_array_equal(rollout.action, part["action"])
+    np.testing.assert_array_equal(rollout.reward, part["reward"])
 
 
 @cache
@@ -75,10 +70,7 @@ def replayed(task):
 @pytest.mark.parametrize("task", TASKS)
 def test_replay_gives_the_stored_episode(task):
     dataset, rollout = Dataset(f"data/sample/{task}"), replayed(task)
-    for ours, theirs in zip(
-        (rollout.observation, rollout.action, rollout.reward), stored(dataset, 1), strict=True
-    ):
-        np.testing.assert_array_equal(ours, theirs)
+    assert_stored(rollout, dataset, 1)
     assert rollout.seed == dataset.episodes["seed"][1]
     assert (rollout.note, len(rollout.motion)) == ("", 1001)
     own, readings = TASKS[task], read(rollout.motion)
@@ -128,13 +120,8 @@ def test_the_target_turns_where_it_is_told():
 def test_a_policy_plays_through_an_encoder():
     task = describe("face_direction", max_episode_steps=20)
     player = find_player("heuristic", task)
-    direct, whole, blurred = (
-        p.play([0])[0]
-        for p in (
-            player,
-            *(player.with_reconstruction(find(e, task)) for e in ("identity", "pca-4")),
-        )
-    )
+    decoding = [player.with_reconstruction(find(each, task)) for each in ("identity", "pca-4")]
+    direct, whole, blurred = (each.play([0])[0] for each in (player, *decoding))
     np.testing.assert_allclose(whole.action, direct.action, atol=1e-4)
     assert np.abs(blurred.action - direct.action).max() > 0.01
     assert blurred.name == "heuristic on pca-4, decoded"
@@ -199,12 +186,7 @@ def test_a_data_set_of_any_robot_is_replayed(hopper):
     for episode in (0, 1):
         rollout = replay(hopper, episode)
         assert (rollout.note, len(rollout.motion)) == ("", len(rollout) + 1)
-        for ours, theirs in zip(
-            (rollout.observation, rollout.action, rollout.reward),
-            stored(hopper, episode),
-            strict=True,
-        ):
-            np.testing.assert_array_equal(ours, theirs)
+        assert_stored(rollout, hopper, episode)
 
 
 def test_what_comes_out_differently_is_shown_as_stored(hopper):
@@ -213,7 +195,7 @@ def test_what_comes_out_differently_is_shown_as_stored(hopper):
     rollout = replay(spoilt, 0)
     assert rollout.motion is None
     assert rollout.note.endswith("it differs, as Hopper-v5 isn't reproducible here")
-    np.testing.assert_array_equal(rollout.observation, stored(hopper, 0)[0])
+    assert_stored(rollout, hopper, 0)
 
 
 def test_what_can_t_be_simulated_here_is_shown_as_stored(hopper):
@@ -222,18 +204,14 @@ def test_what_can_t_be_simulated_here_is_shown_as_stored(hopper):
     rollout = replay(elsewhere, 0)
     assert rollout.motion is None
     assert "is shown without the robot: unknown task 'Theirs/Hopper-v5'" in rollout.note
-    np.testing.assert_array_equal(rollout.observation, stored(hopper, 0)[0])
+    assert_stored(rollout, hopper, 0)
 
 
 def test_arrays_of_the_wrong_shape_are_named_with_both_shapes():
     rollout = replay(Dataset("data/sample/face_direction"), 0)
-    with pytest.raises(
-        InputError, match=r"1000 actions has reward of shape \(999,\): it must be \(1000,\)"
-    ):
+    with pytest.raises(InputError, match=r"1000 actions has reward of shape \(999,\): it must be"):
         replace(rollout, reward=rollout.reward[:999])
-    assert repr(rollout) == (
-        "Rollout('data/sample/face_direction, episode 0': face_direction, 1,000 steps)"
-    )
+    assert repr(rollout).endswith("face_direction, episode 0': face_direction, 1,000 steps)")
 
 
 def test_episodes_may_be_shorter():

@@ -68,10 +68,15 @@ def printable(line: str) -> str:
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
+def say(line: str, err: bool = False) -> None:
+    """Print a line as `printable` makes it."""
+    click.echo(printable(line), err=err)
+
+
 def echo_text(text: str) -> None:
     """Print several lines, each as `printable` makes it."""
     for line in text.splitlines():
-        click.echo(printable(line))
+        say(line)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from jbrep.cli.base import (
     echo_text,
     example,
     on_stop,
-    printable,
+    say,
     stoppable,
 )
 from jbrep.cli.environment import given_task, import_option, needed_task, task_options
@@ -101,7 +101,7 @@ def _tell_kept(out: Path, policy: Mapping[str, Any]) -> None:
     for part in parts_of(policy):
         if part["kind"] == TRAINED and (out / part["file"]).exists():
             known = f"{part['run']} acts as it did at step {part['step']:,}"
-            click.echo(printable(f"{known}, which {out / part['file']} keeps"), err=True)
+            say(f"{known}, which {out / part['file']} keeps", err=True)
 
 
 def _report(out: Path, written: Any) -> None:
@@ -119,7 +119,7 @@ def _report_size(out: Path, manifest: Any) -> None:
     size = sum(entry.bytes for entry in manifest.shards) / 1e6
     plural = "s" if manifest.episodes > 1 else ""
     what = f"{manifest.episodes:,} episode{plural} of {manifest.task.name}, {manifest.rows:,} rows"
-    click.echo(printable(f"{what}, {size:,.1f} MB in {out}"))
+    say(f"{what}, {size:,.1f} MB in {out}")
 
 
 @click.group()
@@ -158,19 +158,19 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
 
     problems = 0
     for problem in find_problems(data):
-        click.echo(printable(problem))
+        say(problem)
         problems += 1
     if not problems:
         dataset = Dataset(data)
         for problem in replay_problems(dataset, replay, threads):
-            click.echo(printable(problem))
+            say(problem)
             problems += 1
     if problems:
         ctx.exit(1)
     manifest = dataset.manifest
     shards = f"{len(manifest.shards)} shard{'s' if len(manifest.shards) != 1 else ''}"
     unfinished = "" if manifest.complete else "; unfinished"
-    click.echo(printable(f"{data}: no problems in {len(dataset):,} rows, {shards}{unfinished}"))
+    say(f"{data}: no problems in {len(dataset):,} rows, {shards}{unfinished}")
     if replay:
         click.echo(f"{replay} episodes simulated again: equal in every bit")
 
@@ -188,10 +188,10 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
     with stoppable(RESUMES):
         repaired = False
         for line in run(data, lanes, threads, kept_policy(data)):
-            click.echo(printable(line))
+            say(line)
             repaired = True
     if not repaired:
-        click.echo(printable(f"{data} is whole: nothing to repair"))
+        say(f"{data} is whole: nothing to repair")
 
 
 @data.command(
@@ -256,7 +256,7 @@ def import_(source: str, out: Path, **options: Any) -> None:
         manifest = write(opened, out, task)
     if not (task or opened.task):
         line = f"{manifest.task.name} is made from the data alone: {opened.why_no_task}"
-        click.echo(printable(line), err=True)
+        say(line, err=True)
     _report_size(out, manifest)
 
 

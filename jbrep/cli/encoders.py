@@ -1,8 +1,7 @@
 """Judging and looking at encoders."""
 
-from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,12 +13,17 @@ from jbrep.cli.base import (
     echo_paths,
     echo_text,
     example,
-    printable,
+    say,
     stoppable,
 )
 from jbrep.cli.environment import given_task, needed_task, task_options
 from jbrep.errors import InputError
 from jbrep.text import terminal_width
+
+if TYPE_CHECKING:
+    from jbrep.encoders import Encoder
+    from jbrep.envs.task import Task
+    from jbrep.evaluate.table import Values
 
 
 @click.command(
@@ -85,14 +89,12 @@ def evaluate(
     for label, source in zip(labels, sources, strict=True):
         line = source if source.startswith(label) else f"{label}: {source}"
         arguments = arguments_of(labelled[label].task)
-        click.echo(printable(f"{line}, made with {arguments}" if arguments else line), err=as_json)
+        say(f"{line}, made with {arguments}" if arguments else line, err=as_json)
     for label, seen in evaluation.seen.items():
         if seen == "maybe":
-            click.echo(
-                printable(
-                    f"note: {label} may have seen these episodes: the data it was trained on has "
-                    "the same seed, or isn't known"
-                ),
+            say(
+                f"note: {label} may have seen these episodes: the data it was trained on has the "
+                "same seed, or isn't known",
                 err=as_json,
             )
     if as_json:
@@ -131,20 +133,16 @@ def list_shipped(task: str | None, as_json: bool) -> None:
     A dash stands for what isn't known; jbrep evaluate finds out.
     """
     from jbrep.encoders.encoder import FULL, IDENTITY
-    from jbrep.encoders.shipped import shipped, shipped_folder
-    from jbrep.evaluate.table import DIAGNOSTICS, SCALARS, read_diagnostics
+    from jbrep.evaluate.table import SCALARS
     from jbrep.jitterbug.tasks import TASKS
     from jbrep.methods.registry import METHODS
     from jbrep.text import facts, r2_text, table
 
     if task is not None and task not in TASKS:
         raise InputError(f"no encoder ships for {task}: only for {', '.join(TASKS)}")
-    tasks = {name: TASKS[name].describe() for name in ([task] if task else TASKS)}
-    ships = {name: shipped(each) for name, each in tasks.items()}
-    rows = chain.from_iterable(
-        read_diagnostics(shipped_folder(each) / DIAGNOSTICS) for each in tasks.values()
-    )
-    known = {row.sha256: row.values for row in rows}
+    listed = {
+        name: _with_diagnostics(TASKS[name].describe()) for name in ([task] if task else TASKS)
+    }
     if as_json:
         return echo_json(
             {
@@ -153,27 +151,36 @@ def list_shipped(task: str | None, as_json: bool) -> None:
                         "name": called,
                         **{key: getattr(each, key) for key in ("kind", "size", "latent_size")},
                         "sha256": each.fingerprint,
-                        "diagnostics": dict(known.get(each.fingerprint, {})),
+                        "diagnostics": dict(known),
                     }
-                    for called, each in encoders.items()
+                    for called, each, known in encoders
                 ]
-                for name, encoders in ships.items()
+                for name, encoders in listed.items()
             }
         )
     width = terminal_width()
-    for name, encoders in ships.items():
-        lines = [
-            (called, str(each.latent_size), *(r2_text(numbers.get(n)) for n in _COLUMNS))
-            for called, each in encoders.items()
-            for numbers in [known.get(each.fingerprint, {})]
+    for name, encoders in listed.items():
+        rows = [
+            (called, str(each.latent_size), *(r2_text(known.get(column)) for column in _COLUMNS))
+            for called, each, known in encoders
         ]
-        click.echo(f"{name}\n{table(('encoder', 'l', *_COLUMNS.values()), lines, width)}\n")
-    kinds = dict.fromkeys(each.kind for encoders in ships.values() for each in encoders.values())
+        click.echo(f"{name}\n{table(('encoder', 'l', *_COLUMNS.values()), rows, width)}\n")
+    kinds = dict.fromkeys(each.kind for encoders in listed.values() for _, each, _ in encoders)
     words = {FULL if kind == IDENTITY else kind: METHODS[kind].words() for kind in kinds}
     columns = {title: SCALARS[name].words for name, title in _COLUMNS.items()}
     columns["error"] = "squared error of the reconstruction, as a multiple of PCA's"
     click.echo(f"columns\n{facts({'l': 'size of the code', **columns}, width)}\n")
     return click.echo(f"kinds of encoders\n{facts(words, width)}")
+
+
+def _with_diagnostics(task: "Task") -> "list[tuple[str, Encoder, Values]]":
+    """The encoders that ship for a task, with what is known of each."""
+    from jbrep.encoders.shipped import shipped, shipped_folder
+    from jbrep.evaluate.table import DIAGNOSTICS, read_diagnostics
+
+    rows = read_diagnostics(shipped_folder(task) / DIAGNOSTICS)
+    known = {row.sha256: row.values for row in rows}
+    return [(name, each, known.get(each.fingerprint, {})) for name, each in shipped(task).items()]
 
 
 _which = click.argument("encoder")
@@ -228,7 +235,7 @@ def export(encoder: str, out: Path, **options: Any) -> None:
             "Encoder.from_torch makes it"
         )
     run(exported, out)
-    click.echo(f"exported {printable(source_of(encoder, task))}")
+    say(f"exported {source_of(encoder, task)}")
     click.echo(f"open it with onnxruntime.InferenceSession({str(out)!r})")
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, example, printable, stoppable
+from jbrep.cli.base import COUNT, example, say, stoppable
 from jbrep.cli.environment import given_task, task_options
 from jbrep.errors import InputError
 
@@ -68,13 +68,10 @@ def inspect(
     from jbrep.encoders.code import import_code
     from jbrep.inspection import inspect as record
 
-    def tell(line: str) -> None:
-        click.echo(printable(line))
-
     import_code(encoder)
     task = given_task(options)
-    path = record(source, episode, task, encoder, traverse, out, data, tell)
-    click.echo(printable(f"{path}" if view or serve else f"{path}; open it with: rerun {path}"))
+    path = record(source, episode, task, encoder, traverse, out, data, say)
+    say(f"{path}" if view or serve else f"{path}; open it with: rerun {path}")
     if view:
         _run_viewer(path)
     if serve:

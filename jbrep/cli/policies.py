@@ -14,7 +14,7 @@ from jbrep.cli.base import (
     example,
     interval_of,
     percentiles,
-    printable,
+    say,
     stoppable,
 )
 from jbrep.cli.environment import given_task, task_options
@@ -81,13 +81,9 @@ def evaluate_policy(
         )
         return
     if source is not None:
-        click.echo(printable(f"encoder: {source}"))
-    click.echo(
-        printable(
-            f"{_title(policy, player)}: median return {interval_of(returns)} "
-            f"(10-90 % of {episodes} episodes)"
-        )
-    )
+        say(f"encoder: {source}")
+    title = _title(policy, player)
+    say(f"{title}: median return {interval_of(returns)} (10-90 % of {episodes} episodes)")
 
 
 def _title(policy: str, player: "Player") -> str:

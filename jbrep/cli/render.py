@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, example, printable, stoppable
+from jbrep.cli.base import COUNT, example, say, stoppable
 from jbrep.cli.environment import given_task, task_options
 
 
@@ -78,9 +78,7 @@ def render(
         rollouts = [find_episode(source, episode, task) for source in sources]
         film = Film(rollouts, seen_by, pace)
         film.write(out, show=True)
-    click.echo(
-        printable(
-            f"{out}: {film.width} x {seen_by.height} pixels, {film.seconds:.1f} s, "
-            f"{len(film)} frames, {out.stat().st_size / 1e6:.1f} MB"
-        )
+    say(
+        f"{out}: {film.width} x {seen_by.height} pixels, {film.seconds:.1f} s, "
+        f"{len(film)} frames, {out.stat().st_size / 1e6:.1f} MB"
     )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, interval_of, on_stop, printable
+from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, interval_of, on_stop, say
 from jbrep.cli.environment import needed_task, parse_arguments, task_options
 from jbrep.cli.options import record_options
 from jbrep.rl.names import CLASSES
@@ -139,7 +139,7 @@ def rl(context: click.Context, /, out: Path, project: str | None, **settings: An
     if "reason" in result:
         click.echo(f"the run failed: {result['reason']}; see {out / RUN}", err=True)
         context.exit(1)
-    click.echo(printable(f"encoder: {source}"))
+    say(f"encoder: {source}")
     rows = read_evaluations(out)
     last = [e.episode_return for e in rows if e.step == rows[-1].step]
     name = result["settings"]["representation"]

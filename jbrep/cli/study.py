@@ -12,7 +12,7 @@ from jbrep.cli.base import (
     echo_paths,
     echo_text,
     example,
-    printable,
+    say,
     stoppable,
 )
 from jbrep.cli.environment import import_option
@@ -150,7 +150,7 @@ def _conclude(
         if not as_json:
             echo_text(as_text(results, terminal_width()))
     for line in add_diagnostics(folder, evaluations):
-        click.echo(printable(line), err=True)
+        say(line, err=True)
     paths += write_report(folder, out)
     if as_json:
         echo_json(json.loads(((out or folder) / SUMMARY).read_bytes()))

@@ -10,12 +10,11 @@ import rerun.blueprint as rrb
 
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Array, Task
-from jbrep.inspection.ghost import ALIGNED
-from jbrep.inspection.latent import PATH
 from jbrep.inspection.recording import PROVENANCE
 from jbrep.inspection.robot import Robot
-from jbrep.inspection.scene import ROBOT, TRAIL, WORLD
+from jbrep.inspection.scene import ALIGNED, ROBOT, TRAIL, WORLD
 from jbrep.inspection.signals import (
+    PATH,
     STEP,
     TIME,
     Panel,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jbrep.encoders import FULL
 from jbrep.inspection.blueprint import TRAINING_STEP, curves_layout
-from jbrep.inspection.recording import Colour, Recording, palette
+from jbrep.inspection.recording import Recording, palette
 from jbrep.stats import RunCurve
 from jbrep.stats.bootstrap import Array
 from jbrep.stats.runs import in_order, with_failure_returns
@@ -51,25 +51,14 @@ def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
     recording = Recording(source, _about(source, labels), *numbers)
     for label, group in labels.items():
         name = group[0].representation
-        for run in group:
-            path_of_run = f"{label}/seed-{run.seed}"
-            _send(recording, path_of_run, run.curve(), name, colours[name], _RUN_WIDTH)
-        _send(recording, f"{label}/median", median_curve(group), name, colours[name], _MEDIAN_WIDTH)
+        curves = {f"seed-{run.seed}": (run.curve(), _RUN_WIDTH) for run in group}
+        curves["median"] = median_curve(group), _MEDIAN_WIDTH
+        for curve, ((steps, returns), width) in curves.items():
+            times = [rr.TimeColumn(TRAINING_STEP, sequence=steps)]
+            look = [name], [colours[name]], width
+            recording.send_series(f"{label}/{curve}", times, returns[:, None], *look)
     groups = sorted({f"{run.task}/{run.algorithm}" for run in runs})
     recording.write(path, curves_layout(groups, max(int(run.curve()[0][-1]) for run in runs)))
-
-
-def _send(
-    recording: Recording,
-    path: str,
-    points: tuple[NDArray[np.int64], Array],
-    name: str,
-    colour: Colour,
-    width: float,
-) -> None:
-    steps, returns = points
-    times = [rr.TimeColumn(TRAINING_STEP, sequence=steps)]
-    recording.send_series(path, times, returns[:, None], [name], [colour], width)
 
 
 def _about(source: str, labels: dict[str, list[RunCurve]]) -> str:

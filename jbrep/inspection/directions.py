@@ -11,8 +11,7 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Array, Task
 from jbrep.evaluate.truth import state
 from jbrep.inspection.blueprint import series_pages
-from jbrep.inspection.examples import Examples
-from jbrep.inspection.forecast import columns, encode
+from jbrep.inspection.forecast import Examples, columns, encode
 from jbrep.inspection.recording import SKY, Recording
 
 PATH = "latent/directions"
@@ -29,27 +28,17 @@ class Directions(NamedTuple):
         mean: of the code, (l,).
         weight: directions (k, l), in which the code has a standard deviation of 1.
         autocorrelation: at the lag, (k,).
+        labels: what each is and correlates with, such as "slow 1: heading cos, r = 0.97".
     """
 
     mean: Array
     weight: Array
     autocorrelation: Array
+    labels: Sequence[str] = ()
 
     def __call__(self, latent: Array) -> Array:
         """Codes (n, l) along the directions, (n, k)."""
         return (latent - self.mean) @ self.weight.T
-
-
-class Named(NamedTuple):
-    """Directions to show.
-
-    Attributes:
-        directions: those shown.
-        labels: what each is and correlates with, such as "slow 1: heading cos, r = 0.97".
-    """
-
-    directions: Directions
-    labels: list[str]
 
     @property
     def titles(self) -> dict[str, str]:
@@ -86,7 +75,7 @@ def _pairs(latents: Sequence[Array], lag: int) -> list[tuple[Array, Array]]:
     return [(each[:-lag], each[lag:]) for each in latents if len(each) > lag]
 
 
-def name_directions(encoder: BaseEncoder, task: Task, examples: Examples) -> Named | None:
+def name_directions(encoder: BaseEncoder, task: Task, examples: Examples) -> Directions | None:
     """The code's slowest and fastest directions, turned to correlate positively with their names.
 
     Each is named by the column of the state that it correlates with most, over the examples.
@@ -116,7 +105,7 @@ def name_directions(encoder: BaseEncoder, task: Task, examples: Examples) -> Nam
         f"r = {abs(r):.2f}"
         for number, slow, i, r in zip(numbers, slowness, best, largest, strict=True)
     ]
-    return Named(Directions(every.mean, weight, slowness), labels)
+    return Directions(every.mean, weight, slowness, labels)
 
 
 def _correlation(left: Array, right: Array) -> Array:
@@ -128,16 +117,16 @@ def _correlation(left: Array, right: Array) -> Array:
 
 
 def send_directions(
-    recording: Recording, times: Sequence[rr.TimeColumn], latent: Array, named: Named
+    recording: Recording, times: Sequence[rr.TimeColumn], latent: Array, directions: Directions
 ) -> None:
     """Send codes (n, l) along each direction."""
-    along = named.directions(latent)
-    titled = zip(named.titles.items(), named.directions.autocorrelation, strict=True)
+    along = directions(latent)
+    titled = zip(directions.titles.items(), directions.autocorrelation, strict=True)
     for i, ((label, path), slowness) in enumerate(titled):
         name = f"{label}; autocorrelation {slowness:.2f}"
         recording.send_series(path, times, along[:, [i]], [name], [SKY])
 
 
-def direction_pages(task: Task, named: Named) -> list[rrb.Grid]:
+def direction_pages(task: Task, directions: Directions) -> list[rrb.Grid]:
     """A plot of each direction."""
-    return series_pages("slow and fast directions", task, named.titles)
+    return series_pages("slow and fast directions", task, directions.titles)

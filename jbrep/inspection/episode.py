@@ -8,14 +8,12 @@ import numpy as np
 from jbrep.encoders.base import BaseEncoder
 from jbrep.inspection.blueprint import episode_layout
 from jbrep.inspection.directions import direction_pages, name_directions, send_directions
-from jbrep.inspection.examples import Examples, from_rollout
 from jbrep.inspection.fan import fan_pages, make_fan, send_fan
-from jbrep.inspection.ghost import send_ghost
-from jbrep.inspection.latent import send_encoding
+from jbrep.inspection.forecast import Examples, from_rollout
 from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot
-from jbrep.inspection.scene import send_scene
-from jbrep.inspection.signals import send_signals, send_terms, times_at
+from jbrep.inspection.scene import send_ghost, send_scene
+from jbrep.inspection.signals import send_encoding, send_signals, send_terms, times_at
 from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.rollout import Rollout
 
@@ -59,9 +57,9 @@ def record_episode(
         if fan:
             send_fan(recording, rollout, fan, robot)
             pages += fan_pages(task, fan)
-        if named := name_directions(encoder, task, examples):
-            send_directions(recording, times, latent.astype(np.float64), named)
-            pages += direction_pages(task, named)
+        if directions := name_directions(encoder, task, examples):
+            send_directions(recording, times, latent.astype(np.float64), directions)
+            pages += direction_pages(task, directions)
     recording.write(path, episode_layout(task, robot, encoder, pages))
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Array, Task
 from jbrep.inspection.blueprint import series_pages
-from jbrep.inspection.examples import Examples
 from jbrep.inspection.forecast import (
+    Examples,
     Forecaster,
     columns,
     encode,

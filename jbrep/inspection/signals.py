@@ -1,23 +1,27 @@
-"""An episode's signals as lines, with an entity for each plot."""
+"""An episode's signals, and an encoder's, as lines: an entity for each plot."""
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.physics import Motion
 from jbrep.envs.task import Array, Feature, Task
-from jbrep.inspection.recording import GREY, Recording, lighten, palette
+from jbrep.inspection.recording import GREY, SKY, YELLOW, Recording, lighten, palette
 from jbrep.play.jitterbug import reward_terms
 from jbrep.play.rollout import Rollout
 
 STEP = "step"
 TIME = "time"
 MOST_LINES = 12  # in a plot
-_DECODED_WIDTH = 1.0  # [points]
+_WIDTH, _DECODED_WIDTH = 2.0, 1.0  # of lines [points]
+PATH = "latent/path"
+_ALL_COLOUR = (90, 98, 112)
+_ALL_RADIUS, _PATH_RADIUS, _NOW_RADIUS = -1.2, -1.0, -6.0  # negative: Rerun's [points]
 
 
 class Panel(NamedTuple):
@@ -92,29 +96,78 @@ def send_features(
     times: Sequence[rr.TimeColumn],
     task: Task,
     values: NDArray[np.floating],
-    unit: str | None = None,
+    title: Callable[[Feature], str] = str,
+    is_faint: bool = False,
 ) -> None:
-    """Send features (n, d), an entity for each panel.
-
-    Their unit is the one given, or each feature's own.
-    """
+    """Send features (n, d), an entity for each panel; faint ones are lighter and thinner."""
     for name, place in feature_panels(task):
-        features = task.features[place]
-        names = [f"{f.name} [{unit}]" if unit else str(f) for f in features]
-        recording.send_series(f"{path}/{name}", times, values[:, place], names)
-
-
-def send_decoded(
-    recording: Recording, times: Sequence[rr.TimeColumn], task: Task, values: Array
-) -> None:
-    """Send decoded features (n, d), as lighter and thinner lines than the observation's."""
-    for name, place in feature_panels(task):
-        names = [_decoded(feature) for feature in task.features[place]]
-        colours = [lighten(colour) for colour in palette(len(names))]
-        path = f"reconstruction/{name}"
-        recording.send_series(path, times, values[:, place], names, colours, _DECODED_WIDTH)
+        titles = [title(feature) for feature in task.features[place]]
+        colours, width = palette(len(titles)), _WIDTH
+        if is_faint:
+            colours, width = [lighten(colour) for colour in colours], _DECODED_WIDTH
+        recording.send_series(f"{path}/{name}", times, values[:, place], titles, colours, width)
 
 
 def _decoded(feature: Feature) -> str:
     unit = f" [{feature.unit}]" if feature.unit else ""
     return f"{feature.name} decoded{unit}"
+
+
+def _scaled(feature: Feature) -> str:
+    return f"{feature.name} [scaled]"
+
+
+def send_encoding(
+    recording: Recording,
+    times: Sequence[rr.TimeColumn],
+    rollout: Rollout,
+    encoder: BaseEncoder,
+    latent: NDArray[np.float32],
+    decoded: Array | None,
+) -> None:
+    """Send the latent (n, l), and decoded features (n, d), if any, with errors in scaled units."""
+    if decoded is not None:
+        path = "reconstruction"
+        send_features(recording, path, times, rollout.task, decoded, _decoded, is_faint=True)
+        _send_errors(recording, times, rollout, encoder.scale(decoded), encoder)
+    names = [f"unit {i}" for i in range(encoder.latent_size)]
+    for name, place in latent_panels(encoder.latent_size):
+        recording.send_series(f"latent/{name}", times, latent[:, place], names[place])
+    _send_path(recording, times, latent.astype(np.float64))
+
+
+def _send_errors(
+    recording: Recording,
+    times: Sequence[rr.TimeColumn],
+    rollout: Rollout,
+    scaled: Array,
+    encoder: BaseEncoder,
+) -> None:
+    """Send the errors of decoded features, scaled, (n, d), and their root mean square."""
+    errors = scaled - encoder.scale(rollout.observation.astype(np.float64))
+    send_features(recording, "error", times, rollout.task, errors.astype(np.float32), _scaled)
+    total = np.sqrt(np.square(errors).mean(axis=1, keepdims=True))
+    recording.send_series("error/total", times, total, ["root mean square [scaled]"])
+
+
+def principal_components(latent: Array) -> Array:
+    """The first two principal components (n, 2) of latents (n, l)."""
+    centred = latent - latent.mean(axis=0)
+    _, _, directions = np.linalg.svd(centred, full_matrices=False)
+    two = np.zeros((2, latent.shape[1]))
+    two[: len(directions)] = directions[:2]
+    largest = two[[0, 1], np.abs(two).argmax(axis=1)]
+    signs = np.where(largest < 0, -1, 1)  # the SVD's are arbitrary
+    return centred @ (two * signs[:, None]).T
+
+
+def _send_path(recording: Recording, times: Sequence[rr.TimeColumn], latent: Array) -> None:
+    """Send all latents as points, lines between successive ones, and the current one."""
+    path = principal_components(latent)
+    recording.send(f"{PATH}/all", rr.Points2D(path, colors=[_ALL_COLOUR], radii=[_ALL_RADIUS]))
+    pieces = np.stack((np.concatenate((path[:1], path[:-1])), path), axis=1)
+    recording.send_columns(PATH, times, rr.LineStrips2D.columns(strips=pieces.astype(np.float32)))
+    recording.send(PATH, rr.LineStrips2D.from_fields(colors=[SKY], radii=[_PATH_RADIUS]))
+    now = rr.Points2D.from_fields(colors=[YELLOW], radii=[_NOW_RADIUS])
+    recording.send_columns(f"{PATH}/now", times, rr.Points2D.columns(positions=path))
+    recording.send(f"{PATH}/now", now)

@@ -16,7 +16,7 @@ from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.inspection.curves import record_curves
 from jbrep.inspection.episode import record_episode
-from jbrep.inspection.examples import Examples, from_dataset
+from jbrep.inspection.forecast import Examples, from_dataset
 from jbrep.inspection.recording import SUFFIX, check_out
 from jbrep.inspection.traversal import record_traversal
 from jbrep.play.rollout import Rollout

@@ -12,10 +12,9 @@ from jbrep.envs.physics import Motion
 from jbrep.envs.task import Array
 from jbrep.inspection.blueprint import TRAVERSE, traversal_layout
 from jbrep.inspection.episode import provenance
-from jbrep.inspection.ghost import as_qpos
 from jbrep.inspection.recording import GREY, Recording
 from jbrep.inspection.robot import Robot
-from jbrep.inspection.scene import WORLD, send_floor
+from jbrep.inspection.scene import WORLD, as_qpos, send_floor
 from jbrep.jitterbug.tasks import POSITION
 from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.rollout import Rollout
