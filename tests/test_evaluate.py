@@ -21,7 +21,7 @@ from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder, Layer, find, save
 from jbrep.errors import InputError
 from jbrep.evaluate import diagnose, diagnosis
-from jbrep.evaluate.diagnosis import write
+from jbrep.evaluate.diagnosis import seen, write
 from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.held_out import MAX_NUMBERS, HeldOut, sample_rows
 from jbrep.evaluate.latent import intrinsic_dimension, latent_units
@@ -137,10 +137,9 @@ def test_sums_of_parts_are_those_of_the_whole(held_out):
     rows = held_out.data.test
     values = held_out.data.load(rows)
     parts = ((values[i : i + 700], values[i : i + 700, :3]) for i in range(0, len(rows), 700))
-    for ours, whole in zip(
-        held_out.sums_of_parts(rows, parts), held_out.sums(rows, values, values[:, :3]), strict=True
-    ):
-        np.testing.assert_allclose(ours, whole, rtol=1e-12)
+    whole = held_out.sums(rows, values, values[:, :3])
+    for ours, theirs in zip(held_out.sums_of_parts(rows, parts), whole, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
 
 
 def test_a_sample_of_wide_rows_is_smaller():
@@ -300,11 +299,8 @@ def test_quantities_are_those_of_the_simulated_body():
 
 
 def test_every_task_has_its_quantities():
-    with_target = {
-        name
-        for name, task in TASKS.items()
-        if "bearing_of_target" in quantities(task, np.ones((1, task.size)))
-    }
+    known = {name: quantities(task, np.ones((1, task.size))) for name, task in TASKS.items()}
+    with_target = {name for name, each in known.items() if "bearing_of_target" in each}
     assert with_target == {"move_to_position", "move_to_pose"}
 
 
@@ -376,11 +372,13 @@ def test_probes_are_ridge_regressions(held_out, coder):
 
 def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     dataset = held_out.data.dataset
-    parts = []
+    parts, changes = [], []
     for rows in (held_out.data.train, held_out.data.test):
         kept = rows[dataset["step"][rows] < 999]
-        z = [coder.encode(dataset["observation"][r]) for r in (kept, kept + 1)]
-        parts.append((np.column_stack((z[0], dataset["action"][kept])), z[1]))
+        now, then = (dataset["observation"][each] for each in (kept, kept + 1))
+        changes.append(then - now)
+        inputs = np.column_stack((coder.encode(now), dataset["action"][kept]))
+        parts.append((inputs, coder.encode(then)))
     (known, after), (unseen, true) = parts
     whiten = PCA(whiten=True).fit(known[:, :4]).transform
     after, true = whiten(after), whiten(true)
@@ -393,26 +391,17 @@ def test_the_next_latent_is_read_from_latent_and_action(held_out, coder):
     still = r2_score(true, unseen[:, :4], multioutput="variance_weighted")
     assert result.persistence[0] == pytest.approx(still, abs=1e-3)
     assert result.linear[0] > result.persistence[0]
-    changes = []
-    for rows in (held_out.data.train, held_out.data.test):
-        kept = rows[dataset["step"][rows] < 999]
-        changes.append(dataset["observation"][kept + 1] - dataset["observation"][kept])
-    changes = [c / changes[0].std(axis=0) for c in changes]
-    predicted = (
-        Ridge(1.0).fit(scaler.transform(known), changes[0]).predict(scaler.transform(unseen))
-    )
-    expected = r2_score(changes[1], predicted, multioutput="variance_weighted")
+    fitted = Ridge(1.0).fit(scaler.transform(known), changes[0] / changes[0].std(axis=0))
+    predicted, true = fitted.predict(scaler.transform(unseen)), changes[1] / changes[0].std(axis=0)
+    expected = r2_score(true, predicted, multioutput="variance_weighted")
     assert result.change[0] == pytest.approx(expected, abs=1e-3)
 
 
 def test_mixing_the_units_does_not_change_how_well_the_next_is_read(held_out, coder):
     mixed = np.random.default_rng(0).normal(size=(4, 4)).astype(np.float32) * [[9], [1], [1], [0.1]]
     (layer,) = coder.encoder
-    stirred = layer._replace(
-        weight=(mixed @ layer.weight).astype(np.float32),
-        bias=(mixed @ layer.bias).astype(np.float32),
-    )
-    other = replace(coder, encoder=(stirred,))
+    weight, bias = ((mixed @ each).astype(np.float32) for each in (layer.weight, layer.bias))
+    other = replace(coder, encoder=(layer._replace(weight=weight, bias=bias),))
     one, two = dynamics(coder, held_out), dynamics(other, held_out)
     for name in ("linear", "persistence", "change"):
         assert getattr(one, name) == pytest.approx(getattr(two, name), abs=1e-3)
@@ -465,23 +454,21 @@ def test_dead_and_single_units_can_be_judged(held_out, parts, tmp_path):
 
 def test_the_observation_alone_can_be_judged(held_out, everything, tmp_path):
     evaluation = write({"identity": everything}, held_out.data, tmp_path)
-    names = [plot.name for plot in encoder_plots(evaluation)]
-    predictions = ["prediction_by_feature", "prediction_by_horizon"]
-    assert names == [*predictions, "error_by_feature", "latent_correlation"]
+    assert [plot.name for plot in encoder_plots(evaluation)] == [
+        *("prediction_by_feature", "prediction_by_horizon"),
+        *("error_by_feature", "latent_correlation"),
+    ]
 
 
 def test_a_constant_feature_can_be_judged(data):
     flat = ScaledDataset(data.dataset)
     flat.observations = lambda rows: iter([still_height(data, rows)])
-    flat.scaler = Scaler(
-        np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.low),
-        np.where(np.arange(16) == 2, np.float32(0.03), data.scaler.high),
-    )
+    is_height, bounds = np.arange(16) == 2, (data.scaler.low, data.scaler.high)
+    flat.scaler = Scaler(*(np.where(is_height, np.float32(0.03), each) for each in bounds))
     result = diagnose({"pca-4": make(flat, principal_code(flat, 4))}, flat).encoders["pca-4"]
     assert set(result.reconstruction.features[2].r2) == {None}
-    assert result.corruption[0].linear_mse[0] == pytest.approx(
-        result.reconstruction.mse[0], rel=1e-3
-    )
+    error = result.reconstruction.mse[0]
+    assert result.corruption[0].linear_mse[0] == pytest.approx(error, rel=1e-3)
 
 
 def still_height(data, rows):
@@ -499,10 +486,8 @@ def test_labels_and_numbers_that_cannot_be_judged(data):
 
 
 def test_an_evaluation_is_one_file_and_repeats(data, tmp_path):
-    encoders = {
-        "pca-4": make(data, principal_code(data, 4)),
-        "r-4": make(data, projection(data, 4, 0)),
-    }
+    parts = {"pca-4": principal_code(data, 4), "r-4": projection(data, 4, 0)}
+    encoders = {name: make(data, each) for name, each in parts.items()}
     one, path = write(encoders, data, tmp_path / "it"), tmp_path / "it" / EVALUATION
     text, there = path.read_text(), read_document(path, Evaluation)
     assert list(there.encoders) == ["full", "pca-4", "r-4"]
@@ -543,16 +528,13 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
 
 def test_whether_an_encoder_may_have_seen_the_episodes(data):
     fingerprint = data.dataset.manifest.fingerprint
-    sources = {
-        "same": {"fingerprint": fingerprint, "seed": 3},
-        "overlaps": {"fingerprint": "other", "seed": 3},
-        "apart": {"fingerprint": "other", "seed": 4},
-    }
-    encoders = {
-        n: make(data, principal_code(data, 2), data=source) for n, source in sources.items()
-    }
-    result = diagnose(encoders, data).seen
-    assert result == {"same": "no test row", "overlaps": "maybe", "apart": "none"}
+    for source, seed, expected in (
+        (fingerprint, 3, "no test row"),
+        ("other", 3, "maybe"),
+        ("other", 4, "none"),
+    ):
+        known = {"fingerprint": source, "seed": seed}
+        assert seen(make(data, principal_code(data, 2), data=known), data) == expected
 
 
 def test_other_features_are_refused(data):

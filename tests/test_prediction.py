@@ -216,9 +216,8 @@ def test_what_follows_is_of_the_same_episode(held_out):
     observation, reward = dataset["observation"], dataset["reward"]
     row = steps.rows[11]
     change = observation[row + 20] - observation[row]
-    np.testing.assert_allclose(
-        steps.wanted[11], [*change, reward[row : row + 20].mean()], atol=1e-6
-    )
+    expected = [*change, reward[row : row + 20].mean()]
+    np.testing.assert_allclose(steps.wanted[11], expected, atol=1e-6)
     short = ScaledDataset(Cart())
     short.dataset.episodes = {"length": np.full(1200, 10), "seed": np.arange(1200)}
     short.train, short.test = short.dataset.split()
@@ -241,9 +240,8 @@ def test_regression_finds_what_is_not_linear_and_repeats_to_the_last_bit(monkeyp
     monkeypatch.setattr(regression, "_STEPS", 600)
     random = np.random.default_rng(0)
     values = random.normal(size=(20_000, 6)) * [1, 1, 1, 1e4, 1, 0] + [0, 0, 0, 0, 1e6, 3]
-    wanted = np.stack(
-        (np.sin(2 * values[:, 0]) * values[:, 1], 1e5 + values[:, 2], 0 * values[:, 5]), 1
-    )
+    sine = np.sin(2 * values[:, 0]) * values[:, 1]
+    wanted = np.stack((sine, 1e5 + values[:, 2], 0 * values[:, 5]), 1)
     problem = Problem(values[:15_000], wanted[:15_000])
     twice = [each(values[15_000:]) for each in fit([problem, problem])]
     assert r2_score(wanted[15_000:, 0], twice[0][:, 0]) > 0.95
@@ -260,10 +258,7 @@ def test_regression_finds_what_is_not_linear_and_repeats_to_the_last_bit(monkeyp
 def test_regressions_side_by_side_are_of_their_own_values():
     random = np.random.default_rng(0)
     narrow, wide = random.normal(size=(9_000, 2)), random.normal(size=(12_000, 7))
-    problems = [
-        Problem(narrow, narrow.prod(axis=1, keepdims=True)),
-        Problem(wide, np.abs(wide[:, :3])),
-    ]
+    problems = [Problem(narrow, narrow.prod(axis=1)[:, None]), Problem(wide, np.abs(wide[:, :3]))]
     for predictor, problem in zip(fit(problems), problems, strict=True):
         predicted = predictor(problem.values)
         assert predicted.shape == problem.wanted.shape
@@ -271,9 +266,8 @@ def test_regressions_side_by_side_are_of_their_own_values():
 
 
 def test_angles_change_by_all_that_they_turn():
-    task = make_task(
-        [make_feature("spin", "rad", -np.pi, np.pi, True), make_feature("place")], "Top-v0"
-    )
+    spin = make_feature("spin", "rad", -np.pi, np.pi, True)
+    task = make_task([spin, make_feature("place")], "Top-v0")
     turned = np.array([0, 1, 2.5, 4, 7, 6, 4])
     rows = np.stack((wrapped(turned + 3), turned), axis=1).astype(np.float32)
     found = changes(task, rows, np.array([0, 2]), 4)
@@ -302,9 +296,8 @@ def test_returns_to_go_are_discounted():
 
 
 def test_nonlinear_probes_read_what_linear_ones_cannot(held_out):
-    bent = Layer(
-        np.array([[3, 0, 0, 0], [0, 0, 3, 0]], np.float32), np.zeros(2, np.float32), "tanh"
-    )
+    weight = np.array([[3, 0, 0, 0], [0, 0, 3, 0]], np.float32)
+    bent = Layer(weight, np.zeros(2, np.float32), "tanh")
     encoder = code(held_out.data, "place")
     encoder = Encoder(encoder.header, encoder.scaler, (bent,), ())
     linear = probes(encoder, held_out)
