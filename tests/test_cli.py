@@ -191,9 +191,9 @@ def test_the_encoders_that_ship_are_listed(monkeypatch, tmp_path):
     text = jbrep("encoder", "list").output
     assert max(map(len, text.splitlines())) <= 80
     assert all(task in text for task in TASKS)
-    assert re.search(r"^ +dae +denoising autoencoder: ", text, re.M)
+    assert re.search(r"^ +dae +Denoising autoencoder: ", text, re.M)
     assert re.search(r"^ +forward +R² of the features' change", text, re.M)  # the column
-    assert re.search(r"^ +forward +what a network needs", text, re.M)  # the kind
+    assert re.search(r"^ +forward +What a network needs", text, re.M)  # the kind
     monkeypatch.setattr("jbrep.encoders.shipped._FOLDER", tmp_path)
     folder = tmp_path / "face_direction"
     folder.mkdir()
