@@ -1,7 +1,7 @@
-"""Worker processes that take one job at a time and never outlive the process that started them.
+"""Workers that take one job at a time: processes on this machine, or a Ray cluster's.
 
-This module imports the standard library alone, so that a new worker watches its parent before the
-seconds that it takes to import torch.
+Processes never outlive the one that started them. This module imports the standard library alone,
+so that a new one watches its parent before the seconds that it takes to import torch.
 """
 
 import multiprocessing
@@ -130,3 +130,20 @@ def _end_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
+
+
+def on_cluster(function: Callable[..., Any], cpus: int | None, gpus: int = 0) -> Any:
+    """A function as Ray's remote function, on a core each, called again if its node dies.
+
+    Args:
+        function: to run.
+        cpus: of the local cluster that is started where RAY_ADDRESS names none; None takes all.
+        gpus: that it needs.
+    """
+    import ray
+
+    if not ray.is_initialized():
+        cores = None if "RAY_ADDRESS" in os.environ else cpus
+        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+        ray.init(num_cpus=cores, include_dashboard=False, **quiet)
+    return ray.remote(num_cpus=1, num_gpus=gpus, max_retries=ATTEMPTS - 1)(function)

@@ -1,6 +1,5 @@
 """Data sets and studies on a Ray cluster: they outlive its nodes."""
 
-import dataclasses
 import os
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from jbrep.study.results import read_runs
 from jbrep.study.work import work
 
 DATA = some(steps=12_000, shard_episodes=50)
-STUDY = dataclasses.replace(TINY, seeds=(0,), steps=1000, evaluate_every=1000)
+STUDY = TINY.replace(seeds=(0,), steps=1000, evaluate_every=1000)
 
 
 def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):

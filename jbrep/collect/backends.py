@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from itertools import count
 from typing import Any
 
-from jbrep.cluster import on_cluster
 from jbrep.collect.policies import Policy
 from jbrep.collect.shards import Missing, Produce, shards_in_turn, simulate_shard
 from jbrep.dataset.schema import Columns, DataSettings
@@ -13,7 +12,7 @@ from jbrep.envs.make import is_batched
 from jbrep.envs.names import import_modules, imported_modules
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, choose, first_line
-from jbrep.pool import ATTEMPTS, Pool, stop_requested
+from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
 
 Backend = Callable[[DataSettings, Policy, int, int | None], Produce]
 

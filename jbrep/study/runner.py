@@ -4,10 +4,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable
 from typing import Any
 
-from jbrep.cluster import on_cluster
 from jbrep.envs.names import imported_modules
 from jbrep.errors import choose
-from jbrep.pool import ATTEMPTS, Pool, stop_requested
+from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
 from jbrep.rl.names import CUDA
 from jbrep.study.packing import Pack
 from jbrep.study.plan import Plan
@@ -75,11 +74,7 @@ def on_ray(plan: Plan, packs: Iterable[Pack], workers: int) -> Generator[Outcome
             ray.cancel(job, force=True)
 
 
-BACKENDS: dict[str, Backend] = {
-    "local": on_this_machine,
-    "ray": on_ray,
-    "joblib": on_this_machine,  # what 0.1.0 called it
-}
+BACKENDS: dict[str, Backend] = {"local": on_this_machine, "ray": on_ray}
 
 
 def get_backend(name: str) -> Backend:
