@@ -20,7 +20,7 @@ Pack = tuple[Cell, ...]
 # wider cohorts don't cost each of their agents less on a CPU
 _WIDEST = {CPU: 16, CUDA: 64}  # agents; for a GPU not measured yet
 _OVERHEAD = 0.3  # what a step costs besides its agents, in what it costs for each
-_SHARE = 0.7  # of the machine's memory, that replay memories may take
+_SHARE = 0.7  # of the machine's memory, that replay buffers may take
 _OF_WORKER, _OF_AGENT = 1 << 29, 1 << 25  # bytes that they take besides
 
 

@@ -58,12 +58,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def explore(self, observation: Tensor, normals: Sequence[Tensor]) -> Tensor:
-        """Actions to learn from, before action noise is added, (n, lanes, k) in [-1, 1].
-
-        Args:
-            observation: (n, lanes, d).
-            normals: (n, lanes, k) each.
-        """
+        """Actions in [-1, 1] before action noise, and draws for them, (n, lanes, k) each."""
 
     @abstractmethod
     def update(

@@ -20,13 +20,6 @@ from jbrep.training.trainer import allocate_adam_state
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam
 
 
-class Product(NamedTuple):
-    """How matrices are multiplied: each is cast once, however many products it is a factor of."""
-
-    cast: Callable[[Tensor], Tensor]
-    multiply: Callable[[Tensor, Tensor], Tensor]  # factors (n, b, in) and (n, in, out), cast
-
-
 class Layer(NamedTuple):
     """An affine layer of n networks."""
 
@@ -38,35 +31,36 @@ Network = list[Layer]
 
 
 class MLP(NamedTuple):
-    """How networks compute: what follows each hidden layer, and how matrices are multiplied."""
+    """How networks compute."""
 
-    activation: Callable[[Tensor], Tensor]  # it may overwrite what it is given
-    product: Product
+    activation: Callable[[Tensor], Tensor]  # of hidden layers; it may overwrite what it is given
+    cast: Callable[[Tensor], Tensor]  # each factor, once, however many products it is in
+    multiply: Callable[[Tensor, Tensor], Tensor]  # (n, b, in) and (n, in, out), both cast
 
     def __call__(self, network: Network, inputs: Tensor) -> Tensor:
         """The outputs (n, b, out) of networks on inputs (n, b, in)."""
         *hidden, last = network
         for layer in hidden:
-            inputs = self.activation(_Affine.apply(inputs, *layer, self.product))
-        outputs: Tensor = _Affine.apply(inputs, *last, self.product)
+            inputs = self.activation(_Affine.apply(inputs, *layer, self))
+        outputs: Tensor = _Affine.apply(inputs, *last, self)
         return outputs
 
 
 class _Affine(Function):
-    """Affine layers, and their gradients, by a product of one's choice."""
+    """Affine layers, and their gradients, by the products of an MLP."""
 
     @staticmethod
-    def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor, product: Product) -> Tensor:
-        inputs, weight = map(product.cast, (inputs, weight))
+    def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor, mlp: MLP) -> Tensor:
+        inputs, weight = map(mlp.cast, (inputs, weight))
         ctx.save_for_backward(inputs, weight)
-        ctx.product = product
-        return product.multiply(inputs, weight).add_(bias)
+        ctx.mlp = mlp
+        return mlp.multiply(inputs, weight).add_(bias)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
         inputs, weight = ctx.saved_tensors
         of_inputs, of_layer, *_ = ctx.needs_input_grad
-        factor, multiply = ctx.product.cast(gradient), ctx.product.multiply
+        factor, multiply = ctx.mlp.cast(gradient), ctx.mlp.multiply
         return (
             multiply(factor, weight.mT) if of_inputs else None,
             multiply(inputs.mT, factor) if of_layer else None,
@@ -75,14 +69,15 @@ class _Affine(Function):
         )
 
 
-def get_product(precision: str, device: torch.device) -> Product:
-    """How matrices are multiplied, with a precision, on a device."""
+def make_mlp(activation: Module, precision: str, device: torch.device) -> MLP:
+    """How networks compute with a precision of products, on a device."""
+    function = torch.relu_ if isinstance(activation, ReLU) else activation
     multiply = torch.bmm if device.type == "cuda" else _one_by_one
     if precision == FLOAT32:
-        return Product(lambda values: values, multiply)
+        return MLP(function, lambda values: values, multiply)
     if device.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported():
-        return Product(Tensor.bfloat16, lambda left, right: multiply(left, right).float())
-    return Product(_rounded, lambda left, right: _rounded(multiply(left, right)))
+        return MLP(function, Tensor.bfloat16, lambda a, b: multiply(a, b).float())
+    return MLP(function, _rounded, lambda a, b: _rounded(multiply(a, b)))
 
 
 def _rounded(values: Tensor) -> Tensor:
@@ -101,7 +96,7 @@ def _one_by_one(left: Tensor, right: Tensor) -> Tensor:
     return products
 
 
-Modules = Iterable[Module | Sequence[Linear]]  # of an agent's network; several can be one layer
+Modules = Iterable[Module | list[Linear]]  # of an agent's network; several can be one layer
 _Part = tuple[Tensor, tuple[int, list[int], slice]]  # an agent's parameter; where a stack has it
 
 
@@ -126,11 +121,8 @@ class Stack:
     def __init__(
         self, agents: Sequence[Any], size: int, precision: str = FLOAT32, device: str = CPU
     ):
-        activation = agents[0].policy.activation_fn()
-        if isinstance(activation, ReLU):
-            activation = torch.relu_
-        self._size, self._device = size, torch.device(device)
-        self.agents, self.mlp = agents, MLP(activation, get_product(precision, self._device))
+        self.agents, self._size, self._device = agents, size, torch.device(device)
+        self.mlp = make_mlp(agents[0].policy.activation_fn(), precision, self._device)
         self._parts: dict[Tensor, list[_Part]] = {}
         self._optimizers: list[tuple[Adam, dict[Tensor, dict[str, Tensor]]]] = []
 
@@ -186,9 +178,7 @@ class Stack:
                     for name in _MOMENTS:
                         yield moments[name], place, _matrix(own[name])
 
-    def _layer(
-        self, modules: Sequence[Sequence[Linear]], sizes: Sequence[int], padded: int
-    ) -> Layer:
+    def _layer(self, modules: Sequence[list[Linear]], sizes: Sequence[int], padded: int) -> Layer:
         """A layer of all agents, whose first inputs, `sizes` of each, are padded to so many."""
         weights, biases = list[_Part](), list[_Part]()
         inputs = modules[0][0].in_features - sizes[0] + padded
@@ -209,13 +199,9 @@ class Stack:
         return stacked
 
 
-def _layers(modules: Modules) -> list[Sequence[Linear]]:
+def _layers(modules: Modules) -> list[list[Linear]]:
     """The linear layers among a network's modules."""
-    return [
-        [module] if isinstance(module, Linear) else module
-        for module in modules
-        if isinstance(module, Linear | Sequence)
-    ]
+    return [[m] if isinstance(m, Linear) else m for m in modules if isinstance(m, Linear | list)]
 
 
 def _matrix(values: Tensor) -> Tensor:

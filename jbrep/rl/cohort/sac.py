@@ -30,7 +30,7 @@ class SAC(Algorithm):
         self.target_entropy = float(agent.target_entropy)
         self.target_update_interval: int = agent.target_update_interval
         (self.actor,) = stack.networks(
-            lambda each: [[*each.actor.latent_pi, (each.actor.mu, each.actor.log_std)]]
+            lambda each: [[*each.actor.latent_pi, [each.actor.mu, each.actor.log_std]]]
         )
         self.critic = stack.networks(lambda each: each.critic.q_networks)
         self.critic_target = stack.networks(lambda each: each.critic_target.q_networks)

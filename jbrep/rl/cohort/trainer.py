@@ -35,7 +35,7 @@ def train_together(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
     for job in jobs:
         snapshot = job.checkpoint.read()
         groups[_kind(job, snapshot)].append((job, snapshot))
-        del snapshot  # it holds a whole replay memory
+        del snapshot  # it holds a whole replay buffer
     for job in jobs:  # now that no checkpoint of another run is there
         job.keep_encoder()
     for kind in sorted(groups):
