@@ -25,6 +25,7 @@ from jbrep.collect.derive import derive
 from jbrep.collect.policies import Uniform
 from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
+from jbrep.collect.shards import Simulator
 from jbrep.dataset import DamageError, Dataset
 from jbrep.dataset.formats import FORMATS, export
 from jbrep.dataset.manifest import new_manifest, read_manifest
@@ -209,7 +210,8 @@ def test_a_shard_that_fails_doesn_t_matter_until_it_is_needed():
     arguments = {"seed": episode_seed(SLEDGE, 3, 300)}
     task = describe("Sledges/Broken-v0", arguments)
     wide = some(task, steps=10**6, shard_episodes=300)
-    shards = backends.local(wide, Uniform(), 1, 2)(0, Missing(), lambda steps: None)
+    simulator = Simulator(wide, Uniform(), 1, 2)
+    shards = backends.local(simulator)(0, Missing(), lambda steps: None)
     assert len(next(shards)["episodes/seed"]) == 300
     with pytest.raises(InputError, match="Sledges/Broken-v0 failed at step 4"):
         next(shards)

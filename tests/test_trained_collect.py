@@ -12,6 +12,7 @@ from small import contents, settings
 from jbrep.collect import collect
 from jbrep.collect.backends import make_shard
 from jbrep.collect.derive import derive
+from jbrep.collect.shards import Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
@@ -102,7 +103,7 @@ def test_a_worker_makes_the_same_shard(runs, tmp_path):
     """Of a network that gives actions in [-1, 1] for what has been normalised before."""
     chosen, actor = some(runs / "sledge", tmp_path, task=SLEDGE, store_state=False, steps=80)
     gather(runs / "sledge", tmp_path / "data", {"num_threads": 1}, task=SLEDGE, store_state=False)
-    sent = pickle.loads(pickle.dumps((("environments",), chosen, actor, 1, 80)))
+    sent = pickle.loads(pickle.dumps((("environments",), Simulator(chosen, actor, 1, 1), 1, 80)))
     made, dataset = make_shard(*sent), Dataset(tmp_path / "data")
     start = dataset.manifest.shards[0].rows
     rows = slice(start, start + len(made["action"]))

@@ -2,42 +2,42 @@
 
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
-from jbrep.collect.policies import Policy
-from jbrep.collect.shards import Missing, Produce, shards_in_turn, simulate_shard
-from jbrep.dataset.schema import Columns, DataSettings
+from jbrep.collect.shards import Missing, Produce, Simulator
+from jbrep.dataset.schema import Columns
 from jbrep.envs.make import is_batched
 from jbrep.envs.names import import_modules, imported_modules
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, choose, first_line
 from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
 
-Backend = Callable[[DataSettings, Policy, int, int | None], Produce]
+Backend = Callable[[Simulator], Produce]
 
 
-def local(settings: DataSettings, policy: Policy, lanes: int, num_threads: int | None) -> Produce:
+def local(simulator: Simulator) -> Produce:
     """A batch's shards in turn on threads; other environments' side by side in processes."""
-    workers = num_threads or os.cpu_count() or 1
-    if is_batched(settings.task) or workers == 1:
-        return shards_in_turn(settings, policy, lanes, num_threads)
-    return _in_processes(settings, policy, workers)
+    workers = simulator.num_threads or os.cpu_count() or 1
+    if is_batched(simulator.settings.task) or workers == 1:
+        return simulator.in_turn
+    return _in_processes(replace(simulator, lanes=1, num_threads=1), workers)
 
 
-def _in_processes(settings: DataSettings, policy: Policy, workers: int) -> Produce:
+def _in_processes(simulator: Simulator, workers: int) -> Produce:
     """Shards made side by side, given in order; one whose worker is killed is made again."""
 
     def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
         if not missing.wants(first + 1):  # one shard alone
-            yield from shards_in_turn(settings, policy, 1, 1)(first, missing, tick)
+            yield from simulator.in_turn(first, missing, tick)
             return
         made: dict[int, Columns | str] = {}
         started, attempts = first, dict[int, int]()
         with Pool[int, Columns | str](make_shard, workers, lambda: None) as pool:
 
             def submit(shard: int) -> None:
-                pool.submit(shard, imported_modules(), settings, policy, shard, missing.rows)
+                pool.submit(shard, imported_modules(), simulator, shard, missing.rows)
 
             for shard in count(first):
                 while shard not in made:
@@ -64,12 +64,12 @@ def _in_processes(settings: DataSettings, policy: Policy, workers: int) -> Produ
 
 
 def make_shard(
-    modules: tuple[str, ...], settings: DataSettings, policy: Policy, shard: int, rows: int
+    modules: tuple[str, ...], simulator: Simulator, shard: int, rows: int
 ) -> Columns | str:
     """A shard, in a process of its own; the message of an error that a user can mend."""
     try:
         import_modules(modules)
-        return simulate_shard(settings, policy, shard, _stop_on_request, 1, 1, rows)
+        return simulator.shard(shard, _stop_on_request, rows)
     except InputError as error:
         return str(error)
 
@@ -86,7 +86,7 @@ def _stop_on_request(steps: int) -> None:
         raise SystemExit
 
 
-def on_ray(settings: DataSettings, policy: Policy, lanes: int, num_threads: int | None) -> Produce:
+def on_ray(simulator: Simulator) -> Produce:
     """Shards made side by side on the Ray cluster that RAY_ADDRESS names, or else on a local one.
 
     Only this process writes to the data set's folder. The shards of a node that dies are made
@@ -96,15 +96,14 @@ def on_ray(settings: DataSettings, policy: Policy, lanes: int, num_threads: int 
     def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
         import ray
 
-        make = on_cluster(make_shard, num_threads)
+        make = on_cluster(make_shard, simulator.num_threads)
+        alone = replace(simulator, lanes=1, num_threads=1)
         started, made = first, dict[int, Any]()
         try:
             for shard in count(first):
                 ahead = shard + 2 * int(ray.cluster_resources().get("CPU", 1))
                 while started == shard or (started < ahead and missing.wants(started)):
-                    made[started] = make.remote(
-                        imported_modules(), settings, policy, started, missing.rows
-                    )
+                    made[started] = make.remote(imported_modules(), alone, started, missing.rows)
                     started += 1
                 yield _columns(ray.get(made.pop(shard)))
         except ray.exceptions.RayError as error:

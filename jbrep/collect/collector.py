@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jbrep.collect.backends import get_backend
 from jbrep.collect.policies import Policy, make_policy
-from jbrep.collect.shards import LANES, Produce, simulate_shard
+from jbrep.collect.shards import LANES, Produce, Simulator
 from jbrep.dataset.manifest import (
     MANIFEST,
     Manifest,
@@ -76,7 +76,7 @@ def collect(
     policy.begin(settings.task, [0])  # may refuse the task
     settings = settings.replace(policy=policy.settings())
     check_counts(lanes, num_threads)
-    produce = get_backend(backend)(settings, policy, lanes, num_threads)
+    produce = get_backend(backend)(Simulator(settings, policy, lanes, num_threads))
     return write_shards(settings, folder, produce, policy.files())
 
 
@@ -253,6 +253,6 @@ def usual_shard_episodes(settings: DataSettings, folder: Path, policy: Policy | 
     if task.terminates is not False:
         policy = policy or make_policy(settings.policy)
         pilot = settings.replace(shard_episodes=_PILOT)
-        columns = simulate_shard(pilot, policy, 0, lambda steps: None)
+        columns = Simulator(pilot, policy).shard(0, lambda steps: None)
         length = columns[EPISODES + "length"].mean()
     return max(1, round((_BATCH_ROWS if is_batched(task) else _SHARD_ROWS) / length))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.collect.policies import Policy, make_policy
-from jbrep.collect.shards import LANES, simulate_shard
+from jbrep.collect.shards import LANES, Simulator
 from jbrep.dataset.manifest import (
     BACKUP,
     MANIFEST,
@@ -129,15 +129,8 @@ def _restore(
             "and actions lead to other states; collect again in another folder"
         )
     with Progress(total=entry.rows, unit="step", unit_scale=True, desc=path.name) as progress:
-        columns = simulate_shard(
-            settings,
-            make(settings.policy),
-            shard,
-            progress.update,
-            lanes,
-            num_threads,
-            most_episodes=entry.episodes,
-        )
+        simulator = Simulator(settings, make(settings.policy), lanes, num_threads)
+        columns = simulator.shard(shard, progress.update, most_episodes=entry.episodes)
     if column_hashes(columns) != entry.sha256:
         raise InputError(
             f"{path} can't be restored here: it comes out differently; use the machine it was made "

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import count
 from typing import Any, Protocol
 
@@ -33,95 +34,75 @@ class Missing(Protocol):
 Produce = Callable[[int, Missing, Tick], Iterator[Columns]]  # shards in order, from a number on
 
 
-def shards_in_turn(
-    settings: DataSettings, policy: Policy, lanes: int, num_threads: int | None
-) -> Produce:
-    """Make one shard after the other, each with all threads."""
+@dataclass(frozen=True)
+class Simulator:
+    """Makes the shards of a data set, each a function of its number and the settings alone.
 
-    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
-        for shard in count(first):
-            rows = missing.rows
-            yield simulate_shard(settings, policy, shard, tick, lanes, num_threads, rows)
-
-    return produce
-
-
-def simulate_shard(
-    settings: DataSettings,
-    policy: Policy,
-    shard: int,
-    tick: Tick,
-    lanes: int = LANES,
-    num_threads: int | None = None,
-    rows: float = math.inf,
-    most_episodes: int | None = None,
-) -> Columns:
-    """The columns of a shard: a function of its number and the settings only.
-
-    It ends early once it has enough rows: what it has is the beginning of the whole shard.
-
-    Args:
+    Attributes:
         settings: of the data set.
         policy: of the settings.
-        shard: its number.
-        tick: called with the number of steps made.
         lanes: environments of a batch, stepped at once.
         num_threads: threads to step a batch on; None takes one for each core.
-        rows: how many are enough.
-        most_episodes: how many of its episodes to make; None makes all.
     """
-    first = shard * settings.shard_episodes
-    episodes = np.arange(first, first + settings.shard_episodes)[:most_episodes]
-    size = _lanes_in_block(settings, lanes)
-    blocks = list(_blocks(settings, policy, episodes, size, tick, num_threads, rows))
-    return {name: np.concatenate([block[name] for block in blocks]) for name in settings.specs()}
 
+    settings: DataSettings
+    policy: Policy
+    lanes: int = LANES
+    num_threads: int | None = None
 
-def _lanes_in_block(settings: DataSettings, lanes: int) -> int:
-    """Episodes played side by side: those that would wait for the longest one cost time."""
-    if not is_batched(settings.task):
-        return 1
-    return max(1, min(lanes, settings.shard_episodes))
+    def in_turn(self, first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
+        """Make one shard after the other, each with all threads."""
+        for number in count(first):
+            yield self.shard(number, tick, missing.rows)
 
+    def shard(
+        self, number: int, tick: Tick, rows: float = math.inf, most_episodes: int | None = None
+    ) -> Columns:
+        """The columns of a shard.
 
-def _blocks(
-    settings: DataSettings,
-    policy: Policy,
-    episodes: Array,
-    size: int,
-    tick: Tick,
-    num_threads: int | None,
-    rows: float,
-) -> Iterator[Columns]:
-    """The columns of the episodes, some at a time, one in each lane, until there are enough."""
-    lanes: Lanes | None = None
-    while len(episodes) and rows > 0:
-        needed = math.ceil(min(rows / settings.task.max_episode_steps, len(episodes)))
-        block, episodes = np.split(episodes, [min(size, needed)])
-        if lanes is None or lanes.num_lanes != len(block):
-            lanes = Lanes(settings.task, len(block), num_threads)
-        columns = _simulate(settings, policy, block, lanes, tick)
-        rows -= len(columns["step"])
-        yield columns
-    if lanes is not None:
-        lanes.close()
+        It ends early once it has enough rows: what it has is the beginning of the whole shard.
 
+        Args:
+            number: of the shard.
+            tick: called with the number of steps made.
+            rows: how many are enough.
+            most_episodes: how many of its episodes to make; None makes all.
+        """
+        each = self.settings.shard_episodes
+        episodes = np.arange(number * each, (number + 1) * each)[:most_episodes]
+        blocks = list(self._blocks(episodes, tick, rows))
+        return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
 
-def _simulate(
-    settings: DataSettings, policy: Policy, episodes: Array, lanes: Lanes, tick: Tick
-) -> Columns:
-    """The columns of some episodes, one in each lane."""
-    task = settings.task
-    seeds = [episode_seed(task, settings.seed, int(episode)) for episode in episodes]
-    lanes.reset(range(lanes.num_lanes), seeds)
-    act = policy.begin(task, seeds)
-    recording = record(
-        lanes,
-        lambda observation: act(observation).astype(np.float32),  # as it is stored
-        tick,
-        read_states if settings.store_state else read_nothing,
-    )
-    return _columns(settings, recording, episodes, np.array(seeds))
+    def _blocks(self, episodes: Array, tick: Tick, rows: float) -> Iterator[Columns]:
+        """The columns of the episodes, some at a time, one in each lane, until there are enough."""
+        task = self.settings.task
+        lanes: Lanes | None = None
+        # side by side, other environments would wait for the longest episode
+        size = self.lanes if is_batched(task) else 1
+        while len(episodes) and rows > 0:
+            needed = math.ceil(min(rows / task.max_episode_steps, len(episodes)))
+            block, episodes = np.split(episodes, [min(size, needed)])
+            if lanes is None or lanes.num_lanes != len(block):
+                lanes = Lanes(task, len(block), self.num_threads)
+            columns = self._simulate(block, lanes, tick)
+            rows -= len(columns["step"])
+            yield columns
+        if lanes is not None:
+            lanes.close()
+
+    def _simulate(self, episodes: Array, lanes: Lanes, tick: Tick) -> Columns:
+        """The columns of some episodes, one in each lane."""
+        task = self.settings.task
+        seeds = [episode_seed(task, self.settings.seed, int(episode)) for episode in episodes]
+        lanes.reset(range(lanes.num_lanes), seeds)
+        act = self.policy.begin(task, seeds)
+        recording = record(
+            lanes,
+            lambda observation: act(observation).astype(np.float32),  # as it is stored
+            tick,
+            read_states if self.settings.store_state else read_nothing,
+        )
+        return _columns(self.settings, recording, episodes, np.array(seeds))
 
 
 def _columns(

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from jbrep.dataset.reader import Dataset
+from jbrep.dataset.scaling import extrema, mean_and_std
 from jbrep.dataset.settings import policy_text
 from jbrep.envs.task import Task
 from jbrep.text import facts, number, table
@@ -105,25 +106,15 @@ def _spread(values: Any) -> dict[str, float | None]:
 
 def _features(dataset: Dataset) -> list[dict[str, Any]]:
     """Unit, extrema, mean and standard deviation of each feature, and its nominal range."""
-    size = dataset.task.size
-    low, high = np.full(size, np.inf), np.full(size, -np.inf)
-    total, squares = np.zeros(size), np.zeros(size)
-    first = dataset["observation"][0].astype(np.float64)
-    for chunk in dataset["observation"].chunks():
-        shifted = chunk - first  # so that squares don't swamp a small spread
-        low = np.minimum(low, chunk.min(axis=0))
-        high = np.maximum(high, chunk.max(axis=0))
-        total += shifted.sum(axis=0)
-        squares += np.square(shifted).sum(axis=0)
-    mean = total / len(dataset)
-    std = np.sqrt(np.maximum(squares / len(dataset) - mean**2, 0))
+    column = dataset["observation"]
+    (low, high), (mean, std) = extrema(column.chunks()), mean_and_std(column.chunks())
     return [
         {
             "feature": feature.name,
             "unit": feature.unit,
             **{
                 name: _finite(values[i])
-                for name, values in zip(_HEADER[2:6], (low, first + mean, high, std), strict=True)
+                for name, values in zip(_HEADER[2:6], (low, mean, high, std), strict=True)
             },
             "nominal": [feature.low, feature.high],
         }

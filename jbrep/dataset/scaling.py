@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -136,12 +136,14 @@ def fit_scaler(
 
 
 def _extrema(task: Task, column: Column, rows: Rows) -> Range:
-    low = np.full(column.shape[1:], np.inf, column.dtype)
-    high = -low
-    for values in column.parts(rows):
-        low = np.minimum(low, values.min(axis=0))
-        high = np.maximum(high, values.max(axis=0))
-    return low, high
+    return extrema(column.parts(rows))
+
+
+def extrema(parts: Iterable[NDArray[Any]]) -> Range:
+    """Least and greatest values of rows (n, d) in parts, (d,) each."""
+    ends = [(values.min(axis=0), values.max(axis=0)) for values in parts]
+    low, high = zip(*ends, strict=True)
+    return np.min(low, axis=0), np.max(high, axis=0)
 
 
 def _nominal(task: Task, column: Column, rows: Rows) -> Range:
@@ -163,15 +165,21 @@ def usual_range(feature: Feature) -> tuple[float, float] | None:
 
 
 def _standard(task: Task, column: Column, rows: Rows) -> Range:
-    first = column[rows[:1]].astype(np.float64)  # taken off, to keep the digits of small spreads
-    total, squares = np.zeros(column.shape[1:]), np.zeros(column.shape[1:])
-    for values in column.parts(rows):
-        shifted = values - first
-        total += shifted.sum(axis=0)
-        squares += np.square(shifted).sum(axis=0)
-    mean = total / len(rows)
-    reach = _DEVIATIONS * np.sqrt(np.maximum(squares / len(rows) - mean**2, 0))
-    return first[0] + mean - reach, first[0] + mean + reach
+    mean, std = mean_and_std(column.parts(rows))
+    return mean - _DEVIATIONS * std, mean + _DEVIATIONS * std
+
+
+def mean_and_std(parts: Iterable[NDArray[Any]]) -> Range:
+    """Mean and standard deviation of rows (n, d) in parts, (d,) each."""
+    count, first, total, squares = 0, np.zeros(()), np.zeros(()), np.zeros(())
+    for values in parts:
+        first = first if count else values[0].astype(np.float64)
+        shifted = values - first  # to keep the digits of small spreads
+        total = total + shifted.sum(axis=0)
+        squares = squares + np.square(shifted).sum(axis=0)
+        count += len(values)
+    mean = total / count
+    return first + mean, np.sqrt(np.maximum(squares / count - mean**2, 0))
 
 
 def _robust(task: Task, column: Column, rows: Rows) -> Range:

@@ -1,11 +1,12 @@
 """One npz file: arrays as Gymnasium's users name them, or all columns as jbrep writes them."""
 
+import math
 import zipfile
 import zlib
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,17 +40,50 @@ _ONCE = {  # what is known once for each episode
 }
 
 
-class _Header(NamedTuple):
-    """How an array is stored."""
+class _Stored(NamedTuple):
+    """An array as it is stored, opened where its values begin."""
 
+    file: IO[bytes]
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    by_columns: bool  # Fortran's order
+    order: Literal["C", "F"]  # F where it is stored by columns
 
-    @property
-    def rows(self) -> int:
-        """How many there are; none of a single number."""
-        return self.shape[0] if self.shape else 0
+    def read(self, *shape: int) -> Array:
+        """The next values, as many as make an array of that shape."""
+        count = math.prod(shape)
+        content = self.file.read(count * self.dtype.itemsize)
+        return np.frombuffer(content, self.dtype, count).reshape(shape, order=self.order)
+
+
+@contextmanager
+def _opened(path: Path, archive: zipfile.ZipFile, name: str) -> Iterator[_Stored]:
+    """An array of the archive.
+
+    Raises:
+        InputError: it is damaged, also if that shows while it is read; or it has objects.
+    """
+    try:
+        with archive.open(f"{name}{_SUFFIX}") as file:
+            read = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }[np.lib.format.read_magic(file)]
+            shape, by_columns, dtype = read(file)
+            if dtype.hasobject:
+                raise InputError(
+                    f"{path} has objects in {name}, which would have to be unpickled, and that "
+                    "can run code: save it as an array of plain numbers"
+                )
+            size = archive.getinfo(f"{name}{_SUFFIX}").file_size - file.tell()
+            if math.prod(shape) * dtype.itemsize != size:
+                raise ValueError
+            yield _Stored(file, shape, dtype, "F" if by_columns else "C")
+    except InputError:
+        raise
+    except _DAMAGE:
+        raise InputError(
+            f"{path} is damaged: {name} is no array, or has other bytes than its shape and type say"
+        ) from None
 
 
 def open_source(given: str) -> Source:
@@ -58,28 +92,26 @@ def open_source(given: str) -> Source:
     Raises:
         InputError: it isn't one, or can't be used; nothing in it is unpickled.
     """
-    name, path = given, Path(given)
+    path, stored = Path(given), dict[str, _Stored]()
     with _archive(path) as archive:
-        headers = {
-            member.removesuffix(_SUFFIX): _header(path, archive, member)
-            for member in archive.namelist()
-            if member.endswith(_SUFFIX)
-        }
-        own = own_names(name, headers)
-        check_names(name, own)
-        chosen = {column: headers[own[column]] for column in own}
-        check_lengths(name, {column: header.rows for column, header in chosen.items()})
-        for column, header in chosen.items():
-            check_kind(name, column, header.dtype, header.shape[1:])
-        known = _once(path, archive, headers)
-        features = _features(path, archive, headers)
-    members = {column: f"{own[column]}{_SUFFIX}" for column in own}
+        for member in archive.namelist():
+            if member.endswith(_SUFFIX):
+                name = member.removesuffix(_SUFFIX)
+                with _opened(path, archive, name) as stored[name]:
+                    pass
+        own = own_names(given, stored)
+        check_names(given, own)
+        lengths = {column: (*stored[name].shape, 0)[0] for column, name in own.items()}
+        check_lengths(given, lengths)
+        for column, name in own.items():
+            check_kind(given, column, stored[name].dtype, stored[name].shape[1:])
+        known = _once(path, archive, stored)
+        features = _features(path, archive, stored)
 
     def episodes() -> Iterator[Incoming]:
-        return split(name, _chunks(path, members), known)
+        return split(given, _chunks(path, own), known)
 
-    rows = headers[own["reward"]].rows
-    return Source(name, label(path.stem), episodes, features=features, rows=rows)
+    return Source(given, label(path.stem), episodes, features=features, rows=lengths["reward"])
 
 
 def _archive(path: Path) -> zipfile.ZipFile:
@@ -90,117 +122,49 @@ def _archive(path: Path) -> zipfile.ZipFile:
         raise InputError(f"{path} can't be read as an npz file: {reason}") from None
 
 
-def _opened(path: Path, archive: zipfile.ZipFile, member: str) -> IO[bytes]:
-    try:
-        return archive.open(member)
-    except _DAMAGE as error:
-        raise InputError(f"{path} is damaged: {member} can't be opened: {error}") from None
-
-
-def _header(path: Path, archive: zipfile.ZipFile, member: str) -> _Header:
-    with _opened(path, archive, member) as file:
-        header = _read_header(path, member, file)
-        size = archive.getinfo(member).file_size - file.tell()
-    if header.dtype.hasobject:
-        raise InputError(
-            f"{path} has objects in {member.removesuffix(_SUFFIX)}, which would have to be "
-            "unpickled, and that can run code: save it as an array of plain numbers"
-        )
-    if int(np.prod(header.shape, dtype=object)) * header.dtype.itemsize != size:
-        raise _cut_short(path, member)
-    return header
-
-
-def _read_header(path: Path, member: str, file: IO[bytes]) -> _Header:
-    try:
-        version = np.lib.format.read_magic(file)
-        read = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }[version]
-        shape, by_columns, dtype = read(file)
-    except _DAMAGE:
-        raise InputError(f"{path} has no array in {member}: it must be a NumPy file") from None
-    return _Header(shape, dtype, by_columns and len(shape) > 1)
-
-
-def _cut_short(path: Path, member: str) -> InputError:
-    name = member.removesuffix(_SUFFIX)
-    return InputError(f"{path} is damaged: {name} has other bytes than its shape and type say")
-
-
-def _chunks(path: Path, members: dict[str, str]) -> Iterator[Rows]:
+def _chunks(path: Path, own: dict[str, str]) -> Iterator[Rows]:
     """The columns, some rows at a time."""
-    with ExitStack() as stack:
-        archive = stack.enter_context(_archive(path))
-        streams = {
-            name: _stream(path, member, stack.enter_context(_opened(path, archive, member)))
-            for name, member in members.items()
-        }
-        for chunk in zip(*streams.values(), strict=True):
-            yield dict(zip(streams, chunk, strict=True))
+    with _archive(path) as archive:
+        streams = [_stream(path, archive, name) for name in own.values()]
+        for chunk in zip(*streams, strict=True):
+            yield dict(zip(own, chunk, strict=True))
 
 
-def _stream(path: Path, member: str, file: IO[bytes]) -> Iterator[Array]:
+def _stream(path: Path, archive: zipfile.ZipFile, name: str) -> Iterator[Array]:
     """An array's rows in chunks; read at once if it is stored by columns."""
-    header = _read_header(path, member, file)
-    count, *row = header.shape
-    width = int(np.prod(row, dtype=object))
-    whole = None
-    if header.by_columns:
-        content = _read(path, member, file, count * width * header.dtype.itemsize)
-        whole = np.frombuffer(content, header.dtype).reshape(header.shape, order="F")
-    for start in range(0, count, CHUNK):
-        rows = min(CHUNK, count - start)
-        if whole is None:
-            content = _read(path, member, file, rows * width * header.dtype.itemsize)
-            chunk = np.frombuffer(content, header.dtype).reshape(rows, *row)
-        else:
-            chunk = whole[start : start + rows]
-        yield chunk
-
-
-def _read(path: Path, member: str, file: IO[bytes], size: int) -> bytes:
-    try:
-        content = file.read(size)
-    except _DAMAGE:
-        raise _cut_short(path, member) from None
-    if len(content) != size:
-        raise _cut_short(path, member)
-    return content
-
-
-def _once(path: Path, archive: zipfile.ZipFile, headers: dict[str, _Header]) -> PerEpisode:
-    """What is known once for each episode."""
-    arrays: dict[str, Array] = {}
-    for column, aliases in _ONCE.items():
-        for alias in aliases:
-            if alias in headers:
-                arrays[column] = _whole(path, archive, alias)
-    return PerEpisode.of(str(path), arrays)
-
-
-def _features(
-    path: Path, archive: zipfile.ZipFile, headers: dict[str, _Header]
-) -> tuple[Feature, ...]:
-    """Names and units, if there are any."""
-    if "feature_names" not in headers:
-        return ()
-    names = [str(name) for name in _whole(path, archive, "feature_names").ravel()]
-    units = [""] * len(names)
-    if "feature_units" in headers:
-        units = [str(unit) for unit in _whole(path, archive, "feature_units").ravel()]
-    if len(units) != len(names):
-        raise InputError(f"{path} has {len(names)} feature names and {len(units)} units")
-    return tuple(Feature(name, unit) for name, unit in zip(names, units, strict=True))
+    with _opened(path, archive, name) as stored:
+        count, *row = stored.shape
+        most = CHUNK if stored.order == "C" else max(1, count)
+        for start in range(0, count, most):
+            values = stored.read(min(most, count - start), *row)
+            for first in range(0, len(values), CHUNK):
+                yield values[first : first + CHUNK]
 
 
 def _whole(path: Path, archive: zipfile.ZipFile, name: str) -> Array:
-    with _opened(path, archive, f"{name}{_SUFFIX}") as file:
-        try:
-            return np.lib.format.read_array(file, allow_pickle=False)
-        except _DAMAGE:
-            raise _cut_short(path, name) from None
+    with _opened(path, archive, name) as stored:
+        return stored.read(*stored.shape)
+
+
+def _once(path: Path, archive: zipfile.ZipFile, names: Collection[str]) -> PerEpisode:
+    """What is known once for each episode."""
+    chosen = {
+        column: alias for column, aliases in _ONCE.items() for alias in aliases if alias in names
+    }
+    arrays = {column: _whole(path, archive, name) for column, name in chosen.items()}
+    return PerEpisode.of(str(path), arrays)
+
+
+def _features(path: Path, archive: zipfile.ZipFile, names: Collection[str]) -> tuple[Feature, ...]:
+    """Names and units, if there are any."""
+    given, units = (
+        [str(word) for word in _whole(path, archive, name).ravel()] if name in names else []
+        for name in ("feature_names", "feature_units")
+    )
+    if units and len(units) != len(given):
+        raise InputError(f"{path} has {len(given)} feature names and {len(units)} units")
+    both = zip(given, units or [""] * len(given), strict=True)
+    return tuple(Feature(name=name, unit=unit) for name, unit in both)
 
 
 def write(dataset: Dataset, out: Path) -> str:
