@@ -36,27 +36,33 @@ from jbrep.study.representations import (
 from jbrep.text import slug
 
 _MOST_SEEDS = (1 << 16) - 1
+Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
 _ANY_TASK = TASKS["face_direction"].describe()
 
 
 class Data(Record, frozen=True, kw_only=True):
     """The data set that encoders are trained on: collected for the study, or an existing one."""
 
-    steps: Annotated[int, Meta(ge=0, le=MAX_STEPS, description="To collect for each task.")] = 0
+    steps: Annotated[
+        int, Meta(ge=0, le=MAX_STEPS, description="Of states to collect for the encoders.")
+    ] = 0
     seed: Annotated[
-        int, Meta(ge=0, le=MAX_ROOT_SEED - MAX_ENCODERS, description="Of the data.")
+        int, Meta(ge=0, le=MAX_ROOT_SEED - MAX_ENCODERS, description="Of the first data set.")
     ] = 0
     sets: Annotated[
         int,
         Meta(
             ge=1,
             le=MAX_ENCODERS,
-            description="To collect, of seed, seed + 1, ...; encoder i of several learns from set "
-            "i.",
+            description="Data sets of that size, of the seeds that follow.",
         ),
     ] = 1
     folder: Annotated[
-        str, Meta(description="A data set, or a folder with one for each task, instead.")
+        str,
+        Meta(
+            description="Existing data in place of steps: a data set, or a folder with TASK for "
+            "each task."
+        ),
     ] = ""
 
     def check(self) -> None:
@@ -78,22 +84,36 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
 
     tasks: Annotated[
         tuple[str, ...],
-        Meta(min_length=1, description="The Jitterbug's by their names, others by their ids."),
+        Meta(
+            min_length=1,
+            title="a list of names",
+            description="The Jitterbug's by name, others by their Gymnasium ids.",
+        ),
     ]
     algorithms: Annotated[
         tuple[str, ...],
-        Meta(min_length=1, description="With presets, or tables of hyperparameters by a name."),
+        Meta(
+            min_length=1,
+            title="a list of names, or tables",
+            description="ddpg, td3, sac, ppo, a2c, trpo, tqc, crossq, each also with a preset, "
+            "sac-modern; or a table of settings for each.",
+        ),
     ]
     representations: Annotated[
         tuple[Given, ...],
-        Meta(min_length=1, description="Names, and tables of users' own encoders."),
+        Meta(
+            min_length=1,
+            title="a list of names and tables",
+            description="full, encoders by name, or tables: name with file, code, kind and its "
+            "settings, or encoders.",
+        ),
     ]
     seeds: Annotated[
-        tuple[Annotated[int, Meta(ge=0, le=MAX_SEED)], ...],
+        tuple[Seed, ...],
         Meta(
             min_length=1,
             title=f"a list of whole numbers, or how many (1 to {_MOST_SEEDS:,})",
-            description="Of runs.",
+            description="Of the runs.",
         ),
     ]
     episode_steps: Annotated[
@@ -101,21 +121,27 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         Meta(description="The time limit.", extra={"default": "each task's own"}),
     ] = None
     environment: Annotated[
-        Mapping[str, Any], Meta(description="A table of arguments of the environments.")
+        Mapping[str, Any], Meta(description="Arguments of all environments.")
     ] = {}
-    data: Annotated[
-        Data | None,
-        Meta(description="What encoders are trained on.", extra={"default": "those that ship"}),
-    ] = None
+    data: Data | None = None  # None: the shipped encoders
     training: Annotated[
-        Mapping[str, Any], Meta(description="Settings of the encoders, other than the usual.")
+        Mapping[str, Any],
+        Meta(
+            description="Settings of the encoders that the study trains: epochs, batch_size, "
+            "learning_rate, noise, seed.",
+            extra={"default": "each method's own"},
+        ),
     ] = {}
     learners: Mapping[str, Mapping[str, Any]] = {}  # the tables of algorithms, by name
     evaluations: Annotated[
         tuple[str, ...],
-        Meta(description="Folders from jbrep evaluate; {task} is each task's name."),
+        Meta(
+            title="a list of folders",
+            description="From jbrep evaluate, whose diagnostics the report sets against returns; "
+            "{task} stands for each task's name.",
+        ),
     ] = ()
-    verdicts: Annotated[Mapping[str, Any], Meta(description="A table of rules.")] = {}
+    verdicts: Mapping[str, Any] = {}  # as `Rules` has them
 
     def check(self) -> None:
         """As for `Record`."""
