@@ -24,7 +24,7 @@ def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):
     """One cluster for both: it takes seconds to start."""
     pytest.importorskip("ray")
     told = subprocess.run(
-        [sys.executable, Path(__file__).with_name("cluster.py"), tmp_path],
+        [sys.executable, Path(__file__).parent / "helpers" / "cluster.py", tmp_path],
         capture_output=True,
         text=True,
         timeout=600,

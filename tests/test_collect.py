@@ -225,7 +225,7 @@ def test_an_episode_ends_where_its_physics_goes_non_finite(tmp_path, brief):
 
 
 def test_kills_lose_at_most_the_open_shard(tmp_path):
-    """`python tests/kills.py 200` does many more."""
+    """`python tests/helpers/kills.py 200` does many more."""
     assert kill_and_resume(3, tmp_path, seed=0).kills == 3
 
 
@@ -237,7 +237,7 @@ def test_a_kill_at_any_stage_of_a_commit(stage, collected, tmp_path):
     folder = tmp_path / "data"
     script = f"""
 import os, sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path.insert(0, {str(Path(__file__).parent / "helpers")!r})
 from pathlib import Path
 from small import write_again
 left = {stage + 1 + 8 + 12}  # eight calls make the first manifest, twelve each shard

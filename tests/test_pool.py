@@ -15,7 +15,7 @@ from jbrep.pool import Pool, stop_requested
 
 PARENT = """
 import sys
-sys.path.insert(0, {tests!r})
+sys.path[:0] = {tests!r}
 from test_pool import Pool, hang
 if __name__ == "__main__":
     with Pool(hang, 2, lambda: None) as pool:
@@ -111,7 +111,7 @@ def test_an_interrupted_stop_ends_jobs_at_once(tmp_path):
 @pytest.mark.parametrize("delay", [0.05, 0.2, 0.6])
 def test_no_worker_outlives_its_parent(delay, tmp_path):
     """Killed while its workers start, or when they are at work."""
-    script = PARENT.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    script = PARENT.format(tests=sys.path, folder=str(tmp_path))
     process = subprocess.Popen([sys.executable, "-c", script])
     assert wait_for(lambda: workers_of(process.pid), process)
     time.sleep(delay)

@@ -20,7 +20,7 @@ from jbrep.study.plan import Plan
 from jbrep.study.results import conclude
 from jbrep.study.study import register_study
 
-DOCS = Path(__file__).parent.parent / "docs" / "studies.md"
+DOCS = Path(__file__).parent.parent / "docs" / "verdicts.md"
 
 
 @pytest.fixture(scope="module")

@@ -119,7 +119,7 @@ def test_a_recording_shows_the_agent_that_was_evaluated(peace, tmp_path):
 
 @pytest.mark.usefixtures("one_figure")
 def test_killed_in_every_stage_it_comes_to_the_same_end(peace, tmp_path):
-    """`python tests/pipeline.py 20` kills at twenty times as many points."""
+    """`python tests/helpers/pipeline.py 20` kills at twenty times as many points."""
     told = killed(tmp_path / "killed", 6, peace[0])  # the study's workers are at work then
     found, expected = ends(tmp_path / "killed"), ends(peace[0])
     assert found.keys() == expected.keys(), told

@@ -1,4 +1,4 @@
-"""Kill a collector at random times and let it go on: python tests/kills.py 200."""
+"""Kill a collector at random times and let it go on: python tests/helpers/kills.py 200."""
 
 import signal
 import subprocess

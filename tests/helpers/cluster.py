@@ -1,4 +1,4 @@
-"""A study and a data set on a Ray cluster that loses a node: python tests/cluster.py OUT."""
+"""A study and data on a Ray cluster that loses a node: python tests/helpers/cluster.py OUT."""
 
 import sys
 import time

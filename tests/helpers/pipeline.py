@@ -1,4 +1,4 @@
-"""From states to a study at toy size, undisturbed or killed: python tests/pipeline.py 20."""
+"""From states to a toy study, undisturbed or killed: python tests/helpers/pipeline.py 20."""
 
 import shutil
 import signal
