@@ -33,7 +33,7 @@ from jbrep.rl.presets import ALGORITHMS, PRESETS, get_preset
 
 CART = describe(cart.ID)
 PENDULUM, HOPPER = describe("Pendulum-v1", max_episode_steps=50), describe("Hopper-v5")
-FAILING = dataclasses.replace(CART, arguments={"fail_seed": training_seed(0) + 3})
+FAILING = CART.replace(arguments={"fail_seed": training_seed(0) + 3})
 
 
 SHORTER = {
