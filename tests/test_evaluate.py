@@ -24,8 +24,14 @@ from jbrep.evaluate import diagnose, diagnosis
 from jbrep.evaluate.diagnosis import seen, write
 from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.held_out import MAX_NUMBERS, HeldOut, sample_rows
-from jbrep.evaluate.latent import intrinsic_dimension, latent_units
-from jbrep.evaluate.readout import correlation, dynamics, neighbours, probes
+from jbrep.evaluate.readout import (
+    correlation,
+    dynamics,
+    intrinsic_dimension,
+    latent_units,
+    neighbours,
+    probes,
+)
 from jbrep.evaluate.reconstruction import NOISES, corruption, reconstruction
 from jbrep.evaluate.truth import quantities, state
 from jbrep.jitterbug.tasks import TASKS

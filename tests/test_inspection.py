@@ -172,9 +172,8 @@ def test_poses_are_the_episodes(entities, rollout):
 def test_the_timelines(entities):
     entity = entities["/observation/position"]
     np.testing.assert_array_equal(entity["step"].to_numpy(), np.arange(ROWS))
-    np.testing.assert_array_equal(
-        entity["time"].to_numpy(zero_copy_only=False) / np.timedelta64(10, "ms"), np.arange(ROWS)
-    )
+    time = entity["time"].to_numpy(zero_copy_only=False) / np.timedelta64(10, "ms")
+    np.testing.assert_array_equal(time, np.arange(ROWS))
     assert entities["/action"]["step"].to_numpy()[-1] == ROWS - 2
     assert entities["/reward/total"]["step"].to_numpy()[0] == 1
 
@@ -242,9 +241,8 @@ def test_what_is_decoded(entities, rollout):
 
 def test_an_encoder_that_keeps_all_gives_the_robot_back(unchanged):
     found, true = read(unchanged), find_episode(POSE)
-    (place, turned), (there, attitude) = (
-        poses(found[f"/world/{which}/jitterbug"]) for which in ("ghost", "robot")
-    )
+    place, turned = poses(found["/world/ghost/jitterbug"])
+    there, attitude = poses(found["/world/robot/jitterbug"])
     up_to_sign = np.where((turned * attitude).sum(axis=1, keepdims=True) < 0, -1, 1)
     np.testing.assert_allclose(place, there, atol=1e-5)
     np.testing.assert_allclose(turned * up_to_sign, attitude, atol=1e-5)
@@ -283,13 +281,9 @@ def test_recordings_are_small_and_bring_their_layout(recording, request):
     assert path.stat().st_size < 6e6
     (layout,) = RrdReader(path).blueprints()
     assert layout.application_id == "jbrep"
-    played = {
-        name: column.to_pylist()
-        for chunk in RrdReader(path).stream(store=layout)
-        if str(chunk.entity_path) == "/time_panel"
-        for name, column in columns(chunk).items()
-    }
-    assert played["TimePanelBlueprint:play_state"] == [[2]]  # playing
+    chunks = [columns(chunk) for chunk in RrdReader(path).stream(store=layout)]
+    name = "TimePanelBlueprint:play_state"
+    assert [each[name].to_pylist() for each in chunks if name in each] == [[[2]]]  # playing
 
 
 def test_the_provenance(entities, rollout):
@@ -503,13 +497,9 @@ def test_forecasts_and_directions_are_recorded(entities, rollout, recorded):
     assert len(directions) == 8
     assert names(entities["/latent/directions/slow_1"])[0].startswith("slow 1: ")
     reader = RrdReader(recorded)
-    titles = {
-        title
-        for chunk in reader.stream(store=reader.blueprints()[0])
-        for name, column in columns(chunk).items()
-        if name.endswith(":display_name")
-        for title in column.to_pylist()[0] or ()
-    }
+    layout = [columns(chunk) for chunk in reader.stream(store=reader.blueprints()[0])]
+    named = [each[name] for each in layout for name in each if name.endswith(":display_name")]
+    titles = {title for column in named for title in column.to_pylist()[0] or ()}
     assert {"forecasts", "slow and fast directions"} < titles
     assert any(re.fullmatch(r"heading cos: R² -?\d+\.\d\d over 10 steps", each) for each in titles)
 
@@ -724,11 +714,9 @@ def write_study(folder):
             run = folder / "runs" / representation / f"seed-{seed}"
             run.mkdir(parents=True)
             write_end(run, representation, seed, FAILED if failed else FINISHED)
-            rows = [
-                Evaluation(step, episode, float(random.uniform(0, 1000)))
-                for step in ((0, 100) if failed else (0, 100, 200, 300))
-                for episode in (0, 1)
-            ]
+            steps = (0, 100) if failed else (0, 100, 200, 300)
+            starts = [(step, episode) for step in steps for episode in (0, 1)]
+            rows = [Evaluation(*start, float(random.uniform(0, 1000))) for start in starts]
             write_rows(run / "evaluations.csv", rows, Evaluation)
     return folder
 
@@ -778,10 +766,8 @@ def test_a_run_under_way_shows_its_checkpoint(tmp_path):
     settings |= {"evaluation_episodes": 1, "episode_steps": 50}
     preset = Preset(settings["hidden"], {})
     agent = make_agent("a2c", preset, make_env("face_direction", 1, 0, encoder), seed=0)
-    weights = {
-        f"parameters.policy.{name}": np.ascontiguousarray(value.numpy())
-        for name, value in agent.policy.state_dict().items()
-    }
+    state = agent.policy.state_dict().items()
+    weights = {f"parameters.policy.{n}": np.ascontiguousarray(v.numpy()) for n, v in state}
     header = {"identity": settings, "counters": {"num_timesteps": 12_000}, "record": {}}
     container.write(tmp_path / CHECKPOINT, weights, header)
     save(encoder, tmp_path / ENCODER)

@@ -1,6 +1,7 @@
 """What a controller needs of the state: a good policy's action and value, and what a code loses."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -12,8 +13,7 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.evaluate.evaluation import Action, Lost, Score, Scores
 from jbrep.evaluate.held_out import HeldOut, Rows, explained, sample_rows
 from jbrep.evaluate.prediction import Matters, following
-from jbrep.evaluate.readout import ridge
-from jbrep.evaluate.regression import Networks, Predictor, Problem
+from jbrep.evaluate.regression import Networks, Predictor, Problem, ridge
 from jbrep.stats.bootstrap import Array, by_episode
 
 GAMMA = 0.99
@@ -42,6 +42,7 @@ class PlayedEpisode(NamedTuple):
     terminated: bool
 
 
+@dataclass(frozen=True, eq=False)
 class GoodPolicy:
     """A policy, and what it did in some episodes.
 
@@ -49,35 +50,31 @@ class GoodPolicy:
         name: of the policy.
         act: its actions (n, k) from observations (n, d) in physical units.
         episodes: that it played.
-
-    Attributes:
-        name: as given.
-        act: as given.
     """
 
-    def __init__(
-        self,
-        name: str,
-        act: Callable[[NDArray[Any]], NDArray[Any]],
-        episodes: Sequence[PlayedEpisode],
-    ):
-        self.name, self.act = name, act
-        self._episodes = [episode for episode in episodes if _known(episode)]
+    name: str
+    act: Callable[[NDArray[Any]], NDArray[Any]]
+    episodes: Sequence[PlayedEpisode]
+
+    @cached_property
+    def _known(self) -> list[PlayedEpisode]:
+        """The episodes with steps whose return to go is known."""
+        return [episode for episode in self.episodes if _known(episode)]
 
     @cached_property
     def fitted_on(self) -> "States":
         """States of two thirds of the episodes."""
-        return States([e for i, e in enumerate(self._episodes) if i % _EVERY])
+        return States([episode for i, episode in enumerate(self._known) if i % _EVERY])
 
     @cached_property
     def judged_on(self) -> "States":
         """States of the others."""
-        return States(self._episodes[::_EVERY])
+        return States(self._known[::_EVERY])
 
     @property
     def has_value(self) -> bool:
         """Whether there are episodes to fit to and to judge on."""
-        return len(self._episodes) > 1
+        return len(self._known) > 1
 
 
 class States:

@@ -21,7 +21,6 @@ from jbrep.evaluate import control, prediction, readout
 from jbrep.evaluate.control import GoodPolicy, Needs, lost, needs
 from jbrep.evaluate.evaluation import EVALUATION, Diagnostics, Evaluation, JudgedOn
 from jbrep.evaluate.held_out import HeldOut
-from jbrep.evaluate.latent import latent_units
 from jbrep.evaluate.reconstruction import corruption, reconstruction
 from jbrep.evaluate.regression import Networks, beside, fit
 from jbrep.progress import Progress
@@ -173,7 +172,7 @@ _DIAGNOSTICS: dict[str, Callable[[_Judged], Any]] = {
         reconstruction(e.encoder, e.held_out) if e.encoder.can_decode else None
     ),
     "corruption": lambda e: corruption(e.encoder, e.held_out) if e.encoder.can_decode else None,
-    "latent_units": lambda e: latent_units(e.encoder, e.held_out),
+    "latent_units": lambda e: readout.latent_units(e.encoder, e.held_out),
     "probes": lambda e: readout.probes(e.encoder, e.held_out),
     "neighbours": lambda e: readout.neighbours(e.encoder, e.held_out),
     "correlation": lambda e: readout.correlation(e.encoder, e.held_out),

@@ -1,4 +1,4 @@
-"""What can be read from a latent: the robot's state, and what comes next.
+"""What a latent looks like, and what can be read from it: the robot's state, what comes next.
 
 Everything is measured on samples of rows, fewer where rows are wide: no array has more than
 MAX_NUMBERS numbers.
@@ -11,11 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.scaled import sample
+from jbrep.encoders import Encoder
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Task
 from jbrep.evaluate.evaluation import (
     Correlation,
     Dynamics,
+    IntrinsicDimension,
+    LatentUnits,
     Neighbours,
     Score,
     Scores,
@@ -30,9 +33,9 @@ from jbrep.evaluate.held_out import (
     explained,
     sample_rows,
 )
-from jbrep.evaluate.regression import Predictor, Problem
+from jbrep.evaluate.regression import Predictor, Problem, ridge
 from jbrep.evaluate.truth import Columns, quantities, quantities_and_features, state
-from jbrep.stats.bootstrap import Array, bootstrap, variation
+from jbrep.stats.bootstrap import Array, bootstrap, variation, without_nan
 
 _ROWS = 100_000  # at most, to fit on and to judge on
 _CORRELATED = 50_000  # held-out rows
@@ -41,8 +44,77 @@ _REFERENCES = 20_000  # training rows among which they are
 _NEIGHBOURS = 5
 _NEGLIGIBLE = 1e-6  # variance, as a share of the largest
 _ROUNDING = 1e-12  # variance that rounding alone can cause
-_PENALTY = 1.0  # of the ridge, on standardised latents
+_UNIT_ROWS = 200_000  # held-out rows
+_POINTS = 4_000  # for intrinsic dimensions
+_SATURATED = 0.95  # magnitude of a tanh unit
+_DEAD = 0.01  # standard deviation, as a share of the most variable unit's
+_STILL = 1e-6  # standard deviation that rounding alone can cause
+_MLE_NEIGHBOURS = 20  # of the maximum-likelihood estimator
 _UNKNOWN = Score(None, None, None)
+
+
+def latent_units(encoder: BaseEncoder, held_out: HeldOut) -> LatentUnits:
+    """Units, their correlations, and dimensions of the latent, over a sample of held-out rows.
+
+    At most 200,000 rows, fewer where the latent has more than 41 units; for the intrinsic dimension
+    4,000. The participation ratio is (sum of the covariance's eigenvalues)^2 / sum of their
+    squares.
+    """
+    rows = sample_rows(held_out.data.test, _UNIT_ROWS, encoder.latent_size)
+    values = encode(encoder, held_out, rows).astype(np.float64)
+    deviation = values.std(axis=0)
+    live = deviation > max(_DEAD * deviation.max(), _STILL)
+    return LatentUnits(
+        mean=values.mean(axis=0).tolist(),
+        variance=(deviation**2).tolist(),
+        dead=tuple(np.flatnonzero(~live).tolist()),
+        saturation=_saturation(encoder, values),
+        correlation=_unit_correlation(values, live),
+        participation_ratio=_participation(values) if live.any() else None,
+        intrinsic_dimension=intrinsic_dimension(sample(values, _POINTS)),
+    )
+
+
+def encode(encoder: BaseEncoder, held_out: HeldOut, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Latents of those rows, (n, l)."""
+    return np.concatenate([encoder.encode(chunk) for chunk in held_out.data.observations(rows)])
+
+
+def _participation(values: NDArray[np.float64]) -> float:
+    spectrum = np.linalg.eigvalsh(np.atleast_2d(np.cov(values.T)))
+    return float(spectrum.sum() ** 2 / np.square(spectrum).sum())
+
+
+def _saturation(encoder: BaseEncoder, values: NDArray[np.float64]) -> tuple[float, ...] | None:
+    """The share of rows in which each tanh unit is saturated; None for another latent."""
+    layers = encoder.encoder if isinstance(encoder, Encoder) else ()
+    if not layers or layers[-1].activation != "tanh":
+        return None
+    return tuple((np.abs(values) > _SATURATED).mean(axis=0).tolist())
+
+
+def _unit_correlation(values: NDArray[np.float64], live: NDArray[np.bool_]) -> Any:
+    """Pearson's correlation of the units, (l, l); None for dead ones."""
+    matrix = np.full((len(live), len(live)), np.nan)
+    matrix[np.ix_(live, live)] = np.corrcoef(values[:, live].T)
+    return without_nan(matrix.tolist())
+
+
+def intrinsic_dimension(values: NDArray[Any]) -> IntrinsicDimension:
+    """Estimates of how many dimensions points (n, k) fill locally, from scikit-dimension.
+
+    TwoNN (Facco et al. 2017) and the maximum likelihood of Levina and Bickel (2005). None where
+    there are too few distinct points.
+    """
+    from skdim.id import MLE, TwoNN  # not at the top: it takes seconds
+
+    points = np.unique(values, axis=0)
+    if len(points) <= 2 * _MLE_NEIGHBOURS:
+        return IntrinsicDimension(two_nn=None, mle=None)
+    points = np.pad(points, ((0, 0), (0, 1)))  # the library refuses a single column
+    estimates = TwoNN().fit(points).dimension_, MLE(K=_MLE_NEIGHBOURS).fit(points).dimension_
+    two_nn, mle = without_nan([float(estimate) for estimate in estimates])
+    return IntrinsicDimension(two_nn=two_nn, mle=mle)
 
 
 def probes(encoder: BaseEncoder, held_out: HeldOut) -> Scores:
@@ -150,17 +222,6 @@ def _whitening(latents: NDArray[Any]) -> Callable[[NDArray[Any]], Array]:
     scales = np.where(kept, 1 / np.sqrt(np.where(kept, variances, 1)), 0)
     matrix = (directions * scales)[:, kept | (np.arange(len(kept)) == len(kept) - 1)]
     return lambda values: (values - mean) @ matrix
-
-
-def ridge(values: NDArray[Any], wanted: NDArray[Any]) -> Predictor:
-    """Ridge regressions of all columns (n, k) on standardised values (n, l), as a map."""
-    from sklearn.linear_model import Ridge  # not at the top: it takes seconds
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-
-    model = make_pipeline(StandardScaler(), Ridge(_PENALTY))
-    model.fit(values.astype(np.float64), wanted)  # features may be as good as collinear
-    return lambda others: model.predict(others.astype(np.float64)).reshape(len(others), -1)
 
 
 def neighbours(encoder: BaseEncoder, held_out: HeldOut) -> Neighbours:

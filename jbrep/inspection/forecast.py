@@ -11,8 +11,7 @@ from jbrep.dataset import Dataset
 from jbrep.dataset.scaled import sample
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Array, Task
-from jbrep.evaluate.readout import ridge
-from jbrep.evaluate.regression import Predictor
+from jbrep.evaluate.regression import Predictor, ridge
 from jbrep.evaluate.truth import state
 from jbrep.play.rollout import Rollout
 

@@ -129,25 +129,15 @@ def send_encoding(
     if decoded is not None:
         path = "reconstruction"
         send_features(recording, path, times, rollout.task, decoded, _decoded, is_faint=True)
-        _send_errors(recording, times, rollout, encoder.scale(decoded), encoder)
+        true = encoder.scale(rollout.observation.astype(np.float64))
+        errors = encoder.scale(decoded) - true
+        send_features(recording, "error", times, rollout.task, errors.astype(np.float32), _scaled)
+        total = np.sqrt(np.square(errors).mean(axis=1, keepdims=True))
+        recording.send_series("error/total", times, total, ["root mean square [scaled]"])
     names = [f"unit {i}" for i in range(encoder.latent_size)]
     for name, place in latent_panels(encoder.latent_size):
         recording.send_series(f"latent/{name}", times, latent[:, place], names[place])
     _send_path(recording, times, latent.astype(np.float64))
-
-
-def _send_errors(
-    recording: Recording,
-    times: Sequence[rr.TimeColumn],
-    rollout: Rollout,
-    scaled: Array,
-    encoder: BaseEncoder,
-) -> None:
-    """Send the errors of decoded features, scaled, (n, d), and their root mean square."""
-    errors = scaled - encoder.scale(rollout.observation.astype(np.float64))
-    send_features(recording, "error", times, rollout.task, errors.astype(np.float32), _scaled)
-    total = np.sqrt(np.square(errors).mean(axis=1, keepdims=True))
-    recording.send_series("error/total", times, total, ["root mean square [scaled]"])
 
 
 def principal_components(latent: Array) -> Array:
