@@ -16,7 +16,6 @@ from test_study import TOML
 from jbrep.cli import main
 from jbrep.cli.base import COUNT
 from jbrep.encoders import find, load, save
-from jbrep.encoders.identity import identity
 from jbrep.envs import describe
 from jbrep.evaluate.table import SCALARS, Diagnosed, write_diagnostics
 from jbrep.jitterbug.tasks import TASKS
@@ -135,7 +134,7 @@ MISTAKES = {
     "rl --task face_direction --algorithm dqn --out x": "ddpg, td3",
     "train-dae --data none --out x": "dae needs --latent, such as --latent 12 8 4",
     "train-encoder --kind pca --data x --latent 8 --seed 1 --out x": "pca takes no --seed: leave i",
-    "train-encoder --kind fly --data x --out x": "unknown kind 'fly': choose one of identity",
+    "train-encoder --kind fly --data x --out x": "unknown kind 'fly': choose one of full",
     "train-dae --data x --latent 8 --architecture wide --out x": "unknown architecture 'wide'",
     "train-encoder --data x --out x --kind slow --latent 8 --lags 5 0": "lags[1] is '0': it must",
     "train-encoder --data x --out x --kind dae --latent 8 --batch-size 0": "batch_size is '0': it",
@@ -182,7 +181,7 @@ def test_encoders_of_several_seeds_and_lags(tmp_path, collected):
         slow = ("train-encoder", "--kind", "slow", "--latent", 4, "--name", name, "--lags", *lags)
         told = jbrep(*slow, *given)
         assert told.exit_code == 0, told.output
-    a, b = (load(tmp_path / f"{name}.safetensors").header["training"] for name in "ab")
+    a, b = (load(tmp_path / f"{name}.safetensors").header.training for name in "ab")
     assert (a["lags"], b["lags"]) == ([5, 10, 20], [5, 10, 20])
 
 
@@ -198,7 +197,7 @@ def test_the_encoders_that_ship_are_listed(monkeypatch, tmp_path):
     folder = tmp_path / "face_direction"
     folder.mkdir()
     task = describe("face_direction")
-    save(identity(task), folder / "identity.safetensors")
+    save(full(task), folder / "full.safetensors")
     for name in ("pca-8", "pca-4"):
         shutil.copy(Path("jbrep/encoders/shipped/face_direction", f"{name}.safetensors"), folder)
     given = {"forward": 0.512, "rewarded": 0.25, "reward": None}
@@ -227,7 +226,7 @@ def test_help_says_which_kind_takes_which_setting_in_80_columns(monkeypatch):
     assert max(map(len, text.splitlines())) <= 80
     said = " ".join(text.split())
     for name, method in METHODS.items():
-        assert f"{'full' if name == 'identity' else name} {method.words()}" in said
+        assert f"{name} {method.words()}" in said
     for line in ("--lags VALUE... Steps from now to later, one or several. [slow", "[all but full"):
         assert line in said
     assert "[default: extrema]" in said

@@ -1,7 +1,6 @@
 """The git commits that data sets, runs and encoders name, and what they don't change."""
 
 import subprocess
-from dataclasses import replace
 
 import pytest
 from small import contents, settings, write_again
@@ -65,9 +64,9 @@ def test_a_manifest_says_the_commit_of_its_start_and_resumes_at_another(collecte
 
 def test_an_encoder_is_the_same_at_another_commit(tmp_path):
     encoder = find("dae-8", describe("face_direction"))
-    other = replace(encoder, header={**encoder.header, "commits": {"work": HEAD}})
+    other = encoder.with_header(commits={"work": HEAD})
     save(other, tmp_path / "it.safetensors")
-    assert load(tmp_path / "it.safetensors").header["commits"] == {"work": HEAD}
+    assert load(tmp_path / "it.safetensors").header.commits == {"work": HEAD}
     assert load(tmp_path / "it.safetensors").fingerprint == encoder.fingerprint
 
 

@@ -3,7 +3,6 @@
 import json
 import re
 import tracemalloc
-from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -19,6 +18,7 @@ from wide import make_feature, make_task, wide
 from jbrep.dataset import ScaledDataset, Scaler
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder, Layer, find, save
+from jbrep.encoders.header import EncoderHeader
 from jbrep.errors import InputError
 from jbrep.evaluate import diagnose, diagnosis
 from jbrep.evaluate.diagnosis import seen, write
@@ -38,7 +38,6 @@ from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.controls import Random
 from jbrep.methods.linear import principal_code
 from jbrep.records.document import read_document
-from jbrep.records.record import to_plain
 from jbrep.report import figures
 from jbrep.report.evaluation import evaluation_text
 from jbrep.report.figures import encoder_plots
@@ -60,9 +59,8 @@ def projection(data, latent, seed):
 
 def make(scaled, parts, name="it-4", **changes):
     task = changes.pop("task", scaled.task)
-    facts = {"kind": "test", "name": name, "task": task.name, "environment": to_plain(task)}
-    features = list(task.feature_names)
-    return Encoder({**facts, "data": {}, "features": features, **changes}, scaled.scaler, *parts)
+    header = EncoderHeader(kind="test", name=name, environment=task, **changes)
+    return Encoder(header, scaled.scaler, *parts)
 
 
 @pytest.fixture(scope="module")
@@ -407,7 +405,8 @@ def test_mixing_the_units_does_not_change_how_well_the_next_is_read(held_out, co
     mixed = np.random.default_rng(0).normal(size=(4, 4)).astype(np.float32) * [[9], [1], [1], [0.1]]
     (layer,) = coder.encoder
     weight, bias = ((mixed @ each).astype(np.float32) for each in (layer.weight, layer.bias))
-    other = replace(coder, encoder=(layer._replace(weight=weight, bias=bias),))
+    turned = (layer._replace(weight=weight, bias=bias),)
+    other = Encoder(coder.header, coder.scaler, turned, coder.decoder)
     one, two = dynamics(coder, held_out), dynamics(other, held_out)
     for name in ("linear", "persistence", "change"):
         assert getattr(one, name) == pytest.approx(getattr(two, name), abs=1e-3)
@@ -514,7 +513,7 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr(figures, "encoder_plots", lambda evaluation: [])  # they take seconds
     shipped = find("pca-4", "face_direction")
-    save(replace(shipped, header={**shipped.header, "name": "dae-4"}), Path("dae-4"))
+    save(shipped.with_header(name="dae-4"), Path("dae-4"))
     chosen = ("--encoder", "dae-4", "./dae-4", "full")
     command = ("evaluate", *chosen, "--data", collected, "--out", "judged")
     shown = jbrep(*command).stdout

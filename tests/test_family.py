@@ -139,7 +139,7 @@ def test_a_weighted_feature_is_reconstructed_better(data, tmp_path):
     place = data.names.index("velocity_x")
     plain = fitter.fit("ae", **settings).encoder
     weighted = fitter.fit("ae", name="w", weights="velocity_x=30", **settings).encoder
-    assert weighted.header["training"]["weights"] == {"velocity_x": 30}
+    assert weighted.header.training["weights"] == {"velocity_x": 30}
     errors = [1 - explained(encoder, data)[place] for encoder in (plain, weighted)]
     assert errors[1] < errors[0] / 2
 

@@ -421,7 +421,7 @@ def test_of_a_wide_robot_the_worst_features_are_shown():
     lost = Reconstruction(**loses, quantiles={}, worst_episodes=[])
     encoders = {
         name: diagnostics(348, kind=kind, reconstruction=lost, corruption=[])
-        for name, kind in (("dae-348", "dae"), ("raw", "identity"))
+        for name, kind in (("dae-348", "dae"), ("raw", "full"))
     }
     by_feature, correlations = encoder_plots(evaluation(encoders, "Humanoid-v5"))
     assert len(by_feature.rows) == 2 * 348
@@ -541,7 +541,7 @@ def of_methods():
     losses = {"train_loss": 0.2, "test_loss": 0.3}
     parts = {"1": {"changes": 0.4, "reward": 0.1}, "20": {"changes": 0.9, "reward": 0.8}}
     methods = {
-        "full": ("identity", 4, 0.9, {}),
+        "full": ("full", 4, 0.9, {}),
         "slow-2": ("slow", 2, 0.8, slow),
         "slow-1": ("slow", 1, 0.1, slow),
         "forward-2-s1": ("forward", 2, 0.7, {**losses, "loss_by_horizon": parts}),

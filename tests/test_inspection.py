@@ -119,7 +119,7 @@ def entities(recorded):
 @pytest.fixture(scope="module")
 def unchanged(folder):
     """Of an encoder that gives back what it took, on the task that observes most."""
-    return inspect(POSE, encoder="identity", out=folder / "identity.rrd")
+    return inspect(POSE, encoder="full", out=folder / "full.rrd")
 
 
 @pytest.fixture(scope="module")
@@ -328,7 +328,7 @@ def test_a_traversal_shows_what_each_unit_decodes_to(traversed, rollout):
         series = found[f"/traverse/unit_{unit}/decoded"]
         np.testing.assert_allclose(scalars(series), scaled, rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(series["traverse"].to_numpy(), np.arange(POINTS))
-        most = encoder.feature_names[np.ptp(scaled, axis=0).argmax()]
+        most = encoder.task.feature_names[np.ptp(scaled, axis=0).argmax()]
         assert names(found[f"/traverse/unit_{unit}/most"])[0] == f"{most} [scaled]"
         row = re.search(rf"^\| {unit} \|.*$", text(found["/traverse/summary"]), re.M)[0]
         assert f"| {most} " in row
@@ -698,7 +698,7 @@ def test_the_force_of_a_contact_is_the_one_on_the_robot():
 
 def write_end(folder, representation, seed=0, status=FINISHED):
     """What a run of 300 steps says at its end; a failed one ended half-way."""
-    encoder = "identity" if representation == "full" else representation
+    encoder = "full" if representation == "full" else representation
     run = Run(task="face_direction", encoder=encoder, steps=300, seed=seed)
     settings, steps = run.describe(find(encoder, run.task)), 150 if status == FAILED else 300
     record = {"status": status, "settings": settings, "steps": steps, "seconds": 1.0}
@@ -751,7 +751,7 @@ def test_training_curves_are_the_evaluations(tmp_path):
 
 def test_a_run_shows_its_own_encoder(tmp_path, rollout, monkeypatch):
     monkeypatch.setattr("jbrep.inspection.subject.find_episode", lambda *given: rollout)
-    for name in ("dae-4", "identity"):
+    for name in ("dae-4", "full"):
         write_end(tmp_path, name)
         save(find(name, describe("face_direction")), tmp_path / ENCODER)
         found = read(inspect(str(tmp_path), out=tmp_path / f"{name}.rrd"))

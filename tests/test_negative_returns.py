@@ -198,7 +198,7 @@ def label_record(representation, size=3):
     }
     latent = [(2, "tanh")] if representation != "full" else []
     encoder = {
-        **{"name": representation, "kind": "dae" if latent else "identity", "size": size},
+        **{"name": representation, "kind": "dae" if latent else "full", "size": size},
         **{"encoder": latent, "decoder": [(size, "linear")] if latent else []},
         **{"training": {}, "data": {}, "metrics": {}},
     }

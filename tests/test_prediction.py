@@ -12,6 +12,7 @@ from wide import make_feature, make_task
 from jbrep.dataset import Column, Dataset, ScaledDataset
 from jbrep.dataset.scaling import wrapped
 from jbrep.encoders import Encoder, Layer
+from jbrep.encoders.header import EncoderHeader
 from jbrep.errors import InputError
 from jbrep.evaluate import diagnose, regression
 from jbrep.evaluate.control import GoodPolicy, PlayedEpisode, lost, needs, returns_to_go
@@ -30,7 +31,6 @@ from jbrep.evaluate.readout import nonlinear_probes, probes
 from jbrep.evaluate.regression import Problem, beside, fit
 from jbrep.evaluate.table import headline
 from jbrep.play.sources import find_good_policy
-from jbrep.records.record import to_plain
 from jbrep.report.evaluation import evaluation_text, in_words
 
 NAMES = ("place", "speed", "load", "idle")
@@ -115,9 +115,8 @@ def policy():
 def code(data, *kept):
     """A code of these features alone."""
     weight = np.eye(4, dtype=np.float32)[[NAMES.index(name) for name in kept]]
-    header = {"kind": "subset", "name": "subset", "task": data.task.name, "data": {}}
-    header |= {"environment": to_plain(data.task), "features": list(NAMES)}
-    header["metrics"] = {"spectrum": [3.0, 1.0]}
+    metrics = {"spectrum": [3.0, 1.0]}
+    header = EncoderHeader(kind="subset", name="subset", environment=data.task, metrics=metrics)
     there, back = (
         (Layer(each, np.zeros(len(each), np.float32), "linear"),)
         for each in (weight, weight.T.copy())
@@ -161,7 +160,8 @@ def test_what_is_dropped_shows_where_it_matters(evaluation):
 
 
 def test_what_the_reward_depends_on_counts_by_how_much_it_does(evaluation, held_out, policy):
-    full = Encoder({"kind": "identity", "name": "full"}, held_out.data.scaler, (), ())
+    header = EncoderHeader(kind="full", name="full", environment=held_out.data.task)
+    full = Encoder(header, held_out.data.scaler, (), ())
     learnt = networks(full, held_out, policy)
     weights = dict(zip(NAMES, needs(full, held_out, policy, learnt).reward, strict=True))
     assert max(weights, key=weights.get) == "place"

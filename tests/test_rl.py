@@ -192,7 +192,7 @@ def test_training_starts_from_these_seeds_whatever_the_agent_seeds(tmp_path, mon
 
 
 def test_the_full_observation_is_scaled_as_encoders_scale_it():
-    full, dae = find("identity", TASK), find("dae-8", TASK)
+    full, dae = find("full", TASK), find("dae-8", TASK)
     env = make_env(TASK, 1, 7, full)
     plain = Lanes(TASK, 1).reset([0], [7]).astype(np.float32)
     np.testing.assert_allclose(env.reset(), dae.scaler.scale(plain), rtol=1e-5, atol=1e-6)

@@ -120,7 +120,7 @@ def test_the_target_turns_where_it_is_told():
 def test_a_policy_plays_through_an_encoder():
     task = describe("face_direction", max_episode_steps=20)
     player = find_player("heuristic", task)
-    decoding = [player.with_reconstruction(find(each, task)) for each in ("identity", "pca-4")]
+    decoding = [player.with_reconstruction(find(each, task)) for each in ("full", "pca-4")]
     direct, whole, blurred = (each.play([0])[0] for each in (player, *decoding))
     np.testing.assert_allclose(whole.action, direct.action, atol=1e-4)
     assert np.abs(blurred.action - direct.action).max() > 0.01

@@ -67,7 +67,7 @@ def test_what_is_kept_passes_exactly_and_the_method_never_saw_it(data, kind, ang
         kind, latent=4, keep="velocity_x,angle_to_target", angles=angles
     )
     it: Encoder = fitted.encoder
-    assert set(it.keep) == set(keep)
+    assert set(it.header.keep) == set(keep)
     assert it.latent_size == 4 + 2 + angles
     observed = data.dataset["observation"][data.test]
     code, scaled = it.encode(observed), it.scaler.scale(observed)

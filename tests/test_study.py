@@ -133,7 +133,7 @@ def test_a_study_from_toml(tmp_path):
                 f'"{name}"',
                 f"unknown representation '{name}': it must be full, or a method",
             )
-            for name in ("pca", "pca-08", "pca-0", "pca-deep-8", "dae-paper-8", "identity-8")
+            for name in ("pca", "pca-08", "pca-0", "pca-deep-8", "dae-paper-8", "full-8")
         ),
         ('"pca-8"', '"full"', "representations is .*each once"),
         (
@@ -342,8 +342,8 @@ def test_it_makes_data_and_encoders(tmp_path, monkeypatch):
     for cell in plan.cells:
         encoder = load(Path(plan.run(cell).encoder))
         assert encoder.task == plan.task(cell.task)
-        assert encoder.header["data"]["seed"] == 5
-        prints.add((cell.task, encoder.header["data"]["fingerprint"]))
+        assert encoder.header.data["seed"] == 5
+        prints.add((cell.task, encoder.header.data["fingerprint"]))
         plan.run(cell).check()
     assert len(prints) == 3
     assert derived == ["move_to_pose"]

@@ -330,9 +330,9 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     plan = Plan(study, tmp_path / "it")
     prepare(plan)
     made = {path.stem: load(path) for path in plan.encoders(TASK).glob("*.safetensors")}
-    assert sorted(made) == ["identity", "late-4", "random-4-s0", "random-4-s1"]
-    assert made["random-4-s1"].header["training"]["seed"] == 1
-    assert made["late-4"].header["training"]["lags"] == [20]
+    assert sorted(made) == ["full", "late-4", "random-4-s0", "random-4-s1"]
+    assert made["random-4-s1"].header.training["seed"] == 1
+    assert made["late-4"].header.training["lags"] == [20]
     runs = {(cell.representation.name, cell.seed): plan.run(cell) for cell in plan.cells}
     told = [(Path(r.encoder).stem, r.representation, r.encoder_seed) for r in runs.values()]
     assert told[1:4] == [
@@ -342,7 +342,7 @@ def test_encoders_nested_in_one_representation(tmp_path, collected):
     ]
     assert told[5:7] == [("random-4-s1", "random-4", 1), ("mine-1", "mine", 1)]
     assert told[9:11] == told[1:3]
-    assert runs["late-4", 0].find_encoder().representation == "late-4"
+    assert runs["late-4", 0].find_encoder().name == "late-4"
     (exploratory,) = study.replace(seeds=(0, 1)).notices
     assert exploratory.startswith("This study is exploratory")
 
@@ -369,7 +369,7 @@ def test_each_encoder_of_several_learns_from_its_own_data(tmp_path):
         assert made["random-4-s2"]["training"]["seed"] == 2
         runs = [plan.run(cell) for cell in plan.cells if cell.task == task]
         assert [Path(run.encoder).stem for run in runs[:4]] == [
-            *("pca-4-s0", "random-4-s0", "identity", "pca-4-s1")
+            *("pca-4-s0", "random-4-s0", "full", "pca-4-s1")
         ]
         first, second = (Dataset(plan.data(task, number)) for number in range(2))
         assert first.manifest.settings.seed == 5
@@ -409,9 +409,9 @@ def test_own_files_beside_those_that_the_study_trains(tmp_path):
     study = with_own("pca-4", PATTERN, data=Data(steps=200))
     plan = Plan(study, tmp_path / "it")
     prepare(plan)
-    assert {path.stem for path in plan.folder.rglob("*.safetensors")} == {"identity", "pca-4"}
+    assert {path.stem for path in plan.folder.rglob("*.safetensors")} == {"full", "pca-4"}
     names = {find(plan.run(cell).encoder, TASK).name for cell in plan.cells}
-    assert names == {"identity", "pca-4", "pca-8", "random-8"}
+    assert names == {"full", "pca-4", "pca-8", "random-8"}
 
 
 @pytest.mark.parametrize(
@@ -469,7 +469,7 @@ def test_own_encoders_are_checked_before_the_first_run(own, message, home, tmp_p
         ([{"name": "a", "file": "x", "encoders": 2}], r"its file x must contain \{encoder\}"),
         ([{"name": "a", "file": "{encoder}"}], r"how many files \{encoder\} stands for, such as"),
         ([{"name": "a", "file": "{seed}{encoder}", "encoders": 2}], r"unknown \{seed\} in its"),
-        ([{"name": "A", "kind": "pca", "latent": 8}], "A: invalid encoder name 'A'"),
+        ([{"name": "A", "kind": "pca", "latent": 8}], "A: the name of an encoder is 'A'"),
         ([{"name": "a", "kind": "fly"}], "a: unknown kind 'fly'"),
         ([{"name": "a", "kind": "slow", "latent": 8, "lags": [0]}], r"a: lags\[0\] is 0: it must"),
         ([{"name": "a", "kind": "slow", "latent": 8, "noise": 1}], "a: slow takes no noise"),

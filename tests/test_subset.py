@@ -24,7 +24,7 @@ def test_a_subset_is_the_scaled_features_in_order(data, fit, observations):
     names = ("velocity_x", "velocity_y", "velocity_z", "motor_angle")
     places = [data.task.feature_names.index(name) for name in names]
     assert encoder.name == "subset-4"
-    assert encoder.header["training"]["features"] == list(names)
+    assert encoder.header.training["features"] == list(names)
     scaled = data.scale(observations)
     np.testing.assert_array_equal(encoder.encode(observations), scaled[:, places])
     back = data.scale(encoder.decode(scaled[:, places]))
@@ -66,7 +66,7 @@ def test_noise_is_beside_all_features_and_unrelated_to_them_and_to_itself(data, 
     noise, features = latent[:, :8], latent[:, 8:]
     np.testing.assert_array_equal(features, data.scale(observations))
     np.testing.assert_allclose(encoder.decode(latent), observations, atol=2e-4)
-    assert encoder.header["metrics"]["held_out_mse"] < 1e-12
+    assert encoder.header.metrics["held_out_mse"] < 1e-12
     related = np.abs(np.corrcoef(latent.T) - np.eye(24))[:8]
     assert related.max() < 0.08  # 5 deviations of 5000 unrelated values are 0.07
     steps = np.corrcoef(np.hstack((noise[1:], noise[:-1])).T)[:8, 8:]
@@ -90,7 +90,7 @@ def test_seeds_give_different_controls(fit, observations):
 @pytest.mark.parametrize("scaling", ["extrema", "nominal", "standard"])
 def test_the_whole_is_scaled_as_its_name_says(data, fit, observations, scaling):
     encoder = fit("full", scaling=scaling)
-    assert encoder.name == ("identity" if scaling == "extrema" else f"full-{scaling}")
+    assert encoder.name == ("full" if scaling == "extrema" else f"full-{scaling}")
     rows = observations[data.train].astype(float)
     features = data.task.features
     low, high = {

@@ -45,9 +45,9 @@ def test_states_become_encoders_and_diagnostics(peace):
     for encoder in map(load, paths):
         found = judged["encoders"][encoder.name]
         assert found["sha256"] == encoder.fingerprint
-        error = encoder.header["metrics"]["held_out_mse"]
+        error = encoder.header.metrics["held_out_mse"]
         assert found["reconstruction"]["mse"][0] == pytest.approx(error, rel=1e-3)
-        assert encoder.header["data"]["train_rows"] == 1500
+        assert encoder.header.data["train_rows"] == 1500
 
 
 def test_a_studys_tables_are_those_of_its_runs(peace):
@@ -68,7 +68,7 @@ def test_a_studys_tables_are_those_of_its_runs(peace):
             assert final == pytest.approx(np.mean([row[2] for row in ours[1:]]))
             encoder = load(run / ENCODER)
             assert encoder.size == 16
-            assert encoder.name == ("identity" if name == "full" else name)
+            assert encoder.name == name
         mean = label["numbers"]["final_return_mean"][0]
         assert mean == pytest.approx(np.mean(label["by_run"]["final_return"]))
     assert len(rows) == 2 * 2 * (1 + 10)

@@ -6,15 +6,14 @@ the full observation and forward-8 without one.
 
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jbrep.encoders import FULL, Encoder, find, save
-from jbrep.encoders.encoder import IMPORTED
 from jbrep.encoders.file import SUFFIX
+from jbrep.encoders.header import IMPORTED, EncoderHeader
 from jbrep.encoders.layers import Layer
 from jbrep.envs import describe
 
@@ -45,7 +44,7 @@ def given(encoder: Encoder, features: Sequence[str]) -> Encoder:
     """The code with scaled features as more numbers."""
     name = f"{encoder.name}-with-{'-and-'.join(features)}"
     keep = tuple(FEATURES[each] for each in features)
-    return replace(encoder, header=named(encoder, name), keep=keep)
+    return Encoder(named(encoder, name), encoder.scaler, encoder.encoder, encoder.decoder, keep)
 
 
 def blinded(encoder: Encoder, name: str, feature: str) -> Encoder:
@@ -54,15 +53,15 @@ def blinded(encoder: Encoder, name: str, feature: str) -> Encoder:
     nothing = Layer(np.eye(size, dtype=np.float32), np.zeros(size, np.float32), "linear")
     first, *others = encoder.encoder or (nothing,)
     weight = first.weight.copy()
-    weight[:, encoder.feature_names.index(FEATURES[feature])] = 0
+    weight[:, encoder.task.feature_names.index(FEATURES[feature])] = 0
     layers = (first._replace(weight=weight), *others)
     decoder = encoder.decoder or (nothing,)
-    return replace(encoder, header=named(encoder, name), encoder=layers, decoder=decoder)
+    return Encoder(named(encoder, name), encoder.scaler, layers, decoder, encoder.header.keep)
 
 
-def named(encoder: Encoder, name: str) -> dict[str, Any]:
+def named(encoder: Encoder, name: str) -> EncoderHeader:
     """The header of a code that no method has made."""
-    return {**encoder.header, "name": name, "kind": IMPORTED}
+    return encoder.header.replace(name=name, kind=IMPORTED)
 
 
 def ablated(study: Ablation, task: str) -> Iterator[Encoder]:

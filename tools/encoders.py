@@ -15,7 +15,6 @@ from typing import Any
 
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import FULL, load
-from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import SUFFIX
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
@@ -107,8 +106,7 @@ def ship(task: Task, files: list[Path], kinds: list[str], results: Path) -> None
     known = evaluated(results / EVALUATION)
     rows = []
     for file in sorted(folder.glob(f"*{SUFFIX}")):
-        name = FULL if file.stem == IDENTITY else file.stem
-        sha256 = load(file).fingerprint
+        name, sha256 = file.stem, load(file).fingerprint
         if values := known.get((task.name, FULL if name == FULL else sha256)):
             rows.append(Diagnosed(task.name, name, sha256, values))
     write_diagnostics(folder / DIAGNOSTICS, rows)

@@ -79,7 +79,7 @@ def evaluate(
     scaled = ScaledDataset(Dataset(data))
     encoders = [find(name, scaled.task) for name in encoder]
     sources = [source_of(name, scaled.task) for name in encoder]
-    labels = _labels([each.representation for each in encoders], sources)
+    labels = _labels([each.name for each in encoders], sources)
     if twice := {label for label in labels if labels.count(label) > 1}:
         raise InputError(f"{min(twice)} is given twice: leave one out")
     labelled = dict(zip(labels, encoders, strict=True))
@@ -132,7 +132,6 @@ def list_shipped(task: str | None, as_json: bool) -> None:
 
     A dash stands for what isn't known; jbrep evaluate finds out.
     """
-    from jbrep.encoders.encoder import FULL, IDENTITY
     from jbrep.evaluate.table import SCALARS
     from jbrep.jitterbug.tasks import TASKS
     from jbrep.methods.registry import METHODS
@@ -166,7 +165,7 @@ def list_shipped(task: str | None, as_json: bool) -> None:
         ]
         click.echo(f"{name}\n{table(('encoder', 'l', *_COLUMNS.values()), rows, width)}\n")
     kinds = dict.fromkeys(each.kind for encoders in listed.values() for _, each, _ in encoders)
-    words = {FULL if kind == IDENTITY else kind: METHODS[kind].words() for kind in kinds}
+    words = {kind: METHODS[kind].words() for kind in kinds}
     columns = {title: SCALARS[name].words for name, title in _COLUMNS.items()}
     columns["error"] = "squared error of the reconstruction, as a multiple of PCA's"
     click.echo(f"columns\n{facts({'l': 'size of the code', **columns}, width)}\n")

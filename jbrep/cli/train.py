@@ -37,7 +37,7 @@ class _Making(Variadic):
     def _methods(self) -> "dict[str, type[Method]]":
         from jbrep.methods.registry import METHODS  # imports torch
 
-        return {_shown_kind(kind): METHODS[kind] for kind in self.kinds or METHODS}
+        return {kind: METHODS[kind] for kind in self.kinds or METHODS}
 
     @cached_property
     def _settings(self) -> list[click.Option]:
@@ -96,12 +96,6 @@ def _help_of(options: Sequence[click.Parameter], ctx: click.Context) -> list[tup
     return [record for each in options if (record := each.get_help_record(ctx))]
 
 
-def _shown_kind(kind: str) -> str:
-    from jbrep.encoders.encoder import FULL, IDENTITY
-
-    return FULL if kind == IDENTITY else kind
-
-
 def _shown(key: Key) -> str:
     """A default as help shows it; empty if there is none, or nothing to say."""
     if isinstance(key.default, tuple):
@@ -125,7 +119,7 @@ def _given(kind: str, options: Mapping[str, Any], preset: str | None) -> dict[st
     }
     for name in given:
         if not method.takes(name):
-            kinds = ", ".join(_shown_kind(each) for each, m in METHODS.items() if m.takes(name))
+            kinds = ", ".join(each for each, m in METHODS.items() if m.takes(name))
             raise InputError(f"{kind} takes no {_option(name)}: leave it out; it is for {kinds}")
     if method.takes("latent") and "latent" not in given:
         raise InputError(f"{kind} needs --latent, such as --latent 12 8 4")
@@ -249,14 +243,14 @@ def _named(
 
 def _report(fitted: "Fitted", data: "ScaledDataset") -> None:
     """Say how an encoder that was fitted to that data compares with PCA."""
-    from jbrep.encoders.file import HELD_OUT_MSE
+    from jbrep.encoders.header import HELD_OUT_MSE
     from jbrep.methods.held_out import ratio_to_pca
 
     encoder, path, is_new = fitted
     ratio = ratio_to_pca(encoder, data)
     comparison = "" if ratio is None else f", {ratio:.2f} times PCA's"
     click.echo(
-        f"{encoder.name}: held-out mean squared error {encoder.header['metrics'][HELD_OUT_MSE]:.5f}"
+        f"{encoder.name}: held-out mean squared error {encoder.header.metrics[HELD_OUT_MSE]:.5f}"
         f"{comparison} (features scaled to [-1, 1]); {path}{'' if is_new else ', already complete'}"
     )
     if ratio is not None and ratio > _POOR and encoder.kind in _RECONSTRUCTING:

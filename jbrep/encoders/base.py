@@ -29,7 +29,7 @@ class BaseEncoder(ABC):
 
     Attributes:
         name: what tables call it.
-        kind: how it was made, such as dae, pca, identity, own.
+        kind: how it was made, such as dae, pca, full, own.
         task: whose observations it reads.
         size: length d of an observation.
         latent_size: length l of a latent.
@@ -37,18 +37,13 @@ class BaseEncoder(ABC):
         fingerprint: SHA-256 that identifies it.
     """
 
-    name: Any
-    kind: Any
-    task: Any
-    size: Any
-    latent_size: Any
-    can_decode: Any
-    fingerprint: Any
-
-    @property
-    def representation(self) -> str:
-        """What an agent that sees its latent sees."""
-        return str(self.name)
+    name: str
+    kind: str
+    task: Task
+    size: int
+    latent_size: int
+    can_decode: bool
+    fingerprint: str
 
     @abstractmethod
     def encode(self, observation: Any) -> Any:
@@ -130,6 +125,7 @@ class OwnEncoder(BaseEncoder):
             raise InputError(f"{self.name} is a class: give an object, such as {self.name}()")
         self.given = given
         self._encode, self._decode = self._has("encode", given), self._has("decode")
+        self.can_decode = callable(self._decode)
         if not callable(self._encode):
             raise InputError(f"{self.name} has no `encode` and can't be called: it is no encoder")
         latents = self._apply(self._encode, self._probes, None)
@@ -144,11 +140,6 @@ class OwnEncoder(BaseEncoder):
 
     def __repr__(self) -> str:
         return f"OwnEncoder({self.name}, {self.task.name}, {self.size} to {self.latent_size})"
-
-    @property
-    def can_decode(self) -> bool:
-        """Whether the user's object has `decode`."""
-        return callable(self._decode)
 
     @property
     def is_module(self) -> bool:

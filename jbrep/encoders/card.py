@@ -38,7 +38,7 @@ def describe(encoder: BaseEncoder, source: str) -> dict[str, Any]:
         **told,
         "encoder": _layers(encoder.encoder),
         "decoder": _layers(encoder.decoder),
-        **{name: encoder.header[name] for name in _RECORDS},
+        **{name: getattr(encoder.header, name) for name in _RECORDS},
         "sha256": encoder.fingerprint,
         "features": [
             {"name": feature.name, "unit": feature.unit, "low": float(low), "high": float(high)}

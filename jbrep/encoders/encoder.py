@@ -1,33 +1,30 @@
 """The encoder: from observations to latents and back, through dense layers."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+import re
+from dataclasses import replace
 from functools import cached_property
-from itertools import zip_longest
-from typing import Any, NamedTuple, TypeVar
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset import Scaler
 from jbrep.dataset.scaling import library_of
-from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.layers import ACTIVATIONS, FIRST_ACTIVATIONS, MAX_UNITS, Layer, run
+from jbrep.encoders.base import BaseEncoder, OwnEncoder
+from jbrep.encoders.header import IMPORTED, MAX_MAGNITUDE, EncoderHeader
+from jbrep.encoders.layers import ACTIVATIONS, MAX_UNITS, Layer, run
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
-from jbrep.jitterbug.tasks import get_task
 from jbrep.records import container
-from jbrep.records.record import from_plain
+
+if TYPE_CHECKING:
+    from torch.nn import Module
 
 Float32 = NDArray[np.float32]
+Layers = tuple[Layer, ...]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 
-FULL = "full"  # the representation that is the whole observation
-FORMAT = "jbrep encoder"
-FORMAT_VERSION = 3  # the newest; see `Encoder.format_version`
-IDENTITY = "identity"  # the kind of encoder that leaves the scaled observation as it is
-IMPORTED = "imported"  # the kind of encoder that was trained elsewhere
-MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
 _SCALING = ("low", "high")  # tensors
 
 
@@ -35,43 +32,70 @@ class _Parts(NamedTuple):
     """An encoder's arrays, all NumPy's, or torch tensors on one device."""
 
     scaler: Scaler
-    encoder: tuple[Layer, ...]
-    decoder: tuple[Layer, ...]
+    encoder: Layers
+    decoder: Layers
 
 
-@dataclass(frozen=True, eq=False)
 class Encoder(BaseEncoder):
     """An encoder with its decoder and the scaling that both expect.
 
     It takes observations in physical units, as data sets and environments give them, and applies
     its own scaling. All arithmetic is float32.
 
-    Attributes:
-        header: its kind, name and origin as plain JSON, see docs/encoder-file.md.
+    Args:
+        header: its kind, name, task and origin.
         scaler: fitted on the training part of its data.
-        encoder: layers from the scaled numbers of an observation to the code; empty for the
-            identity.
-        decoder: layers from the code back to the scaled numbers; empty where there is no decoder.
+        encoder: layers from the scaled numbers of an observation to the code; none if the code is
+            these numbers themselves.
+        decoder: layers from the code back to the scaled numbers; none where there is no decoder.
         keep: features that pass around the layers: scaled, they follow the code in the latent.
+
+    Attributes:
+        header: that of its file, with what follows from the other arguments.
+        scaler, encoder, decoder: as given.
 
     Raises:
         InputError: tensors whose shapes are inconsistent, whose type is not float32, or that hold
             numbers that are not finite; an unknown activation. The message names the tensor.
     """
 
-    header: Mapping[str, Any]
-    scaler: Scaler
-    encoder: tuple[Layer, ...]
-    decoder: tuple[Layer, ...]
-    keep: tuple[str, ...] = ()
-    _on: dict[Any, _Parts] = field(default_factory=dict, init=False, repr=False, compare=False)
+    def __init__(
+        self,
+        header: EncoderHeader,
+        scaler: Scaler,
+        encoder: Layers,
+        decoder: Layers,
+        keep: tuple[str, ...] = (),
+    ):
+        self.name, self.kind, self.task = header.name, header.kind, header.environment
+        self.size = self.task.size
+        self.scaler, self.encoder, self.decoder = scaler, encoder, decoder
+        self._check(keep)
+        self.header = header.replace(
+            angles=[self.task.feature_names[i] for i in scaler.angles],
+            clip=scaler.clip,
+            keep=keep,
+            encoder=[layer.activation for layer in encoder],
+            decoder=[layer.activation for layer in decoder],
+        )
+        code = len(encoder[-1].bias) if encoder else scaler.size
+        self.latent_size = code + len(self.kept)
+        self.can_decode = bool(decoder) or not encoder
+        identifying = {n: v for n, v in self.header.as_json().items() if n != "commits"}
+        self.fingerprint = container.checksum(self.tensors(), identifying)
+        self._on: dict[Any, _Parts] = {None: _Parts(scaler, encoder, decoder)}
 
-    def __post_init__(self) -> None:
-        self._check_scaling()
+    def _check(self, keep: tuple[str, ...]) -> None:
+        for name in _SCALING:
+            _check_tensor(name, getattr(self.scaler, name), (self.size,))
+        if not all(0 <= i < self.size for i in self.scaler.angles):
+            raise InputError("its angles must be different features")
+        if keep and not self.encoder:
+            raise InputError("features can pass around layers, where there are some")
         sizes = [self.scaler.size]
         for name, tensor in self.tensors().items():
             if name not in _SCALING:
-                self._check(name, tensor, sizes)
+                _check_layer(name, tensor, sizes)
         if self.decoder and sizes[-1] != self.scaler.size:
             raise InputError(f"the last layer has {sizes[-1]} units, expected {self.scaler.size}")
         if max(sizes) > MAX_UNITS:
@@ -82,35 +106,10 @@ class Encoder(BaseEncoder):
                 raise InputError(
                     f"unknown activation {layer.activation!r}: choose one of {choices}"
                 )
-        self._on[None] = _Parts(self.scaler, self.encoder, self.decoder)
-
-    def _check_scaling(self) -> None:
-        """Check the scaling, and what passes around the layers."""
-        for name in _SCALING:
-            _check_tensor(name, getattr(self.scaler, name), (self.size,))
-        angles, clip = self.scaler.angles, self.scaler.clip
-        if len(set(angles)) < len(angles) or not all(0 <= i < self.size for i in angles):
-            raise InputError("its angles must be different features")
-        if clip is not None and not 1 <= clip < MAX_MAGNITUDE:
-            raise InputError(f"its clip is {clip}: it must be at least 1")
-        if unknown := [name for name in self.keep if name not in self.feature_names]:
-            raise InputError(f"{unknown[0]} can't pass around its layers: it is no feature")
-        if self.keep and (not self.encoder or len(set(self.keep)) < len(self.keep)):
-            raise InputError("different features can pass around layers, where there are some")
-
-    def _check(self, name: str, tensor: Any, sizes: list[int]) -> None:
-        """Check one tensor; `sizes` holds the widths of the layers so far, and grows."""
-        if name.endswith("weight"):
-            rows = max(1, tensor.shape[0]) if np.ndim(tensor) == 2 else 1
-            expected: tuple[int, ...] = (rows, sizes[-1])
-            sizes.append(rows)
-        else:
-            expected = (sizes[-1],)
-        _check_tensor(name, tensor, expected)
 
     @staticmethod
     def from_torch(
-        encoder: Any, task: Task | str, decoder: Any = None, name: str = "own"
+        encoder: "Module", task: Task | str, decoder: "Module | None" = None, name: str = "own"
     ) -> "Encoder":
         """An encoder with the layers of a torch module, which stays as it is.
 
@@ -129,14 +128,19 @@ class Encoder(BaseEncoder):
         Raises:
             InputError: a module is no such chain; the message names the operation.
         """
-        from jbrep.encoders.from_torch import convert  # imports torch
-        from jbrep.envs.description import describe  # imports Gymnasium
+        from jbrep.encoders.from_torch import layers_of  # imports torch
+        from jbrep.envs.description import as_task  # imports Gymnasium
 
-        known = describe(task) if isinstance(task, str) else task
-        return convert(encoder, known, decoder, name)
+        known = as_task(task)
+        return imported(known, name, *layers_of(encoder, known, decoder), "torch")
 
     def __repr__(self) -> str:
-        return f"Encoder({self.name}, {self.header.get('task')}, {self.size} to {self.latent_size})"
+        return f"Encoder({self.name}, {self.task.name}, {self.size} to {self.latent_size})"
+
+    def with_header(self, **changes: Any) -> "Encoder":
+        """The same encoder with other values of some fields in its header."""
+        header = self.header.replace(**changes)
+        return Encoder(header, self.scaler, self.encoder, self.decoder, header.keep)
 
     def tensors(self) -> dict[str, Float32]:
         """All its numbers, by their names in its file."""
@@ -146,32 +150,11 @@ class Encoder(BaseEncoder):
                 named |= {f"{part}.{i}.weight": layer.weight, f"{part}.{i}.bias": layer.bias}
         return named
 
-    @property
-    def name(self) -> str:
-        """Its name in tables and files, such as `dae-8`, `dae-deep-8`, `pca-8`, `identity`."""
-        return self.header["name"]
-
-    @property
-    def kind(self) -> str:
-        """How it was made."""
-        return self.header["kind"]
-
-    @property
-    def representation(self) -> str:
-        """What an agent that sees its latent sees: `full` for the identity, else its name."""
-        return FULL if self.name == IDENTITY else self.name
-
-    @property
-    def can_decode(self) -> bool:
-        """Whether there is a decoder."""
-        return bool(self.decoder) or not self.encoder
-
     @cached_property
     def kept(self) -> list[int]:
         """Places of the scaled numbers that pass around the layers."""
-        angles = (self.feature_names[i] for i in self.scaler.angles)
-        scaled = (*self.feature_names, *angles) if self.keep else ()
-        return [i for i, name in enumerate(scaled) if name in self.keep]
+        scaled = (*self.task.feature_names, *self.header.angles)
+        return [i for i, name in enumerate(scaled) if name in self.header.keep]
 
     @cached_property
     def restored(self) -> list[int]:
@@ -180,88 +163,6 @@ class Encoder(BaseEncoder):
         for i, place in enumerate(self.kept):
             places[place] = self.scaler.size + i
         return places
-
-    @property
-    def file_header(self) -> dict[str, Any]:
-        """The header with the fields that its file needs."""
-        angles = [self.feature_names[i] for i in self.scaler.angles]
-        inputs = {"angles": angles, "clip": self.scaler.clip, "keep": list(self.keep)}
-        activations = {
-            part: [layer.activation for layer in getattr(self, part)]
-            for part in ("encoder", "decoder")
-        }
-        start = {"format": FORMAT, "format_version": self.format_version}
-        used = {name: value for name, value in inputs.items() if value}
-        return {**start, **self.header, **used, **activations}
-
-    @property
-    def format_version(self) -> int:
-        """The oldest version of the file that can hold it, so that old files keep their bytes.
-
-        Version 1 has no environment: it is the Jitterbug's. Version 3 is of encoders that a jbrep
-        of version 2 can't read: imported, with other activations, without a decoder, with a
-        latent larger than the observation, with angles as sine and cosine, with a limit of scaled
-        values, or with some that pass around the layers.
-        """
-        if "environment" not in self.header:
-            return 1
-        if self.scaler.angles or self.scaler.clip is not None or self.keep:
-            return 3
-        used = {layer.activation for layer in (*self.encoder, *self.decoder)}
-        known = self.kind != IMPORTED and used <= FIRST_ACTIVATIONS
-        return 2 if known and self.can_decode and self.latent_size <= self.size else 3
-
-    @property
-    def fingerprint(self) -> str:
-        """SHA-256 of its header and numbers, but not of commits: it identifies the encoder."""
-        header = {name: value for name, value in self.file_header.items() if name != "commits"}
-        return container.checksum(self.tensors(), header)
-
-    @property
-    def size(self) -> int:
-        """Length d of an observation."""
-        return len(self.scaler.low)
-
-    @property
-    def latent_size(self) -> int:
-        """Length l of a latent."""
-        code = len(self.encoder[-1].bias) if self.encoder else self.scaler.size
-        return code + len(self.kept)
-
-    @cached_property
-    def task(self) -> Task:
-        """The task whose observations it was made from, with the arguments of its environment.
-
-        Raises:
-            InputError: the header's description can't be used, or is of other features.
-        """
-        try:
-            task = self._described_task()
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"the environment of {self.name} can't be used: {error}") from None
-        if self.header["task"] != task.name:
-            raise InputError(
-                f"{self.name} is for {self.header['task']}, but its environment is {task.name}"
-            )
-        if self.feature_names != task.feature_names:
-            pairs = enumerate(
-                zip_longest(self.feature_names, task.feature_names, fillvalue="nothing")
-            )
-            place, (ours, its) = next((i, pair) for i, pair in pairs if pair[0] != pair[1])
-            raise InputError(
-                f"{self.name} has {ours} as feature {place}, where {task.name} has {its}"
-            )
-        return task
-
-    def _described_task(self) -> Task:
-        if "environment" in self.header:
-            return from_plain(self.header["environment"], Task)
-        return get_task(self.header["task"]).describe()  # version 1 knew the Jitterbug's alone
-
-    @property
-    def feature_names(self) -> tuple[str, ...]:
-        """Names of the features of an observation, in order."""
-        return tuple(self.header["features"])
 
     def encode(self, observation: Values) -> Values:
         """Encode observations (..., d) in physical units as latents (..., l).
@@ -275,7 +176,7 @@ class Encoder(BaseEncoder):
         values, parts = self._prepare(observation, self.size, "observations")
         scaled = parts.scaler.scale(values)
         code = run(parts.encoder, scaled)
-        if not self.keep:
+        if not self.kept:
             return code
         return library_of(code).concatenate((code, scaled[..., self.kept]), -1)
 
@@ -287,12 +188,11 @@ class Encoder(BaseEncoder):
         Raises:
             InputError: latents of another length, or there is no decoder.
         """
-        if not self.can_decode:
-            raise InputError(f"{self.name} has no decoder: it can't reconstruct observations")
+        self.check_decodes("it can't reconstruct observations")
         values, parts = self._prepare(latent, self.latent_size, "latents")
         coded = self.latent_size - len(self.kept)
         scaled = run(parts.decoder, values[..., :coded])
-        if self.keep:
+        if self.kept:
             scaled = library_of(scaled).concatenate((scaled, values[..., coded:]), -1)
             scaled = scaled[..., self.restored]
         return parts.scaler.unscale(scaled)
@@ -321,7 +221,7 @@ class Encoder(BaseEncoder):
             def move(array: Float32) -> Any:
                 return torch.tensor(array, device=device)
 
-            def move_all(layers: tuple[Layer, ...]) -> tuple[Layer, ...]:
+            def move_all(layers: Layers) -> Layers:
                 return tuple(Layer(move(w), move(b), activation) for w, b, activation in layers)
 
             scaler, encoder, decoder = self._on[None]
@@ -340,6 +240,17 @@ class Encoder(BaseEncoder):
         check_same(task, self.task, self.name)
 
 
+def _check_layer(name: str, tensor: Any, sizes: list[int]) -> None:
+    """Check a tensor of a layer; `sizes` holds the widths of the layers so far, and grows."""
+    if name.endswith("weight"):
+        rows = max(1, tensor.shape[0]) if np.ndim(tensor) == 2 else 1
+        expected: tuple[int, ...] = (rows, sizes[-1])
+        sizes.append(rows)
+    else:
+        expected = (sizes[-1],)
+    _check_tensor(name, tensor, expected)
+
+
 def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...]) -> None:
     """Make sure that a tensor is of that shape, of float32, and finite.
 
@@ -354,3 +265,39 @@ def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...]) -> None:
         raise InputError(
             f"tensor {name} holds a number that is not finite or not below {MAX_MAGNITUDE:g}"
         )
+
+
+def imported(task: Task, name: str, encoder: Layers, decoder: Layers, package: str) -> Encoder:
+    """An encoder that was trained elsewhere, from layers that take physical units.
+
+    Args:
+        task: whose observations it reads.
+        name: what tables will call it: lower-case letters, digits and hyphens.
+        encoder: from d features to l units.
+        decoder: from l units to d features; empty if there is none.
+        package: that it comes from, such as torch.
+
+    Raises:
+        InputError: an invalid name, or as `Encoder`.
+    """
+    versions = {each: version(each) for each in ("jbrep", "numpy", package)}
+    header = EncoderHeader(kind=IMPORTED, name=name, environment=task, versions=versions)
+    ones = np.ones(task.size, np.float32)
+    return Encoder(header, Scaler(-ones, ones), encoder, decoder)
+
+
+def as_file(encoder: BaseEncoder) -> BaseEncoder:
+    """The encoder that a file can hold, where a user's own is a module with such layers.
+
+    Its header has no versions: equal layers are the same encoder, whatever converted them.
+
+    Returns:
+        The same encoder where it isn't a user's own, or can't be converted.
+    """
+    if not isinstance(encoder, OwnEncoder) or not encoder.is_module:
+        return encoder
+    name = re.sub("[^a-z0-9]+", "-", encoder.name.lower()).strip("-") or "own"
+    try:
+        return Encoder.from_torch(encoder.given, encoder.task, name=name).with_header(versions={})
+    except InputError:
+        return encoder

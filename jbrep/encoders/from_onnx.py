@@ -1,24 +1,35 @@
-"""Encoders from ONNX models whose graph is a chain of dense layers."""
+"""Encoders from ONNX models whose graph is a chain of dense layers.
 
-from collections.abc import Callable
+Models may be strangers': they are bounded, and read from regular files of one folder alone.
+"""
+
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
-from onnx import helper
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
 
 from jbrep.encoders import fold
-from jbrep.encoders.encoder import Encoder
+from jbrep.encoders.encoder import Encoder, imported
 from jbrep.encoders.fold import NOTHING, Action, Step, refusal
-from jbrep.encoders.imported import imported
 from jbrep.encoders.layers import EPSILON, Layer
-from jbrep.encoders.onnx_file import FLOATS, Constants, array, read
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, first_line
+from jbrep.records.storage import exists, read_file
 
 LATENT, RECONSTRUCTION = "latent", "reconstruction"  # the outputs of a model that jbrep exported
+Constants = dict[str, NDArray[np.generic]]
+
 _MOST_LETTERS = 100  # of what a message says of a node
+_MAX_BYTES = 1 << 26  # of a model, and of the file of its numbers
+_MAX_NODES = 1000
+_FLOATS = (TensorProto.FLOAT, TensorProto.DOUBLE)
+_TYPES = (*_FLOATS, TensorProto.INT32, TensorProto.INT64, TensorProto.BOOL)
+_UNREADABLE = (DecodeError, onnx.checker.ValidationError, ValueError, TypeError, RuntimeError)
 
 
 def convert(path: Path, task: Task, decoder: Path | None, name: str) -> Encoder:
@@ -47,7 +58,7 @@ def convert(path: Path, task: Task, decoder: Path | None, name: str) -> Encoder:
 @np.errstate(all="ignore")  # what isn't finite is refused with the whole encoder
 def _layers(path: Path, size: int) -> tuple[tuple[Layer, ...], tuple[Layer, ...]]:
     """The layers of a model, and those from its latent to its reconstruction, if it has both."""
-    model, constants = read(path)
+    model, constants = _read(path)
     try:
         start = _input(model.graph, constants, size)
         outputs = [output.name for output in model.graph.output]
@@ -66,6 +77,81 @@ def _layers(path: Path, size: int) -> tuple[tuple[Layer, ...], tuple[Layer, ...]
         raise InputError(f"{path}: {error}") from None
 
 
+def _read(path: Path) -> tuple[onnx.ModelProto, Constants]:
+    """A model, checked by ONNX's own checker, and its initialisers by name.
+
+    Exporters put large tensors into a second file: it is read if it is a regular file in the
+    model's folder, never through a path or a link.
+
+    Raises:
+        InputError: there is no such file, or it is no ONNX model that can be read.
+    """
+    model = onnx.ModelProto()
+    try:
+        model.ParseFromString(_bytes(path))
+        if len(model.graph.node) > _MAX_NODES:
+            raise InputError(f"{path} has more than {_MAX_NODES} nodes")
+        _fetch_all(model.graph.initializer, path.parent)
+        onnx.checker.check_model(model)
+        return model, {tensor.name: _array(tensor) for tensor in model.graph.initializer}
+    except InputError:
+        raise
+    except _UNREADABLE as error:
+        reason = first_line(error)
+        raise InputError(f"{path} is no ONNX model that can be read: {reason}") from None
+
+
+def _array(tensor: TensorProto) -> NDArray[np.generic]:
+    """The numbers of a tensor.
+
+    Raises:
+        InputError: it is of another type, or in another file.
+        ValueError: it has another number of them than its shape says.
+    """
+    if tensor.data_location == TensorProto.EXTERNAL:
+        raise InputError(f"the tensor {tensor.name} is in another file: only initialisers can be")
+    if tensor.data_type not in _TYPES:
+        kind = TensorProto.DataType.Name(tensor.data_type).lower()
+        raise InputError(f"the tensor {tensor.name} is of {kind}: expected float32 or float64")
+    return numpy_helper.to_array(tensor)
+
+
+def _fetch_all(tensors: Iterable[TensorProto], folder: Path) -> None:
+    """Bring the numbers that tensors have in other files into the tensors."""
+    contents: dict[str, bytes] = {}
+    total = 0
+    for tensor in tensors:
+        if tensor.data_location != TensorProto.EXTERNAL:
+            continue
+        where = {entry.key: entry.value for entry in tensor.external_data}
+        name = where.get("location", "")
+        if not name or name in (".", "..") or set(name) & set("/\\\0"):
+            raise InputError(
+                f"the tensor {tensor.name} is in {name!r}: only a file beside the model is read"
+            )
+        if name not in contents:
+            contents[name] = _bytes(folder / name)
+        start = int(where.get("offset", 0))
+        end = start + int(where["length"]) if "length" in where else len(contents[name])
+        total += end - start
+        if not 0 <= start <= end <= len(contents[name]) or total > _MAX_BYTES:
+            raise InputError(f"the tensor {tensor.name} doesn't fit {folder / name}")
+        tensor.raw_data = contents[name][start:end]
+        tensor.data_location = TensorProto.DEFAULT
+        del tensor.external_data[:]
+
+
+def _bytes(path: Path) -> bytes:
+    """The bytes of a regular file.
+
+    Raises:
+        InputError: there is none, or it is too large.
+    """
+    if not exists(path):
+        raise InputError(f"no file {path}")
+    return read_file(path, _MAX_BYTES)
+
+
 def _input(graph: onnx.GraphProto, constants: Constants, size: int) -> str:
     """The name of a graph's input."""
     inputs = [each for each in graph.input if each.name not in constants]
@@ -74,7 +160,7 @@ def _input(graph: onnx.GraphProto, constants: Constants, size: int) -> str:
         raise InputError(f"it has the inputs {names}: expected one")
     (given,) = inputs
     kind = given.type.tensor_type
-    if kind.elem_type not in FLOATS:
+    if kind.elem_type not in _FLOATS:
         raise InputError(f"its input {given.name} must be of float32")
     if kind.HasField("shape"):
         shape = [dim.dim_value or dim.dim_param or "?" for dim in kind.shape.dim]
@@ -127,7 +213,7 @@ class _Node:
         """The output of a node of constants alone."""
         if self.operation == "Constant":
             ((kind, value),) = self.attributes.items()
-            return array(value) if kind == "value" else np.asarray(value)
+            return _array(value) if kind == "value" else np.asarray(value)
         first, second = self.given(0), self.given(1)
         if self.operation in ("Identity", "Cast"):
             return first
@@ -230,7 +316,7 @@ def _squeeze(node: _Node) -> Action:
 
 
 def _cast(node: _Node) -> Action:
-    if node.attributes["to"] not in FLOATS:
+    if node.attributes["to"] not in _FLOATS:
         raise InputError("it makes other numbers than float32 or float64")
     return NOTHING
 

@@ -1,8 +1,9 @@
-"""Encoders from torch modules, which are traced into chains of layers."""
+"""The layers of torch modules, which are traced into chains of operations."""
 
 import copy
 import inspect
 import operator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,25 +14,25 @@ from torch.nn import functional
 from torch.nn.utils.parametrize import type_before_parametrizations
 
 from jbrep.encoders import fold
-from jbrep.encoders.encoder import Encoder
-from jbrep.encoders.fold import Step, refusal
-from jbrep.encoders.imported import imported
-from jbrep.encoders.layers import Layer, run
-from jbrep.encoders.torch_actions import BINARY, FUNCTIONS, MODULES, VALUE, arithmetic, as_array
+from jbrep.encoders.fold import Action, Step, refusal
+from jbrep.encoders.layers import EPSILON, Layer, run
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line
 
 _ROWS = 64  # on which the layers are compared with the module
 _PRECISION = 1e-3  # of the largest number: single precision, after many layers
+_USUAL_THRESHOLD = 20  # of softplus, beyond which torch takes it as linear
+_VALUE = object()  # stands for what depends on the observation among the arguments of a function
 
 
-def convert(encoder: nn.Module, task: Task, decoder: nn.Module | None, name: str) -> Encoder:
-    """As `Encoder.from_torch`."""
+def layers_of(
+    encoder: nn.Module, task: Task, decoder: nn.Module | None
+) -> tuple[tuple[Layer, ...], tuple[Layer, ...]]:
+    """The layers of encoder and decoder, as `Encoder.from_torch` takes them."""
     rows = task.unscale(np.random.default_rng(0).uniform(-1, 1, (_ROWS, task.size)))
     into, latents = _layers(encoder, "encode", rows)
     decoder = encoder if decoder is None and hasattr(encoder, "decode") else decoder
-    back: tuple[Layer, ...] = _layers(decoder, "decode", latents)[0] if decoder is not None else ()
-    return imported(task, name, into, back, "torch")
+    return into, _layers(decoder, "decode", latents)[0] if decoder is not None else ()
 
 
 class _Method(nn.Module):
@@ -103,7 +104,7 @@ class _Tracer(fx.Tracer):
     """Follows what a module does, down to the modules that are known."""
 
     def is_leaf_module(self, m: nn.Module, module_qualified_name: str) -> bool:
-        known = type_before_parametrizations(m) in MODULES
+        known = type_before_parametrizations(m) in _MODULES
         return known or super().is_leaf_module(m, module_qualified_name)
 
 
@@ -148,11 +149,11 @@ def _step(node: fx.Node, module: nn.Module, constants: dict[fx.Node, Any]) -> St
     if node.op == "call_module":
         called = module.get_submodule(str(node.target))
         said = _said(called, str(node.target))
-        make: Any = MODULES.get(type_before_parametrizations(called))
+        make: Any = _MODULES.get(type_before_parametrizations(called))
         args, kwargs = (called,), {}
     else:
         args, kwargs = fx.node.map_arg(
-            (node.args, node.kwargs), lambda each: as_array(constants.get(each, VALUE))
+            (node.args, node.kwargs), lambda each: _as_array(constants.get(each, _VALUE))
         )
         name = node.target if isinstance(node.target, str) else _name(node.target)
         said = f"the {'method' if node.op == 'call_method' else 'function'} {name}"
@@ -170,9 +171,9 @@ def _step(node: fx.Node, module: nn.Module, constants: dict[fx.Node, Any]) -> St
 
 def _function(name: str, args: Any, values: int) -> Any:
     """What makes the action of a function, given its arguments; None if it isn't known."""
-    if name in BINARY:
-        return partial(arithmetic, BINARY[name])
-    return FUNCTIONS.get(name) if args[:1] == (VALUE,) and values == 1 else None
+    if name in _BINARY:
+        return partial(_arithmetic, _BINARY[name])
+    return _FUNCTIONS.get(name) if args[:1] == (_VALUE,) and values == 1 else None
 
 
 def _flat(node: fx.Node) -> list[fx.Node]:
@@ -193,3 +194,131 @@ def _name(function: Any) -> str:
     if any(getattr(library, name, None) is function for library in (torch, functional, operator)):
         return name
     return f"{getattr(function, '__module__', None)}.{name}"
+
+
+def _as_array(value: Any) -> Any:
+    """A tensor as an array in float64; anything else as it is."""
+    return value.detach().double().numpy() if isinstance(value, Tensor) else value
+
+
+def _affine_of(module: Any) -> dict[str, Any]:
+    """The weight and the bias of a module, where it has them."""
+    return {name: _as_array(getattr(module, name)) for name in ("weight", "bias")}
+
+
+def _arithmetic(name: str, left: Any, right: Any) -> Action:
+    """What an operator does that NumPy calls so."""
+    left, right = (None if v is _VALUE else np.asarray(v, np.float64) for v in (left, right))
+    return fold.binary(name, left, right)
+
+
+def _linear(values: Any, weight: Any, bias: Any = None) -> Action:
+    return fold.affine(weight, 0 if bias is None else bias)
+
+
+def _gelu(values: Any, approximate: str = "none") -> Action:
+    return fold.activation("gelu-tanh" if approximate == "tanh" else "gelu")
+
+
+def _elu(values: Any, alpha: float = 1.0, inplace: bool = False) -> Action:
+    return fold.elu(alpha)
+
+
+def _softplus(values: Any, beta: float = 1, threshold: float = _USUAL_THRESHOLD) -> Action:
+    if threshold < _USUAL_THRESHOLD:
+        raise InputError(f"its threshold is {threshold:g}: it must be {_USUAL_THRESHOLD}")
+    return fold.with_slope("softplus", beta)
+
+
+def _layer_norm(
+    values: Any,
+    normalized_shape: Any,
+    weight: Any = None,
+    bias: Any = None,
+    eps: float = EPSILON,
+) -> Action:
+    if len(normalized_shape) != 1:
+        raise InputError(f"it is over values of shape {tuple(normalized_shape)}, expected one size")
+    return fold.layer_norm(eps, weight, bias)
+
+
+def _batch_norm(
+    values: Any,
+    running_mean: Any,
+    running_var: Any,
+    weight: Any = None,
+    bias: Any = None,
+    training: bool = False,
+    momentum: float = 0.1,
+    eps: float = EPSILON,
+) -> Action:
+    if training or running_mean is None:
+        raise InputError("it has no running statistics, so that rows depend on one another")
+    return fold.batch_norm(running_mean, running_var, eps, weight, bias)
+
+
+def _dropout(values: Any, p: float = 0.5, training: bool = True, inplace: bool = False) -> Action:
+    if training:
+        raise InputError("it is on in evaluation, too: give it training=self.training")
+    return fold.NOTHING
+
+
+def _flatten(values: Any, start_dim: int = 0, end_dim: int = -1) -> Action:
+    if start_dim not in (1, -1):
+        raise InputError("it flattens the rows: start at dimension 1")
+    return fold.NOTHING
+
+
+def _same(name: str) -> Callable[..., Action]:
+    return lambda values, inplace=False: fold.activation(name)
+
+
+def _part(function: Callable[..., Any]) -> Callable[..., Action]:
+    """A function that is an activation only together with others."""
+    return lambda values: Action(None, function)
+
+
+_BINARY = {
+    **dict.fromkeys(("add", "iadd"), "add"),
+    **dict.fromkeys(("sub", "isub", "subtract"), "subtract"),
+    **dict.fromkeys(("mul", "imul", "multiply"), "multiply"),
+    **dict.fromkeys(("div", "divide", "truediv", "itruediv", "true_divide"), "divide"),
+    "pow": "power",
+}
+_FUNCTIONS: dict[str, Callable[..., Action]] = {  # of torch, and methods of its tensors
+    **{name: _same(name) for name in ("relu", "tanh", "sigmoid", "silu", "sin")},
+    "gelu": _gelu,
+    "elu": _elu,
+    "softplus": _softplus,
+    "linear": _linear,
+    "matmul": lambda values, right: fold.affine(np.transpose(right)),
+    "layer_norm": _layer_norm,
+    "batch_norm": _batch_norm,
+    "dropout": _dropout,
+    "flatten": _flatten,
+    "reshape": lambda values, *shape: fold.reshape(shape),
+    "view": lambda values, *shape: fold.reshape(shape),
+    "neg": lambda values: fold.rescale(-1),
+    **{name: _part(getattr(np, name)) for name in ("exp", "log", "sqrt", "expm1", "log1p")},
+    "erf": _part(fold.erf),
+    **dict.fromkeys(
+        ("clone", "contiguous", "cpu", "detach", "double", "float", "to"),
+        lambda *arguments, **options: fold.NOTHING,
+    ),
+}
+_MODULES: dict[type[nn.Module], Callable[[Any], Action]] = {
+    nn.Linear: lambda m: _linear(_VALUE, **_affine_of(m)),
+    nn.ReLU: lambda m: fold.activation("relu"),
+    nn.Tanh: lambda m: fold.activation("tanh"),
+    nn.Sigmoid: lambda m: fold.activation("sigmoid"),
+    nn.SiLU: lambda m: fold.activation("silu"),
+    nn.GELU: lambda m: _gelu(_VALUE, m.approximate),
+    nn.ELU: lambda m: _elu(_VALUE, m.alpha),
+    nn.Softplus: lambda m: _softplus(_VALUE, m.beta, m.threshold),
+    nn.LayerNorm: lambda m: _layer_norm(_VALUE, m.normalized_shape, **_affine_of(m), eps=m.eps),
+    nn.BatchNorm1d: lambda m: _batch_norm(
+        _VALUE, _as_array(m.running_mean), _as_array(m.running_var), **_affine_of(m), eps=m.eps
+    ),
+    nn.Flatten: lambda m: _flatten(_VALUE, m.start_dim, m.end_dim),
+    **dict.fromkeys((nn.Identity, nn.Dropout, nn.AlphaDropout), lambda m: fold.NOTHING),
+}

@@ -1,10 +1,15 @@
 """Names of encoders: method, variant, latent size and seed, such as dae-8, dae-deep-8, pca-8-s2."""
 
 import re
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from jbrep.errors import InputError
+from msgspec import Meta
 
+from jbrep.records.record import converted
+
+Name = Annotated[
+    str, Meta(pattern=r"^[a-z0-9-]+\Z", title="lower-case letters, digits and hyphens")
+]
 _NAME = re.compile(r"(?P<stem>.+?)(-(?P<latent>[0-9]{1,9}))?(-s(?P<seed>[0-9]{1,9}))?", re.ASCII)
 
 
@@ -45,7 +50,4 @@ def check_name(name: str) -> None:
     Raises:
         InputError: it can't.
     """
-    if not re.fullmatch("[a-z0-9-]+", name):
-        raise InputError(
-            f"invalid encoder name {name!r}: use lower-case letters, digits and hyphens"
-        )
+    converted(name, Name, "the name of an encoder")

@@ -3,27 +3,48 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from jbrep.dataset import Scaler
+from jbrep.dataset.scaling import usual_range
 from jbrep.encoders.base import BaseEncoder, as_encoder
 from jbrep.encoders.code import is_code, make
-from jbrep.encoders.encoder import FULL, IDENTITY, Encoder
+from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.file import SUFFIX, load
-from jbrep.encoders.identity import SCALINGS, identity
+from jbrep.encoders.header import FULL, HELD_OUT_MSE, EncoderHeader
 from jbrep.encoders.names import EncoderName
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.storage import exists
 
 _FOLDER = Path(__file__).parent / "shipped"
+_SCALINGS = {  # of the whole observation, by the word for it in the header
+    "ranges": "scaled by the usual ranges",
+    "some ranges": "scaled by the usual ranges where they are known",
+    "none": "unscaled",
+}
 
 
 def names(task: Task) -> tuple[str, ...]:
-    """Names of the encoders that ship for a task, by kind, the largest latent first; often none.
-
-    `full` is the identity, whose file is called after its kind.
-    """
+    """Names of the encoders that ship for a task, by kind, the largest latent first; often none."""
     stems = (path.name.removesuffix(SUFFIX) for path in shipped_folder(task).glob(f"*{SUFFIX}"))
-    shown = (FULL if stem == IDENTITY else stem for stem in stems)
-    return tuple(sorted(shown, key=lambda name: EncoderName.parse(name).order))
+    return tuple(sorted(stems, key=lambda name: EncoderName.parse(name).order))
+
+
+def full(task: Task) -> Encoder:
+    """The encoder that leaves a task's observation as it is, but for its scaling.
+
+    The usual range of a feature becomes [-1, 1]; a feature without one keeps its physical units.
+    """
+    ranges = [usual_range(feature) for feature in task.features]
+    known = sum(each is not None for each in ranges)
+    scaling = "ranges" if known == task.size else "some ranges" if known else "none"
+    low, high = np.array([each or (-1, 1) for each in ranges], np.float32).T
+    training, metrics = {"scaling": scaling}, {HELD_OUT_MSE: 0.0}
+    header = EncoderHeader(
+        kind=FULL, name=FULL, environment=task, training=training, metrics=metrics
+    )
+    return Encoder(header, Scaler(low, high), (), ())
 
 
 def find(name: Any, task: Task | str) -> BaseEncoder:
@@ -46,7 +67,7 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
     if is_code(name):
         return make(name, task)
     if _is_made(name, task):
-        return identity(task)
+        return full(task)
     path = _shipped(name, task) or Path(name)
     if not exists(path):
         ships = ", ".join(names(task))
@@ -87,7 +108,7 @@ def source_of(name: str | Path, task: Task | None) -> str:
     if is_code(name):
         return f"{name}, code"
     if task and _is_made(name, task):
-        return f"{name}, {SCALINGS[identity(task).header['training']['scaling']]}"
+        return f"{name}, {_SCALINGS[full(task).header.training['scaling']]}"
     return f"{name}, shipped" if task and _shipped(name, task) else str(name)
 
 
@@ -108,14 +129,13 @@ def shipped_folder(task: Task) -> Path:
 
 def _is_made(name: str | Path, task: Task) -> bool:
     """Whether the name is of the whole observation of a task for which that doesn't ship."""
-    return str(name) in (FULL, IDENTITY) and FULL not in names(task)
+    return str(name) == FULL and FULL not in names(task)
 
 
 def _shipped(name: str | Path, task: Task) -> Path | None:
     """The file that ships for a task under that name, if there is one."""
-    called = FULL if str(name) == IDENTITY else str(name)
-    return _file(called, task) if called in names(task) else None
+    return _file(str(name), task) if str(name) in names(task) else None
 
 
 def _file(name: str, task: Task) -> Path:
-    return shipped_folder(task) / f"{IDENTITY if name == FULL else name}{SUFFIX}"
+    return shipped_folder(task) / f"{name}{SUFFIX}"

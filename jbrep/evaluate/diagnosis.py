@@ -14,8 +14,8 @@ from jbrep.dataset.scaled import sample
 from jbrep.dataset.settings import IMPORTED
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.encoder import IDENTITY
-from jbrep.encoders.own import as_file
+from jbrep.encoders.encoder import as_file
+from jbrep.encoders.header import EncoderHeader
 from jbrep.errors import InputError
 from jbrep.evaluate import control, prediction, readout
 from jbrep.evaluate.control import GoodPolicy, Needs, lost, needs
@@ -89,7 +89,8 @@ def diagnose(
     judged = {label: find(each, data.task) for label, each in encoders.items()}
     for label, encoder in judged.items():
         _check(label, encoder, data)
-    full = Encoder({"kind": IDENTITY, "name": FULL}, data.scaler, (), ())
+    header = EncoderHeader(kind=FULL, name=FULL, environment=data.task)
+    full = Encoder(header, data.scaler, (), ())
     results, needed = _side_by_side({FULL: full, **judged}, held_out, policy)
     sha256 = hashes(judged)
     return Evaluation(
@@ -200,7 +201,7 @@ def networks(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None 
 
 def _said_by_method(encoder: BaseEncoder) -> dict[str, Any]:
     """What the method says of its own fit, such as its spectrum."""
-    return dict(encoder.header.get("metrics", {})) if isinstance(encoder, Encoder) else {}
+    return dict(encoder.header.metrics) if isinstance(encoder, Encoder) else {}
 
 
 def _check(label: str, encoder: BaseEncoder, data: ScaledDataset) -> None:
@@ -216,7 +217,7 @@ def _check(label: str, encoder: BaseEncoder, data: ScaledDataset) -> None:
 
 def seen(encoder: BaseEncoder, data: ScaledDataset) -> Literal["no test row", "none", "maybe"]:
     """Which of these rows an encoder saw in training."""
-    source = encoder.header["data"] if isinstance(encoder, Encoder) else {}
+    source = encoder.header.data if isinstance(encoder, Encoder) else {}
     manifest = data.dataset.manifest
     if source.get("fingerprint") == manifest.fingerprint:
         return "no test row"

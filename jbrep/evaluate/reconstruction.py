@@ -11,6 +11,7 @@ from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder
 from jbrep.encoders.base import BaseEncoder
+from jbrep.encoders.header import EncoderHeader
 from jbrep.evaluate.evaluation import (
     Corruption,
     EpisodeError,
@@ -130,7 +131,8 @@ def _pca(held_out: HeldOut, latent: int) -> Array:
 
 
 def _linear(data: ScaledDataset, layers: tuple[Layers, Layers]) -> Encoder:
-    return Encoder({"name": "linear"}, data.scaler, *layers)
+    header = EncoderHeader(kind="linear", name="linear", environment=data.task)
+    return Encoder(header, data.scaler, *layers)
 
 
 def _by_feature(sums: Array, held_out: HeldOut) -> tuple[FeatureError, ...]:

@@ -7,9 +7,8 @@ from typing import Any
 
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.encoders import find
+from jbrep.encoders import FULL, find
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import SUFFIX as ENCODER_SUFFIX
 from jbrep.encoders.shipped import find_alone, source_of
 from jbrep.envs.task import Task, check_same
@@ -163,7 +162,7 @@ def _own(source: str, task: Task) -> BaseEncoder | None:
         from jbrep.rl.policy_weights import load_encoder  # imports torch
 
         encoder = load_encoder(policy_file(source, task))
-    return None if encoder.kind == IDENTITY else encoder
+    return None if encoder.kind == FULL else encoder
 
 
 def _words(source: str | None) -> tuple[str, ...]:

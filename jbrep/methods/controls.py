@@ -7,7 +7,7 @@ import numpy as np
 from msgspec import Meta
 
 from jbrep.dataset import ScaledDataset
-from jbrep.encoders.encoder import IDENTITY
+from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.methods.linear import dense, linear_code
 from jbrep.training.method import ClosedForm, Coded, Made, Network
@@ -20,7 +20,7 @@ _FREQUENCY = 1000  # [rad] that a phase turns while a scaled feature goes from 0
 class Full(ClosedForm, frozen=True, kw_only=True):
     """The scaled observation itself."""
 
-    name: ClassVar[str] = IDENTITY
+    name: ClassVar[str] = FULL
 
     def make(self, data: ScaledDataset) -> Made:
         """As for `ClosedForm`."""

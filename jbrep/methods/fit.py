@@ -1,7 +1,6 @@
 """Making encoders by every method from a data set, each in its file."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +10,8 @@ from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import Encoder, load, save
-from jbrep.encoders.file import HELD_OUT_MSE, SUFFIX
+from jbrep.encoders.file import SUFFIX
+from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader
 from jbrep.encoders.names import check_name
 from jbrep.errors import InputError, differences
 from jbrep.methods.held_out import held_out_error
@@ -20,7 +20,6 @@ from jbrep.methods.shape import complete
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
 from jbrep.records.lock import exclusive
-from jbrep.records.record import to_plain
 from jbrep.records.storage import exists, make_folder
 from jbrep.training import checkpoint
 from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method
@@ -48,7 +47,7 @@ class Plan(NamedTuple):
 
     method: Method
     data: ScaledDataset  # scaled as the method says
-    header: dict[str, Any]  # without metrics
+    header: EncoderHeader  # without metrics
     path: Path
 
     def find(self) -> Encoder | None:
@@ -75,7 +74,7 @@ class Plan(NamedTuple):
         """
         encoder = self.find()
         epochs = self.method.epochs if isinstance(self.method, Learned) else None
-        return encoder is not None and encoder.header["metrics"].get("epochs") == epochs
+        return encoder is not None and encoder.header.metrics.get("epochs") == epochs
 
 
 class Fitter:
@@ -160,7 +159,8 @@ class Fitter:
             self._scaled[key] = self._data if key == usual else self._data.rescaled(*key)
         data = self._scaled[key]
         try:
-            Encoder({"name": method.name, "features": []}, data.scaler, (), ())
+            header = EncoderHeader(kind=method.name, name=method.name, environment=data.task)
+            Encoder(header, data.scaler, (), ())
         except InputError as error:
             raise InputError(
                 f"the observations in {data.dataset.folder} are too large to be encoded: {error}"
@@ -188,14 +188,14 @@ class Fitter:
             seed=method.seed,
         )
         trainer = Trainer(objective, schedule, windows, watched)
-        versions = {"device": self._device.type, "torch": header["versions"]["torch"]}
+        versions = {"device": self._device.type, "torch": header.versions["torch"]}
         identity = {**_origin(header), **versions}
         saved = work / "checkpoint.safetensors"
         if exists(saved):
             checkpoint.restore(trainer, identity, saved)
         try:
             with SummaryWriter(str(work), purge_step=len(trainer.history) + 1) as scalars:
-                for _ in _with_progress(trainer, header["name"]):
+                for _ in _with_progress(trainer, header.name):
                     for name, value in trainer.history[-1]._asdict().items():
                         scalars.add_scalar(name, value, len(trainer.history))
                     checkpoint.save(trainer, identity, saved)
@@ -233,35 +233,33 @@ class Fitter:
         parts, keep = complete(made, data, method.codes, method.keep)
         encoder = Encoder(plan.header, data.scaler, *parts, keep)
         metrics = {**made.metrics, HELD_OUT_MSE: held_out_error(encoder, self._data)}
-        save(replace(encoder, header={**plan.header, "metrics": metrics}), plan.path)
+        save(encoder.with_header(metrics=metrics), plan.path)
 
 
-def _header(method: Method, name: str, data: ScaledDataset) -> dict[str, Any]:
+def _header(method: Method, name: str, data: ScaledDataset) -> EncoderHeader:
     """The header of an encoder, without its metrics."""
     manifest = data.dataset.manifest
-    return {
-        "kind": method.name,
-        "name": name,
-        "task": data.task.name,
-        "environment": to_plain(data.task),
-        "features": list(data.task.feature_names),
-        "training": method.training,
-        "data": {
+    return EncoderHeader(
+        kind=method.name,
+        name=name,
+        environment=data.task,
+        training=method.training,
+        data={
             "fingerprint": manifest.fingerprint,
             "policy": dict(manifest.settings.policy),
             "seed": manifest.settings.seed,
             "train_rows": len(data.train),
             "test_rows": len(data.test),
         },
-        "versions": {each: version(each) for each in ("jbrep", "numpy", "torch")},
-        "commits": dict(commits()),
-    }
+        versions={each: version(each) for each in ("jbrep", "numpy", "torch")},
+        commits=dict(commits()),
+    )
 
 
-def _origin(header: Mapping[str, Any]) -> dict[str, Any]:
+def _origin(header: EncoderHeader) -> dict[str, Any]:
     """What must be equal for two encoders of one name to be the same."""
-    of = {"kind": header["kind"], "task": header["task"]}
-    return {**USUAL, **header["training"], **of, "data": header["data"].get("fingerprint")}
+    of = {"kind": header.kind, "task": header.environment.name}
+    return {**USUAL, **header.training, **of, "data": header.data.get("fingerprint")}
 
 
 def _with_progress(trainer: Trainer, name: str) -> Iterator[Epoch]:

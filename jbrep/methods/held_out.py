@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import Encoder
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.file import HELD_OUT_MSE
+from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader
 from jbrep.methods.linear import principal_code
 
 
@@ -58,5 +58,6 @@ def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
     if encoder.latent_size >= data.task.size:
         return None
     layers = principal_code(data, encoder.latent_size)
-    error = held_out_error(Encoder({"name": "pca"}, data.scaler, *layers), data)
-    return encoder.header["metrics"][HELD_OUT_MSE] / error if error else None
+    header = EncoderHeader(kind="pca", name="pca", environment=data.task)
+    error = held_out_error(Encoder(header, data.scaler, *layers), data)
+    return encoder.header.metrics[HELD_OUT_MSE] / error if error else None

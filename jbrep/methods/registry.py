@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 from msgspec.structs import asdict
 
 from jbrep.dataset.scaling import EXTREMA, SCALINGS
-from jbrep.encoders.encoder import FULL, IDENTITY
 from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose
 from jbrep.training.method import Method
@@ -46,12 +45,12 @@ _EXAMPLES = "it must be full, or a method and a latent size, such as dae-8, dae-
 
 
 def get_method(name: str) -> type[Method]:
-    """The method of that name; `full` is another one for the identity.
+    """The method of that name.
 
     Raises:
         InputError: the name is unknown; the message lists the methods.
     """
-    return choose(IDENTITY if name == FULL else name, METHODS, "kind")
+    return choose(name, METHODS, "kind")
 
 
 class Recipe(NamedTuple):
@@ -72,8 +71,6 @@ def name_of(method: Method) -> str:
         if settings.get(name) == value != usual.get(name)
     ]
     words += [name for name, preset in method.presets.items() if preset.items() <= settings.items()]
-    if len(words) > 1 and method.name == IDENTITY:
-        words[0] = FULL
     size = len(settings["features"]) if "features" in settings else settings.get("latent")
     return str(EncoderName("-".join(words), size))
 
@@ -85,11 +82,12 @@ def read_name(name: str) -> Recipe:
         InputError: it stands for none.
     """
     stem, latent, _ = EncoderName.parse(name)
-    known = {FULL: METHODS[IDENTITY], **METHODS}
-    start = max((each for each in known if f"{stem}-".startswith(f"{each}-")), key=len, default="")
+    start = max(
+        (each for each in METHODS if f"{stem}-".startswith(f"{each}-")), key=len, default=""
+    )
     if not start:
         raise InputError(f"unknown representation {name!r}: {_EXAMPLES}")
-    method = known[start]
+    method = METHODS[start]
     given: dict[str, Any] = {} if latent is None else {"latent": latent}
     for word in stem[len(start) :].split("-")[1:]:
         setting, value = _WORDS.get(word, ("architecture", word))
@@ -98,6 +96,6 @@ def read_name(name: str) -> Recipe:
         named = name_of(method.of(given))
     except InputError:
         named = ""
-    if named not in (name, IDENTITY if name == FULL else name):
+    if named != name:
         raise InputError(f"unknown representation {name!r}: {_EXAMPLES}")
     return Recipe(method, given)

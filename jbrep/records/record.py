@@ -108,7 +108,14 @@ def converted(value: Any, kind: Any, where: str, strict: bool = True) -> Any:
 
 def to_plain(value: Any) -> Any:
     """A record, or what holds some, as plain JSON: its fields in order, tuples as lists."""
-    return _with_lists(msgspec.to_builtins(value))
+    return _with_lists(msgspec.to_builtins(value, enc_hook=_python_scalar))
+
+
+def _python_scalar(value: Any) -> Any:
+    """A NumPy scalar as Python's."""
+    if hasattr(value, "dtype") and not getattr(value, "shape", 0):
+        return value.item()
+    raise TypeError(f"it is of type {type(value).__name__}")
 
 
 def _with_lists(value: Any) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 
 from jbrep.encoders import FULL
 from jbrep.encoders.base import OWN
-from jbrep.encoders.file import HELD_OUT_MSE
+from jbrep.encoders.header import HELD_OUT_MSE
 from jbrep.report.figures.diagrams import EncoderRecord, LabelRecord
 from jbrep.report.tables import Tables
 from jbrep.rl.files import FAILED

@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from jbrep.encoders import find, load
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.code import make
-from jbrep.encoders.own import as_file
+from jbrep.encoders.encoder import as_file
 from jbrep.envs.recording import Actor
 from jbrep.envs.task import Array, Task
 from jbrep.errors import DamageError, InputError, choose
@@ -186,7 +186,7 @@ def load_zip(path: Path, task: Task, algorithm: str, encoder: str, trust: bool) 
         reason = one_line(error)
         raise InputError(f"{path} is no {algorithm} policy for {task.name}: {reason}") from None
     statistics = Statistics.read(tensors, seen.latent_size, path) if tensors else None
-    return Trained(agent.policy, task, seen, seen.representation, statistics=statistics)
+    return Trained(agent.policy, task, seen, seen.name, statistics=statistics)
 
 
 class _Checkpoint(NamedTuple):

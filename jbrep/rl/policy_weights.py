@@ -52,7 +52,7 @@ def pack(trained: Trained, run: str) -> bytes:
         "format": POLICY_FORMAT,
         "format_version": FORMAT_VERSION,
         "settings": settings,
-        "encoder": trained.encoder.file_header,
+        "encoder": trained.encoder.header.as_json(),
         "run": run,
         "step": settings["steps"] if steps is None else steps,
         "finished": steps is None,

@@ -8,7 +8,7 @@ from typing import Any
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.code import is_code
-from jbrep.encoders.own import as_file
+from jbrep.encoders.encoder import as_file
 from jbrep.envs.description import as_task
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, choose
@@ -163,7 +163,7 @@ class Run:
             "overrides": self.settings,
             "learner": self._learner.name,
             **asdict(self.used),
-            "representation": self.representation or encoder.representation,
+            "representation": self.representation or encoder.name,
             "encoder": encoder.fingerprint,
             "encoder_code": str(self.encoder) if is_kept_as_code else None,
             "encoder_seed": self.encoder_seed,

@@ -272,7 +272,7 @@ def _encoder(folder: Path, run: Mapping[str, Any]) -> EncoderFacts:
         latent_size=encoder.latent_size,
         encoder=[(len(layer.bias), layer.activation) for layer in encoder.encoder],
         decoder=[(len(layer.bias), layer.activation) for layer in encoder.decoder],
-        **{name: encoder.header[name] for name in ("training", "data", "metrics")},
+        **{name: getattr(encoder.header, name) for name in ("training", "data", "metrics")},
     )
 
 

@@ -11,7 +11,6 @@ from msgspec import Meta
 
 from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
-from jbrep.encoders.encoder import IDENTITY
 from jbrep.encoders.file import SUFFIX
 from jbrep.encoders.names import check_name, of_seed
 from jbrep.errors import InputError
@@ -120,8 +119,7 @@ class ByName(Representation, frozen=True, kw_only=True):
         return get_method(self.kind).takes("seed")
 
     def _stem(self, number: int | None) -> str:
-        name = IDENTITY if self.name == FULL else self.name
-        return name if number is None else of_seed(name, number)
+        return self.name if number is None else of_seed(self.name, number)
 
 
 class ByFile(Representation, frozen=True, kw_only=True):

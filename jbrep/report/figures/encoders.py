@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from jbrep.encoders import FULL
-from jbrep.encoders.encoder import IDENTITY
 from jbrep.evaluate.evaluation import (
     Corruption,
     Diagnostics,
@@ -180,7 +179,7 @@ def _latent_correlation(task: str, encoders: Encoders) -> Plot:
         "latent_correlation",
         f"{task}: correlation between latent units",
         "Pearson's correlation between the latent units of each encoder, numbered from 0, on "
-        "held-out episodes. The units of the identity are the features. Empty: a dead unit.",
+        "held-out episodes. The units of `full` are the features. Empty: a dead unit.",
         ("encoder", "unit", "other_unit", "correlation"),
         [
             (label, names[i], names[j], value)
@@ -194,8 +193,8 @@ def _latent_correlation(task: str, encoders: Encoders) -> Plot:
 
 
 def _unit_names(encoder: Diagnostics) -> list[str]:
-    """Numbers of the latent units from 0; for the identity, names of the features."""
-    if encoder.kind == IDENTITY and encoder.reconstruction:
+    """Numbers of the latent units from 0; for `full`, names of the features."""
+    if encoder.kind == FULL and encoder.reconstruction:
         return [feature.name for feature in encoder.reconstruction.features]
     return [str(i) for i in range(encoder.latent)]
 
@@ -211,7 +210,7 @@ def _draw_correlation(task: str, encoders: Encoders) -> Figure:
         values = np.array(e.latent_units.correlation, float)
         picture = axes.imshow(values, cmap="RdBu_r", vmin=-1, vmax=1)
         names = _unit_names(e)
-        unit, size, angle = ("feature", 5, 90) if e.kind == IDENTITY else ("latent unit", 6.5, 0)
+        unit, size, angle = ("feature", 5, 90) if e.kind == FULL else ("latent unit", 6.5, 0)
         if len(names) <= MOST:  # otherwise some numbers
             axes.set_xticks(range(len(names)), names, size=size, rotation=angle)
             axes.set_yticks(range(len(names)), names, size=size)

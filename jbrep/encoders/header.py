@@ -1,0 +1,70 @@
+"""What an encoder's file says of the encoder, beside its numbers."""
+
+import json
+from typing import Annotated, Any, ClassVar
+
+from msgspec import Meta
+
+from jbrep.encoders.names import Name
+from jbrep.envs.task import Task
+from jbrep.errors import InputError
+from jbrep.records.document import Document
+from jbrep.records.record import to_plain
+
+FULL = "full"  # name and kind of the encoder that only scales: the whole observation
+IMPORTED = "imported"  # the kind of encoder that was trained elsewhere
+HELD_OUT_MSE = "held_out_mse"  # the metric that every encoder has, unless it was trained elsewhere
+MAX_MAGNITUDE = 1e12  # of any number, far from where float32 overflows
+
+_Words = tuple[str, ...]
+
+
+class EncoderHeader(Document, frozen=True):
+    """The header of an encoder's file.
+
+    The fields from `angles` on follow from the encoder; whoever makes one leaves them out.
+    """
+
+    format: ClassVar[str] = "jbrep encoder"
+    format_version: ClassVar[int] = 4
+
+    kind: Annotated[str, Meta(description="How it was made: a method, or `imported`.")]
+    name: Annotated[Name, Meta(description="What tables call it.")]
+    environment: Annotated[Task, Meta(description="The task whose observations it reads.")]
+    training: Annotated[dict[str, Any], Meta(description="Settings of its method.")] = {}
+    data: Annotated[
+        dict[str, Any],
+        Meta(description="Fingerprint, policy and seed of its data set; numbers of rows."),
+    ] = {}
+    versions: Annotated[dict[str, str], Meta(description="Of the packages that made it.")] = {}
+    commits: Annotated[
+        dict[str, str],
+        Meta(description="Of jbrep and of the working directory; not part of the fingerprint."),
+    ] = {}
+    metrics: Annotated[
+        dict[str, Any],
+        Meta(description="Mean squared error on held-out rows, and what its method says of it."),
+    ] = {}
+    angles: Annotated[_Words, Meta(description="Features that become sine and cosine.")] = ()
+    clip: Annotated[
+        Annotated[float, Meta(ge=1, le=MAX_MAGNITUDE)] | None,
+        Meta(description="The limit of scaled values."),
+    ] = None
+    keep: Annotated[
+        _Words, Meta(description="Features that pass around the layers and follow the code.")
+    ] = ()
+    encoder: Annotated[_Words, Meta(description="The activation after each layer.")] = ()
+    decoder: Annotated[_Words, Meta(description="The same of the decoder.")] = ()
+
+    def check(self) -> None:
+        """Check that it is plain JSON, with finite numbers, of features that there are."""
+        try:
+            json.dumps(to_plain(self), allow_nan=False)
+        except (TypeError, ValueError, RecursionError):
+            raise InputError("it must be plain JSON, all numbers finite") from None
+        for name in (*self.angles, *self.keep):
+            if name not in self.environment.feature_names:
+                raise InputError(f"{name} is no feature of {self.environment.name}")
+        for field in ("angles", "keep"):
+            if len(set(names := getattr(self, field))) < len(names):
+                raise InputError(f"its {field} must be different features")
