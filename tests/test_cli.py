@@ -16,6 +16,7 @@ from test_study import TOML
 from jbrep.cli import main
 from jbrep.cli.base import COUNT
 from jbrep.encoders import find, load, save
+from jbrep.encoders.shipped import full
 from jbrep.envs import describe
 from jbrep.evaluate.table import SCALARS, Diagnosed, write_diagnostics
 from jbrep.jitterbug.tasks import TASKS

@@ -361,7 +361,7 @@ def test_each_encoder_of_several_learns_from_its_own_data(tmp_path):
     prepare(plan)
     for task in tasks:
         made = {path.stem: load(path).header for path in plan.encoders(task).glob("*.safetensors")}
-        learned = {name: header["data"]["seed"] for name, header in made.items()}
+        learned = {name: header.data["seed"] for name, header in made.items()}
         assert learned == {
             **{"pca-4-s0": 5, "pca-4-s1": 6, "full": 5},
             **{"random-4-s0": 5, "random-4-s1": 6, "random-4-s2": 5},
