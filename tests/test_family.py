@@ -183,16 +183,3 @@ def test_the_authors_begin_with_normal_weights_and_shake_a_batch_as_one(data):
         torch.testing.assert_close(each, each[:, :1].expand(-1, 100), rtol=0, atol=1e-6)
     assert not torch.equal(noise[0][:, 0], noise[1][:, 0])
     assert 0.05 < torch.cat(noise)[:, 0].std() < 0.2
-
-
-def test_features_that_pass_around_the_encoder_come_after_the_code(data, tmp_path):
-    keep = "motor_angle,motor_velocity,angle_to_target"
-    assert set(keep.split(",")) <= set(data.task.feature_names)
-    encoder = Fitter(data, tmp_path).fit("dae", latent=8, keep=keep, epochs=1).encoder
-    assert encoder.encoder[0].weight.shape == (8, 16)
-    assert encoder.latent_size == 11
-    rows = data.dataset["observation"][data.test]
-    places = [data.task.feature_names.index(name) for name in keep.split(",")]
-    assert not encoder.encoder[0].weight[:, places].any()
-    np.testing.assert_allclose(encoder(rows)[:, 8:], data.scale(rows)[:, sorted(places)], atol=1e-6)
-    np.testing.assert_allclose(explained(encoder, data)[places], 1, atol=1e-5)

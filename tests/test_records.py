@@ -15,7 +15,7 @@ from msgspec import Meta
 from jbrep.errors import DamageError, InputError
 from jbrep.records.document import Document, read_document
 from jbrep.records.keys import key_table
-from jbrep.records.record import Finite, Record, from_plain, to_plain
+from jbrep.records.record import Finite, Record, from_plain, from_text, to_plain
 from jbrep.records.toml import toml_text
 
 Count = Annotated[int, Meta(ge=1, le=10_000)]
@@ -94,6 +94,34 @@ def test_values_become_those_of_their_fields_types():
     assert made.replace(steps=6).steps == 6
     with pytest.raises(AttributeError):
         made.steps = 7
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "value"),
+    [
+        ("0.5", float, 0.5),
+        ("7", int | None, 7),
+        ("5, 1,10", tuple[int, ...], (5, 1, 10)),
+        ("a,b", tuple[str, ...], ("a", "b")),
+        ("size=2,mass=0.5", dict[str, float], {"size": 2, "mass": 0.5}),
+        ("64,32", str, "64,32"),
+    ],
+)
+def test_text_is_read_as_people_write_it(text, kind, value):
+    assert from_text(text, kind, "it") == value
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "message"),
+    [
+        ("x", Annotated[int, Meta(ge=1)], "it is 'x': it must be a whole number from 1"),
+        ("1,x", tuple[int, ...], r"it\[1\] is 'x': it must be a whole number"),
+        ("size", dict[str, float], "it is 'size': it must be a table"),
+    ],
+)
+def test_text_that_is_no_such_value_is_refused(text, kind, message):
+    with pytest.raises(InputError, match=message):
+        from_text(text, kind, "it")
 
 
 def test_a_document_comes_back_equal_and_byte_for_byte(tmp_path):

@@ -60,11 +60,12 @@ def test_a_unit_that_says_nothing_can_be_scaled_but_not_whitened(data, rows, mad
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize(("kind", "angles"), [("pca", False), ("slow", True)])
+@pytest.mark.parametrize(("kind", "angles"), [("pca", False), ("slow", True), ("dae", False)])
 def test_what_is_kept_passes_exactly_and_the_method_never_saw_it(data, kind, angles, tmp_path):
     keep = ("angle_to_target", "velocity_x")
+    how = {"epochs": 1} if kind == "dae" else {}
     fitted = Fitter(data, tmp_path).fit(
-        kind, latent=4, keep="velocity_x,angle_to_target", angles=angles
+        kind, latent=4, keep="velocity_x,angle_to_target", angles=angles, **how
     )
     it: Encoder = fitted.encoder
     assert set(it.header.keep) == set(keep)

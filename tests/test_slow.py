@@ -198,11 +198,8 @@ def test_a_block_stays_small_where_most_episodes_are_too_short(tmp_path, monkeyp
     ("settings", "said"),
     [
         ({"kind": "slow", "lags": 500}, "no episode of .* is longer than 500 steps"),
-        ({"kind": "vamp", "lags": 500}, "no episode of .* is longer than 500 steps"),
         ({"kind": "linear-forward", "horizons": 500}, "no episode of .* is longer than 500 steps"),
         ({"kind": "slow", "latent": 5}, "latent size is 5: with 4 features it must be from 1 to 4"),
-        ({"kind": "vamp", "latent": 5}, "latent size is 5: with 4 features it must be from 1 to 4"),
-        ({"kind": "linear-forward", "latent": 5}, "latent size is 5: with 4 features"),
         (
             {"kind": "linear-forward", "latent": 2, "changes": 0, "values": 0, "horizons": 5},
             "has rank 1 in .*, so it must be from 1 to 1",

@@ -46,7 +46,9 @@ def complete(
             decoder = (_best_decoder(moments, shared, data),)
         if codes != "raw":
             encoder, decoder = _rescaled(encoder, decoder, moments, codes)
-    return Complete((_widened(encoder, data, 1), _widened(decoder, data, 0)), made.keep or keep)
+    if data.size < data.scaler.size:
+        encoder, decoder = _widened(encoder, decoder, data)
+    return Complete((encoder, decoder), made.keep or keep)
 
 
 def _code_moments(layers: Layers, data: ScaledDataset) -> tuple[Moments, Array]:
@@ -98,30 +100,18 @@ def _before(layers: Layers, weight: NDArray[Any], bias: Array) -> Layers:
     return (both, *layers[1:])
 
 
-def _widened(layers: Layers, data: ScaledDataset, axis: int) -> Layers:
-    """Layers that take (axis 1) or give (axis 0) all scaled numbers, not only those that are used.
+def _widened(encoder: Layers, decoder: Layers, data: ScaledDataset) -> tuple[Layers, Layers]:
+    """Layers that take and give all scaled numbers, not only those that are used.
 
     The others count nothing in the encoder, and come out as 0.
     """
-    if data.size == data.scaler.size:
-        return layers
-    place = 0 if axis else -1
-    weight, bias, activation = layers[place]
-    full = list(layers)
-    full[place] = Layer(
-        _spread(weight, data.used, data.scaler.size, axis),
-        bias if axis else _spread(bias, data.used, data.scaler.size, 0),
-        activation,
+    size, used = data.scaler.size, data.used
+    first, last = encoder[0], decoder[-1]
+    takes = np.zeros((len(first.bias), size), np.float32)
+    takes[:, used] = first.weight
+    gives, bias = np.zeros((size, last.weight.shape[1]), np.float32), np.zeros(size, np.float32)
+    gives[used], bias[used] = last.weight, last.bias
+    return (
+        (first._replace(weight=takes), *encoder[1:]),
+        (*decoder[:-1], last._replace(weight=gives, bias=bias)),
     )
-    return tuple(full)
-
-
-def _spread(
-    values: NDArray[np.float32], places: NDArray[np.int64], size: int, axis: int
-) -> NDArray[np.float32]:
-    """Values at their places along an axis of that size, zeros elsewhere."""
-    shape = list(values.shape)
-    shape[axis] = size
-    wide = np.zeros(shape, np.float32)
-    wide[(slice(None),) * axis + (places,)] = values
-    return wide
