@@ -82,20 +82,19 @@ def read_name(name: str) -> Recipe:
         InputError: it stands for none.
     """
     stem, latent, _ = EncoderName.parse(name)
-    start = max(
-        (each for each in METHODS if f"{stem}-".startswith(f"{each}-")), key=len, default=""
-    )
-    if not start:
-        raise InputError(f"unknown representation {name!r}: {_EXAMPLES}")
-    method = METHODS[start]
-    given: dict[str, Any] = {} if latent is None else {"latent": latent}
-    for word in stem[len(start) :].split("-")[1:]:
+    mistake = InputError(f"unknown representation {name!r}: {_EXAMPLES}")
+    kinds = [kind for kind in METHODS if f"{stem}-".startswith(f"{kind}-")]
+    if not kinds:
+        raise mistake
+    kind = max(kinds, key=len)
+    method, given = METHODS[kind], dict[str, Any]({} if latent is None else {"latent": latent})
+    for word in stem[len(kind) :].split("-")[1:]:
         setting, value = _WORDS.get(word, ("architecture", word))
         given |= method.presets.get(word, {setting: value})
     try:
         named = name_of(method.of(given))
     except InputError:
-        named = ""
+        raise mistake from None
     if named != name:
-        raise InputError(f"unknown representation {name!r}: {_EXAMPLES}")
+        raise mistake
     return Recipe(method, given)
