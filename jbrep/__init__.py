@@ -36,7 +36,7 @@ __getattr__ = exports(
 
 
 def _register(_gymnasium: ModuleType) -> None:
-    from jbrep.jitterbug.registration import register
+    from jbrep.jitterbug.tasks import register
 
     register()
 

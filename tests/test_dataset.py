@@ -97,7 +97,7 @@ def test_a_slice_within_a_shard_is_a_view_of_the_file(dataset):
 
 def test_features_and_observables_by_name(dataset):
     observation = dataset["observation"][:]
-    names = TASKS["face_direction"].feature_names
+    names = TASKS["face_direction"].plain.feature_names
     for i, name in enumerate(names):
         np.testing.assert_array_equal(dataset[name][:], observation[:, i])
     np.testing.assert_array_equal(dataset["velocity"][10:20], observation[10:20, 7:10])
@@ -325,7 +325,9 @@ def test_a_shard_is_flat_columns_that_any_hdf5_tool_opens(collected):
     with h5py.File(collected / "shard-00002.h5") as file:
         assert file["observation"].shape == (1000, 16)
         assert all(file[name].chunks is None for name in file if name != "episodes")
-        assert list(file.attrs["feature_names"]) == list(TASKS["face_direction"].feature_names)
+        assert list(file.attrs["feature_names"]) == list(
+            TASKS["face_direction"].plain.feature_names
+        )
         assert list(file.attrs["feature_units"][-3:]) == ["rad", "rad/s", "rad"]
         assert (file.attrs["task"], file.attrs["seed"], file.attrs["shard"]) == (
             "face_direction",

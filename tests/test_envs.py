@@ -90,7 +90,7 @@ def test_forms_and_scaling_agree():
             found[form, scaled] = environment.step(np.array([0.7], np.float32))[0]
     raw = found["flat", False]
     assert raw.dtype == np.float32
-    np.testing.assert_allclose(found["flat", True], task.scale(raw), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found["flat", True], task.plain.scale(raw), rtol=1e-5, atol=1e-6)
     for scaled in (False, True):
         parts = found["dict", scaled]
         assert list(parts) == [o.name for o in task.observables]

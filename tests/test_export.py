@@ -31,7 +31,9 @@ def test_npz(dataset, tmp_path):
             assert archive[name].dtype == dataset[name].dtype
         for name, values in dataset.episodes.items():
             np.testing.assert_array_equal(archive[f"episodes/{name}"], values)
-        assert archive["feature_names"].tolist() == list(TASKS["face_direction"].feature_names)
+        assert archive["feature_names"].tolist() == list(
+            TASKS["face_direction"].plain.feature_names
+        )
         assert archive["feature_units"][-1] == "rad"
 
 
@@ -39,7 +41,7 @@ def test_parquet(dataset, tmp_path):
     assert "pandas.read_parquet(" in export(dataset, "parquet", tmp_path / "data.parquet")
     table = pq.read_table(tmp_path / "data.parquet")
     assert table.num_rows == 5000
-    for name in (*TASKS["face_direction"].feature_names, "reward", "episode", "step"):
+    for name in (*TASKS["face_direction"].plain.feature_names, "reward", "episode", "step"):
         np.testing.assert_array_equal(table[name].to_numpy(), dataset[name])
     np.testing.assert_array_equal(table["action"].to_numpy(), dataset["action"][:, 0])
     np.testing.assert_array_equal(table["qvel_14"].to_numpy(), dataset["qvel"][:][:, 14])

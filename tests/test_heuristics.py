@@ -33,7 +33,7 @@ def test_median_return_of_four_episodes(task):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_policies_are_functions_of_the_observation_alone(task):
-    observation = np.random.default_rng(0).normal(size=(20, TASKS[task].size))
+    observation = np.random.default_rng(0).normal(size=(20, TASKS[task].plain.size))
     kept = observation.copy()
     action = HEURISTICS[task](observation)
     assert action.shape == (20, 1)

@@ -40,12 +40,12 @@ def actions(steps, lanes, task=FACE):
 @pytest.mark.parametrize("task", TASKS)
 def test_spaces_and_types(task):
     environment = JitterbugVecEnv(task, 2)
-    assert environment.observation_space == spaces.Box(-np.inf, np.inf, (TASKS[task].size,))
+    assert environment.observation_space == spaces.Box(-np.inf, np.inf, (TASKS[task].plain.size,))
     assert environment.action_space == spaces.Box(-1, 1, (1,))
     observation = environment.reset()
     assert observation.dtype == np.float32
     observation, reward, done, infos = environment.step(np.zeros((2, 1)))
-    assert observation.shape == (2, TASKS[task].size)
+    assert observation.shape == (2, TASKS[task].plain.size)
     assert (reward.dtype, reward.shape, done.dtype, infos) == (np.float32, (2,), bool, [{}, {}])
 
 

@@ -44,11 +44,11 @@ def reward(task, **state):
 
 
 def test_the_five_tasks_and_their_sizes():
-    assert {name: task.size for name, task in TASKS.items()} == SIZES
+    assert {name: task.plain.size for name, task in TASKS.items()} == SIZES
     for task in TASKS.values():
-        assert task.feature_names[:15] == TASKS["move_from_origin"].feature_names
-        assert len(set(task.feature_names)) == task.size
-        assert task.observe(readings()).shape == (1, task.size)
+        assert task.plain.feature_names[:15] == TASKS["move_from_origin"].plain.feature_names
+        assert len(set(task.plain.feature_names)) == task.plain.size
+        assert task.observe(readings()).shape == (1, task.plain.size)
 
 
 def test_an_unknown_task_is_named_with_the_choices():
@@ -158,17 +158,17 @@ def test_tilting_costs_reward(task):
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_scaling_maps_the_nominal_range_to_one_and_back(task):
-    low = np.array([f.low for f in task.features])
-    high = np.array([f.high for f in task.features])
+    low = np.array([f.low for f in task.plain.features])
+    high = np.array([f.high for f in task.plain.features])
     np.testing.assert_allclose(
-        task.scale(np.stack([low, (low + high) / 2, high])).mean(1), [-1, 0, 1]
+        task.plain.scale(np.stack([low, (low + high) / 2, high])).mean(1), [-1, 0, 1]
     )
-    values = np.random.default_rng(0).normal(size=(50, task.size))
-    np.testing.assert_allclose(task.unscale(task.scale(values)), values)
+    values = np.random.default_rng(0).normal(size=(50, task.plain.size))
+    np.testing.assert_allclose(task.plain.unscale(task.plain.scale(values)), values)
 
 
 def test_nominal_ranges():
-    ranges = {f.name: (f.low, f.high, f.unit) for t in TASKS.values() for f in t.features}
+    ranges = {f.name: (f.low, f.high, f.unit) for t in TASKS.values() for f in t.plain.features}
     assert ranges["position_x"] == (-2, 2, "m")
     assert ranges["position_z"] == (0, 0.1, "m")
     assert ranges["orientation_w"] == (-1, 1, "1")
@@ -182,8 +182,8 @@ def test_nominal_ranges():
 
 def test_split_keeps_order_and_joins_again():
     task = TASKS["move_to_pose"]
-    observation = np.arange(2.0 * task.size).reshape(2, task.size)
-    parts = task.split(observation)
+    observation = np.arange(2.0 * task.plain.size).reshape(2, task.plain.size)
+    parts = task.plain.split(observation)
     assert [o.name for o in task.observables] == list(parts)
     np.testing.assert_array_equal(np.concatenate(list(parts.values()), axis=1), observation)
 

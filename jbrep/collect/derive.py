@@ -152,7 +152,7 @@ def _read(
     n = len(states["qpos"])
     lanes = min(_LANES, n)
     simulation = Simulation(task, lanes, num_threads, **body)
-    observation, reward = np.empty((n, task.size), np.float32), np.empty(n, np.float32)
+    observation, reward = np.empty((n, task.plain.size), np.float32), np.empty(n, np.float32)
     for start in range(0, n, lanes):
         rows = slice(min(start, n - lanes), start + lanes)  # the last ones overlap
         simulation.restore(**{name: values[rows] for name, values in states.items()})

@@ -1,4 +1,4 @@
-"""Names of tasks: the Jitterbug's five, and every id in Gymnasium's registry."""
+"""Names of tasks: every id in Gymnasium's registry, and short names for some of them."""
 
 import difflib
 import sys
@@ -10,18 +10,12 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
+from jbrep.envs.task import SHORT_NAMES
 from jbrep.errors import InputError, kind_and_line
 
-_NAMESPACE = "Jitterbug"
 _REGISTERED_BY = {"dm_control": "shimmy"}  # the package whose import registers a namespace's ids
 _BESIDES = {"shimmy": ("dm-control",)}  # packages that one's environments come from
 _imported: list[str] = []
-
-
-def short_names() -> dict[str, str]:
-    """The Jitterbug's tasks by their short names: face_direction is Jitterbug/FaceDirection-v0."""
-    specs = gymnasium.registry.values()
-    return {spec.kwargs["task"]: spec.id for spec in specs if spec.namespace == _NAMESPACE}
 
 
 def find_spec(name: str) -> EnvSpec:
@@ -36,17 +30,16 @@ def find_spec(name: str) -> EnvSpec:
             f"the task {name!r} names a module: importing it runs its code, so this is possible on "
             "a command line only; elsewhere give the id alone, and --import MODULE to the command"
         )
-    short = short_names()
     namespace = name.partition("/")[0]
     if namespace in _REGISTERED_BY:
         _import_quietly(_REGISTERED_BY[namespace])
     try:
-        return gymnasium.spec(short.get(name, name))
+        return gymnasium.spec(SHORT_NAMES.get(name, name))
     except gymnasium.error.Error:
-        near = difflib.get_close_matches(name, [*short, *gymnasium.registry], n=3)
+        near = difflib.get_close_matches(name, [*SHORT_NAMES, *gymnasium.registry], n=3)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise InputError(
-            f"unknown task {name!r}: {hint}choose one of {', '.join(short)}, or an id that "
+            f"unknown task {name!r}: {hint}choose one of {', '.join(SHORT_NAMES)}, or an id that "
             "Gymnasium knows; for one of another package add --import PACKAGE"
         ) from None
 

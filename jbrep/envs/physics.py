@@ -78,15 +78,20 @@ class Motion:
 
 
 class MotionReader:
-    """Reads the physics of lanes while `jbrep.envs.recording.record` plays their next episodes."""
+    """Reads the physics of lanes while `jbrep.envs.recording.record` plays their next episodes.
+
+    Known are the environments of `physics_of`, and batches that give the `models` of their lanes
+    and their `mujoco_state`, arrays of `mujoco.MjData` by name, (n, ...) each.
+    """
 
     def __init__(self) -> None:
         self._models: list[mujoco.MjModel] = []
 
-    def __call__(self, lanes: Lanes) -> dict[str, Array]:
+    def __call__(self, lanes: Lanes) -> Mapping[str, Array]:
         """The state of each lane, (n, ...) each; nothing where there is no MuJoCo."""
-        if hasattr(lanes.envs, "simulation"):  # the Jitterbug's batch
-            return self._read_batch(lanes)
+        if hasattr(lanes.envs, "mujoco_state"):
+            self._models = self._models or lanes.envs.models
+            return lanes.envs.mujoco_state
         running = [physics_of(env) for env in lanes.envs] if isinstance(lanes.envs, list) else []
         every = [physics for physics in running if physics]
         if len(every) < lanes.num_lanes or len({p.model.nq for p in every}) > 1:
@@ -94,23 +99,9 @@ class MotionReader:
         self._models = self._models or [physics.model for physics in every]
         return {name: np.stack([getattr(p.data, name) for p in every]) for name in _STATE}
 
-    def _read_batch(self, lanes: Lanes) -> dict[str, Array]:
-        if not self._models:
-            self._models = [lanes.envs.simulation.model_of(i) for i in range(lanes.num_lanes)]
-        now = lanes.arrays
-        return {
-            "qpos": now["qpos"],
-            "qvel": now["qvel"],
-            "mocap_pos": now["target_position"][:, None],
-            "mocap_quat": now["target_quaternion"][:, None],
-        }
-
     def motion(self, recording: Recording, lane: int, steps: int) -> Motion | None:
         """What the robot of a lane went through in its first steps; None without MuJoCo."""
         if not recording.arrays:
             return None
-        arrays = {name: read[: steps + 1, lane] for name, read in recording.arrays.items()}
-        if "ctrl" not in arrays:  # the Jitterbug's is its action
-            action = recording.action[:steps, lane]
-            arrays["ctrl"] = np.concatenate((np.zeros_like(action[:1]), action))
-        return Motion(self._models[lane], arrays)
+        read = recording.arrays.items()
+        return Motion(self._models[lane], {n: values[: steps + 1, lane] for n, values in read})

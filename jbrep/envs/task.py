@@ -50,6 +50,8 @@ _Positive = Annotated[float, Meta(gt=0, le=1e12)]
 _Arrays = Mapping[Word, Annotated[int, Meta(ge=1, le=_MAX_FEATURES)]]
 _Bounds = Annotated[tuple[Finite, ...], Meta(min_length=1, max_length=_MAX_ACTIONS)]
 
+SHORT_NAMES: dict[str, str] = {}  # ids of tasks by other names; a robot that ships adds its own
+
 
 class Feature(Record, frozen=True, array_like=True):
     """One number of an observation."""

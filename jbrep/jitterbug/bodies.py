@@ -7,13 +7,13 @@ a body whose weight comes within half a millimetre of a leg is drawn again.
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from importlib import resources
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from jbrep.errors import InputError
-from jbrep.jitterbug.mjcf import read_xml
 from jbrep.jitterbug.tasks import Array
 
 RANDOM = "random"  # another body in each episode
@@ -30,6 +30,11 @@ _DENSITY_LOWEST = 0.1  # share of the published density
 _GEAR_SD = 0.001
 _CLEARANCE = 0.0005  # between the weight's orbit and a leg [m]
 _LEGS = ("leg1", "leg2", "leg3", "leg4")
+
+
+def read_xml() -> str:
+    """The MJCF text of the published robot."""
+    return resources.files(__package__).joinpath("jitterbug.xml").read_text()
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jbrep.jitterbug import tasks
-from jbrep.jitterbug.mjcf import read_xml
+from jbrep.jitterbug.bodies import read_xml
 from jbrep.jitterbug.tasks import Array, Readings
 from jbrep.opengl import prepare_opengl
 
@@ -82,7 +82,7 @@ class Jitterbug(base.Task):
     def get_observation(self, physics: Physics) -> OrderedDict[str, Array]:
         """The observables by name, in the order of the flat observation."""
         observation = self._task.observe(physics.readings())[0]
-        parts = self._task.split(observation)
+        parts = self._task.plain.split(observation)
         return OrderedDict((name, part.copy()) for name, part in parts.items())
 
     def get_reward(self, physics: Physics) -> float:

@@ -44,7 +44,7 @@ class _View:
     @property
     def space(self) -> spaces.Space[Any]:
         if self.form == "flat":
-            return self._box(self.task.size)
+            return self._box(self.task.plain.size)
         return spaces.Dict([(o.name, self._box(len(o.features))) for o in self.task.observables])
 
     def _box(self, size: int) -> spaces.Box:
@@ -53,9 +53,9 @@ class _View:
     def __call__(self, observation: Array) -> Observation:
         """Convert observations in physical units, (..., d), to the form of the space."""
         if self.scaled:
-            observation = self.task.scale(observation)
+            observation = self.task.plain.scale(observation)
         given = observation.astype(_TYPES[self.dtype])
-        return given if self.form == "flat" else self.task.split(given)
+        return given if self.form == "flat" else self.task.plain.split(given)
 
 
 def _render_modes() -> list[str]:
@@ -254,7 +254,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         self._max_steps = max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._generators = [np.random.default_rng() for _ in range(num_envs)]
-        self._observation = np.zeros((num_envs, self.task.size))  # the last finite ones
+        self._observation = np.zeros((num_envs, self.task.plain.size))  # the last finite ones
         self.num_envs = num_envs
         self.single_observation_space = self._view.space
         self.single_action_space = _ACTIONS
@@ -316,6 +316,16 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         terminated = np.zeros(self.num_envs, dtype=np.bool_)
         info |= self._state_info() | {"non_finite": diverged, "_non_finite": self._every_lane}
         return self._view(self._observation), reward, terminated, truncated, info
+
+    @property
+    def models(self) -> list[mujoco.MjModel]:
+        """The model of each lane's robot, as described."""
+        return [self.simulation.model_of(lane) for lane in range(self.num_envs)]
+
+    @property
+    def mujoco_state(self) -> dict[str, Array]:
+        """What pictures of the lanes follow from: arrays of `mujoco.MjData`, (n, ...) each."""
+        return self.simulation.mujoco_state
 
     @property
     def state(self) -> dict[str, NDArray[Any]]:

@@ -92,7 +92,7 @@ def approach_target(state: dict[str, Array], walk: Walk, approach: Approach) -> 
 
 def move_from_origin(observation: Array, walk: Walk = WALK) -> Array:
     """Hop straight out."""
-    state = get_task("move_from_origin").split(observation)
+    state = get_task("move_from_origin").plain.split(observation)
     w, x, y, z = np.split(state["orientation"], 4, axis=1)
     heading = np.arctan2(2 * (x**2 + z**2) - 1, 2 * (w * z - x * y))
     outward = np.arctan2(state["position"][:, 1:2], state["position"][:, :1])
@@ -101,19 +101,19 @@ def move_from_origin(observation: Array, walk: Walk = WALK) -> Array:
 
 def face_direction(observation: Array, turn: Turn = TURN) -> Array:
     """Turn by the angle to the target."""
-    state = get_task("face_direction").split(observation)
+    state = get_task("face_direction").plain.split(observation)
     return turn_by(state, state["angle_to_target"], turn)
 
 
 def move_in_direction(observation: Array, walk: Walk = WALK) -> Array:
     """Hop toward where the target's yaw points."""
-    state = get_task("move_in_direction").split(observation)
+    state = get_task("move_in_direction").plain.split(observation)
     return walk_toward(state, state["angle_to_target"], walk)
 
 
 def move_to_position(observation: Array, walk: Walk = WALK, approach: Approach = APPROACH) -> Array:
     """Hop to the target and rest there."""
-    state = get_task("move_to_position").split(observation)
+    state = get_task("move_to_position").plain.split(observation)
     go = approach_target(state, walk, approach)
     return np.where(_distance(state) > approach.there, go, 0)
 
@@ -125,7 +125,7 @@ def move_to_pose(
     turn: Turn = POSE_TURN,
 ) -> Array:
     """Hop to the target; there, turn."""
-    state = get_task("move_to_pose").split(observation)
+    state = get_task("move_to_pose").plain.split(observation)
     go = approach_target(state, walk, approach)
     face = turn_by(state, state["angle_to_target"], turn)
     return np.where(_distance(state) > approach.there, go, face)

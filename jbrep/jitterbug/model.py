@@ -6,8 +6,7 @@ from functools import lru_cache
 import mujoco
 from mujoco import _batch
 
-from jbrep.jitterbug.bodies import Body
-from jbrep.jitterbug.mjcf import read_xml
+from jbrep.jitterbug.bodies import Body, read_xml
 from jbrep.jitterbug.tasks import CONTROL_TIMESTEP
 
 PHYSICS_TIMESTEP = 0.0002  # [s]

@@ -114,6 +114,17 @@ class Simulation:
             state["body"] = self.body_numbers
         return state
 
+    @property
+    def mujoco_state(self) -> dict[str, Array]:
+        """What pictures of the lanes follow from: views of `mujoco.MjData`, (n, ...) each."""
+        return {
+            "qpos": self.readings.qpos,
+            "qvel": self.readings.qvel,
+            "ctrl": self._control,
+            "mocap_pos": self.readings.target_position[:, None],
+            "mocap_quat": self.target_quaternion[:, None],
+        }
+
     def restore(
         self,
         qpos: Array,

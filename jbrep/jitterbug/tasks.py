@@ -7,16 +7,15 @@ the batched simulation with n. Lengths in m, angles in rad, times in s; n is the
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.envs.task import Feature, Task
+from jbrep.envs.task import SHORT_NAMES, Feature, Task
 from jbrep.errors import choose
 
 Array = NDArray[np.float64]
-_Float = TypeVar("_Float", bound=np.floating[Any])
 
 CONTROL_TIMESTEP = 0.01  # [s]
 EPISODE_STEPS = 1000  # control steps
@@ -219,21 +218,6 @@ class JitterbugTask:
     target_yaw: tuple[float, float] = (0, 0)  # [rad]
 
     @cached_property
-    def features(self) -> tuple[Feature, ...]:
-        """All features in the order of the flat observation."""
-        return tuple(f for observable in self.observables for f in observable.features)
-
-    @property
-    def size(self) -> int:
-        """Length d of the flat observation."""
-        return len(self.features)
-
-    @property
-    def feature_names(self) -> tuple[str, ...]:
-        """Names of all features, in the same order."""
-        return tuple(f.name for f in self.features)
-
-    @cached_property
     def plain(self) -> Task:
         """The task as plain data, with the usual time limit."""
         return self.describe()
@@ -260,7 +244,7 @@ class JitterbugTask:
         return Task(
             id=environment_id(self.name),
             name=self.name,
-            features=self.features,
+            features=tuple(f for each in self.observables for f in each.features),
             action_low=(-1.0,),
             action_high=(1.0,),
             max_episode_steps=steps,
@@ -285,18 +269,6 @@ class JitterbugTask:
         for term in self.terms:
             reward = reward * term(readings)
         return reward
-
-    def scale(self, observation: Array) -> Array:
-        """Scale by the nominal ranges: physical units (n, d) to about [-1, 1]."""
-        return self.plain.scale(observation)
-
-    def unscale(self, scaled: Array) -> Array:
-        """The inverse of `scale`."""
-        return self.plain.unscale(scaled)
-
-    def split(self, observation: NDArray[_Float]) -> dict[str, NDArray[_Float]]:
-        """Split flat observations (..., d) by observable; the parts are views."""
-        return self.plain.split(observation)
 
     def start(self, random: np.random.Generator | np.random.RandomState) -> Start:
         """Draw how an episode begins.
@@ -362,3 +334,19 @@ def get_task(name: str) -> JitterbugTask:
 def environment_id(task: str) -> str:
     """Gymnasium's id of a task: `face_direction` is `Jitterbug/FaceDirection-v0`."""
     return f"Jitterbug/{task.title().replace('_', '')}-v0"
+
+
+def register() -> None:
+    """Register the five tasks and their short names; with jbrep, Gymnasium's import calls this."""
+    import gymnasium
+
+    for name in TASKS:
+        SHORT_NAMES[name] = environment_id(name)
+        gymnasium.register(
+            environment_id(name),
+            entry_point="jbrep.jitterbug.gym:JitterbugEnv",
+            vector_entry_point="jbrep.jitterbug.gym:JitterbugVectorEnv",
+            max_episode_steps=EPISODE_STEPS,
+            reward_threshold=SOLVED_REWARD * EPISODE_STEPS,
+            kwargs={"task": name},
+        )

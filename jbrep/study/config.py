@@ -10,8 +10,8 @@ from msgspec import Meta
 
 from jbrep.dataset.settings import MAX_ROOT_SEED
 from jbrep.encoders import FULL
-from jbrep.envs.names import find_spec, short_names
-from jbrep.envs.task import MAX_EPISODE_STEPS
+from jbrep.envs.names import find_spec
+from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.records.document import Document
@@ -212,7 +212,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             for name, each in ((each.name, each) for each in self.observed)
             if name != FULL
         }
-        short = {full: name for name, full in short_names().items()}
+        short = {full: name for name, full in SHORT_NAMES.items()}
         if self.rules.primary and (long := [task for task in self.tasks if task in short]):
             raise InputError(
                 f"tasks has {long[0]}: say {short[long[0]]}, as tables do, where there are verdicts"
