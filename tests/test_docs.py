@@ -10,6 +10,7 @@ import gymnasium
 import pytest
 
 from jbrep.cli import main
+from jbrep.encoders.header import EncoderHeader
 from jbrep.envs import describe
 from jbrep.records.keys import key_table
 from jbrep.rl.settings import TrainingSettings
@@ -77,6 +78,7 @@ SHARED = (*TrainingSettings.__struct_fields__, "data", "learners", "verdicts")
 @pytest.mark.parametrize(
     ("page", "table"),
     [
+        ("encoder-file", key_table(EncoderHeader)),
         ("learning", key_table(TrainingSettings)),
         ("studies", key_table(Study, without=SHARED)),
         ("studies", key_table(Data, of="data")),

@@ -28,10 +28,14 @@ class EncoderHeader(Document, frozen=True):
     format: ClassVar[str] = "jbrep encoder"
     format_version: ClassVar[int] = 4
 
-    kind: Annotated[str, Meta(description="How it was made: a method, or `imported`.")]
-    name: Annotated[Name, Meta(description="What tables call it.")]
-    environment: Annotated[Task, Meta(description="The task whose observations it reads.")]
-    training: Annotated[dict[str, Any], Meta(description="Settings of its method.")] = {}
+    kind: Annotated[str, Meta(description="The method that made it, `full` or `imported`.")]
+    name: Annotated[Name, Meta(description="What tables call it, such as `dae-8`.")]
+    environment: Annotated[
+        Task, Meta(description="The task whose observations it reads, see data-format.md.")
+    ]
+    training: Annotated[
+        dict[str, Any], Meta(description="Settings of its method: latent size, epochs, seed.")
+    ] = {}
     data: Annotated[
         dict[str, Any],
         Meta(description="Fingerprint, policy and seed of its data set; numbers of rows."),
@@ -43,11 +47,14 @@ class EncoderHeader(Document, frozen=True):
     ] = {}
     metrics: Annotated[
         dict[str, Any],
-        Meta(description="Mean squared error on held-out rows, and what its method says of it."),
+        Meta(description="`held_out_mse`, on all held-out rows; what its method says of its fit."),
     ] = {}
-    angles: Annotated[_Words, Meta(description="Features that become sine and cosine.")] = ()
+    angles: Annotated[
+        _Words,
+        Meta(description="Features that become sine, in their place, and cosine, after all."),
+    ] = ()
     clip: Annotated[
-        Annotated[float, Meta(ge=1, le=MAX_MAGNITUDE)] | None,
+        Annotated[float, Meta(ge=1, le=MAX_MAGNITUDE, title="a number from 1 to 1e12")] | None,
         Meta(description="The limit of scaled values."),
     ] = None
     keep: Annotated[

@@ -1,7 +1,8 @@
 """Reinforcement learning on a representation: one run, its files, its checkpoint."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from jbrep.lazy import exports
 
 if TYPE_CHECKING:
     from jbrep.rl.checkpoint import StoppedError
@@ -10,10 +11,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Run", "StoppedError", "train"]
 
-_MODULES = {"Run": "run", "StoppedError": "checkpoint", "train": "trainers"}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)  # imports torch
+__getattr__ = exports(  # which import torch
+    __name__, {"Run": "run", "StoppedError": "checkpoint", "train": "trainers"}
+)
