@@ -37,7 +37,7 @@ def main(out: Path) -> None:
     replaying = fastest(replay)
     show("replaying", replaying)
     show("recording", fastest(partial(record_episode, episode, out)), out.stat().st_size)
-    for name in ("dae-8", "identity"):
+    for name in ("dae-8", "full"):
         encoder = find(name, episode.task)
         seconds = fastest(partial(record_episode, episode, out, encoder))
         show(f"recording with {name}", seconds, out.stat().st_size)

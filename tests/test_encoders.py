@@ -17,7 +17,7 @@ import torch
 from command import jbrep
 
 from jbrep import JitterbugVecEnv
-from jbrep.dataset import DamageError, Scaler
+from jbrep.dataset import Scaler
 from jbrep.encoders import Encoder, Layer, find, load, save, shipped
 from jbrep.encoders.card import card
 from jbrep.encoders.card import describe as described
@@ -129,7 +129,7 @@ def test_the_file_gives_the_same_encoder_back(encoder, tmp_path):
     np.testing.assert_array_equal(encoder.decode(again(rows)), again.decode(encoder(rows)))
 
 
-def test_an_identity_has_no_layers(tmp_path):
+def test_an_encoder_may_have_no_layers(tmp_path):
     scaler = Scaler(-np.ones(16, np.float32), np.full(16, 3, np.float32))
     save(Encoder(header(), scaler, (), ()), tmp_path / "it")
     it, rows = load(tmp_path / "it"), observations(3)
@@ -307,15 +307,6 @@ def test_wide_layers_are_refused():
     assert larger.encode(np.zeros(16)).shape == (17,)
 
 
-def test_tampering_with_a_weight_is_found(encoder, tmp_path):
-    save(encoder, tmp_path / "encoder")
-    whole = (tmp_path / "encoder").read_bytes()
-    number = encoder.encoder[0].weight[0, 0].tobytes()
-    (tmp_path / "encoder").write_bytes(whole.replace(number, np.float32(1).tobytes()))
-    with pytest.raises(DamageError, match=r"is damaged \(its checksum doesn't match"):
-        load(tmp_path / "encoder")
-
-
 def test_an_encoder_of_another_environment_or_other_features_is_refused(encoder):
     encoder.check_task(TASK)
     with pytest.raises(InputError, match="made for face_direction, not for move_to_pose"):
@@ -331,13 +322,6 @@ def test_an_encoder_of_another_environment_or_other_features_is_refused(encoder)
     with pytest.raises(InputError, match="dae-3 was made for other features of Pendulum-v1"):
         make(task=PENDULUM).check_task(renamed)
     make(task=PENDULUM).check_task(describe("Pendulum-v1"))  # with other arguments
-
-
-def test_the_environment_comes_back_from_the_file(tmp_path):
-    save(make(task=PENDULUM), tmp_path / "it")
-    again = load(tmp_path / "it")
-    assert again.task == PENDULUM
-    assert again.task.arguments == {"g": 1.6}
 
 
 def test_the_environment_shows_latents_and_refuses_another_task(encoder):
@@ -473,10 +457,6 @@ def test_observations_and_latents_of_any_size(size, tmp_path):
         ["latent"], {"observation": rows}
     )
     np.testing.assert_allclose(given, wide(rows), rtol=1e-4, atol=1e-4)
-
-
-def test_an_encoder_is_shown_on_one_line(encoder):
-    assert repr(encoder) == "Encoder(dae-3, face_direction, 16 to 3)"
 
 
 def test_a_name_that_ships_takes_precedence_over_a_file(encoder, tmp_path, monkeypatch):

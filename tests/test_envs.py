@@ -61,15 +61,6 @@ def test_gymnasium_s_environments_need_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_rl_zoo3_s_way_of_importing_registers_them():
-    """Its --gym-packages option imports the package by name, then makes the id."""
-    code = (
-        "import importlib, gymnasium; importlib.import_module('jbrep');"
-        f"assert '{FACE}' in gymnasium.envs.registry; gymnasium.make('{FACE}')"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 @pytest.mark.filterwarnings("ignore:.*-?infinity. This is probably too")  # no state is bounded
 @pytest.mark.parametrize(("env_id", "form"), [*((name, "flat") for name in IDS), (FACE, "dict")])
 def test_checkers(env_id, form):
@@ -275,23 +266,6 @@ def test_lanes_are_reset_by_hand_where_autoreset_is_off():
         observation, _, _, truncated, _ = many.step(action)
         np.testing.assert_array_equal(observation[1], single.step(action[1])[0])
         assert truncated.tolist() == [True, False, True]
-
-
-def test_a_vector_environment_s_state_is_continued_to_the_same_bits():
-    many = gymnasium.make_vec(FACE, num_envs=2, max_episode_steps=30, dtype="float64").unwrapped
-    assert many.single_observation_space.dtype == np.float64
-    many.reset(seed=3)
-    actions = np.random.default_rng(0).uniform(-1, 1, (40, 2, 1))
-    for action in actions[:20]:
-        many.step(action)
-    state = many.state
-    expected = [many.step(action)[:4] for action in actions[20:29]]  # none is reset
-    other = gymnasium.make_vec(FACE, num_envs=2, max_episode_steps=30, dtype="float64").unwrapped
-    for each in (many, other):
-        each.restore(state)
-        for action, before in zip(actions[20:29], expected, strict=True):
-            for one, again in zip(before, each.step(action)[:4], strict=True):
-                np.testing.assert_array_equal(one, again)
 
 
 @pytest.mark.parametrize(

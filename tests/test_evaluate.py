@@ -199,7 +199,9 @@ def test_errors_are_those_of_encode_and_decode(held_out, coder):
     assert worst.seed == held_out.data.dataset.episodes["seed"][worst.episode]
 
 
-def test_pca_is_its_own_reference_and_the_identity_loses_nothing(held_out, coder, everything):
+def test_pca_is_its_own_reference_and_the_full_observation_loses_nothing(
+    held_out, coder, everything
+):
     same = reconstruction(make(held_out.data, principal_code(held_out.data, 4)), held_out)
     np.testing.assert_allclose(same.ratio_to_pca, 1, rtol=1e-4)
     assert same.mse == pytest.approx(same.pca_mse, rel=1e-4)
@@ -219,7 +221,9 @@ def test_errors_are_scaled_by_the_data_not_by_the_encoder(held_out, coder):
     assert reconstruction(shifted, held_out).mse[0] == pytest.approx(expected, rel=1e-3)
 
 
-def test_corruption_of_the_identity_stays_and_the_linear_denoiser_is_better(data, everything):
+def test_corruption_of_the_full_observation_stays_and_the_linear_denoiser_is_better(
+    data, everything
+):
     levels = corruption(everything, HeldOut(train_as_test(data)))
     assert [level.noise for level in levels] == list(NOISES)
     for level in levels[1:]:

@@ -4,8 +4,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from jbrep.envs.lanes import NonFiniteActionError, check_actions
-from jbrep.errors import InputError
 from jbrep.jitterbug.bodies import PUBLISHED, draw
 from jbrep.jitterbug.model import PHYSICS_STEPS, plain_model
 from jbrep.jitterbug.simulation import Simulation
@@ -33,19 +31,6 @@ def rollout(seeds, num_threads, task="move_to_pose", spoil=None):
 def assert_same(one, other, lanes=slice(None), of=slice(None)):
     for a, b in zip(one, other, strict=True):
         np.testing.assert_array_equal(a[:, lanes], b[:, of])
-
-
-def test_any_number_of_threads_gives_the_same():
-    one = rollout(range(5), 1)
-    assert np.abs(np.diff(one[0], axis=0)).max() > 0.1
-    assert_same(one, rollout(range(5), 2))
-    assert_same(one, rollout(range(5), 7))
-
-
-def test_any_number_of_lanes_gives_the_same():
-    many = rollout(range(16), 2)
-    for seed in (0, 3, 15):
-        assert_same(many, rollout([seed], 1), lanes=slice(seed, seed + 1))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e12])
@@ -221,32 +206,3 @@ def test_a_lane_s_model_is_that_of_its_body():
     before = simulation.model_of(0)
     simulation.reset([0], [np.random.default_rng(50)])
     assert simulation.model_of(0) is not before
-
-
-@pytest.mark.parametrize("body", [-1, 2.5, "other"])
-def test_bodies_that_do_not_exist_are_refused(body):
-    with pytest.raises(InputError, match=r"body is .*whole number from 0"):
-        Simulation(get_task("face_direction"), 1, 1, body)
-
-
-def test_a_simulation_is_shown_on_one_line():
-    assert repr(Simulation(get_task("move_to_pose"), 3, 1)) == "Simulation(move_to_pose, 3 lanes)"
-
-
-@pytest.mark.parametrize(("lanes", "threads"), [(0, 1), (-1, None), (1, 0)])
-def test_numbers_below_one_are_refused(lanes, threads):
-    with pytest.raises(InputError, match="must be at least 1"):
-        Simulation(get_task("face_direction"), lanes, threads)
-
-
-@pytest.mark.parametrize("size", [1, 3])
-@pytest.mark.parametrize("actions", [np.zeros(2), np.zeros((2, 2)), np.zeros((3, 1)), 0.5])
-def test_actions_of_another_shape_are_refused(actions, size):
-    with pytest.raises(InputError, match=rf"actions have shape .*: it must be \(2, {size}\)"):
-        check_actions(actions, 2, size)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_actions_that_are_not_finite_are_refused(value):
-    with pytest.raises(NonFiniteActionError, match="actions are not finite"):
-        check_actions(np.array([[0.0], [value]]), 2, 1)
