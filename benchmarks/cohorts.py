@@ -51,11 +51,11 @@ STUDY = Study(
 def run_of(learner: tuple[str, str], number: int, **changes: str) -> Run:
     """A run that learns from its first rollout on."""
     algorithm, preset = learner
-    return Run(
+    return Run.of(
         task="face_direction",
         algorithm=algorithm,
         preset=preset,
-        settings={"learning_starts": 0},
+        overrides={"learning_starts": 0},
         encoder=CODES[number % len(CODES)],
         seed=number,
         **changes,
@@ -67,8 +67,8 @@ def agent(learner: tuple[str, str], number: int) -> OffPolicyAlgorithm:
     """That stable-baselines3 trains, with some transitions to learn from."""
     torch.set_num_threads(1)
     run = run_of(learner, number, trainer="sb3")
-    env = make_env(run.task, run.used.num_envs, 0, run.find_encoder())
-    made = make_agent(run.algorithm, run.used, env, number)
+    env = make_env(run.task, run.learner.hyperparameters.num_envs, 0, run.find_encoder())
+    made = make_agent(run.learner.algorithm, run.learner.hyperparameters, env, number)
     assert isinstance(made, OffPolicyAlgorithm)
     return made.learn(400)
 

@@ -5,7 +5,6 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -62,7 +61,7 @@ def test_a_run_that_fails_says_why_and_ends_with_1(tmp_path, monkeypatch):
     from jbrep.rl.presets import PRESETS, get_preset
 
     preset = get_preset("paper", "a2c")
-    wild = replace(preset, settings={**preset.settings, "learning_rate": 1e30})
+    wild = preset.replace(algorithm_kwargs={**preset.algorithm_kwargs, "learning_rate": 1e30})
     monkeypatch.setitem(PRESETS["paper"], "a2c", wild)
     run = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 200)
     failed = jbrep("rl", *run, "--evaluation-episodes", 1, "--out", tmp_path / "run")

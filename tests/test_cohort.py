@@ -1,7 +1,6 @@
 """Runs that learn together do what stable-baselines3 does with each alone."""
 
 import hashlib
-from dataclasses import replace
 from itertools import count
 
 import numpy as np
@@ -22,10 +21,10 @@ from jbrep.rl.cohort.algorithm import Batch
 from jbrep.rl.cohort.cohort import Cohort
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.cohort.networks import Stack
-from jbrep.rl.job import Job
-from jbrep.rl.overrides import used_settings
+from jbrep.rl.job import Job, Session
+from jbrep.rl.overrides import overridden
 from jbrep.rl.presets import PRESETS
-from jbrep.rl.trainers import train_all
+from jbrep.rl.trainers import train_jobs
 from jbrep.training.trainer import allocate_adam_state
 
 TASK = describe("face_direction", max_episode_steps=50)
@@ -46,7 +45,8 @@ def in_float64(monkeypatch):
 
 def precise(algorithm, preset, code, seed):
     """An agent in float64 with some transitions to learn from."""
-    preset = replace(preset, settings={**preset.settings, "buffer_size": 200})
+    kwargs = {**preset.algorithm_kwargs, "buffer_size": 200}
+    preset = preset.replace(algorithm_kwargs=kwargs)
     agent = make_agent(algorithm, preset, make_env(TASK, 1, 0, find(code, TASK)), seed)
     agent.set_logger(Logger(None, []))
     agent.policy.double()
@@ -86,7 +86,7 @@ VARIANTS = [
 @pytest.mark.parametrize(("algorithm", "preset", "overrides"), VARIANTS)
 def test_gradient_steps_are_those_of_stable_baselines3(in_float64, algorithm, preset, overrides):
     small = {"net_arch": [30, 20], **overrides}
-    used = used_settings(algorithm, preset, small)
+    used = overridden(algorithm, preset, small)
     alone = [precise(algorithm, used, code, seed) for seed, code in enumerate(CODES)]
     together = [precise(algorithm, used, code, seed) for seed, code in enumerate(CODES)]
     stack = Stack(together, 16)
@@ -118,16 +118,16 @@ def runs(steps, preset="modern", **settings):
     """Three runs of one learner on different codes."""
     shared = {"task": TASK, "preset": preset, "evaluate_every": 100, "evaluation_episodes": 2}
     return [
-        Run(encoder=code, seed=seed, steps=steps, **shared, **settings)
+        Run.of(encoder=code, seed=seed, steps=steps, **shared, **settings)
         for seed, code in enumerate(CODES)
     ]
 
 
 def together(given, folder, stop=lambda: False, save_every=1e9):
     """What becomes of runs, each in a folder named by its seed."""
-    folders = {folder / str(run.seed): run for run in given}
-    ended = train_all(folders, save_every=save_every, stop=stop)
-    return {int(path.name): result for path, result in ended}
+    jobs = [Job(run, folder / str(run.seed)) for run in given]
+    ended = train_jobs(jobs, Session(save_every=save_every, stop=stop))
+    return {job.run.seed: result for job, result in ended}
 
 
 def contents(folder):
@@ -144,7 +144,7 @@ def done(tmp_path_factory):
     """Three runs that were trained together."""
     folder = tmp_path_factory.mktemp("cohort")
     results = together(runs(260, **SAC), folder)
-    assert [result["status"] for result in results.values()] == ["finished"] * 3
+    assert [result.status for result in results.values()] == ["finished"] * 3
     return folder
 
 
@@ -159,7 +159,7 @@ FOLLOWED = [
 def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, tmp_path):
     """The same bits until the first gradient step; ten steps later, the same weights nearly."""
     settings = {"learning_starts": 100, **overrides}
-    made = runs(110, preset, algorithm=algorithm, settings=settings)
+    made = runs(110, preset, algorithm=algorithm, overrides=settings)
     members = [Member(Job(run, tmp_path / str(run.seed)), []) for run in made]
     cohort = Cohort(members)
     while cohort.goes_on:
@@ -172,7 +172,7 @@ def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, t
         assert agent._n_updates == members[number].agent._n_updates > 0
         buffer, rows = agent.replay_buffer, cohort._replay.rows_of(number)
         steps, size = len(rows), run.find_encoder().latent_size
-        first = slice(0, 100 // run.used.num_envs)
+        first = slice(0, 100 // run.learner.hyperparameters.num_envs)
         np.testing.assert_array_equal(buffer.observations[first], rows[first, :, :size])
         np.testing.assert_array_equal(buffer.rewards[first], rows[first, :, -2])
         np.testing.assert_allclose(buffer.rewards[:steps], rows[..., -2], atol=1e-5)
@@ -184,9 +184,9 @@ def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, t
 
 def alone(run):
     """What stable-baselines3 makes of a run."""
-    preset, seed = run.used, training_seed(run.seed)
+    preset, seed = run.learner.hyperparameters, training_seed(run.seed)
     env = make_env(run.task, preset.num_envs, seed, run.find_encoder(), preset.normalize)
-    agent = make_agent(run.algorithm, preset, env, run.seed)
+    agent = make_agent(run.learner.algorithm, preset, env, run.seed)
     env.seed(seed)
     agent.set_logger(Logger(None, []))
     return agent.learn(run.steps)
@@ -203,8 +203,8 @@ class Huge:
 
 def test_a_member_that_diverges_fails_alone(done, tmp_path):
     first, second, third = runs(260, **SAC)
-    results = together([first, replace(second, encoder=Huge()), third], tmp_path)
-    assert results[1]["reason"] == "train/critic_loss is inf after 64 steps"
+    results = together([first, second.replace(encoder=Huge()), third], tmp_path)
+    assert results[1].reason == "train/critic_loss is inf after 64 steps"
     for seed in "02":
         assert contents(tmp_path / seed) == contents(done / seed)
     assert not (tmp_path / "1" / "policy.zip").exists()
@@ -221,30 +221,34 @@ def test_an_environment_that_fails_ends_its_run_alone(done, tmp_path, monkeypatc
 
     monkeypatch.setattr(Endless, "step", fail_once)
     results = together(runs(260, **SAC), tmp_path, save_every=0)
-    assert results[2]["reason"] == "the motor is broken after 130 steps"
+    assert results[2].reason == "the motor is broken after 130 steps"
     for seed in "01":
         assert contents(tmp_path / seed) == contents(done / seed)
+
+
+def check(run):
+    return run.settings(run.find_encoder())
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"trainer": "both"}, "unknown trainer 'both': choose one of cohort, sb3"),
+        ({"trainer": "both"}, "trainer is 'both': it must be cohort or sb3"),
         ({"trainer": "cohort", "algorithm": "ppo"}, "cohorts train ddpg, td3, sac, not ppo: add"),
-        ({"settings": {"use_sde": True}}, "can't learn with use_sde = True: add --trainer sb3"),
+        ({"overrides": {"use_sde": True}}, "can't learn with use_sde = True: add --trainer sb3"),
         (
-            {"settings": {"train_freq": [1, "episode"]}},
+            {"overrides": {"train_freq": [1, "episode"]}},
             "takes train_freq as a number of steps: add",
         ),
         ({"trainer": "sb3", "precision": "bfloat16"}, "sb3 has no bfloat16: leave the precision"),
-        ({"precision": "half"}, "unknown precision 'half'"),
+        ({"precision": "half"}, "precision is 'half': it must be one of"),
         ({"device": "cuda"}, "no device 'cuda' on this machine: choose auto or cpu"),
-        ({"settings": {"n_steps": 3}}, "n_steps = 3: add --trainer sb3"),
+        ({"overrides": {"n_steps": 3}}, "n_steps = 3: add --trainer sb3"),
     ],
 )
 def test_what_no_cohort_can_do_is_refused(settings, message):
     with pytest.raises(InputError, match=message):
-        Run(task=TASK, **settings).check()
+        check(Run.of(task=TASK, **settings))
 
 
 def test_members_do_not_depend_on_their_companions(done, tmp_path):

@@ -11,13 +11,9 @@ from jbrep.encoders import find, load, save
 from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.records import commit
-from jbrep.rl.fields import check_run
+from jbrep.records.record import converted
 
 HEAD = "0123456789" * 4
-WELL_FORMED = {
-    **{"status": "finished", "settings": {}, "steps": 1, "seconds": 1, "versions": {}},
-    "cpu": "it",
-}
 
 
 def git(folder, *arguments):
@@ -70,6 +66,8 @@ def test_an_encoder_is_the_same_at_another_commit(tmp_path):
     assert load(tmp_path / "it.safetensors").fingerprint == encoder.fingerprint
 
 
-def test_a_run_s_commits_are_checked(tmp_path):
-    with pytest.raises(InputError, match="commits is invalid, it must be an object of git commits"):
-        check_run(tmp_path, {**WELL_FORMED, "commits": {"work": "\x1b[2J"}})
+def test_commits_are_checked():
+    assert converted({"work": f"{HEAD}+changes"}, commit.Commits, "commits")
+    for wrong in ({"work": "\x1b[2J"}, {"here": HEAD}, {"work": HEAD + "\n"}):
+        with pytest.raises(InputError):
+            converted(wrong, commit.Commits, "commits")

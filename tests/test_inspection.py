@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import rerun as rr
 from command import jbrep, start, wait_for, wait_for_the_end_of
+from made_up import write_checkpoint, write_record
 from rerun.chunk import RrdReader
 
 from jbrep.dataset import Dataset
@@ -36,20 +37,14 @@ from jbrep.play import jitterbug
 from jbrep.play.jitterbug import reward_terms
 from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode
-from jbrep.records import container
 from jbrep.rl import Run
-from jbrep.rl.agent import make_agent, make_env
 from jbrep.rl.files import (
-    CHECKPOINT,
     ENCODER,
-    FAILED,
-    FINISHED,
     Evaluation,
     read_evaluations,
     write_rows,
-    write_run,
 )
-from jbrep.rl.presets import Preset
+from jbrep.rl.record import FAILED, FINISHED
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
 DAE = "jbrep/encoders/shipped/face_direction/dae-4.safetensors"
@@ -698,11 +693,9 @@ def test_the_force_of_a_contact_is_the_one_on_the_robot():
 
 def write_end(folder, representation, seed=0, status=FINISHED):
     """What a run of 300 steps says at its end; a failed one ended half-way."""
-    encoder = "full" if representation == "full" else representation
-    run = Run(task="face_direction", encoder=encoder, steps=300, seed=seed)
-    settings, steps = run.describe(find(encoder, run.task)), 150 if status == FAILED else 300
-    record = {"status": status, "settings": settings, "steps": steps, "seconds": 1.0}
-    write_run(folder, {**record, "versions": {}, "cpu": ""})
+    run = Run.of(task="face_direction", encoder=representation, steps=300, seed=seed)
+    failed = status == FAILED
+    write_record(folder, run, "it failed" if failed else None, steps=150 if failed else 300)
 
 
 def write_study(folder):
@@ -761,16 +754,8 @@ def test_a_run_shows_its_own_encoder(tmp_path, rollout, monkeypatch):
 
 
 def test_a_run_under_way_shows_its_checkpoint(tmp_path):
-    encoder = find("dae-4", describe("face_direction"))
-    settings = Run(task="face_direction", algorithm="a2c", encoder="dae-4").describe(encoder)
-    settings |= {"evaluation_episodes": 1, "episode_steps": 50}
-    preset = Preset(settings["hidden"], {})
-    agent = make_agent("a2c", preset, make_env("face_direction", 1, 0, encoder), seed=0)
-    state = agent.policy.state_dict().items()
-    weights = {f"parameters.policy.{n}": np.ascontiguousarray(v.numpy()) for n, v in state}
-    header = {"identity": settings, "counters": {"num_timesteps": 12_000}, "record": {}}
-    container.write(tmp_path / CHECKPOINT, weights, header)
-    save(encoder, tmp_path / ENCODER)
+    task = describe("face_direction", max_episode_steps=50)
+    write_checkpoint(tmp_path, Run.of(task, "a2c", encoder="dae-4", evaluation_episodes=1), 12_000)
     shown = read(inspect(str(tmp_path), out=tmp_path / "it.rrd"))
     assert f"# {tmp_path} at step 12,000" in text(shown["/provenance"])
     assert "/world/ghost/jitterbug" in shown

@@ -1,7 +1,6 @@
 """Which runs of a study learn in one cohort."""
 
 import os
-from dataclasses import replace
 
 import pytest
 from joblib import cpu_count
@@ -93,10 +92,11 @@ def test_a_gpu_has_one_wide_cohort_at_a_time(tmp_path, monkeypatch):
 )
 def test_trials_take_rollouts_as_short_as_can_be(algorithm, short):
     """The paper's TD3 takes a thousand gradient steps after as many steps."""
-    run = Run(task="face_direction", algorithm=algorithm)
+    run = Run.of(task="face_direction", algorithm=algorithm)
     found = speed._at_once(run)
     assert {"learning_starts": 0, **short}.items() <= found.items()
-    replace(run, settings={**run.settings, **found}).check()
+    run = run.replace(learner=run.learner.overridden(found))
+    run.settings(run.find_encoder())
 
 
 def test_codes_that_are_larger_than_the_observation_take_more_memory(tmp_path, monkeypatch):

@@ -8,9 +8,8 @@ from command import in_this_process, jbrep
 from test_study import TINY, TOML
 
 from jbrep.errors import InputError
-from jbrep.rl.files import RUN
+from jbrep.rl.files import RUN, read_run, runs_below
 from jbrep.study.plan import Plan
-from jbrep.study.record import run_name
 from jbrep.study.registration import REGISTRATION, deviations, read_registration
 from jbrep.study.results import conclude
 from jbrep.study.runner import BACKENDS
@@ -68,14 +67,20 @@ def test_a_changed_study_is_refused_but_for_new_seeds(registered):
 
 def test_every_deviation_is_told(registered):
     registration, study = registered.registration, registered.study
-    runs = [json.loads(path.read_text()) for path in sorted(registered.folder.rglob(RUN))]
-    named = {run_name(run["settings"]): run for run in runs}
+    runs = [read_run(folder) for folder in runs_below(registered.folder)]
+    named = {run.settings.name: run for run in runs}
     assert registration.encoders.keys() == named.keys()
     assert deviations(registration, study, named) == []
-    runs[0]["settings"]["registration"] = None
-    runs[0]["versions"]["torch"] = "2.0.0"
-    runs[0]["commits"] = {"jbrep": "0" * 40}
-    runs[1]["settings"]["encoder"] = "0" * 64
+    one, other, *_ = runs
+    changed = (
+        one.replace(
+            settings=one.settings.replace(registration=None),
+            versions={**one.versions, "torch": "2.0.0"},
+            commits={"jbrep": "0" * 40},
+        ),
+        other.replace(settings=other.settings.replace(encoder="0" * 64)),
+    )
+    named |= {run.settings.name: run for run in changed}
     more = study.replace(seeds=(0, 1, 7), steps=81)
     assert deviations(registration, more, named) == [
         "settings differ: steps 80 (now: 81)",

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_up import write_record
 
 from jbrep.encoders import find, save
 from jbrep.envs import describe
@@ -27,7 +28,7 @@ from jbrep.report.page import page as page_of
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, SUMMARY
 from jbrep.report.tables import read_tables
 from jbrep.report.words import answers, headline
-from jbrep.rl.files import ENCODER, Evaluation, write_rows, write_run
+from jbrep.rl.files import ENCODER, Evaluation, write_rows
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.claims import CLAIMS
 from jbrep.stats.first_claims import FirstClaims
@@ -68,16 +69,8 @@ def write_a_run(plan, cell, failed=False, reason=TRAP):
         for episode in range(2)
     ]
     write_rows(folder / "evaluations.csv", rows[: 4 if failed else 6], Evaluation)
-    result = {
-        "status": "failed" if failed else "finished",
-        **({"reason": reason} if failed else {}),
-        "settings": run.describe(encoder),
-        "steps": 1500 if failed else 2000,
-        "seconds": 60.0,
-        "versions": {"jbrep": "0.1.0", "torch": "2.13.0+cpu"},
-        "cpu": "a processor",
-    }
-    write_run(folder, result)
+    facts = {"versions": {"jbrep": "0.1.0", "torch": "2.13.0+cpu"}}
+    write_record(folder, run, reason if failed else None, steps=1500 if failed else 2000, **facts)
 
 
 def make_study(folder, left=0, failed=()):

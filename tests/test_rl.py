@@ -1,6 +1,5 @@
 """One run: settings, files, evaluation, kills and stops, failures, and files from elsewhere."""
 
-import dataclasses
 import hashlib
 import json
 import pickle
@@ -24,21 +23,25 @@ from stable_baselines3.common.vec_env import VecMonitor
 from jbrep.cli.rl import _Bar
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
+from jbrep.envs.recording import episode_returns
 from jbrep.errors import InputError
 from jbrep.records import container
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
-from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, read_evaluations, read_run
-from jbrep.rl.names import COHORT, SB3
+from jbrep.rl.files import EVALUATION_SEED, POLICY, read_evaluations, read_run
+from jbrep.rl.names import CLASSES, COHORT, SB3
 from jbrep.rl.policy import load_run, load_zip
-from jbrep.rl.presets import ALGORITHMS, PRESETS, get_preset
+from jbrep.rl.presets import PRESETS, get_preset, sb3_class
+from jbrep.rl.record import FAILED, FINISHED
 from jbrep.rl.sb3.checkpointer import restore, take
 
 STEPS = 100  # of an episode: little depends on its length
 TASK = describe("face_direction", max_episode_steps=STEPS)
 QUICK = {"task": TASK, "evaluation_episodes": 1}
-IMPORTS = "from jbrep.envs import Feature, Task"  # to evaluate the text of a run
-SHORT = Run(algorithm="a2c", encoder="dae-8", steps=80, **QUICK)
+IMPORTS = (
+    "from jbrep.envs import Feature, Task; from jbrep.rl.learner import Learner"  # of its text
+)
+SHORT = Run.of(algorithm="a2c", encoder="dae-8", steps=80, **QUICK)
 
 
 def agent_of(algorithm, preset="paper", encoder="dae-8"):
@@ -52,7 +55,7 @@ def widths(network):
 
 
 def assert_same_run(one, other):
-    for name in ("episodes.csv", "evaluations.csv", "policy.zip"):
+    for name in ("episodes.csv", "evaluations.csv", "policy.zip", POLICY):
         assert (one / name).read_bytes() == (other / name).read_bytes(), name
 
 
@@ -109,7 +112,7 @@ def test_the_later_versions_settings_reach_sac_and_td3():
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", CLASSES)
 def test_every_preset_makes_an_agent_with_adam(algorithm, preset):
     agent = agent_of(algorithm, preset)
     optimizers = [
@@ -122,13 +125,13 @@ def test_every_preset_makes_an_agent_with_adam(algorithm, preset):
 
 def test_a_runs_folder(short):
     run = read_run(short)
-    assert run["status"] == FINISHED
-    assert run["steps"] == 80
-    assert run["settings"]["representation"] == "dae-8"
-    assert run["settings"]["hidden"] == [350, 250]
-    assert {"torch", "mujoco", "stable-baselines3"} <= set(run["versions"])
-    assert run["seconds"] > 0
-    assert run["cpu"]
+    assert run.status == FINISHED
+    assert run.steps == 80
+    assert run.settings.representation == "dae-8"
+    assert run.settings.hyperparameters.net_arch == (350, 250)
+    assert {"torch", "mujoco", "stable-baselines3"} <= set(run.versions)
+    assert run.seconds > 0
+    assert run.cpu
     played = [(e.step, e.episode) for e in read_evaluations(short)]
     assert played == [(0, 0), *((80, episode) for episode in range(10))]
     assert (short / "episodes.csv").read_text() == "step,lane,return,length,diverged\n"
@@ -137,13 +140,13 @@ def test_a_runs_folder(short):
 
 
 def test_plain_sb3_loads_the_policy_that_was_evaluated(short):
-    plain = ALGORITHMS["a2c"].load(short / "policy.zip", device="cpu")
+    plain = sb3_class("a2c").load(short / "policy.zip", device="cpu")
     trained = load_run(short)
     encoder = find("dae-8", TASK)
     rows = encoder(np.random.default_rng(0).normal(size=(50, 16)).astype(np.float32))
     expected = plain.predict(rows, deterministic=True)[0]
     np.testing.assert_array_equal(trained.policy.predict(rows, deterministic=True)[0], expected)
-    returns = Evaluator(TASK, trained.encoder, 1).returns(trained.policy)
+    returns = episode_returns(Lanes(TASK, 1), trained.begin(TASK, [0]), EVALUATION_SEED)
     at_end = [e.episode_return for e in read_evaluations(short) if e.step == 80]
     np.testing.assert_allclose(returns, at_end[:1], atol=5e-4)
 
@@ -162,9 +165,9 @@ def test_evaluation_is_the_deterministic_policys_return():
 
 
 def test_training_episodes_are_recorded_and_evaluation_leaves_no_trace(tmp_path):
-    run = dataclasses.replace(SHORT, steps=880)
+    run = SHORT.replace(steps=880)
     for name, every in (("often", 400), ("never", 10_000)):
-        train(dataclasses.replace(run, evaluate_every=every), tmp_path / name)
+        train(run.replace(evaluate_every=every), tmp_path / name)
     often, never = tmp_path / "often", tmp_path / "never"
     for name in ("episodes.csv", "policy.zip"):
         assert (often / name).read_bytes() == (never / name).read_bytes()
@@ -186,7 +189,7 @@ def test_runs_of_two_seeds_share_no_start_with_each_other_or_evaluation():
 def test_training_starts_from_these_seeds_whatever_the_agent_seeds(tmp_path, monkeypatch):
     reset, starts = VecMonitor.reset, []
     monkeypatch.setattr(VecMonitor, "reset", lambda env: starts.append(reset(env)) or starts[-1])
-    train(dataclasses.replace(SHORT, seed=3), tmp_path / "run")
+    train(SHORT.replace(seed=3), tmp_path / "run")
     expected = make_env(TASK, 8, training_seed(3), find("dae-8", TASK)).venv.reset()
     assert [np.array_equal(start, expected) for start in starts if len(start) == 8] == [True]
 
@@ -213,16 +216,16 @@ def test_neither_threads_nor_clock_nor_process_change_a_bit(short, tmp_path):
 
 
 def test_another_seed_is_another_run(short, tmp_path):
-    train(dataclasses.replace(SHORT, seed=1), tmp_path / "other")
+    train(SHORT.replace(seed=1), tmp_path / "other")
     with pytest.raises(AssertionError):
         assert_same_run(short, tmp_path / "other")
 
 
 def test_a_finished_run_is_left_alone(short):
     before = {p: p.stat().st_mtime_ns for p in short.iterdir()}
-    assert train(SHORT, short)["status"] == FINISHED
+    assert train(SHORT, short).status == FINISHED
     with pytest.raises(InputError, match=r"holds another run: seed 0 \(now: 5\)"):
-        train(dataclasses.replace(SHORT, seed=5), short)
+        train(SHORT.replace(seed=5), short)
     assert {p: p.stat().st_mtime_ns for p in short.iterdir()} == before
 
 
@@ -242,8 +245,8 @@ def test_a_run_that_another_process_has_just_finished_is_left_alone(short, tmp_p
 
 
 KILLED = {
-    "ddpg": Run(algorithm="ddpg", encoder="dae-8", steps=300, **QUICK),
-    "sac": Run(task="Hopper-v5", preset="modern", steps=1100, evaluation_episodes=1),
+    "ddpg": Run.of(algorithm="ddpg", encoder="dae-8", steps=300, **QUICK),
+    "sac": Run.of(task="Hopper-v5", preset="modern", steps=1100, evaluation_episodes=1),
 }
 
 
@@ -278,7 +281,7 @@ def test_a_killed_run_resumes_to_the_same_bits(algorithm, tmp_path):
     for content in (written[:-100], b"", pickle.dumps(run), written):
         spoilt.write_bytes(content)
         with pytest.raises(InputError, match=r"checkpoint\.safetensors (is|belongs)"):
-            train(dataclasses.replace(run, seed=9), tmp_path / "spoilt")
+            train(run.replace(seed=9), tmp_path / "spoilt")
     assert [p.name for p in spoilt.parent.iterdir() if p.suffix] == [spoilt.name]
 
 
@@ -312,7 +315,7 @@ def test_ctrl_c_stops_the_command_with_a_checkpoint(tmp_path):
     assert any(line.startswith("stopping: writing a checkpoint") for line in lines)
     told = re.fullmatch(r"stopped after ([\d,]+) steps; the same command resumes it", lines[-1])
     header = container.read(tmp_path / "checkpoint.safetensors", "checkpoint")[1]
-    assert header["counters"]["num_timesteps"] == int(told[1].replace(",", ""))
+    assert header["step"] == int(told[1].replace(",", ""))
 
 
 def test_a_second_signal_ends_the_command_at_once():
@@ -330,12 +333,12 @@ def test_a_second_signal_ends_the_command_at_once():
 
 def test_the_rate_after_resuming_counts_the_steps_since():
     with closing(_Bar(1000, "sac")) as bar:
-        bar.show(500, None)
-        bar.show(600, 1.0)
+        bar.show(None, 500, None)
+        bar.show(None, 600, 1.0)
         assert (bar._progress.n, bar._progress.initial) == (600, 500)
-        bar.show(1000, 1.0)
+        bar.show(None, 1000, 1.0)
         assert bar._progress.postfix == "evaluation=final one under way"
-        bar.show(1000, 2.0)
+        bar.show(None, 1000, 2.0)
         assert bar._progress.postfix == "evaluation=2.00"
     trained, resumed = agent_of("a2c").learn(80), agent_of("a2c").learn(40)
     restore(resumed, take(trained))
@@ -346,13 +349,14 @@ def test_the_rate_after_resuming_counts_the_steps_since():
 @pytest.mark.parametrize("algorithm", ["ddpg", "sac", "ppo", "a2c", "trpo"])
 def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
     preset = get_preset("paper", algorithm)
-    wild = dataclasses.replace(preset, settings={**preset.settings, "learning_rate": 1e30})
+    kwargs = {**preset.algorithm_kwargs, "learning_rate": 1e30}
+    wild = preset.replace(algorithm_kwargs=kwargs)
     monkeypatch.setitem(PRESETS["paper"], algorithm, wild)
-    run = Run(algorithm=algorithm, steps=4096, **QUICK)
+    run = Run.of(algorithm=algorithm, steps=4096, **QUICK)
     result = train(run, tmp_path / "wild")
-    assert result["status"] == FAILED
-    assert "loss is" in result["reason"] or "not finite" in result["reason"]
-    assert result["steps"] < 4096 + 2048
+    assert result.status == FAILED
+    assert "loss is" in result.reason or "not finite" in result.reason
+    assert result.steps < 4096 + 2048
     assert not (tmp_path / "wild" / "policy.zip").exists()
     assert train(run, tmp_path / "wild") == result
     with pytest.raises(InputError, match="failed: it has no policy"):
@@ -362,7 +366,7 @@ def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
 @pytest.mark.parametrize("trainer", [COHORT, SB3])
 def test_a_run_tells_all_its_steps_before_its_last_evaluation(trainer, tmp_path):
     told = []
-    run = Run(algorithm="ddpg", steps=1200, evaluate_every=600, trainer=trainer, **QUICK)
+    run = Run.of(algorithm="ddpg", steps=1200, evaluate_every=600, trainer=trainer, **QUICK)
     train(run, tmp_path / "run", lambda *each: told.append(each))
     evaluations = read_evaluations(tmp_path / "run")
     means = [np.mean([e.episode_return for e in evaluations if e.step == s]) for s in (600, 1200)]
@@ -387,57 +391,47 @@ class Trap:
         return Path.touch, (self.path,)
 
 
-@pytest.mark.parametrize("member", ["policy.pth", "data"])
-def test_nothing_in_a_runs_folder_runs_as_code(member, short, tmp_path):
-    for name in ("run.json", "encoder.safetensors"):
-        (tmp_path / name).write_bytes((short / name).read_bytes())
-    sprung = tmp_path / "sprung"
-    with (
-        zipfile.ZipFile(short / "policy.zip") as old,
-        zipfile.ZipFile(tmp_path / "policy.zip", "w") as new,
-    ):
-        for name in old.namelist():
-            content = pickle.dumps(Trap(sprung), protocol=2) if name == member else old.read(name)
-            new.writestr(name, content)
-    run = json.loads((tmp_path / "run.json").read_text())
-    run["policy_sha256"] = hashlib.sha256((tmp_path / "policy.zip").read_bytes()).hexdigest()
-    (tmp_path / "run.json").write_text(json.dumps(run))
-    if member == "policy.pth":
-        with pytest.raises(
-            InputError, match=r"policy\.zip is damaged, it holds no policy's weights"
-        ):
-            load_run(tmp_path)
-    else:
-        load_run(tmp_path)
+def test_nothing_in_a_runs_folder_runs_as_code(short, tmp_path):
+    """Neither is policy.zip read, nor a pickle in the place of the policy's file."""
+    folder, sprung = shutil.copytree(short, tmp_path / "run"), tmp_path / "sprung"
+    trap = pickle.dumps(Trap(sprung), protocol=2)
+    with zipfile.ZipFile(folder / "policy.zip", "w") as file:
+        file.writestr("policy.pth", trap)
+        file.writestr("data", trap)
+    assert load_run(folder).task == TASK
+    (folder / POLICY).write_bytes(trap)
+    record = json.loads((folder / "run.json").read_text())
+    record["policy_sha256"] = hashlib.sha256(trap).hexdigest()
+    (folder / "run.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match="is not a jbrep policy"):
+        load_run(folder)
     assert not sprung.exists()
 
 
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("policy.zip", b"PK", "damaged"),
-        ("policy.zip", None, r"can't read .*policy\.zip: No such file"),
+        (POLICY, b"PK", "damaged"),
+        (POLICY, None, r"can't read .*policy\.safetensors: No such file"),
         ("encoder.safetensors", None, "no encoder"),
-        ("run.json", b"{", "damaged or not from a jbrep run"),
+        ("run.json", b"{", "damaged, or not a jbrep run file"),
         ("run.json", None, "no run in"),
-        ("run.json", "hidden", "doesn't fit the run's settings"),
-        ("run.json", "algorithm", "unknown algorithm 'x'"),
-        ("run.json", "encoder", "not the encoder"),
+        ("run.json", {"algorithm": "x"}, "settings.algorithm is 'x': it must be one of ddpg, td3"),
+        ("run.json", {"encoder": "0" * 64}, "not the encoder"),
     ],
 )
 def test_a_damaged_folder_is_named(name, content, message, short, tmp_path):
-    for each in ("run.json", "encoder.safetensors", "policy.zip"):
-        (tmp_path / each).write_bytes((short / each).read_bytes())
+    folder = shutil.copytree(short, tmp_path / "run")
     if content is None:
-        (tmp_path / name).unlink()
+        (folder / name).unlink()
     elif isinstance(content, bytes):
-        (tmp_path / name).write_bytes(content)
+        (folder / name).write_bytes(content)
     else:
-        run = json.loads((short / name).read_text())
-        run["settings"][content] = {"hidden": [3], "algorithm": "x", "encoder": "0" * 64}[content]
-        (tmp_path / name).write_text(json.dumps(run))
+        run = json.loads((folder / name).read_text())
+        run["settings"] |= content
+        (folder / name).write_text(json.dumps(run))
     with pytest.raises(InputError, match=message) as error:
-        load_run(tmp_path)
+        load_run(folder)
     assert "\n" not in str(error.value)
 
 
@@ -459,16 +453,16 @@ def test_a_zip_file_from_elsewhere_needs_trust(tmp_path):
         ({"algorithm": "dqn"}, "unknown algorithm 'dqn': choose one of ddpg"),
         ({"preset": "best"}, "unknown preset 'best': choose one of paper, modern"),
         ({"encoder": "dae-9"}, "no encoder 'dae-9'"),
-        ({"seed": 2**31}, "the seed is"),
-        ({"steps": 0}, "steps is 0: it must be between 1 and 1,000,000,000,000"),
-        ({"steps": 10**23}, f"steps is {10**23}: it must be between 1 and"),
-        ({"evaluate_every": 0}, "evaluate every is 0"),
-        ({"evaluate_every": 10**23}, "evaluate every is 1000"),
-        ({"evaluation_episodes": 0}, "evaluation episodes is 0"),
-        ({"evaluation_episodes": 10_001}, "evaluation episodes is 10001: .* 1 and 10,000"),
+        ({"seed": 2**31}, "seed is 2147483648: it must be a whole number from 0"),
+        ({"steps": 0}, "steps is 0: it must be a whole number from 1 to 1,000,000,000,000"),
+        ({"steps": 10**23}, f"steps is {10**23}: it must be"),
+        ({"evaluate_every": 0}, "evaluate_every is 0"),
+        ({"evaluation_episodes": 10_001}, "evaluation_episodes is 10001: .* 1 to 10,000"),
+        ({"evaluation_episodes": 3, "final_episodes": 2}, "final_episodes is 2: .* as many as"),
     ],
 )
 def test_what_cannot_be_run_is_refused(change, message, tmp_path):
+    usual = {"algorithm": "a2c", "encoder": "dae-8", "steps": 80, **QUICK}
     with pytest.raises(InputError, match=message):
-        train(dataclasses.replace(SHORT, **change), tmp_path / "new")
+        train(Run.of(**{**usual, **change}), tmp_path / "new")
     assert not (tmp_path / "new").exists()

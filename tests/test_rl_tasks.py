@@ -1,9 +1,6 @@
 """Runs on tasks of any kind: sizes, terminations, failures, resuming by replay, version 1."""
 
 import csv
-import dataclasses
-import json
-import shutil
 
 import cart
 import numpy as np
@@ -15,21 +12,21 @@ from jbrep.envs import describe
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
 from jbrep.records import container
-from jbrep.records.record import to_plain
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.files import (
     CHECKPOINT,
     EPISODES,
     EVALUATION_SEED,
-    FAILED,
     POLICY,
     RUN,
     read_evaluations,
     read_run,
 )
+from jbrep.rl.names import CLASSES
 from jbrep.rl.policy import load_run, load_untrained
-from jbrep.rl.presets import ALGORITHMS, PRESETS, get_preset
+from jbrep.rl.presets import PRESETS, get_preset
+from jbrep.rl.record import FAILED
 
 CART = describe(cart.ID)
 PENDULUM, HOPPER = describe("Pendulum-v1", max_episode_steps=50), describe("Hopper-v5")
@@ -49,8 +46,9 @@ SHORTER = {
 def short_rollouts(monkeypatch):
     """The paper's settings with shorter rollouts and fewer updates."""
     for algorithm, preset in PRESETS["paper"].items():
-        shorter = {name: value for name, value in SHORTER.items() if name in preset.settings}
-        quick = dataclasses.replace(preset, settings={**preset.settings, **shorter})
+        kwargs = preset.algorithm_kwargs
+        shorter = {name: value for name, value in SHORTER.items() if name in kwargs}
+        quick = preset.replace(algorithm_kwargs={**kwargs, **shorter})
         monkeypatch.setitem(PRESETS["paper"], algorithm, quick)
 
 
@@ -61,14 +59,14 @@ def episodes_of(folder):
 
 @pytest.mark.parametrize(
     ("task", "algorithm"),
-    [*((HOPPER, each) for each in ALGORITHMS), (PENDULUM, "a2c"), (PENDULUM, "sac")],
+    [*((HOPPER, each) for each in CLASSES), (PENDULUM, "a2c"), (PENDULUM, "sac")],
     ids=lambda given: getattr(given, "slug", given),
 )
 def test_every_algorithm_learns_on_any_task(algorithm, task, short_rollouts, tmp_path):
-    run = Run(task=task, algorithm=algorithm, steps=150, evaluation_episodes=1)
+    run = Run.of(task=task, algorithm=algorithm, steps=150, evaluation_episodes=1)
     result = train(run, tmp_path)
-    assert result["status"] == "finished", result["reason"]
-    assert result["settings"]["task"] == task.name
+    assert result.status == "finished", result.reason
+    assert result.settings.task == task.name
     playing = load_run(tmp_path)
     assert playing.task == task
     action = playing.begin(task, [0])(np.zeros((1, task.size)))
@@ -107,7 +105,7 @@ def test_training_is_told_of_terminations(tmp_path):
 @pytest.mark.parametrize("task", [PENDULUM, HOPPER, CART], ids=lambda task: task.slug)
 @pytest.mark.parametrize("algorithm", ["a2c", "sac"])
 def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, task, tmp_path):
-    run = Run(task=task, algorithm=algorithm, preset="modern", steps=320, evaluation_episodes=1)
+    run = Run.of(task=task, algorithm=algorithm, preset="modern", steps=320, evaluation_episodes=1)
     one, other = tmp_path / "one", tmp_path / "other"
     train(run, one)
     steps = []
@@ -121,12 +119,12 @@ def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, tas
 
 
 def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
-    run = Run(task=FAILING, algorithm="a2c", steps=800, evaluation_episodes=1)
+    run = Run.of(task=FAILING, algorithm="a2c", steps=800, evaluation_episodes=1)
     result = train(run, tmp_path)
-    assert result["status"] == FAILED
+    assert result.status == FAILED
     where = f"failed at step 7 of the episode with seed {training_seed(0) + 3}"
-    assert result["reason"].startswith(f"Test/Cart-v0 {where}: RuntimeError: the motor?[2J is")
-    assert result["reason"].endswith(" after 48 steps")  # of 8 lanes
+    assert result.reason.startswith(f"Test/Cart-v0 {where}: RuntimeError: the motor?[2J is")
+    assert result.reason.endswith(" after 48 steps")  # of 8 lanes
     assert read_run(tmp_path) == result
     assert [row.step for row in read_evaluations(tmp_path)] == [0]
     assert not (tmp_path / POLICY).exists()
@@ -145,7 +143,7 @@ def test_the_command_says_that_an_environment_failed(tmp_path):
 
 
 def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
-    run = Run(task=CART, algorithm="a2c", steps=320, evaluation_episodes=1)
+    run = Run.of(task=CART, algorithm="a2c", steps=320, evaluation_episodes=1)
     with pytest.raises(StoppedError):
         train(run, tmp_path, stop=iter((False, True)).__next__)
     before = (tmp_path / CHECKPOINT).read_bytes()
@@ -169,7 +167,7 @@ def test_an_environment_that_is_not_reproducible(tmp_path):
     assert told.stderr.startswith("Test/Cart-v0 is not reproducible: ")
     assert told.stderr.count("\n") == 1
     drifting = describe(cart.ID, {"drifts": True})
-    run = Run(task=drifting, algorithm="a2c", steps=80, evaluation_episodes=1)
+    run = Run.of(task=drifting, algorithm="a2c", steps=80, evaluation_episodes=1)
     with pytest.raises(StoppedError):
         train(run, tmp_path / "stopped", stop=iter((False, True)).__next__)
     with pytest.raises(InputError, match="Test/Cart-v0 is not reproducible here"):
@@ -185,61 +183,10 @@ def test_arguments_and_time_limit_are_settings_of_a_run(tmp_path):
     assert "returns on full at the end: -" in told.output
     run = read_run(tmp_path / "run")
     task = describe("Pendulum-v1", {"g": 3.5}, 40)
-    assert run["settings"]["environment"] == to_plain(task)
+    assert run.settings.environment == task
     assert {row["length"] for row in episodes_of(tmp_path / "run")} == {40}
     again = ("--steps", 400, "--episode-steps", 50, "--env", "g=3.5")
     told = jbrep("rl", "--task", "Pendulum-v1", *again, *made[7:])
     assert told.exit_code == 2
     assert "holds another run: " in told.output
     assert "max_episode_steps 40 (now: 50); choose another folder" in told.output
-
-
-@pytest.fixture(scope="module")
-def jitterbug_run(tmp_path_factory):
-    """A short run of the robot that version 1 had, and its checkpoint after 40 steps."""
-    folder = tmp_path_factory.mktemp("jitterbug")
-    run = Run(task="face_direction", algorithm="a2c", steps=80, evaluation_episodes=1)
-    with pytest.raises(StoppedError):
-        train(run, folder, stop=iter((False, True)).__next__)
-    shutil.copytree(folder, folder / "stopped")
-    train(run, folder)
-    return run, folder
-
-
-def as_version_1(settings, **changes):
-    """The settings as the first release wrote them, the earliest runs without episode_steps."""
-    new = ("environment", "from")
-    return {n: v for n, v in settings.items() if n not in new} | changes
-
-
-def test_a_run_of_version_1_is_left_alone(jitterbug_run, tmp_path):
-    run, folder = jitterbug_run
-    record = json.loads((folder / RUN).read_text())
-    for changes in ({}, {"episode_steps": 1000}):
-        old = {**record, "settings": as_version_1(record["settings"], **changes)}
-        (tmp_path / RUN).write_text(json.dumps({**old, "format_version": 1}))
-        assert train(run, tmp_path)["settings"] == record["settings"]
-    shorter = dataclasses.replace(run, task=describe("face_direction", max_episode_steps=100))
-    with pytest.raises(InputError, match=r"another run: max_episode_steps 1000 \(now: 100\)"):
-        train(shorter, tmp_path)
-    for changes, message in (
-        ({"task": "fly"}, "unknown task 'fly'"),
-        ({"task": ["x"]}, r"settings\.task is invalid"),
-        ({"episode_steps": 0}, r"settings\.episode_steps is invalid"),
-    ):
-        old = {**record, "settings": as_version_1(record["settings"], **changes)}
-        (tmp_path / RUN).write_text(json.dumps({**old, "format_version": 1}))
-        with pytest.raises(InputError, match=message):
-            read_run(tmp_path)
-
-
-def test_a_checkpoint_of_version_1_is_played_but_not_resumed(jitterbug_run, tmp_path):
-    run, folder = jitterbug_run
-    shutil.copytree(folder / "stopped", tmp_path, dirs_exist_ok=True)
-    tensors, header = container.read(tmp_path / CHECKPOINT, "checkpoint")
-    old = {**header, "identity": as_version_1(header["identity"], episode_steps=500)}
-    container.write(tmp_path / CHECKPOINT, tensors, old)
-    playing = load_run(tmp_path)
-    assert (playing.step, playing.task.max_episode_steps) == (40, 500)
-    with pytest.raises(InputError, match="was written by an earlier jbrep"):
-        train(run, tmp_path)

@@ -1,7 +1,6 @@
 """Studies: their files, preparation, workers, kills, clusters and results."""
 
 import csv
-import dataclasses
 import json
 import os
 import shutil
@@ -34,7 +33,7 @@ from jbrep.errors import DamageError, InputError
 from jbrep.play.behaviour import observe
 from jbrep.play.sources import find_player, find_untrained
 from jbrep.rl import Run, train
-from jbrep.rl.files import CHECKPOINT, RUN, read_run, write_run
+from jbrep.rl.files import CHECKPOINT, RUN, read_run
 from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, as_study, read_study
@@ -278,11 +277,9 @@ def test_every_cell_has_its_run(done):
     assert len(names) == 4
     for name in names:
         run = read_run(done.folder / "runs" / name)
-        task, algorithm, representation, seed = name.split("/")
-        settings = run["settings"]
-        assert (settings["task"], settings["algorithm"]) == (task, algorithm)
-        assert settings["representation"] == representation
-        assert f"seed-{settings['seed']}" == seed
+        _, algorithm, _, seed = name.split("/")
+        assert run.settings.name == name
+        assert (run.settings.algorithm, run.settings.seed) == (algorithm, int(seed[5:]))
         assert not (done.folder / "runs" / name / PROGRESS).exists()
 
 
@@ -384,7 +381,7 @@ def test_a_data_set_of_another_environment(collected, tmp_path):
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
 def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     preset = get_preset("paper", "a2c")
-    wild = dataclasses.replace(preset, settings={**preset.settings, "learning_rate": 1e30})
+    wild = preset.replace(algorithm_kwargs={**preset.algorithm_kwargs, "learning_rate": 1e30})
     monkeypatch.setitem(PRESETS["modern"], "a2c", wild)
     study = TINY.replace(algorithms=("a2c", "a2c-modern"), episode_steps=100)
     plan = Plan(study, tmp_path / "mixed")
@@ -393,7 +390,7 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     (blocked / "encoder.safetensors").mkdir()  # in the place of a file
     assert run_study(plan, in_this_process, 1) == 1
     assert "can't write" in (blocked / "error.txt").read_text()
-    statuses = {cell.name: read_run(plan.folder_of(cell))["status"] for cell in plan.cells[1:]}
+    statuses = {cell.name: read_run(plan.folder_of(cell)).status for cell in plan.cells[1:]}
     for name, status in statuses.items():
         assert status == ("failed" if "a2c-modern" in name else "finished")
     (blocked / "encoder.safetensors").rmdir()
@@ -584,8 +581,8 @@ def test_a_single_seed_gives_its_returns_and_says_why_no_more(done, tmp_path):
     [
         ("evaluations.csv", "step,episode,return\n0,0", "not a table of evaluations"),
         ("evaluations.csv", "step,episode,return\n0,0,nan\n80,0,1\n", "finite"),
-        (RUN, "[]", "damaged or not from a jbrep run"),
-        (RUN, "settings", "damaged or not from a jbrep run"),
+        (RUN, "[]", "damaged, or not a jbrep run file"),
+        (RUN, "settings", r"settings\.\w+ is missing"),
     ],
 )
 def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
@@ -593,7 +590,8 @@ def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
     for each in (RUN, "evaluations.csv"):
         (tmp_path / each).write_bytes((source / each).read_bytes())
     if content == "settings":
-        write_run(tmp_path, {**read_run(tmp_path), "settings": {}})
+        record = json.loads((tmp_path / RUN).read_text())
+        (tmp_path / RUN).write_text(json.dumps({**record, "settings": {}}))
     else:
         (tmp_path / name).write_text(content)
     with pytest.raises(InputError, match=message):
@@ -639,7 +637,7 @@ def test_a_run_is_drawn_before_and_after_training_with_the_same_body(done):
     assert find_untrained(run, other).task == find_player(str(run), other).task == other
     task, _ = observe([str(run)], other, 1, 0.5)
     assert task == other
-    train(Run(task=other, algorithm="a2c", steps=80, evaluation_episodes=1), done.folder / "other")
+    train(Run.of(other, "a2c", steps=80, evaluation_episodes=1), done.folder / "other")
     with pytest.raises(InputError, match="with another body or time limit than the policies bef"):
         observe([str(run), str(done.folder / "other")], None, 1, 0.5)
 

@@ -137,10 +137,10 @@ def done(home):
 def test_each_run_has_its_encoder(done):
     for cell in done.cells:
         folder, name = done.folder_of(cell), cell.representation.name
-        settings = read_run(folder)["settings"]
-        assert settings["representation"] == name
-        assert settings["encoder_seed"] == (cell.seed if name == "mine" else None)
-        assert settings["encoder_code"] == (NET if name == "net" else None)
+        settings = read_run(folder).settings
+        assert settings.representation == name
+        assert settings.encoder_seed == (cell.seed if name == "mine" else None)
+        assert settings.encoder_code == (NET if name == "net" else None)
         assert (folder / ENCODER).exists() == (name != "net")
         if name == "mine":
             assert load(folder / ENCODER).name == ("pca-8", "random-8")[cell.seed]
@@ -157,7 +157,7 @@ def test_a_module_and_its_onnx_model_give_equal_tables(done):
     assert len(of_module) == 22
     assert of_module == of_file
     folder = done.folder_of(next(c for c in done.cells if c.representation.name == "dense"))
-    assert read_run(folder)["settings"]["encoder_code"] is None
+    assert read_run(folder).settings.encoder_code is None
     kept, net = load(folder / ENCODER), dense()
     for ours, theirs in zip(kept.encoder, load(Path("from-onnx.safetensors")).encoder, strict=True):
         assert all(map(np.array_equal, ours, theirs))
@@ -190,8 +190,8 @@ def test_runs_with_an_encoder_each_stand_under_one_label(done):
 def test_diagnostics_are_matched_by_the_encoders(done, tmp_path):
     shas = {}
     for cell in done.cells:
-        run = read_run(done.folder_of(cell))["settings"]
-        shas.setdefault(cell.representation.name, []).append(run["encoder"])
+        run = read_run(done.folder_of(cell)).settings
+        shas.setdefault(cell.representation.name, []).append(run.encoder)
     folder = tmp_path / "tables"
     folder.mkdir()
     shutil.copy(done.folder / RECORD, folder)
@@ -230,7 +230,7 @@ def test_an_evaluation_knows_code_by_the_hash_of_its_runs(done):
     known = hashes({name: find(code, SHARED["task"]) for name, code in own.items()})
     for cell in done.cells:
         if (name := cell.representation.name) in own:
-            assert read_run(done.folder_of(cell))["settings"]["encoder"] == known[name]
+            assert read_run(done.folder_of(cell)).settings.encoder == known[name]
 
 
 def write_evaluation(folder, forward):
@@ -260,7 +260,7 @@ def test_different_encoders_under_one_label_are_refused_otherwise(done, tmp_path
     shutil.copytree(done.folder / "runs", tmp_path / "runs")
     for path in tmp_path.rglob("mine/*/run.json"):
         run = json.loads(path.read_text())
-        del run["settings"]["encoder_seed"]
+        run["settings"]["encoder_seed"] = None
         path.write_text(json.dumps(run))
     results = read_results(tmp_path)
     assert results.analysis is None
@@ -530,13 +530,13 @@ def test_a_run_on_code(done, tmp_path, monkeypatch):
 
 def test_a_run_on_an_object_resumes_with_the_same_object_alone(tmp_path):
     asked = iter([False, True])
-    run = Run(encoder=FirstFeatures(), **SHARED)
+    run = Run.of(encoder=FirstFeatures(), **SHARED)
     with pytest.raises(StoppedError):
         train(run, tmp_path, stop=lambda: next(asked))
     with pytest.raises(InputError, match="belongs to another configuration: encoder"):
-        train(Run(encoder=FirstFeatures(-1), **SHARED), tmp_path)
+        train(Run.of(encoder=FirstFeatures(-1), **SHARED), tmp_path)
     result = train(run, tmp_path)
-    assert result["settings"]["representation"] == "FirstFeatures"
+    assert result.settings.representation == "FirstFeatures"
     with pytest.raises(InputError, match="a run on a Python object needs it again"):
         load_run(tmp_path)
     assert not (tmp_path / ENCODER).exists()
@@ -545,10 +545,10 @@ def test_a_run_on_an_object_resumes_with_the_same_object_alone(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"representation": "my encoder"}, "the representation is 'my encoder': it must be a name"),
-        ({"encoder_seed": -1}, "the encoder seed is -1: it must be between 0"),
+        ({"representation": "my encoder"}, "representation is 'my encoder': it must be a name"),
+        ({"encoder_seed": -1}, "encoder_seed is -1: it must be a whole number from 0"),
     ],
 )
 def test_a_run_with_a_name_that_could_not_be_read_again_is_refused(settings, message):
     with pytest.raises(InputError, match=message):
-        Run(task=TASK, **settings)
+        Run.of(task=TASK, **settings)

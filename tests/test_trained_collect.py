@@ -24,7 +24,7 @@ from jbrep.records import container
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, RUN
 from jbrep.rl.policy import load_run
-from jbrep.rl.policy_weights import load, save
+from jbrep.rl.policy_file import read, save
 
 import_modules(["environments"])
 SHORT = describe("face_direction", max_episode_steps=40)
@@ -50,13 +50,11 @@ def runs(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(container, "write", keep)
         train(
-            Run(task=SHORT, algorithm="a2c", encoder="dae-8", steps=80, **usual),
+            Run.of(task=SHORT, algorithm="a2c", encoder="dae-8", steps=80, **usual),
             folder / "jb",
             save_every=0,
         )
-    train(
-        Run(task=SLEDGE, algorithm="sac", steps=20, settings=NORMALIZE, **usual), folder / "sledge"
-    )
+    train(Run.of(SLEDGE, "sac", steps=20, overrides=NORMALIZE, **usual), folder / "sledge")
     return folder
 
 
@@ -182,14 +180,14 @@ def test_a_policy_s_file_that_means_harm(change, message, runs, tmp_path):
     tensors, header = container.read(path, "policy")
     container.write(path, tensors, {**header, **change})
     with pytest.raises(InputError, match=message):
-        load(path)
+        read(path).trained()
     weights = {**tensors, "policy.action_net.bias": np.zeros(7, np.float32)}
     container.write(path, weights, header)
     with pytest.raises(InputError, match="doesn't fit the run's settings"):
-        load(path)
+        read(path).trained()
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(InputError, match="is not a jbrep policy, or is truncated"):
-        load(path)
+        read(path).trained()
 
 
 def test_what_can_t_be_collected_with_is_said_in_one_line(runs, data, tmp_path):

@@ -15,13 +15,13 @@ from jbrep.rl.tracker import Tracker
 from jbrep.rl.tune import BEST, tune
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
-RUN = Run(
+RUN = Run.of(
     task=TASK,
     algorithm="a2c",
     preset="modern",
     steps=128,
     evaluation_episodes=1,
-    settings={"net_arch": [8]},
+    overrides={"net_arch": [8]},
 )
 
 
@@ -35,8 +35,8 @@ def test_a_stopped_search_resumes_to_the_same_trials(tmp_path):
     assert tune(RUN, 3, 1, tmp_path / "parts", parts.append) == best
     assert parts[1:] == whole
     assert best == max(whole, key=lambda trial: trial.value)
-    assert len({trial.settings["learning_rate"] for trial in whole}) == 3
-    expected = ("modern", {"net_arch": [8], **best.settings})
+    assert len({trial.overrides["learning_rate"] for trial in whole}) == 3
+    expected = ("modern", {"net_arch": [8], **best.overrides})
     assert read_preset(tmp_path / "whole" / BEST, "a2c") == expected
     ours, theirs = (tmp_path / each / "trial-1/seed-0" / POLICY for each in ("whole", "parts"))
     assert ours.read_bytes() == theirs.read_bytes()
@@ -71,6 +71,6 @@ def test_weights_and_biases_ends_no_run(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(wandb, "init", fail)
     tracker = Tracker("jbrep", tmp_path / "run", {})
-    assert train(RUN, tmp_path / "run", writers=[tracker])["status"] == "finished"
+    assert train(RUN, tmp_path / "run", writers=[tracker]).status == "finished"
     told = "Weights & Biases: no API key; the run goes on without it\n"
     assert capsys.readouterr().err == told

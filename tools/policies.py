@@ -16,9 +16,10 @@ import numpy as np
 from jbrep.envs.description import describe
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.play.sources import find_player
-from jbrep.rl.files import EPISODES, FINISHED, read_run, runs_below
+from jbrep.rl.files import EPISODES, read_run, runs_below
 from jbrep.rl.policy import load_run
-from jbrep.rl.policy_weights import save
+from jbrep.rl.policy_file import save
+from jbrep.rl.record import FINISHED
 from jbrep.rl.shipped import SHIPPED, file_of, write_returns
 
 SHOWN = (SHIPPED, "heuristic")
@@ -38,9 +39,9 @@ def best(folders: list[Path]) -> dict[str, tuple[float, Path]]:
     found: dict[str, tuple[float, Path]] = {}
     for path in chain.from_iterable(map(runs_below, folders)):
         run = read_run(path)
-        task = run["settings"]["task"]
-        if run["status"] == FINISHED and task in TASKS:
-            scored = (score(path, run["settings"]["steps"]), path)
+        task = run.settings.task
+        if run.status == FINISHED and task in TASKS:
+            scored = (score(path, run.settings.steps), path)
             found[task] = max(found.get(task, scored), scored)
     return {task: found[task] for task in TASKS if task in found}
 

@@ -20,7 +20,7 @@ from jbrep.report.figures import write
 from jbrep.report.figures.curves import curves
 from jbrep.report.figures.style import styles
 from jbrep.report.tables import read_tables
-from jbrep.rl.files import FINISHED
+from jbrep.rl.record import FINISHED
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.first_claims import variance_p

@@ -141,7 +141,7 @@ def _code_of(folder: Path) -> str | None:
     """The code of the encoder that a run was made with, if it is code."""
     from jbrep.rl.policy import run_settings  # imports torch
 
-    return run_settings(folder)["encoder_code"]
+    return run_settings(folder).encoder_code
 
 
 @click.command(epilog=example("jbrep policies"))

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.logger import KVWriter
 
     from jbrep.rl import Run
+    from jbrep.rl.job import Job
 
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 _NOT_REPRODUCIBLE = (
@@ -34,7 +35,7 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 def learner_options(command: _Command) -> _Command:
-    """What learns, with which settings, and on what; `given_settings` reads the settings."""
+    """What learns, with which settings, and on what; `given_run` reads them."""
     options = (
         click.option(
             "--algorithm", default="sac", show_default=True, help=f"One of {', '.join(CLASSES)}."
@@ -71,16 +72,25 @@ def learner_options(command: _Command) -> _Command:
     return command
 
 
-def given_settings(options: dict[str, Any]) -> dict[str, Any]:
-    """What --set and --normalize set; they are taken out of the options.
+def given_run(options: dict[str, Any], **others: Any) -> "Run":
+    """The run that the options of a command say; code that they name is imported.
+
+    Args:
+        options: of `task_options`, `learner_options` and `record_options`.
+        others: fields of a run.
 
     Raises:
-        InputError: --set isn't NAME=VALUE, or names a setting again.
+        InputError: --set isn't NAME=VALUE, or names a setting again; or as `Run.of`.
     """
-    settings = parse_arguments(options.pop("overrides"), "--set")
+    from jbrep.encoders.code import import_code
+    from jbrep.rl import Run
+
+    overrides = parse_arguments(options.pop("overrides"), "--set")
     if options.pop("normalize"):
-        settings["normalize"] = True
-    return settings
+        overrides["normalize"] = True
+    import_code(options["encoder"])
+    task = needed_task(options)
+    return Run.of(task, overrides=overrides, **options, **others)
 
 
 @click.command(
@@ -108,7 +118,7 @@ def given_settings(options: dict[str, Any]) -> dict[str, Any]:
     "--out", required=True, type=click.Path(path_type=Path), help="A folder for this run."
 )
 @click.pass_context
-def rl(context: click.Context, /, out: Path, project: str | None, **settings: Any) -> None:
+def rl(context: click.Context, /, out: Path, project: str | None, **options: Any) -> None:
     """Train and evaluate one agent.
 
     It sees the full observation, scaled, or an encoder's latent. A checkpoint is written every
@@ -116,47 +126,46 @@ def rl(context: click.Context, /, out: Path, project: str | None, **settings: An
     resumes from it, to the same result.
     """
     with stop_signals() as received:
-        from jbrep.encoders.code import import_code
         from jbrep.encoders.shipped import source_of
-        from jbrep.rl import Run, StoppedError, train
+        from jbrep.rl import StoppedError
         from jbrep.rl.files import EVALUATIONS, RUN, read_evaluations
+        from jbrep.rl.job import Job, Session
+        from jbrep.rl.trainers import train_jobs
 
-        settings |= {"task": needed_task(settings), "settings": given_settings(settings)}
-        import_code(settings["encoder"])
-        run = Run(**settings)
-        run.check()
+        run = given_run(options)
+        job = Job(run, out)
         source = source_of(run.encoder, run.task)
         if not run.task.reproducible:
             click.echo(_NOT_REPRODUCIBLE.format(run.task.name), err=True)
         try:
-            with closing(_Bar(run.steps, f"{run.algorithm} on {source}")) as bar:
-                writers = _writers(project, run, out)
-                result = train(run, out, bar.show, stop=lambda: bool(received), writers=writers)
+            with closing(_Bar(run.steps, f"{run.learner.algorithm} on {source}")) as bar:
+                writers = _writers(project, job)
+                session = Session(bar.show, stop=lambda: bool(received), writers=writers)
+                ((_, result),) = train_jobs([job], session)
         except StoppedError as error:
             resumes = f"; {RESUMES}" if run.task.reproducible else ""
             click.echo(f"{error}{resumes}", err=True)
             context.exit(128 + received[0])  # as a shell reports a command that a signal ended
-    if "reason" in result:
-        click.echo(f"the run failed: {result['reason']}; see {out / RUN}", err=True)
+    if result.reason is not None:
+        click.echo(f"the run failed: {result.reason}; see {out / RUN}", err=True)
         context.exit(1)
     say(f"encoder: {source}")
     rows = read_evaluations(out)
     last = [e.episode_return for e in rows if e.step == rows[-1].step]
-    name = result["settings"]["representation"]
+    name = result.settings.representation
     click.echo(
         f"returns on {name} at the end: {interval_of(last)}, median [10 %, 90 %] of {len(last)} "
         f"episodes; all evaluations: {out / EVALUATIONS}"
     )
 
 
-def _writers(project: str | None, run: "Run", out: Path) -> "list[KVWriter]":
+def _writers(project: str | None, job: "Job") -> "list[KVWriter]":
     """What logs to a project of Weights & Biases, if there is one."""
     if project is None:
         return []
-    from jbrep.rl.run import plain
     from jbrep.rl.tracker import Tracker
 
-    return [Tracker(project, out, plain(run.describe(run.find_encoder())))]
+    return [Tracker(project, job.folder, job.settings)]
 
 
 class _Bar:
@@ -166,7 +175,7 @@ class _Bar:
         self._steps, self._name = steps, name
         self._progress: Any = None
 
-    def show(self, step: int, mean: float | None) -> None:
+    def show(self, job: "Job", step: int, mean: float | None) -> None:
         """Show the steps so far and the mean return of the last evaluation.
 
         The final evaluation can take minutes: all steps are told before it, and after it again.

@@ -6,9 +6,9 @@ from typing import Any
 import click
 
 from jbrep.cli.base import COUNT, POSITIVE, RESUMES, example
-from jbrep.cli.environment import needed_task, task_options
+from jbrep.cli.environment import task_options
 from jbrep.cli.options import record_options
-from jbrep.cli.rl import given_settings, learner_options, stop_signals
+from jbrep.cli.rl import given_run, learner_options, stop_signals
 from jbrep.rl.settings import TrainingSettings
 from jbrep.text import rounded
 
@@ -29,7 +29,7 @@ from jbrep.text import rounded
     "--out", required=True, type=click.Path(path_type=Path), help="A folder for this search."
 )
 @click.pass_context
-def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **settings: Any) -> None:
+def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **options: Any) -> None:
     """Search for an algorithm's settings with Optuna.
 
     Learning rate, batch size, discount, layers and others of the algorithm are searched, but for
@@ -38,28 +38,25 @@ def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **settin
     --trials may grow.
     """
     with stop_signals() as received:
-        from jbrep.encoders.code import import_code
-        from jbrep.rl import Run, StoppedError
+        from jbrep.rl import StoppedError
         from jbrep.rl.tune import BEST, Trial
         from jbrep.rl.tune import tune as search
 
         def show(trial: Trial) -> None:
             score = "failed" if trial.value is None else rounded(trial.value)[0]
-            click.echo(f"trial {trial.number + 1} of {trials}: {score}  {_shown(trial.settings)}")
+            click.echo(f"trial {trial.number + 1} of {trials}: {score}  {_shown(trial.overrides)}")
 
-        settings |= {"task": needed_task(settings), "settings": given_settings(settings)}
-        import_code(settings["encoder"])
-        episodes = settings["evaluation_episodes"]
-        run = Run(**settings, evaluate_every=settings["steps"], final_episodes=episodes)
+        steps, episodes = options["steps"], options["evaluation_episodes"]
+        run = given_run(options, evaluate_every=steps, final_episodes=episodes)
         try:
             best = search(run, trials, seeds, out, show, stop=lambda: bool(received))
         except StoppedError as error:
             click.echo(f"{error} of a trial; {RESUMES}", err=True)
             context.exit(128 + received[0])
-    click.echo(f"\nbest: trial {best.number + 1}, {_shown(best.settings)}")
+    click.echo(f"\nbest: trial {best.number + 1}, {_shown(best.overrides)}")
     click.echo(f"as a preset, for --preset: {out / BEST}")
 
 
-def _shown(settings: dict[str, Any]) -> str:
-    values = ((n, f"{v:.3g}" if isinstance(v, float) else str(v)) for n, v in settings.items())
+def _shown(overrides: dict[str, Any]) -> str:
+    values = ((n, f"{v:.3g}" if isinstance(v, float) else str(v)) for n, v in overrides.items())
     return ", ".join(f"{name} {value}" for name, value in values)

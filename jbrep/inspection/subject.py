@@ -159,9 +159,9 @@ def _own(source: str, task: Task) -> BaseEncoder | None:
 
         encoder = run_encoder(folder, run_settings(folder))
     else:
-        from jbrep.rl.policy_weights import load_encoder  # imports torch
+        from jbrep.rl.policy_file import read  # imports torch
 
-        encoder = load_encoder(policy_file(source, task))
+        encoder = read(policy_file(source, task)).encoder()
     return None if encoder.kind == FULL else encoder
 
 

@@ -14,8 +14,8 @@ from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 from jbrep.play.rollout import Begin, Rollout, play
 from jbrep.progress import Progress
-from jbrep.rl.fields import MAX_EVALUATION_EPISODES
 from jbrep.rl.files import EVALUATION_SEED
+from jbrep.rl.settings import MAX_EPISODES
 
 _BATCH_BYTES = 350 * 10**6  # of the steps that `play_first` holds in memory at once
 _MAX_BYTES = 10 * _BATCH_BYTES  # the same, that `play` may return
@@ -107,9 +107,7 @@ def _batches(count: int, most: int) -> Iterator[range]:
     Raises:
         InputError: more episodes than an evaluation may have.
     """
-    if count > MAX_EVALUATION_EPISODES:
-        raise InputError(
-            f"{count:,} episodes are too many: at most {MAX_EVALUATION_EPISODES:,} are played"
-        )
+    if count > MAX_EPISODES:
+        raise InputError(f"{count:,} episodes are too many: at most {MAX_EPISODES:,} are played")
     for start in range(0, count, most):
         yield range(start, min(start + most, count))

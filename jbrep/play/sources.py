@@ -18,11 +18,11 @@ from jbrep.play.player import Player
 from jbrep.play.rollout import Rollout, replay
 from jbrep.records.storage import exists
 from jbrep.rl import shipped
-from jbrep.rl.files import POLICY, is_policy_file, is_run
+from jbrep.rl.files import POLICY, POLICY_ZIP, is_policy_file, is_run
 from jbrep.rl.shipped import SHIPPED
 
 if TYPE_CHECKING:
-    from jbrep.rl.policy import Trained
+    from jbrep.rl.policy_file import Trained
 
 _HEURISTIC = "heuristic"  # the Jitterbug's hand-written policy
 _GOOD_EPISODES = 30  # of a good policy
@@ -129,7 +129,7 @@ def find_player(source: str, task: Task | None = None, encoder: Any = None) -> P
     """The policy of a run, or one by its name, such as heuristic or constant:drive=0.5.
 
     Args:
-        source: the run's folder, or the policy.zip in it, a policy's file, or the name; trained is
+        source: the run's folder, or a policy in it, a policy's file, or the name; trained is
             the one that ships for the task. A run that is not over plays its last checkpoint.
         task: for a policy by its name. A run has its own; if one is given, it must be of the same
             environment, and is played instead: with other arguments or another time limit.
@@ -186,9 +186,9 @@ def find_good_policy(source: str | None, task: Task) -> GoodPolicy | None:
 
 
 def run_folder(source: str) -> Path | None:
-    """The folder of the run that a source names by it, or by its policy.zip; None for another."""
+    """The folder of the run that a source names by it, or by a policy in it; None for another."""
     path = Path(source)
-    folder = path.parent if path.name == POLICY else path
+    folder = path.parent if path.name in (POLICY, POLICY_ZIP) else path
     return folder if source != SHIPPED and is_run(folder) else None
 
 
@@ -206,10 +206,10 @@ def find_untrained(folder: Path, task: Task) -> Player:
 
 def _trained(source: str, task: Task | None, encoder: Any) -> Player:
     from jbrep.rl.policy import load_run  # imports torch
-    from jbrep.rl.policy_weights import load
+    from jbrep.rl.policy_file import read
 
     folder = run_folder(source)
-    trained = load_run(folder, encoder) if folder else load(policy_file(source, task))
+    trained = load_run(folder, encoder) if folder else read(policy_file(source, task)).trained()
     name = str(folder or source)
     _check_task(name, trained.task, task)
     if trained.step is not None:

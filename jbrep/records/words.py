@@ -55,8 +55,17 @@ def _has_parts(node: inspect.Type) -> bool:
 
 
 def _inner(node: inspect.Type, step: str) -> inspect.Type:
-    """The type of a part."""
-    match bare(node):
+    """The type of a part; of a union, that of the first type which has such a part."""
+    match node:
+        case inspect.Metadata(type=inner):
+            return _inner(inner, step)
+        case inspect.UnionType(types=types):
+            structs = [each for each in types if isinstance(each, inspect.StructType)]
+            if tags := tuple(each.tag for each in structs if each.tag_field == step):
+                return inspect.LiteralType(tags)
+            parts = (_inner(each, step) for each in types)
+            any_type = inspect.AnyType()
+            return next((each for each in parts if each != any_type), any_type)
         case (
             inspect.StructType(fields=fields, array_like=True)
             | inspect.NamedTupleType(fields=fields)
@@ -64,7 +73,7 @@ def _inner(node: inspect.Type, step: str) -> inspect.Type:
             return fields[int(step)].type
         case inspect.StructType(fields=fields):
             return next((f.type for f in fields if f.encode_name == step), inspect.AnyType())
-        case inspect.CollectionType(item_type=item):
+        case inspect.CollectionType(item_type=item) if step.isdecimal():
             return item
         case inspect.TupleType(item_types=items) if step.isdecimal():
             return items[int(step)]

@@ -11,26 +11,24 @@ from jbrep.encoders.base import OWN
 from jbrep.encoders.header import HELD_OUT_MSE
 from jbrep.report.figures.diagrams import EncoderRecord, LabelRecord
 from jbrep.report.tables import Tables
-from jbrep.rl.files import FAILED
+from jbrep.rl.record import FAILED
+from jbrep.rl.settings import TrainingSettings
 from jbrep.stats.runs import in_order
 from jbrep.stats.summary import shown_number
-from jbrep.study.record import EACH_ITS_OWN, learner
+from jbrep.study.record import EACH_ITS_OWN
 from jbrep.text import SIGNIFICANT, number, slug
 
 Row = tuple[str, ...]
 Rows = list[Row]
 _BARE = re.compile(r"[\w-]+", re.ASCII)  # a key that TOML needs no quotes for
-_OPTIONS = (  # of jbrep rl, by the names of settings
-    *("task", "algorithm", "preset", "trainer", "precision", "device", "steps"),
-    *("evaluate_every", "evaluation_episodes", "final_episodes"),
-)
+_OPTIONS = ("task", "algorithm", "preset", *TrainingSettings.__struct_fields__)  # of jbrep rl
 
 
 def outline(tables: Tables) -> str:
     """What was run, in a sentence or two."""
     settings = [shared["settings"] for shared in tables.record["labels"].values()]
     tasks = dict.fromkeys(each["task"] for each in settings)
-    algorithms = dict.fromkeys(map(learner, settings))
+    algorithms = dict.fromkeys(each["learner"] for each in settings)
     representations = in_order((each["representation"] for each in settings), FULL)
     runs = tables.record["runs"]
     total = len(runs) + len(tables.record["missing"])
@@ -174,7 +172,7 @@ def setting_rows(tables: Tables) -> tuple[Row, Rows]:
     columns: dict[str, Mapping[str, Any]] = {}
     for shared in tables.record["labels"].values():
         settings = shared["settings"]
-        columns.setdefault(f"{settings['task']}/{learner(settings)}", dict(_flat(settings)))
+        columns.setdefault(f"{settings['task']}/{settings['learner']}", dict(_flat(settings)))
     names = dict.fromkeys(name for settings in columns.values() for name in settings)
     skipped = ("task", "representation", "encoder", "encoder_code")
     rows = [
@@ -274,7 +272,7 @@ def _inline(value: Any) -> str:
 
 def _folder(settings: Mapping[str, Any]) -> str:
     """Of the runs with a label, below that of all; a task's id may contain a slash."""
-    return "/".join(map(slug, (settings["task"], learner(settings), settings["representation"])))
+    return "/".join(map(slug, (settings["task"], settings["learner"], settings["representation"])))
 
 
 def _command(shared: LabelRecord, out: str) -> str:

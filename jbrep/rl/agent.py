@@ -1,5 +1,6 @@
 """A stable-baselines3 agent from a preset, and the evaluation of its policy."""
 
+import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from operator import attrgetter
@@ -22,10 +23,10 @@ from jbrep.envs.recording import Actor, episode_returns
 from jbrep.envs.task import Array, Task
 from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rl.normalization import Statistics, normalized
-from jbrep.rl.presets import ALGORITHMS, Hidden, Preset
-from jbrep.rl.values import linear_from
+from jbrep.rl.presets import LINEAR, Hyperparameters, NetArch, sb3_class
 from jbrep.training.trainer import allocate_adam_state, single_torch_thread
 
+See = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     "relu": torch.nn.ReLU,
     "tanh": torch.nn.Tanh,
@@ -44,6 +45,11 @@ def make_env(
     return normalized(env) if normalize else env
 
 
+def one_line(error: Exception) -> str:
+    """An error's text for a message."""
+    return textwrap.shorten(str(error), 200)
+
+
 class Spaces(gymnasium.Env[Any, Any]):
     """What a policy needs to know of a task to be built, without making the environment."""
 
@@ -56,24 +62,27 @@ def training_seed(seed: int) -> int:
     return int(np.random.SeedSequence(seed).generate_state(1)[0]) >> 1
 
 
-def make_agent(algorithm: str, preset: Preset, env: VecEnv | Spaces, seed: int) -> BaseAlgorithm:
+def make_agent(
+    algorithm: str, hyperparameters: Hyperparameters, env: VecEnv | Spaces, seed: int
+) -> BaseAlgorithm:
     """An untrained agent on the CPU, with its optimisers' state allocated."""
-    settings = {name: _argument(value) for name, value in preset.settings.items()}
-    if preset.noise:
+    of_class = {name: _argument(v) for name, v in hyperparameters.algorithm_kwargs.items()}
+    of_policy, of_adam = hyperparameters.policy_kwargs, hyperparameters.optimizer_kwargs
+    if hyperparameters.noise:
         size = np.prod(env.action_space.shape or (), dtype=int)
-        settings["action_noise"] = preset.noise.make(int(size))
-    agent = ALGORITHMS[algorithm](
+        of_class["action_noise"] = hyperparameters.noise.make(int(size))
+    agent = sb3_class(algorithm)(
         "MlpPolicy",
         env,
         seed=seed,
         device="cpu",
         policy_kwargs={
-            **preset.policy,
-            "net_arch": _layers(preset.hidden),
-            "activation_fn": ACTIVATIONS[preset.policy["activation_fn"]],
-            "optimizer_kwargs": {"fused": True, **preset.optimizer},  # same Adam, less overhead
+            **of_policy,
+            "net_arch": _net_arch(hyperparameters.net_arch),
+            "activation_fn": ACTIVATIONS[of_policy["activation_fn"]],
+            "optimizer_kwargs": {"fused": True, **of_adam},  # same Adam, less overhead
         },
-        **settings,
+        **of_class,
     )
     for _, part in trained_parts(agent):
         if isinstance(part, torch.optim.Optimizer):
@@ -83,15 +92,15 @@ def make_agent(algorithm: str, preset: Preset, env: VecEnv | Spaces, seed: int) 
 
 def _argument(value: Any) -> Any:
     """A setting as stable-baselines3 takes it: schedules as functions, a frequency as a tuple."""
-    if isinstance(value, str) and (start := linear_from(value)) is not None:
-        return LinearSchedule(start, 0.0, 1.0)
+    if isinstance(value, str) and value.startswith(LINEAR):
+        return LinearSchedule(float(value.removeprefix(LINEAR)), 0.0, 1.0)
     return tuple(value) if isinstance(value, list) else value
 
 
-def _layers(hidden: Hidden) -> list[int] | dict[str, list[int]]:
-    if isinstance(hidden, Mapping):
-        return {name: list(units) for name, units in hidden.items()}
-    return list(hidden)
+def _net_arch(given: NetArch) -> list[int] | dict[str, list[int]]:
+    if isinstance(given, Mapping):
+        return {name: list(units) for name, units in given.items()}
+    return list(given)
 
 
 def trained_parts(agent: BaseAlgorithm) -> Iterator[tuple[str, Any]]:
@@ -132,38 +141,44 @@ def unchecked_distributions() -> Iterator[None]:
         Distribution.set_default_validate_args(before)
 
 
-def deterministic(
-    policy: BasePolicy | BaseAlgorithm,
-    encoder: BaseEncoder,
-    task: Task,
-    normalize: Callable[[Any], Any] | None = None,
-) -> Actor:
+def deterministic(policy: BasePolicy, task: Task, see: See, batch_size: int | None = None) -> Actor:
     """The policy's most likely actions, within their bounds despite rounding.
 
     They are not finite where its weights aren't.
 
     Args:
         policy: which to play.
-        encoder: its view of the observation.
         task: what is played.
-        normalize: what it sees of that view, if that isn't the view itself.
+        see: what the policy sees of observations (n, d) in single precision.
+        batch_size: how many go through the network at once, since it rounds differently in batches
+            of other sizes; all of them if not given.
     """
-    bounds = agent_spaces(task, encoder)[1]
+    policy.set_training_mode(False)
+    low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
 
     def act(observation: Array) -> NDArray[np.float32]:
-        with single_torch_thread(), unchecked_distributions():  # as in training
-            seen = encoder.encode(observation.astype(np.float32))
-            if normalize:
-                seen = normalize(seen)
-            actions = policy.predict(seen, deterministic=True)[0]
-        return np.clip(actions, bounds.low, bounds.high)
+        size = batch_size or len(observation)
+        batches = torch.from_numpy(observation.astype(np.float32)).split(size)
+        with single_torch_thread(), torch.no_grad(), unchecked_distributions():
+            chosen = [
+                policy._predict(torch.as_tensor(see(each.numpy())), deterministic=True)
+                for each in batches
+            ]
+        actions = torch.cat(chosen).numpy()
+        scaled = policy.unscale_action(actions) if policy.squash_output else actions
+        return np.clip(scaled, low, high)
 
     return act
 
 
-def statistics_of(policy: BasePolicy | BaseAlgorithm) -> Statistics | None:
+def seeing(encoder: BaseEncoder, statistics: Statistics | None) -> See:
+    """What a policy sees of observations: an encoder's latents, perhaps normalised."""
+    return lambda rows: statistics(encoder.encode(rows)) if statistics else encoder.encode(rows)
+
+
+def statistics_of(agent: BaseAlgorithm) -> Statistics | None:
     """Those by which an agent normalises what it sees, if it does."""
-    env = policy.get_vec_normalize_env() if isinstance(policy, BaseAlgorithm) else None
+    env = agent.get_vec_normalize_env()
     return Statistics.of(env) if env else None
 
 
@@ -189,7 +204,7 @@ class Evaluator:
         self._lanes = Lanes(task, episodes, num_threads)
         self._encoder, self._seed = encoder, seed
 
-    def returns(self, policy: BasePolicy | BaseAlgorithm, episodes: int | None = None) -> Array:
+    def returns(self, agent: BaseAlgorithm, episodes: int | None = None) -> Array:
         """The return of each episode, (episodes,): as many as are played at once, or as asked for.
 
         What an agent normalises, it normalises by its statistics so far, which stay as they are.
@@ -198,7 +213,8 @@ class Evaluator:
             NonFiniteActionError: the policy's actions are not finite.
             EnvironmentFailedError: the environment fails in the middle of an episode.
         """
-        act = deterministic(policy, self._encoder, self._lanes.task, statistics_of(policy))
+        see = seeing(self._encoder, statistics_of(agent))
+        act = deterministic(agent.policy, self._lanes.task, see)
         at_once = self._lanes.num_lanes
         count = at_once if episodes is None else episodes
         seeds = range(self._seed, self._seed + count, at_once)

@@ -4,21 +4,24 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
+from msgspec import Meta
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from jbrep.envs.lanes import EnvironmentFailedError
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import DamageError, InputError, differences
 from jbrep.records import container
 from jbrep.records.container import Tensors
+from jbrep.records.document import Document, document_from
 from jbrep.records.storage import exists
 from jbrep.rl.agent import parameters, statistics_of
-from jbrep.rl.fields import completed
-from jbrep.rl.files import differing
+from jbrep.rl.files import Episode, Evaluation
 from jbrep.rl.history import History
 from jbrep.rl.normalization import Statistics
+from jbrep.rl.record import RunSettings
+from jbrep.rl.settings import MAX_STEPS, Line
 
 MAX_BYTES = 1 << 34
 PARAMETERS = "parameters."  # begins the names of what gradient steps change
@@ -82,17 +85,55 @@ def without(prefix: str, tensors: Tensors) -> Tensors:
     }
 
 
+class CheckpointHeader(Document, frozen=True, kw_only=True):
+    """The header of a checkpoint.
+
+    Attributes:
+        settings: of the run.
+        versions: by package; these and the settings must be equal for the run to resume.
+        step: of training.
+        episodes, evaluations, seconds: of the history so far.
+        counters: of the snapshot.
+    """
+
+    format = "jbrep checkpoint"
+    format_version = 1
+
+    settings: RunSettings
+    versions: Mapping[Line, Line]
+    step: Annotated[int, Meta(ge=0, le=MAX_STEPS)]
+    episodes: list[Episode]
+    evaluations: list[Evaluation]
+    seconds: float
+    counters: Mapping[str, Any]
+
+
+def read_checkpoint(path: Path) -> tuple[Tensors, CheckpointHeader]:
+    """A run's checkpoint.
+
+    Raises:
+        InputError: there is none, or it has another version of the format.
+        DamageError: it isn't what was written.
+    """
+    tensors, header = container.read(path, "checkpoint", MAX_BYTES)
+    return tensors, document_from(header, path, CheckpointHeader)
+
+
 class CheckpointFile:
     """Where a run's snapshots are kept, the last one alone.
 
     Args:
         path: of the file.
-        identity: settings and versions as plain JSON, which must be equal for a run to resume.
+        settings: of the run.
+        versions: by package; these and the settings must be equal for a run to resume.
         history: saved with a snapshot.
     """
 
-    def __init__(self, path: Path, identity: Mapping[str, Any], history: History):
-        self.path, self._identity, self._history = path, identity, history
+    def __init__(
+        self, path: Path, settings: RunSettings, versions: Mapping[str, str], history: History
+    ):
+        self.path, self._history = path, history
+        self._settings, self._versions = settings, versions
         self._saved, self._took = time.monotonic(), 0.0
 
     def is_due(self, every: float, together: int = 1) -> bool:
@@ -114,29 +155,29 @@ class CheckpointFile:
         """
         if not exists(self.path):
             return None
-        tensors, header = container.read(self.path, "checkpoint", MAX_BYTES)
-        try:
-            objection = self._objection(dict(header["identity"]))
-            if not objection:
-                counters = dict(header["counters"])
-                self._history.resume(header["record"], int(counters["num_timesteps"]))
-                return Snapshot(tensors, counters)
-        except _MALFORMED:
-            raise self._damaged() from None
-        raise InputError(
-            f"{self.path} {objection}; choose another folder, or delete the file to start over"
-        )
+        tensors, header = read_checkpoint(self.path)
+        versions = differences(header.versions, self._versions)
+        if others := header.settings.differing(self._settings) or versions:
+            raise InputError(
+                f"{self.path} belongs to another configuration: {others}; choose another folder, "
+                "or delete the file to start over"
+            )
+        self._history.resume(header.episodes, header.evaluations, header.seconds, header.step)
+        return Snapshot(tensors, dict(header.counters))
 
     def write(self, snapshot: Snapshot) -> None:
         """Replace the last one."""
-        tensors, counters = snapshot
-        header = {
-            "identity": self._identity,
-            "record": self._history.as_json(),
-            "counters": counters,
-        }
+        header = CheckpointHeader(
+            settings=self._settings,
+            versions=self._versions,
+            step=snapshot.counters["num_timesteps"],
+            episodes=self._history.episodes,
+            evaluations=self._history.evaluations,
+            seconds=self._history.seconds,
+            counters=snapshot.counters,
+        )
         begun = time.monotonic()
-        container.write(self.path, tensors, header)
+        container.write(self.path, snapshot.tensors, header.as_json())
         self._saved = time.monotonic()
         self._took = self._saved - begun
 
@@ -158,10 +199,3 @@ class CheckpointFile:
 
     def _damaged(self) -> DamageError:
         return DamageError(f"{self.path} is damaged: delete it to start over")
-
-    def _objection(self, identity: Mapping[str, Any]) -> str:
-        """Why a checkpoint of that identity isn't this run's; empty if it is."""
-        if "environment" not in identity:
-            return "was written by an earlier jbrep, which seeded episodes differently"
-        others = differing(completed(identity), self._identity)
-        return f"belongs to another configuration: {others}" if others else ""

@@ -7,22 +7,15 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
 from jbrep.dataset.settings import MAX_LETTERS, TRAINED
-from jbrep.encoders.vec_env import agent_spaces
 from jbrep.envs.recording import Actor
-from jbrep.envs.task import Array, Task, check_same
+from jbrep.envs.task import Task, check_same
 from jbrep.errors import DamageError, InputError
-from jbrep.records.storage import exists
-from jbrep.rl.agent import unchecked_distributions
+from jbrep.records.storage import exists, read_file
 from jbrep.rl.files import ENCODER, is_policy_file
-from jbrep.rl.policy import Trained, load_run
-from jbrep.rl.policy_weights import pack, unpack
-from jbrep.rl.weights import read_file
-from jbrep.training.trainer import single_torch_thread
+from jbrep.rl.policy import load_run
+from jbrep.rl.policy_file import MAX_BYTES, Trained, pack, unpack
+from jbrep.rl.record import PolicyHeader
 
 
 @dataclass(frozen=True)
@@ -38,9 +31,9 @@ class Frozen:
 
     def settings(self) -> dict[str, Any]:
         """What a manifest says of it."""
-        _, header = _opened(self.file, self.content)
+        header, _ = _opened(self.file, self.content)
         digest = hashlib.sha256(self.content).hexdigest()
-        origin = {"run": header["run"], "step": header["step"]}
+        origin = {"run": header.run, "step": header.step}
         return {"kind": TRAINED, "file": self.file, "sha256": digest, **origin}
 
     def files(self) -> dict[str, bytes]:
@@ -54,40 +47,17 @@ class Frozen:
             InputError: it was trained in another task; the actor raises one for actions that are
                 not finite.
         """
-        trained, header = _opened(self.file, self.content)
+        header, trained = _opened(self.file, self.content)
         if task.id != trained.task.id:
-            raise InputError(f"{header['run']} is of {trained.task.name}, not of {task.name}")
-        check_same(task, trained.task, header["run"])
-        return _one_by_one(trained)
+            raise InputError(f"{header.run} is of {trained.task.name}, not of {task.name}")
+        check_same(task, trained.task, header.run)
+        return trained.one_by_one()
 
 
 @lru_cache(maxsize=8)
-def _opened(file: str, content: bytes) -> tuple[Trained, dict[str, Any]]:
-    return unpack(content, Path(file))
-
-
-def _one_by_one(trained: Trained) -> Actor:
-    policy, encoder, statistics = trained.policy, trained.encoder, trained.statistics
-    policy.set_training_mode(False)
-    bounds = agent_spaces(trained.task, encoder)[1]
-
-    def choose(row: torch.Tensor) -> torch.Tensor:
-        seen = encoder.encode(row)
-        if statistics:
-            seen = torch.from_numpy(statistics(seen.numpy()))
-        return policy._predict(seen, deterministic=True)
-
-    def act(observation: Array) -> NDArray[Any]:
-        rows = torch.tensor(observation, dtype=torch.float32).split(1)
-        with single_torch_thread(), torch.inference_mode(), unchecked_distributions():
-            chosen = [choose(row) for row in rows]
-        actions = torch.cat(chosen).numpy()
-        if not np.isfinite(actions).all():
-            raise InputError("the policy's actions are not finite: it can't be played")
-        scaled = policy.unscale_action(actions) if policy.squash_output else actions
-        return np.clip(scaled, bounds.low, bounds.high)
-
-    return act
+def _opened(file: str, content: bytes) -> tuple[PolicyHeader, Trained]:
+    policy = unpack(content, Path(file))
+    return policy.header, policy.trained()
 
 
 def freeze(source: str, path: Path, folder: Path, file: str) -> Frozen:
@@ -109,7 +79,7 @@ def freeze(source: str, path: Path, folder: Path, file: str) -> Frozen:
     if kept := _kept(folder / file, name):
         return kept
     if is_policy_file(path):
-        return Frozen(file, read_file(path))
+        return Frozen(file, read_file(path, MAX_BYTES))
     if not exists(path / ENCODER):
         raise InputError(
             f"{source} can't be collected with: its encoder is code, which can't be kept with the "
@@ -126,7 +96,7 @@ def has_kept(source: str, path: Path) -> bool:
 def _kept(path: Path, run: str) -> Frozen | None:
     if not exists(path):
         return None
-    kept = Frozen(path.name, read_file(path))
+    kept = Frozen(path.name, read_file(path, MAX_BYTES))
     return kept if kept.settings()["run"] == run else None
 
 
@@ -143,7 +113,7 @@ def read_frozen(folder: Path, settings: Mapping[str, Any]) -> Frozen:
         DamageError: it isn't the one that the data were collected with.
     """
     path = folder / settings["file"]
-    frozen = Frozen(settings["file"], read_file(path))
+    frozen = Frozen(settings["file"], read_file(path, MAX_BYTES))
     if frozen.settings() != settings:
         raise DamageError(f"{path} is damaged or another policy: its SHA-256 isn't in the manifest")
     return frozen

@@ -1,10 +1,9 @@
 """What a run has recorded so far, and what it tells while it goes on."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,20 +57,12 @@ class History:
         logger.dump(step)
         return mean
 
-    def as_json(self) -> dict[str, Any]:
-        """A record that `resume` takes."""
-        return {
-            "episodes": self.episodes,
-            "evaluations": self.evaluations,
-            "seconds": self.seconds,
-        }
-
-    def resume(self, record: Mapping[str, Any], step: int) -> None:
+    def resume(
+        self, episodes: list[Episode], evaluations: list[Evaluation], seconds: float, step: int
+    ) -> None:
         """Continue from an earlier process's record, made at that step."""
-        self.episodes = [Episode(*row) for row in record["episodes"]]
-        self.evaluations = [Evaluation(*row) for row in record["evaluations"]]
-        self.earlier_seconds = float(record["seconds"])
-        self.first_step = step
+        self.episodes, self.evaluations = episodes, evaluations
+        self.earlier_seconds, self.first_step = seconds, step
 
 
 class Scalars(TensorBoardOutputFormat):

@@ -7,8 +7,9 @@ from contextlib import suppress
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from jbrep.encoders import Encoder, save
@@ -16,28 +17,29 @@ from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError
 from jbrep.records.commit import commits
 from jbrep.records.storage import exists, write_whole
+from jbrep.rl.agent import statistics_of
 from jbrep.rl.checkpoint import CheckpointFile
-from jbrep.rl.fields import MAX_LINE
 from jbrep.rl.files import (
     CHECKPOINT,
     ENCODER,
     EPISODES,
     EVALUATIONS,
-    FAILED,
-    FINISHED,
     POLICY,
+    POLICY_ZIP,
     RUN,
     Episode,
     Evaluation,
-    differing,
     read_run,
     write_rows,
-    write_run,
 )
 from jbrep.rl.history import History, Scalars
-from jbrep.rl.run import Run, plain
+from jbrep.rl.policy_file import Trained, pack_whole
+from jbrep.rl.policy_zip import policy_zip
+from jbrep.rl.record import FAILED, FINISHED, RunRecord
+from jbrep.rl.run import Run
+from jbrep.rl.settings import MAX_LINE
 
-Ended = tuple["Job", dict[str, Any]]  # a run, and the contents of its run.json
+Ended = tuple["Job", RunRecord]
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 
 
@@ -56,10 +58,10 @@ class Session(NamedTuple):
         writers: of stable-baselines3's logger, that get what TensorBoard gets.
     """
 
-    watch: Callable[["Job", int, float | None], None]
-    save_every: float
-    stop: Callable[[], bool]
-    writers: Sequence[KVWriter]
+    watch: Callable[["Job", int, float | None], None] = lambda job, step, mean: None
+    save_every: float = 60
+    stop: Callable[[], bool] = lambda: False
+    writers: Sequence[KVWriter] = ()
 
 
 class Job:
@@ -77,17 +79,17 @@ class Job:
         history: what was recorded so far.
 
     Raises:
-        InputError: as `Run.check`.
+        InputError: as `Run.settings`.
     """
 
     def __init__(self, run: Run, folder: Path):
         self.run, self.folder = run, folder
         self.encoder = run.find_encoder()
-        self.settings: dict[str, Any] = plain(run.describe(self.encoder))
+        self.settings = run.settings(self.encoder)
         self.history = History()
 
     @property
-    def result(self) -> dict[str, Any] | None:
+    def result(self) -> RunRecord | None:
         """The contents of run.json, if the run has ended.
 
         Raises:
@@ -96,7 +98,7 @@ class Job:
         if not exists(self.folder / RUN):
             return None
         result = read_run(self.folder)
-        if others := differing(result["settings"], self.settings):
+        if others := result.settings.differing(self.settings):
             raise InputError(f"{self.folder} holds another run: {others}; choose another folder")
         return result
 
@@ -117,8 +119,8 @@ class Job:
     @cached_property
     def checkpoint(self) -> CheckpointFile:
         """The run's snapshots."""
-        identity = {**self.settings, **self.versions}
-        return CheckpointFile(self.folder / CHECKPOINT, identity, self.history)
+        path = self.folder / CHECKPOINT
+        return CheckpointFile(path, self.settings, self.versions, self.history)
 
     def keep_encoder(self) -> None:
         """Write the encoder's file; do it when no checkpoint of another run is there."""
@@ -130,36 +132,43 @@ class Job:
         scalars = Scalars(self.folder / "tensorboard", self.history.first_step)
         return Logger(None, [scalars, *writers])
 
-    def end(self, steps: int, failure: str, policy: bytes) -> dict[str, Any]:
+    def end(self, agent: BaseAlgorithm, failure: str) -> RunRecord:
         """Write the run's files.
 
         Args:
-            steps: that it took.
+            agent: trained; the policy of a run that failed isn't kept.
             failure: why it failed; empty if it didn't.
-            policy: the contents of policy.zip; it isn't kept of a run that failed.
 
         Returns:
             The contents of run.json.
         """
-        result = {
-            "status": FAILED if failure else FINISHED,
-            **({"reason": f"{_one_line(failure)} after {steps:,} steps"} if failure else {}),
-            "settings": self.settings,
-            "latent_size": self.encoder.latent_size,
-            "steps": steps,
-            "seconds": self.history.seconds,
-            "versions": self.versions,
-            "commits": dict(commits()),
-            "cpu": _cpu(),
-        }
+        steps = agent.num_timesteps
+        policy = b"" if failure else self._policy(agent)
         write_rows(self.folder / EPISODES, self.history.episodes, Episode)
         write_rows(self.folder / EVALUATIONS, self.history.evaluations, Evaluation)
-        if not failure:
+        if policy:
             write_whole(self.folder / POLICY, policy)
-            result["policy_sha256"] = hashlib.sha256(policy).hexdigest()
-        write_run(self.folder, result)  # last: the run has ended where it exists
+            write_whole(self.folder / POLICY_ZIP, policy_zip(agent))
+        result = RunRecord(
+            status=FAILED if failure else FINISHED,
+            reason=f"{_one_line(failure)} after {steps:,} steps" if failure else None,
+            settings=self.settings,
+            latent_size=self.encoder.latent_size,
+            steps=steps,
+            seconds=self.history.seconds,
+            versions=self.versions,
+            commits=commits(),
+            cpu=_cpu(),
+            policy_sha256=hashlib.sha256(policy).hexdigest() if policy else None,
+        )
+        result.write(self.folder / RUN)  # last: the run has ended where it exists
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
         return result
+
+    def _policy(self, agent: BaseAlgorithm) -> bytes:
+        """The contents of the policy's file."""
+        parts = (agent.policy, self.run.task, self.encoder, self.settings)
+        return pack_whole(Trained(*parts, statistics=statistics_of(agent)))
 
 
 def _one_line(text: str) -> str:

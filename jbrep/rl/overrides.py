@@ -1,37 +1,65 @@
-"""A preset with settings of the user's: which there are, what each may be, and the result."""
+"""Hyperparameters that a user sets: which there are, what each may be, and the result."""
 
 import inspect
 import json
+import types
+import typing
 import warnings
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from functools import cache
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from msgspec import Meta
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from jbrep.errors import InputError, choose
-from jbrep.rl.agent import ACTIVATIONS, make_agent
-from jbrep.rl.fields import HIDDEN
-from jbrep.rl.presets import ALGORITHMS, NormalNoise, OrnsteinUhlenbeckNoise, Preset, get_preset
-from jbrep.rl.values import is_number, refused, typed
-from jbrep.rl.weights import one_line
+from jbrep.errors import InputError
+from jbrep.records.record import Finite, Record, converted, shown
+from jbrep.rl.agent import ACTIVATIONS, make_agent, one_line
+from jbrep.rl.presets import MAX_ENVS, Hyperparameters, NetArch, Noise, get_preset, sb3_class
 
-_NOISES: dict[str, type[NormalNoise] | type[OrnsteinUhlenbeckNoise]] = {
-    "normal": NormalNoise,
-    "ornstein-uhlenbeck": OrnsteinUhlenbeckNoise,
+_MOST = 10**9  # of any number
+_RANGES: dict[str, tuple[float, float]] = {  # others: from 1 if whole, else from 0
+    **dict.fromkeys(("gamma", "tau", "gae_lambda", "batch_norm_momentum"), (0, 1)),
+    **dict.fromkeys(("gradient_steps", "sde_sample_freq"), (-1, _MOST)),
+    **dict.fromkeys(("learning_starts", "top_quantiles_to_drop_per_net"), (0, _MOST)),
+    "renorm_warmup_steps": (0, _MOST),
+    "target_entropy": (-_MOST, _MOST),
+    "log_std_init": (-20, 20),
+    "n_critics": (1, 10),
+    "n_quantiles": (1, 200),
+    "num_envs": (1, MAX_ENVS),
 }
-_OF_ADAM = {
-    "betas": lambda v: isinstance(v, list) and len(v) == 2 and all(map(is_number, v)),
-    "eps": is_number,
-    "weight_decay": is_number,
-}
-_ADAM_EXAMPLE = '{"betas": [0.9, 0.999], "eps": 1e-08, "weight_decay": 0.0}'
+_SCHEDULE = Annotated[
+    str,
+    Meta(pattern=r"\Alinear:([0-9]+\.?[0-9]*|\.[0-9]+)(e-?[0-9]{1,2})?\Z", title="linear:NUMBER"),
+]
+_NONE = Annotated[None, Meta(title="none")]
+_FREQUENCY = Annotated[  # of two parts, but msgspec 0.22 crashes on that beside a bounded number
+    tuple[Annotated[int, Meta(ge=1)] | Literal["step", "episode"], ...],
+    Meta(min_length=2, max_length=2, title='[1, "episode"]'),
+]
+_NOISE = Annotated[
+    Noise | None,
+    Meta(
+        title='none, {"kind": "normal", "sigma": 0.1}, or {"kind": "ornstein-uhlenbeck", "mean": '
+        '0, "sigma": 0.3, "theta": 0.15}'
+    ),
+]
+
+
+class _OfAdam(Record, frozen=True):
+    """Arguments of Adam, but for its learning rate."""
+
+    betas: tuple[Finite, Finite] | None = None
+    eps: Finite | None = None
+    weight_decay: Finite | None = None
+
+
 _OWN = ("net_arch", "noise", "normalize", "num_envs", "optimizer_kwargs")
 _REFUSED = {  # arguments that are jbrep's own, with the reason
     "policy": "the policy is always an MlpPolicy",
@@ -64,11 +92,11 @@ _NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule", "use_sde
 _SHAPING = ("use_sde",)  # arguments of algorithms that decide which weights a policy has
 
 
-def used_settings(algorithm: str, preset: str, overrides: Mapping[str, Any]) -> Preset:
-    """The settings of a preset with some set differently, all checked.
+def overridden(algorithm: str, preset: str, overrides: Mapping[str, Any]) -> Hyperparameters:
+    """The hyperparameters of a preset with some set differently, all checked.
 
     Args:
-        algorithm: a key of ALGORITHMS.
+        algorithm: a key of CLASSES.
         preset: a key of PRESETS.
         overrides: by the names of stable-baselines3's parameters, of the algorithm or its policy,
             or num_envs, noise, normalize and optimizer_kwargs.
@@ -85,36 +113,40 @@ def used_settings(algorithm: str, preset: str, overrides: Mapping[str, Any]) -> 
         raise InputError(
             f"settings of {algorithm} have a value that is no finite number, text, list or table"
         ) from None
-    return _used(algorithm, preset, text)
+    return _overridden(algorithm, preset, text)
 
 
 @cache  # as it builds an agent
-def _used(algorithm: str, preset: str, text: str) -> Preset:
-    used = get_preset(preset, algorithm)
+def _overridden(algorithm: str, preset: str, text: str) -> Hyperparameters:
+    result = get_preset(preset, algorithm)
     for name, value in json.loads(text).items():
-        used = _with(used, algorithm, name, value)
-    _check_together(used)
-    _build(algorithm, used)
-    return used
+        _check_name(algorithm, name)
+        result = result.replace(**_changed(result, algorithm, name, value))
+    _check_together(result)
+    _build(algorithm, result)
+    return result
 
 
-def _with(preset: Preset, algorithm: str, name: str, value: Any) -> Preset:
-    """The preset with one setting checked and set."""
-    _check_name(algorithm, name)
-    if name == "net_arch":
-        return replace(preset, hidden=_hidden(algorithm, value))
-    if name == "noise":
-        return replace(preset, noise=_noise(value))
-    if name == "optimizer_kwargs":
-        return replace(preset, optimizer={**preset.optimizer, **_of_adam(value)})
-    if name == "normalize":
-        return replace(preset, normalize=typed(name, value, bool))
-    if name == "num_envs":
-        return replace(preset, num_envs=typed(name, value, int))
+def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> dict[str, Any]:
+    """The field of hyperparameters that a setting changes."""
+    if name in _OWN:
+        return {name: _own(before, algorithm, name, value)}
     if name in (of_class := _parameters(algorithm)):
-        checked = typed(name, value, of_class[name])
-        return replace(preset, settings={**preset.settings, name: checked})
-    return replace(preset, policy={**preset.policy, name: _of_policy(algorithm, name, value)})
+        checked = _typed(name, value, of_class[name])
+        return {"algorithm_kwargs": {**before.algorithm_kwargs, name: checked}}
+    return {"policy_kwargs": {**before.policy_kwargs, name: _of_policy(algorithm, name, value)}}
+
+
+def _own(before: Hyperparameters, algorithm: str, name: str, value: Any) -> Any:
+    """The value of a setting that isn't stable-baselines3's."""
+    if name == "net_arch":
+        return _net_arch(algorithm, value)
+    if name == "optimizer_kwargs":
+        converted(value, _OfAdam, name)
+        return {**before.optimizer_kwargs, **value}
+    if name == "noise":
+        return None if value == "none" else converted(value, _NOISE, name)
+    return _typed(name, value, {"normalize": bool, "num_envs": int}[name])
 
 
 def setting_names(algorithm: str) -> list[str]:
@@ -123,28 +155,28 @@ def setting_names(algorithm: str) -> list[str]:
     Raises:
         InputError: unknown algorithm.
     """
-    choose(algorithm, ALGORITHMS, "algorithm")
     own = set(_OWN)
     if not _is_off_policy(algorithm):
         own.remove("noise")
     return sorted({*_parameters(algorithm), *_policy_parameters(algorithm), *own})
 
 
-def check_shape(algorithm: str, hidden: Any, policy: Mapping[str, Any]) -> None:
-    """Check what shapes a policy's network, which may come from a stranger's file.
+def check_shape(algorithm: str, hyperparameters: Hyperparameters) -> Hyperparameters:
+    """Those of hyperparameters, perhaps a stranger's, that decide which weights a policy has.
 
     Raises:
-        InputError: an unknown algorithm or argument, or a value that it can't have.
+        InputError: an unknown argument, or a value that it can't have.
     """
-    choose(algorithm, ALGORITHMS, "algorithm")
-    _hidden(algorithm, hidden)
-    for name, value in policy.items():
-        _of_policy(algorithm, name, value)
-
-
-def shaping(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Those arguments of an algorithm that decide which weights its policy has."""
-    return {name: settings[name] is True for name in _SHAPING if name in settings}
+    of_class = hyperparameters.algorithm_kwargs
+    return Hyperparameters(
+        _net_arch(algorithm, hyperparameters.net_arch),
+        {name: of_class[name] is True for name in _SHAPING if name in of_class},
+        policy_kwargs={
+            name: _of_policy(algorithm, name, value)
+            for name, value in hyperparameters.policy_kwargs.items()
+        },
+        normalize=hyperparameters.normalize,
+    )
 
 
 def _check_name(algorithm: str, name: str) -> None:
@@ -160,7 +192,7 @@ def _check_name(algorithm: str, name: str) -> None:
 @cache
 def _parameters(algorithm: str) -> dict[str, Any]:
     """The arguments of an algorithm's class that can be set, with their types."""
-    given = inspect.signature(ALGORITHMS[algorithm]).parameters.values()
+    given = inspect.signature(sb3_class(algorithm)).parameters.values()
     return {
         p.name: p.annotation for p in given if p.name not in _REFUSED and not p.name.startswith("_")
     }
@@ -169,7 +201,7 @@ def _parameters(algorithm: str) -> dict[str, Any]:
 @cache
 def _policy_parameters(algorithm: str) -> dict[str, Any]:
     """The same for its policy's class."""
-    policy = ALGORITHMS[algorithm].policy_aliases["MlpPolicy"]
+    policy = sb3_class(algorithm).policy_aliases["MlpPolicy"]
     left_out = {*_NOT_OF_POLICIES, *_REFUSED, *_OWN}
     given = inspect.signature(policy).parameters.values()
     return {p.name: p.annotation for p in given if p.name not in left_out}
@@ -181,52 +213,64 @@ def _of_policy(algorithm: str, name: str, value: Any) -> Any:
         raise InputError(f"the policy of {algorithm} has no argument {name!r}")
     if name == "activation_fn":
         if not isinstance(value, str) or value not in ACTIVATIONS:
-            raise refused(name, value, f"one of {', '.join(ACTIVATIONS)}")
+            raise InputError(
+                f"{name} is {shown(value)}: it must be one of {', '.join(ACTIVATIONS)}"
+            )
         return value
-    return typed(name, value, known[name])
+    return _typed(name, value, known[name])
 
 
-def _hidden(algorithm: str, value: Any) -> Any:
+def _net_arch(algorithm: str, value: Any) -> Any:
     parts = {"pi", "qf"} if _is_off_policy(algorithm) else {"pi", "vf"}
-    if not HIDDEN.allows(value) or (isinstance(value, dict) and {*value} != parts):
-        raise refused("net_arch", value, f"{HIDDEN.words} for {' and '.join(sorted(parts))}")
-    return value
+    checked = converted(value, NetArch, "net_arch")
+    if isinstance(checked, Mapping) and {*checked} != parts:
+        raise InputError(
+            f"net_arch is {shown(value)}: its parts must be {' and '.join(sorted(parts))}"
+        )
+    return checked
 
 
 def _is_off_policy(algorithm: str) -> bool:
-    return issubclass(ALGORITHMS[algorithm], OffPolicyAlgorithm)
+    return issubclass(sb3_class(algorithm), OffPolicyAlgorithm)
 
 
-def _noise(value: Any) -> NormalNoise | OrnsteinUhlenbeckNoise | None:
-    if value in ("none", None):
+def _typed(name: str, value: Any, annotation: Any) -> Any:
+    """The value, if a parameter of that name and type may have it.
+
+    Raises:
+        InputError: it may not.
+    """
+    kinds = _kinds(annotation)
+    if value == "none" and types.NoneType in kinds:  # TOML has no null
         return None
-    table = value if isinstance(value, dict) else {}
-    kind = _NOISES.get(str(table.get("kind")))
-    numbers = {name: number for name, number in table.items() if name != "kind"}
-    if not kind or {*numbers} != {*kind._fields} or not all(map(is_number, numbers.values())):
-        raise refused(
-            "noise",
-            value,
-            'none, {"kind": "normal", "sigma": 0.1}, or {"kind": "ornstein-uhlenbeck", '
-            '"mean": 0, "sigma": 0.3, "theta": 0.15}',
-        )
-    return kind(**{name: float(number) for name, number in numbers.items()})
+    result = converted(value, _allowed(name, kinds), name)
+    return list(result) if isinstance(result, tuple) else result
 
 
-def _of_adam(value: Any) -> dict[str, Any]:
-    given = value if isinstance(value, dict) else {"": value}
-    if not all(name in _OF_ADAM and _OF_ADAM[name](each) for name, each in given.items()):
-        raise refused("optimizer_kwargs", value, "such as " + _ADAM_EXAMPLE)
-    return given
+def _kinds(annotation: Any) -> tuple[Any, ...]:
+    """The types of a union, or the only one."""
+    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+    return typing.get_args(annotation) if is_union else (annotation,)
 
 
-def _check_together(used: Preset) -> None:
+@cache
+def _allowed(name: str, kinds: tuple[Any, ...]) -> Any:
+    """What JSON may say of a parameter of that name and these types."""
+    least, most = _RANGES.get(name, (1 if int in kinds else 0, _MOST))
+    bounds = Meta(ge=least, le=most)
+    as_json = {int: Annotated[int, bounds], float: Annotated[float, bounds], types.NoneType: _NONE}
+    options = [_FREQUENCY if typing.get_origin(k) is tuple else as_json.get(k, k) for k in kinds]
+    options = [_SCHEDULE if Callable in (k, typing.get_origin(k)) else k for k in options]
+    return typing.Union[tuple(options)]  # noqa: UP007 - of a list
+
+
+def _check_together(chosen: Hyperparameters) -> None:
     """Check what stable-baselines3 would only find out in training."""
-    frequency = used.settings.get("train_freq")
-    if isinstance(frequency, list) and frequency[1] == "episode" and used.num_envs > 1:
+    frequency = chosen.algorithm_kwargs.get("train_freq")
+    if isinstance(frequency, list) and frequency[1] == "episode" and chosen.num_envs > 1:
         raise InputError("train_freq counts episodes: that needs a num_envs of 1")
-    dropped = used.settings.get("top_quantiles_to_drop_per_net", 0)
-    if dropped and dropped >= (most := used.policy.get("n_quantiles", 25)):
+    dropped = chosen.algorithm_kwargs.get("top_quantiles_to_drop_per_net", 0)
+    if dropped and dropped >= (most := chosen.policy_kwargs.get("n_quantiles", 25)):
         raise InputError(
             f"top_quantiles_to_drop_per_net is {dropped}: it must be below n_quantiles, {most}"
         )
@@ -239,14 +283,14 @@ class _Body(gymnasium.Env[Any, Any]):
     action_space = spaces.Box(-1, 1, (1,), np.float32)
 
 
-def _build(algorithm: str, used: Preset) -> None:
+def _build(algorithm: str, chosen: Hyperparameters) -> None:
     """Build an agent, so that what stable-baselines3 refuses is known before the first step."""
-    small = {"buffer_size": used.num_envs} if "buffer_size" in _parameters(algorithm) else {}
-    quick = replace(used, settings={**used.settings, **small})
+    small = {"buffer_size": chosen.num_envs} if "buffer_size" in _parameters(algorithm) else {}
+    quick = chosen.replace(algorithm_kwargs={**chosen.algorithm_kwargs, **small})
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # training gives them
-            make_agent(algorithm, quick, DummyVecEnv([_Body] * used.num_envs), 0)
+            make_agent(algorithm, quick, DummyVecEnv([_Body] * chosen.num_envs), 0)
     except Exception as error:  # stable-baselines3's own checks raise many types
         raise InputError(
             f"stable-baselines3 can't make {algorithm} with these settings: {one_line(error)}"

@@ -1,66 +1,287 @@
-"""Writing policy.zip: stable-baselines3's format, with equal bytes for equal runs."""
+"""policy.safetensors: a trained policy, its encoder and all settings of its run, in a safe file.
 
-import io
-import json
-import zipfile
-from typing import Any
+Reading one runs nothing in it. A run's own also has what only training needs, critics and targets,
+so that another run can begin with it; copies leave that out.
+"""
 
-import safetensors.numpy
-import stable_baselines3
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
 import torch
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import data_to_json
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
 
-from jbrep.rl.agent import statistics_of
-from jbrep.rl.weights import STATISTICS
+from jbrep.encoders import Encoder
+from jbrep.encoders.base import BaseEncoder
+from jbrep.encoders.file import unpack as unpack_encoder
+from jbrep.envs.recording import Actor
+from jbrep.envs.task import Array, Task
+from jbrep.errors import DamageError, InputError
+from jbrep.records import container
+from jbrep.records.container import Tensors
+from jbrep.records.document import document_from
+from jbrep.records.storage import read_file, write_whole
+from jbrep.rl.agent import Spaces, deterministic, make_agent, one_line, seeing
+from jbrep.rl.checkpoint import without
+from jbrep.rl.normalization import Statistics
+from jbrep.rl.overrides import check_shape
+from jbrep.rl.record import PolicyHeader, RunSettings
 
-_OF_THIS_PROCESS = {  # wall times, and where the environment was: `load` starts with defaults
-    "_last_episode_starts",
-    "_last_obs",
-    "_last_original_obs",
-    "_num_timesteps_at_start",
-    "ep_info_buffer",
-    "ep_success_buffer",
-    "start_time",
-}
+MAX_BYTES = 1 << 28
+_ACTING, _TRAINING, _ENCODER = "policy.", "training.", "encoder."  # before the names of tensors
 
 
-def policy_zip(agent: BaseAlgorithm) -> bytes:
-    """A zip file that the algorithm's `load` takes, as its `save` writes it.
+class Trained(NamedTuple):
+    """A policy, and what it acts on."""
 
-    Unlike there, members carry a fixed date, whatever the clock says, and nothing in them depends
-    on the process or the machine. Statistics by which the agent normalises what it sees are a
-    member that `load` leaves alone.
+    policy: BasePolicy
+    task: Task
+    encoder: BaseEncoder
+    settings: RunSettings | None = None  # none of a file from elsewhere
+    step: int | None = None  # of training, if it is not over
+    statistics: Statistics | None = None  # by which it normalises what it sees, if it does
+
+    @property
+    def representation(self) -> str:
+        """What the policy observes, as tables call it."""
+        return self.settings.representation if self.settings else str(self.encoder.name)
+
+    @property
+    def evaluation_episodes(self) -> int:
+        """That the run's evaluations play at once."""
+        return self.settings.evaluation_episodes if self.settings else 1
+
+    def begin(self, task: Task, seeds: Any) -> Actor:
+        """Act deterministically; nothing is drawn.
+
+        The actor raises an InputError for actions that are not finite.
+        """
+        return _finite(deterministic(self.policy, self.task, seeing(self.encoder, self.statistics)))
+
+    def one_by_one(self) -> Actor:
+        """The same with an encoder in torch, in one episode at a time."""
+        encode, statistics = self.encoder.encode, self.statistics
+
+        def see(row: NDArray[np.float32]) -> NDArray[np.float32]:
+            seen: NDArray[np.float32] = encode(torch.from_numpy(row)).numpy()
+            return statistics(seen) if statistics else seen
+
+        return _finite(deterministic(self.policy, self.task, see, batch_size=1))
+
+    def with_weights(self, weights: Tensors, tensors: Tensors, source: Path) -> "Trained":
+        """The policy with these weights, and with statistics from the tensors if it has any.
+
+        Args:
+            weights: of the part that acts, by the names of its parameters.
+            tensors: with those of `Statistics` among them.
+            source: the file that they come from, for messages.
+
+        Raises:
+            InputError: the weights don't fit the policy.
+            DamageError: a number that it acts by isn't finite, or the statistics are missing.
+        """
+        fill(acting(self.policy), weights, source)
+        if self.statistics is None:
+            return self
+        size = self.encoder.latent_size
+        return self._replace(statistics=Statistics.read(tensors, size, source))
+
+
+def _finite(act: Actor) -> Actor:
+    def checked(observation: Array) -> NDArray[Any]:
+        actions = act(observation)
+        if not np.isfinite(actions).all():
+            raise InputError("the policy's actions are not finite: it can't be played")
+        return actions
+
+    return checked
+
+
+def acting(policy: BasePolicy) -> BasePolicy:
+    """The part of a policy that chooses actions: without critics where they are apart."""
+    return getattr(policy, "actor", policy)
+
+
+def fill(policy: BasePolicy, weights: Tensors, path: Path) -> None:
+    """Put weights into a policy or its acting part: all that it has, and no others.
+
+    Args:
+        policy: which they are of.
+        weights: by the names of its parameters.
+        path: of the file that they come from, for messages.
+
+    Raises:
+        InputError: they don't fit the policy.
+        DamageError: a weight that the policy acts by is not finite.
     """
-    names, variables = agent._get_torch_save_params()
-    left_out = {*agent._excluded_save_params(), *_OF_THIS_PROCESS}
-    left_out |= {name.partition(".")[0] for name in (*names, *variables)}
-    data = {name: value for name, value in vars(agent).items() if name not in left_out}
-    statistics = statistics_of(agent)
-    members: dict[str, str | bytes] = {
-        "data": _to_json(data),
-        "pytorch_variables.pth": _to_bytes({name: getattr(agent, name) for name in variables}),
-        **{f"{name}.pth": _to_bytes(state) for name, state in agent.get_parameters().items()},
-        "_stable_baselines3_version": stable_baselines3.__version__,
-        **({STATISTICS: safetensors.numpy.save(statistics.tensors)} if statistics else {}),
-    }
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as file:
-        for name, member in members.items():
-            file.writestr(zipfile.ZipInfo(name), member)  # dated 1980, the format's first year
-    return content.getvalue()
+    try:
+        policy.load_state_dict({name: torch.tensor(values) for name, values in weights.items()})
+    except (AttributeError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(f"{path} doesn't fit the run's settings: {one_line(error)}") from None
+    if not all(bool(torch.isfinite(part).all()) for part in acting(policy).parameters()):
+        raise DamageError(f"{path} is damaged: the policy's weights are not finite")
 
 
-def _to_json(data: dict[str, Any]) -> str:
-    """stable-baselines3's JSON without its notes for human readers, which hold addresses."""
-    stated = json.loads(data_to_json(data))
-    for name, value in stated.items():
-        if isinstance(value, dict) and ":serialized:" in value:
-            stated[name] = {key: value[key] for key in (":type:", ":serialized:")}
-    return json.dumps(stated, indent=4)
+def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
+    """The untrained policy of a run; `Trained.with_weights` gives it weights.
+
+    Args:
+        settings: of the run.
+        encoder: of the run.
+        path: where the settings are from, for messages.
+
+    Raises:
+        InputError: the settings can't be those of a run, or the encoder isn't the run's.
+    """
+    task = settings.environment
+    if encoder.fingerprint != settings.encoder:
+        raise InputError(f"{encoder.name} is not the encoder that the run in {path} was made with")
+    encoder.check_task(task)
+    shape = check_shape(settings.algorithm, settings.hyperparameters)
+    try:
+        agent = make_agent(settings.algorithm, shape, Spaces(task, encoder), settings.seed)
+    except (AssertionError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"no policy can be made from the settings of the run: {one_line(error)}"
+        ) from None
+    statistics = Statistics.untrained(encoder.latent_size) if shape.normalize else None
+    return Trained(agent.policy, task, encoder, settings, statistics=statistics)
 
 
-def _to_bytes(tensors: dict[str, Any]) -> bytes:
-    content = io.BytesIO()
-    torch.save(tensors, content)
-    return content.getvalue()
+def pack(trained: Trained, run: str) -> bytes:
+    """The bytes of a policy's file, to act with alone.
+
+    Args:
+        trained: the policy of a run.
+        run: what the run is called, a line.
+
+    Raises:
+        InputError: its encoder is code, which no file can hold.
+    """
+    if not isinstance(trained.encoder, Encoder):
+        raise InputError(
+            f"the policy of {run} can't be kept in a file: its encoder, {trained.encoder.name}, is "
+            "code"
+        )
+    return _pack(trained, run, {})
+
+
+def pack_whole(trained: Trained) -> bytes:
+    """The bytes of the policy's file in a run's folder, with all that a run can begin with."""
+    assert trained.settings is not None
+    parts = {} if acting(trained.policy) is trained.policy else trained.policy.state_dict()
+    others = {name: each for name, each in parts.items() if not name.startswith("actor.")}
+    return _pack(trained, trained.settings.name, _named(_TRAINING, others))
+
+
+def _pack(trained: Trained, run: str, tensors: Tensors) -> bytes:
+    settings, encoder = trained.settings, trained.encoder
+    assert settings is not None
+    header = PolicyHeader(
+        settings=settings,
+        encoder=encoder.header.as_json() if isinstance(encoder, Encoder) else None,
+        run=run,
+        step=settings.steps if trained.step is None else trained.step,
+        finished=trained.step is None,
+    )
+    tensors |= _named(_ACTING, acting(trained.policy).state_dict())
+    if isinstance(encoder, Encoder):
+        tensors |= {f"{_ENCODER}{name}": values for name, values in encoder.tensors().items()}
+    if trained.statistics is not None:
+        tensors |= trained.statistics.tensors
+    return container.pack(tensors, header.as_json())
+
+
+def _named(prefix: str, weights: Mapping[str, torch.Tensor]) -> Tensors:
+    return {f"{prefix}{name}": each.numpy(force=True) for name, each in weights.items()}
+
+
+def save(trained: Trained, path: Path, run: str) -> None:
+    """Write a policy's file, to act with alone, whole or not at all.
+
+    Raises:
+        InputError: as `pack`, or it can't be written.
+    """
+    write_whole(path, pack(trained, run))
+
+
+class PolicyFile(NamedTuple):
+    """What a policy's file has."""
+
+    header: PolicyHeader
+    tensors: Tensors
+    path: Path
+
+    @property
+    def weights(self) -> Tensors:
+        """Of the part that acts, by the names of its parameters."""
+        return without(_ACTING, self.tensors)
+
+    def fill_whole(self, policy: BasePolicy) -> None:
+        """Put all weights into a policy, those that only training needs, too.
+
+        Raises:
+            InputError: they don't fit the policy, or the file isn't a run's own.
+            DamageError: as `fill`.
+        """
+        prefix = "" if acting(policy) is policy else "actor."
+        acts = {f"{prefix}{name}": values for name, values in self.weights.items()}
+        fill(policy, acts | without(_TRAINING, self.tensors), self.path)
+
+    def encoder(self) -> Encoder:
+        """The encoder in it.
+
+        Raises:
+            InputError: there is none, as it is code.
+            DamageError: it isn't that of the settings.
+        """
+        settings = self.header.settings
+        if self.header.encoder is None:
+            raise InputError(f"{self.path} has no encoder: that of its run is code")
+        encoder = unpack_encoder(self.path, without(_ENCODER, self.tensors), self.header.encoder)
+        if encoder.fingerprint != settings.encoder:
+            raise DamageError(f"{self.path} is damaged: its encoder isn't the one of its settings")
+        return encoder
+
+    def trained(self, encoder: BaseEncoder | None = None) -> Trained:
+        """The policy.
+
+        Args:
+            encoder: that of the run, if the file has none.
+
+        Raises:
+            InputError, DamageError: it isn't what was written.
+        """
+        built = build(self.header.settings, encoder or self.encoder(), self.path)
+        step = None if self.header.finished else self.header.step
+        return built.with_weights(self.weights, self.tensors, self.path)._replace(step=step)
+
+
+def read(path: Path, sha256: str = "") -> PolicyFile:
+    """Read a policy's file.
+
+    Args:
+        path: of the file.
+        sha256: of the file, if that is known.
+
+    Raises:
+        InputError: no such file, another kind of file, or another version of the format.
+        DamageError: it isn't what was written, or the file with that hash.
+    """
+    raw = read_file(path, MAX_BYTES)
+    if sha256 and hashlib.sha256(raw).hexdigest() != sha256:
+        raise DamageError(f"{path} is damaged or another run's: its SHA-256 isn't in run.json")
+    return unpack(raw, path)
+
+
+def unpack(raw: bytes, path: Path) -> PolicyFile:
+    """The same of a file's bytes; the path is for messages.
+
+    Raises:
+        InputError, DamageError: as `read`.
+    """
+    tensors, header = container.unpack(raw, path, "policy")
+    return PolicyFile(document_from(header, path, PolicyHeader), tensors, path)

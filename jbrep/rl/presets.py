@@ -1,37 +1,51 @@
-"""The algorithms and their settings, as data."""
+"""The hyperparameters of algorithms, and the presets of them, as data."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pkgutil import resolve_name
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.noise import (
-    ActionNoise,
-    NormalActionNoise,
-    OrnsteinUhlenbeckActionNoise,
-)
 
 from jbrep.errors import choose
-from jbrep.rl.fields import POLICY
+from jbrep.records.record import Finite, Record
 from jbrep.rl.names import CLASSES, MODERN, PAPER
 
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.noise import ActionNoise
+
 Array = NDArray[np.float64]
-Hidden = Sequence[int] | Mapping[str, Sequence[int]]
 
-
+MAX_LAYERS, MAX_UNITS = 8, 1024  # of a policy's network
+MAX_ENVS = 4096
+LINEAR = "linear:"  # before the number from which a schedule falls to 0
 _DT = 1e-2  # stable-baselines3's unit of time for a step
 
+Layers = Annotated[
+    tuple[Annotated[int, Meta(ge=1, le=MAX_UNITS)], ...], Meta(max_length=MAX_LAYERS)
+]
+_Parts = Annotated[Mapping[str, Layers], Meta(min_length=1, max_length=2)]
+NetArch = Annotated[
+    Layers | _Parts,
+    Meta(
+        title=f"a list of at most {MAX_LAYERS} whole numbers from 1 to {MAX_UNITS:,}, or an object "
+        "of such lists"
+    ),
+]
 
-class NormalNoise(NamedTuple):
+
+class NormalNoise(Record, frozen=True, tag_field="kind", tag="normal"):
     """Independent Gaussian noise on each number of an action, with mean 0."""
 
-    sigma: float
+    sigma: Finite
 
-    def make(self, size: int) -> ActionNoise:
+    def make(self, size: int) -> "ActionNoise":
         """The noise on actions of so many numbers, as a stable-baselines3 object."""
+        from stable_baselines3.common.noise import NormalActionNoise
+
         return NormalActionNoise(np.zeros(size), np.full(size, self.sigma))
 
     def after(self, previous: Array, generator: np.random.RandomState) -> Array:
@@ -39,15 +53,17 @@ class NormalNoise(NamedTuple):
         return generator.normal(0, self.sigma, previous.shape)
 
 
-class OrnsteinUhlenbeckNoise(NamedTuple):
+class OrnsteinUhlenbeckNoise(Record, frozen=True, tag_field="kind", tag="ornstein-uhlenbeck"):
     """Noise that drifts back to its mean, starting from 0 in each episode."""
 
-    mean: float
-    sigma: float
-    theta: float
+    mean: Finite
+    sigma: Finite
+    theta: Finite
 
-    def make(self, size: int) -> ActionNoise:
+    def make(self, size: int) -> "ActionNoise":
         """As for `NormalNoise`; stable-baselines3 takes a step for 0.01 units of time."""
+        from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+
         mean, sigma = np.full(size, self.mean), np.full(size, self.sigma)
         return OrnsteinUhlenbeckActionNoise(mean, sigma, self.theta)
 
@@ -57,39 +73,40 @@ class OrnsteinUhlenbeckNoise(NamedTuple):
         return previous + pull + self.sigma * np.sqrt(_DT) * generator.normal(size=previous.shape)
 
 
-@dataclass(frozen=True)
-class Preset:
-    """Settings of an algorithm; those not named keep stable-baselines3's defaults.
+Noise = NormalNoise | OrnsteinUhlenbeckNoise
+
+
+class Hyperparameters(Record, frozen=True):
+    """Those of an algorithm; what isn't named keeps stable-baselines3's default.
 
     Attributes:
-        hidden: units of the hidden layers of actor and critic, or of each by its name: pi and qf,
-            on policy pi and vf.
-        settings: arguments of the algorithm's class; "linear:0.1" is a schedule from 0.1 to 0.
+        net_arch: units of the hidden layers of actor and critic, or of each by its name: pi and
+            qf, on policy pi and vf.
+        algorithm_kwargs: arguments of the algorithm's class; "linear:0.1" is a schedule from 0.1
+            to 0.
         num_envs: lanes stepped together.
         noise: on actions scaled to [-1, 1].
-        optimizer: arguments of Adam.
-        policy: arguments of the policy's class; activation_fn by its name.
+        optimizer_kwargs: arguments of Adam.
+        policy_kwargs: arguments of the policy's class; activation_fn by its name.
         normalize: whether the agent sees its input by the running mean and variance.
     """
 
-    hidden: Hidden
-    settings: Mapping[str, Any]
-    num_envs: int = 1
-    noise: NormalNoise | OrnsteinUhlenbeckNoise | None = None
-    optimizer: Mapping[str, Any] = field(default_factory=dict)
-    policy: Mapping[str, Any] = field(default_factory=lambda: dict(POLICY))
+    net_arch: NetArch
+    algorithm_kwargs: Mapping[str, Any]
+    num_envs: Annotated[int, Meta(ge=1, le=MAX_ENVS)] = 1
+    noise: Noise | None = None
+    optimizer_kwargs: Mapping[str, Any] = {}
+    policy_kwargs: Mapping[str, Any] = msgspec.field(
+        default_factory=lambda: {"activation_fn": "relu"}
+    )
     normalize: bool = False
 
-
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
-    name: resolve_name(path) for name, path in CLASSES.items()
-}
 
 _SHARED = {"learning_rate": 1e-4, "gamma": 0.99}
 _HIDDEN = (350, 250)
 _ON_POLICY = {"eps": 1e-5}  # of Adam, as stable-baselines3 sets it for PPO and A2C
 _PAPER = {
-    "ddpg": Preset(
+    "ddpg": Hyperparameters(
         _HIDDEN,
         {
             **_SHARED,
@@ -101,18 +118,20 @@ _PAPER = {
         },
         noise=OrnsteinUhlenbeckNoise(mean=0.3, sigma=0.3, theta=0.15),
     ),
-    "td3": Preset(
+    "td3": Hyperparameters(
         _HIDDEN,
         {**_SHARED, "learning_starts": 10_000, "gradient_steps": 1000, "train_freq": 1000},
-        noise=NormalNoise(0.2),
+        noise=NormalNoise(sigma=0.2),
     ),
     **{
-        name: Preset(
-            _HIDDEN, {**_SHARED, "batch_size": 256, "ent_coef": "auto"}, noise=NormalNoise(0.2)
+        name: Hyperparameters(
+            _HIDDEN,
+            {**_SHARED, "batch_size": 256, "ent_coef": "auto"},
+            noise=NormalNoise(sigma=0.2),
         )
         for name in ("sac", "tqc", "crossq")  # the paper has sac alone
     },
-    "ppo": Preset(
+    "ppo": Hyperparameters(
         _HIDDEN,
         {
             **_SHARED,
@@ -127,48 +146,61 @@ _PAPER = {
             "n_epochs": 4,
         },
         num_envs=8,
-        optimizer=_ON_POLICY,
+        optimizer_kwargs=_ON_POLICY,
     ),
-    "a2c": Preset(_HIDDEN, {**_SHARED, "use_rms_prop": False}, num_envs=8, optimizer=_ON_POLICY),
-    "trpo": Preset(_HIDDEN, {**_SHARED, "n_steps": 256}, num_envs=8, optimizer=_ON_POLICY),
+    "a2c": Hyperparameters(
+        _HIDDEN, {**_SHARED, "use_rms_prop": False}, num_envs=8, optimizer_kwargs=_ON_POLICY
+    ),
+    "trpo": Hyperparameters(
+        _HIDDEN, {**_SHARED, "n_steps": 256}, num_envs=8, optimizer_kwargs=_ON_POLICY
+    ),
 }
 
 _OFF_POLICY = {"learning_rate": 3e-4, "learning_starts": 1000, "train_freq": 4}
 _MODERN = {
-    "ddpg": Preset((256, 256), _OFF_POLICY, noise=NormalNoise(0.2)),
-    "td3": Preset((256, 256), _OFF_POLICY, noise=NormalNoise(0.2)),
-    "sac": Preset((256, 256), _OFF_POLICY),
-    "tqc": Preset((256, 256), _OFF_POLICY),
-    "crossq": Preset(  # its own layers and learning rate; it has no target networks
+    "ddpg": Hyperparameters((256, 256), _OFF_POLICY, noise=NormalNoise(sigma=0.2)),
+    "td3": Hyperparameters((256, 256), _OFF_POLICY, noise=NormalNoise(sigma=0.2)),
+    "sac": Hyperparameters((256, 256), _OFF_POLICY),
+    "tqc": Hyperparameters((256, 256), _OFF_POLICY),
+    "crossq": Hyperparameters(  # its own layers and learning rate; it has no target networks
         {"pi": (256, 256), "qf": (1024, 1024)}, {**_OFF_POLICY, "learning_rate": 1e-3}
     ),
-    "ppo": Preset(
+    "ppo": Hyperparameters(
         (64, 64),
         {"learning_rate": 3e-4, "n_steps": 256, "batch_size": 64, "n_epochs": 10},
         num_envs=8,
-        optimizer=_ON_POLICY,
+        optimizer_kwargs=_ON_POLICY,
     ),
-    "a2c": Preset(
+    "a2c": Hyperparameters(
         (64, 64),
         {"learning_rate": 7e-4, "use_rms_prop": False, "n_steps": 8, "gae_lambda": 0.9},
         num_envs=8,
-        optimizer=_ON_POLICY,
+        optimizer_kwargs=_ON_POLICY,
     ),
-    "trpo": Preset(
+    "trpo": Hyperparameters(
         (64, 64),
         {"learning_rate": 1e-3, "n_steps": 256, "n_critic_updates": 20, "cg_damping": 0.1},
         num_envs=8,
-        optimizer=_ON_POLICY,
+        optimizer_kwargs=_ON_POLICY,
     ),
 }
 PRESETS = {PAPER: _PAPER, MODERN: _MODERN}
 
 
-def get_preset(preset: str, algorithm: str) -> Preset:
-    """The settings of an algorithm in the preset of that name.
+def get_preset(preset: str, algorithm: str) -> Hyperparameters:
+    """The hyperparameters of an algorithm in the preset of that name.
 
     Raises:
         InputError: no preset or algorithm of that name; the message lists them.
     """
-    choose(algorithm, ALGORITHMS, "algorithm")
+    choose(algorithm, CLASSES, "algorithm")
     return choose(preset, PRESETS, "preset")[algorithm]
+
+
+def sb3_class(algorithm: str) -> "type[BaseAlgorithm]":
+    """The class that has an algorithm in stable-baselines3.
+
+    Raises:
+        InputError: unknown algorithm.
+    """
+    return cast("type[BaseAlgorithm]", resolve_name(choose(algorithm, CLASSES, "algorithm")))

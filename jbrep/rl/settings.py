@@ -9,6 +9,33 @@ from jbrep.records.record import Record
 MAX_STEPS = 10**12  # of training
 MAX_EPISODES = 10_000  # of an evaluation
 
+MAX_SEED = (1 << 31) - 1
+MAX_LINE = 1000  # letters
+MAX_NAME = 100  # letters of a learner's name
+
+Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
+Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", title="64 hexadecimal digits")]
+Name = Annotated[
+    str,
+    Meta(
+        pattern=r"\A[\w.-]{1,100}\Z",
+        title="a name of letters, digits, dots, hyphens and underscores",
+    ),
+]
+LearnerName = Annotated[
+    str,
+    Meta(
+        pattern=rf"\A(?=.*[^.])[\w.+=-]{{1,{MAX_NAME}}}\Z",
+        title=f"at most {MAX_NAME} letters, digits and characters of . _ - + =",
+    ),
+]
+Line = Annotated[  # nothing in it controls a terminal
+    str,
+    Meta(
+        pattern=rf"\A[^\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f]{{0,{MAX_LINE}}}\Z",
+        title=f"a line of at most {MAX_LINE:,} letters",
+    ),
+]
 Steps = Annotated[int, Meta(ge=1, le=MAX_STEPS)]
 Episodes = Annotated[int, Meta(ge=1, le=MAX_EPISODES)]
 
@@ -53,3 +80,9 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
         Literal["cpu", "cuda", "auto"],
         Meta(description="That a cohort learns on; auto is cuda where there is one."),
     ] = "cpu"
+
+    @property
+    def training_settings(self) -> "TrainingSettings":
+        """These settings, without those that a subclass adds."""
+        own = TrainingSettings.__struct_fields__
+        return TrainingSettings(**{name: getattr(self, name) for name in own})

@@ -9,9 +9,11 @@ import numpy as np
 from jbrep.envs.task import Array, Task
 from jbrep.errors import DamageError, InputError
 from jbrep.records import container
+from jbrep.records.document import document_from
 from jbrep.records.storage import exists
 from jbrep.records.tables import Columns, count, finite, read_csv, write_csv
 from jbrep.rl.files import POLICY_SUFFIX
+from jbrep.rl.record import PolicyHeader
 
 SHIPPED = "trained"  # what commands call the one that ships for their task
 FOLDER = Path(__file__).parent / "shipped"
@@ -59,10 +61,10 @@ def shipped() -> list[Shipped]:
 
 
 def _described(task: str, returns: Returns) -> Shipped:
-    _, header = container.read(file_of(task), "policy")
-    settings = header["settings"]
-    names = (settings["representation"], settings["learner"])
-    return Shipped(task, *names, header["step"], returns)
+    path = file_of(task)
+    header = document_from(container.read(path, "policy")[1], path, PolicyHeader)
+    names = (header.settings.representation, header.settings.learner)
+    return Shipped(task, *names, header.step, returns)
 
 
 def write_returns(played: Mapping[str, Returns], folder: Path = FOLDER) -> None:

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from math import gcd
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +13,7 @@ from jbrep.rl.cohort.cohort import Cohort
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.job import Job
 from jbrep.rl.names import COHORT
-from jbrep.rl.presets import ALGORITHMS
+from jbrep.rl.presets import sb3_class
 from jbrep.rl.run import Run
 from jbrep.training.trainer import single_torch_thread
 
@@ -28,19 +27,21 @@ def estimate(runs: Sequence[Run]) -> float:
         runs: that can be in one cohort, or one of another trainer.
     """
     first = runs[0]
-    if issubclass(ALGORITHMS[first.algorithm], OffPolicyAlgorithm):
-        runs = [replace(run, settings={**run.settings, **_at_once(run)}) for run in runs]
+    if issubclass(sb3_class(first.learner.algorithm), OffPolicyAlgorithm):
+        runs = [run.replace(learner=run.learner.overridden(_at_once(run))) for run in runs]
     with TemporaryDirectory() as folder, single_torch_thread():
-        trial = _together if first.trainer == COHORT else _alone
-        per_step, per_evaluation = trial(runs, Path(folder))
-    at_end = first.final_episodes / first.evaluation_episodes
+        jobs = [Job(run, Path(folder) / str(i)) for i, run in enumerate(runs)]
+        settings = jobs[0].settings
+        trial = _together if settings.trainer == COHORT else _alone
+        per_step, per_evaluation = trial(jobs)
+    at_end = settings.final_episodes / first.evaluation_episodes
     evaluations = first.steps // first.evaluate_every + at_end
     return first.steps * per_step + evaluations * per_evaluation
 
 
 def _at_once(run: Run) -> dict[str, int]:
     """Settings with gradient steps from the first rollout on, in rollouts as short as can be."""
-    used = run.used.settings
+    used = run.learner.hyperparameters.algorithm_kwargs
     every, many = used.get("train_freq"), used.get("gradient_steps")
     if type(every) is not int or type(many) is not int or many < 1:
         return {"learning_starts": 0}
@@ -52,24 +53,24 @@ def _at_once(run: Run) -> dict[str, int]:
     }
 
 
-def _alone(runs: Sequence[Run], folder: Path) -> tuple[float, float]:
+def _alone(jobs: Sequence[Job]) -> tuple[float, float]:
     """Seconds of a step, and of an evaluation."""
-    (run,) = runs
-    encoder, preset = run.find_encoder(), run.used
-    env = make_env(run.task, preset.num_envs, 0, encoder, preset.normalize)
-    agent = make_agent(run.algorithm, preset, env, 0)
-    evaluator = Evaluator(run.task, encoder, run.evaluation_episodes)
+    (job,) = jobs
+    run, chosen = job.run, job.settings.hyperparameters
+    env = make_env(run.task, chosen.num_envs, 0, job.encoder, chosen.normalize)
+    agent = make_agent(run.learner.algorithm, chosen, env, 0)
+    evaluator = Evaluator(run.task, job.encoder, run.evaluation_episodes)
     learned = _seconds(lambda: agent.learn(_MIN_STEPS))  # whole rollouts, so at least one
     return learned / agent.num_timesteps, _seconds(lambda: evaluator.returns(agent))
 
 
-def _together(runs: Sequence[Run], folder: Path) -> tuple[float, float]:
+def _together(jobs: Sequence[Job]) -> tuple[float, float]:
     """The same of a cohort: a step of each run, an evaluation of each."""
-    members = [Member(Job(run, folder / str(i)), []) for i, run in enumerate(runs)]
+    members = [Member(job, []) for job in jobs]
     cohort = Cohort(members)
 
     def learn() -> None:
-        while cohort.step * len(runs) < _MIN_STEPS:
+        while cohort.step * len(jobs) < _MIN_STEPS:
             for _ in range(cohort.rollout):
                 cohort.act()
             cohort.learn()

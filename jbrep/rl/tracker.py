@@ -3,7 +3,6 @@
 import hashlib
 import json
 import sys
-from collections.abc import Mapping
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,8 @@ import wandb
 from stable_baselines3.common.logger import KVWriter
 
 from jbrep.errors import first_line
+from jbrep.records.record import to_plain
+from jbrep.rl.record import RunSettings
 
 TENSORBOARD = "tensorboard"  # what is kept from it is kept from here, too
 
@@ -28,8 +29,8 @@ class Tracker(KVWriter):
         settings: of the run.
     """
 
-    def __init__(self, project: str, folder: Path, settings: Mapping[str, Any]):
-        self._project, self._folder, self._settings = project, folder, settings
+    def __init__(self, project: str, folder: Path, settings: RunSettings):
+        self._project, self._folder, self._settings = project, folder, to_plain(settings)
         self._run: Any = None
         self._failed = False
 
@@ -67,7 +68,7 @@ class Tracker(KVWriter):
             name=self._folder.name,
             id=hashlib.sha256(text.encode()).hexdigest()[:16],  # that a resumed run finds again
             resume="allow",
-            config=dict(self._settings),
+            config=self._settings,
             dir=str(self._folder),
             settings=wandb.Settings(silent=True, console="off"),
         )

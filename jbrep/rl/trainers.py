@@ -1,9 +1,8 @@
 """Training runs, by the trainer that each names."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 from stable_baselines3.common.logger import KVWriter
 
@@ -11,8 +10,9 @@ from jbrep.records.lock import exclusive
 from jbrep.records.storage import make_folder
 from jbrep.rl.cohort.trainer import train_together
 from jbrep.rl.history import Watch
-from jbrep.rl.job import Job, Session
+from jbrep.rl.job import Ended, Job, Session
 from jbrep.rl.names import COHORT, SB3
+from jbrep.rl.record import RunRecord
 from jbrep.rl.run import Run
 from jbrep.rl.sb3.trainer import train_in_turn
 from jbrep.training.trainer import single_torch_thread
@@ -27,7 +27,7 @@ def train(
     save_every: float = 60,
     stop: Callable[[], bool] = lambda: False,
     writers: Sequence[KVWriter] = (),
-) -> dict[str, Any]:
+) -> RunRecord:
     """Train an agent and write its folder, unless the run has ended already.
 
     A run that was killed or stopped resumes from its checkpoint, to the same bits.
@@ -44,33 +44,23 @@ def train(
         The contents of run.json.
 
     Raises:
-        InputError: as `Run.check`; or the folder holds another run, or is in use.
+        InputError: as `Run.settings`; or the folder holds another run, or is in use.
         StoppedError: `stop` was true.
     """
-
-    def watch_it(folder: Path, step: int, mean: float | None) -> None:
-        watch(step, mean)
-
-    return dict(train_all({folder: run}, watch_it, save_every, stop, writers))[folder]
+    session = Session(lambda job, *told: watch(*told), save_every, stop, writers)
+    ((_, record),) = train_jobs([Job(run, folder)], session)
+    return record
 
 
-def train_all(
-    runs: Mapping[Path, Run],
-    watch: Callable[[Path, int, float | None], None] = lambda folder, step, mean: None,
-    save_every: float = 60,
-    stop: Callable[[], bool] = lambda: False,
-    writers: Sequence[KVWriter] = (),
-) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """The same for several runs, by their folders: together, where their trainer can.
+def train_jobs(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
+    """The same for several runs: together, where their trainer can.
 
     Yields:
-        Each folder with the contents of its run.json, when the run has ended.
+        Each run with the contents of its run.json, when it has ended.
 
     Raises:
         InputError, StoppedError: as `train`.
     """
-    session = Session(lambda job, *told: watch(job.folder, *told), save_every, stop, writers)
-    jobs = [Job(run, folder) for folder, run in runs.items()]
     with ExitStack() as stack:
         for job in jobs:
             if not job.result:
@@ -78,7 +68,7 @@ def train_all(
                 stack.enter_context(exclusive(job.folder))
         stack.enter_context(single_torch_thread())
         results = {job: job.result for job in jobs}
-        yield from ((job.folder, result) for job, result in results.items() if result)
-        for trainer, train_jobs in _FUNCTIONS.items():
-            own = [job for job in jobs if job.run.trainer == trainer and not results[job]]
-            yield from ((job.folder, result) for job, result in train_jobs(own, session))
+        yield from ((job, result) for job, result in results.items() if result)
+        for trainer, train_own in _FUNCTIONS.items():
+            own = [job for job in jobs if job.settings.trainer == trainer and not results[job]]
+            yield from train_own(own, session)

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,12 +13,15 @@ from optuna.trial import TrialState
 
 from jbrep.errors import DamageError, InputError, differences
 from jbrep.records.lock import exclusive
+from jbrep.records.record import to_plain
 from jbrep.records.storage import make_folder, write_whole
-from jbrep.rl.files import FINISHED, read_evaluations
-from jbrep.rl.learner import write_preset
+from jbrep.rl.files import read_evaluations
+from jbrep.rl.job import Job, Session
+from jbrep.rl.learner import preset_text
 from jbrep.rl.overrides import setting_names
-from jbrep.rl.run import Run, plain
-from jbrep.rl.trainers import train_all
+from jbrep.rl.record import FINISHED
+from jbrep.rl.run import Run
+from jbrep.rl.trainers import train_jobs
 
 JOURNAL, BEST = "optuna.journal", "best.toml"
 _RANGES: dict[str, tuple[float, float] | list[Any]] = {  # logarithmic, or choices
@@ -41,7 +43,7 @@ class Trial(NamedTuple):
     """What a trial came to."""
 
     number: int  # from 0
-    settings: dict[str, Any]
+    overrides: dict[str, Any]
     value: float | None  # mean return of the last evaluations; None if a run failed
 
 
@@ -73,10 +75,10 @@ def tune(
         InputError: as `train`; or the folder holds another search; or each trial failed.
         StoppedError: `stop` was true.
     """
-    run.check()
+    search = to_plain(run.settings(run.find_encoder())) | {"seeds": seeds}
     make_folder(folder)
     with exclusive(folder):
-        study = _open(run, seeds, folder)
+        study = _open(search, folder)
         ended = []
         for number in range(trials):
             ended.append(_trial(study, number, run, seeds, folder, stop))
@@ -85,12 +87,11 @@ def tune(
     if not sound:
         raise InputError("every trial failed: see the run.json files below the folder")
     best = max(sound, key=lambda trial: trial.value or 0.0)
-    text = write_preset(run.algorithm, run.preset, {**run.settings, **best.settings})
-    write_whole(folder / BEST, text.encode())
+    write_whole(folder / BEST, preset_text(run.learner.overridden(best.overrides)).encode())
     return best
 
 
-def _open(run: Run, seeds: int, folder: Path) -> optuna.Study:
+def _open(search: dict[str, Any], folder: Path) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     path = folder / JOURNAL
     try:
@@ -100,7 +101,6 @@ def _open(run: Run, seeds: int, folder: Path) -> optuna.Study:
         )
     except (ValueError, LookupError):
         raise DamageError(f"{path} is damaged: delete it to start over") from None
-    search = plain(run.describe(run.find_encoder())) | {"seeds": seeds}
     before = study.user_attrs.get("search", search)
     if differing := differences(before, search):
         raise InputError(f"{folder} holds another search: {differing}; choose another folder")
@@ -110,7 +110,8 @@ def _open(run: Run, seeds: int, folder: Path) -> optuna.Study:
 
 def _space(run: Run) -> dict[str, Any]:
     """What is searched: the settings that the algorithm has and the run doesn't set."""
-    names = [n for n in _RANGES if n in setting_names(run.algorithm) and n not in run.settings]
+    there, given = setting_names(run.learner.algorithm), run.learner.overrides
+    names = (name for name in _RANGES if name in there and name not in given)
     return {name: _distribution(_RANGES[name]) for name in names}
 
 
@@ -120,7 +121,7 @@ def _distribution(given: tuple[float, float] | Iterable[Any]) -> Any:
     return CategoricalDistribution([json.dumps(value) for value in given])  # no lists there
 
 
-def _settings(parameters: Mapping[str, Any]) -> dict[str, Any]:
+def _overrides(parameters: Mapping[str, Any]) -> dict[str, Any]:
     return {n: json.loads(v) if isinstance(v, str) else v for n, v in parameters.items()}
 
 
@@ -133,21 +134,21 @@ def _trial(
         study.sampler = optuna.samplers.TPESampler(seed=seed)  # whatever was drawn before
         study.ask(_space(run))
     there = study.get_trials(deepcopy=False)[number]
-    settings = _settings(there.params)
+    overrides = _overrides(there.params)
     if there.state.is_finished():
-        return Trial(number, settings, there.value)
-    trained = replace(run, settings={**run.settings, **settings})
-    runs = {
-        folder / f"trial-{number}" / f"seed-{seed}": replace(trained, seed=seed)
+        return Trial(number, overrides, there.value)
+    trained = run.replace(learner=run.learner.overridden(overrides))
+    jobs = [
+        Job(trained.replace(seed=seed), folder / f"trial-{number}" / f"seed-{seed}")
         for seed in range(run.seed, run.seed + seeds)
-    }
+    ]
     returns = []
-    for of_seed, result in train_all(runs, stop=stop):
-        if result["status"] != FINISHED:
+    for job, result in train_jobs(jobs, Session(stop=stop)):
+        if result.status != FINISHED:
             study.tell(number, state=TrialState.FAIL)
-            return Trial(number, settings, None)
-        rows = read_evaluations(of_seed)
+            return Trial(number, overrides, None)
+        rows = read_evaluations(job.folder)
         returns += [row.episode_return for row in rows if row.step == rows[-1].step]
     value = float(np.mean(returns))
     study.tell(number, value)
-    return Trial(number, settings, value)
+    return Trial(number, overrides, value)

@@ -13,15 +13,13 @@ from jbrep.encoders import FULL
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES
 from jbrep.errors import InputError
-from jbrep.jitterbug.tasks import TASKS
 from jbrep.records.document import Document
 from jbrep.records.record import Record, from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.records.toml import read_toml, toml_text
-from jbrep.rl.fields import MAX_SEED
 from jbrep.rl.learner import Learner
-from jbrep.rl.run import Run
-from jbrep.rl.settings import MAX_STEPS, TrainingSettings
+from jbrep.rl.run import trainer_of
+from jbrep.rl.settings import MAX_SEED, MAX_STEPS, TrainingSettings
 from jbrep.stats.arms import FEWEST
 from jbrep.stats.power import Arms, obstacle
 from jbrep.stats.rules import Planned, Rules
@@ -37,7 +35,6 @@ from jbrep.text import slug
 
 _MOST_SEEDS = (1 << 16) - 1
 Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
-_ANY_TASK = TASKS["face_direction"].describe()
 
 
 class Data(Record, frozen=True, kw_only=True):
@@ -152,8 +149,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                 raise InputError(f"{name} is {values}: it must have each once")
         self._check_tasks()
         for algorithm in self.algorithms:
-            settings = self.learner(algorithm).run_settings
-            Run(task=_ANY_TASK, **settings, **self.run_settings).check_trainer()
+            trainer_of(self.learner(algorithm), self)
         self._check_data()
         self._check_verdicts()
 
@@ -256,11 +252,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     def observed(self) -> tuple[Representation, ...]:
         """What agents observe."""
         return tuple(read_representation(each, self.training) for each in self.representations)
-
-    @property
-    def run_settings(self) -> dict[str, Any]:
-        """The settings of a Run that all runs share."""
-        return {name: getattr(self, name) for name in TrainingSettings.__struct_fields__}
 
     @property
     def comparisons(self) -> int:

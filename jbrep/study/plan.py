@@ -131,13 +131,13 @@ class Plan:
         made = self.encoders(cell.task) if self.study.data else None
         return Run(
             task=self.task(cell.task),
-            **cell.learner.run_settings,
+            learner=cell.learner,
             encoder=cell.representation.encoder(cell.task, cell.seed, made),
             encoder_seed=cell.representation.encoder_seed(cell.seed),
             representation=cell.representation.name,
             seed=cell.seed,
-            registration=self.registration.sha256 if self.registration else "",
-            **self.study.run_settings,
+            registration=self.registration.sha256 if self.registration else None,
+            **to_plain(self.study.training_settings),
         )
 
     @property

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from jbrep.rl.files import FAILED, FINISHED, read_run
+from jbrep.rl.files import read_run
+from jbrep.rl.record import FAILED, FINISHED
 from jbrep.study.plan import Cell, Plan
 from jbrep.study.work import CRASHED, Outcome, read_progress
 
@@ -26,8 +27,8 @@ class Progress:
     def __init__(self, plan: Plan, unfinished: Iterable[Cell]):
         self._plan = plan
         self._unfinished = {cell.name: cell for cell in unfinished}
-        self._counts = Counter(
-            read_run(plan.folder_of(cell))["status"]
+        self._counts = Counter[str](
+            read_run(plan.folder_of(cell)).status
             for cell in plan.cells
             if cell.name not in self._unfinished
         )

@@ -11,14 +11,13 @@ from msgspec import Meta
 from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import FULL, load
 from jbrep.encoders.base import OWN
-from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.document import Document
 from jbrep.records.record import Record, from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER
-from jbrep.rl.names import base_name
-from jbrep.rl.settings import TrainingSettings
+from jbrep.rl.record import RunRecord, RunSettings, SharedSettings
+from jbrep.rl.settings import Sha256
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan, read_plan
@@ -32,27 +31,12 @@ _Value = TypeVar("_Value")
 _MOST = 1 << 53  # of a number: a float holds whole ones exactly
 Count = Annotated[int, Meta(ge=0, le=_MOST)]
 Size = Annotated[int, Meta(ge=1, le=_MOST)]
-Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", title="64 hexadecimal digits")]
 Layer = tuple[Size, str]  # units and activation
 
 
-class LabelSettings(TrainingSettings, frozen=True, kw_only=True):
+class LabelSettings(SharedSettings, frozen=True, kw_only=True):
     """The settings that all runs of a label share: without the seed and what depends on it."""
 
-    task: str
-    environment: dict[str, Any]  # the task's description
-    algorithm: str
-    preset: str
-    overrides: dict[str, Any]  # of the preset
-    learner: str
-    hidden: list[Size] | dict[str, list[Size]]  # units of the agent's layers, or of its networks'
-    settings: dict[str, Any]  # of the algorithm
-    num_envs: Size
-    noise: list[float] | None
-    optimizer: dict[str, Any]
-    policy: dict[str, Any]
-    normalize: bool
-    representation: str
     encoder: Annotated[
         str,
         Meta(
@@ -60,16 +44,7 @@ class LabelSettings(TrainingSettings, frozen=True, kw_only=True):
             title=f"64 hexadecimal digits, or {EACH_ITS_OWN!r}",
         ),
     ]
-    encoder_code: str | None  # module:Class, if it is code
     begin_from: str | None = msgspec.field(name="from")
-
-    def check(self) -> None:
-        """Check the task's description.
-
-        Raises:
-            ValueError: it isn't one.
-        """
-        from_plain(self.environment, Task)
 
 
 class ShownFacts(Record, frozen=True, kw_only=True, forbid_unknown_fields=False):
@@ -170,7 +145,7 @@ class RunsRecord(Document, frozen=True, kw_only=True):
 
 
 def runs_record(
-    folder: Path, ended: Mapping[Path, Mapping[str, Any]], left_out: Sequence[str]
+    folder: Path, ended: Mapping[Path, RunRecord], left_out: Sequence[str]
 ) -> RunsRecord:
     """What was run.
 
@@ -182,11 +157,11 @@ def runs_record(
     Raises:
         InputError: a file is damaged.
     """
-    order = in_order((run["settings"]["representation"] for run in ended.values()), FULL)
-    runs = dict(sorted(ended.items(), key=lambda item: _sort_key(item[1]["settings"], order)))
-    labels: dict[str, dict[Path, Mapping[str, Any]]] = {}
+    order = in_order((run.settings.representation for run in ended.values()), FULL)
+    runs = dict(sorted(ended.items(), key=lambda item: _sort_key(item[1].settings, order)))
+    labels: dict[str, dict[Path, RunRecord]] = {}
     for each, run in runs.items():
-        labels.setdefault(run_label(run["settings"]), {})[each] = run
+        labels.setdefault(run.settings.label, {})[each] = run
     plan = read_plan(folder)
     return RunsRecord(
         study=plan.study if plan else None,
@@ -195,69 +170,59 @@ def runs_record(
         if plan
         else {},
         left_out=list(left_out),
-        versions=_distinct(run["versions"] for run in runs.values()),
-        processors=_distinct(run["cpu"] for run in runs.values()),
+        versions=_distinct(dict(run.versions) for run in runs.values()),
+        processors=_distinct(run.cpu for run in runs.values()),
         labels={label: _label(of_label) for label, of_label in labels.items()},
         runs=[_run(run) for run in runs.values()],
     )
 
 
-def _run(run: Mapping[str, Any]) -> RunFacts:
-    own = {name: run["settings"][name] for name in ("seed", "encoder", "encoder_seed")}
-    ended = {name: run[name] for name in ("status", "steps", "seconds")}
-    label = run_label(run["settings"])
-    return RunFacts(label=label, reason=run.get("reason"), **own, **ended)
+def _run(run: RunRecord) -> RunFacts:
+    return RunFacts(
+        label=run.settings.label,
+        seed=run.settings.seed,
+        encoder=run.settings.encoder,
+        encoder_seed=run.settings.encoder_seed,
+        status=run.status,
+        reason=run.reason,
+        steps=run.steps,
+        seconds=run.seconds,
+    )
 
 
-def _sort_key(settings: Mapping[str, Any], order: list[str]) -> tuple[Any, ...]:
+def _sort_key(settings: RunSettings, order: list[str]) -> tuple[Any, ...]:
     """By task, algorithm, representation (in the order of tables) and seed."""
-    representation = order.index(settings["representation"])
-    return settings["task"], learner(settings), representation, settings["seed"]
+    representation = order.index(settings.representation)
+    return settings.task, settings.learner, representation, settings.seed
 
 
-def run_label(settings: Mapping[str, Any]) -> str:
-    """Task, learner, representation: face_direction/sac-modern/dae-8."""
-    return f"{settings['task']}/{learner(settings)}/{settings['representation']}"
-
-
-def run_name(settings: Mapping[str, Any]) -> str:
-    """The same with the seed: face_direction/sac-modern/dae-8/seed-0."""
-    return f"{run_label(settings)}/seed-{settings['seed']}"
-
-
-def learner(settings: Mapping[str, Any]) -> str:
-    """What tables call the algorithm with its settings: ddpg, sac-modern, my-sac."""
-    return settings.get("learner") or base_name(settings["algorithm"], settings["preset"])
-
-
-def shared_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+def shared_settings(settings: RunSettings) -> LabelSettings:
     """The settings that all runs of a label share: without the seed and what depends on it."""
-    own = ("seed", "encoder_seed", "registration")
-    shared = {name: value for name, value in settings.items() if name not in own}
-    if settings["encoder_seed"] is not None:
-        shared["encoder"] = EACH_ITS_OWN
-    if settings["from"] is not None:
-        shared["from"] = "another run's policy"
-    return shared
+    shared = {name: getattr(settings, name) for name in SharedSettings.__struct_fields__}
+    return LabelSettings(
+        **shared,
+        encoder=settings.encoder if settings.encoder_seed is None else EACH_ITS_OWN,
+        begin_from=None if settings.begin_from is None else "another run's policy",
+    )
 
 
-def _label(runs: Mapping[Path, Mapping[str, Any]]) -> Label:
+def _label(runs: Mapping[Path, RunRecord]) -> Label:
     """What the runs of a label share, by folder."""
-    settings = from_plain(shared_settings(next(iter(runs.values()))["settings"]), LabelSettings)
+    settings = shared_settings(next(iter(runs.values())).settings)
     folders = list(runs) if settings.encoder == EACH_ITS_OWN else list(runs)[:1]
     encoder = _common([_encoder(each, runs[each]) for each in folders])
     return Label(settings=settings, encoder=encoder)
 
 
-def _encoder(folder: Path, run: Mapping[str, Any]) -> EncoderFacts:
+def _encoder(folder: Path, run: RunRecord) -> EncoderFacts:
     """What is known of a run's encoder; of a user's own, its sizes alone."""
-    settings: Mapping[str, Any] = run["settings"]
-    if "latent_size" in run and not exists(folder / ENCODER):
+    settings = run.settings
+    if not exists(folder / ENCODER):
         return EncoderFacts(
-            name=settings["encoder_code"] or "an object in Python",
+            name=settings.encoder_code or "an object in Python",
             kind=OWN,
-            size=from_plain(settings["environment"], Task).size,
-            latent_size=run["latent_size"],
+            size=settings.environment.size,
+            latent_size=run.latent_size,
             encoder=[],
             decoder=[],
             training={},
@@ -289,11 +254,11 @@ def _shared(value: Any, others: Sequence[Any]) -> Any:
     return value if all(each == value for each in others) else type(value)()
 
 
-def _registration(plan: Plan, runs: Iterable[Mapping[str, Any]]) -> RegistrationFacts | None:
+def _registration(plan: Plan, runs: Iterable[RunRecord]) -> RegistrationFacts | None:
     """When a study was registered, and how what ran differs from that; None if it wasn't."""
     if plan.registration is None:
         return None
-    named = {run_name(run["settings"]): run for run in runs}
+    named = {run.settings.name: run for run in runs}
     return RegistrationFacts(
         sha256=plan.registration.sha256,
         date=plan.registration.date,

@@ -14,6 +14,7 @@ from jbrep.records.document import Document, read_document
 from jbrep.records.record import from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.job import packages
+from jbrep.rl.record import RunRecord
 from jbrep.stats.rules import Planned
 from jbrep.study.config import Study
 
@@ -119,7 +120,7 @@ def check_registered(registration: Registration, study: Study, folder: Path) -> 
 
 
 def deviations(
-    registration: Registration, study: Study, runs: Mapping[str, Mapping[str, Any]]
+    registration: Registration, study: Study, runs: Mapping[str, RunRecord]
 ) -> list[str]:
     """How what ran differs from what was registered, in sentences.
 
@@ -134,19 +135,18 @@ def deviations(
     if added := [seed for seed in study.seeds if seed not in registration.registered.seeds]:
         found.append(f"seeds were added, whose runs are exploratory: {_listed(added)}")
     every = list(runs.values())
-    if strays := [run for run in every if run["settings"]["registration"] != registration.sha256]:
+    if strays := [run for run in every if run.settings.registration != registration.sha256]:
         found.append(f"{len(strays)} of its runs weren't made under this registration")
     known = registration.encoders
-    used = {name: run["settings"]["encoder"] for name, run in runs.items()}
+    used = {name: run.settings.encoder for name, run in runs.items()}
     if other := [name for name, encoder in used.items() if known.get(name, encoder) != encoder]:
         found.append(f"{len(other)} of its runs have other encoders than there were")
     for name, version in registration.versions.items():
-        others = {run["versions"].get(name, "none") for run in every} - {version}
+        others = {run.versions.get(name, "none") for run in every} - {version}
         if others:
             found.append(f"{name} was {_listed(sorted(others))}, not {version}")
     registered_commit = registration.commits.get("jbrep")
-    others = {run.get("commits", {}).get("jbrep") for run in every} - {registered_commit, None}
-    if others:
+    if {run.commits.get("jbrep") for run in every} - {registered_commit, None}:
         found.append("some runs were made by other commits of jbrep's code")
     return found
 

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,21 +12,22 @@ import numpy as np
 from jbrep.encoders import FULL
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.records.record import from_plain
+from jbrep.records.record import to_plain
 from jbrep.records.storage import exists, write_whole
 from jbrep.records.tables import Columns, count, finite, write_csv
-from jbrep.rl.files import FAILED, RUN, read_evaluations, read_run, runs_below
+from jbrep.rl.files import RUN, read_evaluations, read_run, runs_below
+from jbrep.rl.record import FAILED, RunRecord
 from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import STILL
 from jbrep.study.plan import STUDY, read_plan
-from jbrep.study.record import RECORD, learner, runs_record, shared_settings
+from jbrep.study.record import RECORD, runs_record, shared_settings
 from jbrep.study.references import References, read_references, write_references
 from jbrep.text import rounded, table
 
 RETURNS = "returns.csv"
 STATISTICS = "statistics.json"
-Ended = dict[Path, dict[str, Any]]  # what run.json says of each run that has ended, by folder
+Ended = dict[Path, RunRecord]  # what run.json says of each run that has ended, by folder
 COLUMNS: Columns = {  # of the long table of returns
     **{"task": str, "algorithm": str, "representation": str},
     **{"seed": count, "step": count, "episode": count, "return": finite},
@@ -131,26 +132,20 @@ def _comparable(runs: list[RunCurve]) -> tuple[list[RunCurve], list[str]]:
     return kept, sorted(alone.values())
 
 
-def _tasks(runs: Iterable[Mapping[str, Any]]) -> Iterable[tuple[Task, int]]:
+def _tasks(runs: Iterable[RunRecord]) -> Iterable[tuple[Task, int]]:
     """The tasks of runs, with the most episodes that one was evaluated on at its end."""
     tasks: dict[str, tuple[Task, int]] = {}
     for run in runs:
-        task, episodes = _task(run), run["settings"]["final_episodes"]
+        task, episodes = run.settings.environment, run.settings.final_episodes
         _, most = tasks.get(task.name, (task, 0))
         tasks[task.name] = task, max(most, episodes)
     return tasks.values()
 
 
-def _task(run: Mapping[str, Any]) -> Task:
-    """The task of a run, from the contents of its run.json."""
-    return from_plain(run["settings"]["environment"], Task)
-
-
 def _curve(
-    folder: Path, run: Mapping[str, Any], references: References, across_trainers: bool = False
+    folder: Path, run: RunRecord, references: References, across_trainers: bool = False
 ) -> RunCurve:
-    task = _task(run)
-    settings = shared_settings(run["settings"])
+    task, settings = run.settings.environment, to_plain(shared_settings(run.settings))
     trainer = [settings.pop(name) for name in ("trainer", "precision", "device")]
     evaluations = read_evaluations(folder)
     steps = sorted({each.step for each in evaluations})
@@ -159,21 +154,21 @@ def _curve(
     episodes = min(map(len, returns), default=0)  # the last evaluation may have more
     return RunCurve(
         task=task.name,
-        algorithm=learner(settings),
-        representation=settings["representation"],
-        seed=run["settings"]["seed"],
+        algorithm=run.settings.learner,
+        representation=run.settings.representation,
+        seed=run.settings.seed,
         settings=hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8],
         steps=np.array(steps, dtype=np.int64),
         returns=np.array([each[:episodes] for each in returns], dtype=np.float64),
-        total_steps=max(run["steps"], settings["steps"]),
-        failed_at=run["steps"] if run["status"] == FAILED else None,
+        total_steps=max(run.steps, run.settings.steps),
+        failed_at=run.steps if run.status == FAILED else None,
         return_floor=task.return_floor,
         return_ceiling=task.return_ceiling,
         still=float(np.mean(still)) if still else None,
         solved=task.solved_return,
         trainer="" if across_trainers else " ".join(trainer),
         final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,
-        encoder_seed=run["settings"]["encoder_seed"],
+        encoder_seed=run.settings.encoder_seed,
     )
 
 

@@ -3,7 +3,6 @@
 import textwrap
 from collections import Counter
 from contextlib import closing
-from dataclasses import replace
 
 from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
@@ -151,4 +150,4 @@ def _kind(pack: Pack) -> tuple[object, ...]:
 
 def _example(run: Run) -> Run:
     """A run that takes as long; an encoder that is no code need not exist yet, and costs little."""
-    return run if is_code(run.encoder) else replace(run, encoder=FULL)
+    return run if is_code(run.encoder) else run.replace(encoder=FULL)

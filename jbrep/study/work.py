@@ -2,16 +2,18 @@
 
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jbrep.envs.names import import_modules
 from jbrep.errors import first_line
 from jbrep.records.storage import make_folder
 from jbrep.rl import Run, StoppedError
-from jbrep.rl.trainers import train_all
+from jbrep.rl.job import Job, Session
+from jbrep.rl.record import RunRecord
+from jbrep.rl.trainers import train_jobs
 from jbrep.text import rounded
 
 PROGRESS = "progress"
@@ -55,9 +57,9 @@ def work(
         for each in assigned:
             make_folder(each.folder)
         import_modules(modules)
-        runs = {each.folder: each.run for each in assigned}
-        progress = _ProgressFiles(assigned[0].run.steps)
-        results = dict(train_all(runs, progress, stop=stop))
+        jobs = [Job(each.run, each.folder) for each in assigned]
+        session = Session(_ProgressFiles(assigned[0].run.steps), stop=stop)
+        results = {job.folder: result for job, result in train_jobs(jobs, session)}
     except StoppedError:
         return None
     except Exception as error:
@@ -68,11 +70,11 @@ def work(
     return [_ended(each, results[each.folder]) for each in assigned]
 
 
-def _ended(assigned: Assigned, result: Mapping[str, Any]) -> Outcome:
+def _ended(assigned: Assigned, result: RunRecord) -> Outcome:
     for leftover in (PROGRESS, ERROR):
         (assigned.folder / leftover).unlink(missing_ok=True)
-    message = result.get("reason", f"{result['seconds'] / 60:.1f} min")
-    return Outcome(assigned.name, result["status"], message)
+    message = result.reason or f"{result.seconds / 60:.1f} min"
+    return Outcome(assigned.name, result.status, message)
 
 
 def _crashed(assigned: Assigned, error: Exception) -> Outcome:
@@ -97,8 +99,8 @@ class _ProgressFiles:
         self._steps = steps  # of each run
         self._written: dict[Path, float] = {}
 
-    def __call__(self, folder: Path, step: int, mean: float | None) -> None:
-        now = time.monotonic()
+    def __call__(self, job: Job, step: int, mean: float | None) -> None:
+        now, folder = time.monotonic(), job.folder
         if step >= self._steps or now - self._written.get(folder, 0.0) >= _WRITE_EVERY:
             (folder / PROGRESS).write_text(f"{step} {'-' if mean is None else rounded(mean)[0]}")
             self._written[folder] = now

@@ -3,8 +3,12 @@
 import numpy as np
 
 from jbrep.encoders import find, save
-from jbrep.rl.files import ENCODER, Evaluation, write_rows, write_run
+from jbrep.rl.agent import Spaces, make_agent, parameters
+from jbrep.rl.checkpoint import CheckpointFile, Snapshot
+from jbrep.rl.files import CHECKPOINT, ENCODER, RUN, Evaluation, write_rows
+from jbrep.rl.history import History
 from jbrep.rl.job import packages
+from jbrep.rl.record import FAILED, FINISHED, RunRecord
 from jbrep.study.config import as_study
 
 STILL = 250
@@ -40,6 +44,7 @@ def _make_run(plan, cell):
     folder, run, name = plan.folder_of(cell), plan.run(cell), cell.representation.name
     folder.mkdir(parents=True)
     encoder = find(run.encoder, run.task)
+    settings = run.settings(encoder)
     save(encoder, folder / ENCODER)
     random = np.random.default_rng([cell.seed, len(cell.task), *name.encode()])
     mean, spread, time = TRUTH[name]
@@ -47,15 +52,35 @@ def _make_run(plan, cell):
     rows = []
     for step in range(0, plan.study.steps + 1, plan.study.evaluate_every):
         level = STILL + (end - STILL) / (1 + np.exp((middle - step) / 700))
-        episodes = run.episodes_at(step)
+        episodes = settings.episodes_at(step)
         returns = level + random.normal(0, 0.5, episodes)
         rows += [Evaluation(step, i, float(each)) for i, each in enumerate(returns.clip(0, 1000))]
     write_rows(folder / "evaluations.csv", rows, Evaluation)
-    settings = run.describe(encoder)
-    write_run(
-        folder,
-        {
-            **{"status": "finished", "settings": settings, "steps": plan.study.steps},
-            **{"seconds": 60.0, "versions": packages(), "cpu": "a processor"},
-        },
+    write_record(folder, run)
+
+
+def write_record(folder, run, reason=None, **changes):
+    """The run.json of a run that has ended as planned, or failed for a reason."""
+    encoder = find(run.encoder, run.task)
+    facts = {"latent_size": encoder.latent_size, "steps": run.steps, "seconds": 60.0}
+    facts |= {"versions": packages(), "commits": {}, "cpu": "a processor"}
+    RunRecord(
+        status=FINISHED if reason is None else FAILED,
+        reason=reason,
+        settings=run.settings(encoder),
+        policy_sha256="0" * 64 if reason is None else None,
+        **{**facts, **changes},
+    ).write(folder / RUN)
+
+
+def write_checkpoint(folder, run, step):
+    """A run under way at that step, with the policy that it began with; returns its agent."""
+    encoder = find(run.encoder, run.task)
+    agent = make_agent(
+        run.learner.algorithm, run.learner.hyperparameters, Spaces(run.task, encoder), run.seed
     )
+    tensors = {f"parameters.{name}": each.numpy() for name, each in parameters(agent)}
+    file = CheckpointFile(folder / CHECKPOINT, run.settings(encoder), packages(), History())
+    file.write(Snapshot(tensors, {"num_timesteps": step}))
+    save(encoder, folder / ENCODER)
+    return agent

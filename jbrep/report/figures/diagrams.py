@@ -37,7 +37,8 @@ class Settings(TypedDict):
     representation: str
     encoder: str  # its SHA-256, or that runs have different encoders
     encoder_code: NotRequired[str | None]  # module:Class, if it is code
-    hidden: list[int] | dict[str, list[int]]  # units of the agent's layers, or of its networks'
+    learner: str
+    hyperparameters: Mapping[str, Any]
     steps: int
     evaluate_every: int
     evaluation_episodes: int
@@ -171,7 +172,7 @@ def system(shared: LabelRecord, looks: Looks) -> Plot:
     """Robot, observation, encoder, agent, action."""
     settings, encoder = shared["settings"], shared["encoder"]
     latent = encoder.get("latent_size", encoder["encoder"][-1][0])
-    hidden = _hidden(settings["hidden"])
+    hidden = _hidden(settings["hyperparameters"]["net_arch"])
     task = settings.get("environment")
     action = _action(task) if task else ""
     step = f" of {task['timestep']:g} s" if task and task["timestep"] else ""

@@ -18,8 +18,7 @@ from torch.utils._pytree import tree_leaves
 from jbrep.errors import InputError
 from jbrep.rl.cohort import ALGORITHMS, get_algorithm
 from jbrep.rl.cohort.networks import Network, Stack
-from jbrep.rl.presets import ALGORITHMS as SB3_CLASSES
-from jbrep.rl.presets import Preset
+from jbrep.rl.presets import Hyperparameters, sb3_class
 
 Losses = dict[str, Tensor]  # (n,) each, by the names under which stable-baselines3 logs them
 _SETTINGS = {  # of stable-baselines3 that every algorithm here honours
@@ -118,7 +117,7 @@ def polyak_update(weights: Any, targets: Any, tau: float) -> None:
         target.lerp_(weight, tau)
 
 
-def check(algorithm: str, preset: Preset) -> None:
+def check(algorithm: str, hyperparameters: Hyperparameters) -> None:
     """Check that agents of an algorithm with these settings can learn in a cohort.
 
     Raises:
@@ -126,13 +125,13 @@ def check(algorithm: str, preset: Preset) -> None:
     """
     if algorithm not in ALGORITHMS:
         raise InputError(f"cohorts train {', '.join(ALGORITHMS)}, not {algorithm}: {_INSTEAD}")
-    if isinstance(preset.settings.get("train_freq"), list):
+    of_class, of_policy = hyperparameters.algorithm_kwargs, hyperparameters.policy_kwargs
+    if isinstance(of_class.get("train_freq"), list):
         raise InputError(f"a cohort takes train_freq as a number of steps: {_INSTEAD}")
     honoured = {*_SETTINGS, *get_algorithm(algorithm).settings}
-    of_class = SB3_CLASSES[algorithm]
-    of_policy = of_class.policy_aliases["MlpPolicy"]
-    for given, takes in ((preset.settings, of_class), (preset.policy, of_policy)):
-        parameters = inspect.signature(takes).parameters
+    takes = sb3_class(algorithm)
+    for given, kind in ((of_class, takes), (of_policy, takes.policy_aliases["MlpPolicy"])):
+        parameters = inspect.signature(kind).parameters
         for name, value in given.items():
             if name not in honoured and value != parameters[name].default:
                 raise InputError(f"a cohort can't learn with {name} = {value}: {_INSTEAD}")

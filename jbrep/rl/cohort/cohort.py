@@ -32,18 +32,19 @@ class Cohort:
     """
 
     def __init__(self, members: Sequence[Member]):
-        run = members[0].job.run
+        job = members[0].job
+        settings, task = job.settings, job.run.task
         self.members, self.step, self._n_updates = members, 0, 0
         self._shared: Any = members[0].agent  # its settings are those of all
-        self._lanes, self._steps = run.used.num_envs, run.steps
-        self._size = padded_size(members[0].job)
-        sizes = self._size, run.task.action_size
-        self._replay = ReplayBuffer(len(members), self._lanes, capacity_of(run), *sizes)
-        self._endless = Endless(run.task, len(members) * self._lanes, run.physics_threads)
-        self._device = torch.device(run.device)
+        self._lanes, self._steps = settings.hyperparameters.num_envs, settings.steps
+        self._size = padded_size(job)
+        sizes = self._size, task.action_size
+        self._replay = ReplayBuffer(len(members), self._lanes, capacity_of(job.run), *sizes)
+        self._endless = Endless(task, len(members) * self._lanes, settings.physics_threads)
+        self._device = torch.device(settings.device)
         agents = [member.agent for member in members]
-        self._stack = Stack(agents, self._size, run.precision, run.device)
-        self._algorithm = get_algorithm(run.algorithm)(self._stack)
+        self._stack = Stack(agents, self._size, settings.precision, settings.device)
+        self._algorithm = get_algorithm(settings.algorithm)(self._stack)
         self._stack.read_from_agents()
         seeds = [training_seed(m.job.run.seed) + i for m in members for i in range(self._lanes)]
         self._observation = self._encode(self._endless.reset(seeds))
@@ -178,7 +179,7 @@ class Cohort:
     @property
     def is_evaluation_due(self) -> bool:
         """Whether policies are to be evaluated at this step, which isn't the last."""
-        return self.members[0].job.run.is_evaluation_due(self.step, self._lanes)
+        return self.members[0].job.settings.is_evaluation_due(self.step, self._lanes)
 
     def evaluate(self) -> None:
         """Let each member play its policy that hasn't failed."""

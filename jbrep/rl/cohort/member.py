@@ -4,7 +4,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +19,13 @@ from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
 from jbrep.records.container import Tensors
 from jbrep.rl import checkpoint
 from jbrep.rl.agent import Evaluator, Spaces, make_agent
-from jbrep.rl.beginning import begin
 from jbrep.rl.checkpoint import Snapshot, without
 from jbrep.rl.files import Episode
 from jbrep.rl.history import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE
 from jbrep.rl.job import Job
 from jbrep.rl.normalization import normalized
-from jbrep.rl.presets import NormalNoise, OrnsteinUhlenbeckNoise
+from jbrep.rl.policy import begin
+from jbrep.rl.presets import Noise
 
 Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -55,26 +54,27 @@ class Member:
     """
 
     def __init__(self, job: Job, writers: Sequence[KVWriter]):
-        run, preset = job.run, job.run.used
-        small = replace(preset, noise=None, settings={**preset.settings, "buffer_size": 1})
+        run, settings, chosen = job.run, job.settings, job.settings.hyperparameters
+        kwargs = {**chosen.algorithm_kwargs, "buffer_size": 1}
+        small = chosen.replace(noise=None, algorithm_kwargs=kwargs)
         self.job, self.failure = job, ""
         self.mean: float | None = None
         env = DummyVecEnv([lambda: Spaces(run.task, job.encoder)])
-        normalizing = normalized(env) if preset.normalize else env
-        self.agent: Any = make_agent(run.algorithm, small, normalizing, run.seed)
+        normalizing = normalized(env) if chosen.normalize else env
+        self.agent: Any = make_agent(settings.algorithm, small, normalizing, run.seed)
         self._normalizer: VecNormalize | None = self.agent.get_vec_normalize_env()
-        self.random = Random(self.agent.action_space, preset.num_envs, preset.noise)
+        self.random = Random(self.agent.action_space, chosen.num_envs, chosen.noise)
         self.agent._total_timesteps = run.steps
         self.agent.ep_info_buffer = deque(maxlen=self.agent._stats_window_size)
         self.agent.ep_success_buffer = deque()
         self.agent.start_time = time.time_ns()
-        self._returns = np.zeros(preset.num_envs, np.float32)
-        self._lengths = np.zeros(preset.num_envs, np.int32)
+        self._returns = np.zeros(chosen.num_envs, np.float32)
+        self._lengths = np.zeros(chosen.num_envs, np.int32)
         self._evaluator = Evaluator(
-            run.task, job.encoder, run.evaluation_episodes, num_threads=run.physics_threads
+            run.task, job.encoder, run.evaluation_episodes, num_threads=settings.physics_threads
         )
-        if run.begin_from:
-            begin(self.agent, Path(run.begin_from), job.settings["from"], job.folder)
+        if settings.begin_from:
+            begin(self.agent, Path(run.begin_from), settings.begin_from, job.folder)
         self.agent.set_logger(job.logger(writers))
 
     @property
@@ -132,7 +132,7 @@ class Member:
         """Play its agent's policy, deterministically."""
         step = self.agent.num_timesteps
         try:
-            episodes = self.job.run.episodes_at(step)
+            episodes = self.job.settings.episodes_at(step)
             returns = self._evaluator.returns(self.agent, episodes)
         except NonFiniteActionError:
             self.fail(ACTIONS_NOT_FINITE)
@@ -173,12 +173,7 @@ class Random:
         noise: on actions.
     """
 
-    def __init__(
-        self,
-        actions: spaces.Space[Any],
-        lanes: int,
-        noise: NormalNoise | OrnsteinUhlenbeckNoise | None,
-    ):
+    def __init__(self, actions: spaces.Space[Any], lanes: int, noise: Noise | None):
         self._actions, self._lanes, self._noise = actions, lanes, noise
         self._numpy = np.random.RandomState()
         self._numpy.set_state(np.random.get_state())  # noqa: NPY002 - stable-baselines3 seeded it

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.rl.presets import ALGORITHMS
+from jbrep.rl.presets import sb3_class
 from jbrep.rl.run import Run
 
 Float32 = NDArray[np.float32]
@@ -14,12 +14,13 @@ Float32 = NDArray[np.float32]
 
 def capacity_of(run: Run) -> int:
     """The most transitions that a run keeps: no more than it makes, in whole rollouts."""
-    usual = inspect.signature(ALGORITHMS[run.algorithm]).parameters
+    chosen = run.learner.hyperparameters
+    usual = inspect.signature(sb3_class(run.learner.algorithm)).parameters
     size, steps = (
-        int(run.used.settings.get(name, usual[name].default))
+        int(chosen.algorithm_kwargs.get(name, usual[name].default))
         for name in ("buffer_size", "train_freq")
     )
-    rollout = steps * run.used.num_envs
+    rollout = steps * chosen.num_envs
     return min(size, -(-run.steps // rollout) * rollout)
 
 

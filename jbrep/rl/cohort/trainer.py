@@ -5,12 +5,12 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
 from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.records.record import to_plain
 from jbrep.rl.agent import unchecked_distributions
 from jbrep.rl.checkpoint import Snapshot, StoppedError
 from jbrep.rl.cohort.cohort import Cohort, padded_size
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.job import Ended, Job, Session
-from jbrep.rl.policy_file import policy_zip
 
 _Begun = tuple[Job, Snapshot | None]
 _Kind = tuple[str, bool, int, int, str]
@@ -46,7 +46,7 @@ def train_together(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
 
 def _kind(job: Job, snapshot: Snapshot | None) -> _Kind:
     """What is the same of all runs of a cohort; one that can't be continued is alone in its."""
-    shared = {n: value for n, value in job.settings.items() if n not in _EACH_ITS_OWN}
+    shared = {n: value for n, value in to_plain(job.settings).items() if n not in _EACH_ITS_OWN}
     alone = "" if job.run.task.reproducible else str(job.folder)
     text, is_new = json.dumps(shared, sort_keys=True), snapshot is None
     return text, is_new, job.history.first_step, padded_size(job), alone
@@ -109,6 +109,4 @@ def _save(cohort: Cohort, session: Session) -> None:
 
 def _end(member: Member) -> Ended:
     """Write what a member leaves; its agent has its last weights."""
-    policy = b"" if member.failure else policy_zip(member.agent)
-    steps = member.agent.num_timesteps
-    return member.job, member.job.end(steps, member.failure, policy)
+    return member.job, member.job.end(member.agent, member.failure)

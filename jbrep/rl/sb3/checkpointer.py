@@ -17,7 +17,7 @@ from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.records.container import Tensors
 from jbrep.rl import checkpoint
 from jbrep.rl.checkpoint import LANES, CheckpointFile, Snapshot, StoppedError, without
-from jbrep.rl.weights import acting
+from jbrep.rl.policy_file import acting
 
 _ROLLOUT = ("_last_obs", "_last_episode_starts")
 _UNSCALED = "_last_original_obs"  # before it was normalised

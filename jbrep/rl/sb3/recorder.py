@@ -8,8 +8,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from jbrep.rl.agent import Evaluator
 from jbrep.rl.files import Episode
 from jbrep.rl.history import WEIGHTS_NOT_FINITE, DivergedError, History, Watch
-from jbrep.rl.run import Run
-from jbrep.rl.weights import acting
+from jbrep.rl.policy_file import acting
+from jbrep.rl.record import RunSettings
 
 
 class Recorder(BaseCallback):
@@ -20,14 +20,14 @@ class Recorder(BaseCallback):
     Args:
         history: to record in.
         evaluator: of the policy.
-        run: that is recorded.
+        settings: of the run that is recorded.
         watch: called with the progress before each rollout.
     """
 
-    def __init__(self, history: History, evaluator: Evaluator, run: Run, watch: Watch):
+    def __init__(self, history: History, evaluator: Evaluator, settings: RunSettings, watch: Watch):
         super().__init__()
         self._history, self._evaluator = history, evaluator
-        self._run, self._watch = run, watch
+        self._settings, self._watch = settings, watch
         self._mean: float | None = None  # return of the last evaluation
 
     def _on_rollout_start(self) -> None:
@@ -44,7 +44,7 @@ class Recorder(BaseCallback):
             self._history.episodes.append(
                 Episode(self.num_timesteps, lane, total, length, diverged)
             )
-        if self._run.is_evaluation_due(self.num_timesteps, self.training_env.num_envs):
+        if self._settings.is_evaluation_due(self.num_timesteps, self.training_env.num_envs):
             self._evaluate()
         return True
 
@@ -56,7 +56,7 @@ class Recorder(BaseCallback):
 
     def _evaluate(self) -> None:
         step = self.model.num_timesteps
-        episodes = self._run.episodes_at(step)
+        episodes = self._settings.episodes_at(step)
         returns = self._evaluator.returns(self.model, episodes)
         self._mean = self._history.evaluated(step, returns, self.logger)
 
