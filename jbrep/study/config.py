@@ -19,7 +19,7 @@ from jbrep.records.storage import exists
 from jbrep.records.toml import read_toml, toml_text
 from jbrep.rl.learner import Learner
 from jbrep.rl.run import trainer_of
-from jbrep.rl.settings import MAX_SEED, MAX_STEPS, TrainingSettings
+from jbrep.rl.settings import MAX_STEPS, Seed, TrainingSettings
 from jbrep.stats.arms import FEWEST
 from jbrep.stats.power import Arms, obstacle
 from jbrep.stats.rules import Planned, Rules
@@ -34,7 +34,6 @@ from jbrep.study.representations import (
 from jbrep.text import slug
 
 _MOST_SEEDS = (1 << 16) - 1
-Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
 
 
 class Data(Record, frozen=True, kw_only=True):
