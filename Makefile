@@ -109,7 +109,7 @@ column = $(shell sed -n 's/^$@ *;//p' studies/judged.txt | cut -d ';' -f $(1))
 $(STUDIES): $(READY) $$(call column,1)
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
-	cp $(addprefix runs/$@/,returns.csv runs.json statistics.json references.csv) results/$@/
+	cp $$(ls $(addprefix runs/$@/,returns.csv runs.json references.csv registration.json) 2>/dev/null) results/$@/
 	$(if $(strip $(call column,4)),for task in $(call column,4); do \
 	  $(BIN)/jbrep evaluate --encoder $(call column,2) --data $(call column,3) --out results/$@/$$task || exit; \
 	done)

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from jbrep.progress import Progress
 from jbrep.stats import claims, spread
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.claims import CLAIMS
+from jbrep.stats.claims import CLAIMS, CONTRADICTED, SUPPORTED
 from jbrep.stats.rules import Planned, Rules
 from jbrep.stats.runs import RunCurve
-from jbrep.stats.verdict import CONTRADICTED, SUPPORTED
 from jbrep.text import table
 
 # verdicts come from p-values and the side of the boundary; intervals would take most of the time

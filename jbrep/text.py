@@ -5,9 +5,43 @@ import re
 import shutil
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 SIGNIFICANT = ",.3g"  # a format for `number`: three digits
 _GAP = "  "  # between columns
+_NUMBER = re.compile(r"[<>]? ?-?[\d,]*\.?\d+(e[-+]?\d+)?( \[.*\]| \(\d+/\d+\))?")
+_NO_NUMBER = re.compile(r"-( \(\d+/\d+\))?")
+
+
+class Table(NamedTuple):
+    """A table to read, in a terminal, in Markdown or on a page.
+
+    Attributes:
+        title: that stands above it.
+        header: a name for each column.
+        rows: a cell for each column.
+    """
+
+    title: str
+    header: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+
+    @property
+    def numeric(self) -> list[bool]:
+        """For each column, whether all its cells are numbers, intervals or dashes."""
+        return [
+            all(_NUMBER.fullmatch(cell) or _NO_NUMBER.fullmatch(cell) for cell in column)
+            for column in zip(*self.rows, strict=True)
+        ]
+
+    def text(self, width: int | None = None) -> str:
+        """The title and the table for a terminal of that width, in columns; None for any."""
+        return f"{wrapped(self.title, width)}\n\n{table(self.header, self.rows, width)}"
+
+
+def wrapped(text: str, width: int | None) -> str:
+    """Text in lines of at most that width; None leaves it on one line."""
+    return text if width is None else textwrap.fill(text, width, break_on_hyphens=False)
 
 
 def terminal_width() -> int:

@@ -10,6 +10,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from judged import NOTHING, diagnostics, evaluation
+from made_up import label_of
 from matplotlib.text import Text
 from PIL import Image
 
@@ -25,38 +26,29 @@ from jbrep.evaluate.evaluation import (
 from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
 from jbrep.records.document import read_document
 from jbrep.report.figures import behaviour_plots, encoder_plots, study_plots, write
-from jbrep.report.figures.claims import claims
-from jbrep.report.figures.curves import Return, every_run
+from jbrep.report.figures.claims import claim_plot
+from jbrep.report.figures.curves import every_run
 from jbrep.report.figures.diagnostics import _free
 from jbrep.report.figures.families import family
 from jbrep.report.figures.methods import method_plots, timescales
 from jbrep.report.figures.plot import Drawing
 from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, styles, with_runs
-from jbrep.stats import Analysis, RunCurve, analyse
+from jbrep.stats import RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval
+from jbrep.study.results import Return
 
 STEPS = np.arange(0, 50_001, 10_000)
 FINAL = {"full": 900, "dae-8": 500, "pca-4": 300}
 GROUPS = [("face_direction", "ddpg"), ("face_direction", "sac"), ("move_to_pose", "sac")]
-LABELS = {
-    "face_direction/sac/dae-8": {
-        "settings": {
-            "task": "face_direction",
-            "algorithm": "sac",
-            "representation": "dae-8",
-            "hidden": [350, 250],
-        },
-        "encoder": {
-            "name": "dae-8",
-            "kind": "dae",
-            "size": 16,
-            "encoder": [(128, "relu"), (8, "tanh")],
-            "decoder": [(128, "relu"), (16, "linear")],
-            "training": {"noise": 0.1},
-        },
-    }
-}
+DAE = label_of(
+    describe("face_direction"),
+    "dae-8",
+    [(128, "relu"), (8, "tanh")],
+    [(128, "relu"), (16, "linear")],
+    noise=0.1,
+)
+LABELS = {"face_direction/sac/dae-8": DAE}
 
 
 def runs():
@@ -78,8 +70,7 @@ def runs():
 
 @pytest.fixture(scope="module")
 def analysis():
-    """As a report has it: written and read."""
-    return Analysis.from_json(analyse(list(runs())).to_json(), Path("statistics.json"))
+    return analyse(list(runs()))
 
 
 @pytest.fixture(scope="module")
@@ -170,8 +161,7 @@ def test_legends_say_how_many_runs_there_are(plots):
 def test_a_representation_has_one_colour_in_all_figures(analysis, returns):
     """Also where the statistics leave out a representation that comes before it."""
     kept = [run for run in runs() if run.representation != "dae-8"]
-    part = Analysis.from_json(analyse(kept).to_json(), Path("statistics.json"))
-    of_part = study_plots(part, returns, {}, {})
+    of_part = study_plots(analyse(kept), returns, {}, {})
     of_all = study_plots(analysis, returns, {}, LABELS)
     for plots in (of_part, of_all):
         colours = set()
@@ -309,7 +299,7 @@ def test_a_ratio_far_from_one_is_marked_at_the_edge(analysis):
     verdicts = (first, replace(steady, estimate=far, interval=far), *others)
     comparisons = (replace(group.comparisons[0], verdicts=verdicts),)
     changed = replace(group, labels=group.labels[:2], comparisons=comparisons)
-    axes = drawn(claims(replace(analysis, groups=(changed,)), lambda: styles(FINAL))).axes[1]
+    axes = drawn(claim_plot(replace(analysis, groups=(changed,)), lambda: styles(FINAL))).axes[1]
     low, high = axes.get_xlim()
     assert 1e-5 < low < 1 < high < 1e5
     assert (low, 0, "<") in cut_marks(axes, "<>")
@@ -348,17 +338,12 @@ def test_diagrams_have_the_real_sizes(plots):
 
 
 def test_diagrams_show_what_any_method_does():
-    encoder = {
-        **{"name": "slow", "kind": "slow", "size": 16, "latent_size": 9, "data": {}, "metrics": {}},
-        "encoder": [(8, "linear")],
-        "decoder": [(17, "linear")],
-        "training": {
-            **{"latent": 8, "lags": [10], "scaling": "standard", "angles": True},
-            "keep": ["angle_to_target"],
-        },
-    }
-    settings = {**LABELS["face_direction/sac/dae-8"]["settings"], "representation": "slow"}
-    diagrams = study_plots(None, [], {}, {"x": {"settings": settings, "encoder": encoder}})
+    slow = label_of(
+        *(describe("face_direction"), "slow", [(8, "linear")], [(17, "linear")], "slow", 9),
+        **{"latent": 8, "lags": [10], "scaling": "standard", "angles": True},
+        keep=["angle_to_target"],
+    )
+    diagrams = study_plots(None, [], {}, {"x": slow})
     of_system, of_layers = (plot.rows for plot in diagrams)
     assert ("observation", "16 features, standard scaling, angles as sine and cosine") in of_system
     assert ("latent", "9 numbers") in of_system  # eight and the one that passes around
@@ -378,8 +363,7 @@ def test_pages_have_a_light_and_a_dark_style(plots):
 def test_policies_with_dollar_signs_are_no_formulas(analysis, returns):
     odd = {"$x^{$": Interval(300.0, 290.0, 310.0)}
     groups = tuple(replace(group, references=odd) for group in analysis.groups)
-    claim = replace(analysis.claims[0], estimand="$x^{$")
-    changed = replace(analysis, groups=groups, claims=(claim, *analysis.claims[1:]))
+    changed = replace(analysis, groups=groups)
     played = {"face_direction": {"$x^{$": [300.0]}}
     for plot in study_plots(changed, returns, played, {})[:5]:
         drawn(plot).canvas.draw()

@@ -5,21 +5,30 @@ import json
 import matplotlib as mpl
 import numpy as np
 import pytest
+from made_up import label_of
 
+from jbrep.envs.task import Feature, Task
 from jbrep.errors import InputError
 from jbrep.records.tables import write_csv
 from jbrep.report import write_report
 from jbrep.report.figures import study_plots, write
-from jbrep.report.figures.curves import Return
 from jbrep.report.figures.limits import limits
 from jbrep.report.figures.style import PAPER
-from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
+from jbrep.report.statistics import statistics_text
+from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.rules import Planned, Rules
+from jbrep.study.record import RECORD, RunFacts, RunsRecord
+from jbrep.study.results import Return
 
 TASK = "dm_control/pendulum-v0"
 STEPS = np.arange(0, 20_001, 2000)
 START = -1400.0  # the untrained policy's
+PENDULUM = Task(
+    **{"id": TASK, "name": TASK, "max_episode_steps": 1000, "timestep": 0.05},
+    features=tuple(map(Feature, ("cosine", "sine", "velocity"))),
+    **{"action_low": (-2.0,) * 6, "action_high": (2.0,) * 6},
+)
 WORST = -1612.0  # of any episode: one of pca-1, in the middle of training
 LEVELS = {  # where runs of each representation end, and how far apart
     "full": (-200, 8),
@@ -69,8 +78,7 @@ def runs():
 
 @pytest.fixture(scope="module")
 def analysis(runs):
-    """As a report has it: written and read."""
-    return Analysis.from_json(judged(runs).to_json(), "statistics.json")
+    return judged(runs)
 
 
 @pytest.fixture(scope="module")
@@ -190,23 +198,12 @@ def returns(runs):
     ]
 
 
-def label_record(representation, size=3):
-    settings = {
-        **{"task": TASK, "algorithm": "sac", "preset": "paper", "representation": representation},
-        **{"encoder": "0" * 64, "hidden": [256, 256], "steps": 20_000},
-        **{"evaluate_every": 2000, "evaluation_episodes": 2},
-    }
-    latent = [(2, "tanh")] if representation != "full" else []
-    encoder = {
-        **{"name": representation, "kind": "dae" if latent else "full", "size": size},
-        **{"encoder": latent, "decoder": [(size, "linear")] if latent else []},
-        **{"training": {}, "data": {}, "metrics": {}},
-    }
-    task = {"action_low": [-2.0] * 6, "action_high": [2.0] * 6, "timestep": 0.05}
-    return {"settings": {**settings, "environment": task}, "encoder": encoder}
+def label(name, task=PENDULUM):
+    latent = [(2, "tanh")] if name != "full" else []
+    return label_of(task, name, latent, [(3, "linear")] if latent else [])
 
 
-LABELS = {f"{TASK}/sac/{name}": label_record(name) for name in LEVELS}
+LABELS = {f"{TASK}/sac/{name}": label(name) for name in LEVELS}
 
 
 @pytest.fixture(scope="module")
@@ -254,16 +251,8 @@ def test_the_diagram_shows_the_task_as_it_is(plots):
     assert rows["robot"] == f"{TASK}, steps of 0.05 s"
     assert rows["action"] == "6 numbers in [-2, 2]"
     assert rows["observation"].startswith("3 features")
-    label = label_record("dae-2")
-    del label["settings"]["environment"]
-    (system, _) = study_plots(None, [], {}, {"x": label})
-    assert dict(system.rows)["action"] == ""
-    label["settings"]["environment"] = {
-        "action_low": [-2, -1],
-        "action_high": [2, 1],
-        "timestep": None,
-    }
-    (system, _) = study_plots(None, [], {}, {"x": label})
+    uneven = PENDULUM.replace(action_low=(-2, -1), action_high=(2, 1), timestep=None)
+    (system, _) = study_plots(None, [], {}, {"x": label("dae-2", uneven)})
     assert dict(system.rows) | {"robot": TASK, "action": "2 numbers"} == dict(system.rows)
     assert "MuJoCo" not in str(rows)
 
@@ -286,26 +275,24 @@ def test_the_line_at_the_solved_return_is_drawn_where_returns_come_near_it():
 
 
 @pytest.fixture(scope="module")
-def folder(analysis, runs, returns, tmp_path_factory):
+def folder(runs, returns, tmp_path_factory):
     """The tables of the study, and its report."""
     folder = tmp_path_factory.mktemp("report")
-    (folder / "statistics.json").write_text(analysis.to_json())
     header = ("task", "algorithm", "representation", "seed", "step", "episode", "return")
     write_csv(folder / "returns.csv", header, returns)
-    record = {
-        **{"format": "jbrep runs", "format_version": 1, "study": None, "missing": {}},
-        **{"left_out": [], "versions": [{"jbrep": "0.2.0"}], "processors": ["a processor"]},
-        "labels": LABELS,
-        "runs": [
-            {
+    RunsRecord(
+        **{"study": None, "registration": None, "missing": {}, "labels": LABELS},
+        **{"versions": [{"jbrep": "0.2.0"}], "processors": ["a processor"]},
+        runs=[
+            RunFacts(
                 **{"label": run.label, "seed": run.seed, "reason": None, "seconds": 60.0},
-                "status": "finished" if run.failed_at is None else "failed",
-                "steps": run.total_steps if run.failed_at is None else run.failed_at,
-            }
+                **{"encoder": "0" * 64, "encoder_seed": None},
+                status="finished" if run.failed_at is None else "failed",
+                steps=run.total_steps if run.failed_at is None else run.failed_at,
+            )
             for run in runs
         ],
-    }
-    (folder / "runs.json").write_text(json.dumps(record))
+    ).write(folder / RECORD)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jbrep.report.report.write", lambda plots, path: write(plots[:1], path))
         write_report(folder)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from jbrep.stats.ranks import rank_correlation
+from jbrep.stats.association import rank_correlation
 
 
 @pytest.mark.parametrize("ties", [False, True])

@@ -121,12 +121,13 @@ def test_a_study_with_primary_cells_is_registered_when_it_begins(tmp_path):
     plan = Plan(study, tmp_path / "study")
     assert run_study(plan, in_this_process, 1) == 0
     again = Plan(study, tmp_path / "study")
-    assert (again.judge.rules.primary, again.judge.seeds) == (tuple(primary["primary"]), seeds)
+    judging = again.registration.planned
+    assert (judging.rules.primary, judging.seeds) == (tuple(primary["primary"]), seeds)
     for path in (tmp_path / "study").rglob(RUN):
         settings = json.loads(path.read_text())["settings"]
         assert settings["registration"] == again.registration.sha256
     (again.folder / REGISTRATION).unlink()
-    assert Plan(study, tmp_path / "study").judge.rules.primary == ()
+    assert Plan(study, tmp_path / "study").registration is None
 
 
 def test_a_study_begins_under_its_registration(tmp_path, monkeypatch):

@@ -16,11 +16,10 @@ from scipy.stats import (
 from jbrep.errors import InputError
 from jbrep.stats.arms import Arm, Frame, measure
 from jbrep.stats.claims import FASTER, LESS_VARIANCE, NOT_WORSE, kept_gain
-from jbrep.stats.looks import levels
-from jbrep.stats.means import Bounds, Part, mean_within, p_of_sum, sum_within
+from jbrep.stats.intervals import Bounds, Part, mean_within, p_of_sum, sum_within
 from jbrep.stats.nested import components
 from jbrep.stats.power import Arms, obstacle
-from jbrep.stats.rules import Planned, Rules, most_failing
+from jbrep.stats.rules import Planned, Rules, levels, most_failing
 from jbrep.stats.runs import RunCurve
 from jbrep.stats.spread import Curves, log_spread, ratio_of_spreads, spread_p
 
@@ -294,10 +293,23 @@ def test_the_order_can_be_another_but_for_the_first():
     assert [verdict.claim for verdict in found] == ["not worse", "faster"]
 
 
-def test_few_runs_decide_nothing():
-    found = verdicts(FULL[:7], BETTER[:7])["dae-12"]
-    assert words(found) == ["undecided"] * 4
-    assert found[0].reason == "7 runs; verdicts take 8"
+@pytest.mark.parametrize("runs", range(2, 8))
+@pytest.mark.parametrize("name", ["better", "worse"])
+def test_fewer_than_eight_runs_decide_nothing(runs, name):
+    other = {"better": BETTER, "worse": WORSE}[name]
+    for full, fewer in ((FULL[:runs], other), (FULL, other[:runs]), (FULL[:runs], other[:runs])):
+        found = verdicts(full, fewer, seeds=range(runs), looks=(1.0,), failing=0.9)["dae-12"]
+        assert words(found) == ["undecided"] * 4
+        assert found[0].reason == f"{runs} runs; verdicts take 8"
+
+
+def test_no_verdict_of_fewer_than_eight_units_can_be_made():
+    sound = verdicts(FULL, BETTER)["dae-12"][0]
+    for changes in ({"runs": (7, 20)}, {"runs": (20, 7)}, {"encoders": 7}):
+        for verdict in ("supported", "contradicted"):
+            with pytest.raises(ValueError, match=f"'not worse' is {verdict} by 7 runs or encoders"):
+                replace(sound, verdict=verdict, **changes)
+        assert replace(sound, verdict="undecided", **changes).verdict == "undecided"
 
 
 def test_what_may_fail_often_is_not_called_as_good():

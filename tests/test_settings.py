@@ -18,6 +18,7 @@ from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import episode_returns
 from jbrep.errors import DamageError, InputError
 from jbrep.records import container
+from jbrep.report.tables import read_tables
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, statistics_of
 from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, RUN, read_evaluations, read_run
@@ -28,8 +29,7 @@ from jbrep.rl.policy import load_run, load_untrained, load_zip
 from jbrep.rl.presets import sb3_class
 from jbrep.study.config import as_study, read_study
 from jbrep.study.plan import Plan, read_plan
-from jbrep.study.record import runs_record
-from jbrep.study.results import read_results
+from jbrep.study.results import conclude
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
 SMALL = {"net_arch": [8], "learning_starts": 10, "train_freq": 5, "batch_size": 8}
@@ -440,7 +440,8 @@ def test_a_study_of_learners(tmp_path):
     written = json.loads((out / "study.json").read_text())
     assert (written["algorithms"], written["learners"]) == (["a2c-modern", *own], own)
     assert read_plan(out).study == read_study(path)
-    labels = runs_record(out, read_results(out).ended, []).labels
+    conclude(out)
+    labels = read_tables(out).record.labels
     assert [*labels] == [f"Pendulum-v1/{name}/full" for name in ("a2c-modern", *own)]
     settings = labels["Pendulum-v1/tuned/full"].settings
     assert (settings.preset, settings.hyperparameters.net_arch) == ("modern", (4,))
@@ -458,7 +459,8 @@ def test_settings_are_not_mixed_under_a_label(tmp_path):
     for seed, gamma in enumerate((0.9, 0.9, 0.8)):
         learner = Learner.given("a2c", "modern", {"gamma": gamma}, "mine")
         train(Run(task=TASK, learner=learner, seed=seed, **steps), tmp_path / str(seed))
-    assert "other settings" in " ".join(read_results(tmp_path).left_out)
+    conclude(tmp_path)
+    assert "other settings" in " ".join(read_tables(tmp_path).left_out)
 
 
 @pytest.mark.parametrize(

@@ -3,17 +3,16 @@
 import json
 import warnings
 from dataclasses import replace
-from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from jbrep.errors import DamageError, InputError
-from jbrep.stats import Analysis, RunCurve, analyse, statistics_text
+from jbrep.errors import InputError
+from jbrep.report.statistics import statistics_text
+from jbrep.stats import RunCurve, analyse
 from jbrep.stats.aggregates import aggregates
-from jbrep.stats.bootstrap import Interval
+from jbrep.stats.analysis import to_plain
 from jbrep.stats.comparison import probability_of_improvement
 from jbrep.stats.curves import (
     bands,
@@ -24,15 +23,15 @@ from jbrep.stats.curves import (
     on_grid,
     steps_to,
 )
-from jbrep.stats.first_claims import (
-    CLAIMS,
-    FirstClaims,
-    decide,
-    mean_p,
-    variance_p,
+from jbrep.stats.intervals import (
+    Bounds,
+    Part,
+    deviation,
+    mean_within,
+    percentile,
+    sum_within,
+    variance_ratio,
 )
-from jbrep.stats.intervals import deviation, difference, percentile, variance_ratio
-from jbrep.stats.means import Bounds, mean_within
 from jbrep.stats.nested import components
 from jbrep.stats.reliability import drawdown, expected_shortfall, fixed_policy, within_runs
 from jbrep.text import SIGNIFICANT, interval
@@ -70,12 +69,7 @@ def analysis():
     random = np.random.default_rng(0)
     levels = {name: random.normal(500, 20, 6) for name in ("full", "dae-8", "dae-4")}
     levels["dae-4"] -= 200
-    return judged(study(levels))
-
-
-def judged(runs, planned=0):
-    """By the claims of the first release."""
-    return analyse(runs, FirstClaims(planned))
+    return analyse(study(levels))
 
 
 def mean(values):
@@ -206,24 +200,11 @@ def test_a_failed_run_counts_as_zero_and_does_not_shorten_the_others():
 
 def test_a_label_whose_runs_all_failed_is_described():
     failed = [make("dae-8", i, steps=[], returns=[], failed_at=0) for i in range(3)]
-    found = judged([*TWO, *failed])
+    found = analyse([*TWO, *failed])
     assert found.groups[0].labels[1].numbers["final_return_mean"].tolist() == [0, None, None]
-    similar, steadier, faster = found.groups[0].comparisons[0].verdicts
-    assert (similar.verdict, faster.verdict) == ("contradicted", "contradicted")
-    assert (steadier.verdict, steadier.reason, steadier.p) == ("undecided", "no variance", ANY_NAN)
     alone = analyse([replace(run, representation="full") for run in failed])
     assert alone.groups[0].labels[0].numbers["steps_to_50_percent"].tolist() == [None] * 3
-    json.loads(alone.to_json())
-
-
-class _AnyNan:
-    def __eq__(self, other):
-        return np.isnan(other)
-
-    __hash__ = None
-
-
-ANY_NAN = _AnyNan()
+    json.dumps(to_plain(alone.groups), allow_nan=False)
 
 
 def test_scalars_of_a_straight_line():
@@ -292,11 +273,6 @@ def test_a_fixed_policy_is_that_of_the_last_evaluation():
 def test_intervals_against_scipy():
     random = np.random.default_rng(0)
     x, y = random.normal(500, 30, 7), random.normal(480, 60, 12)
-    expected = stats.ttest_ind(x, y, equal_var=False)
-    between = expected.confidence_interval(0.99)
-    assert difference(x, y, 0.99) == pytest.approx((x.mean() - y.mean(), *between))
-    assert mean_p(x, y) == pytest.approx(expected.pvalue)
-    assert mean_p(x, y, -25) == pytest.approx(stats.ttest_ind(x + 25, y, equal_var=False).pvalue)
     wins = stats.mannwhitneyu(x, y).statistic / (7 * 12)
     assert probability_of_improvement(x, y) == pytest.approx(wins)
     resampled = stats.bootstrap(
@@ -307,22 +283,6 @@ def test_intervals_against_scipy():
         rng=np.random.default_rng(1),
     )
     assert percentile(iqm, x)[1:] == pytest.approx(resampled.confidence_interval, abs=3)
-
-
-def test_of_two_a_permutation_is_exact():
-    x, y = np.array([0.0, 0, 1]), np.array([0.0, 3, 9])
-    assert variance_p(x, y) == pytest.approx(permutations_by_hand(x, y))
-    assert variance_p(x, y) == variance_p(y, x) == variance_p(x + 7, y - 3)
-
-
-def permutations_by_hand(x, y):
-    pooled = np.concatenate((x - np.median(x), y - np.median(y)))
-    ratios = []
-    for mine in combinations(range(6), 3):
-        rest = [i for i in range(6) if i not in mine]
-        with np.errstate(divide="ignore"):
-            ratios.append(abs(np.log(pooled[list(mine)].var() / pooled[rest].var())))
-    return np.mean(np.array(ratios) >= abs(np.log(x.var() / y.var())) - 1e-9)
 
 
 def test_bonett_by_hand():
@@ -344,11 +304,9 @@ def test_shifts_and_scales_change_what_they_should():
     np.testing.assert_allclose(variance_ratio(3 * x + 5, 3 * y - 9), variance_ratio(x, y))
     low, high = variance_ratio(y, x)[1:]
     np.testing.assert_allclose(variance_ratio(x, y)[1:], (1 / high, 1 / low))
-    np.testing.assert_allclose(difference(x + 7, y + 7), difference(x, y))
     np.testing.assert_allclose(mean(x + 7), np.add(mean(x), 7))
     np.testing.assert_allclose(deviation(3 * x), np.multiply(3, deviation(x)))
     np.testing.assert_allclose(percentile(iqm, 3 * x + 7), np.multiply(3, percentile(iqm, x)) + 7)
-    assert variance_p(3 * x + 5, 3 * y - 9) == variance_p(x, y)
 
 
 @pytest.mark.parametrize("n", [5, 10, 20])
@@ -357,10 +315,15 @@ def test_intervals_of_two_groups_cover_the_truth(n, scale):
     random = np.random.default_rng(n)
     for x, y in zip(shapes(n, random), shapes(n, random), strict=True):
         x = 480 + scale * (x - 500)
-        assert 0.92 <= covered(difference(x, y), -20) <= 0.97
+        assert 0.92 <= covered(apart(x, y), -20) <= 0.985
         assert 0.92 <= covered(variance_ratio(x, y), scale**2) <= 0.985
-        assert covered(difference(x, y, 0.996), -20) >= 0.985
+        assert covered(apart(x, y, 0.996), -20) >= 0.985
         assert covered(variance_ratio(x, y, 0.996), scale**2) >= 0.985
+
+
+def apart(x, y, level=0.95):
+    """The difference of means."""
+    return sum_within([Part(1, x), Part(-1, y)], Bounds(), level)
 
 
 def covered(found, truth):
@@ -383,73 +346,16 @@ def test_percentile_intervals_cover_as_often_as_is_written():
     assert 0.88 <= share <= 0.96
 
 
-@pytest.mark.parametrize(("n", "studies"), [(5, 200), (10, 200)])
-def test_the_permutation_test_holds_its_level(n, studies, monkeypatch):
-    monkeypatch.setattr("jbrep.stats.first_claims._PERMUTATIONS", 499)
-    random = np.random.default_rng(n)
-    fifths = np.where(random.random((2, studies, n)) < 0.2, 0, 600.0)
-    fifths += random.normal(0, 10, fifths.shape)
-    pairs = [*zip(shapes(n, random, studies), shapes(n, random, studies), strict=True), fifths]
-    for x, y in pairs:
-        p = np.array([variance_p(a, b + 100) for a, b in zip(x, y, strict=True)])
-        assert np.mean(p <= 0.05) <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / studies)
-        assert np.mean(p <= 0.5) >= 0.25  # though not by never rejecting
-
-
-def test_the_permutation_test_finds_what_is_there():
-    random = np.random.default_rng(0)
-    p = [variance_p(random.normal(0, 10, 10), random.normal(0, 50, 10)) for _ in range(20)]
-    assert np.mean(np.array(p) < 0.05) >= 0.8
-
-
 def test_groups_without_variance_have_no_interval():
     still, other = np.full(5, 0.1), np.array([1.0, 2, 3, 4, 6])
     assert mean(still).tolist() == [pytest.approx(0.1), None, None]
     assert deviation(still).tolist()[1:] == [None, None]
-    assert difference(still, still).tolist()[1:] == [None, None]
-    assert difference(still, other).tolist()[1] is not None
     for pair in ((still, still), (still, other), (other, still)):
         assert variance_ratio(*pair).tolist()[1:] == [None, None]
-        assert np.isnan(variance_p(*pair))
     assert variance_ratio(other[:2], other[:2]).tolist()[1:] == [None, None]
 
 
 # claims, verdicts, power
-
-
-WORDS = {1: "supported", -1: "contradicted", 0: "undecided"}
-
-
-def test_verdicts_at_their_borders():
-    def verdict(claim, low, high, boundary):
-        return WORDS[int(decide(claim, Interval((low + high) / 2, low, high), boundary))]
-
-    for claim, above in zip(CLAIMS, ("supported", "contradicted", "supported"), strict=True):
-        below = {"supported": "contradicted", "contradicted": "supported"}[above]
-        assert verdict(claim, 1.001, 2, 1) == above
-        assert verdict(claim, 1, 2, 1) == "undecided"
-        assert verdict(claim, 0, 2, 1) == "undecided"
-        assert verdict(claim, 0, 1, 1) == "undecided"
-        assert verdict(claim, 0, 0.999, 1) == below
-        assert verdict(claim, np.nan, np.nan, 1) == "undecided"
-    baseline = np.array([400.0, 600])
-    assert [float(claim.boundary(baseline, 0)) for claim in CLAIMS] == [-25, 1, 0]
-    assert [float(claim.boundary(baseline - 1000, -900)) for claim in CLAIMS] == [-20, 1, 0]
-    assert float(CLAIMS[0].boundary(baseline, 600)) == 0  # no gain, no margin
-
-
-def test_a_p_value_agrees_with_its_interval():
-    random = np.random.default_rng(0)
-    x, y = random.normal(500, 30, 9), random.normal(480, 60, 9)
-    for level in (0.5, 0.9, 0.99):
-        low = float(difference(x, y, level).low)
-        assert mean_p(x, y, low) == pytest.approx(1 - level)
-
-
-def test_a_part_of_a_study_is_judged_as_strictly_as_the_whole():
-    runs = study({"full": (500, 510, 520), "dae-8": (500, 480, 530)})
-    found = [judged(runs, n).groups[0].comparisons[0].verdicts[0].level for n in (0, 1, 10)]
-    assert found == pytest.approx([0.05 / 3, 0.05 / 3, 0.05 / 30])
 
 
 # the whole
@@ -460,13 +366,14 @@ def test_an_analysis_does_not_depend_on_the_order_of_runs(analysis):
     levels = {name: random.normal(500, 20, 6) for name in ("full", "dae-8", "dae-4")}
     levels["dae-4"] -= 200
     runs = study(levels)
-    text = analysis.to_json()
-    assert judged(runs).to_json() == text
+    plain = to_plain(analysis)
+    assert to_plain(analyse(runs)) == plain
     random.shuffle(runs)
-    assert judged(runs).to_json() == text
-    other = json.loads(analyse(runs, seed=1).to_json())
-    first = json.loads(text)["groups"][0]["labels"][0]["numbers"]["final_return_iqm"]
-    second = other["groups"][0]["labels"][0]["numbers"]["final_return_iqm"]
+    assert to_plain(analyse(runs)) == plain
+    first, second = (
+        each.groups[0].labels[0].numbers["final_return_iqm"]
+        for each in (analysis, analyse(runs, seed=1))
+    )
     assert first[0] == second[0]
     assert first[1:] != second[1:]
 
@@ -483,14 +390,7 @@ def test_an_analysis_is_judged_against_the_baseline(analysis):
     assert against.numbers["probability_of_improvement"].value == 0
     assert against.numbers["steps_to_50_percent_ratio"].low > 1
     assert against.numbers["steps_to_90_percent_ratio"].tolist() == [None] * 3
-    similar, _, faster = against.verdicts
-    assert (similar.verdict, faster.verdict) == ("contradicted", "contradicted")
-    assert similar.boundary == pytest.approx(-0.05 * full.by_run["final_return"].mean())
-    assert similar.estimate.value == against.numbers["final_return_difference"].value
-    assert similar.interval.low < similar.estimate.low
-    assert similar.p <= similar.level == pytest.approx(0.05 / 6)
-    undecided = group.comparisons[0].verdicts[1]
-    assert (undecided.verdict, undecided.reason) == ("undecided", None)
+    assert {verdict.verdict for verdict in against.verdicts} == {"exploratory"}
     expected = stats.levene(*(label.by_run["final_return"] for label in (full, group.labels[1])))
     assert group.comparisons[0].brown_forsythe_p == pytest.approx(expected.pvalue)
 
@@ -512,93 +412,18 @@ def test_the_variance_ratio_by_bootstrap_is_scipys(analysis):
     assert np.log(found[1:]) == pytest.approx(np.log(expected), abs=0.2)
 
 
-def test_more_comparisons_widen_what_decides():
-    random = np.random.default_rng(0)
-    levels = {name: random.normal(500, 20, 5) for name in ("full", "a", "b", "c")}
-    few = judged(study({name: levels[name] for name in ("full", "a")}))
-    many = judged(study(levels))
-    one, other = (a.groups[0].comparisons[0].verdicts[0] for a in (few, many))
-    assert one.estimate == other.estimate
-    assert other.interval.high > one.interval.high
-    assert other.level == pytest.approx(0.05 / 9)
-
-
-def test_failed_runs_do_not_speak_for_a_steady_representation():
-    random = np.random.default_rng(0)
-    runs = study({"full": random.normal(500, 100, 12), "dae-8": random.normal(500, 3, 12)})
-    supported = judged(runs).groups[0].comparisons[0].verdicts[1]
-    assert supported.verdict == "supported"
-    failed = [r if r.representation == "full" else replace(r, failed_at=0) for r in runs[:-1]]
-    failed.append(make("dae-8", 11, 1))
-    found = judged(failed).groups[0].comparisons[0].verdicts[1]
-    assert found.interval.high < 1
-    assert (found.verdict, found.reason) == ("undecided", "failed runs")
-
-
-def test_nothing_follows_from_a_baseline_that_did_not_learn():
-    idle = [
-        replace(run, returns=np.full_like(run.returns, 250 + run.seed))
-        for run in study({"full": [0] * 5, "dae-8": [0] * 5})
-    ]
-    for verdict in judged(idle).groups[0].comparisons[0].verdicts:
-        assert (verdict.verdict, verdict.reason) == ("undecided", "full didn't learn")
-
-
-def test_a_representation_that_did_not_learn_is_not_steadier():
-    runs = study({"full": [500, 700, 900, 600, 800], "dae-8": [0] * 5})
-    runs = [
-        run
-        if run.representation == "full"
-        else replace(run, returns=np.full_like(run.returns, 250 + run.seed / 10))
-        for run in runs
-    ]
-    similar, steadier, _ = judged(runs).groups[0].comparisons[0].verdicts
-    assert similar.verdict == "contradicted"
-    assert steadier.interval.high < 1
-    assert (steadier.verdict, steadier.reason) == ("undecided", "dae-8 didn't learn")
-
-
-def test_a_representation_that_did_not_learn_is_no_faster():
-    runs = study({"full": [498, 499, 500, 501, 502], "dae-8": [0] * 5})
-    runs = [
-        run
-        if run.representation == "full"
-        else replace(run, returns=np.full_like(run.returns, 450 + run.seed / 10))
-        for run in runs
-    ]
-    _, _, faster = judged(runs).groups[0].comparisons[0].verdicts
-    assert faster.interval.low > 0
-    assert (faster.verdict, faster.reason) == ("undecided", "dae-8 didn't learn")
-
-
-def test_runs_that_failed_to_learn_by_chance_decide_no_variance():
-    """Two of ten on one side and none on the other: one in seven times, if one in ten fails."""
-    most = np.linspace(880, 920, 10)
-    runs = study({"full": [50, 60, *most[2:]], "dae-8": most})
-    steadier = judged(runs).groups[0].comparisons[0].verdicts[1]
-    assert steadier.interval.high < 1
-    assert (steadier.verdict, steadier.reason) == ("undecided", "its p-value disagrees")
-
-
-def test_two_runs_are_too_few_for_a_variance():
-    found = judged(study({"full": [500, 510], "dae-8": [480, 520]}))
-    steadier = found.groups[0].comparisons[0].verdicts[1]
-    assert (steadier.verdict, steadier.reason) == ("undecided", "too few runs")
-
-
 def test_tables_have_a_line_for_each_label_comparison_and_verdict(analysis):
     text = statistics_text(analysis)
     assert text.startswith("face_direction, sac: 18 runs over 10,000 steps")
     assert "nan" not in text
     assert "inf" not in text
     lines = [line.split() for line in text.splitlines()]
-    for name, times in (("full", 2), ("dae-8", 3), ("dae-4", 3)):
+    for name, times in (("full", 2), ("dae-8", 4), ("dae-4", 4)):
         assert sum(line[:1] == [name] for line in lines) == times
-        assert sum(line[:1] == [f"{name}:"] for line in lines) == 3 * (name != "full")
     first = next(line for line in lines if line[:1] == ["dae-8"])
     assert first[1:3] == ["6", "0"]
     assert first[-2:] == ["-", "(0/6)"]
-    assert "dae-4: similar reward contradicted" in " ".join(text.split())
+    assert "representation not worse less variance faster" in " ".join(text.split())
 
 
 def test_tables_fit_a_terminal(analysis):
@@ -606,67 +431,7 @@ def test_tables_fit_a_terminal(analysis):
     assert max(map(len, text.splitlines())) <= 60
     for cell in statistics_text(analysis).split():
         assert cell in text
-    assert text.count("dae-4: similar reward") > 1  # each part of a table says what it is about
-
-
-def test_an_analysis_is_read_back_from_its_json(analysis):
-    text = analysis.to_json()
-    again = Analysis.from_json(text, Path("statistics.json"))
-    assert again.to_json() == text
-    assert statistics_text(again) == statistics_text(analysis)
-    (group,), (expected,) = again.groups, analysis.groups
-    np.testing.assert_array_equal(group.labels[1].curve.iqm.low, expected.labels[1].curve.iqm.low)
-    assert group.comparisons[0].verdicts == expected.comparisons[0].verdicts
-    assert again.claims == analysis.claims
-    assert np.isnan(group.labels[2].numbers["steps_to_90_percent"].value)  # it was infinite
-
-
-DAMAGES = [
-    (lambda whole, group: whole.pop("baseline"), "the file must be complete: baseline is missing"),
-    (lambda whole, group: whole.update(baseline="pca"), "each group must begin with the baseline"),
-    (lambda whole, group: whole.update(groups={}), "groups must be a list"),
-    (lambda whole, group: whole.update(groups=[]), "each group must begin with the baseline"),
-    (lambda whole, group: whole.update(seed=True), "seed must be a whole number"),
-    (lambda whole, group: group["profile_returns"].pop(), "each profile must have as many values"),
-    (lambda whole, group: group["profile_returns"].reverse(), "two ascending returns"),
-    (lambda whole, group: group.update(profile_returns=[-1e308, 1e308]), "two ascending returns"),
-    (lambda whole, group: group["thresholds"].clear(), "thresholds: ; expected steps_to_50"),
-    (lambda whole, group: group["grid"].pop(), "the curve of full doesn't fit the grid"),
-    (lambda whole, group: group["grid"].reverse(), "two ascending steps"),
-    (lambda whole, group: group.update(grid="x"), r"groups\[0\].grid"),
-    (lambda whole, group: group.update(task=3), r"groups\[0\].task must be text"),
-    (lambda whole, group: group["labels"].pop(), "each representation but the first must have"),
-    (lambda whole, group: group["labels"][0]["seeds"].pop(), "5 seeds, but numbers of"),
-    (lambda whole, group: group["labels"][0]["curve"]["p10"].pop(), "must have the same length"),
-    (lambda whole, group: group["labels"][0]["numbers"].pop("gain"), "numbers: .*expected"),
-    (
-        lambda whole, group: group["labels"][0]["numbers"].update(gain=[[1, 2, 3]]),
-        "each number must be one interval",
-    ),
-    (lambda whole, group: group["labels"][0].update(profile=[10**400]), "profile"),
-    (
-        lambda whole, group: group["comparisons"][0]["verdicts"][1].update(verdict="<b>"),
-        "unknown verdict '<b>'",
-    ),
-    (lambda whole, group: group["comparisons"][0]["verdicts"].pop(), "claims: .*expected"),
-    (lambda whole, group: group["comparisons"][0]["verdicts"].reverse(), "claims: .*expected"),
-    (lambda whole, group: whole.update(claims=[]), "there must be claims, each once"),
-    (lambda whole, group: group["comparisons"][0]["verdicts"][0].update(p="0"), "number or null"),
-]
-
-
-@pytest.mark.parametrize(("change", "message"), DAMAGES)
-def test_a_damaged_analysis_is_refused(change, message, analysis):
-    record = json.loads(analysis.to_json())
-    change(record, record["groups"][0])
-    with pytest.raises(DamageError, match=rf"^a\.json is damaged: .*{message}"):
-        Analysis.from_json(json.dumps(record), Path("a.json"))
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": "other"}', "[" * 10**6, "NaN"])
-def test_what_is_no_analysis_is_refused(text):
-    with pytest.raises(DamageError, match=r"a\.json is damaged, or not a jbrep statistics file"):
-        Analysis.from_json(text, Path("a.json"))
+    assert text.count("dae-4") > 4  # each part of a table says what it is about
 
 
 def test_groups_stay_apart():
@@ -674,10 +439,10 @@ def test_groups_stay_apart():
     other = [
         replace(run, algorithm="ppo", steps=run.steps[:5], returns=run.returns[:5]) for run in runs
     ]
-    both = analyse([*runs, *other]).tolist()["groups"]
+    both = to_plain(analyse([*runs, *other]).groups)
     assert [group["algorithm"] for group in both] == ["ppo", "sac"]
     assert both[0]["grid"][-1] == 4000
-    assert both[1]["labels"] == analyse(runs).tolist()["groups"][0]["labels"]
+    assert both[1]["labels"] == to_plain(analyse(runs).groups)[0]["labels"]
 
 
 def test_rliable_gives_the_same_numbers():

@@ -32,6 +32,9 @@ from jbrep.envs import describe
 from jbrep.errors import DamageError, InputError
 from jbrep.play.behaviour import observe
 from jbrep.play.sources import find_player, find_untrained
+from jbrep.report.report import statistics
+from jbrep.report.statistics import results_text
+from jbrep.report.tables import read_tables
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, RUN, read_run
 from jbrep.rl.presets import PRESETS, get_preset
@@ -43,10 +46,7 @@ from jbrep.study.progress import Progress, duration
 from jbrep.study.references import REFERENCE_RETURNS, read_references, write_references
 from jbrep.study.results import (
     RETURNS,
-    STATISTICS,
-    as_text,
     conclude,
-    read_results,
     read_runs,
 )
 from jbrep.study.runner import get_backend, on_this_machine
@@ -78,7 +78,8 @@ episode_steps = 100
 def tables(folder):
     """The tables of a study, as bytes."""
     conclude(folder)
-    return [(folder / name).read_bytes() for name in (RETURNS, STATISTICS)]
+    found = statistics(read_tables(folder).analysis)
+    return (folder / RETURNS).read_bytes(), json.dumps(found).encode()
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +98,7 @@ def test_the_studies_that_come_along_are_studies(path):
     if path.stem == "paper":
         assert (study.steps, len(study.seeds), study.data) == (5_000_000, 10, Data(steps=5_000_000))
         assert {"dae-12", "dae-8", "dae-4", "full"} <= {*study.representations}
-    assert as_study(tomllib.loads(study.toml)) == study
+    assert as_study(tomllib.loads(study.toml())) == study
 
 
 def test_a_study_from_toml(tmp_path):
@@ -395,7 +396,8 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
         assert status == ("failed" if "a2c-modern" in name else "finished")
     (blocked / "encoder.safetensors").rmdir()
     assert run_study(plan, in_this_process, 1) == 0
-    analysis = read_results(plan.folder).analysis
+    conclude(plan.folder)
+    analysis = read_tables(plan.folder).analysis
     failed = {group.algorithm: [len(x.failed) for x in group.labels] for group in analysis.groups}
     assert failed == {"a2c": [0, 0], "a2c-modern": [2, 2]}
 
@@ -406,12 +408,13 @@ def test_runs_of_different_trainers_are_compared_on_request(done, tmp_path):
         run = json.loads(path.read_text())
         run["settings"]["trainer"] = "cohort"
         path.write_text(json.dumps(run))
-    results = read_results(tmp_path)
+    conclude(tmp_path)
+    results = read_tables(tmp_path)
     assert results.analysis is None
     assert (
         "trainers: cohort float32 cpu, sb3 float32 cpu; report those of one" in results.left_out[0]
     )
-    assert read_results(tmp_path, across_trainers=True).analysis.to_json()
+    assert read_tables(tmp_path, across_trainers=True).analysis
     assert jbrep("report", tmp_path, "--across-trainers", "--json").exit_code == 0
 
 
@@ -481,14 +484,15 @@ def test_progress_is_a_line_for_each_run_where_there_is_no_terminal(done, capsys
 
 
 def test_tables_fit_the_terminal(done):
-    assert max(map(len, as_text(read_results(done.folder), 80).splitlines())) <= 80
+    conclude(done.folder)
+    assert max(map(len, results_text(read_tables(done.folder), 80).splitlines())) <= 80
 
 
 def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     (tmp_path / "tiny.toml").write_text(TOML)
     out = shutil.copytree(done.folder, tmp_path / "out")
     monkeypatch.setattr("jbrep.study.study.run_study", lambda *given: 2)
-    monkeypatch.setattr("jbrep.report.write_report", lambda folder, out: [])
+    monkeypatch.setattr("jbrep.report.report.write_report_of", lambda tables, out: [])
     told = jbrep("study", tmp_path / "tiny.toml", "--out", out)
     assert told.exit_code == 1
     assert told.stderr.endswith("2 runs crashed: the same command tries them again\n")
@@ -514,7 +518,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     path, out = tmp_path / "mixed.toml", tmp_path / "mixed"
     path.write_text(MIXED)
     with monkeypatch.context() as once:
-        once.setattr("jbrep.report.write_report", lambda folder, out: [])
+        once.setattr("jbrep.report.report.write_report_of", lambda tables, out: [])
         told = jbrep("study", path, "--out", out, "--workers", 1, "--import", "robots")
     assert told.exit_code == 0, told.output
     monkeypatch.delitem(gymnasium.registry, robots.ID)
@@ -559,8 +563,9 @@ def test_the_long_table_holds_every_evaluation(done):
     assert lines[0] == "task,algorithm,representation,seed,step,episode,return"
     assert len(lines) == 1 + 4 * (1 + 10)
     assert lines[1].startswith("face_direction,a2c,full,0,0,0,")
-    statistics = json.loads((done.folder / STATISTICS).read_text())
-    final = statistics["groups"][0]["labels"][0]["by_run"]["final_return"]
+    final = statistics(read_tables(done.folder).analysis)["groups"][0]["labels"][0]["by_run"][
+        "final_return"
+    ]
     at_end = [line.split(",") for line in lines[1:] if ",full," in line and ",80," in line]
     for seed, each in enumerate(final):
         returns = [float(row[-1]) for row in at_end if row[3] == str(seed)]
@@ -571,7 +576,8 @@ def test_a_single_seed_gives_its_returns_and_says_why_no_more(done, tmp_path):
     source = done.folder_of(done.cells[0])
     for name in (RUN, "evaluations.csv"):
         (tmp_path / name).write_bytes((source / name).read_bytes())
-    results = read_results(tmp_path)
+    conclude(tmp_path)
+    results = read_tables(tmp_path)
     assert results.analysis is None
     assert "one run has ended, at least two are needed" in results.left_out[0]
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 from command import jbrep
 from judged import diagnostics, evaluation, prediction
+from made_up import label_of
 from my_encoders import LATENT, SIZE, FirstFeatures, dense
 from onnx import helper, numpy_helper
 
@@ -23,7 +24,7 @@ from jbrep.evaluate.diagnosis import hashes
 from jbrep.evaluate.evaluation import EVALUATION
 from jbrep.evaluate.table import DIAGNOSTICS, read_diagnostics
 from jbrep.records.record import to_plain
-from jbrep.report.facts import encoder_rows, outline, reproduce
+from jbrep.report.facts import encoder_table, outline, reproduce
 from jbrep.report.figures.diagrams import autoencoders
 from jbrep.report.figures.style import styles
 from jbrep.report.tables import read_tables
@@ -35,8 +36,8 @@ from jbrep.study.diagnostics import add_diagnostics
 from jbrep.study.plan import Plan, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.record import EACH_ITS_OWN, RECORD
-from jbrep.study.results import RETURNS, conclude, read_results
-from jbrep.study.study import dry_run, run_study
+from jbrep.study.results import RETURNS, conclude
+from jbrep.study.study import forecast, run_study
 from jbrep.study.work import Assigned, work
 
 TASK = "face_direction"
@@ -171,7 +172,7 @@ def test_a_module_and_its_onnx_model_give_equal_tables(done):
 
 
 def test_runs_with_an_encoder_each_stand_under_one_label(done):
-    results = read_results(done.folder)
+    results = read_tables(done.folder)
     assert not results.left_out
     (group,) = results.analysis.groups
     assert [(label.representation, label.seeds) for label in group.labels] == [
@@ -262,7 +263,8 @@ def test_different_encoders_under_one_label_are_refused_otherwise(done, tmp_path
         run = json.loads(path.read_text())
         run["settings"]["encoder_seed"] = None
         path.write_text(json.dumps(run))
-    results = read_results(tmp_path)
+    conclude(tmp_path)
+    results = read_tables(tmp_path)
     assert results.analysis is None
     assert "mixes the settings" in results.left_out[0]
 
@@ -270,7 +272,7 @@ def test_different_encoders_under_one_label_are_refused_otherwise(done, tmp_path
 def test_the_report_tells_of_own_encoders(done):
     tables = read_tables(done.folder)
     assert outline(tables).endswith(f"With mine, {EACH_ITS_OWN}.")
-    rows = {row[0].rpartition("/")[2]: row[1:] for row in encoder_rows(tables)}
+    rows = {row[0].rpartition("/")[2]: row[1:] for row in encoder_table(tables).rows}
     assert rows["mine"][-1] == EACH_ITS_OWN
     assert rows["net"][:4] == (NET, f"{SIZE} - {LATENT}", "-", "-")
     toml, command = (code for _, code in reproduce(tables)[1:3])
@@ -494,8 +496,8 @@ def test_a_worker_imports_the_modules_it_is_told_to(done, tmp_path, monkeypatch)
 
 
 def test_a_drawing_of_an_encoder_without_decoder_ends_with_the_latent():
-    encoder = {"size": 3, "encoder": [(2, "tanh")], "decoder": [], "training": {}}
-    (axes,) = autoencoders(TASK, {"mine": encoder}, lambda: styles(["mine"])).draw().axes
+    mine = label_of(describe(TASK), "mine", [(2, "tanh")]).encoder
+    (axes,) = autoencoders(TASK, {"mine": mine}, lambda: styles(["mine"])).draw().axes
     assert [text.get_text() for text in axes.texts][2:] == ["observation", "latent"]
     assert axes.get_title("center") == "mine"
 
@@ -504,8 +506,8 @@ def test_the_time_of_code_is_estimated_by_itself(done, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "jbrep.study.study.estimate", lambda runs: 60 if runs[0].encoder == NET else 30
     )
-    told = dry_run(Plan(done.study, tmp_path / "it"), 1).splitlines()
-    assert [line.split()[2] for line in told[1:6]] == ["30", "30", "60", "30", "30"]
+    runs = forecast(Plan(done.study, tmp_path / "it"), 1).runs
+    assert [seconds for _, _, seconds in runs[:5]] == [30, 30, 60, 30, 30]
 
 
 def test_a_run_on_code(done, tmp_path, monkeypatch):

@@ -12,9 +12,10 @@ from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.report import report
 from jbrep.report.report import write_report
+from jbrep.report.statistics import group_tables
+from jbrep.report.tables import read_tables
 from jbrep.stats.power import Arms, Prospect, prospects
 from jbrep.stats.rules import Planned, Rules
-from jbrep.stats.summary import group_tables
 from jbrep.study.config import as_study
 from jbrep.study.plan import Plan
 from jbrep.study.results import conclude
@@ -35,9 +36,10 @@ def looks(tmp_path_factory):
             plan = Plan(STUDY.replace(seeds=tuple(range(max(seeds, SEEDS)))), folder)
             plan.write()
             make_runs(plan, range(seeds))
-            results, _ = conclude(folder)
-            page, _, text, _ = write_report(folder)
-            found[seeds] = results.analysis, page.read_text(), text.read_text()
+            conclude(folder)
+            page, _, text, *_ = write_report(folder)
+            analysis = read_tables(folder).analysis
+            found[seeds] = analysis, page.read_text(), text.read_text()
             if seeds == SEEDS:
                 tables = {path.name: path.read_bytes() for path in folder.glob("*.*")}
     whole = folder.parent / "whole"
@@ -63,12 +65,12 @@ def test_before_a_look_there_are_curves_and_counts_alone(looks):
     assert "There are no verdicts yet: the first look is at 8 runs of each arm." in page
     assert "Returns over training" in text
     assert [each.representation for each in analysis.open_aggregates] == ["full"]
-    assert "Compared with full" not in dict(group_tables(analysis.groups[0], analysis))
-    assert "Compared with full" in dict(group_tables(analysis.groups[1], analysis))
     assert words(cell(analysis, "move_in_direction", "dae-8")) == ["exploratory"] * 4
-    titles = [[t.split(".")[0] for t, _ in group_tables(g, analysis)] for g in analysis.groups]
+    tables = [group_tables(group, analysis) for group in analysis.groups]
+    titles = [[table.title.split(".")[0] for table in each] for each in tables]
+    assert ["Compared with full" in each for each in titles] == [False, True]
     assert [each[-1] for each in titles] == ["Verdicts", "What the claims are about"]
-    header, rows = group_tables(analysis.groups[1], analysis)[-1][1]
+    _, header, rows = tables[1][-1]
     assert header == ("representation", "not worse", "less variance", "faster")
     assert [row[0] for row in rows] == ["dae-8", "pca-8"]
 
@@ -160,7 +162,7 @@ def test_rules_that_do_not_fit_the_study(changes, message):
 
 def test_a_dry_run_tells_what_could_be_found(tmp_path, monkeypatch):
     monkeypatch.setattr("jbrep.study.study.estimate", lambda runs: 60)
-    (tmp_path / "it.toml").write_text(STUDY.toml)
+    (tmp_path / "it.toml").write_text(STUDY.toml())
     told = jbrep("study", tmp_path / "it.toml", "--dry-run", "--out", tmp_path / "out")
     assert told.exit_code == 0, told.output
     words = " ".join(told.output.split())

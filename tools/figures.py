@@ -1,9 +1,10 @@
 """Redraw the figures and reports in results/ from the tables there: python tools/figures.py."""
 
-import json
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+from jbrep.evaluate.evaluation import Evaluation
+from jbrep.records.document import read_document
 from jbrep.report import write_report
 from jbrep.report.figures import encoder_plots, write
 
@@ -13,7 +14,7 @@ RESULTS = Path("results")
 def draw(tables: Path) -> list[Path]:
     if tables.name == "runs.json":
         return write_report(tables.parent)
-    return write(encoder_plots(json.loads(tables.read_text())), tables.parent)
+    return write(encoder_plots(read_document(tables, Evaluation)), tables.parent)
 
 
 def main() -> None:

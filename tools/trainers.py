@@ -12,19 +12,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import norm, permutation_test, ttest_ind
 
 from jbrep.errors import InputError
+from jbrep.records.document import read_document
 from jbrep.records.storage import write_whole
+from jbrep.records.tables import read_csv
 from jbrep.report.figures import write
 from jbrep.report.figures.curves import curves
 from jbrep.report.figures.style import styles
-from jbrep.report.tables import read_tables
 from jbrep.rl.record import FINISHED
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.first_claims import variance_p
-from jbrep.stats.intervals import difference, variance_ratio
+from jbrep.stats.intervals import variance_ratio
+from jbrep.study.record import RECORD, RunsRecord
+from jbrep.study.results import COLUMNS, RETURNS, Return
 from jbrep.text import rounded, table
 
 SB3, *COHORTS = ARMS = ("sb3", "float32", "bfloat16")
@@ -32,6 +34,7 @@ LEARNERS = ("sac", "ddpg")
 WIDE, NARROW = 100, 50  # points of return
 SURE, USUAL = 0.99, 0.90  # of intervals: to call arms different, and to call them equal
 POWER = 0.8
+PERMUTATIONS = 9999
 HEADER = (
     "cohort, measure",
     "mean",
@@ -108,17 +111,47 @@ def runs_to_decide(x: Array, y: Array) -> int:
     return int(np.ceil((x.var(ddof=1) + y.var(ddof=1)) * (quantiles / WIDE) ** 2))
 
 
+def difference(x: Array, y: Array, level: float) -> Interval:
+    """The mean of x (n,) minus that of y (m,), with Welch's interval."""
+    found = ttest_ind(x, y, equal_var=False).confidence_interval(level)
+    return Interval(x.mean() - y.mean(), found.low, found.high)
+
+
+def variance_p(x: Array, y: Array) -> float:
+    """P-value of equal variances: a permutation test of the log of their ratio, two-sided.
+
+    Runs are permuted after subtracting their group's median. Subtracting the mean instead, the
+    test rejects 10 % of skewed returns with equal variances at a level of 5 %, and 36 % of returns
+    of which a fifth are near 0.
+    """
+
+    def log_ratio(x: Array, y: Array, axis: int) -> Array:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.abs(np.log(x.var(axis=axis, ddof=1)) - np.log(y.var(axis=axis, ddof=1)))
+
+    result = permutation_test(
+        (x - np.median(x), y - np.median(y)),
+        log_ratio,
+        permutation_type="independent",
+        vectorized=True,
+        n_resamples=PERMUTATIONS,
+        alternative="greater",
+        rng=np.random.default_rng(0),
+    )
+    return float(result.pvalue)
+
+
 def read_arm(folder: Path, arm: str) -> list[RunCurve]:
     """The runs of a study, with the arm in the place of what they observe.
 
     Raises:
         InputError: a run failed, for which the plan has no rule.
     """
-    tables = read_tables(folder)
-    if failed := [run["seed"] for run in tables.record["runs"] if run["status"] != FINISHED]:
+    record = read_document(folder / RECORD, RunsRecord)
+    if failed := [run.seed for run in record.runs if run.status != FINISHED]:
         raise InputError(f"{folder}: the runs of the seeds {failed} failed")
     returns: dict[int, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in tables.returns:
+    for row in (Return(*cells) for cells in read_csv(folder / RETURNS, COLUMNS)):
         returns[row.seed][row.step].append(row.episode_return)
     return [
         RunCurve(

@@ -70,17 +70,18 @@ def study(
     from jbrep.study.plan import Plan
     from jbrep.study.registration import REGISTRATION
     from jbrep.study.runner import get_backend
-    from jbrep.study.study import dry_run as dry_run_text
-    from jbrep.study.study import register_study, run_study
+    from jbrep.study.study import forecast, register_study, run_study
     from jbrep.text import terminal_width
 
     plan = Plan(read_study(study), out or Path("runs") / study.stem)
     run, count = get_backend(backend), workers or usual_workers(plan)
-    text = dry_run_text(plan, count, width, terminal_width()) if dry_run else ""
+    expected = forecast(plan, count, width) if dry_run else None
     for notice in plan.study.notices:
         click.echo(notice, err=True)
-    if dry_run:
-        click.echo(text)
+    if expected:
+        from jbrep.report.statistics import forecast_text
+
+        click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
         return
     if register:
         registered = register_study(plan)
@@ -138,20 +139,22 @@ def _conclude(
     """Write the tables of the runs below a folder, if there are any, and the report; print them."""
     import json
 
-    from jbrep.report import write_report
-    from jbrep.report.report import SUMMARY
+    from jbrep.report.report import SUMMARY, write_report_of
+    from jbrep.report.statistics import results_text
+    from jbrep.report.tables import read_tables
     from jbrep.study.diagnostics import add_diagnostics
-    from jbrep.study.results import as_text, conclude, has_runs
+    from jbrep.study.results import conclude, has_runs
     from jbrep.text import terminal_width
 
-    paths: list[Path] = []
-    if has_runs(folder):
-        results, paths = conclude(folder, across_trainers)
-        if not as_json:
-            echo_text(as_text(results, terminal_width()))
-    for line in add_diagnostics(folder, evaluations):
+    ran = has_runs(folder)
+    paths = conclude(folder) if ran else []
+    lines = add_diagnostics(folder, evaluations)
+    tables = read_tables(folder, across_trainers)
+    if ran and not as_json:
+        echo_text(results_text(tables, terminal_width()))
+    for line in lines:
         say(line, err=True)
-    paths += write_report(folder, out)
+    paths += write_report_of(tables, out or folder)
     if as_json:
         echo_json(json.loads(((out or folder) / SUMMARY).read_bytes()))
     else:

@@ -4,12 +4,12 @@ import re
 from collections.abc import Iterator, Sequence
 
 from jbrep.report import facts
-from jbrep.report.columns import are_numbers
+from jbrep.report.statistics import across_tasks, label_table, matrix
 from jbrep.report.tables import Tables
-from jbrep.report.words import Answer, headline, remark
-from jbrep.stats.analysis import Analysis, GroupAnalysis
-from jbrep.stats.summary import Rows, across_tasks, estimate_rows, label_rows, reference_words
-from jbrep.stats.verdict import EXPLORATORY, Statement, Verdict
+from jbrep.report.words import Answer, headline, notes, reference_words
+from jbrep.stats import Analysis
+from jbrep.stats.claims import EXPLORATORY
+from jbrep.text import Table
 
 # what would be read as markup: an underscore within a word and a bracket without a link are not
 _WITHIN_A_LINE = r"[\\`*<|~#]|&(?=[#\w])|(?<!\w)_|_(?!\w)|!(?=\[)|\](?=[(\[:])"
@@ -17,21 +17,21 @@ _AT_ITS_START = r"^[-+=>]|^\d+(?=[.)])"
 
 
 def markdown(
-    tables: Tables, answers: Sequence[Answer], predictions: Sequence[tuple[str, Rows]], picture: str
+    tables: Tables, answers: Sequence[Answer], predictions: Sequence[Table], picture: str
 ) -> str:
     """The summary, for a README.
 
     Args:
         tables: of the study.
         answers: on each claim.
-        predictions: tables of how well diagnostics predict learning, each with a title.
+        predictions: how well diagnostics predict learning.
         picture: the main figure's path.
     """
     return "\n".join(_lines(tables, answers, predictions, picture))
 
 
 def _lines(
-    tables: Tables, answers: Sequence[Answer], predictions: Sequence[tuple[str, Rows]], picture: str
+    tables: Tables, answers: Sequence[Answer], predictions: Sequence[Table], picture: str
 ) -> Iterator[str]:
     yield from (f"# {escape(tables.name)}", "", escape(facts.outline(tables)), "")
     if registered := facts.registered(tables):
@@ -43,8 +43,8 @@ def _lines(
         yield from _findings(tables.analysis, answers)
         yield from (f"![Returns over training]({picture})", "")
         yield from _numbers(tables.analysis)
-    for title, (header, rows) in predictions:
-        yield from (f"{escape(title)}:", "", *_table(header, rows), "")
+    for table in predictions:
+        yield from (f"{escape(table.title)}:", "", *_rendered(table), "")
 
 
 def _findings(analysis: Analysis, answers: Sequence[Answer]) -> Iterator[str]:
@@ -52,12 +52,12 @@ def _findings(analysis: Analysis, answers: Sequence[Answer]) -> Iterator[str]:
     for group in analysis.groups:
         if group.comparisons:
             title = f"{group.name}, compared with {analysis.baseline}:"
-            yield from (escape(title), "", *_compared(group, analysis.claims), "")
+            yield from (escape(title), "", *_rendered(matrix(group, analysis.planned)), "")
             yield from (escape(f"Gains are counted from {reference_words(group)}."), "")
-    for note in analysis.notes:
+    for note in notes(analysis.planned):
         yield from (escape(note), "")
-    for claim, answer in zip(analysis.claims, answers, strict=True):
-        estimated = f"{claim.name!r} is estimated by: {claim.estimand}."
+    for answer in answers:
+        estimated = f"{answer.claim!r} is estimated by: {answer.estimand}."
         yield from (f"**{escape(answer.headline)}.** {escape(estimated)}", "")
         judged = [each for each in answer.findings if each.verdict != EXPLORATORY]
         for finding in judged:
@@ -69,30 +69,15 @@ def _findings(analysis: Analysis, answers: Sequence[Answer]) -> Iterator[str]:
 def _numbers(analysis: Analysis) -> Iterator[str]:
     for group in analysis.groups:
         yield from (f"{escape(group.name)}, with 95 % intervals over runs:", "")
-        yield from (*_table(*label_rows(group)), "")
-    for title, (header, rows) in across_tasks(analysis):
-        yield from (f"{escape(title)}:", "", *_table(header, rows), "")
+        yield from (*_rendered(label_table(group)), "")
+    for table in across_tasks(analysis):
+        yield from (f"{escape(table.title)}:", "", *_rendered(table), "")
 
 
-def _compared(group: GroupAnalysis, claims: Sequence[Statement]) -> list[str]:
-    """A row for each representation, a column for each claim."""
-    if not any(comparison.is_judged for comparison in group.comparisons):
-        return _table(*estimate_rows(group, claims))
-    header = ("representation", *(claim.name for claim in claims))
-    rows = [
-        (comparison.representation, *map(_short, comparison.verdicts))
-        for comparison in group.comparisons
-    ]
-    return _table(header, rows)
-
-
-def _short(verdict: Verdict) -> str:
-    return "; ".join(filter(None, (verdict.verdict, remark(verdict))))
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    rule = ["---:" if numbers else "---" for numbers in are_numbers(rows)]
-    lines = ([_in_a_line(cell) for cell in line] for line in (header, *rows))
+def _rendered(table: Table) -> list[str]:
+    """The lines of a table, without its title."""
+    rule = ["---:" if numbers else "---" for numbers in table.numeric]
+    lines = ([_in_a_line(cell) for cell in line] for line in (table.header, *table.rows))
     first, *others = ("| " + " | ".join(line) + " |" for line in lines)
     return [first, "| " + " | ".join(rule) + " |", *others]
 

@@ -12,13 +12,13 @@ from markupsafe import Markup
 from jbrep.progress import Progress
 from jbrep.records.tables import csv_text
 from jbrep.report import facts
-from jbrep.report.columns import are_numbers
 from jbrep.report.figures.plot import Drawing, Plot
 from jbrep.report.figures.style import DARK, PAGE
+from jbrep.report.statistics import across_tasks, group_tables
 from jbrep.report.tables import Tables
-from jbrep.report.words import details, headline, remark
+from jbrep.report.words import details, headline, notes, remark, statements
 from jbrep.stats import Analysis
-from jbrep.stats.summary import Rows, across_tasks, group_tables
+from jbrep.text import Table
 
 _WIDEST = 1000  # of a figure [CSS pixels]
 _PER_INCH = 96  # CSS pixels: on a narrow screen a figure is shown at its size on paper
@@ -27,14 +27,14 @@ _PER_INCH = 96  # CSS pixels: on a narrow screen a figure is shown at its size o
 def page(
     tables: Tables,
     plots: Sequence[Plot],
-    predictions: Sequence[tuple[str, Rows]],
+    predictions: Sequence[Table],
 ) -> str:
     """The page; the content of the tables is shown as text and never runs.
 
     Args:
         tables: of the study.
         plots: figures.
-        predictions: tables of how well diagnostics predict learning, each with a title.
+        predictions: how well diagnostics predict learning.
     """
     script = _own("page.js")
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
@@ -45,19 +45,18 @@ def page(
         notices=facts.notices(tables),
         headline=headline(tables.analysis),
         analysis=tables.analysis,
-        registration=tables.record.get("registration"),
+        claims=statements(tables.analysis.planned) if tables.analysis else [],
+        notes=notes(tables.analysis.planned) if tables.analysis else [],
+        registration=tables.record.registration,
         remark=remark,
         details=details,
-        are_numbers=are_numbers,
         figures=[_figure(plot) for plot in Progress(plots, unit="figure", delay=1, leave=False)],
         tables=[*(_tables(tables.analysis) if tables.analysis else ()), *predictions],
-        runs=facts.run_rows(tables),
-        failed=facts.failed_rows(tables),
-        missing=facts.missing_rows(tables),
-        versions=facts.version_rows(tables),
-        processors=tables.record["processors"],
-        encoders=facts.encoder_rows(tables),
-        settings=facts.setting_rows(tables),
+        runs=facts.run_tables(tables),
+        packages=facts.package_table(tables),
+        processors=tables.record.processors,
+        encoders=facts.encoder_table(tables),
+        settings=facts.setting_table(tables),
         reproduce=facts.reproduce(tables),
         style=Markup(_own("page.css")),
         script=Markup(script),
@@ -65,12 +64,12 @@ def page(
     )
 
 
-def _tables(analysis: Analysis) -> list[tuple[str, Rows]]:
+def _tables(analysis: Analysis) -> list[Table]:
     """Every table of every group, each with a title that names the group; those across tasks."""
     of_groups = [
-        (f"{group.name}. {title}" if i else title, rows)
+        table._replace(title=f"{group.name}. {table.title}") if i else table
         for group in analysis.groups
-        for i, (title, rows) in enumerate(group_tables(group, analysis))
+        for i, table in enumerate(group_tables(group, analysis))
     ]
     return [*of_groups, *across_tasks(analysis)]
 

@@ -5,27 +5,33 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from jbrep.evaluate.table import SCALARS
 from jbrep.records.storage import make_folder, write_whole
-from jbrep.report import diagnostics, facts
+from jbrep.report import facts
 from jbrep.report.figures import study_plots, write
 from jbrep.report.markdown import markdown
 from jbrep.report.page import page
+from jbrep.report.statistics import association_tables
 from jbrep.report.tables import Tables, read_tables
-from jbrep.report.words import Answer, answers
-from jbrep.stats.plain import to_plain
+from jbrep.report.words import Answer, answers, notes, statements
+from jbrep.stats import Analysis
+from jbrep.stats.analysis import to_plain
+from jbrep.stats.association import Association, Diagnostic, associations
 
 PAGE, SUMMARY, MARKDOWN, FIGURES = "report.html", "summary.json", "summary.md", "figures"
-FORMAT = "jbrep summary"
-FORMAT_VERSION = 3  # before, claims were those of the first release
+STATISTICS = "statistics.json"
 _MAIN_FIGURE = "representations"
 
 
-def write_report(folder: Path, out: Path | None = None) -> list[Path]:
+def write_report(
+    folder: Path, out: Path | None = None, across_trainers: bool = False
+) -> list[Path]:
     """Write the report of the tables in a folder.
 
     Args:
         folder: with the tables of a study.
         out: folder for the report; the same one if not given.
+        across_trainers: compare runs of different trainers, too.
 
     Returns:
         The paths of the page, the summaries and the folder of the figures.
@@ -34,37 +40,74 @@ def write_report(folder: Path, out: Path | None = None) -> list[Path]:
         InputError: the folder is not that of a study, a table is damaged, or the report can't be
             written.
     """
-    tables = read_tables(folder)
-    out = out or folder
+    return write_report_of(read_tables(folder, across_trainers), out or folder)
+
+
+def write_report_of(tables: Tables, out: Path) -> list[Path]:
+    """The same of tables that were read.
+
+    Raises:
+        InputError: the report can't be written.
+    """
     make_folder(out)
     verdicts = answers(tables.analysis) if tables.analysis else []
-    associated = diagnostics.of_study(tables)
+    associated = _associated(tables)
     plots = study_plots(
-        tables.analysis, tables.returns, tables.references, tables.record["labels"], associated
+        tables.analysis, tables.returns, tables.references, tables.record.labels, associated
     )
-    predictions = diagnostics.diagnostic_tables(associated)
+    predictions = association_tables(associated)
     texts = {
         PAGE: page(tables, plots, predictions),
-        SUMMARY: json.dumps(_summary(tables, verdicts), indent=1, allow_nan=False) + "\n",
+        SUMMARY: _json(_summary(tables, verdicts), indent=1),
         MARKDOWN: markdown(tables, verdicts, predictions, f"{FIGURES}/{_MAIN_FIGURE}.png"),
     }
     write(plots, out / FIGURES)
+    if tables.analysis:
+        texts[STATISTICS] = _json(statistics(tables.analysis), indent=2)
+    else:
+        (out / STATISTICS).unlink(missing_ok=True)  # of fewer runs
     for name, text in texts.items():
         write_whole(out / name, text.encode())
     return [out / name for name in (*texts, FIGURES)]
+
+
+def _json(contents: dict[str, Any], indent: int) -> str:
+    return json.dumps(contents, indent=indent, allow_nan=False) + "\n"
+
+
+def _associated(tables: Tables) -> list[Association]:
+    """Each headline diagnostic with the final returns; none without diagnostics or statistics."""
+    if tables.analysis is None:
+        return []
+    known = [Diagnostic(name, each.words, each.better) for name, each in SCALARS.items()]
+    return associations(tables.analysis.groups, tables.diagnostics, known, tables.analysis.seed)
+
+
+def statistics(analysis: Analysis) -> dict[str, Any]:
+    """All statistics for programs; an interval is [value, low, high], None if not finite."""
+    return {
+        "format": "jbrep statistics",
+        "format_version": 3,
+        "baseline": analysis.baseline,
+        "seed": analysis.seed,
+        "claims": [claim._asdict() for claim in statements(analysis.planned)],
+        "notes": notes(analysis.planned),
+        "groups": to_plain(analysis.groups),
+        "aggregates": to_plain(analysis.aggregates),
+    }
 
 
 def _summary(tables: Tables, verdicts: Sequence[Answer]) -> dict[str, Any]:
     """The summary for programs."""
     record = tables.record
     return {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
+        "format": "jbrep summary",
+        "format_version": 3,
         "study": tables.name,
-        "runs": len(record["runs"]),
-        "missing": list(record["missing"]),
-        "failed": [row[:2] for row in facts.failed_rows(tables)],
-        "left_out": record["left_out"],
+        "runs": len(record.runs),
+        "missing": list(record.missing),
+        "failed": [row[:2] for row in facts.failed_runs(tables).rows],
+        "left_out": tables.left_out,
         "claims": {
             answer.claim: {
                 "counts": answer.counts,
@@ -77,5 +120,5 @@ def _summary(tables: Tables, verdicts: Sequence[Answer]) -> dict[str, Any]:
             for group in (tables.analysis.groups if tables.analysis else ())
             for label in group.labels
         },
-        "versions": record["versions"],
+        "versions": record.versions,
     }

@@ -1,23 +1,64 @@
-"""Verdicts in sentences."""
+"""Statistics in words: what is claimed, how it is decided, what was found."""
 
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from jbrep.report.tables import RegistrationRecord
 from jbrep.stats import Analysis
 from jbrep.stats.analysis import GroupAnalysis
+from jbrep.stats.bootstrap import Interval
+from jbrep.stats.claims import (
+    CLAIMS,
+    EXPLORATORY,
+    FASTER,
+    LESS_VARIANCE,
+    NOT_WORSE,
+    NOT_YET,
+    WITHIN_HALF,
+    Verdict,
+)
 from jbrep.stats.comparison import Comparison
-from jbrep.stats.rules import NONE_PRIMARY
-from jbrep.stats.summary import probability, reference_words, shown, shown_number
-from jbrep.stats.verdict import EXPLORATORY, NOT_YET, Statement, Verdict
+from jbrep.stats.rules import ERROR, Planned
+from jbrep.stats.scale import STILL
+from jbrep.study.record import RegistrationFacts
+from jbrep.text import SIGNIFICANT, interval, number
 
+EFFECTS = (  # of `jbrep.stats.power`
+    f"Power of {NOT_WORSE.name!r} and {WITHIN_HALF.name!r}: if agents keep all of the gain, and "
+    "final returns of runs have an SD of 5, 10 or 20 % of it, on either side. Of "
+    f"{LESS_VARIANCE.name!r}: if the spread of curves is 1/2, 1/3 or 1/5 of the full agents'. Of "
+    f"{FASTER.name!r}: if half of the gain comes earlier by a tenth of training, and the time "
+    "varies by an SD of 5, 10 or 20 % of training. Each by itself: claims before it, and runs that "
+    "fail to learn, may stop a verdict."
+)
+_STATEMENTS = {  # with a place for the percentage that may be lost
+    NOT_WORSE.name: "Agents on less state lose at most {} of the gain",
+    LESS_VARIANCE.name: "Their training varies less from run to run",
+    FASTER.name: "They learn faster",
+    WITHIN_HALF.name: "They lose at most {} of it",
+}
+_KEPT = "gain over standing still, as a share of that on the full state"
+_ESTIMANDS = {
+    NOT_WORSE.name: _KEPT,
+    LESS_VARIANCE.name: "spread of training curves, as a multiple of that on the full state",
+    FASTER.name: "steps to half of the full agents' gain, beyond what these take",
+    WITHIN_HALF.name: _KEPT,
+}
 _BESIDE = {  # a claim's verdict: what else is known of it
     "not worse": ("Difference of final returns", "final_return_difference"),
     "less variance": ("Ratio of variances of final returns", "variance_ratio"),
     "faster": ("Ratio of median steps to half of the gain", "steps_to_50_percent_ratio"),
 }
+
+
+class Statement(NamedTuple):
+    """A claim in words."""
+
+    name: str
+    statement: str  # as a sentence
+    estimand: str  # what is estimated
+    is_ratio: bool  # of which logarithms are drawn
 
 
 class Finding(NamedTuple):
@@ -33,9 +74,40 @@ class Answer(NamedTuple):
     """All verdicts of a study on one claim."""
 
     claim: str
+    estimand: str
     headline: str
     counts: dict[str, int]  # of verdicts
     findings: list[Finding]
+
+
+def statements(planned: Planned) -> list[Statement]:
+    """What is claimed, in the order of the tests."""
+    found = []
+    for name in planned.rules.claims:
+        claim = CLAIMS[name]
+        percent = f"{100 * (1 - claim.boundary(planned.rules.margin)):.3g} %"
+        sentence = _STATEMENTS[name].format(percent)
+        found.append(Statement(name, sentence, _ESTIMANDS[name], claim.is_ratio))
+    return found
+
+
+def notes(planned: Planned) -> list[str]:
+    """How verdicts are reached, in sentences."""
+    cells = len(planned.rules.primary)
+    if not cells:
+        return [
+            "No cell was named primary before the runs: all numbers are exploratory, and there are "
+            "no verdicts."
+        ]
+    shared = "one primary cell has" if cells == 1 else f"{cells} primary cells share"
+    counts = " and ".join(map(str, planned.counts))
+    levels = ", at O'Brien and Fleming's levels" if len(planned.counts) > 1 else ""
+    return [
+        f"Claims are tested in the order {', '.join(planned.rules.claims)}, each once the one "
+        f"before it is supported; {shared} an error of {100 * ERROR:.0f} %, two-sided, in Holm's "
+        "way.",
+        f"Verdicts may come after {counts} runs of each arm{levels}; other cells are exploratory.",
+    ]
 
 
 def headline(analysis: Analysis | None) -> str:
@@ -46,7 +118,7 @@ def headline(analysis: Analysis | None) -> str:
     if not found:
         return "No reduced state was compared with the full one."
     judged = [verdicts for verdicts in found if verdicts[0].verdict != EXPLORATORY]
-    if not judged and NONE_PRIMARY in analysis.notes:
+    if not judged and not analysis.planned.rules.primary:
         return "There are no verdicts: no cell was named primary before the runs."
     if not judged:
         return "There are no verdicts yet: no primary cell has two runs of each side."
@@ -54,8 +126,8 @@ def headline(analysis: Analysis | None) -> str:
     if not decided:
         return f"There are no verdicts yet: {judged[0][0].reason}."
     cells = "the one cell" if len(judged) == 1 else f"the {len(judged)} cells"
-    columns = zip(analysis.claims, zip(*judged, strict=True), strict=True)
-    parts = [f"{claim.name!r} {_overall(_counts(each))}" for claim, each in columns]
+    columns = zip(analysis.planned.rules.claims, zip(*judged, strict=True), strict=True)
+    parts = [f"{claim!r} {_overall(_counts(each))}" for claim, each in columns]
     return f"In {cells} judged: {'; '.join(parts)}."
 
 
@@ -76,23 +148,24 @@ def _overall(counts: Counter[str]) -> str:
 
 def answers(analysis: Analysis) -> list[Answer]:
     """Each claim, with every verdict on it."""
-    return [_answer(number, claim, analysis) for number, claim in enumerate(analysis.claims)]
+    return [_answer(i, claim, analysis) for i, claim in enumerate(statements(analysis.planned))]
 
 
-def _answer(number: int, claim: Statement, analysis: Analysis) -> Answer:
+def _answer(position: int, claim: Statement, analysis: Analysis) -> Answer:
     pairs = [(group, each) for group in analysis.groups for each in group.comparisons]
     findings = [
         Finding(
             group.name,
             each.representation,
-            each.verdicts[number].verdict,
-            _sentence(claim, each.verdicts[number], each.representation, analysis.baseline),
+            each.verdicts[position].verdict,
+            _sentence(claim, each.verdicts[position], each.representation, analysis.baseline),
         )
         for group, each in pairs
     ]
-    counts = _counts([each.verdicts[number] for _, each in pairs])
+    counts = _counts([each.verdicts[position] for _, each in pairs])
     overall = _overall(counts) if counts else "no reduced state was compared"
-    return Answer(claim.name, f"{claim.statement}: {overall}", dict(counts), findings)
+    headline = f"{claim.statement}: {overall}"
+    return Answer(claim.name, claim.estimand, headline, dict(counts), findings)
 
 
 def _sentence(claim: Statement, verdict: Verdict, name: str, baseline: str) -> str:
@@ -132,7 +205,7 @@ def details(
     verdict: Verdict,
     comparison: Comparison,
     group: GroupAnalysis,
-    registration: RegistrationRecord | None,
+    registration: RegistrationFacts | None,
 ) -> list[tuple[str, str]]:
     """All that a verdict rests on, each with a heading."""
     rows = [
@@ -150,8 +223,8 @@ def details(
     if verdict.reason:
         rows.append(("Why", verdict.reason))
     if verdict.claim in _BESIDE and comparison.is_open:
-        words, number = _BESIDE[verdict.claim]
-        rows.append((words, shown(comparison.numbers[number])))
+        words, name = _BESIDE[verdict.claim]
+        rows.append((words, shown(comparison.numbers[name])))
     runs = "{} of {} and {} of {}".format(
         *(verdict.runs[0], comparison.representation),
         *(verdict.runs[1], group.labels[0].representation),
@@ -168,7 +241,35 @@ def scope(comparison: Comparison, verdict: Verdict, group: GroupAnalysis) -> str
     return "for this encoder" if label.encoders == 1 else f"for these {label.encoders} encoders"
 
 
-def _deviations(registration: RegistrationRecord | None) -> str:
+def _deviations(registration: RegistrationFacts | None) -> str:
     if registration is None:
         return "not registered beforehand"
-    return "; ".join(registration["deviations"]) or "none from what was registered"
+    return "; ".join(registration.deviations) or "none from what was registered"
+
+
+def reference_words(group: GroupAnalysis) -> str:
+    """What gains are counted from."""
+    if STILL in group.references:
+        what = "what standing still returns"
+    elif not math.isnan(group.return_floor):
+        what = "the least possible return"
+    else:
+        what = "the mean return of untrained policies"
+    return f"{what}, {shown_number(group.reference)}"
+
+
+def shown(values: Interval, form: str = SIGNIFICANT) -> str:
+    """A value with its interval, if it has one; a dash for what isn't finite."""
+    return interval(values.tolist(), form)
+
+
+def shown_number(value: float, form: str = SIGNIFICANT) -> str:
+    """A number; a dash if it isn't finite."""
+    return number(value if math.isfinite(value) else None, form)
+
+
+def probability(p: float) -> str:
+    """A probability to three digits; a dash where there is none."""
+    if math.isnan(p):
+        return "-"
+    return "<0.001" if p < 0.001 else f"{p:.3f}"

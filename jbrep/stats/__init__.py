@@ -2,6 +2,5 @@
 
 from jbrep.stats.analysis import Analysis, analyse
 from jbrep.stats.runs import RunCurve
-from jbrep.stats.summary import statistics_text
 
-__all__ = ["Analysis", "RunCurve", "analyse", "statistics_text"]
+__all__ = ["Analysis", "RunCurve", "analyse"]

@@ -31,9 +31,6 @@ class Aggregate:
         optimality_gap: mean of what scores lack to 1, with its 95 % interval.
         scores: where the profile is evaluated, (k,).
         profile: the share of runs with a score above each of these, averaged over tasks, (k,).
-
-    Raises:
-        ValueError: a profile that doesn't fit its scores.
     """
 
     algorithm: str
@@ -44,12 +41,6 @@ class Aggregate:
     optimality_gap: Interval
     scores: Array
     profile: Interval
-
-    def __post_init__(self) -> None:
-        if np.shape(self.profile.value) != self.scores.shape:
-            raise ValueError("the profile must have as many values as scores")
-        if np.ndim(self.iqm.value) or np.ndim(self.optimality_gap.value):
-            raise ValueError("iqm and optimality_gap must be one interval each")
 
 
 def aggregates(

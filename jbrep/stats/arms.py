@@ -8,12 +8,11 @@ import numpy as np
 
 from jbrep.stats.bootstrap import Array
 from jbrep.stats.curves import compared, steps_to
-from jbrep.stats.intervals import LEVEL
-from jbrep.stats.means import Bounds, mean_within
+from jbrep.stats.intervals import LEVEL, Bounds, mean_within
 from jbrep.stats.runs import Group, RunCurve, with_failure_returns
 from jbrep.stats.scale import reference_of
 
-FEWEST = 8  # units on either side of a verdict
+FEWEST_UNITS = 8  # units on either side of a verdict
 _HALF = 0.5  # of the baseline's gain: what a run that learns comes to
 _RESOLUTION = 0.01  # of that gain, of differences between curves
 
@@ -131,7 +130,7 @@ def _arm(
 
 def _own_encoders(runs: list[RunCurve]) -> bool:
     """Whether there are enough encoders to speak of others made like them."""
-    return len({run.encoder_seed for run in runs} - {None}) >= FEWEST
+    return len({run.encoder_seed for run in runs} - {None}) >= FEWEST_UNITS
 
 
 def _units(runs: list[RunCurve]) -> list[list[int]]:

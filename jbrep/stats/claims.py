@@ -1,19 +1,66 @@
-"""What is claimed of a representation: how each claim is measured, and what would decide it."""
+"""What is claimed of a representation: how each claim is measured, and what is found of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
 
-from jbrep.stats.arms import Arm, Frame
+from jbrep.stats.arms import FEWEST_UNITS, Arm, Frame
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.means import Bounds, Part, p_of_sum, sum_within
+from jbrep.stats.intervals import Bounds, Part, p_of_sum, sum_within
+from jbrep.stats.runs import Key
 from jbrep.stats.spread import PERMUTATIONS, TO_SHOW, Curves, ratio_of_spreads, spread_p
-from jbrep.stats.verdict import Statement
 
+SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
+NOT_YET, EXPLORATORY = "not yet", "exploratory"
 _FURTHEST = 1e3  # shares of a gain that are looked for
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What is found of a claim, of one representation against the baseline.
+
+    No claim is supported or contradicted by fewer than FEWEST_UNITS units on either side.
+
+    Args:
+        claim: its name.
+        verdict: SUPPORTED, CONTRADICTED, UNDECIDED, NOT_YET or EXPLORATORY.
+        estimate: with its 95 % interval; without one for three runs or fewer.
+        boundary: that the estimate is held against.
+        p: two-sided, of lying on the boundary; NaN where there is none.
+        level: of the last test, two-sided; NaN if there was none.
+        interval: of 1 minus that level.
+        runs: of the representation and of the baseline that count.
+        encoders: how many of the representation are the units of the test; 0 if its runs are.
+        look: how many looks had come when it was decided or last tested; 0 if none.
+        reason: why it is not decided, if not because the estimate is too rough.
+
+    Raises:
+        ValueError: it decides by too few units.
+    """
+
+    claim: str
+    verdict: str
+    estimate: Interval
+    boundary: float
+    p: float
+    level: float
+    interval: Interval
+    runs: tuple[int, int]
+    encoders: int
+    look: int
+    reason: str | None
+
+    def __post_init__(self) -> None:
+        fewest = min(self.encoders or self.runs[0], self.runs[1])
+        if self.verdict in (SUPPORTED, CONTRADICTED) and fewest < FEWEST_UNITS:
+            raise ValueError(f"{self.claim!r} is {self.verdict} by {fewest} runs or encoders")
+
+
+Verdicts = Mapping[Key, Mapping[str, tuple[Verdict, ...]]]  # then by representation
 
 
 class Claim(NamedTuple):
@@ -21,29 +68,23 @@ class Claim(NamedTuple):
 
     Attributes:
         name: in a few words.
-        statement: the claim as a sentence, with a place for the percentage that may be lost.
-        estimand: what is estimated, in words.
         side: 1 if an estimate above the boundary speaks for the claim, -1 if one below does.
         boundary: of the estimate, given the margin.
         estimate: from x, y, their frame, the level of the interval and a seed.
         tested: the same with the interval that the test itself keeps.
         p_value: two-sided, of the estimand lying on the boundary, from x, y, frame, boundary, seed.
+        is_ratio: whether the estimate is a ratio, whose logarithm is symmetrical.
+        limits_failures: whether runs that fail to learn may forbid a verdict for the claim.
     """
 
     name: str
-    statement: str
-    estimand: str
     side: int
     boundary: Callable[[float], float]
     estimate: Callable[[Arm, Arm, Frame, float, int], Interval]
     tested: Callable[[Arm, Arm, Frame, float, int], Interval]
     p_value: Callable[[Arm, Arm, Frame, float, int], float]
-
-    def in_words(self, margin: float) -> Statement:
-        """What is claimed, given the margin."""
-        percent = f"{100 * (1 - self.boundary(margin)):.3g} %"
-        statement = self.statement.format(percent)
-        return Statement(self.name, statement, self.estimand, self.estimate is spread_ratio)
+    is_ratio: bool = False
+    limits_failures: bool = False
 
 
 def kept_gain(x: Arm, y: Arm, frame: Frame, level: float, seed: int = 0) -> Interval:
@@ -108,41 +149,35 @@ def _curves(x: Arm, y: Arm, frame: Frame) -> Curves:
     return Curves(x.curves, y.curves, frame.weights, frame.resolution)
 
 
-_KEPT = "gain over standing still, as a share of that on the full state"
 NOT_WORSE = Claim(
     name="not worse",
-    statement="Agents on less state lose at most {} of the gain",
-    estimand=_KEPT,
     side=1,
     boundary=lambda margin: 1 - margin,
     estimate=kept_gain,
     tested=kept_gain,
     p_value=_kept_p,
+    limits_failures=True,
 )
 WITHIN_HALF = Claim(
     name="within half the margin",
-    statement="They lose at most {} of it",
-    estimand=_KEPT,
     side=1,
     boundary=lambda margin: 1 - margin / 2,
     estimate=kept_gain,
     tested=kept_gain,
     p_value=_kept_p,
+    limits_failures=True,
 )
 LESS_VARIANCE = Claim(
     name="less variance",
-    statement="Their training varies less from run to run",
-    estimand="spread of training curves, as a multiple of that on the full state",
     side=-1,
     boundary=lambda margin: 1.0,
     estimate=spread_ratio,
     tested=partial(spread_ratio, permutations=PERMUTATIONS),
     p_value=_spread_p,
+    is_ratio=True,
 )
 FASTER = Claim(
     name="faster",
-    statement="They learn faster",
-    estimand="steps to half of the full agents' gain, beyond what these take",
     side=-1,
     boundary=lambda margin: 0.0,
     estimate=time_lost,

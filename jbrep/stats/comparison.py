@@ -7,20 +7,20 @@ import numpy as np
 from scipy.stats import levene
 
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.intervals import FEWEST, LEVEL, UNDEFINED, constant, percentile, variance_ratio
-from jbrep.stats.labels import RepresentationResult, check_numbers, median
-from jbrep.stats.means import Bounds, Part, sum_within
-from jbrep.stats.scale import STEPS_TO
-from jbrep.stats.verdict import EXPLORATORY, NOT_YET, Verdict
-
-COMPARISON_NUMBERS = (
-    "final_return_difference",
-    "mean_return_difference",
-    "variance_ratio",
-    "variance_ratio_bootstrap",
-    "probability_of_improvement",
-    *(f"{name}_ratio" for name in STEPS_TO),
+from jbrep.stats.claims import EXPLORATORY, NOT_YET, Verdict
+from jbrep.stats.intervals import (
+    FEWEST_RUNS,
+    LEVEL,
+    UNDEFINED,
+    Bounds,
+    Part,
+    constant,
+    percentile,
+    sum_within,
+    variance_ratio,
 )
+from jbrep.stats.labels import RepresentationResult, median
+from jbrep.stats.scale import STEPS_TO
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,21 +29,16 @@ class Comparison:
 
     Args:
         representation: its name.
-        numbers: COMPARISON_NUMBERS, each with its 95 % interval.
+        numbers: differences, ratios and the probability of improvement, by name, each with its
+            95 % interval.
         brown_forsythe_p: of equal variances of final returns; NaN where it is undefined.
         verdicts: one for each claim.
-
-    Raises:
-        ValueError: numbers that are missing or unknown.
     """
 
     representation: str
     numbers: Mapping[str, Interval]
     brown_forsythe_p: float
     verdicts: tuple[Verdict, ...]
-
-    def __post_init__(self) -> None:
-        check_numbers(self.numbers, COMPARISON_NUMBERS)
 
     @property
     def is_open(self) -> bool:
@@ -105,7 +100,8 @@ def _difference(x: Array, y: Array, bounds: Bounds) -> Interval:
 
 
 def _unless_few(interval: Interval, x: Array, y: Array) -> Interval:
-    return interval if min(len(x), len(y)) >= FEWEST else UNDEFINED._replace(value=interval.value)
+    few = min(len(x), len(y)) < FEWEST_RUNS
+    return UNDEFINED._replace(value=interval.value) if few else interval
 
 
 def probability_of_improvement(x: Array, y: Array) -> Array:
@@ -126,6 +122,6 @@ def _ratio_of_medians(x: Array, y: Array) -> Array:
 
 
 def _brown_forsythe(x: Array, y: Array) -> float:
-    if constant(x) or constant(y) or min(len(x), len(y)) < FEWEST:
+    if constant(x) or constant(y) or min(len(x), len(y)) < FEWEST_RUNS:
         return np.nan
     return float(levene(x, y, center="median").pvalue)

@@ -26,9 +26,6 @@ class Curve:
         p10: 10th percentile over runs; the others likewise.
         mean: over runs.
         iqm: interquartile mean over runs with its 95 % interval.
-
-    Raises:
-        ValueError: they differ in length.
     """
 
     p10: Array
@@ -38,11 +35,6 @@ class Curve:
     p90: Array
     mean: Array
     iqm: Interval
-
-    def __post_init__(self) -> None:
-        parts = (self.p10, self.p25, self.p50, self.p75, self.p90, self.iqm.value)
-        if any(np.shape(part) != self.mean.shape for part in parts):
-            raise ValueError("the parts of a curve must have the same length")
 
 
 def iqm(values: Array) -> Array:

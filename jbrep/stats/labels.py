@@ -1,6 +1,6 @@
 """The results of one representation: of each run, and of all runs together."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,8 +8,15 @@ from scipy.stats import binomtest, iqr, median_abs_deviation
 
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.curves import Curve, bands, iqm, mean_return, steps_to
-from jbrep.stats.intervals import FEWEST, LEVEL, UNDEFINED, deviation, percentile
-from jbrep.stats.means import Bounds, mean_within
+from jbrep.stats.intervals import (
+    FEWEST_RUNS,
+    LEVEL,
+    UNDEFINED,
+    Bounds,
+    deviation,
+    mean_within,
+    percentile,
+)
 from jbrep.stats.nested import components
 from jbrep.stats.reliability import TAIL_OF_RUNS, expected_shortfall, fixed_policy, within_runs
 from jbrep.stats.runs import RunCurve
@@ -29,20 +36,6 @@ COMPONENTS = {  # of the variance of final returns, where each of several encode
     "run_variance": "runs",
     "encoder_variance_ratio": "ratio",
 }
-RUN_NUMBERS = ("final_return", "mean_return", "gain", *STEPS_TO, *WITHIN)
-NUMBERS = (  # of all runs
-    *(
-        f"{name}_{by}"
-        for name in ("final_return", "mean_return")
-        for by in ("mean", "median", "iqm")
-    ),
-    "gain",
-    *(f"final_return_{spread}" for spread in ("sd", "iqr", "mad")),
-    "risk_across_runs",
-    *(name for pair in REACHED.items() for name in pair),
-    *WITHIN,
-    *COMPONENTS,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +49,10 @@ class RepresentationResult:
         failed: seeds of the runs that failed.
         encoders: how many they have among them.
         curve: over the grid of the group.
-        by_run: RUN_NUMBERS, (runs,) each, in the order of seeds.
-        numbers: NUMBERS, each with its 95 % interval.
+        by_run: numbers of each run by name, (runs,) each, in the order of seeds.
+        numbers: of all runs by name, each with its 95 % interval.
         profile: the share of runs whose final return is above each of the group's
             profile_returns, (k,).
-
-    Raises:
-        ValueError: names or lengths that don't fit.
     """
 
     representation: str
@@ -74,34 +64,6 @@ class RepresentationResult:
     by_run: Mapping[str, Array]
     numbers: Mapping[str, Interval]
     profile: Interval
-
-    def __post_init__(self) -> None:
-        check_names("numbers of runs", self.by_run, RUN_NUMBERS)
-        check_numbers(self.numbers, NUMBERS)
-        lengths = {len(self.seeds), *(len(values) for values in self.by_run.values())}
-        if len(lengths) > 1:
-            raise ValueError(f"{len(self.seeds)} seeds, but numbers of {sorted(lengths)} runs")
-
-
-def check_names(what: str, there: Collection[str], expected: Collection[str]) -> None:
-    """Make sure that all names are there and no others, in whatever order.
-
-    Raises:
-        ValueError: they aren't.
-    """
-    if set(there) != set(expected) or len(there) != len(expected):
-        raise ValueError(f"{what}: {', '.join(there)}; expected {', '.join(expected)}")
-
-
-def check_numbers(numbers: Mapping[str, Interval], expected: Collection[str]) -> None:
-    """Make sure that there is one interval for each name.
-
-    Raises:
-        ValueError: there isn't.
-    """
-    check_names("numbers", numbers, expected)
-    if any(np.ndim(number.value) for number in numbers.values()):
-        raise ValueError("each number must be one interval")
 
 
 def describe(
@@ -158,7 +120,7 @@ def _components(runs: list[RunCurve], final: Array) -> dict[str, Interval]:
 
 
 def _mean(values: Array, bounds: Bounds) -> Interval:
-    if len(values) < FEWEST:
+    if len(values) < FEWEST_RUNS:
         return UNDEFINED._replace(value=values.mean())
     return mean_within(values, bounds, LEVEL)
 
@@ -199,7 +161,7 @@ def _share_reached(steps: Array) -> Interval:
     if np.isnan(steps).any():
         return UNDEFINED
     reached = int(np.isfinite(steps).sum())
-    if len(steps) < FEWEST:
+    if len(steps) < FEWEST_RUNS:
         return UNDEFINED._replace(value=reached / len(steps))
     ends = binomtest(reached, len(steps)).proportion_ci(LEVEL, method="wilson")
     return Interval(reached / len(steps), ends.low, ends.high)

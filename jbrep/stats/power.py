@@ -6,21 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jbrep.stats.arms import FEWEST
-from jbrep.stats.claims import CLAIMS, FASTER, LESS_VARIANCE, NOT_WORSE, WITHIN_HALF
-from jbrep.stats.looks import levels
-from jbrep.stats.means import Bounds, Part, sum_within
-from jbrep.stats.rules import ERROR, Planned, Rules, most_failing
+from jbrep.stats.arms import FEWEST_UNITS
+from jbrep.stats.claims import CLAIMS, FASTER, LESS_VARIANCE
+from jbrep.stats.intervals import Bounds, Part, sum_within
+from jbrep.stats.rules import ERROR, Planned, Rules, levels, most_failing
 from jbrep.stats.spread import PERMUTATIONS, Curves, spread_p
 
-EFFECTS = (
-    f"Power of {NOT_WORSE.name!r} and {WITHIN_HALF.name!r}: if agents keep all of the gain, and "
-    "final returns of runs have an SD of 5, 10 or 20 % of it, on either side. Of "
-    f"{LESS_VARIANCE.name!r}: if the spread of curves is 1/2, 1/3 or 1/5 of the full agents'. Of "
-    f"{FASTER.name!r}: if half of the gain comes earlier by a tenth of training, and the time "
-    "varies by an SD of 5, 10 or 20 % of training. Each by itself: claims before it, and runs that "
-    "fail to learn, may stop a verdict."
-)
 _SDS = (0.05, 0.1, 0.2)
 _RATIOS = (1 / 2, 1 / 3, 1 / 5)
 _EARLIER = 0.1
@@ -57,8 +48,8 @@ class Prospect(NamedTuple):
 def obstacle(rules: Rules, claim: str, arms: Arms) -> str | None:
     """Why no outcome of a study could support a claim; None if one could."""
     fewest = min(arms.units, arms.baseline)
-    if fewest < FEWEST:
-        return f"a side has {fewest} runs or encoders, and verdicts take {FEWEST}"
+    if fewest < FEWEST_UNITS:
+        return f"a side has {fewest} runs or encoders, and verdicts take {FEWEST_UNITS}"
     level = _level(Planned(rules, (*range(arms.runs),)))
     if _least_p(claim) > level:
         return f"its least p-value is {_least_p(claim):.2g}, above its level"

@@ -4,48 +4,49 @@ Within a cell (a task, an algorithm and a representation) claims are tested one 
 each once the one before it is supported. The cells begin with equal shares of the level; one that
 is done passes its share on to the others (Holm 1979; with orders within cells, Bretz et al. 2009,
 "A graphical approach to sequentially rejective multiple test procedures", Statistics in Medicine
-28). At each look of the study, tests take their part of that level (`jbrep.stats.looks`).
+28). At each look of the study, tests take their part of that level (O'Brien and Fleming 1979, "A
+multiple testing procedure for clinical trials", Biometrics 35): at the look with a share t of all
+runs, a statistic that is standard normal if there is no effect decides beyond C / sqrt(t). The
+constant C is found by integrating over the paths that haven't decided yet, as in Armitage,
+McPherson and Rowe 1969, "Repeated significance tests on accumulating data".
 """
 
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
-from scipy.stats import binomtest
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.stats import binomtest, norm
 
 from jbrep.errors import InputError
 from jbrep.records.record import Record
-from jbrep.stats.arms import FEWEST, Arm, Frame, learns, measure
+from jbrep.stats.arms import FEWEST_UNITS, Arm, Frame, learns, measure
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.claims import CLAIMS, NOT_WORSE, Claim, kept_gain
-from jbrep.stats.intervals import FEWEST as FEWEST_FOR_INTERVALS
-from jbrep.stats.intervals import LEVEL, UNDEFINED
-from jbrep.stats.looks import levels
-from jbrep.stats.runs import Group
-from jbrep.stats.verdict import (
+from jbrep.stats.claims import (
+    CLAIMS,
     CONTRADICTED,
     EXPLORATORY,
+    NOT_WORSE,
     NOT_YET,
     SUPPORTED,
     UNDECIDED,
-    Key,
-    Statement,
+    Claim,
     Verdict,
     Verdicts,
 )
+from jbrep.stats.intervals import FEWEST_RUNS, LEVEL, UNDEFINED
+from jbrep.stats.runs import Group, Key
 
-NONE_PRIMARY = (
-    "No cell was named primary before the runs: all numbers are exploratory, and there are no "
-    "verdicts."
-)
 ERROR = 0.05  # the probability that any of a study's verdicts is wrong, two-sided
 _USUAL_LOOKS = (0.5, 1.0)
 _Share = Annotated[float, Meta(gt=0, lt=1)]
+_POINTS = 401  # of the grid on which paths are integrated, with Simpson's rule
 
 
 class Rules(Record, frozen=True, kw_only=True):
@@ -112,7 +113,7 @@ class Planned:
         """Shares of the seeds after which there may be verdicts."""
         if self.rules.looks:
             return self.rules.looks
-        return _USUAL_LOOKS if self._count(_USUAL_LOOKS[0]) >= FEWEST else (1.0,)
+        return _USUAL_LOOKS if self._count(_USUAL_LOOKS[0]) >= FEWEST_UNITS else (1.0,)
 
     @cached_property
     def counts(self) -> tuple[int, ...]:
@@ -121,28 +122,6 @@ class Planned:
 
     def _count(self, share: float) -> int:
         return math.ceil(share * len(self.seeds) - 1e-9)
-
-    @property
-    def claims(self) -> tuple[Statement, ...]:
-        """What is claimed."""
-        return tuple(CLAIMS[name].in_words(self.rules.margin) for name in self.rules.claims)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """How verdicts are reached, in sentences."""
-        cells = len(self.rules.primary)
-        if not cells:
-            return (NONE_PRIMARY,)
-        shared = "one primary cell has" if cells == 1 else f"{cells} primary cells share"
-        counts = " and ".join(map(str, self.counts))
-        levels = ", at O'Brien and Fleming's levels" if len(self.counts) > 1 else ""
-        return (
-            f"Claims are tested in the order {', '.join(self.rules.claims)}, each once the one "
-            f"before it is supported; {shared} an error of {100 * ERROR:.0f} %, two-sided, in "
-            f"Holm's way.",
-            f"Verdicts may come after {counts} runs of each arm{levels}; other cells are "
-            "exploratory.",
-        )
 
     def __call__(self, groups: Mapping[Key, Group], seed: int = 0) -> Verdicts:
         """What is found of each claim, for each representation but the first of each group.
@@ -268,11 +247,11 @@ def _reason(
 ) -> str | None:
     """Why there can't be a verdict; None if there can."""
     fewest, what = min(x.units, y.units), "encoders" if x.by_encoder else "runs"
-    if fewest < FEWEST:
-        return f"{fewest} {what}; verdicts take {FEWEST}"
+    if fewest < FEWEST_UNITS:
+        return f"{fewest} {what}; verdicts take {FEWEST_UNITS}"
     if not learns(y, frame):
         return "agents on the full state didn't learn"
-    if claim.estimate is kept_gain and direction > 0:
+    if claim.limits_failures and direction > 0:
         most = most_failing(x.units - x.learnt, x.units, level)
         if most > rules.failing:
             return (
@@ -297,7 +276,7 @@ def most_failing(failing: int, runs: int, level: float) -> float:
 def _estimated(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, seed: int) -> Verdict:
     """An estimate without a verdict."""
     estimate = claim.estimate(x, y, frame, LEVEL, seed)
-    if min(x.units, y.units) < FEWEST_FOR_INTERVALS:
+    if min(x.units, y.units) < FEWEST_RUNS:
         estimate = Interval(estimate.value, np.nan, np.nan)
     return Verdict(
         claim=claim.name,
@@ -349,3 +328,39 @@ def _whole(
             for each in _explored(group, name, rules, seeds, seed, len(tested))
         ),
     )
+
+
+@lru_cache(256)
+def levels(shares: Sequence[float], level: float) -> tuple[float, ...]:
+    """The two-sided level of the test at each look.
+
+    Args:
+        shares: of the runs that are there at each look, ascending to 1.
+        level: of all looks together, two-sided.
+    """
+    if len(shares) == 1:
+        return (level,)
+    least = norm.isf(level / 2)
+    constant = brentq(lambda c: _decided(shares, c) - level, least - 0.1, 2 * least + 2)
+    return tuple(2 * norm.sf(constant / np.sqrt(shares)).astype(float))
+
+
+def _decided(shares: Sequence[float], constant: float) -> float:
+    """The probability that one of the looks decides if there is no effect."""
+    score, weight, before, undecided = np.zeros(1), np.ones(1), 0.0, 1.0
+    for share in shares:  # a score with variance t, which decides beyond C
+        spread = np.sqrt(share - before)
+        grid = np.linspace(-constant, constant, _POINTS)
+        density = norm.pdf(grid[:, None], score, spread) @ weight
+        stays = norm.cdf(constant, score, spread) - norm.cdf(-constant, score, spread)
+        undecided = float(weight @ stays)
+        score, weight, before = grid, density * _simpson(grid), share
+    return 1 - undecided
+
+
+def _simpson(grid: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The weights of an integral over an odd number of evenly spaced points."""
+    weights = np.full(len(grid), 2.0)
+    weights[1::2] = 4
+    weights[[0, -1]] = 1
+    return weights * (grid[1] - grid[0]) / 3

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError
 from jbrep.stats.bootstrap import Array
-from jbrep.stats.means import Bounds
+from jbrep.stats.intervals import Bounds
 
 LARGEST_RETURN = 1e15  # of either sign: beyond, a number has diverged
 _ROUNDING = 1e-6  # of returns, relative to the largest
@@ -170,6 +170,7 @@ def _is_whole(value: object) -> bool:
 
 
 Group = dict[str, list[RunCurve]]  # runs by seed, under their representation
+Key = tuple[str, str]  # task and algorithm
 
 
 def with_failure_returns(runs: Sequence[RunCurve]) -> list[RunCurve]:
@@ -179,7 +180,7 @@ def with_failure_returns(runs: Sequence[RunCurve]) -> list[RunCurve]:
     episode in which a run of that task and algorithm was evaluated, whatever its representation.
     Where none was evaluated, it stays as it was.
     """
-    worst: dict[tuple[str, str], float] = {}
+    worst: dict[Key, float] = {}
     for run in runs:
         seen = run.returns.min(initial=np.inf) if run.return_floor is None else run.return_floor
         key = run.task, run.algorithm
@@ -191,7 +192,7 @@ def with_failure_returns(runs: Sequence[RunCurve]) -> list[RunCurve]:
     ]
 
 
-def groups(runs: Sequence[RunCurve], baseline: str) -> dict[tuple[str, str], Group]:
+def groups(runs: Sequence[RunCurve], baseline: str) -> dict[Key, Group]:
     """Runs by (task, algorithm), then by representation, the baseline first.
 
     The order doesn't depend on that of the runs given. Each run has its failure_return.
@@ -201,7 +202,7 @@ def groups(runs: Sequence[RunCurve], baseline: str) -> dict[tuple[str, str], Gro
             without any evaluation, or with different facts of its task, or a label with one run,
             with a seed twice, or with different settings; or runs of different trainers.
     """
-    by_group: dict[tuple[str, str], Group] = defaultdict(lambda: defaultdict(list))
+    by_group: dict[Key, Group] = defaultdict(lambda: defaultdict(list))
     for run in runs:
         if not isinstance(run, RunCurve):
             raise InputError(
@@ -215,7 +216,7 @@ def groups(runs: Sequence[RunCurve], baseline: str) -> dict[tuple[str, str], Gro
     return {key: _ordered(by_group[key], key, baseline) for key in sorted(by_group)}
 
 
-def _ordered(group: Group, key: tuple[str, str], baseline: str) -> Group:
+def _ordered(group: Group, key: Key, baseline: str) -> Group:
     if baseline not in group:
         raise InputError(
             f"{'/'.join(key)} has no runs of the baseline {baseline!r}: train some, or choose "

@@ -20,7 +20,7 @@ from jbrep.records.toml import read_toml, toml_text
 from jbrep.rl.learner import Learner
 from jbrep.rl.run import trainer_of
 from jbrep.rl.settings import MAX_STEPS, Seed, TrainingSettings
-from jbrep.stats.arms import FEWEST
+from jbrep.stats.arms import FEWEST_UNITS
 from jbrep.stats.power import Arms, obstacle
 from jbrep.stats.rules import Planned, Rules
 from jbrep.study.representations import (
@@ -212,7 +212,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             raise InputError(
                 f"tasks has {long[0]}: say {short[long[0]]}, as tables do, where there are verdicts"
             )
-        counts = Planned(self.rules, self.seeds).counts
+        counts = self.planned.counts
         if len(set(counts)) < len(counts):
             raise InputError(
                 f"verdicts.looks are {list(self.rules.looks)}: of {len(self.seeds)} seeds, they "
@@ -240,12 +240,17 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     def arms(self, representation: Representation) -> Arms:
         """How many runs are planned of a representation, and of the full observation."""
         runs, encoders = len(self.seeds), len(representation.shares(self.seeds))
-        return Arms(runs, encoders if encoders >= FEWEST else runs, runs)
+        return Arms(runs, encoders if encoders >= FEWEST_UNITS else runs, runs)
 
     @cached_property
     def rules(self) -> Rules:
         """How verdicts are reached."""
         return from_plain(dict(self.verdicts), Rules, "verdicts")
+
+    @property
+    def planned(self) -> Planned:
+        """What would reach verdicts, if the study were registered as it is."""
+        return Planned(self.rules, self.seeds)
 
     @cached_property
     def observed(self) -> tuple[Representation, ...]:
@@ -259,7 +264,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             return 0
         return len(self.tasks) * len(self.algorithms) * (len(self.representations) - 1)
 
-    @property
     def toml(self) -> str:
         """The file that describes it."""
         given = {

@@ -16,7 +16,6 @@ from jbrep.rl import Run
 from jbrep.rl.files import RUN
 from jbrep.rl.learner import Learner
 from jbrep.rl.names import usual_trainer
-from jbrep.stats.rules import Planned
 from jbrep.study.config import Study
 from jbrep.study.registration import Registration, check_registered, read_registration
 from jbrep.study.representations import Representation
@@ -82,11 +81,6 @@ class Plan:
     def registration(self) -> Registration | None:
         """What was written down before the first run; None if nothing was."""
         return read_registration(self.folder)
-
-    @property
-    def judge(self) -> Planned:
-        """What reaches verdicts: the rules that were registered, on the seeds that were."""
-        return self.registration.planned if self.registration else Planned()
 
     def trainer(self, cell: Cell) -> str:
         """What trains a run."""

@@ -103,6 +103,7 @@ class RunFacts(Record, frozen=True, kw_only=True):
     reason: str | None  # why it failed
     steps: Count
     seconds: Annotated[float, Meta(ge=0)]
+    differs: dict[str, Any] = msgspec.field(default_factory=dict)  # settings other than its label's
 
 
 class RegistrationFacts(Record, frozen=True, kw_only=True):
@@ -124,7 +125,6 @@ class RunsRecord(Document, frozen=True, kw_only=True):
     study: Study | None  # None for runs without one
     registration: RegistrationFacts | None
     missing: dict[str, Count]  # unfinished runs: training steps done
-    left_out: list[str]  # what has no statistics, and why
     versions: list[dict[str, str]]  # by package
     processors: list[str]
     labels: dict[str, Label]
@@ -143,16 +143,23 @@ class RunsRecord(Document, frozen=True, kw_only=True):
         if unknown := [run.label for run in self.runs if run.label not in self.labels]:
             raise InputError(f"settings of {unknown[0]} are missing")
 
+        for run in self.runs:
+            self.settings_of(run)
 
-def runs_record(
-    folder: Path, ended: Mapping[Path, RunRecord], left_out: Sequence[str]
-) -> RunsRecord:
+    def settings_of(self, run: RunFacts) -> LabelSettings:
+        """The settings of a run, without its seed and what depends on it."""
+        shared = self.labels[run.label].settings
+        if not run.differs:
+            return shared
+        return from_plain({**to_plain(shared), **run.differs}, LabelSettings)
+
+
+def runs_record(folder: Path, ended: Mapping[Path, RunRecord]) -> RunsRecord:
     """What was run.
 
     Args:
         folder: of a study, or any folder with runs below it.
         ended: what run.json says of each run that has finished or failed, by folder.
-        left_out: what the statistics leave out, in sentences.
 
     Raises:
         InputError: a file is damaged.
@@ -169,15 +176,23 @@ def runs_record(
         missing={c.name: read_progress(plan.folder_of(c))[0] for c in plan.unfinished}
         if plan
         else {},
-        left_out=list(left_out),
         versions=_distinct(dict(run.versions) for run in runs.values()),
         processors=_distinct(run.cpu for run in runs.values()),
         labels={label: _label(of_label) for label, of_label in labels.items()},
-        runs=[_run(run) for run in runs.values()],
+        runs=[
+            run_facts(run, next(iter(labels[run.settings.label].values()))) for run in runs.values()
+        ],
     )
 
 
-def _run(run: RunRecord) -> RunFacts:
+def run_facts(run: RunRecord, first: RunRecord) -> RunFacts:
+    """What is told of a run, whose label's settings are those of the first one.
+
+    Args:
+        run: what its run.json says.
+        first: the same of the first run of its label.
+    """
+    settings, shared = (to_plain(shared_settings(each.settings)) for each in (run, first))
     return RunFacts(
         label=run.settings.label,
         seed=run.settings.seed,
@@ -187,6 +202,7 @@ def _run(run: RunRecord) -> RunFacts:
         reason=run.reason,
         steps=run.steps,
         seconds=run.seconds,
+        differs={name: value for name, value in settings.items() if value != shared[name]},
     )
 
 

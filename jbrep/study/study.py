@@ -1,8 +1,8 @@
 """A study from start to end, and an estimate of how long it takes."""
 
-import textwrap
 from collections import Counter
 from contextlib import closing
+from typing import NamedTuple
 
 from jbrep.encoders import FULL
 from jbrep.encoders.code import is_code
@@ -12,18 +12,15 @@ from jbrep.records.storage import make_folder
 from jbrep.rl import Run
 from jbrep.rl.job import Job
 from jbrep.rl.speed import estimate
-from jbrep.stats.power import EFFECTS, prospects
-from jbrep.stats.rules import Planned
-from jbrep.stats.summary import probability
+from jbrep.stats.power import Prospect, prospects
 from jbrep.study.packing import Pack, packed, until_done
-from jbrep.study.plan import Plan
+from jbrep.study.plan import Cell, Plan
 from jbrep.study.prepare import check, prepare
-from jbrep.study.progress import Progress, duration
+from jbrep.study.progress import Progress
 from jbrep.study.registration import Registration, has_begun, register
 from jbrep.study.representations import ByCode
 from jbrep.study.runner import Backend
 from jbrep.study.work import CRASHED
-from jbrep.text import table
 
 
 def run_study(plan: Plan, backend: Backend, workers: int, width: int | None = None) -> int:
@@ -82,14 +79,24 @@ def register_study(plan: Plan) -> Registration:
     return register(plan.folder, plan.study, plan.fingerprints)
 
 
-def dry_run(plan: Plan, workers: int, width: int | None = None, columns: int | None = None) -> str:
+class Forecast(NamedTuple):
+    """What a study would do, and how long it would take."""
+
+    runs: list[tuple[Cell, int, float]]  # to go: each with its cohort's number and time [s]
+    done: int
+    seconds: float  # on one core, besides data and encoders
+    elapsed: float  # with so many workers [s]
+    workers: int
+    prospects: list[Prospect]  # of its primary cells
+
+
+def forecast(plan: Plan, workers: int, width: int | None = None) -> Forecast:
     """The runs to go, and how long they would take, estimated from a few steps of each learner.
 
     Args:
         plan: the study.
         workers: how many processes would go on at a time.
         width: the most agents that would learn together in one.
-        columns: to fit; None for no limit.
 
     Raises:
         InputError: as `run_study`, as far as that is known beforehand.
@@ -103,43 +110,15 @@ def dry_run(plan: Plan, workers: int, width: int | None = None, columns: int | N
         for kind, pack in Bar(examples.items(), desc="timing", unit="trial", delay=1, leave=False)
     }
     each = [seconds[_kind(pack)] for pack in packs]
-    rows = [
-        (cell.name, str(number), duration(each[number - 1]))
-        for number, pack in enumerate(packs, 1)
-        for cell in pack
-    ]
-    done = len(plan.cells) - len(unfinished)
-    summary = (
-        f"{len(unfinished)} runs to go, {done} done; {duration(sum(each))} on one core, "
-        f"{duration(until_done(each, workers))} with {workers} workers, besides data and encoders"
-    )
-    told = textwrap.fill(summary, columns) if columns else summary
-    parts = [table(("run", "cohort", "time"), rows, columns)] if rows else []
-    return "\n\n".join([*parts, told, *_outlook(plan, columns)])
-
-
-def _outlook(plan: Plan, columns: int | None) -> list[str]:
-    """What could be found in the primary cells."""
-    judge = Planned(plan.study.rules, plan.study.seeds)
-    if not judge.rules.primary:
-        return []
     arms = {cell.label: plan.study.arms(cell.representation) for cell in plan.cells}
-    rows = [
-        (
-            f"{each.cell}: {each.claim}",
-            f"{each.arms.units} and {each.arms.baseline}",
-            probability(each.level),
-            probability(each.least_p),
-            ", ".join(f"{100 * power:.0f} %" for power in each.power),
-        )
-        for each in prospects(judge, arms)
-    ]
-    header = ("primary cell: claim", "runs", "level", "least p", "power")
-    words = (*judge.notes, EFFECTS)
-    return [
-        table(header, rows, columns),
-        *(textwrap.fill(each, columns) if columns else each for each in words),
-    ]
+    return Forecast(
+        runs=[(cell, i + 1, each[i]) for i, pack in enumerate(packs) for cell in pack],
+        done=len(plan.cells) - len(unfinished),
+        seconds=sum(each),
+        elapsed=until_done(each, workers),
+        workers=workers,
+        prospects=list(prospects(plan.study.planned, arms)),
+    )
 
 
 def _kind(pack: Pack) -> tuple[object, ...]:

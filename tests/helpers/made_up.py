@@ -1,4 +1,4 @@
-"""A registered study whose truth is known: its runs are made up, all else is real."""
+"""Studies whose truth is known: their runs are made up, all else is real."""
 
 import numpy as np
 
@@ -8,8 +8,10 @@ from jbrep.rl.checkpoint import CheckpointFile, Snapshot
 from jbrep.rl.files import CHECKPOINT, ENCODER, RUN, Evaluation, write_rows
 from jbrep.rl.history import History
 from jbrep.rl.job import packages
+from jbrep.rl.learner import Learner
 from jbrep.rl.record import FAILED, FINISHED, RunRecord
 from jbrep.study.config import as_study
+from jbrep.study.record import EncoderFacts, Label, LabelSettings
 
 STILL = 250
 # what runs of each representation end with on average, with what SD, and when they come to half
@@ -31,6 +33,23 @@ STUDY = as_study(
         },
     }
 )
+
+
+def label_of(task, representation, encoder=(), decoder=(), kind="dae", latent_size=0, **training):
+    """What runs.json says of the runs of SAC on a task, and of their encoder, layer by layer."""
+    learner = Learner.of("sac")
+    settings = LabelSettings(
+        **{"task": task.name, "environment": task, "representation": representation},
+        **{"algorithm": "sac", "preset": "paper", "learner": "sac", "overrides": {}},
+        **{"hyperparameters": learner.hyperparameters, "encoder": "0" * 64, "encoder_code": None},
+        **{"steps": 20_000, "evaluate_every": 2000, "evaluation_episodes": 2, "final_episodes": 2},
+        **{"trainer": "sb3", "device": "cpu", "begin_from": None},
+    )
+    facts = EncoderFacts(
+        **{"name": representation, "kind": kind, "size": task.size, "latent_size": latent_size},
+        **{"encoder": encoder, "decoder": decoder, "training": training, "data": {}, "metrics": {}},
+    )
+    return Label(settings=settings, encoder=facts)
 
 
 def make_runs(plan, seeds):

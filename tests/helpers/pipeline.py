@@ -12,9 +12,9 @@ import pytest
 from command import in_this_process, jbrep, start, wait_for, wait_for_the_end_of, workers_of
 from small import contents
 
-from jbrep.report.report import SUMMARY
+from jbrep.report.report import STATISTICS, SUMMARY
 from jbrep.study.references import REFERENCE_RETURNS
-from jbrep.study.results import RETURNS, STATISTICS
+from jbrep.study.results import RETURNS
 from jbrep.study.runner import BACKENDS
 
 STUDY = """
@@ -56,7 +56,7 @@ def in_peace(folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(BACKENDS, "local", in_this_process)
         with pytest.MonkeyPatch.context() as once:
-            once.setattr("jbrep.report.write_report", lambda folder, out: [])
+            once.setattr("jbrep.report.report.write_report_of", lambda tables, out: [])
             said = {stage: jbrep(*given).output for stage, given in stages(folder).items()}
         return said | {"report": jbrep("report", folder / "study").output}
 

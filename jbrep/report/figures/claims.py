@@ -13,14 +13,15 @@ from jbrep.report.figures.curves import Groups, cell, names_with_runs
 from jbrep.report.figures.limits import limits
 from jbrep.report.figures.plot import Plot
 from jbrep.report.figures.style import COLUMN, PAGE, Looks, Styles, mark_cut, plain, reference
+from jbrep.report.words import Statement, statements
 from jbrep.stats.analysis import Analysis, GroupAnalysis
-from jbrep.stats.verdict import Verdict
+from jbrep.stats.claims import Verdict
 
 _MAX_DECADES = 4  # of a ratio, on each side of 1
 _ACROSS = 38  # characters of a panel's axis
 
 
-def claims(analysis: Analysis, looks: Looks) -> Plot:
+def claim_plot(analysis: Analysis, looks: Looks) -> Plot:
     """The estimate of each claim, with its boundary."""
     return Plot(
         "claims",
@@ -49,17 +50,18 @@ def _rows(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
 def _draw(analysis: Analysis, looks: Looks) -> Figure:
     """A row of panels for each group, a column for each estimand, to one scale each."""
     groups = [group for group in analysis.groups if group.comparisons]
-    look, columns = looks(), _columns(analysis)
+    look, claims = looks(), statements(analysis.planned)
+    columns = _columns(claims)
     most = max(len(group.comparisons) for group in groups)
     width = COLUMN if len(columns) == 1 else PAGE
     figure = Figure(figsize=(width, 0.2 + (0.75 + 0.19 * most) * len(groups)))
     panels = figure.subplots(len(groups), len(columns), squeeze=False, sharey="row")
     for j, numbers in enumerate(columns):
-        claim = analysis.claims[numbers[0]]
+        claim = claims[numbers[0]]
         for axes, group in zip(panels[:, j], groups, strict=True):
             _scale(axes, claim.is_ratio, groups, numbers)
             _draw_panel(axes, group, numbers, look)
-            title = ", ".join(analysis.claims[number].name for number in numbers)
+            title = ", ".join(claims[number].name for number in numbers)
             axes.set_title(plain(f"{group.name}\n{title}" if j == 0 else f"\n{title}"))
             axes.set_xlabel(textwrap.fill(plain(claim.estimand), _ACROSS))
     for axes, group in zip(panels[:, 0], groups, strict=True):
@@ -69,10 +71,10 @@ def _draw(analysis: Analysis, looks: Looks) -> Figure:
     return figure
 
 
-def _columns(analysis: Analysis) -> list[list[int]]:
+def _columns(claims: Sequence[Statement]) -> list[list[int]]:
     """The numbers of the claims of each estimand."""
     found: dict[str, list[int]] = {}
-    for number, claim in enumerate(analysis.claims):
+    for number, claim in enumerate(claims):
         found.setdefault(claim.estimand, []).append(number)
     return [*found.values()]
 

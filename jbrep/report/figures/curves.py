@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,12 +22,12 @@ from jbrep.report.figures.style import (
     with_runs,
 )
 from jbrep.stats.analysis import GroupAnalysis
+from jbrep.study.references import References
+from jbrep.study.results import Return
 
 Groups = Sequence[GroupAnalysis]
 Evaluated = tuple[str, str, str, int, int]  # task, algorithm, representation, seed, step
 Runs = dict[int, dict[int, float]]  # mean returns of a label, by seed and step
-# returns of policies that learn nothing, by task and policy
-References = dict[str, dict[str, list[float]]]
 
 _MOST_ACROSS = 5  # panels of runs side by side
 _TITLE = 0.062  # width of a character in a panel's title [inches]
@@ -38,18 +38,6 @@ _COLUMNS = (
     *("task", "algorithm", "representation", "step"),
     *("p10", "p50", "p90", "iqm", "iqm_low", "iqm_high"),
 )
-
-
-class Return(NamedTuple):
-    """A row of returns.csv: an episode of an evaluation."""
-
-    task: str
-    algorithm: str
-    representation: str
-    seed: int
-    step: int
-    episode: int
-    episode_return: float
 
 
 def curves(groups: Groups, references: References, looks: Looks) -> Plot:

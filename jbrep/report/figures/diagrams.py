@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from textwrap import fill
-from typing import Any, NotRequired, TypedDict
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,99 +12,34 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from jbrep.dataset.scaling import EXTREMA
+from jbrep.envs.task import Task
 from jbrep.report.figures.plot import Plot
 from jbrep.report.figures.style import PAGE, Looks, ink, panel_grid, plain
+from jbrep.study.record import EncoderFacts, Label, ShownFacts
 
 _MOST = 20  # units of a layer that are drawn
 _TITLE = 45  # characters on a line above a panel
 _BOX = 19  # characters on a line of a box
 
 
-class TaskRecord(TypedDict):
-    """What is drawn of a task's description."""
-
-    action_low: list[float]  # of each action
-    action_high: list[float]
-    timestep: float | None  # [s]
-
-
-class Settings(TypedDict):
-    """What runs that differ by seed alone share; settings that nothing here reads come beside."""
-
-    task: str
-    algorithm: str
-    preset: str
-    representation: str
-    encoder: str  # its SHA-256, or that runs have different encoders
-    encoder_code: NotRequired[str | None]  # module:Class, if it is code
-    learner: str
-    hyperparameters: Mapping[str, Any]
-    steps: int
-    evaluate_every: int
-    evaluation_episodes: int
-    environment: NotRequired[TaskRecord]
-
-
-class Training(TypedDict, total=False):
-    """How an encoder was trained."""
-
-    noise: float  # standard deviation of the corruption
-    scaling: str  # of the features, if not by their extrema
-    angles: bool  # whether each angle is encoded as its sine and cosine
-    keep: list[str]  # features that pass around the encoder
-
-
-class Data(TypedDict, total=False):
-    """What an encoder was trained on."""
-
-    train_rows: int
-
-
-class Metrics(TypedDict, total=False):
-    """What training measured."""
-
-    held_out_mse: float | None
-
-
-class EncoderRecord(TypedDict):
-    """An encoder, layer by layer: units and activation."""
-
-    name: str
-    kind: str
-    size: int  # of the observation
-    latent_size: NotRequired[int]
-    encoder: list[tuple[int, str]]
-    decoder: list[tuple[int, str]]
-    training: Training
-    data: Data
-    metrics: Metrics
-
-
-class LabelRecord(TypedDict):
-    """A label in runs.json."""
-
-    settings: Settings
-    encoder: EncoderRecord
-
-
-def diagrams(labels: Mapping[str, LabelRecord], looks: Looks) -> list[Plot]:
+def diagrams(labels: Mapping[str, Label], looks: Looks) -> list[Plot]:
     """The paper's Fig. 6 and Fig. 2; nothing of a study without reduced states."""
-    reduced = [shared for shared in labels.values() if shared["encoder"]["encoder"]]
-    drawn = [shared for shared in reduced if shared["encoder"]["kind"] == "dae"] or reduced
+    reduced = [shared for shared in labels.values() if shared.encoder.encoder]
+    drawn = [shared for shared in reduced if shared.encoder.kind == "dae"] or reduced
     if not drawn:
         return []
-    task = drawn[0]["settings"]["task"]
-    of_task = [shared for shared in drawn if shared["settings"]["task"] == task]
-    by_representation = {each["settings"]["representation"]: each["encoder"] for each in of_task}
+    task = drawn[0].settings.task
+    of_task = [shared for shared in drawn if shared.settings.task == task]
+    by_representation = {each.settings.representation: each.encoder for each in of_task}
     return [system(drawn[0], looks), autoencoders(task, by_representation, looks)]
 
 
-def autoencoders(task: str, encoders: Mapping[str, EncoderRecord], looks: Looks) -> Plot:
+def autoencoders(task: str, encoders: Mapping[str, EncoderFacts], looks: Looks) -> Plot:
     """The encoders of a task with their decoders, unit by unit; by representation."""
     rows = [
         (name, part, i, *layer)
         for name, encoder in encoders.items()
-        for part, layers in (("encoder", encoder["encoder"]), ("decoder", encoder["decoder"]))
+        for part, layers in (("encoder", encoder.encoder), ("decoder", encoder.decoder))
         for i, layer in enumerate(layers)
     ]
     return Plot(
@@ -118,28 +53,27 @@ def autoencoders(task: str, encoders: Mapping[str, EncoderRecord], looks: Looks)
     )
 
 
-def _draw_autoencoders(encoders: Mapping[str, EncoderRecord], looks: Looks) -> Figure:
+def _draw_autoencoders(encoders: Mapping[str, EncoderFacts], looks: Looks) -> Figure:
     figure, panels = panel_grid(len(encoders), 2.5)
     look = looks()
     for axes, (representation, encoder) in zip(panels, encoders.items(), strict=True):
         axes.set_axis_off()
         _draw_layers(axes, encoder, look[representation]["color"])
-        axes.set_title(plain(_title(representation, encoder["training"])), loc="center")
+        axes.set_title(plain(_title(representation, encoder.shown)), loc="center")
     return figure
 
 
-def _title(representation: str, training: Training) -> str:
+def _title(representation: str, facts: ShownFacts) -> str:
     """The name, what it was trained with, and on a line below, what passes around it."""
-    noise, kept = training.get("noise"), training.get("keep")
-    corrupted = f", trained with noise N(0, {noise:g}²)" if noise else ""
-    beside = f"{', '.join(kept)} passed around" if kept else ""
+    corrupted = f", trained with noise N(0, {facts.noise:g}²)" if facts.noise else ""
+    beside = f"{', '.join(facts.keep)} passed around" if facts.keep else ""
     return "\n".join(filter(None, (f"{representation}{corrupted}", fill(beside, _TITLE))))
 
 
-def _draw_layers(axes: Axes, encoder: EncoderRecord, colour: str) -> None:
+def _draw_layers(axes: Axes, encoder: EncoderFacts, colour: str) -> None:
     """A column of units for each layer, joined to the next one's."""
-    sizes = [(encoder["size"], "scaled"), *encoder["encoder"], *encoder["decoder"]]
-    latent = len(encoder["encoder"])
+    sizes = [(encoder.size, "scaled"), *encoder.encoder, *encoder.decoder]
+    latent = len(encoder.encoder)
     columns = [_heights(units) for units, _ in sizes]
     for x, (left, right) in enumerate(pairwise(columns)):
         lines = [((x, a), (x + 1, b)) for a in left for b in right]
@@ -161,27 +95,27 @@ def _heights(units: int) -> Any:
     return 0.5 + (np.arange(shown) - (shown - 1) / 2) / _MOST
 
 
-def _hidden(layers: list[int] | dict[str, list[int]]) -> str:
+def _hidden(layers: Sequence[int] | Mapping[str, Sequence[int]]) -> str:
     """Units of hidden layers: 64-64, or pi 64-64, qf 256-256."""
-    if isinstance(layers, dict):
+    if isinstance(layers, Mapping):
         return ", ".join(f"{name} {_hidden(units)}" for name, units in layers.items())
     return "-".join(map(str, layers)) or "none"
 
 
-def system(shared: LabelRecord, looks: Looks) -> Plot:
+def system(shared: Label, looks: Looks) -> Plot:
     """Robot, observation, encoder, agent, action."""
-    settings, encoder = shared["settings"], shared["encoder"]
-    latent = encoder.get("latent_size", encoder["encoder"][-1][0])
-    hidden = _hidden(settings["hyperparameters"]["net_arch"])
-    task = settings.get("environment")
-    action = _action(task) if task else ""
-    step = f" of {task['timestep']:g} s" if task and task["timestep"] else ""
+    settings, encoder = shared.settings, shared.encoder
+    latent = encoder.latent_size or encoder.encoder[-1][0]
+    hidden = _hidden(settings.hyperparameters.net_arch)
+    task = settings.environment
+    action = _action(task)
+    step = f" of {task.timestep:g} s" if task.timestep else ""
     boxes = [
-        ("robot", settings["task"] + (f"\nsteps{step}" if step else "")),
-        ("observation", f"{encoder['size']} features\n{_scaled(encoder['training'])}"),
-        ("encoder", f"{settings['representation']}\n{encoder['size']} to {latent}"),
+        ("robot", settings.task + (f"\nsteps{step}" if step else "")),
+        ("observation", f"{encoder.size} features\n{_scaled(encoder.shown)}"),
+        ("encoder", f"{settings.representation}\n{encoder.size} to {latent}"),
         ("latent", f"{latent} numbers"),
-        ("agent", f"{settings['algorithm'].upper()}\nhidden {hidden}"),
+        ("agent", f"{settings.algorithm.upper()}\nhidden {hidden}"),
     ]
     return Plot(
         "system",
@@ -189,21 +123,20 @@ def system(shared: LabelRecord, looks: Looks) -> Plot:
         f"What an agent sees and does in each step{step}.",
         ("part", "what"),
         [(name, what.replace("\n", ", ")) for name, what in [*boxes, ("action", action)]],
-        lambda: _draw_system(boxes, action, looks()[settings["representation"]]["color"]),
+        lambda: _draw_system(boxes, action, looks()[settings.representation]["color"]),
     )
 
 
-def _scaled(training: Training) -> str:
-    scaling = training.get("scaling", EXTREMA)
-    how = "scaled to [-1, 1]" if scaling == EXTREMA else f"{scaling} scaling"
-    return f"{how}, angles as sine and cosine" if training.get("angles") else how
+def _scaled(facts: ShownFacts) -> str:
+    how = "scaled to [-1, 1]" if facts.scaling == EXTREMA else f"{facts.scaling} scaling"
+    return f"{how}, angles as sine and cosine" if facts.angles else how
 
 
-def _action(task: TaskRecord) -> str:
+def _action(task: Task) -> str:
     """Such as 6 numbers in [-1, 1]; without bounds where they differ."""
-    count = len(task["action_low"])
+    count = len(task.action_low)
     numbers = "1 number" if count == 1 else f"{count} numbers"
-    bounds = set(zip(task["action_low"], task["action_high"], strict=False))
+    bounds = set(zip(task.action_low, task.action_high, strict=True))
     return f"{numbers} in [{{:g}}, {{:g}}]".format(*bounds.pop()) if len(bounds) == 1 else numbers
 
 

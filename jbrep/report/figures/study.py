@@ -6,29 +6,32 @@ from functools import partial
 
 from jbrep.encoders import FULL
 from jbrep.report.figures.across import across_tasks
-from jbrep.report.figures.claims import claims
-from jbrep.report.figures.curves import References, Return, curves, every_run
+from jbrep.report.figures.claims import claim_plot
+from jbrep.report.figures.curves import curves, every_run
 from jbrep.report.figures.diagnostics import diagnostics
-from jbrep.report.figures.diagrams import LabelRecord, diagrams
+from jbrep.report.figures.diagrams import diagrams
 from jbrep.report.figures.plot import Plot
 from jbrep.report.figures.returns import final_return, learning_rate, profiles
 from jbrep.report.figures.style import styles
 from jbrep.stats import Analysis
 from jbrep.stats.association import Association
 from jbrep.stats.runs import in_order
+from jbrep.study.record import Label
+from jbrep.study.references import References
+from jbrep.study.results import Return
 
 
 def study_plots(
     analysis: Analysis | None,
     returns: Sequence[Return],
     references: References,
-    labels: Mapping[str, LabelRecord],
+    labels: Mapping[str, Label],
     associations: Sequence[Association] = (),
 ) -> list[Plot]:
     """The figures that the tables of a study allow; a representation has one colour in all.
 
     Args:
-        analysis: statistics.json; None if there is none.
+        analysis: the statistics; None if there are none.
         returns: returns.csv.
         references: returns of policies that learn nothing, by task and policy.
         labels: of runs.json.
@@ -39,14 +42,14 @@ def study_plots(
     names = {
         *(row.representation for row in returns),
         *(label.representation for group in groups for label in group.labels),
-        *(shared["settings"]["representation"] for shared in labels.values()),
+        *(shared.settings.representation for shared in labels.values()),
     }
     looks = partial(styles, in_order(names, baseline), baseline if baseline in names else None)
     plots, shown = [], _on_the_same_starts(references, returns)
     if analysis:
         plots += [curves(groups, shown, looks), final_return(groups, looks)]
         if any(group.comparisons for group in groups):
-            plots.append(claims(analysis, looks))
+            plots.append(claim_plot(analysis, looks))
         plots += [learning_rate(groups, looks), profiles(analysis, looks)]
         if analysis.aggregates:
             plots.append(across_tasks(analysis, looks))
