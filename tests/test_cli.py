@@ -53,7 +53,7 @@ def test_a_run_from_training_to_its_returns(tmp_path):
     assert (tmp_path / "runs" / "returns.csv").exists()
     again = jbrep("rl", "--task", "face_direction", "--seed", 1, "--out", run)
     assert (again.exit_code, again.output.count("\n")) == (2, 1)
-    assert "holds another run: algorithm a2c (now: sac)" in again.output
+    assert "holds another run: steps 40 (now: 100000)" in again.output
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
@@ -150,11 +150,11 @@ MISTAKES = {
     "encoder info none": "no encoder at none",
     "encoder info dae-9 --task face_direction": "no encoder 'dae-9'",
     "rl --task face_direction --encoder x --out y": "no encoder 'x'",
-    "rl --task face_direction --out x --trainer both": "unknown trainer 'both': choose one of coho",
+    "rl --task face_direction --out x --trainer both": "trainer is 'both': it must be",
     "rl --task face_direction --out x --algorithm ppo --trainer cohort": "not ppo: add --trainer s",
     "rl --task face_direction --out x --algorithm ppo --precision bfloat16": "sb3 has no bfloat16",
-    "rl --task face_direction --out x --precision half": "unknown precision 'half'",
-    "rl --task face_direction --out x --device tpu": "no device 'tpu' on this machine",
+    "rl --task face_direction --out x --precision half": "precision is 'half': it must be one of",
+    "rl --task face_direction --out x --device tpu": "device is 'tpu': it must be one of",
     "report none": "none is not the folder of a study",
     "report": "Missing argument 'FOLDER'. See jbrep report --help.",
     "fly": "No such command 'fly'. See jbrep --help.",

@@ -281,7 +281,7 @@ def test_intrinsic_dimensions_of_what_is_known():
 
 
 def test_quantities_are_those_of_the_simulated_body():
-    task = TASKS["move_to_pose"]
+    task = TASKS["move_to_pose"].describe()
     random = np.random.default_rng(0)
     rows = random.normal(size=(50, task.size))
     rows[:, 3:7] /= np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
@@ -307,7 +307,8 @@ def test_quantities_are_those_of_the_simulated_body():
 
 
 def test_every_task_has_its_quantities():
-    known = {name: quantities(task, np.ones((1, task.size))) for name, task in TASKS.items()}
+    tasks = {name: task.describe() for name, task in TASKS.items()}
+    known = {name: quantities(task, np.ones((1, task.size))) for name, task in tasks.items()}
     with_target = {name for name, each in known.items() if "bearing_of_target" in each}
     assert with_target == {"move_to_position", "move_to_pose"}
 
