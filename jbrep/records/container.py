@@ -114,4 +114,5 @@ def _header(raw: bytes) -> dict[str, Any]:
     header = json.loads(text)
     if not isinstance(header, dict) or json.dumps(header) != text:
         raise TypeError("its header is not in the form that jbrep writes")
+    json.dumps(header, ensure_ascii=False).encode()  # half a character can't be written again
     return header

@@ -9,6 +9,7 @@ from jbrep.rl.files import CHECKPOINT, ENCODER, RUN, Evaluation, write_rows
 from jbrep.rl.history import History
 from jbrep.rl.job import packages
 from jbrep.rl.learner import Learner
+from jbrep.rl.overrides import check_shape
 from jbrep.rl.record import FAILED, FINISHED, RunRecord
 from jbrep.study.config import as_study
 from jbrep.study.record import EncoderFacts, Label, LabelSettings
@@ -95,9 +96,8 @@ def write_record(folder, run, reason=None, **changes):
 def write_checkpoint(folder, run, step):
     """A run under way at that step, with the policy that it began with; returns its agent."""
     encoder = find(run.encoder, run.task)
-    agent = make_agent(
-        run.learner.algorithm, run.learner.hyperparameters, Spaces(run.task, encoder), run.seed
-    )
+    shape = check_shape(run.learner.algorithm, run.learner.hyperparameters)
+    agent = make_agent(run.learner.algorithm, shape, Spaces(run.task, encoder), run.seed)
     tensors = {f"parameters.{name}": each.numpy() for name, each in parameters(agent)}
     file = CheckpointFile(folder / CHECKPOINT, run.settings(encoder), packages(), History())
     file.write(Snapshot(tensors, {"num_timesteps": step}))
