@@ -28,21 +28,6 @@ def kind_and_line(error: BaseException) -> str:
     return line if line == kind else f"{kind}: {line}"
 
 
-def check_version(path: object, version: Any, newest: int) -> None:
-    """Make sure that a file's format version is one that this jbrep reads: 1 to the newest.
-
-    Raises:
-        InputError: it is newer.
-        DamageError: it isn't a version number.
-    """
-    if type(version) is not int or version < 1:
-        raise DamageError(f"{path} is damaged: its format version is {version!r}")
-    if version > newest:
-        raise InputError(
-            f"{path} has format version {version}: this jbrep reads up to {newest}; update jbrep"
-        )
-
-
 def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:
     """The choice of that name.
 

@@ -12,8 +12,7 @@ from jbrep.errors import InputError
 from jbrep.records.tables import write_csv
 from jbrep.report import write_report
 from jbrep.report.figures import study_plots, write
-from jbrep.report.figures.limits import limits
-from jbrep.report.figures.style import PAPER
+from jbrep.report.figures.style import PAPER, limits
 from jbrep.report.statistics import statistics_text
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Interval

@@ -6,14 +6,13 @@ from jbrep.cli.base import Cli
 from jbrep.cli.data import collect, data
 from jbrep.cli.doctor import doctor
 from jbrep.cli.encoders import encoder, evaluate
-from jbrep.cli.env import env
+from jbrep.cli.environment import env
 from jbrep.cli.inspect import inspect
 from jbrep.cli.policies import behaviour, evaluate_policy, policies
 from jbrep.cli.render import render
-from jbrep.cli.rl import rl
+from jbrep.cli.rl import rl, tune
 from jbrep.cli.study import report, study
 from jbrep.cli.train import train_dae, train_encoder
-from jbrep.cli.tune import tune
 
 
 @click.group(cls=Cli, context_settings={"help_option_names": ["-h", "--help"]})

@@ -11,13 +11,92 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from jbrep.cli.output import lasting_output
 from jbrep.errors import InputError
 from jbrep.text import rounded
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+import errno
+import os
+import sys
+from contextlib import suppress
+from typing import TextIO
+
+
+@contextmanager
+def lasting_output() -> Iterator[None]:
+    """Let a command finish its work whatever becomes of its output.
+
+    A reader that has seen enough, as `head` has, is no error. Output that is lost for want of
+    space is told on standard error once the work is done, and ends the command with code 1.
+    """
+    _open_standard_descriptors()
+    streams = sys.stdout, sys.stderr
+    out, err = _Lasting(sys.stdout), _Lasting(sys.stderr)
+    sys.stdout, sys.stderr = out, err
+    try:
+        yield
+    except SystemExit as ending:
+        out.flush()
+        if out.is_incomplete and not ending.code:
+            err.write(f"Error: can't write the output: {os.strerror(out.error)}\n")
+            raise SystemExit(1) from None
+        raise
+    finally:
+        out.flush()
+        err.flush()
+        sys.stdout, sys.stderr = streams
+
+
+def _open_standard_descriptors() -> None:
+    """Fill those that are closed, or else the next files to be opened would take their places."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free one
+
+
+class _Lasting:
+    """A text stream that goes quiet at the first error.
+
+    Attributes:
+        error: the number of that error; 0 before it.
+    """
+
+    def __init__(self, stream: TextIO | None):
+        self._stream: Any = stream or open(os.devnull, "w")  # noqa: PTH123, SIM115
+        self.error = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    @property
+    def is_incomplete(self) -> bool:
+        """Whether something is missing of what a reader still waits for."""
+        return self.error not in (0, errno.EPIPE)
+
+    def write(self, text: str) -> int:
+        try:
+            return self._stream.write(text)
+        except OSError as error:
+            self._silence(error)
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            self._stream.flush()
+        except OSError as error:
+            self._silence(error)
+
+    def _silence(self, error: OSError) -> None:
+        """Send what is still buffered, and all that follows, nowhere."""
+        self.error = self.error or error.errno or errno.EIO
+        with suppress(OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._stream.fileno())
+            os.close(nowhere)
 
 
 class _Count(click.ParamType[int]):

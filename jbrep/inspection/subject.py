@@ -1,9 +1,15 @@
 """Recordings of whatever a user names: an episode, an encoder or a study."""
 
 import re
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
 
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
@@ -13,16 +19,73 @@ from jbrep.encoders.file import SUFFIX as ENCODER_SUFFIX
 from jbrep.encoders.shipped import find_alone, source_of
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
-from jbrep.inspection.curves import record_curves
+from jbrep.inspection.blueprint import TRAINING_STEP, curves_layout
 from jbrep.inspection.episode import record_episode
 from jbrep.inspection.forecast import Examples, from_dataset
-from jbrep.inspection.recording import SUFFIX, check_out
+from jbrep.inspection.recording import SUFFIX, Recording, check_out, palette
 from jbrep.inspection.traversal import record_traversal
 from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode, is_trained, policy_file, run_folder
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, is_run
+from jbrep.stats import RunCurve
+from jbrep.stats.bootstrap import Array
+from jbrep.stats.runs import in_order, with_failure_returns
 from jbrep.study.results import has_runs, read_runs
+
+_RUN_WIDTH = 1.0  # [points]
+_MEDIAN_WIDTH = 4.0  # [points]
+
+
+def median_curve(runs: Sequence[RunCurve]) -> tuple[NDArray[np.int64], Array]:
+    """Median over runs at the steps at which all were evaluated.
+
+    A failed run counts as its failure_return from the step at which it failed.
+    """
+    whole = [run.steps for run in runs if run.failed_at is None] or [runs[0].curve()[0]]
+    steps: NDArray[np.int64] = reduce(np.intersect1d, whole)
+    each = [np.interp(steps, *run.curve()) for run in runs]
+    return steps, np.median(each, axis=0)
+
+
+def record_curves(runs: Sequence[RunCurve], source: str, path: Path) -> None:
+    """Write the training curves of runs, with a colour for each representation.
+
+    Args:
+        runs: of one study, or of several.
+        source: their folder, as the recording's title.
+        path: the .rrd file.
+
+    Raises:
+        InputError: the file can't be written.
+    """
+    labels = defaultdict(list)
+    for run in sorted(with_failure_returns(runs), key=lambda run: (run.label, run.seed)):
+        labels[run.label].append(run)
+    representations = in_order((run.representation for run in runs), FULL)
+    colours = dict(zip(representations, palette(len(representations)), strict=True))
+    numbers = [number for run in runs for number in (run.steps, run.returns)]
+    recording = Recording(source, _about(source, labels), *numbers)
+    for label, group in labels.items():
+        name = group[0].representation
+        curves = {f"seed-{run.seed}": (run.curve(), _RUN_WIDTH) for run in group}
+        curves["median"] = median_curve(group), _MEDIAN_WIDTH
+        for curve, ((steps, returns), width) in curves.items():
+            times = [rr.TimeColumn(TRAINING_STEP, sequence=steps)]
+            look = [name], [colours[name]], width
+            recording.send_series(f"{label}/{curve}", times, returns[:, None], *look)
+    groups = sorted({f"{run.task}/{run.algorithm}" for run in runs})
+    recording.write(path, curves_layout(groups, max(int(run.curve()[0][-1]) for run in runs)))
+
+
+def _about(source: str, labels: dict[str, list[RunCurve]]) -> str:
+    """The runs and their final returns, as Markdown."""
+    lines = [f"# {source}", "", "| runs | seeds | median return at the end |", "|---|---|---|"]
+    for label, runs in labels.items():
+        last = np.median([run.curve()[1][-1] for run in runs])
+        lines.append(f"| {label} | {len(runs)} | {last:.0f} |")
+    return "\n".join(lines)
+
 
 FOLDER = Path("inspect")  # of recordings without an --out
 _POLICY = "uniform"  # plays the episode that an encoder alone is shown on

@@ -10,9 +10,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from jbrep.report.figures.curves import Groups, cell, names_with_runs
-from jbrep.report.figures.limits import limits
 from jbrep.report.figures.plot import Plot
-from jbrep.report.figures.style import COLUMN, PAGE, Looks, Styles, mark_cut, plain, reference
+from jbrep.report.figures.style import (
+    COLUMN,
+    PAGE,
+    Looks,
+    Styles,
+    limits,
+    mark_cut,
+    plain,
+    reference,
+)
 from jbrep.report.words import Statement, statements
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.claims import Verdict

@@ -9,9 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jbrep.report.figures.curves import below, cell
-from jbrep.report.figures.limits import limits
 from jbrep.report.figures.plot import Plot
-from jbrep.report.figures.style import PAGE, Looks, Styles, ink, plain, reference
+from jbrep.report.figures.style import PAGE, Looks, Styles, ink, limits, plain, reference
 from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.association import Association
 

@@ -19,10 +19,9 @@ from jbrep.evaluate.evaluation import (
 )
 from jbrep.report.figures.curves import below
 from jbrep.report.figures.families import Encoders, family, family_styles
-from jbrep.report.figures.heat_map import MOST, bare, heat_map, least
 from jbrep.report.figures.methods import method_plots
 from jbrep.report.figures.plot import Plot
-from jbrep.report.figures.prediction import prediction_plots
+from jbrep.report.figures.prediction import MOST, bare, heat_map, least, prediction_plots
 from jbrep.report.figures.style import COLUMN, PAGE, ink, plain, reference
 
 _ERROR = ("mse", "low", "high")

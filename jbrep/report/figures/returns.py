@@ -8,13 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jbrep.report.figures.curves import Groups, below, cell, names_with_runs
-from jbrep.report.figures.limits import Limits, limits
 from jbrep.report.figures.plot import Plot
 from jbrep.report.figures.style import (
     COLUMN,
     PAGE,
+    Limits,
     Looks,
     Styles,
+    limits,
     mark_cut,
     plain,
     reference,

@@ -5,9 +5,8 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from jbrep.encoders import FULL
-from jbrep.report.figures.across import across_tasks
 from jbrep.report.figures.claims import claim_plot
-from jbrep.report.figures.curves import curves, every_run
+from jbrep.report.figures.curves import across_tasks, curves, every_run
 from jbrep.report.figures.diagnostics import diagnostics
 from jbrep.report.figures.diagrams import diagrams
 from jbrep.report.figures.plot import Plot
