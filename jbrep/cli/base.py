@@ -1,13 +1,16 @@
 """What the commands share: how mistakes are shown, Ctrl-C, numbers as people write them."""
 
+import errno
 import json
 import math
+import os
 import signal
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 import click
 
@@ -17,11 +20,6 @@ from jbrep.text import rounded
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-import errno
-import os
-import sys
-from contextlib import suppress
-from typing import TextIO
 
 
 @contextmanager
