@@ -1,0 +1,80 @@
+"""The tools that make what ships and what results/ shows, at small size."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_up import write_record
+
+from jbrep.dataset import Dataset
+from jbrep.encoders import load
+from jbrep.envs import describe
+from jbrep.rl import Run
+from jbrep.rl.files import EPISODES, Episode, write_rows
+
+ROOT = Path(__file__).parent.parent
+FACE, MOVE = "face_direction", "move_in_direction"
+
+
+@pytest.fixture(autouse=True)
+def tools(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tools")
+
+
+def test_ablations_give_and_take_a_feature(tmp_path):
+    import ablate
+
+    ablate.main(ablate.STUDIES["ablation-speed"], tmp_path)
+    codes = {path.stem: load(path) for path in (tmp_path / MOVE).iterdir()}
+    assert sorted(codes) == [
+        *("dae-8-with-speed", "dae-8-with-speed-and-yaw-rate"),
+        *("forward-8-without-speed", "full-without-speed"),
+    ]
+    rows = Dataset(ROOT / "data/sample" / MOVE)["observation"][:50]
+    changed = rows.copy()
+    changed[:, describe(MOVE).feature_names.index("velocity_in_target_frame_x")] += 0.1
+    differs = {n: np.abs(e.encode(rows) - e.encode(changed)).max(0) for n, e in codes.items()}
+    assert differs["dae-8-with-speed"][-1] > 0.01
+    assert len(differs["dae-8-with-speed"]) == 9
+    assert not differs["forward-8-without-speed"].any()
+    assert not differs["full-without-speed"].any()
+
+
+def test_the_overview_of_encoders_is_the_one_on_their_page(capsys, monkeypatch):
+    import encoders
+
+    monkeypatch.setattr(sys, "argv", ["encoders", "data", "encoders", "results/encoders"])
+    encoders.main()
+    page = (ROOT / "results/encoders/README.md").read_text()
+    lines = capsys.readouterr().out.strip().splitlines()
+    rows = {line for line in lines[2:] if line.split("|")[1].strip() != "full"}
+    assert len(rows) > 20
+    assert not [line for line in rows if line not in page]
+
+
+def test_the_best_agent_is_the_best_at_the_end_of_training(tmp_path):
+    import policies
+
+    for seed, late in ((0, 300.0), (1, 500.0), (2, 400.0)):
+        folder = tmp_path / "study" / str(seed)
+        folder.mkdir(parents=True)
+        run = Run.of(FACE, "sac", seed=seed, steps=1000)
+        write_record(folder, run)
+        rows = [Episode(500, 0, 900.0 - late, 100, False), Episode(1000, 0, late, 100, False)]
+        write_rows(folder / EPISODES, rows, Episode)
+    assert policies.best([tmp_path]) == {FACE: (500.0, tmp_path / "study" / "1")}
+
+
+def test_the_search_for_a_gait_tells_constants_and_returns(capsys, monkeypatch):
+    import tune_heuristics as tool
+
+    short = describe(FACE).replace(max_episode_steps=20)
+    monkeypatch.setattr(tool, "describe", lambda name: short)
+    for name, value in (("SEARCH_EPISODES", 2), ("TEST_EPISODES", 2), ("REPORT_EVERY", 1)):
+        monkeypatch.setattr(tool, name, value)
+    monkeypatch.setattr(sys, "argv", ["tune", FACE, "--minutes", "0.001"])
+    tool.main()
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].startswith("generation 1: ")
+    assert "Turn(" in told[0]
