@@ -18,7 +18,6 @@ from jbrep.dataset.manifest import (
     write_manifest,
 )
 from jbrep.dataset.verify import find_problems
-from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.jitterbug import model
 from jbrep.jitterbug.tasks import TASKS
@@ -70,16 +69,6 @@ def test_a_derived_data_set_is_the_collected_one(task, brief, tmp_path):
     collect(wanted, tmp_path / "collected")
     written = derive(brief, task, tmp_path / "derived", wanted.store_state)
     assert written.rows == 500
-    assert contents(tmp_path / "derived") == contents(tmp_path / "collected")
-
-
-def test_so_it_is_for_other_policies_and_wider_shards(tmp_path):
-    policy = {"kind": "ornstein-uhlenbeck", "mu": 0.1, "theta": 1.0, "sigma": 0.5}
-    some = small.brief(steps=300, shard_episodes=2, policy=policy)
-    collect(some, tmp_path / "source")
-    position = describe("move_to_position", max_episode_steps=100)
-    collect(some.replace(task=position, store_state=False), tmp_path / "collected")
-    derive(tmp_path / "source", "move_to_position", tmp_path / "derived")
     assert contents(tmp_path / "derived") == contents(tmp_path / "collected")
 
 

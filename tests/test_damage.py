@@ -194,6 +194,10 @@ def settings_of(**changes):
     return lambda record: record["settings"].update(changes)
 
 
+def environment_of(**changes):
+    return lambda record: record["settings"]["environment"].update(changes)
+
+
 def versions_of(jbrep):
     return lambda record: record["versions"].update(jbrep=jbrep)
 
@@ -219,16 +223,14 @@ def entry_of(**changes):
         (manifest_of(shards={}), "is damaged .*: shards is {}: it must be a list of tables"),
         (manifest_of(shards=[[]]), "is damaged"),
         (manifest_of(versions=[]), "is damaged"),
-        (settings_of(task="fly"), "is damaged"),
-        (settings_of(task=["fly"]), "is damaged"),
+        (lambda record: record["settings"].pop("seed"), "is damaged: it isn't what jbrep wrote"),
+        (settings_of(task="fly"), "is damaged: it isn't what jbrep wrote"),
         (settings_of(steps=-1), "is damaged"),
-        (settings_of(steps="many"), "is damaged"),
-        (settings_of(shard_episodes=1.5), "is damaged"),
-        (settings_of(policy="uniform"), "is damaged"),
+        (environment_of(id="os:system"), "is damaged"),
+        (environment_of(arguments={"g": float("nan")}), "is damaged"),
+        (environment_of(state={"length": 1}), "has an array 'length': data sets have such a col"),
+        (environment_of(seed_bits=31, draws=1 << 40), "is damaged"),
         (settings_of(more=1), "is damaged"),
-        (settings_of(steps=10**30), "is damaged"),
-        (settings_of(steps=10**12, shard_episodes=10**12), "is damaged"),
-        (settings_of(store_state="yes"), "is damaged"),
         (settings_of(policy={"kind": "../../up"}), "is damaged"),
         (settings_of(policy={"kind": "constant", "drive": 10**400}), "is damaged"),
         (settings_of(policy={"kind": "constant", "drive": "\x1b[2J"}), "is damaged"),
@@ -237,13 +239,10 @@ def entry_of(**changes):
         (versions_of("\x1b[2J"), "is damaged"),
         (versions_of("\ud800"), "is damaged"),
         (entry_of(rows=-1), "is damaged"),
-        (entry_of(rows=2.5), "is damaged"),
         (entry_of(rows=1001), "is damaged"),
         (entry_of(episodes=0), "is damaged"),
         (entry_of(episodes=2), "is damaged"),
-        (entry_of(episodes=1.5), "is damaged"),
         (entry_of(rows=999), "has shape"),
-        (entry_of(rows=10**30), "is damaged"),
         (entry_of(bytes=10**15), "has"),
         (entry_of(sha256=[]), "is damaged"),
         (entry_of(sha256={}), "is damaged"),
@@ -259,17 +258,6 @@ def test_a_manifest_that_means_harm(change, message, copied):
     (copied / MANIFEST).write_text(manifest._hashed(record))
     with pytest.raises(InputError, match=message):
         read_all(copied)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"{}", b"[" * 100_000, b"null", b"\xff\xfe", b'{"format": "jbrep data set"}', b"\0" * 99],
-    ids=range(7),
-)
-def test_a_manifest_of_anything_else(content, copied):
-    (copied / MANIFEST).write_bytes(content)
-    with pytest.raises(DamageError, match=r"manifest\.json is damaged"):
-        Dataset(copied)
 
 
 def test_a_huge_manifest_is_not_read(copied):

@@ -2,12 +2,13 @@
 
 import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import jbrep
-from small import brief, contents, settings, write_again
+from small import brief, contents, write_again
 
 from jbrep.collect import collect
 from jbrep.collect.derive import derive
@@ -15,20 +16,11 @@ from jbrep.collect.repair import repair
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import BACKUP, MANIFEST, read_manifest, write_manifest
 from jbrep.dataset.verify import find_problems
-from jbrep.envs import describe
-from jbrep.envs.names import import_modules
 from jbrep.errors import InputError
-
-import_modules(["environments"])
-SLEDGE = describe("Sledges/Sledge-v0")
 
 
 def two_by_two(steps, **changes):
     return brief(steps=steps, shard_episodes=2, **changes)
-
-
-def sledges(steps):
-    return settings(task=SLEDGE, steps=steps, shard_episodes=5, store_state=False)
 
 
 @pytest.fixture(scope="module")
@@ -52,15 +44,11 @@ def test_an_extended_data_set_is_the_one_collected_at_once(short, long, tmp_path
     assert collect(two_by_two(350), folder).rows == 100  # the last shard becomes a full one
     assert collect(two_by_two(400), folder).rows == 0
     assert collect(two_by_two(500), folder, lanes=1, num_threads=1).rows == 100
-    assert contents(folder) == contents(long)
+    found = subprocess.run(
+        ["diff", "-r", folder, long], capture_output=True, text=True, check=False
+    )
+    assert (found.returncode, found.stdout) == (0, "")
     assert not list(find_problems(folder))
-
-
-def test_episodes_of_any_length_in_turn_and_in_processes(tmp_path):
-    for steps, workers in ((60, 1), (61, 1), (150, 1), (400, 2)):
-        collect(sledges(steps), tmp_path / "data", num_threads=workers)
-    collect(sledges(400), tmp_path / "at once", num_threads=1)
-    assert contents(tmp_path / "data") == contents(tmp_path / "at once")
 
 
 def test_a_derived_data_set_is_extended_with_its_source(short, long, tmp_path):

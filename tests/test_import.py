@@ -19,21 +19,26 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from command import jbrep
+from small import settings
 
+from jbrep.collect import collect
 from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
 from jbrep.dataset import Dataset
 from jbrep.dataset.card import card
-from jbrep.dataset.formats import export, open_source
+from jbrep.dataset.formats import FORMATS, export, open_source
 from jbrep.dataset.formats.writer import write
 from jbrep.dataset.manifest import shard_name
 from jbrep.dataset.verify import find_problems
 from jbrep.encoders import find
 from jbrep.envs import describe
+from jbrep.envs.names import import_modules
 from jbrep.envs.task import check_same
 from jbrep.errors import InputError
 from jbrep.evaluate.diagnosis import seen
 from jbrep.play.rollout import replay
+
+import_modules(["environments"])
 
 
 def import_data(given, folder, task=None):
@@ -151,14 +156,24 @@ def table(dataset):
     return columns | {name: dataset.episodes[name] for name in once}
 
 
-@pytest.mark.parametrize("to", ["npz", "parquet", "minari"])
-def test_what_is_exported_comes_back(to, collected, tmp_path):
-    dataset = Dataset(collected)
-    out = tmp_path / (f"data.{to}" if to != "minari" else "minari")
+@pytest.fixture(scope="module", params=["face_direction", "Sledges/Sledge-v0", "Sledges/Nested-v0"])
+def any_data(request, collected, tmp_path_factory):
+    """Data sets of one action and of several, also with observations of several parts."""
+    if request.param == "face_direction":
+        return Dataset(collected)
+    folder = tmp_path_factory.mktemp("sledges") / "data"
+    some = settings(request.param, steps=60, shard_episodes=5, store_state=False)
+    collect(some, folder, num_threads=1)
+    return Dataset(folder)
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_what_is_exported_comes_back(to, any_data, tmp_path):
+    dataset, out = any_data, tmp_path / (f"data.{to}" if to != "minari" else "minari")
     export(dataset, to, out)
-    given = out / "jitterbug/face_direction/uniform-v0" if to == "minari" else out
-    task = dataset.task if to == "npz" else None  # the others name their own
-    import_data(str(given), tmp_path / "back", task)
+    given = next(out.glob("**/uniform-v0")) if to == "minari" else out
+    names_task = to == "parquet" or (to == "minari" and dataset.task.name == "face_direction")
+    import_data(str(given), tmp_path / "back", None if names_task else dataset.task)
     back = Dataset(tmp_path / "back")
     for name, values in table(dataset).items():
         np.testing.assert_array_equal(table(back)[name], values, err_msg=name)

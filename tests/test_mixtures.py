@@ -70,13 +70,14 @@ def test_neither_lanes_nor_threads_nor_repair_change_a_byte(mixture, tmp_path):
 
 
 def test_in_processes_and_extended(tmp_path):
-    text = "uniform:1+constant:drive=-1:1"
-    sledges = describe("Sledges/Sledge-v0")
-    policy = {"policy": parse_policy(text).settings(), "task": sledges, "store_state": False}
-    for steps in (60, 200):
-        collect(settings(**policy, steps=steps, shard_episodes=5), tmp_path / "data", num_threads=2)
-    collect(settings(**policy, steps=200, shard_episodes=5), tmp_path / "turn", num_threads=1)
-    assert contents(tmp_path / "data") == contents(tmp_path / "turn")
+    """Of episodes of any length."""
+    policy = parse_policy("uniform:1+constant:drive=-1:1").settings()
+    how = {"task": describe("Sledges/Sledge-v0"), "policy": policy, "store_state": False}
+    for steps, workers in ((60, 1), (61, 2), (150, 1), (400, 2)):
+        some = settings(**how, steps=steps, shard_episodes=5)
+        collect(some, tmp_path / "data", num_threads=workers)
+    collect(some, tmp_path / "at once", num_threads=1)
+    assert contents(tmp_path / "data") == contents(tmp_path / "at once")
     assert not list(find_problems(tmp_path / "data"))
 
 

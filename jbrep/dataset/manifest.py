@@ -204,14 +204,16 @@ def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
 
 def _manifest_from(raw: bytes, path: Path) -> Manifest:
     plain = parse_json(raw, path, Manifest.format)
+    damage = DamageError(f"{path} is damaged: it isn't what jbrep wrote")
     if raw != _hashed(plain).encode():
-        raise DamageError(f"{path} is damaged: it isn't what jbrep wrote")
+        raise damage
     del plain[_HASH]
     settings = plain.get("settings")
-    name = settings.pop("task", None) if isinstance(settings, dict) else None
-    manifest = document_from(plain, path, Manifest)
-    if name != manifest.task.name:
-        raise DamageError(f"{path} is damaged: its task has two names")
+    if isinstance(settings, dict):  # which have the task's name besides
+        settings = {name: value for name, value in settings.items() if name != "task"}
+    manifest = document_from({**plain, "settings": settings}, path, Manifest)
+    if manifest.as_json() != plain:
+        raise damage
     return manifest
 
 

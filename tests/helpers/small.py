@@ -35,5 +35,5 @@ def write_again(source, folder):
 
 
 def contents(folder):
-    """The bytes of all files that belong to a data set."""
-    return {p.name: p.read_bytes() for p in sorted(folder.iterdir())}
+    """The bytes of all files in a data set's folder."""
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
