@@ -9,7 +9,6 @@ import subprocess
 import sys
 import warnings
 import zipfile
-from dataclasses import replace
 from types import SimpleNamespace
 
 import gymnasium
@@ -499,7 +498,7 @@ def test_whether_an_encoder_saw_imported_rows_is_not_known(written):
     """The seed, which tells data sets apart that were collected, says nothing of them."""
     trained = {"fingerprint": "", "policy": {"kind": "uniform"}, "seed": 5}
     shipped = find("dae-8", describe("face_direction"))
-    encoder = replace(shipped, header={**shipped.header, "data": trained})
+    encoder = shipped.with_header(data=trained)
     assert seen(encoder, SimpleNamespace(dataset=written)) == "maybe"
 
 

@@ -104,9 +104,13 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
 
 
 def _flat(settings: RunSettings) -> dict[str, Any]:
-    """Settings with those of the environment and the hyperparameters among them."""
+    """Settings with those of the environment and the hyperparameters among them.
+
+    What is learned, by what and from what comes first.
+    """
     own = to_plain(settings)
-    return {**own, **own.pop("environment"), **own.pop("hyperparameters")}
+    first = {name: own[name] for name in ("task", "algorithm", "representation")}
+    return {**first, **own, **own.pop("environment"), **own.pop("hyperparameters")}
 
 
 class RunRecord(Document, frozen=True, kw_only=True):

@@ -62,6 +62,7 @@ def run(study, study_folder, data, data_folder):
 
 
 if __name__ == "__main__":
+    sys.path.append(str(Path(__file__).parent.parent))
     from test_cluster import DATA, STUDY
 
     folder = Path(sys.argv[1])
