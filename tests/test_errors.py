@@ -1,15 +1,8 @@
-"""What messages say of errors, settings and versions."""
+"""What messages say of errors and settings."""
 
 import pytest
 
-from jbrep.errors import (
-    DamageError,
-    InputError,
-    check_version,
-    differences,
-    first_line,
-    kind_and_line,
-)
+from jbrep.errors import differences, first_line, kind_and_line
 
 
 @pytest.mark.parametrize(
@@ -32,15 +25,3 @@ def test_at_most_three_settings_are_named_and_long_values_are_cut():
     assert text == f"a 1 (now: {'x' * 37}...), b 1 (now: 2), c 1 (now: 3), and 2 more"
     assert differences(there, there) == ""
     assert differences({}, {"a": 1}) == "a None (now: 1)"
-
-
-@pytest.mark.parametrize("version", [0, -1, True, 1.0, "1", None])
-def test_a_version_that_is_none_is_damage(version):
-    with pytest.raises(DamageError, match="its format version is"):
-        check_version("file", version, 3)
-
-
-def test_a_newer_version_asks_for_a_newer_jbrep():
-    check_version("file", 3, 3)
-    with pytest.raises(InputError, match="file has format version 4: this jbrep reads up to 3"):
-        check_version("file", 4, 3)
