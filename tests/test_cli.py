@@ -53,7 +53,7 @@ def test_a_run_from_training_to_its_returns(tmp_path):
     assert (tmp_path / "runs" / "returns.csv").exists()
     again = jbrep("rl", "--task", "face_direction", "--seed", 1, "--out", run)
     assert (again.exit_code, again.output.count("\n")) == (2, 1)
-    assert "holds another run: steps 40 (now: 100000)" in again.output
+    assert "holds another run: algorithm a2c (now: sac)" in again.output
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
