@@ -25,7 +25,7 @@ from jbrep.rl.agent import make_agent, make_env
 from jbrep.rl.cohort.cohort import Cohort
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.job import Job
-from jbrep.rl.names import FLOAT32, PRECISIONS
+from jbrep.rl.settings import FLOAT32, PRECISIONS
 from jbrep.study.config import Study
 from jbrep.study.packing import usual_workers
 from jbrep.study.plan import Plan

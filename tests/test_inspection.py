@@ -38,13 +38,7 @@ from jbrep.play.jitterbug import reward_terms
 from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode
 from jbrep.rl import Run
-from jbrep.rl.files import (
-    ENCODER,
-    Evaluation,
-    read_evaluations,
-    write_rows,
-)
-from jbrep.rl.record import FAILED, FINISHED
+from jbrep.rl.files import ENCODER, FAILED, FINISHED, Evaluation, read_evaluations, write_rows
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
 DAE = "jbrep/encoders/shipped/face_direction/dae-4.safetensors"

@@ -28,12 +28,11 @@ from jbrep.errors import InputError
 from jbrep.records import container
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
-from jbrep.rl.files import EVALUATION_SEED, POLICY, read_evaluations, read_run
-from jbrep.rl.names import CLASSES, COHORT, SB3
+from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, POLICY, read_evaluations, read_run
 from jbrep.rl.policy import load_run, load_zip
 from jbrep.rl.presets import PRESETS, get_preset, sb3_class
-from jbrep.rl.record import FAILED, FINISHED
-from jbrep.rl.sb3.checkpointer import restore, take
+from jbrep.rl.sb3 import restore, take
+from jbrep.rl.settings import CLASSES, COHORT, SB3
 
 STEPS = 100  # of an episode: little depends on its length
 TASK = describe("face_direction", max_episode_steps=STEPS)

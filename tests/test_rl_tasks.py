@@ -18,15 +18,15 @@ from jbrep.rl.files import (
     CHECKPOINT,
     EPISODES,
     EVALUATION_SEED,
+    FAILED,
     POLICY,
     RUN,
     read_evaluations,
     read_run,
 )
-from jbrep.rl.names import CLASSES
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.presets import PRESETS, get_preset
-from jbrep.rl.record import FAILED
+from jbrep.rl.settings import CLASSES
 
 CART = describe(cart.ID)
 PENDULUM, HOPPER = describe("Pendulum-v1", max_episode_steps=50), describe("Hopper-v5")

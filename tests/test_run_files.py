@@ -32,14 +32,14 @@ from jbrep.rl.files import (
     POLICY,
     POLICY_ZIP,
     RUN,
+    PolicyHeader,
     is_policy_file,
     read_evaluations,
     read_run,
 )
-from jbrep.rl.history import Scalars
+from jbrep.rl.job import Scalars
 from jbrep.rl.policy import load_run, load_untrained, load_zip
 from jbrep.rl.policy_file import read
-from jbrep.rl.record import PolicyHeader
 from jbrep.study.results import conclude
 
 TASK = describe("face_direction")
@@ -215,7 +215,7 @@ def test_a_run_file_of_anything_else(content, message, run):
 def test_evaluations_that_are_none(rows, run):
     header = "step,episode,return\n" if rows else ""
     (run / EVALUATIONS).write_text(header + rows)
-    assert "not a table of evaluations" in refused(read_evaluations, run)
+    assert f"{EVALUATIONS} is damaged or " in refused(read_evaluations, run)
     told = jbrep("report", run)
     assert (told.exit_code, told.output.count("\n")) == (2, 1)
 

@@ -23,10 +23,10 @@ from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, statistics_of
 from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, RUN, read_evaluations, read_run
 from jbrep.rl.learner import Learner, preset_text, read_preset, usual_name
-from jbrep.rl.names import CLASSES
 from jbrep.rl.overrides import overridden, setting_names
 from jbrep.rl.policy import load_run, load_untrained, load_zip
 from jbrep.rl.presets import sb3_class
+from jbrep.rl.settings import CLASSES
 from jbrep.study.config import as_study, read_study
 from jbrep.study.plan import Plan, read_plan
 from jbrep.study.results import conclude

@@ -585,8 +585,8 @@ def test_a_single_seed_gives_its_returns_and_says_why_no_more(done, tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("evaluations.csv", "step,episode,return\n0,0", "not a table of evaluations"),
-        ("evaluations.csv", "step,episode,return\n0,0,nan\n80,0,1\n", "finite"),
+        ("evaluations.csv", "step,episode,return\n0,0", "damaged or cut short"),
+        ("evaluations.csv", "step,episode,return\n0,0,nan\n80,0,1\n", "damaged or cut short"),
         (RUN, "[]", "damaged, or not a jbrep run file"),
         (RUN, "settings", r"settings\.\w+ is missing"),
     ],

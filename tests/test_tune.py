@@ -9,7 +9,7 @@ from command import jbrep
 from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.rl import Run, StoppedError, train
-from jbrep.rl.files import POLICY
+from jbrep.rl.files import POLICY, read_run, runs_below
 from jbrep.rl.learner import read_preset
 from jbrep.rl.tracker import Tracker
 from jbrep.rl.tune import BEST, tune
@@ -40,7 +40,9 @@ def test_a_stopped_search_resumes_to_the_same_trials(tmp_path):
     assert read_preset(tmp_path / "whole" / BEST, "a2c") == expected
     ours, theirs = (tmp_path / each / "trial-1/seed-0" / POLICY for each in ("whole", "parts"))
     assert ours.read_bytes() == theirs.read_bytes()
-    assert len(set((tmp_path / "whole").glob("trial-*"))) == 3
+    names = {run.settings.learner for run in map(read_run, runs_below(tmp_path / "whole"))}
+    assert len(names) == 3
+    assert all(name.startswith("a2c-modern+net_arch=8+") for name in names)
     with pytest.raises(InputError, match="holds another search: seeds 1"):
         tune(RUN, 3, 2, tmp_path / "whole")
 

@@ -16,10 +16,9 @@ import numpy as np
 from jbrep.envs.description import describe
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.play.sources import find_player
-from jbrep.rl.files import EPISODES, read_run, runs_below
+from jbrep.rl.files import EPISODES, FINISHED, read_run, runs_below
 from jbrep.rl.policy import load_run
 from jbrep.rl.policy_file import save
-from jbrep.rl.record import FINISHED
 from jbrep.rl.shipped import SHIPPED, file_of, write_returns
 
 SHOWN = (SHIPPED, "heuristic")

@@ -21,7 +21,7 @@ from jbrep.records.tables import read_csv
 from jbrep.report.figures import write
 from jbrep.report.figures.curves import curves
 from jbrep.report.figures.style import styles
-from jbrep.rl.record import FINISHED
+from jbrep.rl.files import FINISHED
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.intervals import variance_ratio

@@ -14,8 +14,7 @@ import click
 from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, interval_of, on_stop, say
 from jbrep.cli.environment import needed_task, parse_arguments, task_options
 from jbrep.cli.options import record_options
-from jbrep.rl.names import CLASSES
-from jbrep.rl.settings import TrainingSettings
+from jbrep.rl.settings import CLASSES, TrainingSettings
 from jbrep.text import rounded
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from jbrep.encoders.base import OWN
 from jbrep.records.record import to_plain
 from jbrep.report.tables import Tables
 from jbrep.report.words import shown_number
-from jbrep.rl.record import FAILED
+from jbrep.rl.files import FAILED
 from jbrep.rl.settings import TrainingSettings
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study

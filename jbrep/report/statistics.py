@@ -15,7 +15,7 @@ from jbrep.report.words import (
     shown_number,
     statements,
 )
-from jbrep.rl.record import FAILED
+from jbrep.rl.files import FAILED
 from jbrep.stats.aggregates import Aggregate
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.association import Association

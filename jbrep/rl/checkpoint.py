@@ -1,14 +1,18 @@
-"""The checkpoint of a run, in a file that can't run code when it is read."""
+"""What a run has recorded so far, and its checkpoint, which runs no code when it is read."""
 
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 import torch
 from msgspec import Meta
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
 
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import DamageError, InputError, differences
@@ -17,10 +21,8 @@ from jbrep.records.container import Tensors
 from jbrep.records.document import Document, document_from
 from jbrep.records.storage import exists
 from jbrep.rl.agent import parameters, statistics_of
-from jbrep.rl.files import Episode, Evaluation
-from jbrep.rl.history import History
+from jbrep.rl.files import Episode, Evaluation, RunSettings
 from jbrep.rl.normalization import Statistics
-from jbrep.rl.record import RunSettings
 from jbrep.rl.settings import MAX_STEPS, Line
 
 MAX_BYTES = 1 << 34
@@ -29,6 +31,55 @@ LANES = "lanes."  # likewise, of what decides how the lanes continue
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")  # of an agent
 _QUICK = 2.0  # seconds of writing that don't matter
 _MALFORMED = (KeyError, TypeError, ValueError, RuntimeError, IndexError, AttributeError)
+WEIGHTS_NOT_FINITE = "the policy's weights are not finite"  # reasons for a run to fail
+ACTIONS_NOT_FINITE = "the policy's actions are not finite"
+
+
+class DivergedError(ArithmeticError):
+    """A loss or a weight of the policy is NaN or infinite: training can't continue."""
+
+
+@dataclass
+class History:
+    """What a run has recorded so far, over all the processes that worked on it.
+
+    Attributes:
+        episodes: of training.
+        evaluations: of the deterministic policy.
+        first_step: the training step from which this process continues.
+        earlier_seconds: the wall time that earlier processes took.
+    """
+
+    episodes: list[Episode] = field(default_factory=list)
+    evaluations: list[Evaluation] = field(default_factory=list)
+    first_step: int = 0
+    earlier_seconds: float = 0.0
+    _started: float = field(default_factory=time.monotonic)
+
+    @property
+    def seconds(self) -> float:
+        """The wall time so far."""
+        return round(self.earlier_seconds + time.monotonic() - self._started, 1)
+
+    def evaluated(self, step: int, returns: NDArray[np.float64], logger: Logger) -> float:
+        """Record an evaluation's returns (e,) after so many steps, and log their mean.
+
+        Returns:
+            The mean.
+        """
+        rounded = returns.round(3).tolist()
+        self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(rounded)]
+        mean = float(np.mean(rounded))
+        logger.record("evaluation/mean_return", mean)
+        logger.dump(step)
+        return mean
+
+    def resume(
+        self, episodes: list[Episode], evaluations: list[Evaluation], seconds: float, step: int
+    ) -> None:
+        """Continue from an earlier process's record, made at that step."""
+        self.episodes, self.evaluations = episodes, evaluations
+        self.earlier_seconds, self.first_step = seconds, step
 
 
 class StoppedError(Exception):

@@ -12,10 +12,9 @@ from jbrep.envs.recording import Actor
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import DamageError, InputError
 from jbrep.records.storage import exists, read_file
-from jbrep.rl.files import ENCODER, is_policy_file
+from jbrep.rl.files import ENCODER, PolicyHeader, is_policy_file
 from jbrep.rl.policy import load_run
 from jbrep.rl.policy_file import MAX_BYTES, Trained, pack, unpack
-from jbrep.rl.record import PolicyHeader
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
+from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.encoders import Encoder, save
 from jbrep.envs.names import environment_versions
@@ -18,27 +19,29 @@ from jbrep.errors import InputError
 from jbrep.records.commit import commits
 from jbrep.records.storage import exists, write_whole
 from jbrep.rl.agent import statistics_of
-from jbrep.rl.checkpoint import CheckpointFile
+from jbrep.rl.checkpoint import CheckpointFile, History
 from jbrep.rl.files import (
     CHECKPOINT,
     ENCODER,
     EPISODES,
     EVALUATIONS,
+    FAILED,
+    FINISHED,
     POLICY,
     POLICY_ZIP,
     RUN,
     Episode,
     Evaluation,
+    RunRecord,
     read_run,
     write_rows,
 )
-from jbrep.rl.history import History, Scalars
 from jbrep.rl.policy_file import Trained, pack_whole
 from jbrep.rl.policy_zip import policy_zip
-from jbrep.rl.record import FAILED, FINISHED, RunRecord
 from jbrep.rl.run import Run
 from jbrep.rl.settings import MAX_LINE
 
+Watch = Callable[[int, float | None], None]  # steps so far; mean return of the last evaluation
 Ended = tuple["Job", RunRecord]
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 
@@ -183,3 +186,11 @@ def _cpu() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+class Scalars(TensorBoardOutputFormat):
+    """TensorBoard's file after a step; later ones of an earlier process are hidden."""
+
+    def __init__(self, folder: Path, step: int):
+        self.writer = SummaryWriter(str(folder), purge_step=step + 1)
+        self._is_closed = False

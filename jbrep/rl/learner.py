@@ -10,10 +10,9 @@ from typing import Any
 from jbrep.errors import InputError
 from jbrep.records.record import Record
 from jbrep.records.toml import read_toml, toml_text
-from jbrep.rl.names import PAPER, base_name
 from jbrep.rl.overrides import overridden
 from jbrep.rl.presets import PRESETS, Hyperparameters, get_preset
-from jbrep.rl.settings import MAX_NAME, LearnerName
+from jbrep.rl.settings import MAX_NAME, PAPER, LearnerName, base_name
 from jbrep.text import slug
 
 _SUFFIX = ".toml"
@@ -97,8 +96,9 @@ class Learner(Record, frozen=True, kw_only=True):
         return learner
 
     def overridden(self, overrides: Mapping[str, Any]) -> "Learner":
-        """The same with more set differently."""
-        return self.replace(overrides={**self.overrides, **overrides})
+        """The same with more set differently, which its name then says."""
+        name = usual_name(self.name, overrides)
+        return self.replace(name=name, overrides={**self.overrides, **overrides})
 
     @property
     def hyperparameters(self) -> Hyperparameters:

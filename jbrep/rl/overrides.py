@@ -75,18 +75,12 @@ _REFUSED = {  # arguments that are jbrep's own, with the reason
     "rms_prop_eps": "the optimiser is always Adam",
     "optimize_memory_usage": "a checkpoint needs whole transitions",
     "normalize_images": "observations are no images",
-    **dict.fromkeys(
-        ("features_extractor_class", "features_extractor_kwargs"), "observations are flat already"
-    ),
-    **dict.fromkeys(
-        (
-            "replay_buffer_class",
-            "replay_buffer_kwargs",
-            "rollout_buffer_class",
-            "rollout_buffer_kwargs",
-        ),
-        "a checkpoint needs the usual buffer",
-    ),
+    "features_extractor_class": "observations are flat already",
+    "features_extractor_kwargs": "observations are flat already",
+    "replay_buffer_class": "a checkpoint needs the usual buffer",
+    "replay_buffer_kwargs": "a checkpoint needs the usual buffer",
+    "rollout_buffer_class": "a checkpoint needs the usual buffer",
+    "rollout_buffer_kwargs": "a checkpoint needs the usual buffer",
 }
 _NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule", "use_sde", "net_arch"}
 _SHAPING = ("use_sde",)  # arguments of algorithms that decide which weights a policy has

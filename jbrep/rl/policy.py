@@ -22,6 +22,7 @@ from jbrep.rl.files import (
     ENCODER,
     POLICY,
     RUN,
+    RunSettings,
     is_run,
     read_finished,
     read_run,
@@ -31,7 +32,6 @@ from jbrep.rl.overrides import check_shape
 from jbrep.rl.policy_file import MAX_BYTES, Trained, acting, build, read
 from jbrep.rl.policy_zip import statistics_in
 from jbrep.rl.presets import sb3_class
-from jbrep.rl.record import RunSettings
 from jbrep.training.trainer import single_torch_thread
 
 

@@ -26,9 +26,9 @@ from jbrep.records.document import document_from
 from jbrep.records.storage import read_file, write_whole
 from jbrep.rl.agent import Spaces, deterministic, make_agent, one_line, seeing
 from jbrep.rl.checkpoint import without
+from jbrep.rl.files import PolicyHeader, RunSettings
 from jbrep.rl.normalization import Statistics
 from jbrep.rl.overrides import check_shape
-from jbrep.rl.record import PolicyHeader, RunSettings
 
 MAX_BYTES = 1 << 28
 _ACTING, _TRAINING, _ENCODER = "policy.", "training.", "encoder."  # before the names of tensors
@@ -246,16 +246,13 @@ class PolicyFile(NamedTuple):
             raise DamageError(f"{self.path} is damaged: its encoder isn't the one of its settings")
         return encoder
 
-    def trained(self, encoder: BaseEncoder | None = None) -> Trained:
-        """The policy.
-
-        Args:
-            encoder: that of the run, if the file has none.
+    def trained(self) -> Trained:
+        """The policy with the encoder in the file.
 
         Raises:
             InputError, DamageError: it isn't what was written.
         """
-        built = build(self.header.settings, encoder or self.encoder(), self.path)
+        built = build(self.header.settings, self.encoder(), self.path)
         step = None if self.header.finished else self.header.step
         return built.with_weights(self.weights, self.tensors, self.path)._replace(step=step)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jbrep.errors import choose
 from jbrep.records.record import Finite, Record
-from jbrep.rl.names import CLASSES, MODERN, PAPER
+from jbrep.rl.settings import CLASSES, MODERN, PAPER
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

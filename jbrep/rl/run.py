@@ -13,11 +13,21 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.rl.cohort.algorithm import check as check_for_cohort
+from jbrep.rl.files import RunSettings
 from jbrep.rl.learner import Learner
-from jbrep.rl.names import COHORT, CPU, PAPER, PRECISIONS, usual_trainer
 from jbrep.rl.policy import policy_to_begin_with
-from jbrep.rl.record import RunSettings
-from jbrep.rl.settings import MAX_EPISODES, Name, Seed, Sha256, TrainingSettings
+from jbrep.rl.settings import (
+    COHORT,
+    CPU,
+    MAX_EPISODES,
+    PAPER,
+    PRECISIONS,
+    Name,
+    Seed,
+    Sha256,
+    TrainingSettings,
+    usual_trainer,
+)
 from jbrep.training.trainer import get_device, single_torch_thread
 
 _FINAL = 10  # times as many episodes as the other evaluations, if a run doesn't say how many

@@ -12,8 +12,7 @@ from jbrep.records import container
 from jbrep.records.document import document_from
 from jbrep.records.storage import exists
 from jbrep.records.tables import Columns, count, finite, read_csv, write_csv
-from jbrep.rl.files import POLICY_SUFFIX
-from jbrep.rl.record import PolicyHeader
+from jbrep.rl.files import POLICY_SUFFIX, PolicyHeader
 
 SHIPPED = "trained"  # what commands call the one that ships for their task
 FOLDER = Path(__file__).parent / "shipped"

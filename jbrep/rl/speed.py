@@ -12,9 +12,9 @@ from jbrep.rl.agent import Evaluator, make_agent, make_env
 from jbrep.rl.cohort.cohort import Cohort
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.job import Job
-from jbrep.rl.names import COHORT
 from jbrep.rl.presets import sb3_class
 from jbrep.rl.run import Run
+from jbrep.rl.settings import COHORT
 from jbrep.training.trainer import single_torch_thread
 
 _MIN_STEPS = 300  # of all runs

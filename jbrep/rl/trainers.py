@@ -9,12 +9,11 @@ from stable_baselines3.common.logger import KVWriter
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import make_folder
 from jbrep.rl.cohort.trainer import train_together
-from jbrep.rl.history import Watch
-from jbrep.rl.job import Ended, Job, Session
-from jbrep.rl.names import COHORT, SB3
-from jbrep.rl.record import RunRecord
+from jbrep.rl.files import RunRecord
+from jbrep.rl.job import Ended, Job, Session, Watch
 from jbrep.rl.run import Run
-from jbrep.rl.sb3.trainer import train_in_turn
+from jbrep.rl.sb3 import train_in_turn
+from jbrep.rl.settings import COHORT, SB3
 from jbrep.training.trainer import single_torch_thread
 
 _FUNCTIONS = {COHORT: train_together, SB3: train_in_turn}

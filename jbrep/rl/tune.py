@@ -15,11 +15,10 @@ from jbrep.errors import DamageError, InputError, differences
 from jbrep.records.lock import exclusive
 from jbrep.records.record import to_plain
 from jbrep.records.storage import make_folder, write_whole
-from jbrep.rl.files import read_evaluations
+from jbrep.rl.files import FINISHED, read_evaluations
 from jbrep.rl.job import Job, Session
 from jbrep.rl.learner import preset_text
 from jbrep.rl.overrides import setting_names
-from jbrep.rl.record import FINISHED
 from jbrep.rl.run import Run
 from jbrep.rl.trainers import train_jobs
 

@@ -11,7 +11,7 @@ from joblib import cpu_count
 
 from jbrep.errors import InputError
 from jbrep.rl.cohort.replay import memory_of
-from jbrep.rl.names import COHORT, CPU, CUDA
+from jbrep.rl.settings import COHORT, CPU, CUDA
 from jbrep.study.plan import Cell, Plan
 from jbrep.study.representations import ByName
 

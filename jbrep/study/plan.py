@@ -15,7 +15,7 @@ from jbrep.records.storage import exists, make_folder
 from jbrep.rl import Run
 from jbrep.rl.files import RUN
 from jbrep.rl.learner import Learner
-from jbrep.rl.names import usual_trainer
+from jbrep.rl.settings import usual_trainer
 from jbrep.study.config import Study
 from jbrep.study.registration import Registration, check_registered, read_registration
 from jbrep.study.representations import Representation

@@ -10,8 +10,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from jbrep.rl.files import read_run
-from jbrep.rl.record import FAILED, FINISHED
+from jbrep.rl.files import FAILED, FINISHED, read_run
 from jbrep.study.plan import Cell, Plan
 from jbrep.study.work import CRASHED, Outcome, read_progress
 

@@ -15,8 +15,7 @@ from jbrep.errors import InputError
 from jbrep.records.document import Document
 from jbrep.records.record import Record, from_plain, to_plain
 from jbrep.records.storage import exists
-from jbrep.rl.files import ENCODER
-from jbrep.rl.record import RunRecord, RunSettings, SharedSettings
+from jbrep.rl.files import ENCODER, RunRecord, RunSettings, SharedSettings
 from jbrep.rl.settings import Sha256
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study

@@ -13,8 +13,8 @@ from jbrep.records.commit import commits
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import from_plain, to_plain
 from jbrep.records.storage import exists
+from jbrep.rl.files import RunRecord
 from jbrep.rl.job import packages
-from jbrep.rl.record import RunRecord
 from jbrep.stats.rules import Planned
 from jbrep.study.config import Study
 

@@ -16,8 +16,7 @@ from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
 from jbrep.records.tables import Columns, count, finite, write_csv
-from jbrep.rl.files import RUN, read_evaluations, read_run, runs_below
-from jbrep.rl.record import FAILED, RunRecord
+from jbrep.rl.files import FAILED, RUN, RunRecord, read_evaluations, read_run, runs_below
 from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import STILL

@@ -7,7 +7,7 @@ from typing import Any
 from jbrep.envs.names import imported_modules
 from jbrep.errors import choose
 from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
-from jbrep.rl.names import CUDA
+from jbrep.rl.settings import CUDA
 from jbrep.study.packing import Pack
 from jbrep.study.plan import Plan
 from jbrep.study.progress import say

@@ -11,8 +11,8 @@ from jbrep.envs.names import import_modules
 from jbrep.errors import first_line
 from jbrep.records.storage import make_folder
 from jbrep.rl import Run, StoppedError
+from jbrep.rl.files import RunRecord
 from jbrep.rl.job import Job, Session
-from jbrep.rl.record import RunRecord
 from jbrep.rl.trainers import train_jobs
 from jbrep.text import rounded
 

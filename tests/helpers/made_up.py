@@ -4,13 +4,20 @@ import numpy as np
 
 from jbrep.encoders import find, save
 from jbrep.rl.agent import Spaces, make_agent, parameters
-from jbrep.rl.checkpoint import CheckpointFile, Snapshot
-from jbrep.rl.files import CHECKPOINT, ENCODER, RUN, Evaluation, write_rows
-from jbrep.rl.history import History
+from jbrep.rl.checkpoint import CheckpointFile, History, Snapshot
+from jbrep.rl.files import (
+    CHECKPOINT,
+    ENCODER,
+    FAILED,
+    FINISHED,
+    RUN,
+    Evaluation,
+    RunRecord,
+    write_rows,
+)
 from jbrep.rl.job import packages
 from jbrep.rl.learner import Learner
 from jbrep.rl.overrides import check_shape
-from jbrep.rl.record import FAILED, FINISHED, RunRecord
 from jbrep.study.config import as_study
 from jbrep.study.record import EncoderFacts, Label, LabelSettings
 

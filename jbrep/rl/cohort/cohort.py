@@ -10,13 +10,12 @@ from torch import Tensor
 
 from jbrep.envs.endless import Endless
 from jbrep.rl.agent import training_seed
-from jbrep.rl.checkpoint import LANES, Snapshot, without
+from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, LANES, Snapshot, without
 from jbrep.rl.cohort import get_algorithm
 from jbrep.rl.cohort.algorithm import Batch, Losses
 from jbrep.rl.cohort.member import Array, Float32, Member
 from jbrep.rl.cohort.networks import Stack
 from jbrep.rl.cohort.replay import ReplayBuffer, capacity_of
-from jbrep.rl.history import ACTIONS_NOT_FINITE
 from jbrep.rl.job import Job
 
 

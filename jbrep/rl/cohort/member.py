@@ -19,9 +19,8 @@ from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
 from jbrep.records.container import Tensors
 from jbrep.rl import checkpoint
 from jbrep.rl.agent import Evaluator, Spaces, make_agent
-from jbrep.rl.checkpoint import Snapshot, without
+from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE, Snapshot, without
 from jbrep.rl.files import Episode
-from jbrep.rl.history import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE
 from jbrep.rl.job import Job
 from jbrep.rl.normalization import normalized
 from jbrep.rl.policy import begin

@@ -14,7 +14,7 @@ from torch.nn import Linear, Module, ReLU
 from torch.optim import Adam
 from torch.utils._pytree import tree_leaves
 
-from jbrep.rl.names import CPU, FLOAT32
+from jbrep.rl.settings import CPU, FLOAT32
 from jbrep.training.trainer import allocate_adam_state
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam
