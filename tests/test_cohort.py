@@ -136,7 +136,7 @@ def contents(folder):
     return [hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names]
 
 
-SAC = {"algorithm": "sac", "settings": {"learning_starts": 60}}
+SAC = {"algorithm": "sac", "overrides": {"learning_starts": 60}}
 
 
 @pytest.fixture(scope="module")
