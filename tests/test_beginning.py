@@ -103,18 +103,8 @@ def test_it_is_resumed_to_the_same_bits(source, later, tmp_path):
 
 def test_other_arguments_are_another_body(source, tmp_path):
     other = ("--task", cart.ID, "--env", "fail_seed=5", "--algorithm", "sac", "--preset", "modern")
-    told = jbrep(
-        "rl",
-        *other,
-        "--steps",
-        8,
-        "--evaluation-episodes",
-        1,
-        "--from",
-        source,
-        "--out",
-        tmp_path / "run",
-    )
+    quick = ("--steps", 8, "--evaluation-episodes", 1, "--from", source, "--out", tmp_path / "run")
+    told = jbrep("rl", *other, *quick)
     assert told.exit_code == 0, told.output
     assert read_run(tmp_path / "run").settings.begin_from == read_run(source).policy_sha256
 

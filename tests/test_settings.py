@@ -245,38 +245,29 @@ def resumed(run, folder, stop_at=40):
 
 @pytest.mark.filterwarnings("ignore:`n_steps=2` is ignored")  # in stable-baselines3's `load`
 @pytest.mark.parametrize(
-    "run",
+    ("algorithm", "overrides"),
     [
-        Run.of(**QUICK, algorithm="tqc", overrides=SMALL),
-        Run.of(**QUICK, algorithm="crossq", overrides={**SMALL, "renorm_warmup_steps": 2}),
-        Run.of(
-            **QUICK,
-            algorithm="sac",
-            overrides={**SMALL, "use_sde": True, "n_steps": 2},
-            trainer="sb3",
+        ("tqc", SMALL),
+        ("crossq", {**SMALL, "renorm_warmup_steps": 2}),
+        ("sac", {**SMALL, "use_sde": True, "n_steps": 2}),
+        (
+            "ppo",
+            {"n_steps": 10, "batch_size": 20, "num_envs": 2, "use_sde": True, "normalize": True},
         ),
-        Run.of(
-            **QUICK,
-            algorithm="ppo",
-            overrides={
-                "n_steps": 10,
-                "batch_size": 20,
-                "num_envs": 2,
-                "use_sde": True,
-                "normalize": True,
-            },
-        ),
-        Run.of(**QUICK, algorithm="td3", overrides={**SMALL, "learning_rate": "linear:0.01"}),
+        ("td3", {**SMALL, "learning_rate": "linear:0.01"}),
     ],
-    ids=lambda run: run.learner.algorithm,
 )
-def test_a_stopped_run_resumes_to_the_same_bytes_whatever_its_settings(run, tmp_path):
+def test_a_stopped_run_resumes_to_the_same_bytes_whatever_its_settings(
+    algorithm, overrides, tmp_path
+):
+    trainer = "" if algorithm == "td3" else "sb3"
+    run = Run.of(**QUICK, algorithm=algorithm, overrides=overrides, trainer=trainer)
     train(run, tmp_path / "whole")
     resumed(run, tmp_path / "stopped")
     for name in ("episodes.csv", "evaluations.csv", POLICY):
         whole, stopped = (tmp_path / each / name for each in ("whole", "stopped"))
         assert whole.read_bytes() == stopped.read_bytes(), name
-    sb3_class(run.learner.algorithm).load(tmp_path / "whole" / POLICY_ZIP, device="cpu")
+    sb3_class(algorithm).load(tmp_path / "whole" / POLICY_ZIP, device="cpu")
     check_last_evaluation(tmp_path / "whole")
 
 
