@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated
 
 from msgspec import Meta
 
@@ -30,15 +30,6 @@ def commits() -> Commits:
     places = {"jbrep": Path(__file__).resolve().parent, "work": Path.cwd()}
     known = {name: _commit(folder) for name, folder in places.items()}
     return MappingProxyType({name: commit for name, commit in known.items() if commit})
-
-
-def are_commits(value: Any) -> bool:
-    """Whether a value is what `commits` returns, read back from JSON."""
-    form = rf"[0-9a-f]{{40,64}}({re.escape(_CHANGES)})?"
-    return isinstance(value, dict) and all(
-        name in ("jbrep", "work") and isinstance(commit, str) and re.fullmatch(form, commit)
-        for name, commit in value.items()
-    )
 
 
 def _commit(folder: Path) -> str:
