@@ -51,10 +51,10 @@ def agent_on_shimmy() -> BaseAlgorithm:
     torch.set_num_threads(1)
     preset = get_preset("paper", "ddpg")
     environment = FlattenObservation(DmControlCompatibilityV0(jitterbug.load(TASK, seed=0)))
-    network = {"net_arch": list(preset.hidden), "activation_fn": torch.nn.ReLU}
+    network = {"net_arch": list(preset.net_arch), "activation_fn": torch.nn.ReLU}
     noise = {"action_noise": preset.noise.make(1)}
-    settings = {"seed": 0, "device": "cpu", "policy_kwargs": network, **preset.settings, **noise}
-    return DDPG("MlpPolicy", environment, **settings).learn(4 * STEPS)
+    kwargs = {"seed": 0, "device": "cpu", "policy_kwargs": network, **preset.algorithm_kwargs}
+    return DDPG("MlpPolicy", environment, **kwargs, **noise).learn(4 * STEPS)
 
 
 @cache

@@ -241,6 +241,7 @@ def check(run):
             "takes train_freq as a number of steps: add",
         ),
         ({"trainer": "sb3", "precision": "bfloat16"}, "sb3 has no bfloat16: leave the precision"),
+        ({"trainer": "sb3", "device": "cuda"}, "sb3 trains on the cpu here: leave the device out"),
         ({"precision": "half"}, "precision is 'half': it must be one of"),
         ({"device": "cuda"}, "no device 'cuda' on this machine: choose auto or cpu"),
         ({"overrides": {"n_steps": 3}}, "n_steps = 3: add --trainer sb3"),

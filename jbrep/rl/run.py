@@ -19,6 +19,7 @@ from jbrep.rl.policy import policy_to_begin_with
 from jbrep.rl.settings import (
     COHORT,
     CPU,
+    CUDA,
     MAX_EPISODES,
     PAPER,
     PRECISIONS,
@@ -105,10 +106,10 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
                 policy that this run can't begin with.
         """
         is_kept_as_code = is_code(self.encoder) and not isinstance(encoder, Encoder)
-        shared = to_plain(self.training_settings)
+        trainer, shared = trainer_of(self.learner, self), to_plain(self.training_settings)
         shared |= {
-            "trainer": trainer_of(self.learner, self),
-            "device": str(get_device(self.device).type),
+            "trainer": trainer,
+            "device": str(get_device(self.device).type) if trainer == COHORT else CPU,
             "final_episodes": self.final_episodes
             or min(_FINAL * self.evaluation_episodes, MAX_EPISODES),
         }
@@ -146,6 +147,6 @@ def trainer_of(learner: Learner, settings: TrainingSettings) -> str:
         check_for_cohort(learner.algorithm, learner.hyperparameters)
     elif trainer not in PRECISIONS[settings.precision]:
         raise InputError(f"{trainer} has no {settings.precision}: leave the precision out")
-    elif settings.device != CPU:
+    elif settings.device == CUDA:
         raise InputError(f"{trainer} trains on the cpu here: leave the device out")
     return trainer
