@@ -29,8 +29,7 @@ from jbrep.rl.settings import FLOAT32, PRECISIONS
 from jbrep.study.config import Study
 from jbrep.study.packing import usual_workers
 from jbrep.study.plan import Plan
-from jbrep.study.runner import on_this_machine
-from jbrep.study.study import run_study
+from jbrep.study.runner import on_this_machine, run_study
 
 LEARNERS = (("ddpg", "paper"), ("sac", "modern"))
 CODES = ("full", "dae-12", "dae-8", "dae-4")

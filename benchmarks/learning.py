@@ -28,8 +28,7 @@ from jbrep.rl.agent import make_agent, make_env
 from jbrep.rl.presets import get_preset
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan
-from jbrep.study.runner import on_this_machine
-from jbrep.study.study import run_study
+from jbrep.study.runner import on_this_machine, run_study
 
 TASK = "face_direction"
 ROUNDS = 12

@@ -135,3 +135,11 @@ def slug(text: str) -> str:
     Letters are those of ASCII: dm_control/cheetah-run-v0 becomes dm_control-cheetah-run-v0.
     """
     return re.sub(r"[^A-Za-z0-9._-]", "-", text)
+
+
+def duration(seconds: float) -> str:
+    """A duration as text: 40 s, 7 min, 12.5 h."""
+    for unit, size in (("h", 3600), ("min", 60)):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} s"

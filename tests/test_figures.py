@@ -36,7 +36,7 @@ from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, styles, with_r
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval
-from jbrep.study.results import Return
+from jbrep.study.tables import Return
 
 STEPS = np.arange(0, 50_001, 10_000)
 FINAL = {"full": 900, "dae-8": 500, "pca-4": 300}

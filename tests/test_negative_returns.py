@@ -18,7 +18,7 @@ from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.rules import Planned, Rules
 from jbrep.study.record import RECORD, RunFacts, RunsRecord
-from jbrep.study.results import Return
+from jbrep.study.tables import Return
 
 TASK = "dm_control/pendulum-v0"
 STEPS = np.arange(0, 20_001, 2000)

@@ -8,12 +8,15 @@ from command import in_this_process, jbrep
 from test_study import TINY, TOML
 
 from jbrep.errors import InputError
+from jbrep.records.document import read_document
+from jbrep.records.record import to_plain
 from jbrep.rl.files import RUN, read_run, runs_below
+from jbrep.study.config import read_study
 from jbrep.study.plan import Plan
-from jbrep.study.registration import REGISTRATION, deviations, read_registration
+from jbrep.study.record import RECORD, RunsRecord
+from jbrep.study.registration import REGISTRATION, _hash, read_registration
 from jbrep.study.results import conclude
-from jbrep.study.runner import BACKENDS
-from jbrep.study.study import register_study, run_study
+from jbrep.study.runner import BACKENDS, register_study, run_study
 
 TINIER = TINY.replace(representations=("full",), seeds=(0, 1))
 
@@ -68,10 +71,9 @@ def test_a_changed_study_is_refused_but_for_new_seeds(registered):
 def test_every_deviation_is_told(registered):
     registration, study = registered.registration, registered.study
     runs = [read_run(folder) for folder in runs_below(registered.folder)]
-    named = {run.settings.name: run for run in runs}
-    assert registration.encoders.keys() == named.keys()
-    assert deviations(registration, study, named) == []
-    one, other, *_ = runs
+    assert registration.encoders.keys() == {run.settings.name for run in runs}
+    assert registration.deviations(study, runs) == []
+    one, other, *others = runs
     changed = (
         one.replace(
             settings=one.settings.replace(registration=None),
@@ -80,9 +82,8 @@ def test_every_deviation_is_told(registered):
         ),
         other.replace(settings=other.settings.replace(encoder="0" * 64)),
     )
-    named |= {run.settings.name: run for run in changed}
     more = study.replace(seeds=(0, 1, 7), steps=81)
-    assert deviations(registration, more, named) == [
+    assert registration.deviations(more, [*changed, *others]) == [
         "settings differ: steps 80 (now: 81)",
         "seeds were added, whose runs are exploratory: 7",
         "1 of its runs weren't made under this registration",
@@ -107,10 +108,22 @@ def test_a_registration_comes_first_and_stays_as_it_is(tmp_path):
 
 
 def test_a_registration_without_a_study_is_refused(registered, tmp_path):
-    record = json.loads((registered.folder / REGISTRATION).read_text())
-    (tmp_path / REGISTRATION).write_text(json.dumps({**record, "study": {}}))
-    with pytest.raises(InputError, match="was changed after it was written"):
+    facts = {**to_plain(registered.registration), "study": {}}
+    header = {"format": "jbrep registration", "format_version": 1}
+    text = json.dumps({**header, **facts, "sha256": _hash(facts)})
+    (tmp_path / REGISTRATION).write_text(text)
+    with pytest.raises(InputError, match=r"registration\.json is damaged .*study.tasks is missing"):
         read_registration(tmp_path)
+
+
+@pytest.mark.parametrize("path", sorted(Path("results").glob(f"*/{REGISTRATION}")), ids=str)
+def test_the_committed_results_are_of_the_studies_that_were_registered(path):
+    registration = read_registration(path.parent)
+    study = read_study(Path("studies") / f"{path.parent.name}.toml")
+    assert not registration.differences(study)
+    record = read_document(path.with_name(RECORD), RunsRecord)
+    assert record.registration.sha256 == registration.sha256
+    assert not registration.differences(record.study)
 
 
 def test_a_study_with_primary_cells_is_registered_when_it_begins(tmp_path):

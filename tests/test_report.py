@@ -31,8 +31,8 @@ from jbrep.stats.claims import CLAIMS
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD
-from jbrep.study.references import REFERENCE_RETURNS, write_references
 from jbrep.study.results import conclude
+from jbrep.study.tables import REFERENCE_RETURNS, write_references
 from jbrep.text import SIGNIFICANT, Table, number
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -429,7 +429,7 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
     for _, name, episode, played in rows[1:]:
         alone = find_episode(policies[name], int(episode), tasks[0][0]).reward.sum()
         assert float(played) == pytest.approx(alone, abs=1e-3)
-    monkeypatch.setattr("jbrep.study.references.find_player", None)
+    monkeypatch.setattr("jbrep.study.tables.find_player", None)
     write_references(tasks, tmp_path)
 
 

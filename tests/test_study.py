@@ -42,16 +42,11 @@ from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, as_study, read_study
 from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.prepare import prepare
-from jbrep.study.progress import Progress, duration
-from jbrep.study.references import REFERENCE_RETURNS, read_references, write_references
-from jbrep.study.results import (
-    RETURNS,
-    conclude,
-    read_runs,
-)
-from jbrep.study.runner import get_backend, on_this_machine
-from jbrep.study.study import run_study
+from jbrep.study.results import conclude, read_runs
+from jbrep.study.runner import Progress, on_this_machine, run_study
+from jbrep.study.tables import REFERENCE_RETURNS, RETURNS, read_references, write_references
 from jbrep.study.work import PROGRESS, Outcome, work
+from jbrep.text import duration
 
 TINY = Study(
     tasks=("face_direction",),
@@ -221,7 +216,7 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
     ]
     path = tmp_path / "tiny.toml"
     path.write_text(TOML.replace('["full", "pca-8"]', json.dumps(representations)))
-    monkeypatch.setattr("jbrep.study.study.estimate", lambda run: 60)
+    monkeypatch.setattr("jbrep.study.packing.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
     assert "This study compares nothing: representations must have full" in told.stderr
     assert "1.0 h" not in told.stdout
@@ -491,7 +486,7 @@ def test_tables_fit_the_terminal(done):
 def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     (tmp_path / "tiny.toml").write_text(TOML)
     out = shutil.copytree(done.folder, tmp_path / "out")
-    monkeypatch.setattr("jbrep.study.study.run_study", lambda *given: 2)
+    monkeypatch.setattr("jbrep.study.runner.run_study", lambda *given: 2)
     monkeypatch.setattr("jbrep.report.report.write_report_of", lambda tables, out: [])
     told = jbrep("study", tmp_path / "tiny.toml", "--out", out)
     assert told.exit_code == 1
@@ -607,8 +602,12 @@ def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
 def test_no_run_and_no_backend(tmp_path):
     with pytest.raises(InputError, match=r"no finished run below .* train one with jbrep rl"):
         read_runs(tmp_path)
-    with pytest.raises(InputError, match="unknown backend 'slurm': choose one of local, ray"):
-        get_backend("slurm")
+    (tmp_path / "tiny.toml").write_text(TOML)
+    told = jbrep("study", tmp_path / "tiny.toml", "--backend", "slurm")
+    assert (told.exit_code, told.stderr) == (
+        2,
+        "Error: unknown backend 'slurm': choose one of local, ray\n",
+    )
 
 
 @pytest.mark.parametrize(

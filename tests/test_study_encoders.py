@@ -32,12 +32,13 @@ from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.files import ENCODER, read_run
 from jbrep.rl.policy import load_run
 from jbrep.study.config import Data, Study, as_study
-from jbrep.study.diagnostics import add_diagnostics
+from jbrep.study.packing import forecast
 from jbrep.study.plan import Plan, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.record import EACH_ITS_OWN, RECORD
-from jbrep.study.results import RETURNS, conclude
-from jbrep.study.study import forecast, run_study
+from jbrep.study.results import conclude
+from jbrep.study.runner import run_study
+from jbrep.study.tables import RETURNS, add_diagnostics
 from jbrep.study.work import Assigned, work
 
 TASK = "face_direction"
@@ -504,7 +505,7 @@ def test_a_drawing_of_an_encoder_without_decoder_ends_with_the_latent():
 
 def test_the_time_of_code_is_estimated_by_itself(done, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "jbrep.study.study.estimate", lambda runs: 60 if runs[0].encoder == NET else 30
+        "jbrep.study.packing.estimate", lambda runs: 60 if runs[0].encoder == NET else 30
     )
     runs = forecast(Plan(done.study, tmp_path / "it"), 1).runs
     assert [seconds for _, _, seconds in runs[:5]] == [30, 30, 60, 30, 30]

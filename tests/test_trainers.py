@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jbrep.study.record import RECORD
-from jbrep.study.results import COLUMNS, RETURNS
+from jbrep.study.tables import COLUMNS, RETURNS
 
 SEEDS, STEPS, EPISODES = 20, (5_000, 10_000), 10
 ARMS = {  # mean and standard deviation of runs

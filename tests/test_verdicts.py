@@ -19,7 +19,7 @@ from jbrep.stats.rules import Planned, Rules
 from jbrep.study.config import as_study
 from jbrep.study.plan import Plan
 from jbrep.study.results import conclude
-from jbrep.study.study import register_study
+from jbrep.study.runner import register_study
 
 DOCS = Path(__file__).parent.parent / "docs" / "verdicts.md"
 
@@ -161,7 +161,7 @@ def test_rules_that_do_not_fit_the_study(changes, message):
 
 
 def test_a_dry_run_tells_what_could_be_found(tmp_path, monkeypatch):
-    monkeypatch.setattr("jbrep.study.study.estimate", lambda runs: 60)
+    monkeypatch.setattr("jbrep.study.packing.estimate", lambda runs: 60)
     (tmp_path / "it.toml").write_text(STUDY.toml())
     told = jbrep("study", tmp_path / "it.toml", "--dry-run", "--out", tmp_path / "out")
     assert told.exit_code == 0, told.output

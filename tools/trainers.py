@@ -26,7 +26,7 @@ from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.intervals import variance_ratio
 from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.results import COLUMNS, RETURNS, Return
+from jbrep.study.tables import COLUMNS, RETURNS, Return
 from jbrep.text import rounded, table
 
 SB3, *COHORTS = ARMS = ("sb3", "float32", "bfloat16")

@@ -17,20 +17,21 @@ from jbrep.cli.base import (
 )
 from jbrep.cli.environment import import_option
 
+_COUNT = click.IntRange(1, 1024)
+_PATH = click.Path(path_type=Path)
+
 
 @click.command(epilog=example("jbrep study studies/demo.toml --out runs/demo"))
-@click.argument("study", type=click.Path(path_type=Path))
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="A folder.  [default: runs/NAME of the STUDY]"
-)
+@click.argument("study", type=_PATH)
+@click.option("--out", type=_PATH, help="A folder.  [default: runs/NAME of the STUDY]")
 @click.option(
     "--workers",
-    type=click.IntRange(1, 1024),
+    type=_COUNT,
     help="Processes at a time.  [default: one for each core; one if it learns on a GPU]",
 )
 @click.option(
     "--width",
-    type=click.IntRange(1, 1024),
+    type=_COUNT,
     help="The most agents that learn together in a process.  [default: what keeps all busy]",
 )
 @click.option(
@@ -65,22 +66,20 @@ def study(
     Data sets and encoders are made first. Stopped or killed, the same command resumes the study;
     runs that have ended are never run again.
     """
-    from jbrep.study.config import read_study
-    from jbrep.study.packing import usual_workers
-    from jbrep.study.plan import Plan
+    from jbrep.errors import choose
+    from jbrep.report.statistics import forecast_text
+    from jbrep.study import Plan, read_study, register_study, run_study
+    from jbrep.study.packing import forecast
     from jbrep.study.registration import REGISTRATION
-    from jbrep.study.runner import get_backend
-    from jbrep.study.study import forecast, register_study, run_study
+    from jbrep.study.runner import BACKENDS
     from jbrep.text import terminal_width
 
     plan = Plan(read_study(study), out or Path("runs") / study.stem)
-    run, count = get_backend(backend), workers or usual_workers(plan)
-    expected = forecast(plan, count, width) if dry_run else None
+    run = choose(backend, BACKENDS, "backend")
+    expected = forecast(plan, workers, width) if dry_run else None
     for notice in plan.study.notices:
         click.echo(notice, err=True)
     if expected:
-        from jbrep.report.statistics import forecast_text
-
         click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
         return
     if register:
@@ -89,17 +88,17 @@ def study(
         echo_paths([plan.folder / REGISTRATION])
         return
     with stoppable(RESUMES):
-        crashed = run_study(plan, run, count, width)
+        crashed = run_study(plan, run, workers, width)
     if crashed:
         click.echo(f"{crashed} runs crashed: the same command tries them again", err=True)
     if any(map(plan.has_ended, plan.cells)):
-        _conclude(plan.folder)
+        context.invoke(report, folder=plan.folder)
     if crashed:
         context.exit(1)
 
 
 @click.command(cls=Variadic, epilog=example("jbrep report runs/demo"))
-@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("folder", type=_PATH)
 @click.option(
     "--evaluation",
     multiple=True,
@@ -110,9 +109,7 @@ def study(
 @click.option(
     "--across-trainers", is_flag=True, help="Compare runs of different trainers or precisions, too."
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="A folder for it.  [default: the study's own]"
-)
+@click.option("--out", type=_PATH, help="A folder for it.  [default: the study's own]")
 @as_json
 def report(
     folder: Path,
@@ -126,29 +123,18 @@ def report(
     FOLDER holds a study, finished or not, or any runs. Where there are no runs, as in
     results/confirm, the report is made from the tables alone.
     """
-    _conclude(folder, evaluation, across_trainers, out, as_json)
-
-
-def _conclude(
-    folder: Path,
-    evaluations: tuple[str, ...] = (),
-    across_trainers: bool = False,
-    out: Path | None = None,
-    as_json: bool = False,
-) -> None:
-    """Write the tables of the runs below a folder, if there are any, and the report; print them."""
     import json
 
     from jbrep.report.report import SUMMARY, write_report_of
     from jbrep.report.statistics import results_text
     from jbrep.report.tables import read_tables
-    from jbrep.study.diagnostics import add_diagnostics
     from jbrep.study.results import conclude, has_runs
+    from jbrep.study.tables import add_diagnostics
     from jbrep.text import terminal_width
 
     ran = has_runs(folder)
     paths = conclude(folder) if ran else []
-    lines = add_diagnostics(folder, evaluations)
+    lines = add_diagnostics(folder, evaluation)
     tables = read_tables(folder, across_trainers)
     if ran and not as_json:
         echo_text(results_text(tables, terminal_width()))

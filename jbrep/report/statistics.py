@@ -23,9 +23,8 @@ from jbrep.stats.labels import COMPONENTS, REACHED, RepresentationResult
 from jbrep.stats.power import Prospect
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import STEPS_TO
-from jbrep.study.progress import duration
-from jbrep.study.study import Forecast
-from jbrep.text import Table, rounded, table, wrapped
+from jbrep.study.packing import Forecast
+from jbrep.text import Table, duration, rounded, table, wrapped
 
 _KEY = "representation"
 _MOST_DIGITS = 9  # after the point

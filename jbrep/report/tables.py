@@ -11,9 +11,9 @@ from jbrep.records.tables import read_csv
 from jbrep.stats import Analysis
 from jbrep.stats.rules import Planned
 from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.references import References, read_references
 from jbrep.study.registration import REGISTRATION, read_registration
-from jbrep.study.results import COLUMNS, RETURNS, Return, found
+from jbrep.study.results import found
+from jbrep.study.tables import COLUMNS, RETURNS, References, Return, read_references
 
 
 class Tables(NamedTuple):

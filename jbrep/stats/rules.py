@@ -49,7 +49,7 @@ _Share = Annotated[float, Meta(gt=0, lt=1)]
 _POINTS = 401  # of the grid on which paths are integrated, with Simpson's rule
 
 
-class Rules(Record, frozen=True, kw_only=True):
+class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
     """What is tested, and how strictly: the table `verdicts` of a study's file.
 
     Raises:

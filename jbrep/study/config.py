@@ -137,7 +137,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             "{task} stands for each task's name.",
         ),
     ] = ()
-    verdicts: Mapping[str, Any] = {}  # as `Rules` has them
+    verdicts: Rules = Rules()
 
     def check(self) -> None:
         """As for `Record`."""
@@ -208,24 +208,24 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             if name != FULL
         }
         short = {full: name for name, full in SHORT_NAMES.items()}
-        if self.rules.primary and (long := [task for task in self.tasks if task in short]):
+        if self.verdicts.primary and (long := [task for task in self.tasks if task in short]):
             raise InputError(
                 f"tasks has {long[0]}: say {short[long[0]]}, as tables do, where there are verdicts"
             )
         counts = self.planned.counts
         if len(set(counts)) < len(counts):
             raise InputError(
-                f"verdicts.looks are {list(self.rules.looks)}: of {len(self.seeds)} seeds, they "
+                f"verdicts.looks are {list(self.verdicts.looks)}: of {len(self.seeds)} seeds, they "
                 f"come after {' and '.join(map(str, counts))}"
             )
-        for cell in self.rules.primary:
+        for cell in self.verdicts.primary:
             if cell not in cells or not self.comparisons:
                 raise InputError(
                     f"verdicts.primary has {cell}: it must be of TASK/ALGORITHM/REPRESENTATION of "
                     f"this study, compared with {FULL}"
                 )
-            for claim in self.rules.claims:
-                if reason := obstacle(self.rules, claim, self.arms(cells[cell])):
+            for claim in self.verdicts.claims:
+                if reason := obstacle(self.verdicts, claim, self.arms(cells[cell])):
                     raise InputError(
                         f"verdicts: no outcome could support {claim!r} of {cell}: {reason}"
                     )
@@ -242,15 +242,10 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         runs, encoders = len(self.seeds), len(representation.shares(self.seeds))
         return Arms(runs, encoders if encoders >= FEWEST_UNITS else runs, runs)
 
-    @cached_property
-    def rules(self) -> Rules:
-        """How verdicts are reached."""
-        return from_plain(dict(self.verdicts), Rules, "verdicts")
-
     @property
     def planned(self) -> Planned:
         """What would reach verdicts, if the study were registered as it is."""
-        return Planned(self.rules, self.seeds)
+        return Planned(self.verdicts, self.seeds)
 
     @cached_property
     def observed(self) -> tuple[Representation, ...]:
@@ -289,7 +284,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                 f"This study compares nothing: representations must have {FULL} and at least one "
                 "other."
             )
-        elif not self.rules.primary:
+        elif not self.verdicts.primary:
             lines.append(
                 "This study is exploratory: its report will give no verdicts, as its file names no "
                 "cell in verdicts.primary."

@@ -1,19 +1,28 @@
-"""Which runs of a study go on together: cohorts that keep all workers busy to the end."""
+"""Which runs of a study go on together, to keep all workers busy, and how long that takes."""
 
 import heapq
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
 from joblib import cpu_count
 
+from jbrep.encoders import FULL
+from jbrep.encoders.code import is_code
 from jbrep.errors import InputError
+from jbrep.progress import Progress
+from jbrep.rl import Run
 from jbrep.rl.cohort.replay import memory_of
+from jbrep.rl.run import trainer_of
 from jbrep.rl.settings import COHORT, CPU, CUDA
+from jbrep.rl.speed import estimate
+from jbrep.stats.power import Prospect, prospects
 from jbrep.study.plan import Cell, Plan
-from jbrep.study.representations import ByName
+from jbrep.study.prepare import check
+from jbrep.study.representations import ByCode, ByName
 
 Pack = tuple[Cell, ...]
 
@@ -49,7 +58,7 @@ def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = 
     place, observed = {}, {}
     for number, cell in enumerate(cells):
         place[cell.name] = number
-        if plan.trainer(cell) == COHORT:
+        if trainer_of(cell.learner, plan.study) == COHORT:
             seen = cell.task, cell.representation.name
             if seen not in observed:
                 observed[seen] = _observed(plan, cell)
@@ -98,3 +107,58 @@ def until_done(durations: Iterable[float], workers: int) -> float:
     for each in sorted(durations, reverse=True):
         heapq.heapreplace(busy, busy[0] + each)
     return max(busy)
+
+
+class Forecast(NamedTuple):
+    """What a study would do, and how long it would take."""
+
+    runs: list[tuple[Cell, int, float]]  # to go: each with its cohort's number and time [s]
+    done: int
+    seconds: float  # on one core, besides data and encoders
+    elapsed: float  # with so many workers [s]
+    workers: int
+    prospects: list[Prospect]  # of its primary cells
+
+
+def forecast(plan: Plan, workers: int | None = None, width: int | None = None) -> Forecast:
+    """The runs to go, and how long they would take, estimated from a few steps of each learner.
+
+    Args:
+        plan: the study.
+        workers: how many processes would go on at a time; by default as many as are usual.
+        width: the most agents that would learn together in one.
+
+    Raises:
+        InputError: as `run_study`, as far as that is known beforehand.
+    """
+    check(plan)
+    workers, unfinished = workers or usual_workers(plan), plan.unfinished
+    packs = packed(plan, unfinished, workers, width)
+    examples = {_kind(pack): pack for pack in packs}
+    seconds = {
+        kind: estimate([_example(plan.run(cell)) for cell in pack])
+        for kind, pack in Progress(
+            examples.items(), desc="timing", unit="trial", delay=1, leave=False
+        )
+    }
+    each = [seconds[_kind(pack)] for pack in packs]
+    arms = {cell.label: plan.study.arms(cell.representation) for cell in plan.cells}
+    return Forecast(
+        runs=[(cell, i + 1, each[i]) for i, pack in enumerate(packs) for cell in pack],
+        done=len(plan.cells) - len(unfinished),
+        seconds=sum(each),
+        elapsed=until_done(each, workers),
+        workers=workers,
+        prospects=list(prospects(plan.study.planned, arms)),
+    )
+
+
+def _kind(pack: Pack) -> tuple[object, ...]:
+    """What the duration of a pack depends on."""
+    own = [c.representation.name for c in pack if isinstance(c.representation, ByCode)]
+    return pack[0].task, pack[0].learner.name, len(pack), tuple(own)
+
+
+def _example(run: Run) -> Run:
+    """A run that takes as long; an encoder that is no code need not exist yet, and costs little."""
+    return run if is_code(run.encoder) else run.replace(encoder=FULL)

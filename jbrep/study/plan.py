@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 
 from jbrep.envs.description import describe
@@ -15,9 +16,8 @@ from jbrep.records.storage import exists, make_folder
 from jbrep.rl import Run
 from jbrep.rl.files import RUN
 from jbrep.rl.learner import Learner
-from jbrep.rl.settings import usual_trainer
 from jbrep.study.config import Study
-from jbrep.study.registration import Registration, check_registered, read_registration
+from jbrep.study.registration import REGISTRATION, Registration, read_registration
 from jbrep.study.representations import Representation
 from jbrep.study.work import Assigned
 from jbrep.text import slug
@@ -56,35 +56,22 @@ class Plan:
         folder: of this study alone.
     """
 
-    def __init__(self, study: Study, folder: Path):
+    def __init__(self, study: Study, folder: str | Path):
         self.study = study
-        self.folder = folder.absolute()  # workers may have another working directory
-
-    @cached_property
-    def representations(self) -> tuple[Representation, ...]:
-        """What agents observe."""
-        return self.study.observed
+        self.folder = Path(folder).absolute()  # workers may have another working directory
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
         """All runs; those of the first seed come first."""
         study = self.study
-        return tuple(
-            Cell(task, study.learner(algorithm), representation, seed)
-            for seed in study.seeds
-            for task in study.tasks
-            for algorithm in study.algorithms
-            for representation in self.representations
-        )
+        learners = [study.learner(algorithm) for algorithm in study.algorithms]
+        grid = product(study.seeds, study.tasks, learners, study.observed)
+        return tuple(Cell(task, learner, seen, seed) for seed, task, learner, seen in grid)
 
     @cached_property
     def registration(self) -> Registration | None:
         """What was written down before the first run; None if nothing was."""
         return read_registration(self.folder)
-
-    def trainer(self, cell: Cell) -> str:
-        """What trains a run."""
-        return self.study.trainer or usual_trainer(cell.learner.algorithm)
 
     @property
     def device(self) -> str:
@@ -169,13 +156,37 @@ class Plan:
                 seeds may change, of a registered study only seeds be added.
         """
         make_folder(self.folder)
-        if self.registration:
-            check_registered(self.registration, self.study, self.folder)
+        if self.registration and (differing := self.registration.differences(self.study)):
+            raise InputError(
+                f"{self.folder} holds the study registered on {self.registration.date[:10]}, and "
+                f"its file was changed: {differing}; put it back, or choose another --out"
+            )
         if (there := read_plan(self.folder)) and (differing := _differing(there.study, self.study)):
             raise InputError(
                 f"{self.folder} holds another study: {differing}; choose another --out"
             )
         self.study.write(self.folder / STUDY)
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether it has runs, at whatever step."""
+        return any((self.folder / "runs").glob("**/*.*"))
+
+    def register(self) -> Registration:
+        """Write down what is going to be run; what is registered already stays as it is.
+
+        Raises:
+            InputError: as `write`, or there are runs already.
+        """
+        self.write()
+        if self.registration is None:
+            if self.has_begun:
+                raise InputError(
+                    f"{self.folder} has runs: a study is registered before its first run"
+                )
+            self.registration = Registration.of(self.study, self.fingerprints)
+            self.registration.write(self.folder / REGISTRATION)
+        return self.registration
 
 
 def _differing(there: Study, study: Study) -> str:

@@ -51,7 +51,7 @@ def check(plan: Plan) -> None:
 
 
 def _by_name(plan: Plan) -> list[ByName]:
-    return [each for each in plan.representations if isinstance(each, ByName)]
+    return [each for each in plan.study.observed if isinstance(each, ByName)]
 
 
 def _is_too_large(representation: ByName, task: Task) -> bool:

@@ -1,6 +1,6 @@
 """What was run, in one file: every run, the settings under each label, the unfinished runs."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -20,7 +20,6 @@ from jbrep.rl.settings import Sha256
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan, read_plan
-from jbrep.study.registration import deviations
 from jbrep.study.work import read_progress
 
 RECORD = "runs.json"
@@ -64,11 +63,11 @@ class EncoderFacts(Record, frozen=True, kw_only=True):
     kind: str
     size: Size  # of the observation
     latent_size: Count  # 0 if they differ
-    encoder: list[Layer]  # of a user's own encoder, none
-    decoder: list[Layer]
-    training: dict[str, Any]  # settings
-    data: dict[str, Any]  # that it was trained on
-    metrics: dict[str, Any]  # of the training
+    encoder: tuple[Layer, ...] = ()  # none of a user's own encoder
+    decoder: tuple[Layer, ...] = ()
+    training: Mapping[str, Any] = {}  # settings
+    data: Mapping[str, Any] = {}  # that it was trained on
+    metrics: Mapping[str, Any] = {}  # of the training
 
     def check(self) -> None:
         """Check what reports show.
@@ -141,7 +140,6 @@ class RunsRecord(Document, frozen=True, kw_only=True):
             raise InputError("the version of jbrep is missing")
         if unknown := [run.label for run in self.runs if run.label not in self.labels]:
             raise InputError(f"settings of {unknown[0]} are missing")
-
         for run in self.runs:
             self.settings_of(run)
 
@@ -178,20 +176,14 @@ def runs_record(folder: Path, ended: Mapping[Path, RunRecord]) -> RunsRecord:
         versions=_distinct(dict(run.versions) for run in runs.values()),
         processors=_distinct(run.cpu for run in runs.values()),
         labels={label: _label(of_label) for label, of_label in labels.items()},
-        runs=[
-            run_facts(run, next(iter(labels[run.settings.label].values()))) for run in runs.values()
-        ],
+        runs=[_run(run, labels[run.settings.label]) for run in runs.values()],
     )
 
 
-def run_facts(run: RunRecord, first: RunRecord) -> RunFacts:
-    """What is told of a run, whose label's settings are those of the first one.
-
-    Args:
-        run: what its run.json says.
-        first: the same of the first run of its label.
-    """
-    settings, shared = (to_plain(shared_settings(each.settings)) for each in (run, first))
+def _run(run: RunRecord, of_label: Mapping[Path, RunRecord]) -> RunFacts:
+    """What is told of a run; its label has the settings of the first of its runs."""
+    first = next(iter(of_label.values()))
+    settings, shared = (to_plain(_shared_settings(each.settings)) for each in (run, first))
     return RunFacts(
         label=run.settings.label,
         seed=run.settings.seed,
@@ -211,7 +203,7 @@ def _sort_key(settings: RunSettings, order: list[str]) -> tuple[Any, ...]:
     return settings.task, settings.learner, representation, settings.seed
 
 
-def shared_settings(settings: RunSettings) -> LabelSettings:
+def _shared_settings(settings: RunSettings) -> LabelSettings:
     """The settings that all runs of a label share: without the seed and what depends on it."""
     shared = {name: getattr(settings, name) for name in SharedSettings.__struct_fields__}
     return LabelSettings(
@@ -223,7 +215,7 @@ def shared_settings(settings: RunSettings) -> LabelSettings:
 
 def _label(runs: Mapping[Path, RunRecord]) -> Label:
     """What the runs of a label share, by folder."""
-    settings = shared_settings(next(iter(runs.values())).settings)
+    settings = _shared_settings(next(iter(runs.values())).settings)
     folders = list(runs) if settings.encoder == EACH_ITS_OWN else list(runs)[:1]
     encoder = _common([_encoder(each, runs[each]) for each in folders])
     return Label(settings=settings, encoder=encoder)
@@ -238,11 +230,6 @@ def _encoder(folder: Path, run: RunRecord) -> EncoderFacts:
             kind=OWN,
             size=settings.environment.size,
             latent_size=run.latent_size,
-            encoder=[],
-            decoder=[],
-            training={},
-            data={},
-            metrics={},
         )
     encoder = load(folder / ENCODER)
     return EncoderFacts(
@@ -250,8 +237,8 @@ def _encoder(folder: Path, run: RunRecord) -> EncoderFacts:
         kind=encoder.kind,
         size=encoder.size,
         latent_size=encoder.latent_size,
-        encoder=[(len(layer.bias), layer.activation) for layer in encoder.encoder],
-        decoder=[(len(layer.bias), layer.activation) for layer in encoder.decoder],
+        encoder=tuple((len(layer.bias), layer.activation) for layer in encoder.encoder),
+        decoder=tuple((len(layer.bias), layer.activation) for layer in encoder.decoder),
         **{name: getattr(encoder.header, name) for name in ("training", "data", "metrics")},
     )
 
@@ -269,15 +256,15 @@ def _shared(value: Any, others: Sequence[Any]) -> Any:
     return value if all(each == value for each in others) else type(value)()
 
 
-def _registration(plan: Plan, runs: Iterable[RunRecord]) -> RegistrationFacts | None:
+def _registration(plan: Plan, runs: Collection[RunRecord]) -> RegistrationFacts | None:
     """When a study was registered, and how what ran differs from that; None if it wasn't."""
-    if plan.registration is None:
+    registered = plan.registration
+    if registered is None:
         return None
-    named = {run.settings.name: run for run in runs}
     return RegistrationFacts(
-        sha256=plan.registration.sha256,
-        date=plan.registration.date,
-        deviations=deviations(plan.registration, plan.study, named),
+        sha256=registered.sha256,
+        date=registered.date,
+        deviations=registered.deviations(plan.study, runs),
     )
 
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -54,45 +54,53 @@ class Registration(Document, frozen=True, kw_only=True):
     @property
     def planned(self) -> Planned:
         """What reaches verdicts: the rules that were registered, on the seeds that were."""
-        return Planned(self.registered.rules, self.registered.seeds)
+        return Planned(self.registered.verdicts, self.registered.seeds)
+
+    @classmethod
+    def of(cls, study: Study, encoders: Mapping[str, str]) -> "Registration":
+        """The registration of a study, now.
+
+        Args:
+            study: its settings.
+            encoders: the SHA-256 of those that are there, by the name of the run.
+        """
+        facts = {
+            "study": to_plain(study),
+            "encoders": dict(encoders),
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "versions": packages(),
+            "commits": dict(commits()),
+        }
+        return cls(sha256=_hash(facts), **facts)
 
     def differences(self, study: Study) -> str:
         """How a study differs from the registered one, but for seeds that were added."""
         kept = [seed for seed in study.seeds if seed in self.registered.seeds]
         return differences(to_plain(self.registered), {**to_plain(study), "seeds": kept})
 
+    def deviations(self, study: Study, runs: Collection[RunRecord]) -> list[str]:
+        """How what ran differs from what was registered, in sentences.
 
-def register(folder: Path, study: Study, encoders: Mapping[str, str]) -> Registration:
-    """Write a study's plan into its folder; one that is registered stays as it is.
-
-    Args:
-        folder: of the study.
-        study: its settings.
-        encoders: the SHA-256 of those that are there, by the name of the run.
-
-    Raises:
-        InputError: it is registered with other settings, or has runs already.
-    """
-    if there := read_registration(folder):
-        check_registered(there, study, folder)
-        return there
-    if has_begun(folder):
-        raise InputError(f"{folder} has runs: a study is registered before its first run")
-    facts = {
-        "study": to_plain(study),
-        "encoders": dict(encoders),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": packages(),
-        "commits": dict(commits()),
-    }
-    made = Registration(sha256=_hash(facts), **facts)
-    made.write(folder / REGISTRATION)
-    return made
-
-
-def has_begun(folder: Path) -> bool:
-    """Whether a study has runs, at whatever step."""
-    return any((folder / "runs").glob("**/*.*"))
+        Args:
+            study: its settings now.
+            runs: all that have ended.
+        """
+        found = []
+        if differing := self.differences(study):
+            found.append(f"settings differ: {differing}")
+        if added := [seed for seed in study.seeds if seed not in self.registered.seeds]:
+            found.append(f"seeds were added, whose runs are exploratory: {_listed(added)}")
+        if strays := [run for run in runs if run.settings.registration != self.sha256]:
+            found.append(f"{len(strays)} of its runs weren't made under this registration")
+        used = ((run.settings.name, run.settings.encoder) for run in runs)
+        if other := [name for name, each in used if self.encoders.get(name, each) != each]:
+            found.append(f"{len(other)} of its runs have other encoders than there were")
+        for name, version in self.versions.items():
+            if others := {run.versions.get(name, "none") for run in runs} - {version}:
+                found.append(f"{name} was {_listed(sorted(others))}, not {version}")
+        if {run.commits.get("jbrep") for run in runs} - {self.commits.get("jbrep"), None}:
+            found.append("some runs were made by other commits of jbrep's code")
+        return found
 
 
 def read_registration(folder: Path) -> Registration | None:
@@ -104,51 +112,6 @@ def read_registration(folder: Path) -> Registration | None:
     """
     path = folder / REGISTRATION
     return read_document(path, Registration) if exists(path) else None
-
-
-def check_registered(registration: Registration, study: Study, folder: Path) -> None:
-    """Check that a study is the one that was registered, but for seeds that were added.
-
-    Raises:
-        InputError: it isn't.
-    """
-    if differing := registration.differences(study):
-        raise InputError(
-            f"{folder} holds the study registered on {registration.date[:10]}, and its file was "
-            f"changed: {differing}; put it back, or choose another --out"
-        )
-
-
-def deviations(
-    registration: Registration, study: Study, runs: Mapping[str, RunRecord]
-) -> list[str]:
-    """How what ran differs from what was registered, in sentences.
-
-    Args:
-        registration: of the study.
-        study: its settings now.
-        runs: contents of run.json, of all that have ended, by label and seed.
-    """
-    found = []
-    if differing := registration.differences(study):
-        found.append(f"settings differ: {differing}")
-    if added := [seed for seed in study.seeds if seed not in registration.registered.seeds]:
-        found.append(f"seeds were added, whose runs are exploratory: {_listed(added)}")
-    every = list(runs.values())
-    if strays := [run for run in every if run.settings.registration != registration.sha256]:
-        found.append(f"{len(strays)} of its runs weren't made under this registration")
-    known = registration.encoders
-    used = {name: run.settings.encoder for name, run in runs.items()}
-    if other := [name for name, encoder in used.items() if known.get(name, encoder) != encoder]:
-        found.append(f"{len(other)} of its runs have other encoders than there were")
-    for name, version in registration.versions.items():
-        others = {run.versions.get(name, "none") for run in every} - {version}
-        if others:
-            found.append(f"{name} was {_listed(sorted(others))}, not {version}")
-    registered_commit = registration.commits.get("jbrep")
-    if {run.commits.get("jbrep") for run in every} - {registered_commit, None}:
-        found.append("some runs were made by other commits of jbrep's code")
-    return found
 
 
 def _listed(values: Iterable[object]) -> str:

@@ -15,7 +15,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
-from jbrep.records.tables import Columns, count, finite, write_csv
+from jbrep.records.tables import write_csv
 from jbrep.rl.files import FAILED, RUN, RunRecord, read_evaluations, read_run, runs_below
 from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.rules import Planned
@@ -26,30 +26,18 @@ from jbrep.study.record import (
     LabelSettings,
     RunFacts,
     RunsRecord,
-    run_facts,
     runs_record,
-    shared_settings,
 )
-from jbrep.study.references import References, read_references, write_references
+from jbrep.study.tables import (
+    COLUMNS,
+    RETURNS,
+    References,
+    Return,
+    read_references,
+    write_references,
+)
 
-RETURNS = "returns.csv"
 Ended = dict[Path, RunRecord]  # what run.json says of each run that has ended, by folder
-COLUMNS: Columns = {  # of the long table of returns
-    **{"task": str, "algorithm": str, "representation": str},
-    **{"seed": count, "step": count, "episode": count, "return": finite},
-}
-
-
-class Return(NamedTuple):
-    """A row of returns.csv: an episode of an evaluation."""
-
-    task: str
-    algorithm: str
-    representation: str
-    seed: int
-    step: int
-    episode: int
-    episode_return: float
 
 
 class Found(NamedTuple):
@@ -99,14 +87,7 @@ def found(
     Raises:
         InputError: a run has returns that it can't have.
     """
-    by_run: dict[tuple[str, int], list[tuple[int, float]]] = defaultdict(list)
-    for row in returns:
-        label = f"{row.task}/{row.algorithm}/{row.representation}"
-        by_run[label, row.seed].append((row.step, row.episode_return))
-    runs = [
-        _curve(run, record.settings_of(run), by_run[run.label, run.seed], references)
-        for run in record.runs
-    ]
+    runs = _curves(record, returns, references)
     if across_trainers:
         runs = [replace(run, trainer="") for run in runs]
     compared, left_out = _comparable(runs)
@@ -123,16 +104,8 @@ def read_runs(folder: Path) -> list[RunCurve]:
     Raises:
         InputError: there is none, or a file of one is damaged.
     """
-    references = read_references(folder)
-    return [
-        _curve(
-            run_facts(run, run),
-            shared_settings(run.settings),
-            [(row.step, row.episode_return) for row in read_evaluations(each)],
-            references,
-        )
-        for each, run in _ended(folder).items()
-    ]
+    ended = _ended(folder)
+    return _curves(runs_record(folder, ended), _returns(ended), read_references(folder))
 
 
 def has_runs(folder: Path) -> bool:
@@ -189,6 +162,20 @@ def _returns(ended: Ended) -> Iterator[Return]:
 
 def _order(run: RunRecord) -> tuple[str, int]:
     return run.settings.label, run.settings.seed
+
+
+def _curves(
+    record: RunsRecord, returns: Iterable[Return], references: References
+) -> list[RunCurve]:
+    """The runs of a study, from its tables."""
+    by_run: dict[tuple[str, int], list[tuple[int, float]]] = defaultdict(list)
+    for row in returns:
+        label = f"{row.task}/{row.algorithm}/{row.representation}"
+        by_run[label, row.seed].append((row.step, row.episode_return))
+    return [
+        _curve(run, record.settings_of(run), by_run[run.label, run.seed], references)
+        for run in record.runs
+    ]
 
 
 def _curve(

@@ -1,17 +1,29 @@
-"""The runs of a study, side by side: on this machine, or on a Ray cluster."""
+"""A study from start to end: its runs side by side, on this machine or on a Ray cluster."""
 
+import sys
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from typing import Any
 
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
 from jbrep.envs.names import imported_modules
-from jbrep.errors import choose
 from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
+from jbrep.records.lock import exclusive
+from jbrep.records.storage import make_folder
+from jbrep.rl.files import FAILED, FINISHED, read_run
+from jbrep.rl.job import Job
 from jbrep.rl.settings import CUDA
-from jbrep.study.packing import Pack
-from jbrep.study.plan import Plan
-from jbrep.study.progress import say
-from jbrep.study.work import CRASHED, Outcome, work
+from jbrep.study.packing import Pack, packed, usual_workers
+from jbrep.study.plan import Cell, Plan
+from jbrep.study.prepare import check, prepare
+from jbrep.study.registration import Registration
+from jbrep.study.work import CRASHED, Outcome, read_progress, work
+from jbrep.text import duration
 
 Backend = Callable[[Plan, Iterable[Pack], int], Generator[Outcome]]
 
@@ -77,15 +89,146 @@ def on_ray(plan: Plan, packs: Iterable[Pack], workers: int) -> Generator[Outcome
 BACKENDS: dict[str, Backend] = {"local": on_this_machine, "ray": on_ray}
 
 
-def get_backend(name: str) -> Backend:
-    """A way to run.
-
-    Raises:
-        InputError: there is none of that name; the message lists them.
-    """
-    return choose(name, BACKENDS, "backend")
-
-
 def _job(plan: Plan, pack: Pack) -> tuple[Any, ...]:
     """The arguments of `work`."""
     return plan.assigned(pack), stop_requested, imported_modules()
+
+
+def run_study(
+    plan: Plan,
+    backend: Backend = on_this_machine,
+    workers: int | None = None,
+    width: int | None = None,
+) -> int:
+    """Collect data, train encoders, and train every agent that hasn't been trained yet.
+
+    A study that names primary cells is registered first, unless it has begun.
+
+    `jbrep.study.results.conclude` then writes what came of it.
+
+    Args:
+        plan: the study.
+        backend: what runs it.
+        workers: how many processes go on at a time; by default as many as are usual.
+        width: the most agents that learn together in one.
+
+    Returns:
+        How many runs crashed.
+
+    Raises:
+        InputError: the folder holds another study, the study's settings can't be used, or memory
+            doesn't hold as many agents.
+    """
+    check(plan)
+    workers, unfinished = workers or usual_workers(plan), plan.unfinished
+    packs = packed(plan, unfinished, workers, width)
+    make_folder(plan.folder)
+    with exclusive(plan.folder):
+        plan.write()
+        if plan.study.verdicts.primary and not plan.has_begun:
+            plan.register()
+        prepare(plan)
+        for cell in plan.cells:  # so that any mistake shows before the first run
+            Job(plan.run(cell), plan.folder_of(cell)).clear()
+        if not unfinished:
+            return 0
+        statuses = Counter[str]()
+        with (
+            Progress(plan, unfinished) as progress,
+            closing(backend(plan, packs, workers)) as outcomes,
+        ):
+            for outcome in outcomes:
+                progress.report(outcome)
+                statuses[outcome.status] += 1
+    return statuses[CRASHED]
+
+
+def register_study(plan: Plan) -> Registration:
+    """Write down what is going to be run, before the first run.
+
+    Raises:
+        InputError: as `run_study`, or there are runs already.
+    """
+    check(plan)
+    return plan.register()
+
+
+class Progress:
+    """A line for each run that ends; on a terminal also a live table of the runs under way.
+
+    Args:
+        plan: the study.
+        unfinished: the runs to go.
+    """
+
+    def __init__(self, plan: Plan, unfinished: Iterable[Cell]):
+        self._plan = plan
+        self._unfinished = {cell.name: cell for cell in unfinished}
+        self._counts = Counter[str](
+            read_run(plan.folder_of(cell)).status
+            for cell in plan.cells
+            if cell.name not in self._unfinished
+        )
+        self._start, self._ended = time.monotonic(), 0  # runs that ended since then
+        self._steps_before = self._steps_under_way()
+        self._live: AbstractContextManager[object] = nullcontext()
+        if sys.stderr is not None and sys.stderr.isatty():
+            self._live = Live(
+                console=Console(stderr=True),
+                get_renderable=self._table,
+                refresh_per_second=1,
+                transient=True,
+            )
+
+    def __enter__(self) -> "Progress":
+        self._live.__enter__()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._live.__exit__(None, None, None)
+
+    def report(self, outcome: Outcome) -> None:
+        """Count a run that has ended, and print a line."""
+        self._counts[outcome.status] += 1
+        self._ended += 1
+        total = len(self._plan.cells)
+        del self._unfinished[outcome.name]
+        number = total - len(self._unfinished)
+        say(f"{number}/{total} {outcome.name} {outcome.status}: {outcome.message}")
+
+    def _table(self) -> Table:
+        table = Table(box=None, pad_edge=False)
+        for name in ("running", "steps", "last evaluation"):
+            table.add_column(name, justify="left" if name == "running" else "right")
+        for cell in list(self._unfinished.values()):
+            step, mean = read_progress(self._plan.folder_of(cell))
+            last = mean if step < self._plan.study.steps else "final one under way"
+            if step:
+                table.add_row(cell.name, f"{step:,} of {self._plan.study.steps:,}", last)
+        table.caption = self._summary()
+        return table
+
+    def _summary(self) -> str:
+        counts = [f"{self._counts[status]} {status}" for status in (FINISHED, FAILED, CRASHED)]
+        return ", ".join([*counts, f"{len(self._unfinished)} to go, {self._time_left()} left"])
+
+    def _steps_under_way(self) -> int:
+        """Steps that the unfinished runs have done."""
+        cells = list(self._unfinished.values())
+        return sum(read_progress(self._plan.folder_of(cell))[0] for cell in cells)
+
+    def _time_left(self) -> str:
+        """From the steps done since the start."""
+        steps, under_way = self._plan.study.steps, self._steps_under_way()
+        done = self._ended * steps + under_way - self._steps_before
+        if done <= 0:
+            return "-"
+        seconds_per_step = (time.monotonic() - self._start) / done
+        return duration(seconds_per_step * (len(self._unfinished) * steps - under_way))
+
+
+def say(line: str) -> None:
+    """Print a line on standard error, above a live table; a study goes on where that fails."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(line, file=sys.stderr, flush=True)

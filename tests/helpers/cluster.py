@@ -12,8 +12,7 @@ from ray.cluster_utils import Cluster
 
 from jbrep.collect import collect
 from jbrep.study.plan import Plan
-from jbrep.study.runner import on_ray
-from jbrep.study.study import run_study
+from jbrep.study.runner import on_ray, run_study
 from jbrep.study.work import PROGRESS
 
 NODE = {"num_cpus": 1, "include_dashboard": False, "include_log_monitor": False}

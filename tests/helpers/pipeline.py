@@ -13,9 +13,8 @@ from command import in_this_process, jbrep, start, wait_for, wait_for_the_end_of
 from small import contents
 
 from jbrep.report.report import STATISTICS, SUMMARY
-from jbrep.study.references import REFERENCE_RETURNS
-from jbrep.study.results import RETURNS
 from jbrep.study.runner import BACKENDS
+from jbrep.study.tables import REFERENCE_RETURNS, RETURNS
 
 STUDY = """
 tasks = ["face_direction"]

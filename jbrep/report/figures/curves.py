@@ -24,8 +24,7 @@ from jbrep.report.figures.style import (
     with_runs,
 )
 from jbrep.stats.analysis import Analysis, GroupAnalysis
-from jbrep.study.references import References
-from jbrep.study.results import Return
+from jbrep.study.tables import References, Return
 
 Groups = Sequence[GroupAnalysis]
 Evaluated = tuple[str, str, str, int, int]  # task, algorithm, representation, seed, step

@@ -16,8 +16,7 @@ from jbrep.stats import Analysis
 from jbrep.stats.association import Association
 from jbrep.stats.runs import in_order
 from jbrep.study.record import Label
-from jbrep.study.references import References
-from jbrep.study.results import Return
+from jbrep.study.tables import References, Return
 
 
 def study_plots(

@@ -1,10 +1,12 @@
-"""What evaluations say of the encoders of a study's runs, in its diagnostics.csv."""
+"""The tables of a study: returns of its runs and of reference policies, diagnostics of encoders."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from jbrep.encoders import FULL
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.table import (
@@ -15,13 +17,105 @@ from jbrep.evaluate.table import (
     read_diagnostics,
     write_diagnostics,
 )
+from jbrep.jitterbug.heuristics import HEURISTICS
+from jbrep.play.sources import find_player
 from jbrep.records.document import read_document
 from jbrep.records.storage import exists
+from jbrep.records.tables import Columns, count, finite, read_csv, write_csv
+from jbrep.stats.scale import STILL
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.text import slug
 
+RETURNS = "returns.csv"
+COLUMNS: Columns = {  # of the long table of returns
+    **{"task": str, "algorithm": str, "representation": str},
+    **{"seed": count, "step": count, "episode": count, "return": finite},
+}
+
+REFERENCE_RETURNS = "references.csv"
+RANDOM, HAND_WRITTEN = "random", "hand-written"
+_POLICIES = {STILL: "still", RANDOM: "uniform", HAND_WRITTEN: "heuristic"}
+_REFERENCE_COLUMNS: Columns = {"task": str, "policy": str, "episode": count, "return": finite}
+_Reference = tuple[Any, ...]  # task, policy, episode, return
+References = dict[str, dict[str, list[float]]]  # returns by task and policy
+
 _TASK = "{task}"  # in an evaluation's path: the task's name as in folders
 _Key = tuple[str, str]  # a task, and an encoder's SHA-256 or `full`
+
+
+class Return(NamedTuple):
+    """A row of returns.csv: an episode of an evaluation."""
+
+    task: str
+    algorithm: str
+    representation: str
+    seed: int
+    step: int
+    episode: int
+    episode_return: float
+
+
+def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | None:
+    """Play the reference policies of tasks: standing still, random, and hand-written if there is.
+
+    What the file has already isn't played again; nor is a task whose environment is missing.
+
+    Args:
+        tasks: each with its number of episodes.
+        folder: for the file.
+
+    Returns:
+        The file; None if there is nothing to write.
+
+    Raises:
+        DamageError: what is there isn't such a file.
+    """
+    path = folder / REFERENCE_RETURNS
+    there = _references(path)
+    rows = [
+        row
+        for task, episodes in sorted(tasks, key=lambda each: each[0].name)
+        for policy in _POLICIES
+        if policy != HAND_WRITTEN or task.name in HEURISTICS
+        for row in _kept(there, task, policy, episodes) or _played(task, policy, episodes)
+    ]
+    if not rows:
+        path.unlink(missing_ok=True)
+        return None
+    if rows != there:
+        write_csv(path, [*_REFERENCE_COLUMNS], rows)
+    return path
+
+
+def read_references(folder: Path) -> References:
+    """What `write_references` wrote; nothing if there is no such file.
+
+    Raises:
+        DamageError: it isn't what was written.
+    """
+    found: References = {}
+    for task, policy, _, each in _references(folder / REFERENCE_RETURNS):
+        found.setdefault(task, {}).setdefault(policy, []).append(each)
+    return found
+
+
+def _references(path: Path) -> list[_Reference]:
+    """What the file has; nothing if there is none."""
+    return read_csv(path, _REFERENCE_COLUMNS) if exists(path) else []
+
+
+def _kept(there: list[_Reference], task: Task, policy: str, episodes: int) -> list[_Reference]:
+    """The rows of a task and policy, if they are those wanted."""
+    own = [row for row in there if row[:2] == (task.name, policy)]
+    return own if [row[2] for row in own] == [*range(episodes)] else []
+
+
+def _played(task: Task, policy: str, episodes: int) -> list[_Reference]:
+    try:
+        returns = find_player(_POLICIES[policy], task).returns(episodes)
+    except (InputError, ModuleNotFoundError):  # reports don't need the environments
+        return []
+    return [(task.name, policy, i, round(float(each), 3)) for i, each in enumerate(returns)]
 
 
 def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
@@ -100,9 +194,9 @@ def _unknown(used: Sequence[Diagnosed], known: Mapping[_Key, Values]) -> Iterato
     encoders = Counter(row[:2] for row in used)
     missing = Counter(row[:2] for row in used if _key(row) not in known)
     names = defaultdict[str, list[str]](list)
-    for (task, name), count in missing.items():
+    for (task, name), lacking in missing.items():
         total = encoders[task, name]
-        names[task].append(name if total == 1 else f"{name} ({count} of {total} encoders)")
+        names[task].append(name if total == 1 else f"{name} ({lacking} of {total} encoders)")
     for task, unknown in names.items():
         yield (
             f"no diagnostics for {task} of {', '.join(unknown)}: evaluate them, then jbrep report "
