@@ -110,13 +110,7 @@ def test_codes_that_are_larger_than_the_observation_take_more_memory(tmp_path, m
 
 def test_codes_that_are_larger_than_the_observation_have_packs_of_their_own(tmp_path):
     """They can't be in one cohort with others, so in one pack they would wait for it to end."""
-    packs = packs_of(
-        tmp_path,
-        2,
-        tasks=("face_direction",),
-        algorithms=("sac-modern",),
-        representations=("full", "dae-8", "noise-38"),
-        data=Data(steps=1000),
-    )
+    codes = {"representations": ("full", "dae-8", "noise-38"), "data": Data(steps=1000)}
+    packs = packs_of(tmp_path, 2, algorithms=("sac-modern",), **codes)
     seen = [{cell.representation.name for cell in pack} for pack in packs]
     assert all(names == {"noise-38"} or "noise-38" not in names for names in seen)

@@ -96,88 +96,64 @@ def test_the_studies_that_come_along_are_studies(path):
     assert as_study(tomllib.loads(study.toml())) == study
 
 
+def written(folder, *lines):
+    """The file of the tiny study with other lines, or more of them."""
+    changed = {line.partition(" = ")[0]: line for line in TOML.split("\n") if line}
+    changed |= {line.partition(" = ")[0]: line for line in lines}
+    (folder / "tiny.toml").write_text("\n".join(changed.values()))
+    return folder / "tiny.toml"
+
+
 def test_a_study_from_toml(tmp_path):
-    path = tmp_path / "tiny.toml"
-    path.write_text(TOML)
-    assert read_study(path) == TINY
+    assert read_study(written(tmp_path)) == TINY
+    with pytest.raises(InputError, match="no study at"):
+        read_study(tmp_path / "none.toml")
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("line", "message"),
     [
+        ("task = 7", "unknown task: it must be one of steps, .*, tasks, algorithms"),
+        ('tasks = ["fly"]', "unknown task 'fly'"),
+        ('tasks = [".."]', "unknown task '..': it must be a name or a Gymnasium id"),
+        ('tasks = ["my_robots:Robot-v0"]', "only; elsewhere give the id alone, and --import"),
         (
-            "tasks",
-            "task",
-            "unknown task: it must be one of steps, .*, tasks, algorithms",
-        ),
-        ("face_direction", "fly", "unknown task 'fly'"),
-        ("face_direction", "..", "unknown task '..': it must be a name or a Gymnasium id"),
-        ("face_direction", "my_robots:Robot-v0", "only; elsewhere give the id alone, and --import"),
-        (
-            '"face_direction"',
-            '"Robots/Ant-v0", "Robots-Ant-v0"',
+            'tasks = ["Robots/Ant-v0", "Robots-Ant-v0"]',
             "Robots/Ant-v0 and Robots-Ant-v0 would share a folder",
         ),
-        ('"a2c"', '"dqn"', "unknown algorithm 'dqn'"),
-        ('"a2c"', '"a2c-best"', "unknown preset 'best'"),
-        ('"pca-8"', '"fit-8"', "unknown representation 'fit-8'"),
-        ('"pca-8"', '"dae-wide-8"', "unknown representation 'dae-wide-8'"),
+        ('algorithms = ["dqn"]', "unknown algorithm 'dqn'"),
+        ('algorithms = ["a2c-best"]', "unknown preset 'best'"),
         *(
             (
-                '"pca-8"',
-                f'"{name}"',
+                f'representations = ["full", "{name}"]',
                 f"unknown representation '{name}': it must be full, or a method",
             )
-            for name in ("pca", "pca-08", "pca-0", "pca-deep-8", "dae-paper-8", "full-8")
+            for name in ("fit-8", "dae-wide-8", "pca", "pca-08", "pca-0", "pca-deep-8", "full-8")
         ),
-        ('"pca-8"', '"full"', "representations is .*each once"),
-        (
-            "seeds = 2",
-            "seeds = []",
-            r"seeds is \[\]: it must be a list of whole",
-        ),
-        (
-            "seeds = 2",
-            "seeds = 0",
-            r"seeds is 0: it must be a list of whole numbers, or how many \(1 to 65,535\)",
-        ),
-        ("seeds = 2", "seeds = [0.5]", r"seeds\[0\] is 0.5: it must be a whole number from 0"),
-        ("seeds = 2", "seeds = true", "seeds is True: it must be a list of whole numbers"),
-        ("seeds = 2", "seeds = [-1]", r"seeds\[0\] is -1: it must be a whole number"),
-        ("steps = 80", "steps = 0", "steps is 0: it must be"),
-        ("steps = 80", f"steps = {10**23}", "steps"),
-        (
-            "evaluate_every = 80",
-            "evaluate_every = 0",
-            "evaluate_every is 0: it must be a whole number from 1 to 1,000,000,000,000",
-        ),
-        (
-            "episode_steps = 100",
-            "episode_steps = 0",
-            "episode_steps is 0: it must be a whole number from 1 to 1,000,000",
-        ),
-        (
-            "episode_steps = 100",
-            "episode_steps = 1.5",
-            "episode_steps is 1.5: it must be a whole",
-        ),
-        ("steps = 80", "steps = 80\nenvironment = 7", "environment is 7: it must be a table"),
+        ('representations = ["full", "full"]', "representations is .*each once"),
+        ("seeds = []", r"seeds is \[\]: it must be a list of whole"),
+        ("seeds = 0", r"seeds is 0: it must be a list of whole numbers, or how many \(1 to 65,535"),
+        ("seeds = [0.5]", r"seeds\[0\] is 0.5: it must be a whole number from 0"),
+        ("seeds = true", "seeds is True: it must be a list of whole numbers"),
+        ("seeds = [-1]", r"seeds\[0\] is -1: it must be a whole number"),
+        ("steps = 0", "steps is 0: it must be"),
+        (f"steps = {10**23}", "steps"),
+        ("steps = '80'", "steps is '80': it must be a whole number"),
+        ("evaluate_every = 0", "every is 0: it must be a whole number from 1 to 1,000,000,000,000"),
+        ("episode_steps = 0", "steps is 0: it must be a whole number from 1 to 1,000,000"),
+        ("episode_steps = 1.5", "episode_steps is 1.5: it must be a whole"),
+        ("environment = 7", "environment is 7: it must be a table"),
+        ("environment = {g = 1979-05-27}", "environment has a date, or a num"),
+        ("environment = {g = inf}", "environment has a date, or a num"),
+        ("data = 7", "data is 7: it must be a table"),
+        ("data = {rows = 7}", "unknown data.rows"),
+        ("data = {}", "data: it must have either steps"),
+        ("data = {steps = -5}", "data.steps is -5: it must be a whole number from 0"),
+        ("data = {steps = 9, sets = 0}", "sets is 0: it must be a whole number from 1 to 1,000"),
+        ('data = {folder = "it", sets = 2}', "sets is 2: it is left out where there is a folder"),
+        ("training = {epochs = 3}", r"\[data\] is missing"),
         *(
-            (
-                "steps = 80",
-                f"steps = 80\nenvironment.g = {value}",
-                "environment has a date, or a num",
-            )
-            for value in ("1979-05-27", "inf")
-        ),
-        ("steps = 80", "steps = '80'", "steps is '80': it must be a whole number"),
-        ("seeds = 2", "", "seeds is missing"),
-        ("steps = 80", "steps = 80\ndata = 7", "data is 7: it must be a table"),
-        ("steps = 80", "steps = 80\ndata = {rows = 7}", "unknown data.rows"),
-        ("steps = 80", "steps = 80\ndata = {}", "data: it must have either steps"),
-        ("steps = 80", "steps = 80\ntraining = {epochs = 3}", r"\[data\] is missing"),
-        *(
-            ("steps = 80", f"steps = 80\ndata = {{steps = 9}}\ntraining = {training}", message)
+            (f"data = {{steps = 9}}\ntraining = {training}", message)
             for training, message in [
                 ("{depth = 3}", "unknown training.depth: it must be one of epochs, "),
                 ("{latent = 3}", "unknown training.latent"),
@@ -186,22 +162,22 @@ def test_a_study_from_toml(tmp_path):
                 ("7", "training is 7: it must be a table"),
             ]
         ),
-        ("steps = 80", "steps 80", "is not valid TOML"),
+        ("steps 80", "is not valid TOML"),
     ],
 )
-def test_a_mistaken_study_is_refused(old, new, message, tmp_path):
-    path = tmp_path / "tiny.toml"
-    path.write_text(TOML.replace(old, new, 1))
+def test_a_mistaken_study_is_refused(line, message, tmp_path):
+    path = written(tmp_path, line)
     with pytest.raises(InputError, match=message) as error:
         read_study(path)
     assert "\n" not in str(error.value)
     assert str(path) in str(error.value)
 
 
-def test_training_is_checked_even_if_no_encoder_is_trained():
-    study = TINY.replace(representations=("full",), data=Data(steps=9))
+def test_a_study_without_seeds_or_with_settings_of_no_encoder_is_refused():
+    with pytest.raises(InputError, match="seeds is missing"):
+        as_study({"tasks": ["face_direction"], "algorithms": ["a2c"], "representations": ["full"]})
     with pytest.raises(InputError, match=r"unknown training\.depth"):
-        study.replace(training={"depth": 3})
+        TINY.replace(representations=("full",), data=Data(steps=9), training={"depth": 3})
 
 
 @pytest.mark.parametrize("representations", [("pca-8", "pca-4"), ("full",)])
@@ -214,8 +190,7 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
         "This study is exploratory: its report will give no verdicts, as its file names no cell in "
         "verdicts.primary."
     ]
-    path = tmp_path / "tiny.toml"
-    path.write_text(TOML.replace('["full", "pca-8"]', json.dumps(representations)))
+    path = written(tmp_path, f"representations = {json.dumps(representations)}")
     monkeypatch.setattr("jbrep.study.packing.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
     assert "This study compares nothing: representations must have full" in told.stderr
@@ -269,14 +244,11 @@ def test_what_the_environment_rules_out_is_said_first(changes, message, tmp_path
 
 
 def test_every_cell_has_its_run(done):
-    names = {cell.name for cell in done.cells}
-    assert len(names) == 4
-    for name in names:
-        run = read_run(done.folder / "runs" / name)
-        _, algorithm, _, seed = name.split("/")
-        assert run.settings.name == name
-        assert (run.settings.algorithm, run.settings.seed) == (algorithm, int(seed[5:]))
-        assert not (done.folder / "runs" / name / PROGRESS).exists()
+    assert len({cell.name for cell in done.cells}) == 4
+    for cell in done.cells:
+        settings = read_run(done.folder_of(cell)).settings
+        assert (settings.name, settings.algorithm, settings.seed) == (cell.name, "a2c", cell.seed)
+        assert not (done.folder_of(cell) / PROGRESS).exists()
 
 
 def test_two_workers_of_which_one_is_killed_give_the_same_tables(done, tmp_path):
@@ -352,26 +324,16 @@ def test_a_data_set_from_elsewhere(collected, tmp_path):
         plan = Plan(study, tmp_path / folder.name)
         prepare(plan)
         assert (plan.encoders("face_direction") / "pca-8.safetensors").exists()
-    for name, message in (
-        ("pca-16", "pca-16 can't be trained for face_direction: latent size is 16"),
-        ("pca-99", "latent size is 99"),
+    five = {"representations": ("full", "pca-5"), "data": None}
+    for changes, message in (
+        ({"representations": ("full", "pca-16")}, "pca-16 can't be trained for face_direction: la"),
+        ({"representations": ("full", "pca-99")}, "latent size is 99"),
+        (five, r"no encoder 'pca-5' ships for .*: choose one of dae-12"),
+        ({"tasks": ("move_to_pose",), "data": Data(folder=str(collected))}, "made for face_direc"),
     ):
-        wrong = study.replace(representations=("full", name))
         with pytest.raises(InputError, match=message):
-            run_study(Plan(wrong, tmp_path / "wrong"), None, 1)
-    with pytest.raises(InputError, match=r"no encoder 'pca-5' ships for .*: choose one of dae-12"):
-        run_study(
-            Plan(TINY.replace(representations=("full", "pca-5")), tmp_path / "w"),
-            *(None, 1),
-        )
-    assert not (tmp_path / "w").exists()
-
-
-def test_a_data_set_of_another_environment(collected, tmp_path):
-    data = Data(folder=str(collected))
-    study = TINY.replace(tasks=("move_to_pose",), data=data)
-    with pytest.raises(InputError, match=r"face_direction was made for face_direction, not for mo"):
-        run_study(Plan(study, tmp_path / "it"), None, 1)
+            run_study(Plan(study.replace(**changes), tmp_path / "wrong"), None, 1)
+    assert not (tmp_path / "wrong").exists()
 
 
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # of infinite returns
@@ -397,18 +359,21 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     assert failed == {"a2c": [0, 0], "a2c-modern": [2, 2]}
 
 
-def test_runs_of_different_trainers_are_compared_on_request(done, tmp_path):
-    shutil.copytree(done.folder / "runs", tmp_path / "runs")
-    for path in tmp_path.rglob("pca-8/*/run.json"):
+def tables_with(plan, folder, runs, **settings):
+    """The tables of a study of which some runs have other settings."""
+    shutil.copytree(plan.folder / "runs", folder / "runs")
+    for path in folder.rglob(f"{runs}/{RUN}"):
         run = json.loads(path.read_text())
-        run["settings"]["trainer"] = "cohort"
-        path.write_text(json.dumps(run))
-    conclude(tmp_path)
-    results = read_tables(tmp_path)
+        path.write_text(json.dumps({**run, "settings": {**run["settings"], **settings}}))
+    conclude(folder)
+    return read_tables(folder)
+
+
+def test_runs_of_different_trainers_are_compared_on_request(done, tmp_path):
+    results = tables_with(done, tmp_path, "pca-8/*", trainer="cohort")
     assert results.analysis is None
-    assert (
-        "trainers: cohort float32 cpu, sb3 float32 cpu; report those of one" in results.left_out[0]
-    )
+    trainers = "trainers: cohort float32 cpu, sb3 float32 cpu; report those of one"
+    assert trainers in results.left_out[0]
     assert read_tables(tmp_path, across_trainers=True).analysis
     assert jbrep("report", tmp_path, "--across-trainers", "--json").exit_code == 0
 
@@ -432,25 +397,17 @@ def test_a_stopped_study_is_resumed(done, tmp_path, monkeypatch):
     assert tables(out) == tables(done.folder)
 
 
-def stop(process):
-    """Stop a study as Ctrl-C does; what it says."""
-    workers = workers_of(process.pid)
-    process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=120)
-    assert process.returncode == 128 + signal.SIGINT, told
-    assert workers
-    wait_for_the_end_of(workers, seconds=1)
-    assert "Traceback" not in told
-    return told
-
-
 def test_a_stopped_study_leaves_checkpoints_and_no_workers(tmp_path):
     """Nor does a killed one leave workers: test_whole, and test_pool while they start."""
-    path, out = tmp_path / "long.toml", tmp_path / "stopped"
-    path.write_text(TOML.replace("steps = 80", "steps = 1_000_000", 1))
+    path, out = written(tmp_path, "steps = 1_000_000"), tmp_path / "stopped"
     process = start("study", path, "--out", out, "--workers", 1)
     assert wait_for(lambda: list(out.rglob(PROGRESS)), process), process.communicate()[1]
-    told = stop(process)
+    workers = workers_of(process.pid)
+    process.send_signal(signal.SIGINT)
+    told = process.communicate(timeout=120)[1]
+    assert (process.returncode, "Traceback" in told) == (128 + signal.SIGINT, False), told
+    assert workers
+    wait_for_the_end_of(workers, seconds=1)
     assert "stopping: the runs under way write their checkpoints" in told
     assert len(list(out.rglob(CHECKPOINT))) == 1
     told = jbrep("report", out)
@@ -484,34 +441,28 @@ def test_tables_fit_the_terminal(done):
 
 
 def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
-    (tmp_path / "tiny.toml").write_text(TOML)
+    path = written(tmp_path)
     out = shutil.copytree(done.folder, tmp_path / "out")
     monkeypatch.setattr("jbrep.study.runner.run_study", lambda *given: 2)
     monkeypatch.setattr("jbrep.report.report.write_report_of", lambda tables, out: [])
-    told = jbrep("study", tmp_path / "tiny.toml", "--out", out)
+    told = jbrep("study", path, "--out", out)
     assert told.exit_code == 1
     assert told.stderr.endswith("2 runs crashed: the same command tries them again\n")
 
 
-MIXED = """
-tasks = ["Robots/Pendulum-v1", "face_direction"]
-algorithms = ["a2c"]
-representations = ["full", "dae-2"]
-seeds = 2
-steps = 80
-evaluate_every = 80
-evaluation_episodes = 1
-episode_steps = 50
-data = {steps = 1000}
-training = {epochs = 2}
-"""
+MIXED = (
+    'tasks = ["Robots/Pendulum-v1", "face_direction"]',
+    'representations = ["full", "dae-2"]',
+    "episode_steps = 50",
+    "data = {steps = 1000}",
+    "training = {epochs = 2}",
+)
 
 
 @pytest.mark.usefixtures("one_figure")
 def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monkeypatch):
     """Its workers import the package; its report is made where that is missing."""
-    path, out = tmp_path / "mixed.toml", tmp_path / "mixed"
-    path.write_text(MIXED)
+    path, out = written(tmp_path, *MIXED), tmp_path / "mixed"
     with monkeypatch.context() as once:
         once.setattr("jbrep.report.report.write_report_of", lambda tables, out: [])
         told = jbrep("study", path, "--out", out, "--workers", 1, "--import", "robots")
@@ -539,11 +490,14 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     assert "--import PACKAGE" in refused.stderr
 
 
-def test_no_references_no_table(tmp_path):
-    text = "task,policy,episode,return\nof other runs,random,0,1.0\n"
-    (tmp_path / REFERENCE_RETURNS).write_text(text)
+def test_no_references_no_table_and_damaged_ones_are_named(tmp_path):
+    path, header = tmp_path / REFERENCE_RETURNS, "task,policy,episode,return\n"
+    path.write_text(header + "of other runs,random,0,1.0\n")
     assert write_references([], tmp_path) is None
-    assert not (tmp_path / REFERENCE_RETURNS).exists()
+    assert not path.exists()
+    path.write_text(header + "a,b,0,x\n")
+    with pytest.raises(DamageError, match=r"references\.csv is damaged or cut short"):
+        read_references(tmp_path)
 
 
 def test_one_study_at_a_time(done):
@@ -558,9 +512,8 @@ def test_the_long_table_holds_every_evaluation(done):
     assert lines[0] == "task,algorithm,representation,seed,step,episode,return"
     assert len(lines) == 1 + 4 * (1 + 10)
     assert lines[1].startswith("face_direction,a2c,full,0,0,0,")
-    final = statistics(read_tables(done.folder).analysis)["groups"][0]["labels"][0]["by_run"][
-        "final_return"
-    ]
+    (group,) = statistics(read_tables(done.folder).analysis)["groups"]
+    final = group["labels"][0]["by_run"]["final_return"]
     at_end = [line.split(",") for line in lines[1:] if ",full," in line and ",80," in line]
     for seed, each in enumerate(final):
         returns = [float(row[-1]) for row in at_end if row[3] == str(seed)]
@@ -602,12 +555,9 @@ def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
 def test_no_run_and_no_backend(tmp_path):
     with pytest.raises(InputError, match=r"no finished run below .* train one with jbrep rl"):
         read_runs(tmp_path)
-    (tmp_path / "tiny.toml").write_text(TOML)
-    told = jbrep("study", tmp_path / "tiny.toml", "--backend", "slurm")
-    assert (told.exit_code, told.stderr) == (
-        2,
-        "Error: unknown backend 'slurm': choose one of local, ray\n",
-    )
+    told = jbrep("study", written(tmp_path), "--backend", "slurm")
+    message = "Error: unknown backend 'slurm': choose one of local, ray\n"
+    assert (told.exit_code, told.stderr) == (2, message)
 
 
 @pytest.mark.parametrize(
@@ -615,12 +565,6 @@ def test_no_run_and_no_backend(tmp_path):
 )
 def test_durations_as_text(seconds, text):
     assert duration(seconds) == text
-
-
-def test_interpolation_leaves_evaluations_as_they_are(done):
-    run = read_runs(done.folder)[0]
-    assert run.steps.tolist() == [0, 80]
-    assert np.all((run.returns >= 0) & (run.returns <= 1000))
 
 
 def test_the_runs_below_a_folder_behave_as_one_policy(done):
@@ -670,17 +614,6 @@ def test_a_study_for_a_gpu_is_read_where_there_is_none(tmp_path, monkeypatch):
     assert read_plan(tmp_path).study.device == "cuda"
     with pytest.raises(InputError, match="no device 'cuda' on this machine: choose auto or cpu"):
         run_study(Plan(study, tmp_path), on_this_machine, 1)
-
-
-def test_what_a_data_set_can_not_be_is_refused_before_anything_is_written():
-    with pytest.raises(InputError, match="-5"):
-        TINY.replace(data=Data(steps=-5))
-
-
-def test_damaged_references_are_named(done, tmp_path):
-    (tmp_path / REFERENCE_RETURNS).write_text("task,policy,episode,return\na,b,0,x\n")
-    with pytest.raises(DamageError, match=r"references\.csv is damaged or cut short"):
-        read_references(tmp_path)
 
 
 def test_what_a_run_killed_at_its_very_end_left_is_removed(done):

@@ -9,11 +9,13 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from command import jbrep
+from command import in_this_process, jbrep
 from judged import diagnostics, evaluation, prediction
 from made_up import label_of
 from my_encoders import LATENT, SIZE, FirstFeatures, dense
-from onnx import helper, numpy_helper
+from test_convert import model
+from test_study import TINY as TINY_STUDY
+from test_study import tables_with
 
 from jbrep.dataset import Dataset
 from jbrep.encoders import find, load, save
@@ -31,7 +33,7 @@ from jbrep.report.tables import read_tables
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.files import ENCODER, read_run
 from jbrep.rl.policy import load_run
-from jbrep.study.config import Data, Study, as_study
+from jbrep.study.config import Data, as_study
 from jbrep.study.packing import forecast
 from jbrep.study.plan import Plan, read_plan
 from jbrep.study.prepare import prepare
@@ -50,27 +52,12 @@ SHARED = {
     "evaluate_every": 80,
     "evaluation_episodes": 1,
 }
-TINY = Study(
-    tasks=(TASK,),
-    algorithms=("a2c",),
-    representations=("full",),
-    seeds=(0, 1),
-    steps=80,
-    evaluate_every=80,
-    evaluation_episodes=1,
-    episode_steps=50,
-)
+TINY = TINY_STUDY.replace(representations=("full",), episode_steps=50)
 
 
 def with_own(*own, **changes):
     """The tiny study with other encoders beside the whole observation."""
     return TINY.replace(representations=("full", *own), **changes)
-
-
-def in_this_process(plan, packs, workers):
-    """A backend that needs no start."""
-    for pack in packs:
-        yield from work(plan.assigned(pack))
 
 
 def put(name, path):
@@ -100,23 +87,14 @@ def at_home(home, monkeypatch):
 
 
 def write_onnx(net, path):
-    """Write a chain of layers as an ONNX model."""
-    nodes, weights, value = [], [], "observation"
-    for i, layer in enumerate(net):
-        inputs = [value, *(f"{i}.{name}" for name in layer.state_dict())]
-        value = f"value-{i}"
-        if isinstance(layer, torch.nn.Linear):
-            arrays = [each.detach().numpy() for each in layer.parameters()]
-            weights += map(numpy_helper.from_array, arrays, inputs[1:])
-            nodes.append(helper.make_node("Gemm", inputs, [value], transB=1))
-        else:
-            nodes.append(helper.make_node(type(layer).__name__, inputs, [value]))
-    ends = [
-        helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["rows", size])
-        for name, size in (("observation", SIZE), (value, LATENT))
-    ]
-    graph = helper.make_graph(nodes, "net", ends[:1], ends[1:], weights)
-    onnx.save(helper.make_model(graph), path)
+    """Write two layers with a tanh between them as an ONNX model."""
+    nodes = "h = Gemm observation w0 b0; t = Tanh h; y = Gemm t w1 b1"
+    weights = {
+        f"{name}{i}": values.detach().numpy().T
+        for i, layer in enumerate((net[0], net[2]))
+        for name, values in (("w", layer.weight), ("b", layer.bias))
+    }
+    onnx.save(model(nodes, weights, ("observation", ("rows", SIZE))), path)
 
 
 PATTERN = {"name": "mine", "file": "encoders/{task}/mine-{seed}.safetensors"}
@@ -259,13 +237,7 @@ def test_a_study_names_evaluations(done, tmp_path):
 
 
 def test_different_encoders_under_one_label_are_refused_otherwise(done, tmp_path):
-    shutil.copytree(done.folder / "runs", tmp_path / "runs")
-    for path in tmp_path.rglob("mine/*/run.json"):
-        run = json.loads(path.read_text())
-        run["settings"]["encoder_seed"] = None
-        path.write_text(json.dumps(run))
-    conclude(tmp_path)
-    results = read_tables(tmp_path)
+    results = tables_with(done, tmp_path, "mine/*", encoder_seed=None)
     assert results.analysis is None
     assert "mixes the settings" in results.left_out[0]
 
@@ -302,10 +274,7 @@ def test_a_file_that_changes_is_refused_once_its_run_has_ended(done, home):
         ({"Hopper-v5": "no.safetensors", TASK: "one.safetensors"}, "one.safetensors"),
         ("folder", f"folder/{TASK}/mine.safetensors"),
         ("for-all", "for-all/mine.safetensors"),
-        (
-            "{task}/{seed}.safetensors",
-            f"{TASK}/1.safetensors",
-        ),
+        ("{task}/{seed}.safetensors", f"{TASK}/1.safetensors"),
     ],
 )
 def test_where_a_file_is(file, expected, tmp_path, monkeypatch):
@@ -378,18 +347,6 @@ def test_each_encoder_of_several_learns_from_its_own_data(tmp_path):
         assert first.manifest.settings.seed == 5
         assert not np.array_equal(first["observation"][:], second["observation"][:])
     assert not (tmp_path / "it" / "data" / TASK / "manifest.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        ({"steps": 100, "sets": 0}, "sets is 0: it must be a whole number from 1 to 1,000"),
-        ({"folder": "data", "sets": 2}, "sets is 2: it is left out where there is a folder"),
-    ],
-)
-def test_mistaken_numbers_of_data_sets_are_refused(data, message):
-    with pytest.raises(InputError, match=message):
-        TINY.replace(data=Data(**data))
 
 
 @pytest.mark.parametrize(
