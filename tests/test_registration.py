@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from command import in_this_process, jbrep
-from test_study import TINY, TOML
+from test_study import TINY, written
 
 from jbrep.errors import InputError
 from jbrep.records.document import read_document
@@ -32,8 +32,7 @@ def registered(tmp_path_factory):
 
 
 def test_a_plan_is_written_down(tmp_path):
-    (tmp_path / "tiny.toml").write_text(TOML)
-    command = ("study", tmp_path / "tiny.toml", "--out", tmp_path / "out", "--register")
+    command = ("study", written(tmp_path), "--out", tmp_path / "out", "--register")
     told = jbrep(*command)
     assert told.exit_code == 0, told.output
     registration = read_registration(tmp_path / "out")
@@ -145,10 +144,9 @@ def test_a_study_with_primary_cells_is_registered_when_it_begins(tmp_path):
 
 def test_a_study_begins_under_its_registration(tmp_path, monkeypatch):
     monkeypatch.setitem(BACKENDS, "local", in_this_process)
-    (tmp_path / "tiny.toml").write_text(TOML)
-    command = ("study", tmp_path / "tiny.toml", "--out", tmp_path / "out")
+    command = ("study", written(tmp_path), "--out", tmp_path / "out")
     assert jbrep(*command, "--register").exit_code == 0
-    (tmp_path / "tiny.toml").write_text(TOML.replace("steps = 80", "steps = 90", 1))
+    written(tmp_path, "steps = 90")
     refused = jbrep(*command)
     assert refused.exit_code == 2
     assert "holds the study registered on" in refused.stderr

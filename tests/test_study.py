@@ -46,7 +46,6 @@ from jbrep.study.results import conclude, read_runs
 from jbrep.study.runner import Progress, on_this_machine, run_study
 from jbrep.study.tables import REFERENCE_RETURNS, RETURNS, read_references, write_references
 from jbrep.study.work import PROGRESS, Outcome, work
-from jbrep.text import duration
 
 TINY = Study(
     tasks=("face_direction",),
@@ -558,13 +557,6 @@ def test_no_run_and_no_backend(tmp_path):
     told = jbrep("study", written(tmp_path), "--backend", "slurm")
     message = "Error: unknown backend 'slurm': choose one of local, ray\n"
     assert (told.exit_code, told.stderr) == (2, message)
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(12.4, "12 s"), (300, "5.0 min"), (90 * 60, "1.5 h"), (1e6, "277.8 h")]
-)
-def test_durations_as_text(seconds, text):
-    assert duration(seconds) == text
 
 
 def test_the_runs_below_a_folder_behave_as_one_policy(done):

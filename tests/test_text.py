@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from jbrep.text import facts, slug, table
+from jbrep.text import duration, facts, slug, table
 
 HEADER = ("encoder", "error", "ratio", "worst feature")
 ROWS = [("dae-8", "0.01", "1.10", "velocity_x"), ("dae-12", "0.002", "1.05", "motor_angle")]
@@ -69,3 +69,8 @@ def test_a_slug_has_hyphens_for_what_a_path_should_not_hold():
     assert slug("dm_control/cheetah-run-v0") == "dm_control-cheetah-run-v0"
     assert slug("my_package:Env-v0 \u00e9\n..") == "my_package-Env-v0---.."
     assert slug("face_direction") == "face_direction"
+
+
+def test_durations_as_text():
+    told = [duration(seconds) for seconds in (12.4, 300, 90 * 60, 1e6)]
+    assert told == ["12 s", "5.0 min", "1.5 h", "277.8 h"]
