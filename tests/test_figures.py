@@ -6,11 +6,10 @@ from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 import pytest
 from judged import NOTHING, diagnostics, evaluation
-from made_up import label_of
+from made_up import drawn, label_of, returns_of
 from matplotlib.text import Text
 from PIL import Image
 
@@ -29,14 +28,12 @@ from jbrep.report.figures import behaviour_plots, encoder_plots, study_plots, wr
 from jbrep.report.figures.claims import claim_plot
 from jbrep.report.figures.curves import every_run
 from jbrep.report.figures.diagnostics import _free
-from jbrep.report.figures.families import family
 from jbrep.report.figures.methods import method_plots, timescales
 from jbrep.report.figures.plot import Drawing
-from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, styles, with_runs
+from jbrep.report.figures.style import COLUMN, DARK, PAGE, PAPER, family, styles, with_runs
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.association import Diagnostic, associations
 from jbrep.stats.bootstrap import Interval
-from jbrep.study.tables import Return
 
 STEPS = np.arange(0, 50_001, 10_000)
 FINAL = {"full": 900, "dae-8": 500, "pca-4": 300}
@@ -75,25 +72,13 @@ def analysis():
 
 @pytest.fixture(scope="module")
 def returns():
-    return [
-        Return(run.task, run.algorithm, run.representation, run.seed, int(step), i, float(each))
-        for run in runs()
-        for step, episodes in zip(run.steps, run.returns, strict=True)
-        for i, each in enumerate(episodes)
-    ]
+    return returns_of(runs())
 
 
 @pytest.fixture(scope="module")
 def plots(analysis, returns):
-    drawn = study_plots(
-        analysis, returns, {"face_direction": {"hand-written": [910, 950, 990]}}, LABELS
-    )
-    return {plot.name: plot for plot in drawn}
-
-
-def drawn(plot, style=PAPER):
-    with mpl.rc_context(style):
-        return plot.draw()
+    played = {"face_direction": {"hand-written": [910, 950, 990]}}
+    return {plot.name: plot for plot in study_plots(analysis, returns, played, LABELS)}
 
 
 def panels(figure):
@@ -178,38 +163,37 @@ def test_a_representation_has_one_colour_in_all_figures(analysis, returns):
     assert latent.get_color() == "#0072B2"
 
 
+def of_first_group(name):
+    key = (*GROUPS[0], name)
+    return [run for run in runs() if (run.task, run.algorithm, run.representation) == key]
+
+
+def check_apart(figure, words, count):
+    """Check that so many texts with these words don't overlap."""
+    boxes = [t.get_window_extent() for t in figure.findobj(Text) if words in t.get_text()]
+    assert len(boxes) == count
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+
+
 def test_titles_of_many_representations_do_not_overlap(returns):
     names = [f"representation-{number}" for number in range(7)]
     full = [row for row in returns if row[:3] == (*GROUPS[0], "full")]
     rows = [row._replace(representation=name) for name in names for row in full]
     figure = Drawing(every_run(rows, {}, lambda: styles(names)), PAPER)._figure
-    titles = [t for t in figure.findobj(Text) if t.get_text().endswith(" (n = 4)")]
-    assert len(titles) == len(names)
-    boxes = [title.get_window_extent() for title in titles]
-    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+    check_apart(figure, "(n = 4)", len(names))
 
 
 def test_titles_of_many_algorithms_do_not_overlap():
-    full = [
-        run
-        for run in runs()
-        if (run.task, run.algorithm, run.representation) == (*GROUPS[0], "full")
-    ]
+    full = of_first_group("full")
     many = [replace(run, algorithm=f"algorithm-{number}") for number in range(6) for run in full]
     (curves,) = (p for p in study_plots(analyse(many), [], {}, {}) if p.name == "representations")
     figure = Drawing(curves, PAPER)._figure
-    titles = [t for t in figure.findobj(Text) if "algorithm-" in t.get_text()]
-    assert len(titles) == 6
-    boxes = [title.get_window_extent() for title in titles]
-    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+    check_apart(figure, "algorithm-", 6)
 
 
 def test_a_study_of_many_representations_can_be_read():
     """Legends don't take the room of panels, and no two lines look alike."""
-    some = [run for run in runs() if (run.task, run.algorithm) == GROUPS[0]]
-    full, other = (
-        [run for run in some if run.representation == name] for name in ("full", "dae-8")
-    )
+    full, other = of_first_group("full"), of_first_group("dae-8")
     names = [f"another-one-{number}" for number in range(15)]
     many = [replace(run, representation=name) for name in names for run in other]
     plots = study_plots(analyse(full + many), [], {}, {})

@@ -2,23 +2,21 @@
 
 import json
 
-import matplotlib as mpl
 import numpy as np
 import pytest
-from made_up import label_of
+from made_up import drawn, label_of, returns_of
 
 from jbrep.envs.task import Feature, Task
 from jbrep.errors import InputError
 from jbrep.records.tables import write_csv
 from jbrep.report import write_report
 from jbrep.report.figures import study_plots, write
-from jbrep.report.figures.style import PAPER, limits
+from jbrep.report.figures.style import limits
 from jbrep.report.statistics import statistics_text
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.rules import Planned, Rules
 from jbrep.study.record import RECORD, RunFacts, RunsRecord
-from jbrep.study.tables import Return
 
 TASK = "dm_control/pendulum-v0"
 STEPS = np.arange(0, 20_001, 2000)
@@ -189,12 +187,7 @@ def test_returns_below_the_floor_are_refused():
 
 @pytest.fixture(scope="module")
 def returns(runs):
-    return [
-        Return(run.task, run.algorithm, run.representation, run.seed, int(step), i, float(each))
-        for run in runs
-        for step, episodes in zip(run.steps, run.returns, strict=True)
-        for i, each in enumerate(episodes)
-    ]
+    return returns_of(runs)
 
 
 def label(name, task=PENDULUM):
@@ -208,11 +201,6 @@ LABELS = {f"{TASK}/sac/{name}": label(name) for name in LEVELS}
 @pytest.fixture(scope="module")
 def plots(analysis, returns):
     return {plot.name: plot for plot in study_plots(analysis, returns, {}, LABELS)}
-
-
-def drawn(plot):
-    with mpl.rc_context(PAPER):
-        return plot.draw()
 
 
 def test_axes_of_returns_are_those_of_the_data(plots, group):

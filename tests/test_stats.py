@@ -13,6 +13,7 @@ from jbrep.report.statistics import statistics_text
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.aggregates import aggregates
 from jbrep.stats.analysis import to_plain
+from jbrep.stats.association import rank_correlation
 from jbrep.stats.comparison import probability_of_improvement
 from jbrep.stats.curves import (
     bands,
@@ -445,11 +446,16 @@ def test_groups_stay_apart():
     assert both[1]["labels"] == to_plain(analyse(runs).groups)[0]["labels"]
 
 
-def test_rliable_gives_the_same_numbers():
+@pytest.fixture(scope="module")
+def rliable():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         library = pytest.importorskip("rliable.library")
-        metrics = pytest.importorskip("rliable.metrics")
+        return library, pytest.importorskip("rliable.metrics")
+
+
+def test_rliable_gives_the_same_numbers(rliable):
+    library, metrics = rliable
     random = np.random.default_rng(0)
     x, y = random.normal(520, 30, 10), random.normal(500, 40, 8)
     np.random.seed(0)  # noqa: NPY002  rliable ignores its random_state
@@ -470,11 +476,8 @@ def test_rliable_gives_the_same_numbers():
     assert found[1:] == pytest.approx(intervals["xy"][:, 0], abs=0.05)
 
 
-def test_results_across_tasks_are_rliable_s():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        library = pytest.importorskip("rliable.library")
-        metrics = pytest.importorskip("rliable.metrics")
+def test_results_across_tasks_are_rliable_s(rliable):
+    library, metrics = rliable
     random = np.random.default_rng(0)
     scores = np.stack([random.normal(0.9, 0.1, 12), random.normal(0.6, 0.2, 12)])
     full = np.ones(10)
@@ -551,3 +554,24 @@ def test_three_digits_are_shown_without_powers_of_ten():
     assert interval([-826.4, -1194.0, -0.00919], SIGNIFICANT) == "-826 [-1,194, -0.00919]"
     assert interval([99999.9, None, None], SIGNIFICANT) == "100,000"
     assert interval([None, None, None], SIGNIFICANT) == "-"
+
+
+@pytest.mark.parametrize("ties", [False, True])
+def test_the_correlation_of_ranks_is_spearman_s(ties):
+    x, noise = np.random.default_rng(0).normal(size=(2, 12))
+    y = x + noise
+    if ties:
+        x, y = x.round(), y.round()
+    value, low, high = rank_correlation(x, y)
+    assert value == pytest.approx(stats.spearmanr(x, y).statistic)
+    assert -1 <= low < value < high <= 1
+    assert rank_correlation(x, y) == rank_correlation(np.exp(x), 3 * y)  # ranks alone count
+    assert rank_correlation(x, y, seed=1) != rank_correlation(x, y)
+    assert rank_correlation(-x, y).value == pytest.approx(-value)
+
+
+def test_few_pairs_and_constant_values_say_nothing():
+    x = np.arange(5.0)
+    assert np.isnan(rank_correlation(x[:4], x[:4])).all()
+    assert np.isnan(rank_correlation(x, np.ones(5))).all()
+    assert rank_correlation(x, x).value == 1

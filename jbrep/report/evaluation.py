@@ -1,14 +1,13 @@
 """An evaluation of encoders as tables to read on a screen."""
 
 import sys
-import textwrap
 from collections.abc import Mapping
 
 from jbrep.encoders import FULL
 from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Scores
 from jbrep.evaluate.table import headline
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.text import facts, interval, number, r2_text, table
+from jbrep.text import Table, facts, interval, number, r2_text, wrapped
 
 _Encoders = Mapping[str, Diagnostics]  # by label
 
@@ -31,6 +30,9 @@ _SERVES = {  # of the headline
     "action": "the action",
 }
 _OF_POLICY = ("value", "action")
+_LOST = (
+    "What a controller needs and the code loses (R² of reading it below .5), the most needed first"
+)
 _NOISE = 0.1  # the level of corruption that is shown
 _MANY = 8  # quantities from which probes are summed up
 
@@ -42,26 +44,20 @@ def evaluation_text(evaluation: Evaluation, width: int | None = None) -> str:
         evaluation: of encoders.
         width: columns to fit; None for lines as long as they come.
     """
-    data, encoders = evaluation.data, evaluation.encoders
-    parts = (
-        *_headline(evaluation, width),
-        f"Error on {data.test_episodes:,} held-out episodes of {data.task} "
-        f"({data.test_rows:,} rows), features scaled to [-1, 1], with 95 % intervals over "
-        "episodes",
-        _losses(encoders, width),
-        "What can be read from the latent: R² of linear probes; KNN-MSE (2: nothing); GTC (1: the "
-        f"units are the state itself{_drawn(encoders)}); R² of the next latent, whitened",
-        _readings(encoders, width),
-        "Latent units: dead ones, the most saturated one, participation ratio, intrinsic dimension",
-        _units(encoders, width),
+    lost = facts(_lost(evaluation), width or sys.maxsize, indent=0)
+    others = _errors(evaluation), _readings(evaluation.encoders), _units(evaluation.encoders)
+    return "\n\n".join(
+        (
+            _served(evaluation).text(width),
+            wrapped(_LOST, width),
+            lost,
+            *(t.text(width) for t in others),
+        )
     )
-    texts, tables = parts[::2], parts[1::2]
-    wrapped = texts if width is None else [textwrap.fill(text, width) for text in texts]
-    return "\n\n".join(part for pair in zip(wrapped, tables, strict=True) for part in pair)
 
 
-def _headline(evaluation: Evaluation, width: int | None) -> tuple[str, ...]:
-    """What tells codes that serve from others, and a line on what each loses."""
+def _served(evaluation: Evaluation) -> Table:
+    """What tells codes that serve from others."""
     policy = evaluation.policy
     shown = {name: words for name, words in _SERVES.items() if policy or name not in _OF_POLICY}
     rows = []
@@ -69,17 +65,16 @@ def _headline(evaluation: Evaluation, width: int | None) -> tuple[str, ...]:
         numbers = headline(known)
         rows.append((label, str(known.latent), *(r2_text(numbers[name]) for name in shown)))
     explained = "; ".join(f"{name}: {words}" for name, words in shown.items())
-    return (
+    return Table(
         f"Whether a controller can work with the code: held-out R², nonlinear (1: all, 0: nothing)."
         f" {explained[0].upper()}{explained[1:]}{f' of {policy}' if policy else ''}",
-        table(("encoder", "l", *shown), rows, width),
-        "What a controller needs and the code loses (R² of reading it below .5), the most needed "
-        "first",
-        _lost(evaluation, width),
+        ("encoder", "l", *shown),
+        rows,
     )
 
 
-def _lost(evaluation: Evaluation, width: int | None) -> str:
+def _lost(evaluation: Evaluation) -> dict[str, str]:
+    """What each code loses of what a controller needs."""
     lines = {}
     for label, known in evaluation.encoders.items():
         lost: dict[str, float] = {}
@@ -88,7 +83,7 @@ def _lost(evaluation: Evaluation, width: int | None) -> str:
         more = len(lost) - _MANY
         some = [f"{words} ({r2_text(kept)})" for words, kept in list(lost.items())[:_MANY]]
         lines[label] = ", ".join(some) + (f" and {more} more" if more > 0 else "") or "nothing"
-    return facts(lines, width or sys.maxsize, indent=0)
+    return lines
 
 
 def in_words(task: str, feature: str) -> str:
@@ -97,10 +92,11 @@ def in_words(task: str, feature: str) -> str:
     return words.get(feature, feature.replace("_", " "))
 
 
-def _losses(encoders: _Encoders, width: int | None) -> str:
+def _errors(evaluation: Evaluation) -> Table:
+    data = evaluation.data
     header = ("encoder", "l", "error", "times PCA's", f"from noise {_NOISE}", "best linear")
     rows = []
-    for label, known in encoders.items():
+    for label, known in evaluation.encoders.items():
         error = known.reconstruction
         if label == FULL:
             continue
@@ -120,7 +116,13 @@ def _losses(encoders: _Encoders, width: int | None) -> str:
                 f"{worst.name} {r2_text(worst.r2.value)}",
             )
         )
-    return table((*header, "worst feature, R²"), rows, width)
+    return Table(
+        f"Error on {data.test_episodes:,} held-out episodes of {data.task} "
+        f"({data.test_rows:,} rows), features scaled to [-1, 1], with 95 % intervals over "
+        "episodes",
+        (*header, "worst feature, R²"),
+        rows,
+    )
 
 
 def _drawn(encoders: _Encoders) -> str:
@@ -130,9 +132,8 @@ def _drawn(encoders: _Encoders) -> str:
     return f"; {judged} of its {whole} dimensions" if judged < whole else ""
 
 
-def _readings(encoders: _Encoders, width: int | None) -> str:
+def _readings(encoders: _Encoders) -> Table:
     probes = {label: _probes(known.probes) for label, known in encoders.items()}
-    header = ("encoder", *probes[FULL], "KNN-MSE", "GTC", "next")
     rows = [
         (
             label,
@@ -143,7 +144,12 @@ def _readings(encoders: _Encoders, width: int | None) -> str:
         )
         for label, known in encoders.items()
     ]
-    return table(header, rows, width)
+    return Table(
+        "What can be read from the latent: R² of linear probes; KNN-MSE (2: nothing); GTC (1: the "
+        f"units are the state itself{_drawn(encoders)}); R² of the next latent, whitened",
+        ("encoder", *probes[FULL], "KNN-MSE", "GTC", "next"),
+        rows,
+    )
 
 
 def _probes(scores: Scores) -> dict[str, str]:
@@ -160,7 +166,7 @@ def _probes(scores: Scores) -> dict[str, str]:
     }
 
 
-def _units(encoders: _Encoders, width: int | None) -> str:
+def _units(encoders: _Encoders) -> Table:
     rows = []
     for label, known in encoders.items():
         units = known.latent_units
@@ -174,5 +180,8 @@ def _units(encoders: _Encoders, width: int | None) -> str:
                 number(units.intrinsic_dimension.mle, ".1f"),
             )
         )
-    header = ("encoder", "dead", "saturated", "participation", "TwoNN", "max. likelihood")
-    return table(header, rows, width)
+    return Table(
+        "Latent units: dead ones, the most saturated one, participation ratio, intrinsic dimension",
+        ("encoder", "dead", "saturated", "participation", "TwoNN", "max. likelihood"),
+        rows,
+    )

@@ -16,6 +16,7 @@ from jbrep.rl.settings import TrainingSettings
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study
 from jbrep.study.record import EACH_ITS_OWN, EncoderFacts, Label
+from jbrep.study.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, number, slug
 
 _NOT_SHOWN = ("task", "representation", "encoder", "encoder_code")  # among the settings
@@ -89,13 +90,9 @@ def _runs(which: Sequence[object]) -> str:
 
 def ended_runs(tables: Tables) -> Table:
     """A row for each finished or failed run, with the mean return of its last evaluation."""
-    returns: dict[tuple[str, int], dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in tables.returns:
-        label = f"{row.task}/{row.algorithm}/{row.representation}"
-        returns[label, row.seed][row.step].append(row.episode_return)
-    rows = []
+    returns, rows = by_run(tables.returns), []
     for run in tables.record.runs:
-        of_run = returns[run.label, run.seed]
+        of_run = returns.get((run.label, run.seed), {})
         final = of_run[max(of_run)] if of_run else []
         last = number(sum(final) / len(final), SIGNIFICANT) if final else "-"
         minutes = f"{run.seconds / 60:.1f}"

@@ -24,6 +24,7 @@ from jbrep.stats.power import Prospect
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import STEPS_TO
 from jbrep.study.packing import Forecast
+from jbrep.study.tables import by_run
 from jbrep.text import Table, duration, rounded, table, wrapped
 
 _KEY = "representation"
@@ -54,19 +55,13 @@ def results_text(tables: Tables, width: int | None = None) -> str:
 
 
 def _last(tables: Tables, width: int | None) -> str:
-    last: dict[tuple[str, int], tuple[int, list[float]]] = {}
-    for row in tables.returns:
-        label = f"{row.task}/{row.algorithm}/{row.representation}"
-        step, returns = last.get((label, row.seed), (-1, []))
-        returns = [*returns, row.episode_return] if step == row.step else [row.episode_return]
-        last[label, row.seed] = row.step, returns
-    rows = []
+    returns, rows = by_run(tables.returns), []
     for run in tables.record.runs:
         if run.status == FAILED:
             rows.append((run.label, str(run.seed), f"{run.steps:,}", "failed", "-"))
             continue
-        step, returns = last[run.label, run.seed]
-        low, median, high = rounded(*np.percentile(returns, (10, 50, 90)))
+        step, final = max(returns[run.label, run.seed].items())
+        low, median, high = rounded(*np.percentile(final, (10, 50, 90)))
         rows.append((run.label, str(run.seed), f"{step:,}", median, f"[{low}, {high}]"))
     return table(("run", "seed", "steps", "median return", "10-90 %"), rows, width)
 
@@ -304,21 +299,18 @@ def forecast_text(forecast: Forecast, planned: Planned, width: int | None = None
     parts = [table(("run", "cohort", "time"), rows, width)] if rows else []
     parts.append(wrapped(summary, width))
     if forecast.prospects:
-        header, cells = _prospects(forecast.prospects)
-        parts.append(table(header, cells, width))
+        header = ("primary cell: claim", "runs", "level", "least p", "power")
+        parts.append(table(header, map(_prospect, forecast.prospects), width))
         parts += [wrapped(each, width) for each in (*notes(planned), EFFECTS)]
     return "\n\n".join(parts)
 
 
-def _prospects(prospects: list[Prospect]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """What could be found of each claim in the primary cells of a study."""
-    return ("primary cell: claim", "runs", "level", "least p", "power"), [
-        (
-            f"{each.cell}: {each.claim}",
-            f"{each.arms.units} and {each.arms.baseline}",
-            probability(each.level),
-            probability(each.least_p),
-            ", ".join(f"{100 * power:.0f} %" for power in each.power),
-        )
-        for each in prospects
-    ]
+def _prospect(prospect: Prospect) -> tuple[str, ...]:
+    """What could be found of a claim in a primary cell."""
+    return (
+        f"{prospect.cell}: {prospect.claim}",
+        f"{prospect.arms.units} and {prospect.arms.baseline}",
+        probability(prospect.level),
+        probability(prospect.least_p),
+        ", ".join(f"{100 * power:.0f} %" for power in prospect.power),
+    )

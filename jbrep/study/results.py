@@ -2,8 +2,8 @@
 
 import hashlib
 import json
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -33,6 +33,7 @@ from jbrep.study.tables import (
     RETURNS,
     References,
     Return,
+    by_run,
     read_references,
     write_references,
 )
@@ -168,12 +169,9 @@ def _curves(
     record: RunsRecord, returns: Iterable[Return], references: References
 ) -> list[RunCurve]:
     """The runs of a study, from its tables."""
-    by_run: dict[tuple[str, int], list[tuple[int, float]]] = defaultdict(list)
-    for row in returns:
-        label = f"{row.task}/{row.algorithm}/{row.representation}"
-        by_run[label, row.seed].append((row.step, row.episode_return))
+    evaluated = by_run(returns)
     return [
-        _curve(run, record.settings_of(run), by_run[run.label, run.seed], references)
+        _curve(run, record.settings_of(run), evaluated.get((run.label, run.seed), {}), references)
         for run in record.runs
     ]
 
@@ -181,15 +179,12 @@ def _curves(
 def _curve(
     run: RunFacts,
     shared: LabelSettings,
-    evaluated: Iterable[tuple[int, float]],
+    by_step: Mapping[int, list[float]],
     references: References,
 ) -> RunCurve:
-    """A run, from its settings without the seed, and the steps and returns of its evaluations."""
+    """A run, from its settings without the seed, and the returns of its evaluations by step."""
     task, settings = shared.environment, to_plain(shared)
     trainer = [settings.pop(name) for name in ("trainer", "precision", "device")]
-    by_step: dict[int, list[float]] = defaultdict(list)
-    for step, each in evaluated:
-        by_step[step].append(each)
     steps = sorted(by_step)
     returns = [by_step[step] for step in steps]
     still = references.get(task.name, {}).get(STILL)

@@ -55,6 +55,16 @@ class Return(NamedTuple):
     episode_return: float
 
 
+def by_run(returns: Iterable[Return]) -> dict[tuple[str, int], dict[int, list[float]]]:
+    """The returns of each run's evaluations, by the run's label and seed, then by step."""
+    found: dict[tuple[str, int], dict[int, list[float]]] = {}
+    for row in returns:
+        label = f"{row.task}/{row.algorithm}/{row.representation}"
+        by_step = found.setdefault((label, row.seed), {})
+        by_step.setdefault(row.step, []).append(row.episode_return)
+    return found
+
+
 def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | None:
     """Play the reference policies of tasks: standing still, random, and hand-written if there is.
 

@@ -1,8 +1,10 @@
 """Studies whose truth is known: their runs are made up, all else is real."""
 
+import matplotlib as mpl
 import numpy as np
 
 from jbrep.encoders import find, save
+from jbrep.report.figures.style import PAPER
 from jbrep.rl.agent import Spaces, make_agent, parameters
 from jbrep.rl.checkpoint import CheckpointFile, History, Snapshot
 from jbrep.rl.files import (
@@ -20,6 +22,7 @@ from jbrep.rl.learner import Learner
 from jbrep.rl.overrides import check_shape
 from jbrep.study.config import as_study
 from jbrep.study.record import EncoderFacts, Label, LabelSettings
+from jbrep.study.tables import Return
 
 STILL = 250
 # what runs of each representation end with on average, with what SD, and when they come to half
@@ -58,6 +61,21 @@ def label_of(task, representation, encoder=(), decoder=(), kind="dae", latent_si
         **{"encoder": encoder, "decoder": decoder, "training": training, "data": {}, "metrics": {}},
     )
     return Label(settings=settings, encoder=facts)
+
+
+def returns_of(runs):
+    """The rows of returns.csv of runs."""
+    return [
+        Return(run.task, run.algorithm, run.representation, run.seed, int(step), i, float(each))
+        for run in runs
+        for step, episodes in zip(run.steps, run.returns, strict=True)
+        for i, each in enumerate(episodes)
+    ]
+
+
+def drawn(plot, style=PAPER):
+    with mpl.rc_context(style):
+        return plot.draw()
 
 
 def make_runs(plan, seeds):

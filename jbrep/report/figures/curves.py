@@ -1,7 +1,7 @@
 """Learning curves: returns over training."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ from jbrep.report.figures.style import (
     PAGE,
     Limits,
     Looks,
+    Styles,
+    draw_profile,
     limits,
     panel_grid,
     plain,
@@ -24,7 +26,7 @@ from jbrep.report.figures.style import (
     with_runs,
 )
 from jbrep.stats.analysis import Analysis, GroupAnalysis
-from jbrep.study.tables import References, Return
+from jbrep.study.tables import References, Return, by_run
 
 Groups = Sequence[GroupAnalysis]
 Evaluated = tuple[str, str, str, int, int]  # task, algorithm, representation, seed, step
@@ -57,7 +59,7 @@ def curves(groups: Groups, references: References, looks: Looks) -> Plot:
         caption,
         _COLUMNS,
         list(_rows(groups)),
-        lambda: _grid_of_curves(groups, references, extents, looks),
+        lambda: _draw_curves(groups, references, extents, looks),
     )
 
 
@@ -81,14 +83,12 @@ def every_run(returns: Sequence[Return], references: References, looks: Looks) -
         references: returns of policies that learn nothing, by task and policy.
         looks: of the representations, in the order of their panels.
     """
-    episodes = defaultdict(list)
-    for row in returns:
-        key = (row.task, row.algorithm, row.representation, row.seed, row.step)
-        episodes[key].append(row.episode_return)
-    fewest: dict[tuple[Any, ...], int] = {}  # of an evaluation: the last one may have more starts
-    for (*run, _), each in episodes.items():
-        fewest[*run] = min(fewest.get((*run,), len(each)), len(each))
-    means = {key: float(np.mean(each[: fewest[key[:-1]]])) for key, each in episodes.items()}
+    means: dict[Evaluated, float] = {}
+    for (label, seed), by_step in by_run(returns).items():
+        task, algorithm, name = label.rsplit("/", 2)
+        fewest = min(map(len, by_step.values()))  # the last evaluation may have more starts
+        for step, each in by_step.items():
+            means[task, algorithm, name, seed, step] = float(np.mean(each[:fewest]))
     return Plot(
         "every_run",
         "Every run",
@@ -115,34 +115,6 @@ def cell(value: float) -> str:
     return f"{value:.7g}" if np.isfinite(value) else ""
 
 
-def _grid_of_curves(
-    groups: Groups, references: References, extents: Mapping[str, Limits], looks: Looks
-) -> Figure:
-    look, names = looks(), names_with_runs(groups)
-    faint = 0.15 if len(names) <= _FEW else 0.05
-
-    def draw(axes: Axes, group: GroupAnalysis) -> None:
-        _draw_references(axes, references.get(group.task, {}))
-        if extents[group.task].contain(group.solved):
-            axes.axhline(group.solved, **solved_line_style())
-        for label in group.labels:
-            style, curve = look[label.representation], label.curve
-            axes.fill_between(
-                group.grid, curve.p10, curve.p90, color=style["color"], alpha=faint, linewidth=0
-            )
-            axes.plot(
-                group.grid,
-                curve.p50,
-                label=names[label.representation],
-                ms=2.5,
-                markevery=max(1, len(group.grid) // 8),
-                clip_on=False,  # whole markers at the edges
-                **style,
-            )
-
-    return _grid(groups, extents, draw)
-
-
 def _draw_references(axes: Axes, played: Mapping[str, Sequence[float]]) -> None:
     for i, (policy, returns) in enumerate(played.items()):
         axes.axhline(float(np.mean(returns)), label=plain(policy), **reference(i))
@@ -157,15 +129,15 @@ def names_with_runs(groups: Groups) -> dict[str, str]:
     return {name: with_runs(name, each) for name, each in counts.items()}
 
 
-def _grid(
-    groups: Groups, extents: Mapping[str, Limits], draw: Callable[[Axes, GroupAnalysis], None]
+def _draw_curves(
+    groups: Groups, references: References, extents: Mapping[str, Limits], looks: Looks
 ) -> Figure:
     """A panel for each task (rows) and algorithm (columns), over steps of training."""
     tasks = list(dict.fromkeys(group.task for group in groups))
     algorithms = list(dict.fromkeys(group.algorithm for group in groups))
     by_place = {(group.task, group.algorithm): group for group in groups}
-    is_narrow = len(algorithms) == 1 and len(names_with_runs(groups)) <= _FEW
-    width = COLUMN if is_narrow else PAGE
+    look, names = looks(), names_with_runs(groups)
+    width = COLUMN if len(algorithms) == 1 and len(names) <= _FEW else PAGE
     figure = Figure(figsize=(width, 0.5 + (2.0 if len(algorithms) < 3 else 1.6) * len(tasks)))
     panels = figure.subplots(len(tasks), len(algorithms), squeeze=False, sharey="row")
     longest = max(len(group.name) for group in groups)
@@ -175,13 +147,33 @@ def _grid(
         if group is None:
             axes.set_axis_off()
             continue
-        draw(axes, group)
+        _draw_references(axes, references.get(group.task, {}))
+        if extents[group.task].contain(group.solved):
+            axes.axhline(group.solved, **solved_line_style())
+        _draw_medians(axes, group, names, look)
         axes.set_title(plain(f"{tasks[i]}{gap}{algorithms[j]}"))
         _training_axes(axes, group.grid[-1], extents[group.task], len(algorithms))
         axes.set_xlabel("training step" if i == len(tasks) - 1 else "")
         axes.set_ylabel("" if j else "return")
     below(figure, panels.ravel())
     return figure
+
+
+def _draw_medians(axes: Axes, group: GroupAnalysis, names: Mapping[str, str], look: Styles) -> None:
+    """The median over runs of each representation, with a band from 10 to 90 %."""
+    grid, faint = group.grid, 0.15 if len(names) <= _FEW else 0.05
+    for label in group.labels:
+        style, curve = look[label.representation], label.curve
+        axes.fill_between(grid, curve.p10, curve.p90, color=style["color"], alpha=faint, lw=0)
+        axes.plot(
+            grid,
+            curve.p50,
+            label=names[label.representation],
+            ms=2.5,
+            markevery=max(1, len(grid) // 8),
+            clip_on=False,  # whole markers at the edges
+            **style,
+        )
 
 
 def _training_axes(axes: Axes, last: float, extent: Limits, across: int) -> None:
@@ -285,12 +277,9 @@ def _draw(analysis: Analysis, looks: Looks) -> Figure:
         axes.axvline(1, **reference())
         own = [each for each in aggregates if each.algorithm == algorithm]
         for each in own:
-            colour, (share, low, high) = look[each.representation]["color"], each.profile
-            axes.fill_between(each.scores, low, high, step="post", color=colour, alpha=0.12, lw=0)
-            name = with_runs(each.representation, [each.runs])
-            axes.step(each.scores, share, where="post", color=colour, label=name)
+            name, colour = each.representation, look[each.representation]["color"]
+            draw_profile(axes, each.scores, each.profile, with_runs(name, [each.runs]), colour)
         axes.set_title(plain(f"{algorithm}, {len(own[0].tasks)} tasks"))
-        axes.set(ylim=(-0.02, 1.02), xlabel="share of the full agents' gain")
-        axes.set(ylabel="share of runs above")
+        axes.set_xlabel("share of the full agents' gain")
     below(figure, panels)
     return figure

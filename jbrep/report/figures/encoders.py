@@ -1,7 +1,7 @@
 """Figures of encoders, from their evaluation."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,14 +15,22 @@ from jbrep.evaluate.evaluation import (
     Evaluation,
     FeatureError,
     Reconstruction,
-    Score,
 )
 from jbrep.report.figures.curves import below
-from jbrep.report.figures.families import Encoders, family, family_styles
 from jbrep.report.figures.methods import method_plots
 from jbrep.report.figures.plot import Plot
 from jbrep.report.figures.prediction import MOST, bare, heat_map, least, prediction_plots
-from jbrep.report.figures.style import COLUMN, PAGE, ink, plain, reference
+from jbrep.report.figures.style import (
+    COLUMN,
+    PAGE,
+    Encoders,
+    draw_line,
+    family,
+    family_styles,
+    ink,
+    plain,
+    reference,
+)
 
 _ERROR = ("mse", "low", "high")
 _Encoders = Mapping[str, "_Decoding"]  # by label
@@ -120,8 +128,9 @@ def _draw_sizes(task: str, encoders: _Encoders) -> Figure:
     sizes = _sizes(encoders)
     families = _families(encoders)
     for name, style in family_styles(families).items():
-        points = {size: e.error.mse for size, e in sorted(families[name].items())}
-        _draw_errors(axes, points, label=plain(name), **style)
+        of_size = dict(sorted(families[name].items()))
+        errors = [e.error.mse for e in of_size.values()]
+        draw_line(axes, [*of_size], errors, label=plain(name), **style)
     pca = {e.latent: e.error.pca_mse.value for e in encoders.values()}
     axes.plot(sizes, np.array([pca[size] for size in sizes], float), label="PCA", **reference())
     axes.set(xlabel="latent size l", ylabel="mean squared error", yscale="log", xticks=sizes)
@@ -158,13 +167,13 @@ def _draw_corruption(task: str, encoders: _Encoders) -> Figure:
         for name, style in family_styles(families).items():
             if size in families[name]:
                 levels = families[name][size].corruption
-                points = {level.noise: level.mse for level in levels}
-                _draw_errors(axes, points, label=plain(name), **style)
+                noise, errors = zip(*((level.noise, level.mse) for level in levels), strict=True)
+                draw_line(axes, noise, errors, label=plain(name), **style)
         levels = next(e.corruption for e in encoders.values() if e.latent == size)
-        noise = np.array([level.noise for level in levels])
+        sd = np.array([level.noise for level in levels])
         best = [level.linear_mse.value for level in levels]
-        axes.plot(noise, best, label="best linear denoiser", **reference())
-        axes.plot(noise[1:], noise[1:] ** 2, ":", color=ink(), alpha=0.65, label="corrupted input")
+        axes.plot(sd, best, label="best linear denoiser", **reference())
+        axes.plot(sd[1:], sd[1:] ** 2, ":", color=ink(), alpha=0.65, label="corrupted input")
         axes.set(title=f"latent size {size}", xlabel="noise (standard deviation)", yscale="log")
     panels[0].set_ylabel("mean squared error")
     below(figure, panels)
@@ -229,11 +238,3 @@ def _families(encoders: _Encoders) -> dict[str, dict[int, _Decoding]]:
         if name != "pca" and e.latent in sizes:
             families.setdefault(name, {})[e.latent] = e
     return families
-
-
-def _draw_errors(axes: Axes, points: Mapping[Any, Score], **style: Any) -> None:
-    """A line through values with intervals."""
-    if points:
-        mse, low, high = np.array(list(points.values()), float).T
-        spread = np.nan_to_num((mse - low, high - mse)).clip(0)
-        axes.errorbar(list(points), mse, spread, ms=3, lw=1.1, capsize=1.5, **style)

@@ -10,13 +10,16 @@ from numpy.typing import NDArray
 
 from jbrep.encoders import FULL
 from jbrep.report.figures.curves import below
-from jbrep.report.figures.families import Encoders, line_styles
 from jbrep.report.figures.plot import Plot
-from jbrep.report.figures.style import COLUMN, PAGE, ink, plain
+from jbrep.report.figures.style import COLUMN, PAGE, Encoders, draw_line, ink, line_styles, plain
 from jbrep.stats.bootstrap import Array
 from jbrep.text import r2_text
 
 MOST = 40  # features in a picture, and names on an axis
+_HORIZON = 10  # steps that the heat map looks ahead, if the evaluation has them
+_SUMS = {"mean": "mean of features", "reward": "reward"}  # of a prediction, in words
+_COLUMNS = ("encoder", "steps", "target", "r2", "low", "high")
+_LOWEST = -0.1  # R² on an axis
 
 
 def heat_map(
@@ -61,12 +64,6 @@ def bare(axes: Axes) -> None:
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
-
-
-_HORIZON = 10  # steps that the heat map looks ahead, if the evaluation has them
-_SUMS = {"mean": "mean of features", "reward": "reward"}  # of a prediction, in words
-_COLUMNS = ("encoder", "steps", "target", "r2", "low", "high")
-_LOWEST = -0.1  # R² on an axis
 
 
 def prediction_plots(task: str, encoders: Encoders) -> list[Plot]:
@@ -159,8 +156,8 @@ def _draw_horizons(task: str, encoders: Encoders) -> Figure:
     look = line_styles(encoders)
     for axes, (key, words) in zip(panels, _SUMS.items(), strict=True):
         for label, e in encoders.items():
-            values = np.array([getattr(s, key) for s in e.prediction.values()], float)
-            _draw_line(axes, list(e.prediction), values, label=plain(label), **look[label])
+            scores = [getattr(each, key) for each in e.prediction.values()]
+            draw_line(axes, [*e.prediction], scores, label=plain(label), **look[label])
         axes.set(xlabel="steps ahead", title=words)
     panels[0].set(
         ylabel="R² on held-out episodes", ylim=(max(panels[0].get_ylim()[0], _LOWEST), None)
@@ -168,10 +165,3 @@ def _draw_horizons(task: str, encoders: Encoders) -> Figure:
     below(figure, panels)
     figure.suptitle(plain(f"{task}: prediction by steps ahead"), size=8)
     return figure
-
-
-def _draw_line(axes: Axes, steps: list[str], values: Array, **style: Any) -> None:
-    """A line through values with intervals, (steps, 3), at places that are equally far apart."""
-    value, low, high = values.T
-    spread = np.nan_to_num((value - low, high - value)).clip(0)
-    axes.errorbar(steps, value, spread, ms=3, lw=1.1, elinewidth=0.6, capsize=1.5, **style)

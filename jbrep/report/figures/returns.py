@@ -15,6 +15,7 @@ from jbrep.report.figures.style import (
     Limits,
     Looks,
     Styles,
+    draw_profile,
     limits,
     mark_cut,
     plain,
@@ -195,18 +196,14 @@ def _draw_profiles(analysis: Analysis, looks: Looks) -> Figure:
     look, names = looks(), names_with_runs(groups)
     for (axes,), group in zip(panels, groups, strict=True):
         for label in group.labels:
-            colour, returns = look[label.representation]["color"], group.profile_returns
-            share, low, high = label.profile
-            axes.fill_between(returns, low, high, step="post", color=colour, alpha=0.12, lw=0)
-            name = names[label.representation]
-            axes.step(returns, share, where="post", color=colour, label=name)
+            name, colour = names[label.representation], look[label.representation]["color"]
+            draw_profile(axes, group.profile_returns, label.profile, name, colour)
         for i, (policy, each) in enumerate(group.references.items()):
             axes.axvline(each.value, label=plain(policy), **reference(i))
         extent = limits(group.profile_returns, solved=group.solved)
         if extent.contain(group.solved):
             axes.axvline(group.solved, **solved_line_style())
         axes.set_title(plain(group.name))
-        axes.set(xlim=extent.with_room(0.02), ylim=(-0.02, 1.02))
-        axes.set(xlabel="final return", ylabel="share of runs above")
+        axes.set(xlim=extent.with_room(0.02), xlabel="final return")
     below(figure, panels.ravel())
     return figure

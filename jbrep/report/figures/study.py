@@ -1,6 +1,5 @@
 """All figures of a study."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 
@@ -16,7 +15,7 @@ from jbrep.stats import Analysis
 from jbrep.stats.association import Association
 from jbrep.stats.runs import in_order
 from jbrep.study.record import Label
-from jbrep.study.tables import References, Return
+from jbrep.study.tables import References, Return, by_run
 
 
 def study_plots(
@@ -61,8 +60,8 @@ def study_plots(
 def _on_the_same_starts(references: References, returns: Sequence[Return]) -> References:
     """References in the episodes that curves are of; the last evaluation may have more."""
     fewest: dict[str, int] = {}
-    counts = Counter((r.task, r.algorithm, r.representation, r.seed, r.step) for r in returns)
-    for (task, *_), count in counts.items():
+    for (label, _), by_step in by_run(returns).items():
+        task, count = label.rsplit("/", 2)[0], min(map(len, by_step.values()))
         fewest[task] = min(fewest.get(task, count), count)
     return {
         task: {policy: each[: fewest.get(task)] for policy, each in of_task.items()}

@@ -1,6 +1,6 @@
 """One style for all figures: sized for a paper's column, safe for the colour-blind."""
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
@@ -10,10 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
-from jbrep.stats.bootstrap import Interval
+from jbrep.encoders import FULL
+from jbrep.encoders.names import EncoderName
+from jbrep.evaluate.evaluation import Diagnostics, Score
+from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.runs import LARGEST_RETURN
 
 Styles = dict[str, dict[str, Any]]  # colour and marker, by name
+Encoders = Mapping[str, Diagnostics]  # of an evaluation, by label
 Looks = Callable[[], Styles]  # of a study's representations, in the style in use
 
 COLUMN, PAGE = 3.45, 7.1  # widths in a paper of two columns [inches]
@@ -60,6 +64,9 @@ DARK: Any = {
     "ytick.color": "#DDDDDD",
 }
 _SHADES = (0.25, 0.5)  # how far from a colour to that of text, where colours are used again
+_LINES = ("-", "--", ":", "-.")  # of codes of a family, from the largest on
+_FILLED = 1 / 3  # of an axis of returns, at least, by the returns themselves
+_BEYOND = 0.25  # of their range, for the ends of intervals on either side
 _DASHES = ("--", "-.", (0, (6, 1.5)))
 
 
@@ -104,6 +111,45 @@ def _colour(colours: Sequence[str], number: int) -> str:
     pairs = zip(to_rgb(colour), to_rgb(ink()), strict=True)
     mixed = [(1 - share) * own + share * text for own, text in pairs]
     return to_hex((mixed[0], mixed[1], mixed[2]))
+
+
+def family(label: str, latent: int) -> str:
+    """The label without the latent size, where it ends with that: dae of dae-8, dae-s2 of dae-8-s2.
+
+    Args:
+        label: of an encoder.
+        latent: its size.
+    """
+    name = EncoderName.parse(label)
+    return str(name._replace(latent=None)) if name.latent == latent else label
+
+
+def family_styles(families: Iterable[str]) -> Styles:
+    """Colour and marker of each family, denoising autoencoders first, the full one's that of text.
+
+    Args:
+        families: names, with repeats or without.
+    """
+    names = sorted(set(families), key=lambda name: (not name.startswith("dae"), name))
+    return styles(names, FULL if FULL in names else None)
+
+
+def line_styles(encoders: Encoders) -> Styles:
+    """Of each encoder: colour and marker of its family, and a line that says its latent size."""
+    families = {label: family(label, e.latent) for label, e in encoders.items()}
+    look = family_styles(families.values())
+    sizes: dict[str, list[int]] = {}
+    for label, e in encoders.items():
+        sizes.setdefault(families[label], []).append(e.latent)
+    return {
+        label: {
+            **look[families[label]],
+            "linestyle": _LINES[
+                sorted(sizes[families[label]], reverse=True).index(e.latent) % len(_LINES)
+            ],
+        }
+        for label, e in encoders.items()
+    }
 
 
 def panel_grid(count: int, height: float, above: float = 0.0) -> tuple[Figure, Sequence[Axes]]:
@@ -151,10 +197,6 @@ def mark_cut(axes: Axes, axis: str, at: float, values: Sequence[float], colour: 
         if is_cut:
             place = ([edge], [at]) if axis == "x" else ([at], [edge])
             axes.plot(*place, marker, color=colour, ms=3.5, mew=0, clip_on=False, zorder=5)
-
-
-_FILLED = 1 / 3  # of an axis, at least, by the returns themselves
-_BEYOND = 0.25  # of their range, for the ends of intervals on either side
 
 
 class Limits(NamedTuple):
@@ -211,3 +253,18 @@ def limits(returns: Iterable[float], floor: float = np.nan, solved: float = np.n
     if high - low >= _FILLED * wider.width:
         low, high = wider
     return Limits(low, high) if high > low else Limits(low - 0.5, high + 0.5)
+
+
+def draw_line(axes: Axes, x: Sequence[Any], scores: Sequence[Score], **style: Any) -> None:
+    """A line through values, each with a bar for its interval if it has one."""
+    value, low, high = np.array(scores, float).T
+    spread = np.nan_to_num((value - low, high - value)).clip(0)
+    axes.errorbar(x, value, spread, ms=3, lw=1.1, elinewidth=0.8, capsize=1.5, **style)
+
+
+def draw_profile(axes: Axes, x: Array, profile: Interval, label: str, colour: str) -> None:
+    """The share of runs above each of x (k,), with its interval."""
+    share, low, high = profile
+    axes.fill_between(x, low, high, step="post", color=colour, alpha=0.12, lw=0)
+    axes.step(x, share, where="post", color=colour, label=label)
+    axes.set(ylim=(-0.02, 1.02), ylabel="share of runs above")
