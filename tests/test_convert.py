@@ -182,7 +182,7 @@ class Wrong(nn.Module):
         (lambda m, x: m.mish(x), r"Mish \(mish\) can't be converted: an encoder has no such layer"),
         (lambda m, x: functional.mish(x), "the function mish can't be converted"),
         (lambda m, x: x.softmax(1), "the method softmax can't be converted"),
-        (lambda m, x: x + m.first(x), r"Linear \(first\) .* stands in a branch"),
+        (lambda m, x: x + m.first(x), "the function add .* stands in a branch"),
         (lambda m, x: x if x.sum() > 0 else m.first(x), "control flow"),
         (lambda m, x: x * functional.softplus(x).tanh(), "softplus, .* tanh, .* no activation"),
         (lambda m, x: m.batch(x), "no running statistics"),

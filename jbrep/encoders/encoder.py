@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from functools import cached_property
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -28,12 +27,38 @@ Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 _SCALING = ("low", "high")  # tensors
 
 
-class _Parts(NamedTuple):
-    """An encoder's arrays, all NumPy's, or torch tensors on one device."""
+class Arrays(NamedTuple):
+    """An encoder's arrays, all NumPy's or all torch tensors on one device, and what it computes.
+
+    Attributes:
+        scaler: of observations.
+        encoder, decoder: layers.
+        kept: places of the scaled numbers that pass around the layers.
+    """
 
     scaler: Scaler
     encoder: Layers
     decoder: Layers
+    kept: list[int]
+
+    def encode(self, observation: Any) -> Any:
+        """Latents (..., l) of observations (..., d): arrays, torch tensors, or rows of a model."""
+        scaled = self.scaler.scale(observation)
+        code = run(self.encoder, scaled)
+        if not self.kept:
+            return code
+        return library_of(code).concatenate((code, scaled[..., self.kept]), -1)
+
+    def decode(self, latent: Any) -> Any:
+        """Observations (..., d) from latents (..., l)."""
+        coded = -len(self.kept) or None
+        scaled = run(self.decoder, latent[..., :coded])
+        if self.kept:
+            beside = library_of(scaled).concatenate((scaled, latent[..., coded:]), -1)
+            places = np.arange(self.scaler.size)
+            places[self.kept] = self.scaler.size + np.arange(len(self.kept))
+            scaled = beside[..., places.tolist()]
+        return self.scaler.unscale(scaled)
 
 
 class Encoder(BaseEncoder):
@@ -53,6 +78,8 @@ class Encoder(BaseEncoder):
     Attributes:
         header: that of its file, with what follows from the other arguments.
         scaler, encoder, decoder: as given.
+        kept: places of the scaled numbers that pass around the layers.
+        arrays: what it computes with, in NumPy.
 
     Raises:
         InputError: tensors whose shapes are inconsistent, whose type is not float32, or that hold
@@ -79,11 +106,14 @@ class Encoder(BaseEncoder):
             decoder=[layer.activation for layer in decoder],
         )
         code = len(encoder[-1].bias) if encoder else scaler.size
+        scaled = (*self.task.feature_names, *self.header.angles)
+        self.kept = [i for i, name in enumerate(scaled) if name in keep]
         self.latent_size = code + len(self.kept)
         self.can_decode = bool(decoder) or not encoder
         identifying = {n: v for n, v in self.header.as_json().items() if n != "commits"}
         self.fingerprint = container.checksum(self.tensors(), identifying)
-        self._on: dict[Any, _Parts] = {None: _Parts(scaler, encoder, decoder)}
+        self.arrays = Arrays(scaler, encoder, decoder, self.kept)
+        self._on: dict[Any, Arrays] = {}  # by device
 
     def _check(self, keep: tuple[str, ...]) -> None:
         for name in _SCALING:
@@ -150,20 +180,6 @@ class Encoder(BaseEncoder):
                 named |= {f"{part}.{i}.weight": layer.weight, f"{part}.{i}.bias": layer.bias}
         return named
 
-    @cached_property
-    def kept(self) -> list[int]:
-        """Places of the scaled numbers that pass around the layers."""
-        scaled = (*self.task.feature_names, *self.header.angles)
-        return [i for i, name in enumerate(scaled) if name in self.header.keep]
-
-    @cached_property
-    def restored(self) -> list[int]:
-        """Places of the scaled numbers among decoded ones with those that are kept after them."""
-        places = list(range(self.scaler.size))
-        for i, place in enumerate(self.kept):
-            places[place] = self.scaler.size + i
-        return places
-
     def encode(self, observation: Values) -> Values:
         """Encode observations (..., d) in physical units as latents (..., l).
 
@@ -173,12 +189,8 @@ class Encoder(BaseEncoder):
         Raises:
             InputError: observations of another length.
         """
-        values, parts = self._prepare(observation, self.size, "observations")
-        scaled = parts.scaler.scale(values)
-        code = run(parts.encoder, scaled)
-        if not self.kept:
-            return code
-        return library_of(code).concatenate((code, scaled[..., self.kept]), -1)
+        values, arrays = self._prepare(observation, self.size, "observations")
+        return arrays.encode(values)
 
     __call__ = encode
 
@@ -189,31 +201,26 @@ class Encoder(BaseEncoder):
             InputError: latents of another length, or there is no decoder.
         """
         self.check_decodes("it can't reconstruct observations")
-        values, parts = self._prepare(latent, self.latent_size, "latents")
-        coded = self.latent_size - len(self.kept)
-        scaled = run(parts.decoder, values[..., :coded])
-        if self.kept:
-            scaled = library_of(scaled).concatenate((scaled, values[..., coded:]), -1)
-            scaled = scaled[..., self.restored]
-        return parts.scaler.unscale(scaled)
+        values, arrays = self._prepare(latent, self.latent_size, "latents")
+        return arrays.decode(values)
 
     def scale(self, observation: Float32) -> Float32:
         """Scale observations (..., d) linearly, as its training data were."""
         return (observation - self.scaler.centre) / self.scaler.half_width
 
-    def _prepare(self, values: Any, size: int, what: str) -> tuple[Any, _Parts]:
+    def _prepare(self, values: Any, size: int, what: str) -> tuple[Any, Arrays]:
         """Values as float32, and this encoder's arrays on the device that they are on."""
         if type(values).__module__ == "torch":
-            values, parts = values.float(), self._on_device(values.device)
+            values, arrays = values.float(), self._on_device(values.device)
         else:
-            values, parts = np.asarray(values, np.float32), self._on[None]
+            values, arrays = np.asarray(values, np.float32), self.arrays
         if not values.ndim or values.shape[-1] != size:
             raise InputError(
                 f"{self.name} takes {what} of {size} numbers, but got shape {tuple(values.shape)}"
             )
-        return values, parts
+        return values, arrays
 
-    def _on_device(self, device: Any) -> _Parts:
+    def _on_device(self, device: Any) -> Arrays:
         """This encoder's arrays as torch tensors on a device, made once."""
         if device not in self._on:
             import torch
@@ -224,9 +231,9 @@ class Encoder(BaseEncoder):
             def move_all(layers: Layers) -> Layers:
                 return tuple(Layer(move(w), move(b), activation) for w, b, activation in layers)
 
-            scaler, encoder, decoder = self._on[None]
-            moved = replace(scaler, low=move(scaler.low), high=move(scaler.high))
-            self._on[device] = _Parts(moved, move_all(encoder), move_all(decoder))
+            scaler = replace(self.scaler, low=move(self.scaler.low), high=move(self.scaler.high))
+            encoder, decoder = move_all(self.encoder), move_all(self.decoder)
+            self._on[device] = Arrays(scaler, encoder, decoder, self.kept)
         return self._on[device]
 
     def check_task(self, task: Task) -> None:

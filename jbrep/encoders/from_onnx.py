@@ -15,14 +15,16 @@ from onnx import TensorProto, helper, numpy_helper
 
 from jbrep.encoders import fold
 from jbrep.encoders.encoder import Encoder, imported
-from jbrep.encoders.fold import NOTHING, Action, Step, refusal
+from jbrep.encoders.fold import Action, Value, refusal
 from jbrep.encoders.layers import EPSILON, Layer
+from jbrep.encoders.operations import NOTHING, VALUE, check_first_alone, operation, with_slope
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, first_line
 from jbrep.records.storage import exists, read_file
 
 LATENT, RECONSTRUCTION = "latent", "reconstruction"  # the outputs of a model that jbrep exported
 Constants = dict[str, NDArray[np.generic]]
+_Values = dict[str, Value | None]  # None of those from before the latent
 
 _MOST_LETTERS = 100  # of what a message says of a node
 _MAX_BYTES = 1 << 26  # of a model, and of the file of its numbers
@@ -62,17 +64,17 @@ def _layers(path: Path, size: int) -> tuple[tuple[Layer, ...], tuple[Layer, ...]
     try:
         start = _input(model.graph, constants, size)
         outputs = [output.name for output in model.graph.output]
-        steps = _steps(model, start, constants)
-        if sorted(outputs) == [LATENT, RECONSTRUCTION]:
-            layers = fold.fold(steps, start, LATENT, size)
-            back = fold.fold(steps, LATENT, RECONSTRUCTION, len(layers[-1].bias))
-            return layers, back
-        if len(outputs) != 1:
+        if len(outputs) != 1 and sorted(outputs) != [LATENT, RECONSTRUCTION]:
             raise InputError(
                 f"it has the outputs {', '.join(outputs)}: expected one, or {LATENT} and "
                 f"{RECONSTRUCTION}"
             )
-        return fold.fold(steps, start, outputs[0], size), ()
+        nodes, values = iter(model.graph.node), _Values({start: fold.given(size)})
+        if len(outputs) == 1:
+            return _fold(nodes, values, outputs[0], constants), ()
+        layers = _fold(nodes, values, LATENT, constants)
+        values = {**dict.fromkeys(values), LATENT: fold.given(len(layers[-1].bias))}
+        return layers, _fold(nodes, values, RECONSTRUCTION, constants)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -170,44 +172,56 @@ def _input(graph: onnx.GraphProto, constants: Constants, size: int) -> str:
     return given.name
 
 
-def _steps(model: onnx.ModelProto, start: str, constants: Constants) -> list[Step]:
-    """The steps of a graph; its nodes of constants alone are added to the constants."""
-    steps: list[Step] = []
-    values = {start}
-    for node in model.graph.node:
+def _fold(
+    nodes: Iterable[onnx.NodeProto], values: _Values, end: str, constants: Constants
+) -> tuple[Layer, ...]:
+    """The layers that lead to a value, by the nodes up to its own; values and constants grow."""
+    for node in nodes:
         said = f"{node.op_type} ({node.name or node.output[0]})"[:_MOST_LETTERS]
         if node.domain not in ("", "ai.onnx"):
             raise InputError(refusal(f"{node.domain}.{said}", "it is no operation of ONNX itself"))
-        inputs = tuple(name for name in node.input if name in values)
         try:
             given = _Node(node, values, constants)
-            if inputs:
-                steps.append(Step(said, inputs, node.output[0], given.action()))
-                values.add(node.output[0])
+            if given.values:
+                action = given.action()
             else:
                 constants[node.output[0]] = given.constant()
+                continue
         except InputError as error:
             raise InputError(refusal(said, error)) from None
         except (IndexError, TypeError, ValueError, KeyError) as error:
             raise InputError(refusal(said, first_line(error))) from None
-    return steps
+        values[node.output[0]] = fold.take(said, action, given.values)
+        if node.output[0] == end:
+            break
+    return fold.layers_to(values.get(end))
 
 
 class _Node:
-    """A node with its attributes and its inputs, of which each is a value or a constant."""
+    """A node with its attributes and inputs: VALUE, a constant, or None for one left out."""
 
-    def __init__(self, node: onnx.NodeProto, values: set[str], constants: Constants):
+    def __init__(self, node: onnx.NodeProto, values: _Values, constants: Constants):
         self.operation = node.op_type
         self.attributes: dict[str, Any] = {
             each.name: helper.get_attribute_value(each) for each in node.attribute
         }
-        self._names = list(node.input)
-        self.count = len(self._names)
-        for name in self._names:
-            if name and name not in values and name not in constants:
-                raise InputError(f"it reads {name}, which is no output that can be used")
-        self._constants = constants
-        self._values = values
+        self.values: list[Value] = []
+        self.inputs = [self._input(name, values, constants) for name in node.input]
+
+    def _input(self, name: str, values: _Values, constants: Constants) -> Any:
+        if value := values.get(name):
+            self.values.append(value)
+            return VALUE
+        if name in values:
+            raise InputError(f"it reads {name}, from before the latent")
+        if not name:
+            return None
+        if name not in constants:
+            raise InputError(f"it reads {name}, which is no output that can be used")
+        constant = constants[name]
+        if constant.dtype.kind not in "fib":
+            raise InputError(f"its input {name} is no number")
+        return constant.astype(np.float64) if constant.dtype.kind == "f" else constant
 
     def constant(self) -> Any:
         """The output of a node of constants alone."""
@@ -225,22 +239,14 @@ class _Node:
 
     def action(self) -> Action:
         """What it does."""
-        if self.operation in _POINTWISE:
-            return _POINTWISE[self.operation](self)
-        if self.operation not in _ACTIONS:
-            raise InputError("an encoder has no such layer")
-        if self._names[0] not in self._values or self._values & set(self._names[1:]):
-            raise InputError("its first input alone may depend on the observation")
-        return _ACTIONS[self.operation](self)
+        if self.operation in _ACTIONS:
+            check_first_alone(self.inputs)
+            return _ACTIONS[self.operation](self)
+        return operation(self.operation.lower() if self.operation in _SAME else "", *self.inputs)
 
     def given(self, place: int) -> Any:
-        """The constant that an input is, in float64 unless of integers; None if there is none."""
-        if place >= len(self._names) or self._names[place] not in self._constants:
-            return None
-        value = self._constants[self._names[place]]
-        if value.dtype.kind not in "fib":
-            raise InputError(f"its input {place} is no number")
-        return value.astype(np.float64) if value.dtype.kind == "f" else value
+        """An input; None if there is none."""
+        return self.inputs[place] if place < len(self.inputs) else None
 
     def number(self, name: str, default: float) -> float:
         """An attribute that is a number: float32, brought back to the decimal that was meant."""
@@ -253,49 +259,26 @@ class _Node:
             raise InputError(f"its {name} is {value}, expected {allowed[0]}")
 
 
-def _arithmetic(name: str) -> Callable[[_Node], Action]:
-    return lambda node: fold.binary(name, node.given(0), node.given(1))
-
-
-def _part(function: Callable[..., Any]) -> Callable[[_Node], Action]:
-    """A function that is an activation only together with others."""
-
-    def make(node: _Node) -> Action:
-        given = [node.given(place) for place in range(node.count)]
-        if any(np.size(each) != 1 for each in given if each is not None):
-            raise InputError("it has a constant of several numbers, expected one")
-        numbers = [each if each is None else np.reshape(each, ()) for each in given]
-
-        def filled(*values: Any) -> Any:
-            rest = iter(values)
-            return function(*(next(rest) if each is None else each for each in numbers))
-
-        return Action(None, filled)
-
-    return make
-
-
-def _same(name: str) -> Callable[[_Node], Action]:
-    return lambda node: fold.activation(name)
-
-
 def _gemm(node: _Node) -> Action:
     node.must("transA", 0)
     weight, bias = node.given(1), node.given(2)
     weight = weight if node.attributes.get("transB") else np.transpose(weight)
     bias = 0 if bias is None else bias * node.number("beta", 1)
-    return fold.affine(weight * node.number("alpha", 1), bias)
+    return operation("linear", VALUE, weight * node.number("alpha", 1), bias)
 
 
 def _layer_norm(node: _Node) -> Action:
     node.must("axis", -1, 1)
-    return fold.layer_norm(node.number("epsilon", EPSILON), node.given(1), node.given(2))
+    weight, bias = node.given(1), node.given(2)
+    epsilon = node.number("epsilon", EPSILON)
+    return operation("layer_norm", VALUE, np.shape(weight), weight, bias, epsilon)
 
 
 def _batch_norm(node: _Node) -> Action:
     node.must("training_mode", 0)
     weight, bias, mean, variance = (node.given(place) for place in range(1, 5))
-    return fold.batch_norm(mean, variance, node.number("epsilon", EPSILON), weight, bias)
+    epsilon = node.number("epsilon", EPSILON)
+    return operation("batch_norm", VALUE, mean, variance, weight, bias, eps=epsilon)
 
 
 def _dropout(node: _Node) -> Action:
@@ -322,45 +305,25 @@ def _cast(node: _Node) -> Action:
 
 
 def _gelu(node: _Node) -> Action:
-    approximate = node.attributes.get("approximate") == b"tanh"
-    return fold.activation("gelu-tanh" if approximate else "gelu")
+    return operation("gelu", VALUE, node.attributes.get("approximate", b"none").decode())
 
 
-_POINTWISE: dict[str, Callable[[_Node], Action]] = {  # of values and constants in any order
-    "Add": _arithmetic("add"),
-    "Sub": _arithmetic("subtract"),
-    "Mul": _arithmetic("multiply"),
-    "Div": _arithmetic("divide"),
-    "Pow": _arithmetic("power"),
-    "Erf": _part(fold.erf),
-    "Exp": _part(np.exp),
-    "Log": _part(np.log),
-    "Sqrt": _part(np.sqrt),
-    "Reciprocal": _part(np.reciprocal),
-    "Greater": _part(np.greater),
-    "Less": _part(np.less),
-    "Where": _part(np.where),
+_SAME = {  # those that PyTorch calls so, too, and that have no attributes
+    *("Add", "Div", "Erf", "Exp", "Greater", "Identity", "Less", "Log", "MatMul", "Mul", "Neg"),
+    *("Pow", "Reciprocal", "Relu", "Sigmoid", "Sin", "Softplus", "Sqrt", "Sub", "Tanh", "Where"),
 }
 _ACTIONS: dict[str, Callable[[_Node], Action]] = {  # of one value, the first input
-    "MatMul": lambda node: fold.affine(np.transpose(node.given(1))),
     "Gemm": _gemm,
-    "Identity": lambda node: NOTHING,
-    "Neg": lambda node: fold.rescale(-1),
     "Flatten": _flatten,
-    "Reshape": lambda node: fold.reshape(node.given(1).tolist()),
+    "Reshape": lambda node: operation("reshape", VALUE, *node.given(1).tolist()),
     "Squeeze": _squeeze,
     "Cast": _cast,
     "Dropout": _dropout,
     "BatchNormalization": _batch_norm,
     "LayerNormalization": _layer_norm,
-    "Relu": _same("relu"),
-    "Tanh": _same("tanh"),
-    "Sigmoid": _same("sigmoid"),
     "Gelu": _gelu,
-    "Swish": lambda node: fold.with_slope("silu", node.number("alpha", 1)),
-    "Elu": lambda node: fold.elu(node.number("alpha", 1)),
-    "Softplus": _same("softplus"),
-    "Sin": _same("sin"),
+    "Swish": lambda node: with_slope("silu", node.number("alpha", 1)),
+    "Elu": lambda node: operation("elu", VALUE, node.number("alpha", 1)),
 }
 _SHAPES: dict[str, Callable[[Any, tuple[int, ...]], Any]] = {  # of constants
     "Reshape": lambda value, shape: value.reshape(

@@ -33,13 +33,16 @@ def run(layers: tuple[Layer, ...], values: Any) -> Any:
 
 
 def activate(name: str, values: Any) -> Any:
-    """Apply an activation to values (..., units), a NumPy array or a torch tensor, in their type.
+    """Apply an activation to values (..., units) in their type.
+
+    They are a NumPy array, a torch tensor, or something that has `activations` of its own.
 
     `layer-norm` is over the units, without weights of its own: an affine map after it has them.
     `avg-l1-norm` divides them by their average magnitude (Fujimoto et al. 2023).
     """
-    known = _torch() if type(values).__module__ == "torch" else ACTIVATIONS
-    return known[name](values)
+    if type(values).__module__ == "torch":
+        return _torch()[name](values)
+    return getattr(values, "activations", ACTIVATIONS)[name](values)
 
 
 def _sigmoid(values: Any) -> Any:
@@ -83,7 +86,6 @@ ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {  # for NumPy arrays
     LAYER_NORM: _layer_norm,
     AVG_L1_NORM: _avg_l1_norm,
 }
-FIRST_ACTIVATIONS = frozenset(("linear", "relu", "tanh"))  # those of format versions 1 and 2
 
 
 @cache
