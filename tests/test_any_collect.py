@@ -18,12 +18,11 @@ from command import (
 from small import contents, settings
 
 from jbrep.collect import backends, collect
-from jbrep.collect.collector import _Missing
 from jbrep.collect.derive import derive
 from jbrep.collect.policies import Uniform
 from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
-from jbrep.collect.shards import Simulator
+from jbrep.collect.shards import Missing, Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.formats import export
 from jbrep.dataset.manifest import new_manifest, read_manifest
@@ -107,8 +106,8 @@ def test_shards_of_episodes_that_may_end_early_are_started_together():
     """Though 900 episodes could have more rows than are needed, had they their full length."""
     task = SLEDGE.replace(max_episode_steps=1000)
     made = new_manifest(some(task, steps=200_000, shard_episodes=900))
-    assert _Missing(made).wants(1)
-    assert not _Missing(made.replace(settings=some(task, steps=900, shard_episodes=1))).wants(1)
+    assert Missing(made).wants(1)
+    assert not Missing(made.replace(settings=some(task, steps=900, shard_episodes=1))).wants(1)
 
 
 def test_another_division_into_shards_has_the_same_rows(sledges, tmp_path):

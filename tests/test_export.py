@@ -15,7 +15,7 @@ from jbrep.dataset import Dataset
 from jbrep.dataset.formats import FORMATS, export
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.records.lock import exclusive_file
+from jbrep.records.lock import exclusive
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,10 @@ def test_an_export_is_on_the_disk_and_has_one_writer(to, dataset, tmp_path, monk
 
     monkeypatch.setattr(os, "fsync", note)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with exclusive_file(path), pytest.raises(InputError, match="is being written by process"):
+    with (
+        exclusive(path, beside=True),
+        pytest.raises(InputError, match="is being written by process"),
+    ):
         export(dataset, to, tmp_path / to)
     assert not synced
     export(dataset, to, tmp_path / to)

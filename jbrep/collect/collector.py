@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jbrep.collect.backends import get_backend
 from jbrep.collect.policies import Policy, make_policy
-from jbrep.collect.shards import LANES, Produce, Simulator
+from jbrep.collect.shards import LANES, SHARD_ROWS, Missing, Produce, Simulator
 from jbrep.dataset.manifest import (
     MANIFEST,
     Manifest,
@@ -32,7 +32,7 @@ from jbrep.records.record import to_plain
 from jbrep.records.storage import check_space, exists, make_folder, read_regular, write_whole
 
 _MAX_SHARDS = 10_000
-_BATCH_ROWS, _SHARD_ROWS = 100_000, 20_000  # of a shard
+_BATCH_ROWS = 100_000  # of a shard that a batch makes
 _PILOT = 10  # episodes
 
 Array = NDArray[Any]
@@ -124,7 +124,7 @@ def _fill(
 
     What is there counts until the first shard has been simulated, which may replace its last one.
     """
-    missing = _Missing(manifest)
+    missing = Missing(manifest)
     shards = produce(len(manifest.shards), missing, progress.update)
     try:
         for columns in shards:
@@ -147,24 +147,6 @@ def _fill(
         if isinstance(shards, Generator):
             shards.close()
     return manifest
-
-
-class _Missing:
-    """What a manifest's shards lack."""
-
-    def __init__(self, manifest: Manifest):
-        self.manifest = manifest
-
-    @property
-    def rows(self) -> int:
-        return self.manifest.settings.steps - self.manifest.rows
-
-    def wants(self, shard: int) -> bool:
-        """Judging by the mean of the shards so far, or else by the usual size."""
-        settings, done = self.manifest.settings, len(self.manifest.shards)
-        longest = settings.shard_episodes * settings.task.max_episode_steps
-        mean = self.manifest.rows / done if done else min(longest, _SHARD_ROWS)
-        return (shard - done) * mean < self.rows
 
 
 def _cut(columns: Columns, rows: int) -> Columns:
@@ -255,4 +237,4 @@ def usual_shard_episodes(settings: DataSettings, folder: Path, policy: Policy | 
         pilot = settings.replace(shard_episodes=_PILOT)
         columns = Simulator(pilot, policy).shard(0, lambda steps: None)
         length = columns[EPISODES + "length"].mean()
-    return max(1, round((_BATCH_ROWS if is_batched(task) else _SHARD_ROWS) / length))
+    return max(1, round((_BATCH_ROWS if is_batched(task) else SHARD_ROWS) / length))

@@ -1,6 +1,7 @@
 """Deriving another task's data set: the same motion, with its observations and rewards."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,10 @@ from numpy.typing import NDArray
 from jbrep.collect.collector import Written, write_shards
 from jbrep.collect.policies import acts_on_observations
 from jbrep.collect.replay import replay_problems
-from jbrep.collect.shards import Missing, Produce
+from jbrep.collect.shards import Missing
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import new_manifest, open_shard
-from jbrep.dataset.schema import EPISODES, Columns, Frame, episode_columns
+from jbrep.dataset.schema import EPISODES, Columns, episode_columns
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, differences
@@ -73,7 +74,7 @@ def derive(
             f"the physics diverged in {source}, after which no state is stored: run jbrep collect "
             f"--task {task_name} instead"
         )
-    return write_shards(settings, folder, _deriving(dataset, task, settings, num_threads))
+    return write_shards(settings, folder, _Deriver(dataset, task, settings, num_threads))
 
 
 def _check_versions(dataset: Dataset, versions: Mapping[str, str], num_threads: int | None) -> None:
@@ -90,71 +91,56 @@ def _check_versions(dataset: Dataset, versions: Mapping[str, str], num_threads: 
         raise InputError(f"{problem} A derived data set needs the same states")
 
 
-def _deriving(
-    dataset: Dataset, task: JitterbugTask, settings: DataSettings, num_threads: int | None
-) -> Produce:
-    """Make the shards of a data set as another task observes and rewards them."""
+@dataclass(frozen=True)
+class _Deriver:
+    """Makes the shards of a data set as another task observes and rewards them."""
 
-    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
-        for shard in range(first, len(dataset.manifest.shards)):
-            columns = open_shard(dataset.folder, dataset.manifest, shard)
-            yield _as_task(columns, task, settings, tick, num_threads)
+    dataset: Dataset
+    task: JitterbugTask
+    settings: DataSettings
+    num_threads: int | None
 
-    return produce
+    def __call__(self, first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
+        manifest = self.dataset.manifest
+        for shard in range(first, len(manifest.shards)):
+            yield self._derived(open_shard(self.dataset.folder, manifest, shard))
 
+    def _derived(self, columns: Columns) -> Columns:
+        own = episode_columns(columns)
+        length = own["length"]
+        starts = [self.task.start(np.random.default_rng(int(seed))) for seed in own["seed"]]
+        target = {
+            "target_position": np.stack([start.target_position for start in starts]),
+            "target_quaternion": np.stack([start.target_quaternion for start in starts]),
+        }
+        episode = np.repeat(np.arange(len(length)), length)
+        row = np.arange(len(episode)) + episode  # its place once final states are inserted
+        ends = np.cumsum(length)
+        final = ends + np.arange(len(length))
+        constants = target | ({"body": own["body"][:, 0]} if "body" in own else {})
+        states = {
+            **{n: np.insert(columns[n], ends, own[f"final_{n}"], axis=0) for n in ("qpos", "qvel")},
+            **{name: np.repeat(values, length + 1, axis=0) for name, values in constants.items()},
+        }
+        observation, reward = self._read(states)
+        changed = {
+            "observation": observation[row],
+            "reward": reward[row + 1],
+            EPISODES + "final_observation": observation[final],
+            **{EPISODES + name: values for name, values in target.items()},
+        }
+        return self.settings.columns({**columns, **changed})
 
-def _as_task(
-    columns: Columns,
-    task: JitterbugTask,
-    settings: DataSettings,
-    tick: Tick,
-    num_threads: int | None,
-) -> Columns:
-    """The columns of a shard as another task observes and rewards them."""
-    own = episode_columns(columns)
-    length = own["length"]
-    starts = [task.start(np.random.default_rng(int(seed))) for seed in own["seed"]]
-    target = {
-        "target_position": np.stack([start.target_position for start in starts]),
-        "target_quaternion": np.stack([start.target_quaternion for start in starts]),
-    }
-    episode = np.repeat(np.arange(len(length)), length)
-    row = np.arange(len(episode)) + episode  # its place once final states are inserted
-    ends = np.cumsum(length)
-    final = ends + np.arange(len(length))
-    constants = target | ({"body": own["body"][:, 0]} if "body" in own else {})
-    states = {
-        **{n: np.insert(columns[n], ends, own[f"final_{n}"], axis=0) for n in ("qpos", "qvel")},
-        **{name: np.repeat(values, length + 1, axis=0) for name, values in constants.items()},
-    }
-    observation, reward = _read(states, task, settings.task.arguments, num_threads)
-    tick(len(row))
-    changed = {
-        "observation": observation[row],
-        "reward": reward[row + 1],
-        EPISODES + "final_observation": observation[final],
-        **{EPISODES + name: values for name, values in target.items()},
-    }
-    frame = Frame(own["episode"], own["seed"], length, changed["reward"], settings.weights)
-    return settings.columns({**columns, **changed}, frame)
-
-
-def _read(
-    states: Mapping[str, Array],
-    task: JitterbugTask,
-    body: Mapping[str, Any],
-    num_threads: int | None,
-) -> tuple[Array, Array]:
-    """Observations (n, d) and rewards (n,) of the states, as `Simulation.restore` takes them.
-
-    The body is what chooses it of the arguments of `Simulation`.
-    """
-    n = len(states["qpos"])
-    lanes = min(_LANES, n)
-    simulation = Simulation(task, lanes, num_threads, **body)
-    observation, reward = np.empty((n, task.plain.size), np.float32), np.empty(n, np.float32)
-    for start in range(0, n, lanes):
-        rows = slice(min(start, n - lanes), start + lanes)  # the last ones overlap
-        simulation.restore(**{name: values[rows] for name, values in states.items()})
-        observation[rows], reward[rows] = simulation.observe(), simulation.reward()
-    return observation, reward
+    def _read(self, states: Mapping[str, Array]) -> tuple[Array, Array]:
+        """Observations (n, d) and rewards (n,) of states, as `Simulation.restore` takes them."""
+        n = len(states["qpos"])
+        lanes = min(_LANES, n)
+        body = self.settings.task.arguments
+        simulation = Simulation(self.task, lanes, self.num_threads, **body)
+        observation = np.empty((n, self.settings.task.size), np.float32)
+        reward = np.empty(n, np.float32)
+        for start in range(0, n, lanes):
+            rows = slice(min(start, n - lanes), start + lanes)  # the last ones overlap
+            simulation.restore(**{name: values[rows] for name, values in states.items()})
+            observation[rows], reward[rows] = simulation.observe(), simulation.reward()
+        return observation, reward

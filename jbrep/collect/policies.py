@@ -64,7 +64,7 @@ class Constants(Record, frozen=True):
     """The base of policies that are records of their constants."""
 
     kind: ClassVar[str]
-    open_loop: ClassVar[bool]  # whether actions don't depend on what is observed
+    open_loop: ClassVar[bool] = True  # whether actions don't depend on what is observed
 
     def files(self) -> dict[str, bytes]:
         """None are needed."""
@@ -79,7 +79,6 @@ class Uniform(Constants, frozen=True):
     """Uniformly random actions within the bounds, a new one for each step."""
 
     kind: ClassVar[str] = "uniform"
-    open_loop: ClassVar[bool] = True
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Draw the actions of the episodes, some steps at a time."""
@@ -98,7 +97,6 @@ class Constant(Constants, frozen=True):
     """The same action throughout."""
 
     kind: ClassVar[str] = "constant"
-    open_loop: ClassVar[bool] = True
     drive: _Drive = 1.0
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
@@ -111,7 +109,6 @@ class Still(Constants, frozen=True):
     """No action at all: zero, or what the bounds have next to it."""
 
     kind: ClassVar[str] = "still"
-    open_loop: ClassVar[bool] = True
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Nothing is drawn."""
@@ -127,7 +124,6 @@ class OrnsteinUhlenbeck(Constants, frozen=True):
     """
 
     kind: ClassVar[str] = "ornstein-uhlenbeck"
-    open_loop: ClassVar[bool] = True
     mu: _Drive = 0.0
     theta: Annotated[float, Meta(ge=0)] = 0.15  # [1/s]
     sigma: Annotated[float, Meta(ge=0, le=1e6)] = 0.3  # [1/sqrt(s)]

@@ -39,7 +39,12 @@ def replay_problems(
         raise InputError(f"{episodes} episodes can't be replayed: the data set has {total:,}")
     if not episodes:
         return  # without a look at the environment, whose package need not be there
-    check_reproducible(dataset, "episodes can't be replayed")
+    _check_collected(dataset)
+    if not dataset.task.reproducible:
+        raise InputError(
+            f"episodes can't be replayed: {dataset.task.name} is not reproducible, the same seed "
+            "and actions lead to other states"
+        )
     numbers = np.sort(np.random.default_rng(0).permutation(total)[:episodes])
     chosen = [dataset.episode(int(number)) for number in numbers]
     steps = sum(map(len, chosen))
@@ -56,20 +61,6 @@ def replay_problems(
                         f"{dataset.folder}: episode {episode.number} simulated again differs: "
                         f"another machine, or other versions than {versions}?"
                     )
-
-
-def check_reproducible(dataset: Dataset, what: str) -> None:
-    """Make sure that episodes come out the same again.
-
-    Raises:
-        InputError: the environment doesn't do that, or the data set was imported.
-    """
-    _check_collected(dataset)
-    if not dataset.task.reproducible:
-        raise InputError(
-            f"{what}: {dataset.task.name} is not reproducible, the same seed and actions lead to "
-            "other states"
-        )
 
 
 def _check_collected(dataset: Dataset) -> None:
@@ -122,8 +113,4 @@ def _is_equal(recording: Recording, lane: int, episode: Episode) -> bool:
     for name, values in recording.start.items():
         column = f"initial_{name}" if name in episode.dataset.task.state else name
         pairs.append((values[lane], stored[column]))
-    return all(_same_bits(*pair) for pair in pairs)
-
-
-def _same_bits(one: NDArray[Any], other: NDArray[Any]) -> bool:
-    return one.dtype == other.dtype and one.tobytes() == other.tobytes()
+    return all(a.dtype == b.dtype and a.tobytes() == b.tobytes() for a, b in pairs)

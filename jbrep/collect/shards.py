@@ -4,31 +4,44 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.collect.policies import Policy
-from jbrep.dataset.schema import EPISODES, Columns, DataSettings, Frame, episode_seed
+from jbrep.dataset.manifest import Manifest
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Recording, Tick, read_nothing, read_states, record
 
 LANES = 100  # of a batch
+SHARD_ROWS = 20_000  # of a shard of the usual size, unless a batch makes it
 
 Array = NDArray[Any]
 
 
-class Missing(Protocol):
-    """What a data set still lacks."""
+class Missing:
+    """What the shards of a manifest lack."""
+
+    def __init__(self, manifest: Manifest):
+        self.manifest = manifest
 
     @property
     def rows(self) -> int:
         """How many rows, at present."""
+        return self.manifest.settings.steps - self.manifest.rows
 
     def wants(self, shard: int) -> bool:
-        """Whether a shard of that number is likely to be needed."""
+        """Whether a shard of that number is likely to be needed.
+
+        Judging by the mean of the shards so far, or else by the usual size.
+        """
+        settings, done = self.manifest.settings, len(self.manifest.shards)
+        longest = settings.shard_episodes * settings.task.max_episode_steps
+        mean = self.manifest.rows / done if done else min(longest, SHARD_ROWS)
+        return (shard - done) * mean < self.rows
 
 
 Produce = Callable[[int, Missing, Tick], Iterator[Columns]]  # shards in order, from a number on
@@ -93,16 +106,16 @@ class Simulator:
     def _simulate(self, episodes: Array, lanes: Lanes, tick: Tick) -> Columns:
         """The columns of some episodes, one in each lane."""
         task = self.settings.task
-        seeds = [episode_seed(task, self.settings.seed, int(episode)) for episode in episodes]
-        lanes.reset(range(lanes.num_lanes), seeds)
-        act = self.policy.begin(task, seeds)
+        seeds = self.settings.seeds(episodes)
+        lanes.reset(range(lanes.num_lanes), seeds.tolist())
+        act = self.policy.begin(task, seeds.tolist())
         recording = record(
             lanes,
             lambda observation: act(observation).astype(np.float32),  # as it is stored
             tick,
             read_states if self.settings.store_state else read_nothing,
         )
-        return _columns(self.settings, recording, episodes, np.array(seeds))
+        return _columns(self.settings, recording, episodes, seeds)
 
 
 def _columns(
@@ -115,12 +128,13 @@ def _columns(
     kept = np.arange(len(recording.reward)) < length[:, None]
     known = {name: each[: kept.shape[1]].swapaxes(0, 1)[kept] for name, each in steps.items()}
     once: dict[str, Array] = {
+        "episode": episodes,
+        "seed": seeds,
+        "length": length,
         "terminated": recording.terminated,
         "truncated": recording.truncated,
         **{f"initial_{name}": recording.start[name] for name in settings.task.state},
         **{name: recording.start[name] for name in settings.task.constants},
         **{f"final_{name}": values[length, lanes] for name, values in seen.items()},
     }
-    known |= {EPISODES + name: values for name, values in once.items()}
-    frame = Frame(episodes, seeds, length, known["reward"], settings.weights)
-    return settings.columns(known, frame)
+    return settings.columns(known | {EPISODES + name: values for name, values in once.items()})

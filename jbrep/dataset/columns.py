@@ -3,6 +3,7 @@
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,33 +17,32 @@ _CHUNK = 1 << 16  # rows processed at a time, at most
 _CHUNK_NUMBERS = 1 << 22  # in those rows: fewer of them where they are wide
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class Column:
     """A column of a data set as one array over its shards; nothing is copied before it is indexed.
 
     Index it like an array: first the rows, by number, slice, array of numbers in any order, or
     mask, then the other axes. `numpy.asarray(column)` copies all of it.
 
-    Args:
+    Attributes:
         part: returns the column's rows in the shard of a given number, (rows, ...).
         ends: cumulative number of rows after each shard.
         dtype: of the values.
         row: shape of one row.
     """
 
-    def __init__(
-        self,
-        part: Callable[[int], Array],
-        ends: Sequence[int],
-        dtype: np.dtype[Any],
-        row: tuple[int, ...],
-    ):
-        self._part = part
-        self._ends = ends
-        self.dtype = dtype
-        self.shape = (ends[-1] if ends else 0, *row)
+    part: Callable[[int], Array]
+    ends: Sequence[int]
+    dtype: np.dtype[Any]
+    row: tuple[int, ...]
 
     def __len__(self) -> int:
-        return self.shape[0]
+        return self.ends[-1] if self.ends else 0
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
+        return (len(self), *self.row)
 
     def __getitem__(self, rows: int | slice | ArrayLike | tuple[Any, ...]) -> Array:
         if isinstance(rows, tuple):
@@ -82,45 +82,45 @@ class Column:
     def chunks(self, size: int = _CHUNK) -> Iterator[Array]:
         """All rows in order, in views of at most `size` rows."""
         first = 0
-        for shard, end in enumerate(self._ends):
+        for shard, end in enumerate(self.ends):
             for start in range(0, end - first, size):
-                yield self._part(shard)[start : start + size]  # its file is looked at each time
+                yield self.part(shard)[start : start + size]  # its file is looked at each time
             first = end
 
     def parts(self, rows: NDArray[np.int64]) -> Iterator[Array]:
         """The given rows in their order, copied some at a time."""
-        size = max(1, min(_CHUNK, _CHUNK_NUMBERS // math.prod(self.shape[1:])))
+        size = max(1, min(_CHUNK, _CHUNK_NUMBERS // math.prod(self.row)))
         for start in range(0, len(rows), size):
             yield self[rows[start : start + size]]
 
     def __repr__(self) -> str:
-        return f"Column(shape={self.shape}, dtype={self.dtype}, shards={len(self._ends)})"
+        return f"Column(shape={self.shape}, dtype={self.dtype}, shards={len(self.ends)})"
 
     def _slice(self, start: int, stop: int, step: int) -> Array:
         if step != 1:
             return self._take(np.arange(start, stop, step))
         parts = []
-        shard = bisect_right(self._ends, start)
+        shard = bisect_right(self.ends, start)
         while start < stop:
-            end, part = self._ends[shard], self._part(shard)
+            end, part = self.ends[shard], self.part(shard)
             first = end - len(part)
             parts.append(part[start - first : stop - first])
             start, shard = min(stop, end), shard + 1
         if len(parts) == 1:
             return parts[0]
-        return np.concatenate(parts) if parts else np.empty((0, *self.shape[1:]), self.dtype)
+        return np.concatenate(parts) if parts else np.empty((0, *self.row), self.dtype)
 
     def _take(self, rows: Array) -> Array:
         flat = rows.ravel()
-        taken = np.empty((len(flat), *self.shape[1:]), self.dtype)
-        owner = np.searchsorted(self._ends, flat, side="right")
+        taken = np.empty((len(flat), *self.row), self.dtype)
+        owner = np.searchsorted(self.ends, flat, side="right")
         order = np.argsort(owner, kind="stable")
-        bounds = np.searchsorted(owner[order], np.arange(len(self._ends) + 1))
+        bounds = np.searchsorted(owner[order], np.arange(len(self.ends) + 1))
         for shard in np.unique(owner):
             where = order[bounds[shard] : bounds[shard + 1]]
-            part = self._part(int(shard))
-            taken[where] = part[flat[where] - (self._ends[shard] - len(part))]
-        return taken.reshape((*rows.shape, *self.shape[1:]))[()]
+            part = self.part(int(shard))
+            taken[where] = part[flat[where] - (self.ends[shard] - len(part))]
+        return taken.reshape((*rows.shape, *self.row))[()]
 
 
 class Batches:

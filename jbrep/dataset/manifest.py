@@ -25,7 +25,7 @@ from jbrep.errors import DamageError, InputError
 from jbrep.records.commit import Commits, commits
 from jbrep.records.document import Document, document_from, parse_json
 from jbrep.records.record import Record
-from jbrep.records.storage import exists, read_regular, write_whole
+from jbrep.records.storage import MissingFileError, exists, read_regular, write_whole
 
 MANIFEST = "manifest.json"
 BACKUP = "manifest.backup.json"
@@ -102,16 +102,6 @@ class Manifest(Document, frozen=True, kw_only=True):
     def specs(self) -> dict[str, Spec]:
         """The columns of each shard."""
         return self.settings.specs()
-
-    def episode_range(self, shard: int) -> range:
-        """Numbers of the episodes in a committed shard."""
-        first = shard * self.settings.shard_episodes
-        return range(first, first + self.shards[shard].episodes)
-
-    def row_counts(self, shard: int) -> dict[str, int]:
-        """Number of rows of each column of a committed shard."""
-        entry = self.shards[shard]
-        return {n: entry.episodes if n.startswith(EPISODES) else entry.rows for n in self.specs()}
 
     def extended(self, steps: int) -> "Manifest":
         """The manifest of more steps, before what it lacks is collected.
@@ -191,13 +181,9 @@ def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
     """
     path = folder / name
     try:
-        raw = read_regular(path, Manifest.max_bytes)
-    except (FileNotFoundError, NotADirectoryError):
+        return _manifest_from(read_regular(path, Manifest.max_bytes), path)
+    except MissingFileError:
         raise _explain_missing(path) from None
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from error
-    try:
-        return _manifest_from(raw, path)
     except DamageError as error:
         raise DamageError(f"{error}; {REPAIR}") from None
 
@@ -269,9 +255,8 @@ def open_shard(
             )
         if checked is not None:
             checked.add(state)
-    return Shard(
-        path, content, manifest.specs(), manifest.row_counts(shard), manifest.task.max_episode_steps
-    )
+    specs, most = manifest.specs(), manifest.task.max_episode_steps
+    return Shard(path, content, specs, entry.rows, entry.episodes, most)
 
 
 def hdf5_files(folder: Path) -> list[Path]:

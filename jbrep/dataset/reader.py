@@ -181,15 +181,16 @@ class Dataset:
                 f"no column, group or feature {name!r}: choose one of "
                 f"{', '.join(dict.fromkeys((*self._specs, *places)))}"
             )
-        place, row = places[name]
-        dtype = self._specs["observation"].dtype
-        return Column(lambda k: self._shard(k)["observation"][:, place], self._ends, dtype, row)
+        place, spec = places[name], self._specs["observation"]
+        row = np.empty(spec.row)[place].shape
+        return Column(
+            lambda k: self._shard(k)["observation"][:, place], self._ends, spec.dtype, row
+        )
 
     @cached_property
-    def _places(self) -> dict[str, tuple[int | slice, tuple[int, ...]]]:
-        """Index in an observation, and shape of a row, of each group and feature."""
-        groups = {n: (place, (place.stop - place.start,)) for n, place in self.task.groups.items()}
-        return groups | {name: (i, ()) for i, name in enumerate(self.task.feature_names)}
+    def _places(self) -> dict[str, int | slice]:
+        """Index in an observation of each group and feature."""
+        return self.task.groups | {name: i for i, name in enumerate(self.task.feature_names)}
 
     @cached_property
     def episodes(self) -> dict[str, NDArray[Any]]:
@@ -197,7 +198,10 @@ class Dataset:
         shards = [self._shard(k) for k in range(len(self.manifest.shards))]
         return {
             name: np.concatenate(
-                [np.empty(spec.shape(0), spec.dtype), *(shard[EPISODES + name] for shard in shards)]
+                [
+                    np.empty((0, *spec.row), spec.dtype),
+                    *(shard[EPISODES + name] for shard in shards),
+                ]
             )
             for name, spec in episode_columns(self.manifest.specs()).items()
         }

@@ -1,16 +1,20 @@
 """What determines a data set, and the columns that follow from it."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
-from jbrep.dataset.settings import IMPORTED, MIXTURE, CollectSettings, check_policy
+from jbrep.dataset.settings import (
+    IMPORTED,
+    MIXTURE,
+    CollectSettings,
+    PolicySettings,
+    check_policy,
+)
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
@@ -23,65 +27,54 @@ _PART_STREAM = 0x6D6978  # beside an episode's seed: nothing else is drawn from 
 _EPISODE_BITS = {63: 32, 31: 20}  # of a seed, for the number of the episode
 
 
-class Frame(NamedTuple):
-    """Some episodes of a data set, one after the other: what decides the columns that follow.
-
-    Attributes:
-        numbers: of the episodes, (n,).
-        seeds: of the episodes, (n,).
-        lengths: of the episodes [steps], (n,).
-        reward: of all their steps, (N,).
-        weights: of a mixture's policies; of another policy, none.
-    """
-
-    numbers: NDArray[Any]
-    seeds: NDArray[Any]
-    lengths: NDArray[Any]
-    reward: NDArray[np.float32]
-    weights: Sequence[float] = ()
-
-
-@dataclass(frozen=True)
-class Spec:
-    """Type of a column and shape of one of its rows; how it follows from a frame, if it does."""
+class Spec(NamedTuple):
+    """Type of a column and shape of one of its rows; how it follows from others, if it does."""
 
     dtype: np.dtype[Any]
     row: tuple[int, ...] = ()
-    follows: Callable[[Frame], NDArray[Any]] | None = field(default=None, compare=False)
-
-    def shape(self, rows: int) -> tuple[int, ...]:
-        """Shape of the whole column."""
-        return (rows, *self.row)
+    follows: Callable[[Columns], NDArray[Any]] | None = None
 
 
-def _spec(dtype: str, *row: int, follows: Callable[[Frame], NDArray[Any]] | None = None) -> Spec:
+def _spec(dtype: str, *row: int, follows: Callable[[Columns], NDArray[Any]] | None = None) -> Spec:
     return Spec(np.dtype(dtype), row, follows)
 
 
-def _specs(task: Task, store_state: bool, is_mixture: bool) -> dict[str, Spec]:
+def _specs(task: Task, store_state: bool, weights: Sequence[float]) -> dict[str, Spec]:
     """The columns of each shard, by their paths in the file.
 
     Raises:
         InputError: an array of the task's states has the name of another column.
     """
+
+    def steps_of(known: Columns) -> NDArray[Any]:
+        rows, firsts = len(known["reward"]), episode_bounds(known[length])[:-1]
+        return np.arange(rows) - np.repeat(firsts, known[length])
+
+    def parts(known: Columns) -> NDArray[Any]:
+        seeds = known[EPISODES + "seed"].tolist()
+        return np.array([episode_part(seed, weights) for seed in seeds], np.int64)
+
+    number, length = EPISODES + "episode", EPISODES + "length"
     moving = {name: _spec("<f8", width) for name, width in task.state.items()}
     steps = {  # a row for each step, in the order of episode, then step
         "observation": _spec("<f4", task.size),  # before the action, in physical units
         "action": _spec("<f4", task.action_size),  # within the task's bounds
         "reward": _spec("<f4"),  # of the state that the action led to; 0 if the physics diverged
-        "episode": _spec("<i4", follows=lambda frame: np.repeat(frame.numbers, frame.lengths)),
-        "step": _spec("<i4", follows=_steps),  # from 0 in the episode
+        "episode": _spec("<i4", follows=lambda known: np.repeat(known[number], known[length])),
+        "step": _spec("<i4", follows=steps_of),  # from 0 in the episode
     }
     begins = {  # a row for each episode, as those below
-        "episode": _spec("<i4", follows=lambda frame: frame.numbers),  # from 0 in the data set
-        "seed": _spec("<i8", follows=lambda frame: frame.seeds),
-        "length": _spec("<i4", follows=lambda frame: frame.lengths),  # rows stored
-        "return": _spec("<f8", follows=lambda frame: episode_returns(frame.reward, frame.lengths)),
+        "episode": _spec("<i4"),  # its number, from 0 in the data set
+        "seed": _spec("<i8"),
+        "length": _spec("<i4"),  # rows stored
+        "return": _spec(
+            "<f8", follows=lambda known: episode_returns(known["reward"], known[length])
+        ),
         "terminated": _spec("|u1"),
         "truncated": _spec("|u1"),
     }
     ends = {"final_observation": _spec("<f4", task.size)}  # after the last action
-    policy = {"policy": _spec("<i4", follows=_parts)}  # the number of the part of a mixture
+    policy = {"policy": _spec("<i4", follows=parts)}  # the number of the part of a mixture
     for name in task.arrays:
         if name in {**steps, **begins, **policy} or name.startswith(("initial_", "final_")):
             raise InputError(f"{task.name} has an array {name!r}: data sets have such a column")
@@ -91,19 +84,10 @@ def _specs(task: Task, store_state: bool, is_mixture: bool) -> dict[str, Spec]:
         **{name: _spec("<f8", width) for name, width in task.constants.items()},
         **ends,
         **({f"final_{name}": spec for name, spec in moving.items()} if store_state else {}),
-        **(policy if is_mixture else {}),
+        **(policy if weights else {}),
     }
     by_step = steps | (moving if store_state else {})  # states with the observation
     return by_step | {EPISODES + name: spec for name, spec in once.items()}
-
-
-def _steps(frame: Frame) -> NDArray[np.int64]:
-    firsts = episode_bounds(frame.lengths)[:-1]
-    return np.arange(frame.lengths.sum()) - np.repeat(firsts, frame.lengths)
-
-
-def _parts(frame: Frame) -> NDArray[np.int64]:
-    return np.array([episode_part(int(seed), frame.weights) for seed in frame.seeds], np.int64)
 
 
 class DataSettings(CollectSettings, frozen=True, kw_only=True):
@@ -115,10 +99,7 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
     """
 
     task: Task = msgspec.field(name="environment")
-    policy: Annotated[  # its kind and constants
-        Mapping[str, Any],
-        Meta(title="a kind and its constants, such as {'kind': 'constant', 'drive': 0.5}"),
-    ] = msgspec.field(default_factory=lambda: {"kind": "uniform"})
+    policy: PolicySettings = msgspec.field(default_factory=lambda: {"kind": "uniform"})
 
     def check(self) -> None:
         """As for `Record`."""
@@ -147,29 +128,26 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
 
     def specs(self) -> dict[str, Spec]:
         """The columns of each shard, by their paths in the file."""
-        return _specs(self.task, self.store_state, bool(self.weights))
+        return _specs(self.task, self.store_state, self.weights)
 
     def step_specs(self) -> dict[str, Spec]:
         """Those with a row for each step."""
         return {n: spec for n, spec in self.specs().items() if not n.startswith(EPISODES)}
 
-    def columns(self, known: Columns, frame: Frame) -> Columns:
+    def columns(self, known: Columns) -> Columns:
         """All columns of some episodes, in order.
 
         Args:
-            known: those that don't follow from the frame; of any type that fits the column's.
-            frame: of the episodes.
+            known: those at least that don't follow from others; of any type that fits the column's.
         """
         return {
-            name: np.asarray(spec.follows(frame) if spec.follows else known[name], spec.dtype)
+            name: np.asarray(spec.follows(known) if spec.follows else known[name], spec.dtype)
             for name, spec in self.specs().items()
         }
 
-    def wrong_columns(self, columns: Columns, frame: Frame) -> Iterator[str]:
-        """The names of those that don't follow from the frame as they should."""
-        for name, spec in self.specs().items():
-            if spec.follows and not np.array_equal(columns[name], spec.follows(frame)):
-                yield name
+    def seeds(self, episodes: Iterable[int]) -> NDArray[np.int64]:
+        """The seeds that episodes of these numbers have."""
+        return np.array([episode_seed(self.task, self.seed, int(n)) for n in episodes], np.int64)
 
     def row_bytes(self) -> int:
         """Bytes for each step."""

@@ -21,13 +21,11 @@ Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", title="a SHA-256")]
 _Line = Annotated[str, Meta(max_length=MAX_LETTERS)]
 _Number = Annotated[float, Meta(gt=-(10**12), lt=10**12, title="a number")]
 _List = Annotated[tuple[_Number | _Line, ...], Meta(max_length=_MAX_CONSTANTS)]
+_POLICY = "a kind and its constants, such as {'kind': 'constant', 'drive': 0.5}"
 _Constants = Annotated[
-    Mapping[_Line, _Number | _Line | _List],
-    Meta(
-        max_length=_MAX_CONSTANTS,
-        title="a kind and its constants, such as {'kind': 'constant', 'drive': 0.5}",
-    ),
+    Mapping[_Line, _Number | _Line | _List], Meta(max_length=_MAX_CONSTANTS, title=_POLICY)
 ]
+PolicySettings = Annotated[Mapping[str, Any], Meta(title=_POLICY)]
 _Kind = Annotated[str, Meta(pattern=r"\A[a-z-]+\Z", title="a word of small letters")]
 _Weight = Annotated[float, Meta(gt=0, lt=10**12)]
 

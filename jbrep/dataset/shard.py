@@ -5,6 +5,7 @@ import math
 import mmap
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -78,56 +79,51 @@ def map_file(path: Path) -> mmap.mmap:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error
 
 
+@dataclass(frozen=True, eq=False)
 class Shard(Mapping[str, NDArray[Any]]):
     """The columns of a shard as read-only views of its bytes, each checked at its first use.
 
     Only contiguous data inside the file itself is accepted, so HDF5 never reads any data: no link,
     external file, virtual data set or filter is followed.
 
-    Args:
+    Attributes:
         path: of the shard, for messages and for reading HDF5's structure.
         content: its bytes.
         specs: the expected columns, no more and no fewer.
-        rows: number of rows of each.
+        rows: how many there are.
+        episodes: how many there are.
         max_length: rows of the longest episode that is possible.
 
     Raises:
         DamageError: at the use of a column, if the file is structured differently.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        content: mmap.mmap,
-        specs: Mapping[str, Spec],
-        rows: Mapping[str, int],
-        max_length: int,
-    ):
-        self._path = path
-        self._content = content
-        self._specs = specs
-        self._rows = rows
-        self._max_length = max_length
-        self._views: dict[str, NDArray[Any]] = {}
+    path: Path
+    content: mmap.mmap
+    specs: Mapping[str, Spec]
+    rows: int
+    episodes: int
+    max_length: int
+    _views: dict[str, NDArray[Any]] = field(default_factory=dict, init=False)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._specs)
+        return iter(self.specs)
 
     def __len__(self) -> int:
-        return len(self._specs)
+        return len(self.specs)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         if name not in self._views:
-            spec = self._specs[name]
-            shape = spec.shape(self._rows[name])
+            spec = self.specs[name]
+            shape = (self.episodes if name.startswith(EPISODES) else self.rows, *spec.row)
             with self._structure() as file:
                 if not self._views:
                     self._check_names(file)
                 offset = self._offset(h5py.h5d.open(file, name.encode()), name, spec.dtype, shape)
             count = math.prod(shape)
-            if offset + count * spec.dtype.itemsize > len(self._content):
+            if offset + count * spec.dtype.itemsize > len(self.content):
                 raise self._damage(f"{name} extends beyond the end of the file")
-            view = np.frombuffer(self._content, spec.dtype, count, offset).reshape(shape)
+            view = np.frombuffer(self.content, spec.dtype, count, offset).reshape(shape)
             if name == EPISODES + "length":
                 self._check_lengths(view)
             self._views[name] = view
@@ -135,18 +131,17 @@ class Shard(Mapping[str, NDArray[Any]]):
 
     def _check_lengths(self, lengths: NDArray[Any]) -> None:
         """Check that the episodes have as many rows as the shard: they locate its rows."""
-        rows = self._rows["step"]
-        if lengths.min() < 1 or lengths.max() > self._max_length or lengths.sum() != rows:
-            raise self._damage(f"the lengths of its episodes don't add up to {rows:,} rows")
+        if lengths.min() < 1 or lengths.max() > self.max_length or lengths.sum() != self.rows:
+            raise self._damage(f"the lengths of its episodes don't add up to {self.rows:,} rows")
 
     def _damage(self, what: str) -> DamageError:
-        return DamageError(f"{self._path} is damaged: {what}")
+        return DamageError(f"{self.path} is damaged: {what}")
 
     @contextmanager
     def _structure(self) -> Iterator[h5py.h5f.FileID]:
         """The file as HDF5 sees it; anything that HDF5 can't parse is damage."""
         try:
-            with h5py.File(self._path, "r", locking=False) as file:
+            with h5py.File(self.path, "r", locking=False) as file:
                 yield file.id
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             if isinstance(error, DamageError):
@@ -155,7 +150,7 @@ class Shard(Mapping[str, NDArray[Any]]):
 
     def _check_names(self, file: h5py.h5f.FileID) -> None:
         """Check that the file holds the expected columns, by hard links, and nothing else."""
-        names = {name.encode() for name in self._specs}
+        names = {name.encode() for name in self.specs}
         self._check_links(h5py.h5g.open(file, b"/"), {n.partition(b"/")[0] for n in names})
         for group in {name.rpartition(b"/")[0] for name in names} - {b""}:
             inside = {n.rpartition(b"/")[2] for n in names if n.startswith(group + b"/")}

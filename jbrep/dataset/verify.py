@@ -18,7 +18,7 @@ from jbrep.dataset.manifest import (
     read_manifest,
     shard_name,
 )
-from jbrep.dataset.schema import EPISODES, UNKNOWN_SEED, Columns, Frame, episode_seed
+from jbrep.dataset.schema import EPISODES, UNKNOWN_SEED, Columns
 from jbrep.dataset.settings import TRAINED, parts_of
 from jbrep.dataset.shard import REPAIR, column_hash
 from jbrep.envs.task import Task
@@ -55,8 +55,6 @@ def find_problems(folder: Path) -> Iterator[str]:
             if path.exists() and path.lstat().st_size == manifest.shards[shard].bytes:
                 yield str(damage)  # a wrong size or absence has been reported above
             continue
-        for problem in _hash_problems(manifest, shard, columns):
-            yield f"{path}: {problem}"
         for problem in _content_problems(manifest, shard, columns):
             yield f"{path}: {problem}"
 
@@ -78,7 +76,7 @@ def _policy_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
         if policy["kind"] != TRAINED:
             continue
         path, raw = folder / policy["file"], b""
-        with suppress(OSError):
+        with suppress(InputError):
             raw = read_regular(path, _MAX_POLICY_BYTES)
         if hashlib.sha256(raw).hexdigest() != policy["sha256"]:
             yield (
@@ -87,14 +85,11 @@ def _policy_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
             )
 
 
-def _hash_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
+def _content_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
+    """Numbers that aren't those committed, not finite, out of range, or inconsistent."""
     for name, expected in manifest.shards[shard].sha256.items():
         if column_hash(columns[name]) != expected:
             yield f"the SHA-256 of {name} differs from the manifest's"
-
-
-def _content_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
-    """Numbers that aren't finite, out of range, or inconsistent with each other."""
     for name, values in columns.items():
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             yield f"{name} has values that are not finite"
@@ -124,20 +119,18 @@ def range_problems(task: Task, columns: Columns) -> Iterator[str]:
 
 def _episode_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:
     """Columns that are inconsistent with the settings or with each other."""
-    numbers = np.array(manifest.episode_range(shard))
-    seeds = _seeds(manifest, numbers, columns[EPISODES + "seed"])
-    lengths, settings = columns[EPISODES + "length"], manifest.settings
-    frame = Frame(numbers, seeds, lengths, columns["reward"], settings.weights)
-    wrong = [*settings.wrong_columns(columns, frame)]
+    settings, stored = manifest.settings, columns[EPISODES + "seed"]
+    numbers = shard * settings.shard_episodes + np.arange(len(stored))
+    # imported episodes may have any seed, or an unknown one
+    seeds = np.maximum(stored, UNKNOWN_SEED) if settings.is_imported else settings.seeds(numbers)
+    own = {EPISODES + "episode": numbers, EPISODES + "seed": seeds}
+    expected = settings.columns({**columns, **own})
+    wrong = [
+        name
+        for name, values in columns.items()
+        if expected[name] is not values and not np.array_equal(expected[name], values)
+    ]
     if not ((columns[EPISODES + "terminated"] | columns[EPISODES + "truncated"]) == 1).all():
         wrong.append("the ends of episodes")
     for what in wrong:
         yield f"{what}: inconsistent with the settings, or with other columns"
-
-
-def _seeds(manifest: Manifest, numbers: NDArray[Any], stored: NDArray[Any]) -> NDArray[Any]:
-    """The seeds that episodes must have; of imported ones, any that is one, or unknown."""
-    if manifest.settings.is_imported:
-        return np.maximum(stored, UNKNOWN_SEED)
-    root = manifest.settings.seed
-    return np.array([episode_seed(manifest.task, root, int(number)) for number in numbers])

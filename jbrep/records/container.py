@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from jbrep.errors import DamageError, InputError
-from jbrep.records.storage import read_regular, regular_size, write_whole
+from jbrep.records.storage import MissingFileError, read_regular, regular_size, write_whole
 
 Tensors = dict[str, NDArray[Any]]
 
@@ -61,10 +61,8 @@ def read(path: Path, what: str, most: int = MAX_BYTES) -> tuple[Tensors, dict[st
     """
     try:
         raw = read_regular(path, most)
-    except (FileNotFoundError, NotADirectoryError):
+    except MissingFileError:
         raise InputError(f"no {what} at {path}") from None
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from error
     if not raw:
         raise InputError(
             f"{path} is not a jbrep {what}: it must be a regular file of 1 to {most:,} bytes"

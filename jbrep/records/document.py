@@ -53,10 +53,7 @@ def read_document(path: Path, kind: type[_Document]) -> _Document:
         InputError: the file can't be read, or has another version of the format.
         DamageError: it isn't such a document.
     """
-    try:
-        raw = read_regular(path, kind.max_bytes)
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from None
+    raw = read_regular(path, kind.max_bytes)
     return document_from(parse_json(raw, path, kind.format), path, kind)
 
 

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from jbrep.errors import InputError
-from jbrep.records.lock import exclusive_file
-from jbrep.records.storage import sync_folder
+from jbrep.records.lock import exclusive
+from jbrep.records.storage import sync
 
 
 @contextmanager
@@ -20,7 +20,7 @@ def unfinished(path: Path) -> Iterator[Path]:
     Raises:
         InputError: the path exists already, or another process is writing it.
     """
-    with exclusive_file(path):
+    with exclusive(path, beside=True):
         if os.path.lexists(path):
             raise _taken(path)
         partial = path.with_name(f".{path.name}.partial")
@@ -37,7 +37,7 @@ def publish_file(partial: Path, path: Path) -> None:
     Raises:
         InputError: the name has been taken meanwhile.
     """
-    _sync_file(partial)
+    sync(partial)
     try:
         os.link(partial, path)  # unlike a rename, it never replaces a file
     except FileExistsError:
@@ -45,7 +45,7 @@ def publish_file(partial: Path, path: Path) -> None:
     except OSError:  # no hard links on this file system
         path.touch(exist_ok=False)
         partial.replace(path)
-    sync_folder(path.parent)
+    sync(path.parent)
 
 
 def publish_folder(partial: Path, path: Path) -> None:
@@ -56,19 +56,14 @@ def publish_folder(partial: Path, path: Path) -> None:
     """
     for folder, _, files in os.walk(partial):
         for name in files:
-            _sync_file(Path(folder) / name)
-        sync_folder(Path(folder))
+            sync(Path(folder, name))
+        sync(Path(folder))
     partial.rename(path)  # it replaces an empty folder, and nothing else
-    sync_folder(path.parent)
+    sync(path.parent)
 
 
 def _taken(path: Path) -> InputError:
     return InputError(f"{path} exists already: choose another name")
-
-
-def _sync_file(path: Path) -> None:
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
 
 
 def _remove(path: Path) -> None:

@@ -45,7 +45,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         for field in msgspec.structs.fields(type(self)):
             if field.type is not Any:
                 value = getattr(self, field.name)
-                force_setattr(self, field.name, _fitting(value, field.type, field.encode_name))
+                fitting = converted(_of_python(value), field.type, field.encode_name)
+                force_setattr(self, field.name, fitting)
         self.check()
 
     def check(self) -> None:
@@ -58,12 +59,6 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def replace(self, **changes: Any) -> Self:
         """The same with other values of some fields, checked again."""
         return msgspec.structs.replace(self, **changes)
-
-
-def _fitting(value: Any, kind: Any, name: str) -> Any:
-    """A value as its field's type."""
-    value = value.item() if hasattr(value, "dtype") and not getattr(value, "shape", 0) else value
-    return converted(value, kind, name)
 
 
 def from_plain(value: Any, kind: type[_Kind], where: str = "") -> _Kind:
@@ -111,11 +106,15 @@ def to_plain(value: Any) -> Any:
     return _with_lists(msgspec.to_builtins(value, enc_hook=_python_scalar))
 
 
+def _of_python(value: Any) -> Any:
+    """A NumPy scalar as Python's; anything else as it is."""
+    return value.item() if hasattr(value, "dtype") and not getattr(value, "shape", 0) else value
+
+
 def _python_scalar(value: Any) -> Any:
-    """A NumPy scalar as Python's."""
-    if hasattr(value, "dtype") and not getattr(value, "shape", 0):
-        return value.item()
-    raise TypeError(f"it is of type {type(value).__name__}")
+    if (plain := _of_python(value)) is value:
+        raise TypeError(f"it is of type {type(value).__name__}")
+    return plain
 
 
 def _with_lists(value: Any) -> Any:

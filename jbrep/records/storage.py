@@ -11,6 +11,10 @@ from jbrep.errors import InputError
 _PARTIAL = ".partial"
 
 
+class MissingFileError(InputError):
+    """There is no file at a path."""
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file atomically: even after a power cut it has all its bytes or doesn't exist.
 
@@ -27,7 +31,7 @@ def write_whole(path: Path, content: bytes) -> None:
         if partial.read_bytes() != content:
             raise OSError("it reads back otherwise")
         partial.replace(path)
-        sync_folder(path.parent)
+        sync(path.parent)
     except OSError as error:
         raise InputError(
             f"can't write {path}: {error.strerror or error} ({len(content):,} bytes are needed)"
@@ -37,9 +41,9 @@ def write_whole(path: Path, content: bytes) -> None:
             partial.unlink(missing_ok=True)
 
 
-def sync_folder(folder: Path) -> None:
-    """Make a rename in the folder durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
+def sync(path: Path) -> None:
+    """Bring a file, or the names in a folder, to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
@@ -86,21 +90,24 @@ def read_regular(path: Path, most: int) -> bytes:
     """The bytes of a regular file of at most `most` bytes; of anything else, none.
 
     Raises:
-        OSError: it can't be read.
+        MissingFileError: there is none.
+        InputError: it can't be read.
     """
-    return path.read_bytes() if 0 < regular_size(path) <= most else b""
+    try:
+        return path.read_bytes() if 0 < regular_size(path) <= most else b""
+    except OSError as error:
+        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
+        kind = MissingFileError if is_missing else InputError
+        raise kind(f"can't read {path}: {error.strerror or error}") from error
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """The bytes of a regular file of 1 to `most` bytes.
+    """The same of 1 to `most` bytes.
 
     Raises:
         InputError: it can't be read, or is something else.
     """
-    try:
-        content = read_regular(path, most)
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from None
+    content = read_regular(path, most)
     if not content:
         raise InputError(f"{path} must be a regular file of 1 to {most:,} bytes")
     return content

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jbrep.errors import DamageError, InputError
+from jbrep.errors import DamageError
 from jbrep.records.storage import read_regular, write_whole
 
 Columns = Mapping[str, Callable[[str], Any]]  # by their names: what their cells are
@@ -44,17 +44,15 @@ def read_csv(path: Path, columns: Columns) -> list[tuple[Any, ...]]:
         InputError: it can't be read.
         DamageError: it isn't such a table.
     """
+    raw = read_regular(path, _MAX_BYTES)
     try:
-        text = read_regular(path, _MAX_BYTES).decode()
-        header, *rows = csv.reader(io.StringIO(text, newline=""), strict=True)
+        header, *rows = csv.reader(io.StringIO(raw.decode(), newline=""), strict=True)
         if header != [*columns]:
             raise ValueError
         return [
             tuple(kind(cell) for kind, cell in zip(columns.values(), row, strict=True))
             for row in rows
         ]
-    except OSError as error:
-        raise InputError(f"can't read {path}: {error.strerror or error}") from error
     except (ValueError, csv.Error):
         raise DamageError(f"{path} is damaged or cut short") from None
 

@@ -9,6 +9,10 @@ from msgspec import UNSET, inspect
 
 _STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+|\.\.\.)\]")
 _LARGEST = sys.float_info.max
+_WITH_PARTS = (
+    *(inspect.StructType, inspect.NamedTupleType, inspect.DictType),
+    *(inspect.CollectionType, inspect.TupleType),
+)
 
 
 class Part(NamedTuple):
@@ -45,17 +49,22 @@ def bare(node: inspect.Type) -> inspect.Type:
         node = node.type
     if isinstance(node, inspect.UnionType):
         inner = [bare(each) for each in node.types]
-        return next((each for each in inner if _has_parts(each)), inner[0])
+        return next((each for each in inner if isinstance(each, _WITH_PARTS)), inner[0])
     return node
 
 
-def _has_parts(node: inspect.Type) -> bool:
-    structs = inspect.StructType, inspect.NamedTupleType
-    return isinstance(node, (*structs, inspect.CollectionType, inspect.TupleType, inspect.DictType))
+def _in_list(node: inspect.Type) -> tuple[inspect.Field, ...]:
+    """The fields of a record that is written as a list, in order."""
+    match node:
+        case inspect.StructType(array_like=True) | inspect.NamedTupleType():
+            return node.fields
+    return ()
 
 
 def _inner(node: inspect.Type, step: str) -> inspect.Type:
     """The type of a part; of a union, that of the first type which has such a part."""
+    if step.isdecimal() and (fields := _in_list(node)):
+        return fields[int(step)].type
     match node:
         case inspect.Metadata(type=inner):
             return _inner(inner, step)
@@ -66,11 +75,6 @@ def _inner(node: inspect.Type, step: str) -> inspect.Type:
             parts = (_inner(each, step) for each in types)
             any_type = inspect.AnyType()
             return next((each for each in parts if each != any_type), any_type)
-        case (
-            inspect.StructType(fields=fields, array_like=True)
-            | inspect.NamedTupleType(fields=fields)
-        ) if step.isdecimal():
-            return fields[int(step)].type
         case inspect.StructType(fields=fields):
             return next((f.type for f in fields if f.encode_name == step), inspect.AnyType())
         case inspect.CollectionType(item_type=item) if step.isdecimal():
@@ -83,14 +87,11 @@ def _inner(node: inspect.Type, step: str) -> inspect.Type:
 
 
 def _name(node: inspect.Type, step: str) -> str:
-    match bare(node):
-        case (
-            inspect.StructType(fields=fields, array_like=True)
-            | inspect.NamedTupleType(fields=fields)
-        ) if step.isdecimal():
-            return f".{fields[int(step)].encode_name}"
-        case inspect.StructType():
-            return f".{step}"
+    plain = bare(node)
+    if step.isdecimal() and (fields := _in_list(plain)):
+        return f".{fields[int(step)].encode_name}"
+    if isinstance(plain, inspect.StructType):
+        return f".{step}"
     return "" if step == "..." else f"[{step}]"
 
 
@@ -143,12 +144,9 @@ def _scalar(node: inspect.Type) -> str:
 
 
 def _collection(node: inspect.Type) -> str:
+    if fields := _in_list(node):
+        return f"a list of {', '.join(each.encode_name for each in fields)}"
     match node:
-        case (
-            inspect.StructType(array_like=True, fields=fields)
-            | inspect.NamedTupleType(fields=fields)
-        ):
-            return f"a list of {', '.join(each.encode_name for each in fields)}"
         case inspect.StructType() | inspect.DictType():
             return "a table"
         case inspect.TupleType(item_types=items):

@@ -1,7 +1,6 @@
 """Rows of many episodes, one after the other, divided into episodes; and arrays in Python."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,28 +30,20 @@ Array = NDArray[Any]
 CHUNK = 1 << 14  # rows read at a time
 
 
-@dataclass(frozen=True)
-class PerEpisode:
-    """What is known once for each episode; None where it isn't."""
+def per_episode(name: str, given: Mapping[str, Any]) -> dict[str, Array]:
+    """What a source knows once for each episode, checked.
 
-    final_observation: Array | None = None  # (episodes, ...)
-    terminated: Array | None = None  # (episodes,)
-    seed: Array | None = None  # (episodes,)
+    Args:
+        name: of the source.
+        given: final_observation (episodes, ...), terminated (episodes,) and seed (episodes,), as
+            far as they are known.
 
-    @classmethod
-    def of(cls, name: str, given: Mapping[str, Any]) -> "PerEpisode":
-        """Check the arrays of a source.
-
-        Raises:
-            InputError: one holds what can't be imported.
-        """
-        arrays = {what: plain(name, what, values) for what, values in given.items()}
-        check_arrays(name, arrays)
-        return cls(**{what: narrow(what, values) for what, values in arrays.items()})
-
-    def known(self) -> dict[str, Array]:
-        """The arrays that there are."""
-        return {name: values for name, values in vars(self).items() if values is not None}
+    Raises:
+        InputError: one holds what can't be imported.
+    """
+    arrays = {what: plain(name, what, values) for what, values in given.items()}
+    check_arrays(name, arrays)
+    return {what: narrow(what, values) for what, values in arrays.items()}
 
 
 def own_names(name: str, names: Iterable[str]) -> dict[str, str]:
@@ -76,7 +67,7 @@ def own_names(name: str, names: Iterable[str]) -> dict[str, str]:
     return own
 
 
-def split(name: str, chunks: Iterable[Rows], once: PerEpisode) -> Iterator[Incoming]:
+def split(name: str, chunks: Iterable[Rows], known: Mapping[str, Array]) -> Iterator[Incoming]:
     """Divide rows into episodes, in bounded memory.
 
     An episode ends where it is terminated or truncated, before another episode's number or a
@@ -85,13 +76,13 @@ def split(name: str, chunks: Iterable[Rows], once: PerEpisode) -> Iterator[Incom
     Args:
         name: of the source.
         chunks: of rows, in order.
-        once: what is known once for each episode.
+        known: once for each episode, as of `per_episode`.
 
     Raises:
         InputError: gaps in an episode, one that is too long or in two parts, as many episodes as
-            `once` doesn't have, or as `checked`.
+            `known` doesn't have, or as `checked`.
     """
-    count, numbers, known = 0, set[int](), once.known()
+    count, numbers = 0, set[int]()
     for rows in _divided(name, chunks):
         number = int(rows["episode"][0]) if "episode" in rows else count
         if number in numbers:
@@ -159,7 +150,7 @@ def source_of(columns: Mapping[str, Any], once: Mapping[str, Any], name: str) ->
     Args:
         columns: by their names in `ALIASES`: a row for each step of all episodes, or a list with
             such an array for each episode; those that are None aren't there.
-        once: what `PerEpisode` takes, likewise.
+        once: what `per_episode` takes, likewise.
         name: of the source.
 
     Raises:
@@ -175,12 +166,12 @@ def source_of(columns: Mapping[str, Any], once: Mapping[str, Any], name: str) ->
     rows = len(arrays["reward"])
     check_lengths(name, {what: len(values) for what, values in arrays.items()})
     check_arrays(name, arrays)
-    per_episode = PerEpisode.of(name, known)
+    checked_once = per_episode(name, known)
 
     def episodes() -> Iterator[Incoming]:
         starts = range(0, rows, CHUNK)
         chunks = ({n: v[start : start + CHUNK] for n, v in arrays.items()} for start in starts)
-        return split(name, chunks, per_episode)
+        return split(name, chunks, checked_once)
 
     return Source(name, label(name), episodes, rows=rows)
 
@@ -189,7 +180,7 @@ def _listed(name: str, columns: Mapping[str, Any], once: dict[str, Any]) -> Sour
     """Lists of arrays, one for each episode."""
     check_lengths(name, {n: len(values) for n, values in {**columns, **once}.items()}, "episodes")
     if "seed" in once:
-        once["seed"] = PerEpisode.of(name, {"seed": once["seed"]}).seed
+        once |= per_episode(name, {"seed": once["seed"]})
 
     def episodes() -> Iterator[Incoming]:
         for number in range(len(columns["reward"])):

@@ -65,14 +65,10 @@ def open_source(given: str) -> Source:
     identity = env_id or label(name)
     if task and (task.size, task.action_size) != (len(features), actions.low.size):
         task, identity, why_not = None, label(name), f"{env_id} has other sizes"
-
-    def episodes() -> Iterator[Incoming]:
-        return _episodes(name, storage)
-
     return Source(
         name,
         identity,
-        episodes,
+        lambda: _episodes(name, storage),
         task=task,
         features=features,
         action_bounds=(actions.low.ravel(), actions.high.ravel()),
@@ -111,10 +107,11 @@ def _metadata(folder: Path) -> dict[str, Any]:
             can run code that the data set names.
     """
     path = folder / _METADATA
+    raw = read_regular(path, _MAX_BYTES)
     try:
-        metadata = json.loads(read_regular(path, _MAX_BYTES))
+        metadata = json.loads(raw)
         spaces_of = [metadata["observation_space"], metadata["action_space"]]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path} can't be read: {kind_and_line(error)}") from None
     if not all(isinstance(space, str) for space in spaces_of):
         raise InputError(f"{path} doesn't say what observations and actions are")
@@ -232,21 +229,18 @@ def _namespace(task: Task) -> str:
 
 def _create(dataset: Dataset, name: str) -> None:
     settings, versions = dataset.manifest.settings, dataset.manifest.versions
+    task = settings.task
+    low, high = (np.array(ends, np.float32) for ends in (task.action_low, task.action_high))
     minari.create_dataset_from_buffers(
         name,
         _buffers(dataset),
         env=_env_spec(settings),
-        observation_space=spaces.Box(-np.inf, np.inf, (settings.task.size,), np.float32),
-        action_space=_actions(settings.task),
+        observation_space=spaces.Box(-np.inf, np.inf, (task.size,), np.float32),
+        action_space=spaces.Box(low, high, dtype=np.float32),
         algorithm_name=settings.policy["kind"],
         description=f"{json.dumps(settings.as_json())} {dataset.manifest.fingerprint}",
         requirements=[f"{package}=={versions[package]}" for package in ("jbrep", "mujoco")],
     )
-
-
-def _actions(task: Task) -> spaces.Box:
-    low, high = (np.array(ends, np.float32) for ends in (task.action_low, task.action_high))
-    return spaces.Box(low, high, dtype=np.float32)
 
 
 def _env_spec(settings: DataSettings) -> EnvSpec | None:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.formats.episodes import (
-    Incoming,
     Rows,
     Source,
     check_kind,
@@ -20,7 +19,7 @@ from jbrep.dataset.formats.episodes import (
     check_names,
     label,
 )
-from jbrep.dataset.formats.flat import CHUNK, PerEpisode, own_names, split
+from jbrep.dataset.formats.flat import CHUNK, own_names, per_episode, split
 from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Feature
 from jbrep.errors import InputError
@@ -56,7 +55,7 @@ class _Stored(NamedTuple):
 
 
 @contextmanager
-def _opened(path: Path, archive: zipfile.ZipFile, name: str) -> Iterator[_Stored]:
+def _opened(archive: zipfile.ZipFile, name: str) -> Iterator[_Stored]:
     """An array of the archive.
 
     Raises:
@@ -71,8 +70,8 @@ def _opened(path: Path, archive: zipfile.ZipFile, name: str) -> Iterator[_Stored
             shape, by_columns, dtype = read(file)
             if dtype.hasobject:
                 raise InputError(
-                    f"{path} has objects in {name}, which would have to be unpickled, and that "
-                    "can run code: save it as an array of plain numbers"
+                    f"{archive.filename} has objects in {name}, which would have to be unpickled, "
+                    "and that can run code: save it as an array of plain numbers"
                 )
             size = archive.getinfo(f"{name}{_SUFFIX}").file_size - file.tell()
             if math.prod(shape) * dtype.itemsize != size:
@@ -82,7 +81,8 @@ def _opened(path: Path, archive: zipfile.ZipFile, name: str) -> Iterator[_Stored
         raise
     except _DAMAGE:
         raise InputError(
-            f"{path} is damaged: {name} is no array, or has other bytes than its shape and type say"
+            f"{archive.filename} is damaged: {name} is no array, or has other bytes than its shape "
+            "and type say"
         ) from None
 
 
@@ -97,7 +97,7 @@ def open_source(given: str) -> Source:
         for member in archive.namelist():
             if member.endswith(_SUFFIX):
                 name = member.removesuffix(_SUFFIX)
-                with _opened(path, archive, name) as stored[name]:
+                with _opened(archive, name) as stored[name]:
                     pass
         own = own_names(given, stored)
         check_names(given, own)
@@ -105,13 +105,15 @@ def open_source(given: str) -> Source:
         check_lengths(given, lengths)
         for column, name in own.items():
             check_kind(given, column, stored[name].dtype, stored[name].shape[1:])
-        known = _once(path, archive, stored)
-        features = _features(path, archive, stored)
-
-    def episodes() -> Iterator[Incoming]:
-        return split(given, _chunks(path, own), known)
-
-    return Source(given, label(path.stem), episodes, features=features, rows=lengths["reward"])
+        known = per_episode(given, _once(archive, stored))
+        features = _features(archive, stored)
+    return Source(
+        given,
+        label(path.stem),
+        lambda: split(given, _chunks(path, own), known),
+        features=features,
+        rows=lengths["reward"],
+    )
 
 
 def _archive(path: Path) -> zipfile.ZipFile:
@@ -125,14 +127,14 @@ def _archive(path: Path) -> zipfile.ZipFile:
 def _chunks(path: Path, own: dict[str, str]) -> Iterator[Rows]:
     """The columns, some rows at a time."""
     with _archive(path) as archive:
-        streams = [_stream(path, archive, name) for name in own.values()]
+        streams = [_stream(archive, name) for name in own.values()]
         for chunk in zip(*streams, strict=True):
             yield dict(zip(own, chunk, strict=True))
 
 
-def _stream(path: Path, archive: zipfile.ZipFile, name: str) -> Iterator[Array]:
+def _stream(archive: zipfile.ZipFile, name: str) -> Iterator[Array]:
     """An array's rows in chunks; read at once if it is stored by columns."""
-    with _opened(path, archive, name) as stored:
+    with _opened(archive, name) as stored:
         count, *row = stored.shape
         most = CHUNK if stored.order == "C" else max(1, count)
         for start in range(0, count, most):
@@ -141,30 +143,29 @@ def _stream(path: Path, archive: zipfile.ZipFile, name: str) -> Iterator[Array]:
                 yield values[first : first + CHUNK]
 
 
-def _whole(path: Path, archive: zipfile.ZipFile, name: str) -> Array:
-    with _opened(path, archive, name) as stored:
+def _whole(archive: zipfile.ZipFile, name: str) -> Array:
+    with _opened(archive, name) as stored:
         return stored.read(*stored.shape)
 
 
-def _once(path: Path, archive: zipfile.ZipFile, names: Collection[str]) -> PerEpisode:
+def _once(archive: zipfile.ZipFile, names: Collection[str]) -> dict[str, Array]:
     """What is known once for each episode."""
     chosen = {
         column: alias for column, aliases in _ONCE.items() for alias in aliases if alias in names
     }
-    arrays = {column: _whole(path, archive, name) for column, name in chosen.items()}
-    return PerEpisode.of(str(path), arrays)
+    return {column: _whole(archive, name) for column, name in chosen.items()}
 
 
-def _features(path: Path, archive: zipfile.ZipFile, names: Collection[str]) -> tuple[Feature, ...]:
+def _features(archive: zipfile.ZipFile, names: Collection[str]) -> tuple[Feature, ...]:
     """Names and units, if there are any."""
     given, units = (
-        [str(word) for word in _whole(path, archive, name).ravel()] if name in names else []
+        [str(word) for word in _whole(archive, name).ravel()] if name in names else []
         for name in ("feature_names", "feature_units")
     )
     if units and len(units) != len(given):
-        raise InputError(f"{path} has {len(given)} feature names and {len(units)} units")
-    both = zip(given, units or [""] * len(given), strict=True)
-    return tuple(Feature(name=name, unit=unit) for name, unit in both)
+        has = f"{len(given)} feature names and {len(units)} units"
+        raise InputError(f"{archive.filename} has {has}")
+    return tuple(map(Feature, given, units or [""] * len(given)))
 
 
 def write(dataset: Dataset, out: Path) -> str:

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,13 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jbrep.dataset.formats.episodes import (
-    Incoming,
     Rows,
     Source,
     check_kind,
     check_names,
     label,
 )
-from jbrep.dataset.formats.flat import CHUNK, PerEpisode, own_names, split
+from jbrep.dataset.formats.flat import CHUNK, own_names, per_episode, split
 from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Feature, Task
 from jbrep.errors import InputError, first_line
@@ -39,7 +39,8 @@ def open_source(given: str) -> Source:
         InputError: it can't be read, or has no columns that can be used.
     """
     name, path = given, Path(given)
-    schema = _schema(path)
+    with _reading(path):
+        schema, rows = pq.read_schema(path), pq.read_metadata(path).num_rows
     task = _own_task(schema)
     own = own_names(name, schema.names)
     actions = [column for column in schema.names if _ACTION.fullmatch(column)]
@@ -53,24 +54,27 @@ def open_source(given: str) -> Source:
     check_names(name, [column for column, given in columns.items() if given])
     _check_types(name, schema, columns)
     once = _once(path)
-
-    def episodes() -> Iterator[Incoming]:
-        return split(name, _chunks(path, columns), once)
-
     named = () if task else tuple(Feature(_word(column)) for column in features)
-    rows = pq.read_metadata(path).num_rows
-    return Source(name, label(path.stem), episodes, task=task, features=named, rows=rows)
+    return Source(
+        name,
+        label(path.stem),
+        lambda: split(name, _chunks(path, columns), once),
+        task=task,
+        features=named,
+        rows=rows,
+    )
 
 
-def _schema(path: Path) -> pa.Schema:
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Say of a file that it can't be read."""
     try:
-        return pq.read_schema(path)
-    except (OSError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
-
-
-def _unreadable(path: Path, error: BaseException) -> InputError:
-    return InputError(f"{path} can't be read as a Parquet file: {first_line(error)}")
+        yield
+    except InputError:
+        raise
+    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+        reason = first_line(error)
+        raise InputError(f"{path} can't be read as a Parquet file: {reason}") from None
 
 
 def _own_task(schema: pa.Schema) -> Task | None:
@@ -99,13 +103,10 @@ def _check_types(name: str, schema: pa.Schema, columns: dict[str, list[str]]) ->
 
 def _chunks(path: Path, columns: dict[str, list[str]]) -> Iterator[Rows]:
     wanted = [given for group in columns.values() for given in group]
-    try:
-        with pq.ParquetFile(path) as file:
-            for batch in file.iter_batches(CHUNK, columns=wanted):
-                _check_full(path, batch)
-                yield {name: _array(name, batch, given) for name, given in columns.items()}
-    except (OSError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from None
+    with _reading(path), pq.ParquetFile(path) as file:
+        for batch in file.iter_batches(CHUNK, columns=wanted):
+            _check_full(path, batch)
+            yield {name: _array(name, batch, given) for name, given in columns.items()}
 
 
 def _check_full(path: Path, batch: pa.RecordBatch) -> None:
@@ -122,18 +123,16 @@ def _array(name: str, batch: pa.RecordBatch, columns: list[str]) -> NDArray[Any]
     return np.stack(arrays, axis=1) if name in ("observation", "action") else arrays[0]
 
 
-def _once(path: Path) -> PerEpisode:
+def _once(path: Path) -> dict[str, NDArray[Any]]:
     """What the file of episodes that jbrep exports beside it says, if there is one."""
     beside = path.with_stem(f"{path.stem}-episodes")
     if not exists(beside):
-        return PerEpisode()
-    try:
+        return {}
+    with _reading(beside):
         table = pq.read_table(beside)
         final = np.stack(table["final_observation"].to_numpy())
         once = {name: table[name].to_numpy() for name in ("terminated", "seed")}
-        return PerEpisode.of(str(beside), {"final_observation": final, **once})
-    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
-        raise _unreadable(beside, error) from None
+        return per_episode(str(beside), {"final_observation": final, **once})
 
 
 def _word(column: str) -> str:
@@ -171,7 +170,7 @@ def _write_steps(dataset: Dataset, path: Path, name: str) -> None:
     with pq.ParquetWriter(path, schema, **coding) as writer:
         chunks = zip(*(dataset[name].chunks() for name in dataset.columns), strict=True)
         for chunk in Progress(chunks, unit="chunk", desc=name, leave=False):
-            arrays = [column for values in chunk for column in _flat(values)]
+            arrays = [numbers for values in chunk for numbers in values.reshape(len(values), -1).T]
             writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
 
 
@@ -187,8 +186,3 @@ def _numeric_columns(dataset: Dataset) -> Iterator[tuple[str, np.dtype[Any], str
         else:
             for i in range(column.shape[1]):
                 yield f"{name}_{i}", column.dtype, ""
-
-
-def _flat(values: NDArray[Any]) -> list[NDArray[Any]]:
-    """The columns of (n,) or (n, k)."""
-    return list(values.reshape(len(values), -1).T)

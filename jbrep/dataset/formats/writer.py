@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.formats.episodes import Incoming, Source
 from jbrep.dataset.manifest import Manifest, commit, new_manifest, write_manifest
-from jbrep.dataset.schema import EPISODES, Columns, DataSettings, Frame
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.dataset.settings import IMPORTED, MAX_LETTERS
 from jbrep.dataset.verify import range_problems
 from jbrep.envs.description import features_of
@@ -184,6 +184,9 @@ def _columns(settings: DataSettings, episodes: list[Incoming], first: int) -> Co
     action = np.concatenate([episode.action for episode in episodes])
     terminated = np.array([episode.terminated for episode in episodes])
     known = {
+        EPISODES + "episode": np.arange(first, first + len(episodes)),
+        EPISODES + "seed": np.array([episode.seed for episode in episodes]),
+        EPISODES + "length": np.array([len(episode.reward) for episode in episodes]),
         "observation": np.concatenate([episode.observation for episode in episodes]),
         "action": _bounded(settings.task, action),
         "reward": np.concatenate([episode.reward for episode in episodes]),
@@ -191,10 +194,7 @@ def _columns(settings: DataSettings, episodes: list[Incoming], first: int) -> Co
         EPISODES + "truncated": ~terminated,
         EPISODES + "final_observation": np.stack([episode.final for episode in episodes]),
     }
-    lengths = np.array([len(episode.reward) for episode in episodes])
-    seeds = np.array([episode.seed for episode in episodes])
-    numbers = np.arange(first, first + len(episodes))
-    return settings.columns(known, Frame(numbers, seeds, lengths, known["reward"]))
+    return settings.columns(known)
 
 
 def _bounded(task: Task, action: Array) -> Array:
