@@ -16,7 +16,7 @@ from made_up import write_checkpoint, write_record
 from rerun.chunk import RrdReader
 
 from jbrep.dataset import Dataset
-from jbrep.encoders import find, save
+from jbrep.encoders import find
 from jbrep.encoders.base import as_encoder
 from jbrep.envs import describe
 from jbrep.envs.physics import Motion
@@ -29,7 +29,7 @@ from jbrep.inspection.episode import record_episode
 from jbrep.inspection.fan import make_fan
 from jbrep.inspection.forecast import Examples, from_dataset, windows
 from jbrep.inspection.recording import Recording
-from jbrep.inspection.robot import Robot, own_colours, rotate, shapes
+from jbrep.inspection.robot import Robot, rotate, shapes
 from jbrep.inspection.scene import contacts, shades
 from jbrep.inspection.signals import MOST_LINES, panels, principal_components
 from jbrep.inspection.traversal import POINTS, SPACING, sweep
@@ -38,7 +38,7 @@ from jbrep.play.jitterbug import reward_terms
 from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode
 from jbrep.rl import Run
-from jbrep.rl.files import ENCODER, FAILED, FINISHED, Evaluation, read_evaluations, write_rows
+from jbrep.rl.files import Evaluation, read_evaluations, write_rows
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
 DAE = "jbrep/encoders/shipped/face_direction/dae-4.safetensors"
@@ -402,9 +402,9 @@ def test_windows_stay_in_their_part_and_leave_out_turns():
     observation = np.zeros((8, task.size))
     observation[:, place] = [0, 1, 2, 3, -3, -2, -1, 0]
     latent, action = np.arange(8.0)[:, None], np.arange(10.0, 17)[:, None]
-    some = windows(latent, action, observation, task, 2)
-    np.testing.assert_array_equal(some.inputs, [[0, 10, 11], [1, 11, 12], [4, 14, 15], [5, 15, 16]])
-    np.testing.assert_array_equal(some.change, np.full((4, 1), 2))
+    inputs, change = windows(latent, action, observation, task, 2)
+    np.testing.assert_array_equal(inputs, [[0, 10, 11], [1, 11, 12], [4, 14, 15], [5, 15, 16]])
+    np.testing.assert_array_equal(change, np.full((4, 1), 2))
 
 
 def test_a_code_that_cannot_decode_is_read_by_regression(walk, others, walker):
@@ -594,7 +594,7 @@ def test_a_traversal_of_any_robot_shows_series(folder):
 
 
 def test_panels_have_few_lines_of_about_equal_number():
-    found = dict(panels({"a": slice(0, 12), "b": slice(12, 25), "c": slice(25, 26)}))
+    found = panels({"a": slice(0, 12), "b": slice(12, 25), "c": slice(25, 26)})
     parts = {"b_0-5": slice(12, 18), "b_6-12": slice(18, 25)}
     assert found == {"a": slice(0, 12), **parts, "c": slice(25, 26)}
 
@@ -633,9 +633,9 @@ def test_shapes_of_every_kind():
     geoms = robot.geoms(1)
     drawn = [model.geom(geom).name for geom in geoms]
     assert drawn == ["ball", "egg", "pill", "can", "brick", "stone"]
-    given = own_colours(model, geoms)[:3, :3].tolist()
-    assert given == [[0, 255, 0], [255, 0, 0], [128, 128, 128]]
-    found = {type(each).__name__: each for each in shapes(model, geoms, own_colours(model, geoms))}
+    colours = robot.colours[geoms]
+    assert colours[:3, :3].tolist() == [[0, 255, 0], [255, 0, 0], [128, 128, 128]]
+    found = {type(each).__name__: each for each in shapes(model, geoms, colours)}
     halves = found["Ellipsoids3D"].half_sizes.as_arrow_array().to_pylist()
     np.testing.assert_allclose(halves, [[0.1] * 3, [0.1, 0.2, 0.3]], rtol=1e-6)
     assert {*found} == {"Ellipsoids3D", "Capsules3D", "Cylinders3D", "Boxes3D", "Mesh3D"}
@@ -685,13 +685,6 @@ def test_the_force_of_a_contact_is_the_one_on_the_robot():
     assert force[2] > 1
 
 
-def write_end(folder, representation, seed=0, status=FINISHED):
-    """What a run of 300 steps says at its end; a failed one ended half-way."""
-    run = Run.of(task="face_direction", encoder=representation, steps=300, seed=seed)
-    failed = status == FAILED
-    write_record(folder, run, "it failed" if failed else None, steps=150 if failed else 300)
-
-
 def write_study(folder):
     """Two representations with two runs each, of which one failed."""
     random = np.random.default_rng(0)
@@ -700,7 +693,9 @@ def write_study(folder):
             failed = (representation, seed) == ("dae-8", 1)
             run = folder / "runs" / representation / f"seed-{seed}"
             run.mkdir(parents=True)
-            write_end(run, representation, seed, FAILED if failed else FINISHED)
+            settings = Run.of(task="face_direction", encoder=representation, steps=300, seed=seed)
+            end = {"steps": 150, "reason": "it failed"} if failed else {"steps": 300}
+            write_record(run, settings, **end)
             steps = (0, 100) if failed else (0, 100, 200, 300)
             starts = [(step, episode) for step in steps for episode in (0, 1)]
             rows = [Evaluation(*start, float(random.uniform(0, 1000))) for start in starts]
@@ -736,23 +731,15 @@ def test_training_curves_are_the_evaluations(tmp_path):
     assert "| face_direction/sac/full | 2 |" in text(found["/provenance"])
 
 
-def test_a_run_shows_its_own_encoder(tmp_path, rollout, monkeypatch):
-    monkeypatch.setattr("jbrep.inspection.subject.find_episode", lambda *given: rollout)
-    for name in ("dae-4", "full"):
-        write_end(tmp_path, name)
-        save(find(name, describe("face_direction")), tmp_path / ENCODER)
-        found = read(inspect(str(tmp_path), out=tmp_path / f"{name}.rrd"))
-        assert ("/world/ghost/jitterbug" in found) == (name == "dae-4")
-        other = read(inspect(str(tmp_path), encoder="dae-8", out=tmp_path / "other.rrd"))
-        assert "- encoder: dae-8 (dae)" in text(other["/provenance"])
-
-
-def test_a_run_under_way_shows_its_checkpoint(tmp_path):
+@pytest.mark.parametrize("name", ["dae-4", "full"])
+def test_a_run_under_way_shows_its_checkpoint_and_its_own_encoder(name, tmp_path):
     task = describe("face_direction", max_episode_steps=50)
-    write_checkpoint(tmp_path, Run.of(task, "a2c", encoder="dae-4", evaluation_episodes=1), 12_000)
+    write_checkpoint(tmp_path, Run.of(task, "a2c", encoder=name, evaluation_episodes=1), 12_000)
     shown = read(inspect(str(tmp_path), out=tmp_path / "it.rrd"))
     assert f"# {tmp_path} at step 12,000" in text(shown["/provenance"])
-    assert "/world/ghost/jitterbug" in shown
+    assert ("/world/ghost/jitterbug" in shown) == (name == "dae-4")
+    other = read(inspect(str(tmp_path), encoder="dae-8", out=tmp_path / "other.rrd"))
+    assert "- encoder: dae-8 (dae)" in text(other["/provenance"])
 
 
 def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):

@@ -10,12 +10,9 @@ import pytest
 from command import jbrep
 
 from jbrep.collect import collect
-from jbrep.collect.policies import Heuristic
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
-from jbrep.envs.make import make_env
-from jbrep.envs.physics import physics_of, root_of
 from jbrep.envs.recording import episode_returns
 from jbrep.errors import InputError
 from jbrep.jitterbug.heuristics import HEURISTICS
@@ -24,7 +21,7 @@ from jbrep.jitterbug.tasks import TASKS
 from jbrep.play.behaviour import observe
 from jbrep.play.jitterbug import read, reward_terms
 from jbrep.play.player import Player
-from jbrep.play.rollout import play, replay
+from jbrep.play.rollout import replay
 from jbrep.play.sources import find_episode, find_player
 from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, read_evaluations
@@ -172,16 +169,6 @@ def test_a_robot_without_mujoco_has_no_motion():
     assert rollout.episode_return < 0
 
 
-def test_the_physics_of_environments():
-    for name, root in (("Hopper-v5", "torso"), ("dm_control/cheetah-run-v0", "torso")):
-        physics = physics_of(make_env(name, {}))
-        assert physics.model.body(root_of(physics.model)).name == root
-        assert physics.data.qpos.shape == (physics.model.nq,)
-    own = physics_of(make_env("face_direction", {}))
-    assert own.model.body(root_of(own.model)).name == "jitterbug"
-    assert physics_of(make_env("Pendulum-v1", {})) is None
-
-
 def test_a_data_set_of_any_robot_is_replayed(hopper):
     for episode in (0, 1):
         rollout = replay(hopper, episode)
@@ -212,13 +199,6 @@ def test_arrays_of_the_wrong_shape_are_named_with_both_shapes():
     with pytest.raises(InputError, match=r"1000 actions has reward of shape \(999,\): it must be"):
         replace(rollout, reward=rollout.reward[:999])
     assert repr(rollout).endswith("face_direction, episode 0': face_direction, 1,000 steps)")
-
-
-def test_episodes_may_be_shorter():
-    task = describe("face_direction", max_episode_steps=20)
-    (rollout,) = play(task, Heuristic().begin, "heuristic", [0])
-    assert (len(rollout), rollout.truncated, rollout.terminated) == (20, True, False)
-    assert rollout.motion.qpos.shape == (21, 16)
 
 
 @pytest.mark.parametrize(

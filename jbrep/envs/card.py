@@ -24,7 +24,7 @@ def _facts(task: Task) -> Iterator[tuple[str, str]]:
         yield "id", task.id
     if task.arguments:
         yield "arguments", ", ".join(f"{n}={value}" for n, value in task.arguments.items())
-    yield "observation", f"{_count(task.size, 'feature')}"
+    yield "observation", _count(task.size, "feature")
     yield "action", f"{_count(task.action_size, 'number')} in {_bounds(task)}"
     step = "" if task.timestep is None else f" of {task.timestep:g} s"
     yield "time limit", f"{task.max_episode_steps:,} steps{step}"
@@ -38,16 +38,12 @@ def _facts(task: Task) -> Iterator[tuple[str, str]]:
         yield "solved", f"from a return of {task.solved_return:,g}"
     if task.state:
         yield "states", ", ".join(f"{name} ({width})" for name, width in task.state.items())
-    yield "reproducible", _reproducible(task)
-
-
-def _reproducible(task: Task) -> str:
+    found = "with the same seed and actions a fresh and a used instance"
     if task.reproducible:
-        return "yes: with the same seed and actions a fresh and a used instance give the same bits"
-    return (
-        "no: with the same seed and actions a fresh and a used instance differ, so data sets can't "
-        "be repaired and stopped runs can't be resumed"
-    )
+        yield "reproducible", f"yes: {found} give the same bits"
+    else:
+        lost = "data sets can't be repaired and stopped runs can't be resumed"
+        yield "reproducible", f"no: {found} differ, so {lost}"
 
 
 def _count(number: int, what: str) -> str:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -16,15 +16,7 @@ from numpy.typing import NDArray
 
 from jbrep.envs.make import creator, make_env
 from jbrep.envs.names import find_spec
-from jbrep.envs.task import (
-    NARROW_SEEDS,
-    WIDE_SEEDS,
-    EpisodeSteps,
-    Feature,
-    SeedBits,
-    Task,
-    Word,
-)
+from jbrep.envs.task import NARROW_SEEDS, WIDE_SEEDS, EpisodeSteps, Feature, SeedBits, Task, Word
 from jbrep.errors import InputError, kind_and_line
 from jbrep.records.record import Finite, Record, converted, from_plain
 from jbrep.records.toml import read_toml
@@ -93,11 +85,12 @@ def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | N
         action = _checked_action(env_id, env.action_space)
         spec = env.spec or find_spec(env_id)
         limit = max_episode_steps or spec.max_episode_steps or _find_limit(env, env_id)
-        episodes = [_play(env, seed=1), _play(env, seed=0), _play(fresh, seed=0)]
+        plays = ((env, 1), (env, 0), (fresh, 0))
+        contents, terminated = zip(*(_play(each, seed) for each, seed in plays), strict=True)
         timestep: Any = getattr(env.unwrapped, "dt", None)
         return Task(
-            id=find_spec(env_id).id,
-            name=find_spec(env_id).id,
+            id=env_id,
+            name=env_id,
             features=tuple(features_of(env_id, env.observation_space)),
             action_low=tuple((-_below(-action.low)).tolist()),
             action_high=tuple(_below(action.high).tolist()),
@@ -105,8 +98,8 @@ def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | N
             arguments=dict(arguments),
             timestep=float(timestep) if _is_positive(timestep) else None,
             solved_return=spec.reward_threshold,
-            terminates=True if any(each.terminated for each in episodes) else None,
-            reproducible=episodes[1].content == episodes[2].content,
+            terminates=True if any(terminated) else None,
+            reproducible=contents[1] == contents[2],
             seed_bits=_seed_bits(env),
         )
     finally:
@@ -216,15 +209,8 @@ def _seed_bits(env: gymnasium.Env[Any, Any]) -> SeedBits:
     return WIDE_SEEDS
 
 
-class _Played(NamedTuple):
-    """The first steps of an episode."""
-
-    content: list[bytes]  # of what each step gave
-    terminated: bool
-
-
-def _play(env: gymnasium.Env[Any, Any], seed: int) -> _Played:
-    """Play an episode's first steps with random actions."""
+def _play(env: gymnasium.Env[Any, Any], seed: int) -> tuple[list[bytes], bool]:
+    """An episode's first steps under random actions: what each gave; whether a state ended it."""
     random = np.random.default_rng(seed)
     space: Any = env.action_space
     observation, _ = env.reset(seed=seed)
@@ -234,8 +220,8 @@ def _play(env: gymnasium.Env[Any, Any], seed: int) -> _Played:
         observation, reward, terminated, truncated, _ = env.step(action)
         content.append(_bytes(env, observation, reward, terminated, truncated))
         if terminated or truncated:
-            return _Played(content, bool(terminated))
-    return _Played(content, False)
+            return content, bool(terminated)
+    return content, False
 
 
 def _bytes(env: gymnasium.Env[Any, Any], observation: Any, *others: Any) -> bytes:

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jbrep.envs.lanes import Array, Flags, Lanes, State
-from jbrep.envs.task import Task
+from jbrep.envs.lanes import Flags, Lanes, State
+from jbrep.envs.task import Array, Task
 
 
 class Moved(NamedTuple):

@@ -2,16 +2,15 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jbrep.envs.make import flattener, is_batched, make_batch, make_env
-from jbrep.envs.task import Task
+from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError, kind_and_line
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 State = dict[str, NDArray[Any]]  # everything that decides how lanes continue; (n, ...) each
 
@@ -71,28 +70,6 @@ class Step(NamedTuple):
     arrays: Mapping[str, Array]  # those of the task's `state` and `constants`, (n, width) each
 
 
-class _Engine(Protocol):
-    """What steps the lanes."""
-
-    envs: Any
-
-    def reset(self, lanes: Sequence[int], seeds: Sequence[int]) -> tuple[Array, dict[str, Any]]:
-        """Start episodes; observations (n, d) of all lanes, and infos."""
-
-    def step(self, actions: Array, active: Flags) -> tuple[Array, Array, Flags, Flags, Any]:
-        """Step the active lanes at least."""
-
-    @property
-    def state(self) -> State:
-        """See `Lanes.state`."""
-
-    def restore(self, state: State) -> tuple[Array, dict[str, Any]]:
-        """See `Lanes.restore`."""
-
-    def close(self) -> None:
-        """Free what it holds."""
-
-
 class Lanes:
     """n lanes of a task, each going through an episode at a time.
 
@@ -122,9 +99,12 @@ class Lanes:
     def __init__(self, task: Task, num_lanes: int, num_threads: int | None = None):
         check_counts(num_lanes, num_threads)
         self.task, self.num_lanes = task, num_lanes
-        engine = _Batch if is_batched(task) else _Separate
-        self._engine: _Engine = engine(task, num_lanes, num_threads)
-        self.envs = self._engine.envs
+        if is_batched(task):
+            self._batch: Any = make_batch(task, num_lanes, num_threads)
+            self.envs: Any = self._batch
+        else:
+            self._batch = _Separate(task, num_lanes)
+            self.envs = self._batch.envs
         self.observation = np.zeros((num_lanes, task.size))
         self.arrays: Mapping[str, Array] = {}
         self.info: Mapping[str, Any] = {}
@@ -153,7 +133,10 @@ class Lanes:
         self.terminated, self.truncated = self.terminated.copy(), self.truncated.copy()
         self.terminated[at] = self.truncated[at] = False
         self._count()
-        observation, info = self._engine.reset(lanes, seeds)
+        given = dict(zip(lanes, map(int, seeds), strict=True))
+        every = [given.get(lane) for lane in range(self.num_lanes)]
+        mask = np.isin(np.arange(self.num_lanes), lanes)
+        observation, info = self._batch.reset(seed=every, options={"reset_mask": mask})
         self._check(observation, np.zeros(self.num_lanes), "reset gave")
         self._see(observation, info)
         return observation
@@ -170,7 +153,7 @@ class Lanes:
         checked = check_actions(actions, self.num_lanes, self.task.action_size)
         active = self.active
         self._steps += active
-        observation, reward, terminated, truncated, info = self._engine.step(checked, active)
+        observation, reward, terminated, truncated, info = self._batch.step(checked)
         arrays = {name: info[name] for name in self._names}
         if self.num_active < self.num_lanes:
             here = active[:, None]
@@ -195,7 +178,7 @@ class Lanes:
             "truncated": self.truncated.copy(),
             "observation": self.observation.copy(),
         }
-        return own | self._engine.state
+        return own | self._batch.state
 
     def restore(self, state: State) -> None:
         """Continue from where the state was taken, to the same bits.
@@ -203,12 +186,12 @@ class Lanes:
         Raises:
             InputError: the environment isn't reproducible.
         """
-        engine = dict(state)
-        self._seeds, self._steps = engine.pop("seeds").copy(), engine.pop("steps").copy()
-        self.terminated, self.truncated = engine.pop("terminated"), engine.pop("truncated")
+        batch = dict(state)
+        self._seeds, self._steps = batch.pop("seeds").copy(), batch.pop("steps").copy()
+        self.terminated, self.truncated = batch.pop("terminated"), batch.pop("truncated")
         self._count()
-        expected = engine.pop("observation")
-        observation, info = self._engine.restore(engine)
+        expected = batch.pop("observation")
+        observation, info = self._batch.restore(batch)
         observation = np.where(self.active[:, None], observation, expected)
         if observation.tobytes() != expected.astype(np.float64).tobytes():
             raise InputError(
@@ -219,7 +202,7 @@ class Lanes:
 
     def close(self) -> None:
         """Free what the environments hold."""
-        self._engine.close()
+        self._batch.close()
 
     def _see(self, observation: Array, info: Mapping[str, Any]) -> None:
         self.observation, self.info = observation, info
@@ -244,41 +227,13 @@ class Lanes:
         )
 
 
-class _Batch:
-    """All lanes in one environment, whose state can be taken."""
-
-    def __init__(self, task: Task, num_lanes: int, num_threads: int | None):
-        self.envs: Any = make_batch(task, num_lanes, num_threads)
-        self._num_lanes = num_lanes
-
-    def reset(self, lanes: Sequence[int], seeds: Sequence[int]) -> tuple[Array, dict[str, Any]]:
-        mask = np.zeros(self._num_lanes, np.bool_)
-        mask[np.asarray(lanes)] = True
-        every: list[int | None] = [None] * self._num_lanes
-        for lane, seed in zip(lanes, seeds, strict=True):
-            every[lane] = int(seed)
-        observation, info = self.envs.reset(seed=every, options={"reset_mask": mask})
-        return observation, info
-
-    def step(self, actions: Array, active: Flags) -> tuple[Array, Array, Flags, Flags, Any]:
-        return self.envs.step(actions)
-
-    @property
-    def state(self) -> State:
-        return self.envs.state
-
-    def restore(self, state: State) -> tuple[Array, dict[str, Any]]:
-        observation, info = self.envs.restore(state)
-        return observation, info
-
-    def close(self) -> None:
-        self.envs.close()
-
-
 class _Separate:
-    """An environment for each lane; a lane's state is its seed and the actions since."""
+    """An environment for each lane, used like a batch without resets of its own.
 
-    def __init__(self, task: Task, num_lanes: int, num_threads: int | None):
+    A lane's state is its seed and the actions since.
+    """
+
+    def __init__(self, task: Task, num_lanes: int):
         self._task = task
         self.envs: Any = [
             make_env(task.id, task.arguments, task.max_episode_steps) for _ in range(num_lanes)
@@ -288,52 +243,50 @@ class _Separate:
         self._action_type, self._action_shape = space.dtype, space.shape
         self._observation = np.zeros((num_lanes, task.size))
         self._arrays = {name: np.zeros((num_lanes, w)) for name, w in task.arrays.items()}
-        self._seeds = [0] * num_lanes
+        self._seeds: list[int | None] = [0] * num_lanes
+        self._active = np.zeros(num_lanes, np.bool_)
         self._actions: list[list[NDArray[np.float32]]] = [[] for _ in range(num_lanes)]
 
-    def reset(self, lanes: Sequence[int], seeds: Sequence[int]) -> tuple[Array, dict[str, Any]]:
+    def reset(
+        self, seed: Sequence[int | None], options: Mapping[str, Flags]
+    ) -> tuple[Array, dict[str, Array]]:
         self._make_new_arrays()
-        for lane, seed in zip(lanes, seeds, strict=True):
-            self._seeds[lane], self._actions[lane] = int(seed), []
+        for lane in np.flatnonzero(options["reset_mask"]).tolist():
+            self._seeds[lane], self._actions[lane], self._active[lane] = seed[lane], [], True
             try:
-                observation, info = self.envs[lane].reset(seed=int(seed))
+                observation, info = self.envs[lane].reset(seed=seed[lane])
                 self._put(lane, observation, info)
             except Exception as error:
                 raise self._failure(lane, error) from error
         return self._observation, self._arrays
 
-    def step(self, actions: Array, active: Flags) -> tuple[Array, Array, Flags, Flags, Any]:
+    def step(self, actions: Array) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
+        return self._advance(actions, self._active)
+
+    def _advance(
+        self, actions: Array, chosen: Flags
+    ) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
+        """Step the lanes that are chosen."""
         self._make_new_arrays()
-        single = actions.astype(np.float32)
-        rewards: list[float] = []
-        terminated: list[bool] = []
-        truncated: list[bool] = []
-        for lane, goes_on in enumerate(active.tolist()):
-            if not goes_on:
-                result: Sequence[Any] = (0.0, False, False)
-            else:
-                self._actions[lane].append(single[lane])
-                try:
-                    observation, *result, info = self._step(lane)
-                    self._put(lane, observation, info)
-                except Exception as error:
-                    raise self._failure(lane, error) from error
-            rewards.append(result[0])
-            terminated.append(result[1])
-            truncated.append(result[2])
-        flags = np.array(terminated, np.bool_), np.array(truncated, np.bool_)
-        return self._observation, np.array(rewards, np.float64), *flags, self._arrays
+        single, reward = actions.astype(np.float32), np.zeros(len(chosen))
+        terminated, truncated = np.zeros((2, len(chosen)), np.bool_)
+        for lane in np.flatnonzero(chosen).tolist():
+            self._actions[lane].append(single[lane])
+            action = single[lane].astype(self._action_type, copy=False).reshape(self._action_shape)
+            try:
+                observation, *result, info = self.envs[lane].step(action)
+                self._put(lane, observation, info)
+                reward[lane], terminated[lane], truncated[lane] = result
+            except Exception as error:
+                raise self._failure(lane, error) from error
+            self._active[lane] = not (terminated[lane] or truncated[lane])
+        return self._observation, reward, terminated, truncated, self._arrays
 
     def _make_new_arrays(self) -> None:
         """So that those given before don't change."""
         self._observation = self._observation.copy()
         if self._arrays:
             self._arrays = {name: values.copy() for name, values in self._arrays.items()}
-
-    def _step(self, lane: int) -> Any:
-        """Step with the last action."""
-        action = self._actions[lane][-1].astype(self._action_type, copy=False)
-        return self.envs[lane].step(action.reshape(self._action_shape))
 
     def _put(self, lane: int, observation: Any, info: Mapping[str, Any]) -> None:
         flat = self._flat(observation)
@@ -364,12 +317,12 @@ class _Separate:
             "actions": taken,
         }
 
-    def restore(self, state: State) -> tuple[Array, dict[str, Any]]:
-        seeds, lengths, actions = state["episode_seeds"], state["lengths"], state["actions"]
-        observation, arrays = self.reset(range(len(self.envs)), seeds.tolist())
+    def restore(self, state: State) -> tuple[Array, dict[str, Array]]:
+        lengths, every_lane = state["lengths"], np.ones(len(self.envs), np.bool_)
+        self.reset(state["episode_seeds"].tolist(), {"reset_mask": every_lane})
         for step in range(max(lengths.tolist())):
-            observation, _, _, _, arrays = self.step(actions[:, step], step < lengths)
-        return observation, arrays
+            self._advance(state["actions"][:, step], step < lengths)
+        return self._observation, self._arrays
 
     def close(self) -> None:
         for env in self.envs:

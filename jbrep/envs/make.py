@@ -44,16 +44,14 @@ def make_env(
     except InputError:
         raise
     except Exception as error:
-        raise InputError(
-            f"can't make {env_id}{_with(arguments)}: {kind_and_line(error)}"
-        ) from error
+        given = f" with {dict(arguments)}" if arguments else ""
+        raise InputError(f"can't make {env_id}{given}: {kind_and_line(error)}") from error
 
 
 def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:
     """All lanes as one environment that steps them together, see `is_batched`."""
-    spec = find_spec(task.id)
     return gymnasium.make_vec(
-        spec,
+        find_spec(task.id),
         num_envs=num_lanes,
         vectorization_mode="vector_entry_point",
         autoreset_mode=AutoresetMode.DISABLED,
@@ -105,7 +103,3 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         logger.setLevel(level)
-
-
-def _with(arguments: Mapping[str, Any]) -> str:
-    return f" with {dict(arguments)}" if arguments else ""

@@ -13,8 +13,6 @@ from gymnasium.envs.registration import EnvSpec
 from jbrep.envs.task import SHORT_NAMES
 from jbrep.errors import InputError, kind_and_line
 
-_REGISTERED_BY = {"dm_control": "shimmy"}  # the package whose import registers a namespace's ids
-_BESIDES = {"shimmy": ("dm-control",)}  # packages that one's environments come from
 _imported: list[str] = []
 
 
@@ -30,9 +28,8 @@ def find_spec(name: str) -> EnvSpec:
             f"the task {name!r} names a module: importing it runs its code, so this is possible on "
             "a command line only; elsewhere give the id alone, and --import MODULE to the command"
         )
-    namespace = name.partition("/")[0]
-    if namespace in _REGISTERED_BY:
-        _import_quietly(_REGISTERED_BY[namespace])
+    if name.startswith("dm_control/"):
+        _import_shimmy()
     try:
         return gymnasium.spec(SHORT_NAMES.get(name, name))
     except gymnasium.error.Error:
@@ -96,12 +93,13 @@ def environment_versions(env_id: str) -> dict[str, str]:
     if package == "jbrep":
         return {}
     distributions = metadata.packages_distributions().get(package, [])
-    names = {"gymnasium", *distributions, *_BESIDES.get(package, ())}
+    behind = ["dm-control"] if package == "shimmy" else []
+    names = {"gymnasium", *distributions, *behind}
     return {name: metadata.version(name) for name in sorted(names)}
 
 
-def _import_quietly(module: str) -> None:
-    """Import a package that opens OpenGL and complains of a missing display."""
+def _import_shimmy() -> None:
+    """Register dm_control's tasks; it opens OpenGL, and complains of a missing display."""
     import warnings
 
     from jbrep.opengl import prepare_opengl
@@ -109,4 +107,4 @@ def _import_quietly(module: str) -> None:
     prepare_opengl()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        import_module(module)
+        import_module("shimmy")

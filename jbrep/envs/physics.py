@@ -6,12 +6,10 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import Recording
-
-Array = NDArray[np.float64]
+from jbrep.envs.task import Array
 
 # of an MjData: what a picture and the contact forces of a state follow from
 _STATE = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")

@@ -190,20 +190,19 @@ class Task(Record, frozen=True):
         return max(self.reward_high, 0.0) * self.max_episode_steps
 
     @cached_property
-    def _centre(self) -> Array:
-        return np.array([(f.high + f.low) / 2 if _ranged(f) else 0 for f in self.features])  # type: ignore[operator]
-
-    @cached_property
-    def _half_width(self) -> Array:
-        return np.array([(f.high - f.low) / 2 if _ranged(f) else 1 for f in self.features])  # type: ignore[operator]
+    def _centre_and_half_width(self) -> tuple[Array, Array]:
+        low, high = np.array([_usual_range(feature) for feature in self.features]).T
+        return (high + low) / 2, (high - low) / 2
 
     def scale(self, observation: Array) -> Array:
         """Scale to about [-1, 1] by the usual ranges, (..., d); features without one stay."""
-        return (observation - self._centre) / self._half_width
+        centre, half_width = self._centre_and_half_width
+        return (observation - centre) / half_width
 
     def unscale(self, scaled: Array) -> Array:
         """The inverse of `scale`."""
-        return scaled * self._half_width + self._centre
+        centre, half_width = self._centre_and_half_width
+        return scaled * half_width + centre
 
     def split(self, observation: NDArray[_Float]) -> dict[str, NDArray[_Float]]:
         """Split flat observations (..., d) by group; the parts are views."""
@@ -215,9 +214,10 @@ def _check_range(name: str, low: float | None, high: float | None) -> None:
         raise InputError(f"the range of {name} is from {low:g} to {high:g}: swap them")
 
 
-def _ranged(feature: Feature) -> bool:
+def _usual_range(feature: Feature) -> tuple[float, float]:
+    """That of a feature, or one by which it isn't scaled."""
     low, high = feature.low, feature.high
-    return low is not None and high is not None and low < high
+    return (low, high) if low is not None and high is not None and low < high else (-1.0, 1.0)
 
 
 def check_same(expected: Task, actual: Task, what: str) -> None:

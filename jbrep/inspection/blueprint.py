@@ -17,10 +17,8 @@ from jbrep.inspection.signals import (
     PATH,
     STEP,
     TIME,
-    Panel,
-    action_panels,
-    feature_panels,
-    latent_panels,
+    numbered_panels,
+    panels,
 )
 from jbrep.play.jitterbug import jitterbug_task
 
@@ -36,49 +34,51 @@ _NEAR_EYE = (0.9, -1.3, 0.65)  # likewise
 
 
 def episode_layout(
-    task: Task,
-    robot: Robot | None,
-    encoder: BaseEncoder | None,
-    pages: Sequence[rrb.Grid] = (),
+    task: Task, robot: Robot | None, encoder: BaseEncoder | None, pages: Sequence[rrb.Grid] = ()
 ) -> rrb.Blueprint:
     """The robot on the left, its signals on the right; the signals alone if there is no robot.
 
-    Pages about the encoder are more tabs beside the observation's.
+    Pages about the encoder are more tabs beside the observation's, which take more than half of the
+    height.
     """
-    near = _window(task, _NEAR, _NEAR)
-    about = rrb.TextDocumentView(origin=PROVENANCE, name="provenance")
-    acting = [_series(name, [name], time_ranges=near) for name, _ in action_panels(task)]
-    motor = rrb.Horizontal(*_pages("action", acting), _series("reward", ["reward/**"]))
+    decodes = encoder is not None and encoder.can_decode
+    has_ghost = decodes and robot is not None and jitterbug_task(task) is not None
     observed = _features("observation", task, ["observation"])
-    if encoder is None:
-        scene = [_world("robot", robot, task)] if robot else []
-        return _episode(task, scene, [rrb.Tabs(*observed, about), motor])
-    has_ghost = robot is not None and jitterbug_task(task) is not None and encoder.can_decode
-    observed = _decoded(task, has_ghost) if encoder.can_decode else observed
-    units = [
-        _series(
-            _title("latent", panel, encoder.latent_size),
-            [f"latent/{panel.name}"],
-            time_ranges=near,
-        )
-        for panel in latent_panels(encoder.latent_size)
-    ]
-    numbers = [rrb.Tabs(*observed, *pages, about), _tabs(_pages("latent", units)), motor]
-    return _episode(task, _encoded_scene(task, robot, has_ghost), numbers)
+    if decodes:
+        observed = _decoded(task, has_ghost)
+    about = rrb.TextDocumentView(origin=PROVENANCE, name="provenance")
+    numbers: list[rrb.Container] = [rrb.Tabs(*observed, *pages, about)]
+    near = {"time_ranges": _near(task)}
+    if encoder:
+        units = [
+            _series(path.replace("units", "latent").replace("_", " "), [f"latent/{path}"], **near)
+            for path in numbered_panels("units", encoder.latent_size)
+        ]
+        numbers.append(_tabs(_pages("latent", units)))
+    actions = numbered_panels("action", task.action_size)
+    acting = _pages("action", [_series(path, [path], **near) for path in actions])
+    numbers.append(rrb.Horizontal(*acting, _series("reward", ["reward/**"])))
+    shares = [1.2 * len(numbers), *[1.2] * (len(numbers) - 2), 1]
+    column = rrb.Vertical(*numbers, row_shares=shares)
+    scene = _scene(task, robot, encoder is not None, has_ghost)
+    timeline = STEP if task.timestep is None else TIME
+    return _blueprint(rrb.Horizontal(*scene, column) if scene else column, timeline)
 
 
-def series_pages(name: str, task: Task, titles: Mapping[str, str]) -> list[rrb.Grid]:
-    """Pages of plots of what is near in time: by their titles, what each shows."""
-    plots = [
-        _series(
-            title,
-            [contents],
-            plot_legend=rrb.PlotLegend(visible=False),
-            time_ranges=_window(task, _NEAR, _NEAR),
-        )
-        for title, contents in titles.items()
-    ]
-    return _pages(name, plots)
+def series_pages(
+    name: str, task: Task, plots: Mapping[str, Sequence[str]], others: Sequence[str] = ()
+) -> list[rrb.Grid]:
+    """Pages of plots of what is near in time, then of others of everything.
+
+    Args:
+        name: of the pages.
+        task: of the episode.
+        plots: the entities that each shows, by its title.
+        others: an entity each.
+    """
+    look = {"plot_legend": rrb.PlotLegend(visible=False), "time_ranges": _near(task)}
+    near = [_series(title, contents, **look) for title, contents in plots.items()]
+    return _pages(name, [*near, *(_series(each, [each]) for each in others)])
 
 
 def traversal_layout(units: int, robot: Robot | None, places: Array) -> rrb.Blueprint:
@@ -131,16 +131,6 @@ def _blueprint(
     )
 
 
-def _episode(
-    task: Task, scene: Sequence[rrb.Container | rrb.View], numbers: Sequence[rrb.Container]
-) -> rrb.Blueprint:
-    """Stacked views on the right, of which the first takes more than half of the height."""
-    shares = [1.2 * len(numbers), *[1.2] * (len(numbers) - 2), 1]
-    column = rrb.Vertical(*numbers, row_shares=shares)
-    timeline = STEP if task.timestep is None else TIME
-    return _blueprint(rrb.Horizontal(*scene, column) if scene else column, timeline)
-
-
 def _decoded(task: Task, has_ghost: bool) -> list[rrb.Grid]:
     """Pages of features beside what is decoded, then of their errors."""
     both = _features("observation (thick) and decoded", task, ["observation", "reconstruction"])
@@ -148,18 +138,19 @@ def _decoded(task: Task, has_ghost: bool) -> list[rrb.Grid]:
     return [*both, *_features("error", task, ["error"], "scaled", others)]
 
 
-def _encoded_scene(
-    task: Task, robot: Robot | None, has_ghost: bool
+def _scene(
+    task: Task, robot: Robot | None, has_latent: bool, has_ghost: bool
 ) -> list[rrb.Container | rrb.View]:
     """The robot, with its ghost where there is one, and the path of the latent."""
+    ghost = "robot and decoded robot: blue is 1 mm off, yellow 10 cm"
+    world = [_world(ghost if has_ghost else "robot", robot, task)] if robot else []
+    if not has_latent:
+        return [*world]
     path = _path(task)
     if robot is None:
         return [path]
-    if not has_ghost:
-        return [rrb.Vertical(_world("robot", robot, task), path, row_shares=[1.6, 1])]
-    world = _world("robot and decoded robot: blue is 1 mm off, yellow 10 cm", robot, task)
-    below = rrb.Horizontal(_aligned(robot), path)
-    return [rrb.Vertical(world, below, row_shares=[1.6, 1])]
+    below = rrb.Horizontal(_aligned(robot), path) if has_ghost else path
+    return [rrb.Vertical(*world, below, row_shares=[1.6, 1])]
 
 
 def _world(name: str, robot: Robot, task: Task) -> rrb.Spatial3DView:
@@ -217,45 +208,29 @@ def _path(task: Task) -> rrb.Spatial2DView:
 
 def _window(task: Task, before: float | None, after: float = 0.0) -> rrb.VisibleTimeRanges:
     """The seconds shown before and after the current time; None shows all before."""
-    edge = rrb.TimeRangeBoundary
-    ends = []
-    for seconds in (-before if before is not None else None, after):
-        if seconds is None:
-            ends.append((edge.infinite(), edge.infinite()))
-        else:
-            steps = round(seconds / (task.timestep or _USUAL_TIMESTEP))
-            ends.append((edge.cursor_relative(seq=steps), edge.cursor_relative(seconds=seconds)))
-    starts, stops = ends
-    return rrb.VisibleTimeRanges(
-        [
-            rrb.VisibleTimeRange(timeline, start=start, end=end)
-            for timeline, start, end in zip((STEP, TIME), starts, stops, strict=True)
-        ]
-    )
+    edge, timestep = rrb.TimeRangeBoundary, task.timestep or _USUAL_TIMESTEP
+    relative, starts = edge.cursor_relative, [edge.infinite()] * 2
+    if before is not None:
+        starts = [relative(seq=-round(before / timestep)), relative(seconds=-before)]
+    stops = [relative(seq=round(after / timestep)), relative(seconds=after)]
+    ends = zip((STEP, TIME), starts, stops, strict=True)
+    return rrb.VisibleTimeRanges([rrb.VisibleTimeRange(t, start=a, end=b) for t, a, b in ends])
+
+
+def _near(task: Task) -> rrb.VisibleTimeRanges:
+    return _window(task, _NEAR, _NEAR)
 
 
 def _features(
     name: str, task: Task, roots: Sequence[str], unit: str = "", others: Sequence[str] = ()
 ) -> list[rrb.Grid]:
     """Pages with a plot for each panel of features, then one for each of the other entities."""
-    plots = []
-    for panel in feature_panels(task):
-        shown = unit or task.features[panel.place][0].unit
-        plots.append(
-            _series(
-                f"{panel.name} [{shown}]" if shown else panel.name,
-                [f"{root}/{panel.name}" for root in roots],
-                plot_legend=rrb.PlotLegend(visible=False),
-                time_ranges=_window(task, _NEAR, _NEAR),
-            )
-        )
-    return _pages(name, [*plots, *(_series(each, [each]) for each in others)])
-
-
-def _title(name: str, panel: Panel, size: int) -> str:
-    """A plot's title; of one among several, with the numbers of its lines."""
-    start, stop, _ = panel.place.indices(size)
-    return name if stop - start == size else f"{name} {start}-{stop - 1}"
+    plots = {}
+    for panel, place in panels(task.groups).items():
+        shown = unit or task.features[place.start].unit
+        title = f"{panel} [{shown}]" if shown else panel
+        plots[title] = [f"{root}/{panel}" for root in roots]
+    return series_pages(name, task, plots, others)
 
 
 def _pages(name: str, plots: Sequence[rrb.View]) -> list[rrb.Grid]:

@@ -5,12 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Array, Task
 from jbrep.evaluate.truth import state
-from jbrep.inspection.blueprint import series_pages
 from jbrep.inspection.forecast import Examples, columns, encode
 from jbrep.inspection.recording import SKY, Recording
 
@@ -41,7 +39,7 @@ class Directions(NamedTuple):
         return (latent - self.mean) @ self.weight.T
 
     @property
-    def titles(self) -> dict[str, str]:
+    def paths(self) -> dict[str, str]:
         """The entity of each direction, by its label."""
         return {
             label: f"{PATH}/{label.partition(':')[0].replace(' ', '_')}" for label in self.labels
@@ -57,7 +55,8 @@ def slow_to_fast(latents: Sequence[Array], lag: int) -> Directions:
         latents: codes (n, l) of parts of episodes.
         lag: steps, fewer than the rows of the longest part.
     """
-    now, later = (np.concatenate(part) for part in zip(*_pairs(latents, lag), strict=True))
+    now = np.concatenate([each[:-lag] for each in latents])
+    later = np.concatenate([each[lag:] for each in latents])
     mean = (now.mean(axis=0) + later.mean(axis=0)) / 2
     now, later = now - mean, later - mean
     covariance = (now.T @ now + later.T @ later) / (2 * len(now))
@@ -69,10 +68,6 @@ def slow_to_fast(latents: Sequence[Array], lag: int) -> Directions:
     whiten = (vectors[:, kept] / np.sqrt(variances[kept])).T / deviation
     slowness, turned = np.linalg.eigh(whiten @ ((across + across.T) / 2) @ whiten.T)
     return Directions(mean, turned[:, ::-1].T @ whiten, slowness[::-1])
-
-
-def _pairs(latents: Sequence[Array], lag: int) -> list[tuple[Array, Array]]:
-    return [(each[:-lag], each[lag:]) for each in latents if len(each) > lag]
 
 
 def name_directions(encoder: BaseEncoder, task: Task, examples: Examples) -> Directions | None:
@@ -121,12 +116,7 @@ def send_directions(
 ) -> None:
     """Send codes (n, l) along each direction."""
     along = directions(latent)
-    titled = zip(directions.titles.items(), directions.autocorrelation, strict=True)
-    for i, ((label, path), slowness) in enumerate(titled):
+    labelled = zip(directions.paths.items(), directions.autocorrelation, strict=True)
+    for i, ((label, path), slowness) in enumerate(labelled):
         name = f"{label}; autocorrelation {slowness:.2f}"
         recording.send_series(path, times, along[:, [i]], [name], [SKY])
-
-
-def direction_pages(task: Task, directions: Directions) -> list[rrb.Grid]:
-    """A plot of each direction."""
-    return series_pages("slow and fast directions", task, directions.titles)

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from jbrep.encoders.base import BaseEncoder
-from jbrep.inspection.blueprint import episode_layout
-from jbrep.inspection.directions import direction_pages, name_directions, send_directions
+from jbrep.inspection.blueprint import episode_layout, series_pages
+from jbrep.inspection.directions import name_directions, send_directions
 from jbrep.inspection.fan import fan_pages, make_fan, send_fan
 from jbrep.inspection.forecast import Examples, from_rollout
 from jbrep.inspection.recording import Recording
@@ -59,7 +59,8 @@ def record_episode(
             pages += fan_pages(task, fan)
         if directions := name_directions(encoder, task, examples):
             send_directions(recording, times, latent.astype(np.float64), directions)
-            pages += direction_pages(task, directions)
+            plots = {label: [path] for label, path in directions.paths.items()}
+            pages += series_pages("slow and fast directions", task, plots)
     recording.write(path, episode_layout(task, robot, encoder, pages))
 
 

@@ -104,10 +104,7 @@ def make_fan(rollout: Rollout, encoder: BaseEncoder, examples: Examples) -> Fan 
     starts = np.arange(0, len(rollout) - ahead[-1] + 1, _EVERY)
     latent, steps = encode(encoder, rollout.observation[starts]), [0, *ahead]
     actions = {TAKEN: next_actions(rollout.action, ahead[-1])[starts]}
-    actions |= {
-        name: np.broadcast_to(sequence, (len(starts), *sequence.shape))
-        for name, sequence in held(task, ahead[-1]).items()
-    }
+    actions |= held(task, len(starts), ahead[-1])
     now = forecaster.read(latent)
     lines = {
         name: np.stack([now, *(forecaster(latent, each, k) for k in ahead)], axis=1)
@@ -134,7 +131,7 @@ def fan_pages(task: Task, fan: Fan) -> list[rrb.Grid]:
     middle = len(fan.steps) // 2
     scores = fan.explained[middle - 1]
     titles = {
-        f"{_words(name)}: R² {score:.2f} over {fan.steps[middle]} steps": f"{_path(name)}/**"
+        f"{_words(name)}: R² {score:.2f} over {fan.steps[middle]} steps": [f"{_path(name)}/**"]
         for name, score in zip(fan.shown, scores, strict=False)
     }
     return series_pages("forecasts", task, titles)
@@ -152,18 +149,15 @@ def _send_series(recording: Recording, rollout: Rollout, fan: Fan) -> None:
     """Send forecasts every 25 steps, with a gap after each, and the truth at all steps."""
     task, apart = rollout.task, slice(None, None, _APART // _EVERY)
     steps = fan.starts[apart, None] + np.array([*fan.steps, fan.steps[-1]])
-    times = times_at(task, steps.ravel())
+    times, every = times_at(task, steps.ravel()), times_at(task, np.arange(len(rollout) + 1))
     true = columns(task, rollout.observation)
     for i, name in enumerate(fan.shown):
         lines = [_with_gaps(states[apart, :, i]) for states in fan.lines.values()]
         labels = [f"{_words(name)}, {_words(each)}" for each in fan.lines]
         colours = [_COLOURS[each] for each in fan.lines]
-        every = times_at(task, np.arange(len(rollout) + 1))
-        recording.send_series(
-            f"{_path(name)}/truth", every, true[:, [i]], [_words(name)], [GREY], 3.0
-        )
-        values = np.stack(lines, axis=1)
-        recording.send_series(f"{_path(name)}/ahead", times, values, labels, colours, 1.5)
+        path, values = _path(name), np.stack(lines, axis=1)
+        recording.send_series(f"{path}/truth", every, true[:, [i]], [_words(name)], [GREY], 3.0)
+        recording.send_series(f"{path}/ahead", times, values, labels, colours, 1.5)
 
 
 def _with_gaps(values: Array) -> Array:
@@ -180,19 +174,10 @@ def _send_lines(
     size: float,
 ) -> None:
     """Send the path of the robot over the next steps, with its heading at the end."""
-    places = [fan.names.index(each) for each in _POSITION]
-    path = states[..., places]
+    path = states[..., [fan.names.index(each) for each in _POSITION]]
     turned = states[:, -1, [fan.names.index(each) for each in _HEADING]]
     ahead = _ARROW * size * np.column_stack((turned, np.zeros(len(turned))))
-    recording.send_columns(
-        f"{FAN}/{name}",
-        times,
-        rr.LineStrips3D.columns(strips=path.astype(np.float32)),
-        rr.Arrows3D.columns(origins=path[:, -1], vectors=ahead),
-    )
-    colour = [_COLOURS.get(name, GREY)]
-    recording.send(
-        f"{FAN}/{name}",
-        rr.LineStrips3D.from_fields(colors=colour, radii=[_LINE * size]),
-        rr.Arrows3D.from_fields(colors=colour, radii=[_LINE * size]),
-    )
+    entity, look = f"{FAN}/{name}", (_COLOURS.get(name, GREY), _LINE * size)
+    strips, ends = path.astype(np.float32), path[:, -1]
+    recording.send_moving(entity, times, rr.LineStrips3D, *look, strips=strips)
+    recording.send_moving(entity, times, rr.Arrows3D, *look, origins=ends, vectors=ahead)

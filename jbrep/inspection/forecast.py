@@ -1,6 +1,6 @@
 """Forecasts of an encoder's code: what it and the next actions say of the next states."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,18 +79,6 @@ def from_dataset(dataset: Dataset, shown: int | None = None) -> Examples | None:
     return Examples(observations, actions, f"{count} of {dataset.folder}")
 
 
-class Windows(NamedTuple):
-    """States with what is known of them now, and some steps later in the same episode.
-
-    Attributes:
-        inputs: the code now and the actions until then, (n, l + k * m).
-        change: of the code, (n, l).
-    """
-
-    inputs: Array
-    change: Array
-
-
 class Forecaster:
     """Predicts the code at several horizons, and reads the state from it.
 
@@ -116,7 +104,7 @@ class Forecaster:
         for ahead in HORIZONS:
             parts = zip(latents, examples.actions, examples.observations, strict=True)
             some = [windows(*part, task, ahead) for part in parts if len(part[1]) >= ahead]
-            if sum(len(each.change) for each in some) >= _FEWEST:
+            if sum(len(change) for _, change in some) >= _FEWEST:
                 inputs, change = map(np.concatenate, zip(*some, strict=True))
                 self._predictors[ahead] = _nonlinear(inputs, change)
         self.horizons = list(self._predictors)
@@ -154,7 +142,7 @@ def next_actions(action: NDArray[Any], count: int) -> NDArray[Any]:
 
 def windows(
     latent: Array, action: NDArray[Any], observation: NDArray[Any], task: Task, ahead: int
-) -> Windows:
+) -> tuple[Array, Array]:
     """All windows of part of an episode but those in which an angle jumps.
 
     Args:
@@ -162,7 +150,10 @@ def windows(
         action: (n, m), n at least `ahead`.
         observation: (n + 1, d).
         task: which says what is an angle.
-        ahead: steps from now to then.
+        ahead: steps from now to then, k.
+
+    Returns:
+        The code now with the actions until then, (w, l + k * m), and the code's change, (w, l).
     """
     angles = [feature.is_angle for feature in task.features]
     turned = np.abs(observation[ahead:, angles] - observation[:-ahead, angles])
@@ -170,7 +161,7 @@ def windows(
     actions = next_actions(action, ahead)[smooth]
     now = latent[:-ahead][smooth]
     inputs = np.hstack((now, actions.reshape(len(now), -1)))
-    return Windows(inputs, latent[ahead:][smooth] - now)
+    return inputs, latent[ahead:][smooth] - now
 
 
 def _nonlinear(inputs: Array, wanted: Array) -> Predictor:
@@ -196,9 +187,8 @@ def explained(predicted: Array, true: Array) -> Array:
     return np.where(variation > 0, 1 - residual / np.where(variation > 0, variation, 1), np.nan)
 
 
-def held(task: Task, steps: int) -> dict[str, Array]:
-    """All actions held at their lowest, midway and highest for so many steps, (steps, m) each."""
-    low, high = (np.asarray(bound, float) for bound in (task.action_low, task.action_high))
-    values: Sequence[Array] = (low, (low + high) / 2, high)
-    names = ("held_low", "held_midway", "held_high")
-    return {name: np.tile(value, (steps, 1)) for name, value in zip(names, values, strict=True)}
+def held(task: Task, count: int, steps: int) -> dict[str, Array]:
+    """All actions held at their lowest, midway and highest, (count, steps, m) each."""
+    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
+    values = {"held_low": low, "held_midway": (low + high) / 2, "held_high": high}
+    return {name: np.tile(value, (count, steps, 1)) for name, value in values.items()}

@@ -70,6 +70,19 @@ class Recording:
         flat = [column for each in columns for column in each]
         self._stream.send_columns(path, times, flat, strict=True)
 
+    def send_moving(
+        self,
+        path: str,
+        times: Sequence[rr.TimeColumn],
+        shape: Any,
+        colour: Colour,
+        radius: float,
+        **columns: Any,
+    ) -> None:
+        """Send a shape, Rerun's class of it, whose columns change but not colour and radius."""
+        self.send(path, shape.from_fields(colors=[colour], radii=[radius]))
+        self.send_columns(path, times, shape.columns(**columns))
+
     def send_series(
         self,
         path: str,

@@ -50,6 +50,7 @@ class Robot:
 
     Attributes:
         model: the MuJoCo model.
+        colours: of all geoms, (geoms, 4).
         names: of all bodies as parts of paths, each a different one.
         root: number of the body that carries the robot's others.
         bodies: numbers of the robot's bodies, the root first.
@@ -60,6 +61,9 @@ class Robot:
 
     def __init__(self, model: mujoco.MjModel):
         self.model = model
+        self.colours = _colours(model)
+        self._shown = (model.geom_group < _SHOWN_GROUPS) & (self.colours[:, 3] > 0)
+        self._shown &= np.isin(model.geom_type, [*_KINDS])
         self.names = _names(model)
         self.root = root_of(model)
         roots = model.body_rootid if self.root else np.zeros(model.nbody, int)
@@ -82,9 +86,9 @@ class Robot:
         return data.xpos[self.root].copy(), size
 
     def geoms(self, body: int) -> list[int]:
-        """Numbers of a body's geoms that can be drawn."""
-        address, count = self.model.body_geomadr[body], self.model.body_geomnum[body]
-        return [g for g in range(address, address + count) if is_shown(self.model, g)]
+        """Numbers of a body's geoms that are visible and can be drawn; height fields can't."""
+        numbers: list[int] = np.flatnonzero(self._shown & (self.model.geom_bodyid == body)).tolist()
+        return numbers
 
     def poses(self, motion: Motion) -> Poses:
         """Where all bodies are in each state."""
@@ -120,7 +124,7 @@ class Robot:
         for i, body in enumerate(bodies):
             geoms, columns = self.geoms(body), []
             if colours is None or colours.ndim == 1:
-                own = own_colours(self.model, geoms)
+                own = self.colours[geoms]
                 fixed = own if colours is None else np.tile(colours, (len(geoms), 1))
                 static: list[Any] = shapes(self.model, geoms, fixed)
             else:
@@ -148,22 +152,11 @@ def _names(model: mujoco.MjModel) -> list[str]:
     return names
 
 
-def is_shown(model: mujoco.MjModel, geom: int) -> bool:
-    """Whether a geom is visible and of a kind that `shapes` knows; height fields aren't."""
-    seen = model.geom_group[geom] < _SHOWN_GROUPS and _colour_of(model, geom)[3] > 0
-    return bool(seen) and int(model.geom_type[geom]) in _KINDS
-
-
-def own_colours(model: mujoco.MjModel, geoms: Sequence[int]) -> NDArray[np.uint8]:
-    """The colours that the model gives to geoms, (len(geoms), 4)."""
-    return np.reshape([_colour_of(model, geom) for geom in geoms], (-1, 4)).astype(np.uint8)
-
-
-def _colour_of(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
-    """A geom's colour, (4,): its own, or its material's as in MuJoCo; textures are left out."""
-    rgba, material = model.geom_rgba[geom], model.geom_matid[geom]
-    if material >= 0 and np.allclose(rgba, _NO_COLOUR):
-        rgba = model.mat_rgba[material]
+def _colours(model: mujoco.MjModel) -> NDArray[np.uint8]:
+    """The geoms' own colours, or their materials' as in MuJoCo; textures are left out."""
+    rgba, material = model.geom_rgba.copy(), model.geom_matid
+    of_material = (material >= 0) & np.isclose(rgba, _NO_COLOUR).all(axis=1)
+    rgba[of_material] = model.mat_rgba[material[of_material]]
     return np.round(255 * np.clip(rgba, 0, 1)).astype(np.uint8)
 
 
@@ -174,7 +167,7 @@ def shapes(
 
     Args:
         model: the model.
-        geoms: their numbers; each must be one that `is_shown`.
+        geoms: their numbers, as of `Robot.geoms`.
         colours: of each geom, (len(geoms), 4); none if not given.
     """
     kinds: dict[Any, list[int]] = defaultdict(list)

@@ -119,8 +119,7 @@ def _send_trail(
     radius = _TRAIL_RADIUS * size
     ground = np.column_stack((path[:, :2], np.full(len(path), radius)))
     pieces = np.stack((np.concatenate((ground[:1], ground[:-1])), ground), axis=1)
-    recording.send_columns(TRAIL, times, rr.LineStrips3D.columns(strips=pieces))
-    recording.send(TRAIL, rr.LineStrips3D.from_fields(colors=[SKY], radii=[radius]))
+    recording.send_moving(TRAIL, times, rr.LineStrips3D, SKY, radius, strips=pieces)
 
 
 def _send_contacts(
@@ -194,29 +193,19 @@ def send_ghost(
 
 
 def _send_goal(
-    recording: Recording,
-    times: Sequence[rr.TimeColumn],
-    task: Task,
-    decoded: Array,
-    qpos: Array,
+    recording: Recording, times: Sequence[rr.TimeColumn], task: Task, decoded: Array, qpos: Array
 ) -> None:
     """Send the decoded target, if the task observes it."""
     parts = task.split(decoded)
     origin, turned = qpos[:, POSITION], qpos[:, QUATERNION]
     if "target" in parts:
-        points = rr.Points3D.columns(positions=origin + rotate(turned, parts["target"]))
-        recording.send_columns(f"{GHOST}/target", times, points)
-        recording.send(
-            f"{GHOST}/target",
-            rr.Points3D.from_fields(colors=[ORANGE], radii=[_TARGET_RADIUS]),
-        )
+        points = origin + rotate(turned, parts["target"])
+        look = rr.Points3D, ORANGE, _TARGET_RADIUS
+        recording.send_moving(f"{GHOST}/target", times, *look, positions=points)
     if "angle_to_target" in parts:
         face = rotate(turned, np.tile((0.0, -1.0, 0.0), (len(turned), 1)))
         yaw = np.arctan2(face[:, 1], face[:, 0]) + parts["angle_to_target"][:, 0]
         ahead = np.stack((np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)), axis=1)
-        arrows = rr.Arrows3D.columns(origins=origin, vectors=_HEADING_LENGTH * ahead)
-        recording.send_columns(f"{GHOST}/heading", times, arrows)
-        recording.send(
-            f"{GHOST}/heading",
-            rr.Arrows3D.from_fields(colors=[ORANGE], radii=[_HEADING_RADIUS]),
-        )
+        path, vectors = f"{GHOST}/heading", _HEADING_LENGTH * ahead
+        arrow = rr.Arrows3D, ORANGE, _HEADING_RADIUS
+        recording.send_moving(path, times, *arrow, origins=origin, vectors=vectors)

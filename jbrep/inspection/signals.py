@@ -1,8 +1,7 @@
 """An episode's signals, and an encoder's, as lines: an entity for each plot."""
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import rerun as rr
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.physics import Motion
-from jbrep.envs.task import Array, Feature, Task
+from jbrep.envs.task import Array, Task
 from jbrep.inspection.recording import GREY, SKY, YELLOW, Recording, lighten, palette
 from jbrep.play.jitterbug import reward_terms
 from jbrep.play.rollout import Rollout
@@ -24,40 +23,31 @@ _ALL_COLOUR = (90, 98, 112)
 _ALL_RADIUS, _PATH_RADIUS, _NOW_RADIUS = -1.2, -1.0, -6.0  # negative: Rerun's [points]
 
 
-class Panel(NamedTuple):
-    """The lines of a plot."""
+def panels(groups: Mapping[str, slice]) -> dict[str, slice]:
+    """A plot for each group of numbers, or several of about equal size for a large one.
 
-    name: str  # of its entity
-    place: slice  # of its numbers among all
-
-
-def panels(groups: Mapping[str, slice]) -> Iterator[Panel]:
-    """A panel for each group of numbers, or several of about equal size for a large one."""
+    Returns:
+        Where their lines are among all numbers, by the names of their entities.
+    """
+    found = {}
     for name, place in groups.items():
         size = place.stop - place.start
         count = -(-size // MOST_LINES)
-        if count == 1:
-            yield Panel(name, place)
-            continue
         bounds = [size * i // count for i in range(count + 1)]
         for start, stop in itertools.pairwise(bounds):
-            there = slice(place.start + start, place.start + stop)
-            yield Panel(f"{name}_{start}-{stop - 1}", there)
+            part = name if count == 1 else f"{name}_{start}-{stop - 1}"
+            found[part] = slice(place.start + start, place.start + stop)
+    return found
 
 
-def feature_panels(task: Task) -> list[Panel]:
-    """The panels of an observation."""
-    return list(panels(task.groups))
+def numbered_panels(name: str, size: int) -> dict[str, slice]:
+    """The same of so many numbers in one group."""
+    return panels({name: slice(0, size)})
 
 
-def action_panels(task: Task) -> list[Panel]:
-    """The panels of an action."""
-    return list(panels({"action": slice(0, task.action_size)}))
-
-
-def latent_panels(size: int) -> list[Panel]:
-    """The panels of a latent with so many units."""
-    return list(panels({"units": slice(0, size)}))
+def scaled_titles(task: Task) -> list[str]:
+    """Titles of features in scaled units."""
+    return [f"{name} [scaled]" for name in task.feature_names]
 
 
 def times_at(task: Task, steps: NDArray[np.int64]) -> list[rr.TimeColumn]:
@@ -72,11 +62,12 @@ def times_at(task: Task, steps: NDArray[np.int64]) -> list[rr.TimeColumn]:
 def send_signals(recording: Recording, rollout: Rollout) -> None:
     """Send the observation of each state, the actions and the rewards."""
     task, states = rollout.task, np.arange(len(rollout) + 1)
-    send_features(recording, "observation", times_at(task, states), task, rollout.observation)
+    titles, times = [str(feature) for feature in task.features], times_at(task, states)
+    send_features(recording, "observation", times, task, rollout.observation, titles)
     acting = times_at(task, states[:-1])
     bounds = zip(task.action_low, task.action_high, strict=True)
     names = [f"action_{i} [{low:g}, {high:g}]" for i, (low, high) in enumerate(bounds)]
-    for name, place in action_panels(task):
+    for name, place in numbered_panels("action", task.action_size).items():
         recording.send_series(name, acting, rollout.action[:, place], names[place])
     total = rollout.reward[:, None]
     recording.send_series("reward/total", times_at(task, states[1:]), total, ["reward"], [GREY])
@@ -96,25 +87,16 @@ def send_features(
     times: Sequence[rr.TimeColumn],
     task: Task,
     values: NDArray[np.floating],
-    title: Callable[[Feature], str] = str,
+    titles: Sequence[str],
     is_faint: bool = False,
 ) -> None:
     """Send features (n, d), an entity for each panel; faint ones are lighter and thinner."""
-    for name, place in feature_panels(task):
-        titles = [title(feature) for feature in task.features[place]]
-        colours, width = palette(len(titles)), _WIDTH
+    for name, place in panels(task.groups).items():
+        lines = titles[place]
+        colours, width = palette(len(lines)), _WIDTH
         if is_faint:
             colours, width = [lighten(colour) for colour in colours], _DECODED_WIDTH
-        recording.send_series(f"{path}/{name}", times, values[:, place], titles, colours, width)
-
-
-def _decoded(feature: Feature) -> str:
-    unit = f" [{feature.unit}]" if feature.unit else ""
-    return f"{feature.name} decoded{unit}"
-
-
-def _scaled(feature: Feature) -> str:
-    return f"{feature.name} [scaled]"
+        recording.send_series(f"{path}/{name}", times, values[:, place], lines, colours, width)
 
 
 def send_encoding(
@@ -127,15 +109,17 @@ def send_encoding(
 ) -> None:
     """Send the latent (n, l), and decoded features (n, d), if any, with errors in scaled units."""
     if decoded is not None:
-        path = "reconstruction"
-        send_features(recording, path, times, rollout.task, decoded, _decoded, is_faint=True)
+        task, path = rollout.task, "reconstruction"
+        titles = [str(f).replace(f.name, f"{f.name} decoded", 1) for f in task.features]
+        send_features(recording, path, times, task, decoded, titles, is_faint=True)
         true = encoder.scale(rollout.observation.astype(np.float64))
         errors = encoder.scale(decoded) - true
-        send_features(recording, "error", times, rollout.task, errors.astype(np.float32), _scaled)
+        single, titles = errors.astype(np.float32), scaled_titles(task)
+        send_features(recording, "error", times, task, single, titles)
         total = np.sqrt(np.square(errors).mean(axis=1, keepdims=True))
         recording.send_series("error/total", times, total, ["root mean square [scaled]"])
     names = [f"unit {i}" for i in range(encoder.latent_size)]
-    for name, place in latent_panels(encoder.latent_size):
+    for name, place in numbered_panels("units", encoder.latent_size).items():
         recording.send_series(f"latent/{name}", times, latent[:, place], names[place])
     _send_path(recording, times, latent.astype(np.float64))
 
@@ -156,8 +140,6 @@ def _send_path(recording: Recording, times: Sequence[rr.TimeColumn], latent: Arr
     path = principal_components(latent)
     recording.send(f"{PATH}/all", rr.Points2D(path, colors=[_ALL_COLOUR], radii=[_ALL_RADIUS]))
     pieces = np.stack((np.concatenate((path[:1], path[:-1])), path), axis=1)
-    recording.send_columns(PATH, times, rr.LineStrips2D.columns(strips=pieces.astype(np.float32)))
-    recording.send(PATH, rr.LineStrips2D.from_fields(colors=[SKY], radii=[_PATH_RADIUS]))
-    now = rr.Points2D.from_fields(colors=[YELLOW], radii=[_NOW_RADIUS])
-    recording.send_columns(f"{PATH}/now", times, rr.Points2D.columns(positions=path))
-    recording.send(f"{PATH}/now", now)
+    strips = pieces.astype(np.float32)
+    recording.send_moving(PATH, times, rr.LineStrips2D, SKY, _PATH_RADIUS, strips=strips)
+    recording.send_moving(f"{PATH}/now", times, rr.Points2D, YELLOW, _NOW_RADIUS, positions=path)

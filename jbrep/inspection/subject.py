@@ -25,7 +25,7 @@ from jbrep.inspection.forecast import Examples, from_dataset
 from jbrep.inspection.recording import SUFFIX, Recording, check_out, palette
 from jbrep.inspection.traversal import record_traversal
 from jbrep.play.rollout import Rollout
-from jbrep.play.sources import find_episode, is_trained, policy_file, run_folder
+from jbrep.play.sources import find_episode, is_trained, run_folder
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, is_run
 from jbrep.stats import RunCurve
@@ -142,18 +142,16 @@ def inspect(
         tell(rollout.note)
     if data and (traverse or not shown):
         raise InputError("--data is for forecasts from a latent: give an --encoder, no --traverse")
-    name = [rollout.task.slug, *_words(source), f"episode-{episode or 0}"]
-    if shown:
-        name.append(shown.name)
-    if not traverse:
-        out = out or _default(*name)
-        examples = _examples(source, episode or 0, data, rollout.task) if shown else None
-        record_episode(rollout, out, shown, examples)
-    elif shown:
-        out = out or _default(*name, "traverse")
+    if traverse and not shown:
+        raise InputError("--traverse moves the units of a latent: give an --encoder")
+    if out is None:
+        more = [*([shown.name] if shown else []), *(["traverse"] if traverse else [])]
+        out = _default(rollout.task.slug, *_words(source), f"episode-{episode or 0}", *more)
+    if shown and traverse:
         record_traversal(rollout, out, shown)
     else:
-        raise InputError("--traverse moves the units of a latent: give an --encoder")
+        examples = _examples(source, episode or 0, data, rollout.task) if shown else None
+        record_episode(rollout, out, shown, examples)
     return out
 
 
@@ -185,17 +183,11 @@ def _find(
             "run: jbrep collect makes a data set, jbrep rl a run"
         )
     rollout = find_episode(source, episode, task, _acting(run_folder(source), encoder))
-    if encoder is not None:
-        return rollout, find(encoder, rollout.task)
-    return rollout, _own(source, rollout.task) if is_trained(source) else None
+    return rollout, rollout.encoder if encoder is None else find(encoder, rollout.task)
 
 
 def _examples(source: str | None, episode: int, data: Path | None, task: Task) -> Examples | None:
-    """What forecasts are fitted to, if it isn't the episode that is shown.
-
-    Raises:
-        InputError: the data set is of another task, or has too few episodes.
-    """
+    """What forecasts are fitted to, if it isn't the episode that is shown."""
     own = Path(source) if source and exists(Path(source) / MANIFEST) else None
     folder = data or own
     if folder is None:
@@ -213,19 +205,6 @@ def _acting(folder: Path | None, encoder: Any) -> Any:
     """The given encoder, if a run needs it to act: an object, where the run's folder has none."""
     is_object = encoder is not None and not isinstance(encoder, (str, Path))
     return encoder if is_object and folder and not exists(folder / ENCODER) else None
-
-
-def _own(source: str, task: Task) -> BaseEncoder | None:
-    """The encoder of a run, or of a policy's file; None if it observes the full state."""
-    if folder := run_folder(source):
-        from jbrep.rl.policy import run_encoder, run_settings  # imports torch
-
-        encoder = run_encoder(folder, run_settings(folder))
-    else:
-        from jbrep.rl.policy_file import read  # imports torch
-
-        encoder = read(policy_file(source, task)).encoder()
-    return None if encoder.kind == FULL else encoder
 
 
 def _words(source: str | None) -> tuple[str, ...]:

@@ -1,6 +1,5 @@
 """A recording of the features that each unit of a latent moves."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +8,13 @@ from numpy.typing import NDArray
 
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.physics import Motion
-from jbrep.envs.task import Array
+from jbrep.envs.task import Array, Feature
 from jbrep.inspection.blueprint import TRAVERSE, traversal_layout
 from jbrep.inspection.episode import provenance
 from jbrep.inspection.recording import GREY, Recording
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import WORLD, as_qpos, send_floor
+from jbrep.inspection.signals import scaled_titles
 from jbrep.jitterbug.tasks import POSITION
 from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.rollout import Rollout
@@ -52,25 +52,29 @@ def record_traversal(rollout: Rollout, path: Path, encoder: BaseEncoder) -> None
         InputError: the encoder can't decode, or the file can't be written.
     """
     encoder.check_decodes("--traverse shows what each unit is decoded to")
-    swept = sweep(encoder.encode(rollout.observation))
-    about = provenance(rollout, encoder)
+    task, swept = rollout.task, sweep(encoder.encode(rollout.observation))
     name = f"{encoder.name} on {rollout.name}: each unit of the latent"
-    recording = Recording(name, about, swept)
+    recording = Recording(name, provenance(rollout, encoder), swept)
     times = [rr.TimeColumn(TRAVERSE, sequence=np.arange(POINTS))]
-    places, robot = _places(len(swept)), None
-    if rollout.motion and jitterbug_task(rollout.task):
+    places, robot, titles = _places(len(swept)), None, scaled_titles(task)
+    if rollout.motion and jitterbug_task(task):
         robot = Robot(rollout.motion.model)
         recording.send(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         send_floor(recording, robot, places)
-    moved = []
+    summary = ["| unit | from | to | moves most |", "|---|---|---|---|"]
     for unit, (latent, place) in enumerate(zip(swept, places, strict=True)):
-        decoded = encoder.decode(latent).astype(np.float64)
+        single, below = encoder.decode(latent), f"{TRAVERSE}/unit_{unit}"
+        decoded = single.astype(np.float64)
         if robot:
-            _send_robot(recording, robot, times, as_qpos(rollout.task, decoded), unit, place)
+            _send_robot(recording, robot, times, as_qpos(task, decoded), unit, place)
         scaled = encoder.scale(decoded)
-        moved.append(np.argsort(-np.ptp(scaled, axis=0))[:_MOST])
-        _send_features(recording, times, scaled, unit, moved[-1], rollout.task.feature_names)
-    recording.send_text(f"{TRAVERSE}/summary", _summary(encoder, rollout, swept, moved))
+        most = np.argsort(-np.ptp(scaled, axis=0))[:_MOST]
+        recording.send_series(f"{below}/decoded", times, scaled, titles)
+        recording.send_series(f"{below}/most", times, scaled[:, most], [titles[i] for i in most])
+        ends = f"{latent[0, unit]:.2f} | {latent[-1, unit]:.2f}"
+        told = (_span(task.features[i], np.ptp(single[:, i])) for i in most)
+        summary.append(f"| {unit} | {ends} | {', '.join(told)} |")
+    recording.send_text(f"{TRAVERSE}/summary", "\n".join(summary))
     recording.write(path, traversal_layout(len(swept), robot, places))
 
 
@@ -94,43 +98,11 @@ def _send_robot(
     here[:, POSITION.start : POSITION.start + 2] = place[:2]
     poses = robot.poses(Motion(robot.model, {"qpos": here}))
     robot.draw(recording, path, times, poses, robot.bodies)
-    above = [(*place[:2], _LABEL_HEIGHT)]
-    label = rr.Points3D(
-        above, labels=[f"unit {unit}"], colors=[GREY], radii=[0.0], show_labels=True
-    )
+    above, text = [(*place[:2], _LABEL_HEIGHT)], [f"unit {unit}"]
+    label = rr.Points3D(above, labels=text, colors=[GREY], radii=[0.0], show_labels=True)
     recording.send(f"{path}/label", label)
 
 
-def _send_features(
-    recording: Recording,
-    times: list[rr.TimeColumn],
-    scaled: Array,
-    unit: int,
-    most: NDArray[np.int64],
-    names: Sequence[str],
-) -> None:
-    """Send all decoded features, and those that move most."""
-    path = f"{TRAVERSE}/unit_{unit}"
-    labels = [f"{name} [scaled]" for name in names]
-    recording.send_series(f"{path}/decoded", times, scaled, labels)
-    recording.send_series(f"{path}/most", times, scaled[:, most], [labels[i] for i in most])
-
-
-def _summary(
-    encoder: BaseEncoder,
-    rollout: Rollout,
-    swept: NDArray[np.float32],
-    moved: list[NDArray[np.int64]],
-) -> str:
-    """The features that each unit moves most, as a table in Markdown."""
-    lines = ["| unit | from | to | moves most |", "|---|---|---|---|"]
-    for unit, (latent, most) in enumerate(zip(swept, moved, strict=True)):
-        spans = np.ptp(encoder.decode(latent), axis=0)
-        features = [rollout.task.features[i] for i in most]
-        told = [
-            f"{feature.name} {spans[i]:.3g} {feature.unit}".removesuffix(" 1").rstrip()
-            for i, feature in zip(most, features, strict=True)
-        ]
-        ends = f"{latent[0, unit]:.2f} | {latent[-1, unit]:.2f}"
-        lines.append(f"| {unit} | {ends} | {', '.join(told)} |")
-    return "\n".join(lines)
+def _span(feature: Feature, span: float) -> str:
+    """How far a unit moves a feature."""
+    return f"{feature.name} {span:.3g} {feature.unit}".removesuffix(" 1").rstrip()

@@ -58,12 +58,6 @@ class _View:
         return given if self.form == "flat" else self.task.plain.split(given)
 
 
-def _render_modes() -> list[str]:
-    """The render modes possible here: without a display, opening a window aborts the process."""
-    modes = JitterbugEnv.metadata["render_modes"]
-    return [mode for mode in modes if mode != "human" or has_display()]
-
-
 def describe(arguments: Mapping[str, Any], max_episode_steps: int | None) -> Task:
     """A task as plain data, see `jbrep.envs.description`.
 
@@ -120,12 +114,15 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         materials: bool = False,
     ):
         self.task = get_task(task)
-        self._view = _View(self.task, scaled, form)
-        self.metadata = {**self.metadata, "render_modes": _render_modes()}
-        if render_mode not in (None, *self.metadata["render_modes"]):
+        self.scaled, self._view = scaled, _View(self.task, scaled, form)
+        modes = self.metadata["render_modes"]
+        if not has_display():  # opening a window would abort the process
+            modes = [mode for mode in modes if mode != "human"]
+        self.metadata = {**self.metadata, "render_modes": modes}
+        if render_mode not in (None, *modes):
             raise InputError(
                 f"render_mode {render_mode!r} is not possible here: choose one of "
-                f"{', '.join(self.metadata['render_modes'])}; human needs a display"
+                f"{', '.join(modes)}; human needs a display"
             )
         self._simulation = Simulation(self.task, 1, 1, body, materials)
         self.observation_space = self._view.space
@@ -134,11 +131,6 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._frame: dict[str, Any] = {"camera_name": camera, "width": width, "height": height}
         self._renderer: Any = None
         self._data: Any = None
-
-    @property
-    def scaled(self) -> bool:
-        """Whether observations are scaled, rather than in physical units."""
-        return self._view.scaled
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -250,7 +242,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         self.simulation = Simulation(self.task, num_envs, num_threads, body, materials)
         self.metadata = {"autoreset_mode": autoreset_mode}
         self._resets = autoreset_mode == AutoresetMode.SAME_STEP
-        self._view = _View(self.task, scaled, form, dtype)
+        self.scaled, self._view = scaled, _View(self.task, scaled, form, dtype)
         self._max_steps = max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._generators = [np.random.default_rng() for _ in range(num_envs)]
@@ -260,11 +252,6 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         self.single_action_space = _ACTIONS
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(_ACTIONS, num_envs)
-
-    @property
-    def scaled(self) -> bool:
-        """Whether observations are scaled, rather than in physical units."""
-        return self._view.scaled
 
     def reset(
         self,
@@ -286,7 +273,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
             if (number := seed[lane]) is not None:
                 self._generators[lane] = np.random.default_rng(number)
         self._restart(lanes)
-        return self._view(self._observation), self._state_info()
+        return self._view(self._observation), self._info()
 
     def step(
         self, actions: NDArray[np.floating]
@@ -314,7 +301,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
                 info = self._add_info(info, final, lane)
             self._restart(np.flatnonzero(truncated).tolist())
         terminated = np.zeros(self.num_envs, dtype=np.bool_)
-        info |= self._state_info() | {"non_finite": diverged, "_non_finite": self._every_lane}
+        info |= self._info(non_finite=diverged)
         return self._view(self._observation), reward, terminated, truncated, info
 
     @property
@@ -342,7 +329,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         self._steps[:] = physics.pop("episode_steps")
         self._observation = physics.pop("last_observation").copy()
         self.simulation.restore(**physics)
-        return self._view(self._observation), self._state_info()
+        return self._view(self._observation), self._info()
 
     def _restart(self, lanes: Sequence[int]) -> None:
         self.simulation.reset(lanes, [self._generators[lane] for lane in lanes])
@@ -350,12 +337,8 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         self._observation = self._observation.copy()
         self._observation[lanes] = self.simulation.observe()[lanes]
 
-    @property
-    def _every_lane(self) -> NDArray[np.bool_]:
-        return np.ones(self.num_envs, np.bool_)
-
-    def _state_info(self) -> dict[str, Any]:
-        """The state of each lane, as Gymnasium's vector environments give infos."""
+    def _info(self, **others: NDArray[Any]) -> dict[str, Any]:
+        """The state of each lane and more, as Gymnasium's vector environments give infos."""
         now = self.simulation.readings
         arrays = {
             "qpos": now.qpos.copy(),
@@ -363,5 +346,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
             "target_position": now.target_position.copy(),
             "target_quaternion": self.simulation.target_quaternion.copy(),
             "body": self.simulation.body_numbers[:, None],
+            **others,
         }
-        return arrays | dict.fromkeys((f"_{name}" for name in arrays), self._every_lane)
+        every_lane = np.ones(self.num_envs, np.bool_)
+        return arrays | dict.fromkeys((f"_{name}" for name in arrays), every_lane)

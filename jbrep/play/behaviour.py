@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
@@ -68,12 +68,12 @@ def observe(
             assert shared is not None  # the players'
             subjects[f"{short}, before training"] = [find_untrained(run, shared) for run in runs]
         subjects[_title(short, players)] = players
-    played = [_Visits(*each, episodes, target_yaw) for each in subjects.items()]
-    reach = max(np.abs(visits.position).max() for visits in played)
+    played = {name: _visits(each, episodes, target_yaw) for name, each in subjects.items()}
+    reach = max(np.abs(visits.position).max() for visits in played.values())
     cells = int(np.ceil((reach + _CELL) / _CELL))
     edges: Array = _CELL * np.arange(-cells, cells + 1, dtype=np.float64)
     assert shared is not None  # the players'
-    return shared, [visits.counted(edges) for visits in played]
+    return shared, [_counted(name, visits, edges) for name, visits in played.items()]
 
 
 def fast_shares(behaviour: Behaviour) -> tuple[float, float]:
@@ -127,31 +127,27 @@ def _shared(player: Player, shared: Task | None) -> Task:
     return player.task
 
 
-class _Visits:
+class _Visits(NamedTuple):
     """Where policies that count as one went, and how the motor turned."""
 
-    def __init__(self, name: str, players: Sequence[Player], episodes: int, target_yaw: float):
-        self._name = name
-        returns, motor, position = [], [], []
-        for rollout in chain.from_iterable(p.play_first(episodes, target_yaw) for p in players):
-            assert rollout.motion is not None  # the Jitterbug has one
-            returns.append(rollout.episode_return)
-            motor.append(rollout.motion.qvel[:, -1].copy())  # a view would keep the whole rollout
-            position.append(rollout.motion.qpos[:, :2].copy())
-        self._returns, self._motor = np.array(returns), np.concatenate(motor)
-        self.position = np.concatenate(position)
-
-    def counted(self, edges: Array) -> Behaviour:
-        """The shares of states by motor velocity, and by cells between these edges [m]."""
-        x, y = self.position.T
-        return Behaviour(
-            name=self._name,
-            returns=self._returns,
-            motor=_shares(np.histogram(self._motor.clip(SPEEDS[0], SPEEDS[-1]), SPEEDS)[0]),
-            edges=edges,
-            places=_shares(np.histogram2d(x, y, (edges, edges))[0]),
-        )
+    returns: Array  # of each episode, (episodes,)
+    motor: Array  # its velocity in each state, (n,) [rad/s]
+    position: Array  # x and y in each state, (n, 2) [m]
 
 
-def _shares(counts: NDArray[np.number]) -> Array:
-    return counts / counts.sum()
+def _visits(players: Sequence[Player], episodes: int, target_yaw: float) -> _Visits:
+    returns, motor, position = [], [], []
+    for rollout in chain.from_iterable(p.play_first(episodes, target_yaw) for p in players):
+        assert rollout.motion is not None  # the Jitterbug has one
+        returns.append(rollout.episode_return)
+        motor.append(rollout.motion.qvel[:, -1].copy())  # a view would keep the whole rollout
+        position.append(rollout.motion.qpos[:, :2].copy())
+    return _Visits(np.array(returns), np.concatenate(motor), np.concatenate(position))
+
+
+def _counted(name: str, visits: _Visits, edges: Array) -> Behaviour:
+    """The shares of states by motor velocity, and by cells between these edges [m]."""
+    motor, _ = np.histogram(visits.motor.clip(SPEEDS[0], SPEEDS[-1]), SPEEDS)
+    x, y = visits.position.T
+    places, _, _ = np.histogram2d(x, y, (edges, edges))
+    return Behaviour(name, visits.returns, motor / motor.sum(), edges, places / places.sum())

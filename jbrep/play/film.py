@@ -164,11 +164,7 @@ class Film:
 
 
 def _check_shown(rollout: Rollout) -> None:
-    """Make sure that an episode has all that a film needs.
-
-    Raises:
-        InputError: it hasn't.
-    """
+    """Make sure that an episode has all that a film needs."""
     if rollout.motion is None:
         why = rollout.note or f"{rollout.task.name} has no MuJoCo model and data"
         raise InputError(f"{why}: only MuJoCo's robots can be filmed; jbrep inspect shows signals")

@@ -1,6 +1,6 @@
 """Policies with their tasks, which play the episodes that every run is evaluated on."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,13 +9,17 @@ from jbrep.encoders import FULL
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
-from jbrep.envs.recording import Actor, episode_returns
+from jbrep.envs.physics import MotionReader
+from jbrep.envs.recording import Actor, Recording, episode_returns, record
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
-from jbrep.play.rollout import Begin, Rollout, play
+from jbrep.play.jitterbug import hold_diverged, turn_targets
+from jbrep.play.rollout import Rollout
 from jbrep.progress import Progress
 from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rl.settings import MAX_EPISODES
+
+Begin = Callable[[Task, Sequence[int]], Actor]  # as `Policy.begin`
 
 _BATCH_BYTES = 350 * 10**6  # of the steps that `play_first` holds in memory at once
 _MAX_BYTES = 10 * _BATCH_BYTES  # the same, that `play` may return
@@ -31,16 +35,17 @@ class Player(NamedTuple):
     representation: str = FULL  # what the policy observes
     evaluation_batch: int = 1  # episodes that its evaluation plays at once
     step: int | None = None  # of training, if it is not over
+    encoder: BaseEncoder | None = None  # of a trained policy that doesn't observe all features
 
     def play(self, episodes: Sequence[int], target_yaw: float | None = None) -> list[Rollout]:
         """Play some of the episodes that every run is evaluated on.
 
         Args:
             episodes: their numbers, from 0.
-            target_yaw: where every target points [rad]; where it points in the episode if None.
+            target_yaw: where every target of the Jitterbug points [rad]; None draws it.
 
         Raises:
-            InputError: too many steps to hold in memory.
+            InputError: too many steps to hold in memory; the environment can't be made, or fails.
         """
         if len(episodes) * self._episode_bytes > _MAX_BYTES:
             raise InputError(
@@ -48,7 +53,34 @@ class Player(NamedTuple):
                 f"steps at once: at most {_MAX_BYTES // self._episode_bytes:,} are possible"
             )
         seeds = [EVALUATION_SEED + episode for episode in episodes]
-        return play(self.task, self.begin, self.name, seeds, target_yaw)
+        lanes, read = Lanes(self.task, len(seeds)), MotionReader()
+        lanes.reset(range(len(seeds)), seeds)
+        if target_yaw is not None:
+            turn_targets(lanes, target_yaw)
+        act = self.begin(self.task, seeds)
+        with _progress(len(seeds) * self.task.max_episode_steps) as bar:
+            recording = record(lanes, act, bar.update, read)
+        lanes.close()
+        return [self._rollout(recording, lane, seed, read) for lane, seed in enumerate(seeds)]
+
+    def _rollout(self, recording: Recording, lane: int, seed: int, read: MotionReader) -> Rollout:
+        steps = int(recording.length[lane])
+        truncated = bool(recording.truncated[lane])
+        motion = read.motion(recording, lane, steps)
+        if motion and truncated and steps < self.task.max_episode_steps:
+            motion = hold_diverged(self.task, motion)
+        return Rollout(
+            task=self.task,
+            name=self.name,
+            seed=seed,
+            observation=recording.observation[: steps + 1, lane],
+            action=recording.action[:steps, lane],
+            reward=recording.reward[:steps, lane],
+            terminated=bool(recording.terminated[lane]),
+            truncated=truncated,
+            motion=motion,
+            encoder=self.encoder,
+        )
 
     def play_first(self, count: int, target_yaw: float | None = None) -> Iterator[Rollout]:
         """Play the first `count` of these episodes, with bounded memory.
@@ -66,12 +98,12 @@ class Player(NamedTuple):
             InputError: more episodes than an evaluation may have.
         """
         most = _BATCH_LANES if is_batched(self.task) else _SEPARATE_LANES
-        total, returns = count * self.task.max_episode_steps, []
-        with Progress(total=total, unit="step", unit_scale=True, leave=False, delay=1) as progress:
+        returns = []
+        with _progress(count * self.task.max_episode_steps) as bar:
             for some in _batches(count, most):
                 lanes, first = Lanes(self.task, len(some)), EVALUATION_SEED + some[0]
                 act = self.begin(self.task, range(first, first + len(some)))
-                returns.append(episode_returns(lanes, act, first, progress.update))
+                returns.append(episode_returns(lanes, act, first, bar.update))
                 lanes.close()
         return np.concatenate(returns)
 
@@ -101,12 +133,12 @@ class Player(NamedTuple):
         )
 
 
-def _batches(count: int, most: int) -> Iterator[range]:
-    """The first episodes of evaluation, at most so many at a time.
+def _progress(steps: int) -> Progress:
+    return Progress(total=steps, unit="step", unit_scale=True, leave=False, delay=1)
 
-    Raises:
-        InputError: more episodes than an evaluation may have.
-    """
+
+def _batches(count: int, most: int) -> Iterator[range]:
+    """The first episodes of evaluation, at most so many at a time."""
     if count > MAX_EPISODES:
         raise InputError(f"{count:,} episodes are too many: at most {MAX_EPISODES:,} are played")
     for start in range(0, count, most):

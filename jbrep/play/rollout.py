@@ -1,6 +1,5 @@
 """Single episodes to look at: replayed from a data set, or played by a policy."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,15 +7,11 @@ from numpy.typing import NDArray
 
 from jbrep.collect.replay import simulate_again
 from jbrep.dataset import Dataset, Episode
-from jbrep.envs.lanes import Lanes
+from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.physics import Motion, MotionReader
-from jbrep.envs.recording import Actor, Recording, record
+from jbrep.envs.recording import Recording
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
-from jbrep.play.jitterbug import hold_diverged, turn_targets
-from jbrep.progress import Progress
-
-Begin = Callable[[Task, Sequence[int]], Actor]  # as `Policy.begin`
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -34,6 +29,7 @@ class Rollout:
         truncated: whether the time limit did, or physics that diverged.
         motion: of the robot, n + 1 states; None where there is no MuJoCo.
         note: why there is no motion though the environment may have one.
+        encoder: through which a trained policy observed; None if it observed all features.
 
     Raises:
         InputError: an array of another shape.
@@ -49,6 +45,7 @@ class Rollout:
     truncated: bool
     motion: Motion | None = None
     note: str = ""
+    encoder: BaseEncoder | None = None
 
     def __post_init__(self) -> None:
         steps = len(self.action)
@@ -122,50 +119,3 @@ def _is_same(recording: Recording, rollout: Rollout) -> bool:
         recording.observation[: steps + 1, 0].tobytes() == rollout.observation.tobytes()
         and recording.reward[:steps, 0].tobytes() == rollout.reward.tobytes()
     )
-
-
-def play(
-    task: Task, begin: Begin, name: str, seeds: Sequence[int], target_yaw: float | None = None
-) -> list[Rollout]:
-    """Play one episode for each seed.
-
-    Args:
-        task: whose environment is made.
-        begin: of the policy.
-        name: of the policy.
-        seeds: an episode starts like a Gymnasium environment reset with its seed.
-        target_yaw: orientation of the Jitterbug's target in every episode [rad]; None draws it.
-
-    Raises:
-        InputError: the environment can't be made, or fails.
-    """
-    lanes = Lanes(task, len(seeds))
-    lanes.reset(range(len(seeds)), seeds)
-    if target_yaw is not None:
-        turn_targets(lanes, target_yaw)
-    act, read = begin(task, seeds), MotionReader()
-    total = task.max_episode_steps * len(seeds)
-    with Progress(total=total, unit="step", unit_scale=True, leave=False, delay=1) as progress:
-        recording = record(lanes, act, progress.update, read)
-    lanes.close()
-    return [_rollout(task, recording, lane, name, seed, read) for lane, seed in enumerate(seeds)]
-
-
-def _rollout(
-    task: Task, recording: Recording, lane: int, name: str, seed: int, read: MotionReader
-) -> Rollout:
-    steps = int(recording.length[lane])
-    rollout = Rollout(
-        task=task,
-        name=name,
-        seed=seed,
-        observation=recording.observation[: steps + 1, lane],
-        action=recording.action[:steps, lane],
-        reward=recording.reward[:steps, lane],
-        terminated=bool(recording.terminated[lane]),
-        truncated=bool(recording.truncated[lane]),
-    )
-    motion = read.motion(recording, lane, steps)
-    if motion and rollout.truncated and steps < task.max_episode_steps:
-        motion = hold_diverged(task, motion)
-    return replace(rollout, motion=motion)

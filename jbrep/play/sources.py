@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from jbrep.collect.policies import POLICIES, Policy, make_policy, parse_policy
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import MANIFEST
+from jbrep.encoders import FULL
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.evaluate.control import GoodPolicy, PlayedEpisode
@@ -235,4 +236,5 @@ def as_player(name: str, trained: "Trained") -> Player:
         trained.representation,
         trained.evaluation_episodes,
         trained.step,
+        None if trained.encoder.kind == FULL else trained.encoder,
     )
