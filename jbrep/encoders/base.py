@@ -45,6 +45,10 @@ class BaseEncoder(ABC):
     can_decode: bool
     fingerprint: str
 
+    def __repr__(self) -> str:
+        kind = type(self).__name__
+        return f"{kind}({self.name}, {self.task.name}, {self.size} to {self.latent_size})"
+
     @abstractmethod
     def encode(self, observation: Any) -> Any:
         """Encode observations (..., d) in physical units as latents (..., l)."""
@@ -137,9 +141,6 @@ class OwnEncoder(BaseEncoder):
             )
         self._check_repeats(latents)
         self.fingerprint = hashlib.sha256(latents.tobytes()).hexdigest()
-
-    def __repr__(self) -> str:
-        return f"OwnEncoder({self.name}, {self.task.name}, {self.size} to {self.latent_size})"
 
     @property
     def is_module(self) -> bool:

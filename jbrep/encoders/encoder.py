@@ -24,8 +24,6 @@ Float32 = NDArray[np.float32]
 Layers = tuple[Layer, ...]
 Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 
-_SCALING = ("low", "high")  # tensors
-
 
 class Arrays(NamedTuple):
     """An encoder's arrays, all NumPy's or all torch tensors on one device, and what it computes.
@@ -116,26 +114,20 @@ class Encoder(BaseEncoder):
         self._on: dict[Any, Arrays] = {}  # by device
 
     def _check(self, keep: tuple[str, ...]) -> None:
-        for name in _SCALING:
+        for name in ("low", "high"):
             _check_tensor(name, getattr(self.scaler, name), (self.size,))
         if not all(0 <= i < self.size for i in self.scaler.angles):
             raise InputError("its angles must be different features")
         if keep and not self.encoder:
             raise InputError("features can pass around layers, where there are some")
         sizes = [self.scaler.size]
-        for name, tensor in self.tensors().items():
-            if name not in _SCALING:
-                _check_layer(name, tensor, sizes)
+        for part in ("encoder", "decoder"):
+            for i, layer in enumerate(getattr(self, part)):
+                sizes.append(_check_layer(f"{part}.{i}", layer, sizes[-1]))
         if self.decoder and sizes[-1] != self.scaler.size:
             raise InputError(f"the last layer has {sizes[-1]} units, expected {self.scaler.size}")
         if max(sizes) > MAX_UNITS:
             raise InputError(f"a layer has {max(sizes)} units: the limit is {MAX_UNITS}")
-        for layer in (*self.encoder, *self.decoder):
-            if layer.activation not in ACTIVATIONS:
-                choices = ", ".join(ACTIVATIONS)
-                raise InputError(
-                    f"unknown activation {layer.activation!r}: choose one of {choices}"
-                )
 
     @staticmethod
     def from_torch(
@@ -163,9 +155,6 @@ class Encoder(BaseEncoder):
 
         known = as_task(task)
         return imported(known, name, *layers_of(encoder, known, decoder), "torch")
-
-    def __repr__(self) -> str:
-        return f"Encoder({self.name}, {self.task.name}, {self.size} to {self.latent_size})"
 
     def with_header(self, **changes: Any) -> "Encoder":
         """The same encoder with other values of some fields in its header."""
@@ -237,25 +226,19 @@ class Encoder(BaseEncoder):
         return self._on[device]
 
     def check_task(self, task: Task) -> None:
-        """Make sure that it can read this task's observations.
-
-        Other arguments of the same environment will do, such as another body of the same robot.
-
-        Raises:
-            InputError: it was made for another environment or other features.
-        """
+        """As for `BaseEncoder`; other arguments, such as another body of the robot, will do."""
         check_same(task, self.task, self.name)
 
 
-def _check_layer(name: str, tensor: Any, sizes: list[int]) -> None:
-    """Check a tensor of a layer; `sizes` holds the widths of the layers so far, and grows."""
-    if name.endswith("weight"):
-        rows = max(1, tensor.shape[0]) if np.ndim(tensor) == 2 else 1
-        expected: tuple[int, ...] = (rows, sizes[-1])
-        sizes.append(rows)
-    else:
-        expected = (sizes[-1],)
-    _check_tensor(name, tensor, expected)
+def _check_layer(name: str, layer: Layer, inputs: int) -> int:
+    """Check a layer of so many inputs; its units."""
+    units = max(1, layer.weight.shape[0]) if np.ndim(layer.weight) == 2 else 1
+    _check_tensor(f"{name}.weight", layer.weight, (units, inputs))
+    _check_tensor(f"{name}.bias", layer.bias, (units,))
+    if layer.activation not in ACTIVATIONS:
+        choices = ", ".join(ACTIVATIONS)
+        raise InputError(f"unknown activation {layer.activation!r}: choose one of {choices}")
+    return units
 
 
 def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...]) -> None:

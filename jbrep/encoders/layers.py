@@ -91,19 +91,15 @@ ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {  # for NumPy arrays
 @cache
 def _torch() -> Mapping[str, Callable[[Any], Any]]:
     """The same for torch tensors."""
+    import torch
     from torch.nn import functional
 
     return {
         "linear": lambda values: values,
         "relu": lambda values: values.clip(min=0),
-        "tanh": lambda values: values.tanh(),
-        "sigmoid": lambda values: values.sigmoid(),
-        "gelu": functional.gelu,
+        **{name: getattr(torch, name) for name in ("tanh", "sigmoid", "sin")},
+        **{name: getattr(functional, name) for name in ("gelu", "silu", "elu", "softplus")},
         "gelu-tanh": lambda values: functional.gelu(values, approximate="tanh"),
-        "silu": functional.silu,
-        "elu": functional.elu,
-        "softplus": functional.softplus,
-        "sin": lambda values: values.sin(),
         LAYER_NORM: lambda values: functional.layer_norm(values, values.shape[-1:], eps=EPSILON),
         AVG_L1_NORM: lambda v: v / v.abs().mean(-1, keepdim=True).clip(min=LEAST_NORM),
     }

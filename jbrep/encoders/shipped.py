@@ -27,8 +27,7 @@ _SCALINGS = {  # of the whole observation, by the word for it in the header
 
 def names(task: Task) -> tuple[str, ...]:
     """Names of the encoders that ship for a task, by kind, the largest latent first; often none."""
-    stems = (path.name.removesuffix(SUFFIX) for path in shipped_folder(task).glob(f"*{SUFFIX}"))
-    return tuple(sorted(stems, key=lambda name: EncoderName.parse(name).order))
+    return tuple(_files(task))
 
 
 def full(task: Task) -> Encoder:
@@ -68,7 +67,7 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
         return make(name, task)
     if _is_made(name, task):
         return full(task)
-    path = _shipped(name, task) or Path(name)
+    path = _files(task).get(str(name)) or Path(name)
     if not exists(path):
         ships = ", ".join(names(task))
         raise InputError(
@@ -109,7 +108,7 @@ def source_of(name: str | Path, task: Task | None) -> str:
         return f"{name}, code"
     if task and _is_made(name, task):
         return f"{name}, {_SCALINGS[full(task).header.training['scaling']]}"
-    return f"{name}, shipped" if task and _shipped(name, task) else str(name)
+    return f"{name}, shipped" if task and str(name) in _files(task) else str(name)
 
 
 def shipped(task: Task) -> dict[str, Encoder]:
@@ -118,8 +117,8 @@ def shipped(task: Task) -> dict[str, Encoder]:
     Raises:
         DamageError: a file is damaged.
     """
-    ordered = sorted(names(task), key=lambda name: name != FULL)
-    return {name: load(_file(name, task)) for name in ordered}
+    files = _files(task)
+    return {name: load(files[name]) for name in sorted(files, key=lambda name: name != FULL)}
 
 
 def shipped_folder(task: Task) -> Path:
@@ -129,13 +128,11 @@ def shipped_folder(task: Task) -> Path:
 
 def _is_made(name: str | Path, task: Task) -> bool:
     """Whether the name is of the whole observation of a task for which that doesn't ship."""
-    return str(name) == FULL and FULL not in names(task)
+    return str(name) == FULL and FULL not in _files(task)
 
 
-def _shipped(name: str | Path, task: Task) -> Path | None:
-    """The file that ships for a task under that name, if there is one."""
-    return _file(str(name), task) if str(name) in names(task) else None
-
-
-def _file(name: str, task: Task) -> Path:
-    return shipped_folder(task) / f"{name}{SUFFIX}"
+def _files(task: Task) -> dict[str, Path]:
+    """The files that ship for a task, by their names in order."""
+    paths = shipped_folder(task).glob(f"*{SUFFIX}")
+    files = {path.name.removesuffix(SUFFIX): path for path in paths}
+    return dict(sorted(files.items(), key=lambda item: EncoderName.parse(item[0]).order))

@@ -1,8 +1,8 @@
 """What a controller needs of the state: a good policy's action and value, and what a code loses."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,24 +57,16 @@ class GoodPolicy:
     episodes: Sequence[PlayedEpisode]
 
     @cached_property
-    def _known(self) -> list[PlayedEpisode]:
-        """The episodes with steps whose return to go is known."""
-        return [episode for episode in self.episodes if _known(episode)]
+    def states(self) -> "tuple[States, States] | None":
+        """States to fit to, of two thirds of the episodes, and to judge on.
 
-    @cached_property
-    def fitted_on(self) -> "States":
-        """States of two thirds of the episodes."""
-        return States([episode for i, episode in enumerate(self._known) if i % _EVERY])
-
-    @cached_property
-    def judged_on(self) -> "States":
-        """States of the others."""
-        return States(self._known[::_EVERY])
-
-    @property
-    def has_value(self) -> bool:
-        """Whether there are episodes to fit to and to judge on."""
-        return len(self._known) > 1
+        None where too few episodes have steps whose return to go is known.
+        """
+        known = [episode for episode in self.episodes if _known(episode)]
+        if len(known) < 2:
+            return None
+        fitted_on = [episode for i, episode in enumerate(known) if i % _EVERY]
+        return States(fitted_on), States(known[::_EVERY])
 
 
 class States:
@@ -122,8 +114,8 @@ def problems(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> dic
     """
     seen, taken, _ = _acting(held_out, policy, "train")
     told = {"action": Problem(encoder.encode(seen), taken)}
-    if policy.has_value:
-        states = policy.fitted_on
+    if policy.states:
+        states, _ = policy.states
         told["value"] = Problem(encoder.encode(states.observation), states.value, share=_SHARE)
     return told
 
@@ -136,9 +128,9 @@ def value(
     Fitted on two thirds of its episodes, judged on the others; None without them. The last 300
     steps of an episode are left out unless a state ended it.
     """
-    if policy is None or "value" not in predictors:
+    if policy is None or policy.states is None:
         return None
-    states = policy.judged_on
+    _, states = policy.states
     predicted = predictors["value"](encoder.encode(states.observation))
     return explained(predicted, states.value, states.rows, states)[0]
 
@@ -215,7 +207,7 @@ def needs(
         lambda seen: told(np.hstack((full.encode(seen), inputs))), seen, steps.wanted[:count]
     )
     moving, reward = shares[:, :-1], shares[:, -1]
-    of_policy = _of_policy(full, policy, learnt.of_policy, seen) if policy else ()
+    of_policy = _of_policy(full, policy, learnt.of_policy, seen) if policy else []
     direct = np.max([reward, *of_policy], axis=0)
     need = np.maximum(direct, (moving * direct).max(axis=1)).tolist()
     names = held_out.data.task.feature_names
@@ -227,20 +219,18 @@ def _of_policy(
     policy: GoodPolicy,
     predictors: Mapping[str, Predictor],
     seen: NDArray[Any],
-) -> Iterator[Array]:
+) -> list[Array]:
     """How much each of what predictors say of a policy depends on each feature, (d,)."""
-    count = len(seen)
-    asked = {"action": (seen, policy.act(seen))}
-    if policy.has_value:
-        states = policy.judged_on
-        asked["value"] = states.observation[:count], states.value[:count]
-    for name, (observation, wanted) in asked.items():
-        told = partial(_predict, full, predictors[name])
-        yield _shares(told, observation, wanted).max(axis=1)
 
+    def shares(name: str, observation: NDArray[Any], wanted: NDArray[Any]) -> Array:
+        predict = predictors[name]
+        return _shares(lambda seen: predict(full.encode(seen)), observation, wanted).max(axis=1)
 
-def _predict(full: BaseEncoder, predict: Predictor, observation: NDArray[Any]) -> Array:
-    return predict(full.encode(observation))
+    asked = [shares("action", seen, policy.act(seen))]
+    if policy.states:
+        _, states = policy.states
+        asked.append(shares("value", states.observation[: len(seen)], states.value[: len(seen)]))
+    return asked
 
 
 def _shares(

@@ -93,15 +93,12 @@ def problems(encoder: BaseEncoder, held_out: HeldOut) -> dict[int, tuple[Problem
 
     The reward has a network of its own: beside many features a rare one would hardly be learnt.
     """
-    return {
-        ahead: _changes_and_reward(following(held_out, "train", ahead), encoder)
-        for ahead in usual_horizons(held_out.data)
-    }
-
-
-def _changes_and_reward(steps: Steps, encoder: BaseEncoder) -> tuple[Problem, Problem]:
-    inputs, (changed, reward) = steps.inputs(encoder), np.split(steps.wanted, [-1], axis=1)
-    return Problem(inputs, changed, share=_SHARE), Problem(inputs, reward)
+    told = {}
+    for ahead in usual_horizons(held_out.data):
+        steps = following(held_out, "train", ahead)
+        inputs, (changed, reward) = steps.inputs(encoder), np.split(steps.wanted, [-1], axis=1)
+        told[ahead] = Problem(inputs, changed, share=_SHARE), Problem(inputs, reward)
+    return told
 
 
 def usual_horizons(data: ScaledDataset) -> list[int]:

@@ -123,13 +123,13 @@ def probes(encoder: BaseEncoder, held_out: HeldOut) -> Scores:
     The cosine and sine of an angle count together. At most 100,000 rows are fitted to, and as many
     judged; of more than 83 features, fewer.
     """
-    predict = ridge(*_readable(encoder, held_out, quantities))
-    return _probes(encoder, held_out, quantities, predict)
+    fitted_to = _problem(encoder, held_out, quantities)
+    return _probes(encoder, held_out, quantities, ridge(fitted_to.values, fitted_to.wanted))
 
 
 def problem(encoder: BaseEncoder, held_out: HeldOut) -> Problem:
     """Each quantity and every feature, from the latent."""
-    return Problem(*_readable(encoder, held_out, quantities_and_features))
+    return _problem(encoder, held_out, quantities_and_features)
 
 
 def nonlinear_probes(encoder: BaseEncoder, held_out: HeldOut, predict: Predictor) -> Scores:
@@ -140,14 +140,10 @@ def nonlinear_probes(encoder: BaseEncoder, held_out: HeldOut, predict: Predictor
 _Truth = Callable[[Task, NDArray[Any]], Columns]
 
 
-def _readable(
-    encoder: BaseEncoder, held_out: HeldOut, truth: _Truth
-) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Latents of training rows, and what is true of them."""
+def _problem(encoder: BaseEncoder, held_out: HeldOut, truth: _Truth) -> Problem:
     data = held_out.data
-    rows = sample_rows(data.train, _ROWS, data.task.size)
-    seen = data.dataset["observation"][rows]
-    return encoder.encode(seen), np.hstack(list(truth(data.task, seen).values()))
+    seen = data.dataset["observation"][sample_rows(data.train, _ROWS, data.task.size)]
+    return Problem(encoder.encode(seen), np.hstack(list(truth(data.task, seen).values())))
 
 
 def _probes(encoder: BaseEncoder, held_out: HeldOut, truth: _Truth, predict: Predictor) -> Scores:
