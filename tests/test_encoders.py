@@ -404,12 +404,6 @@ def test_shipped_files_keep_their_bytes_when_saved_again(tmp_path):
         assert (tmp_path / name).read_bytes() == path.read_bytes()
 
 
-def test_the_full_observation_goes_by_one_name():
-    full = find("full", TASK)
-    assert (full.name, full.kind) == ("full", "full")
-    assert source_of("full", TASK) == "full, shipped"
-
-
 @pytest.mark.parametrize(
     ("task", "source", "reading"),
     [
@@ -429,7 +423,7 @@ def test_the_full_observation_of_any_task(task, source, reading, tmp_path):
     full = find("full", task)
     assert source_of("full", task) == source
     np.testing.assert_array_equal(full(np.array(reading)), np.ones(task.size))
-    assert (full.name, full.task) == ("full", task)
+    assert (full.name, full.kind, full.task) == ("full", "full", task)
     save(full, tmp_path / "it")
     assert load(tmp_path / "it").fingerprint == find("full", task).fingerprint
 
@@ -462,6 +456,7 @@ def test_observations_and_latents_of_any_size(size, tmp_path):
 def test_a_name_that_ships_takes_precedence_over_a_file(encoder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save(encoder, tmp_path / "dae-8")
+    assert (find("full", TASK).kind, source_of("full", TASK)) == ("full", "full, shipped")
     assert source_of("dae-8", TASK) == "dae-8, shipped"
     assert source_of("./dae-8", TASK) == "./dae-8"
     assert source_of("dae-8", None) == "dae-8"

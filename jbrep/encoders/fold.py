@@ -20,27 +20,22 @@ _MOST_NAMED = 8  # operations in a message
 _MOST_FORMS = 4  # of a value: a GELU written out needs two
 
 
+@dataclass(frozen=True, eq=False)
 class Chain:
     """Layers from affine maps, of which any number in a row become one, and activations.
 
     Affine maps are multiplied in float64; the layers are float32. A chain never changes: whatever
     adds to it makes another.
 
-    Args:
+    Attributes:
         width: numbers that it gives.
-        layers: those that end with an activation.
-        affine: weight (out, in) and bias (out,) of the map after them, if there is one.
+        ended: layers with their activations.
+        last: weight (out, in) and bias (out,) of the map after them, if there is one.
     """
 
-    def __init__(
-        self,
-        width: int,
-        layers: tuple[Layer, ...] = (),
-        affine: tuple[Array, Array] | None = None,
-    ):
-        self.width = width
-        self._layers = layers
-        self._map = affine
+    width: int
+    ended: tuple[Layer, ...] = ()
+    last: tuple[Array, Array] | None = None
 
     def affine(self, weight: Any, bias: Any = 0) -> "Chain":
         """Add values @ weight.T + bias.
@@ -61,10 +56,10 @@ class Chain:
         if outputs > MAX_UNITS:
             raise InputError(f"it has {outputs} units: the limit is {MAX_UNITS}")
         bias = _row(bias, outputs)
-        if self._map:
-            before, shift = self._map
+        if self.last:
+            before, shift = self.last
             weight, bias = weight @ before, weight @ shift + bias
-        return Chain(outputs, self._layers, (weight, bias))
+        return Chain(outputs, self.ended, (weight, bias))
 
     def scale(self, factor: Any, shift: Any = 0) -> "Chain":
         """Add values * factor + shift, each (width,) or one number.
@@ -74,16 +69,16 @@ class Chain:
         """
         factor, shift = (_row(np.asarray(v, np.float64), self.width) for v in (factor, shift))
         weight, bias = self._affine()
-        return Chain(self.width, self._layers, (weight * factor[:, None], bias * factor + shift))
+        return Chain(self.width, self.ended, (weight * factor[:, None], bias * factor + shift))
 
     def activate(self, name: str) -> "Chain":
         """Add an activation, which ends a layer."""
         weight, bias = self._affine()
         single = np.asarray(weight, np.float32, order="C"), np.float32(bias + 0.0)  # no -0.0
-        return Chain(self.width, (*self._layers, Layer(*single, name)))
+        return Chain(self.width, (*self.ended, Layer(*single, name)))
 
     def _affine(self) -> tuple[Array, Array]:
-        return self._map or (np.eye(self.width), np.zeros(self.width))
+        return self.last or (np.eye(self.width), np.zeros(self.width))
 
     def layer_norm(self, epsilon: float) -> "Chain":
         """Add a layer norm without weights of its own.
@@ -105,17 +100,13 @@ class Chain:
         Raises:
             InputError: there are none, since it leaves values as they are.
         """
-        if self._map and not _is_nothing(*self._map):
-            return self.activate("linear").layers()
-        if not self._layers:
+        if self.last:
+            weight, bias = self.last
+            if len(bias) != weight.shape[1] or bias.any() or (weight != np.eye(len(bias))).any():
+                return self.activate("linear").ended
+        if not self.ended:
             raise InputError("it leaves what it takes as it is, so there is nothing to convert")
-        return self._layers
-
-
-def _is_nothing(weight: Array, bias: Array) -> bool:
-    """Whether an affine map leaves values as they are."""
-    same = weight.shape[0] == weight.shape[1] and np.array_equal(weight, np.eye(len(weight)))
-    return same and not bias.any()
+        return self.ended
 
 
 def _row(values: Array, width: int) -> Array:

@@ -54,7 +54,7 @@ def check_first_alone(args: Any) -> None:
         raise InputError("its first input alone may depend on the observation")
 
 
-def activation(name: str) -> Action:
+def _activation(name: str, values: Any = VALUE, inplace: bool = False) -> Action:
     """One of an encoder's activations but the layer norm."""
     return Action(lambda chain: chain.activate(name), ACTIVATIONS[name])
 
@@ -68,7 +68,7 @@ def with_slope(name: str, beta: float) -> Action:
     if not 0 < beta < math.inf:
         raise InputError(f"its beta is {beta}: it must be positive")
     if beta == 1:
-        return activation(name)
+        return _activation(name)
     return Action(
         lambda chain: chain.scale(beta).activate(name).scale(1 / beta),
         lambda values: ACTIVATIONS[name](values * beta) / beta,
@@ -109,13 +109,13 @@ def _batch_norm(
 
 
 def _gelu(values: Any, approximate: str = "none") -> Action:
-    return activation("gelu-tanh" if approximate == "tanh" else "gelu")
+    return _activation("gelu-tanh" if approximate == "tanh" else "gelu")
 
 
 def _elu(values: Any, alpha: float = 1.0, inplace: bool = False) -> Action:
     if alpha != 1:
         raise InputError(f"its alpha is {alpha:g}: only 1 can be converted")
-    return activation("elu")
+    return _activation("elu")
 
 
 def _softplus(values: Any, beta: float = 1, threshold: float = _USUAL_THRESHOLD) -> Action:
@@ -206,12 +206,8 @@ _POINTWISE: dict[str, Callable[..., Action]] = {  # of values and constants in a
 }
 
 
-def _same(name: str) -> Callable[..., Action]:
-    return lambda values, inplace=False: activation(name)
-
-
 _OPERATIONS: dict[str, Callable[..., Action]] = {  # of one value, the first argument
-    **{name: _same(name) for name in ("relu", "tanh", "sigmoid", "silu", "sin")},
+    **{name: partial(_activation, name) for name in ("relu", "tanh", "sigmoid", "silu", "sin")},
     "gelu": _gelu,
     "elu": _elu,
     "softplus": _softplus,

@@ -1,6 +1,5 @@
 """The stable-baselines3 environment: many lanes of a task, observed in full or by an encoder."""
 
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -142,7 +141,7 @@ class JitterbugVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Get an attribute of this environment, which the lanes share."""
-        return self._for_lanes(indices, lambda: getattr(self, attr_name))
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of this environment, for all lanes."""
@@ -153,16 +152,8 @@ class JitterbugVecEnv(VecEnv):
     ) -> list[Any]:
         """Call a method of this environment once; the result is repeated for every lane."""
         result = getattr(self, method_name)(*args, **kwargs)
-        return self._for_lanes(indices, lambda: result)
+        return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
         """False: no lane is an environment of its own."""
-        return self._for_lanes(indices, lambda: False)
-
-    def _for_lanes(self, indices: VecEnvIndices, value: Callable[[], Any]) -> list[Any]:
-        lanes: Sequence[int] = range(self.num_envs)
-        if isinstance(indices, int):
-            lanes = [indices]
-        elif indices is not None:
-            lanes = list(indices)
-        return [value() for _ in lanes]
+        return [False for _ in self._get_indices(indices)]

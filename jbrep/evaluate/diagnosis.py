@@ -140,7 +140,7 @@ def _side_by_side(
                     kind=encoder.kind,
                     latent=encoder.latent_size,
                     loses=lost(judged.needs.controller, known["nonlinear_probes"]),
-                    method=_said_by_method(encoder),
+                    method=dict(encoder.header.metrics) if isinstance(encoder, Encoder) else {},
                     **known,
                 )
 
@@ -197,11 +197,6 @@ def networks(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy | None 
     fitted = iter(fit([*pairs, readout.problem(encoder, held_out), *of_policy.values()]))
     forward = {steps: beside(next(fitted), next(fitted)) for steps in ahead}
     return Networks(forward, next(fitted), dict(zip(of_policy, fitted, strict=True)))
-
-
-def _said_by_method(encoder: BaseEncoder) -> dict[str, Any]:
-    """What the method says of its own fit, such as its spectrum."""
-    return dict(encoder.header.metrics) if isinstance(encoder, Encoder) else {}
 
 
 def _check(label: str, encoder: BaseEncoder, data: ScaledDataset) -> None:
