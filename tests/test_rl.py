@@ -102,11 +102,8 @@ def test_the_later_versions_settings_reach_sac_and_td3():
         assert (agent.action_noise._mu, agent.action_noise._sigma) == (0, 0.2)
         assert widths(agent.actor)[:2] == [350, 250]
     assert (sac.batch_size, sac.ent_coef) == (256, "auto")
-    assert (td3.learning_starts, td3.gradient_steps, td3.train_freq.frequency) == (
-        10_000,
-        1000,
-        1000,
-    )
+    assert (td3.learning_starts, td3.gradient_steps) == (10_000, 1000)
+    assert td3.train_freq.frequency == 1000
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -407,22 +404,16 @@ def test_nothing_in_a_runs_folder_runs_as_code(short, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "message"),
+    ("name", "message"),
     [
-        (POLICY, None, r"can't read .*policy\.safetensors: No such file"),
-        ("encoder.safetensors", None, "no encoder"),
-        ("run.json", None, "no run in"),
-        ("run.json", {"encoder": "0" * 64}, "not the encoder"),
+        (POLICY, r"can't read .*policy\.safetensors: No such file"),
+        ("encoder.safetensors", "no encoder"),
+        ("run.json", "no run in"),
     ],
 )
-def test_a_damaged_folder_is_named(name, content, message, short, tmp_path):
+def test_a_folder_without_one_of_its_files_is_named(name, message, short, tmp_path):
     folder = shutil.copytree(short, tmp_path / "run")
-    if content is None:
-        (folder / name).unlink()
-    else:
-        run = json.loads((folder / name).read_text())
-        run["settings"] |= content
-        (folder / name).write_text(json.dumps(run))
+    (folder / name).unlink()
     with pytest.raises(InputError, match=message) as error:
         load_run(folder)
     assert "\n" not in str(error.value)

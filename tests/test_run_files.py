@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import jbrep
+from command import jbrep, mistake, refused
 from made_up import write_checkpoint
 from stable_baselines3 import A2C
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -77,14 +77,6 @@ def under_way(trained, tmp_path):
     shutil.copy(trained / ENCODER, folder)
     shutil.copy(trained.with_name(CHECKPOINT), folder)
     return folder
-
-
-def refused(use, *arguments):
-    """The one line that a user gets."""
-    with pytest.raises(InputError) as error:
-        use(*arguments)
-    assert "\n" not in str(error.value)
-    return str(error.value)
 
 
 def forge(folder, tensors, **changes):
@@ -170,8 +162,7 @@ def test_a_run_file_of_anything_else(content, message, run):
     (run / RUN).write_bytes(content)
     assert message in refused(read_run, run)
     for command in (("evaluate-policy", run), ("report", run), ("inspect", run)):
-        told = jbrep(*command)
-        assert (told.exit_code, told.output.count("\n")) == (2, 1)
+        mistake(*command)
 
 
 NO_EVALUATIONS = (
@@ -185,8 +176,7 @@ def test_evaluations_that_are_none(run):
     for rows in NO_EVALUATIONS:
         (run / EVALUATIONS).write_text(f"step,episode,return\n{rows}" if rows else "")
         assert f"{EVALUATIONS} is damaged or " in refused(read_evaluations, run)
-    told = jbrep("report", run)
-    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    mistake("report", run)
 
 
 def test_weights_are_those_of_the_run(run):
@@ -257,9 +247,7 @@ def test_weights_too_large_to_act_with_are_refused(run):
         n: np.sign(t - np.float32(0.01)) if n[0] == "p" else t for n, t in weights_of(run).items()
     }
     forge(run, {n: np.float32(1e38) * sign if n[0] == "p" else sign for n, sign in signs.items()})
-    told = jbrep("evaluate-policy", run, "--episodes", 1)
-    assert (told.exit_code, told.output.count("\n")) == (2, 1)
-    assert "the policy's actions are not finite" in told.output
+    assert "the policy's actions are not finite" in mistake("evaluate-policy", run, "--episodes", 1)
 
 
 @pytest.mark.parametrize("name", [RUN, POLICY, ENCODER, EVALUATIONS])
@@ -355,9 +343,7 @@ def test_a_damaged_checkpoint_is_named(under_way):
 def test_a_run_without_a_checkpoint_so_far(under_way):
     (under_way / CHECKPOINT).unlink()
     assert f"{RUN} or {CHECKPOINT} is expected" in refused(load_run, under_way)
-    told = jbrep("evaluate-policy", under_way)
-    assert (told.exit_code, told.output.count("\n")) == (2, 1)
-    assert "no run with a policy or checkpoint" in told.output
+    assert "no run with a policy or checkpoint" in mistake("evaluate-policy", under_way)
 
 
 def test_evaluating_a_run(run):
@@ -375,12 +361,6 @@ def test_evaluating_a_run(run):
     assert "step" not in record
 
 
-def test_a_run_is_evaluated_as_it_was_while_it_trained(run):
-    at_end = [row.episode_return for row in read_evaluations(run) if row.step == 80]
-    (rollout,) = find_player(str(run)).play([0])
-    assert rollout.reward.sum() == pytest.approx(at_end[0], abs=2e-3)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -390,9 +370,7 @@ def test_a_run_is_evaluated_as_it_was_while_it_trained(run):
     ],
 )
 def test_options_that_a_run_refuses(arguments, message, run):
-    told = jbrep("evaluate-policy", run, *arguments)
-    assert (told.exit_code, told.output.count("\n")) == (2, 1)
-    assert message in told.output
+    assert message in mistake("evaluate-policy", run, *arguments)
 
 
 def test_which_encoder_a_policy_by_name_observes_through(tmp_path):
@@ -415,9 +393,8 @@ def test_episodes_are_as_long_as_the_run_s(run):
 
 def test_more_episodes_than_memory_holds_are_not_played(run):
     shorten(run, 10**6, evaluation_episodes=10_000, final_episodes=10_000)
-    told = jbrep("inspect", run, "--out", run / "it.rrd")
-    assert (told.exit_code, told.output.count("\n")) == (2, 1)
-    assert "plays 10,000 episodes of 1,000,000 steps at once" in told.output
+    told = mistake("inspect", run, "--out", run / "it.rrd")
+    assert "plays 10,000 episodes of 1,000,000 steps at once" in told
 
 
 def test_another_encoder_is_not_the_run_s(run):

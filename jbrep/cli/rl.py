@@ -128,7 +128,7 @@ def rl(context: click.Context, /, out: Path, project: str | None, **options: Any
     with stop_signals() as received:
         from jbrep.encoders.shipped import source_of
         from jbrep.rl import StoppedError
-        from jbrep.rl.files import EVALUATIONS, RUN, read_evaluations
+        from jbrep.rl.files import EVALUATIONS, RUN, last_returns, read_evaluations
         from jbrep.rl.job import Job, Session
         from jbrep.rl.trainers import train_jobs
 
@@ -150,8 +150,7 @@ def rl(context: click.Context, /, out: Path, project: str | None, **options: Any
         click.echo(f"the run failed: {result.reason}; see {out / RUN}", err=True)
         context.exit(1)
     say(f"encoder: {source}")
-    rows = read_evaluations(out)
-    last = [e.episode_return for e in rows if e.step == rows[-1].step]
+    last = last_returns(read_evaluations(out))
     name = result.settings.representation
     click.echo(
         f"returns on {name} at the end: {interval_of(last)}, median [10 %, 90 %] of {len(last)} "

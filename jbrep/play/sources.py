@@ -80,13 +80,13 @@ def find_policy(text: str, folder: Path, task: Task) -> Policy:
         by_name = part.partition(":")[0] in POLICIES
         if not is_trained(part) and (by_name or not any(folder.glob("policy-*.safetensors"))):
             return None
-        from jbrep.rl.frozen import freeze, has_kept  # imports torch
+        from jbrep.rl.frozen import freeze, kept  # imports torch
 
-        file = next(files)
-        if is_trained(part) or has_kept(part, folder / file):
-            path = run_folder(part) or policy_file(part, task)
-            return freeze(part if part == SHIPPED else str(path), path, folder, file)
-        return None
+        file, run = next(files), run_folder(part)
+        source = str(run or part)
+        if found := kept(source, folder / file):  # it stays, even if the run has gone on since
+            return found
+        return freeze(source, run or policy_file(part, task), file) if is_trained(part) else None
 
     return parse_policy(text, frozen)
 

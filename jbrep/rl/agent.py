@@ -1,7 +1,7 @@
 """A stable-baselines3 agent from a preset, and the evaluation of its policy."""
 
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from operator import attrgetter
 from typing import Any
@@ -21,9 +21,11 @@ from jbrep.encoders.vec_env import JitterbugVecEnv, agent_spaces
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.recording import Actor, episode_returns
 from jbrep.envs.task import Array, Task
+from jbrep.records.container import Tensors
+from jbrep.records.record import to_plain
 from jbrep.rl.files import EVALUATION_SEED
 from jbrep.rl.normalization import Statistics, normalized
-from jbrep.rl.presets import LINEAR, Hyperparameters, NetArch, sb3_class
+from jbrep.rl.presets import LINEAR, Hyperparameters, sb3_class
 from jbrep.training.trainer import allocate_adam_state, single_torch_thread
 
 See = Callable[[NDArray[np.float32]], NDArray[np.float32]]
@@ -78,7 +80,7 @@ def make_agent(
         device="cpu",
         policy_kwargs={
             **of_policy,
-            "net_arch": _net_arch(hyperparameters.net_arch),
+            "net_arch": to_plain(hyperparameters.net_arch),
             "activation_fn": ACTIVATIONS[of_policy["activation_fn"]],
             "optimizer_kwargs": {"fused": True, **of_adam},  # same Adam, less overhead
         },
@@ -97,12 +99,6 @@ def _argument(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _net_arch(given: NetArch) -> list[int] | dict[str, list[int]]:
-    if isinstance(given, Mapping):
-        return {name: list(units) for name, units in given.items()}
-    return list(given)
-
-
 def trained_parts(agent: BaseAlgorithm) -> Iterator[tuple[str, Any]]:
     """The modules and optimisers that training changes, by stable-baselines3's names for them."""
     names, _ = agent._get_torch_save_params()
@@ -114,17 +110,11 @@ def parameters(agent: BaseAlgorithm) -> Iterator[tuple[str, torch.Tensor]]:
     _, variables = agent._get_torch_save_params()
     yield from ((name, getattr(agent, name).data) for name in variables)
     for name, part in trained_parts(agent):
+        state = part.state_dict()
         if isinstance(part, torch.optim.Optimizer):
-            yield from _moments(name, part)
-        else:
-            yield from ((f"{name}.{key}", t) for key, t in part.state_dict().items())
-
-
-def _moments(name: str, optimizer: torch.optim.Optimizer) -> Iterator[tuple[str, torch.Tensor]]:
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    for i, parameter in enumerate(parameters):
-        for key, tensor in optimizer.state[parameter].items():
-            yield f"{name}.{i}.{key}", tensor
+            moments = state["state"].items()
+            state = {f"{i}.{key}": t for i, each in moments for key, t in each.items()}
+        yield from ((f"{name}.{key}", t) for key, t in state.items())
 
 
 @contextmanager
@@ -180,6 +170,17 @@ def statistics_of(agent: BaseAlgorithm) -> Statistics | None:
     """Those by which an agent normalises what it sees, if it does."""
     env = agent.get_vec_normalize_env()
     return Statistics.of(env) if env else None
+
+
+def restore_statistics(agent: BaseAlgorithm, tensors: Tensors, source: object) -> None:
+    """Let an agent that normalises go on from the statistics among tensors, see `Statistics.read`.
+
+    Raises:
+        DamageError: they aren't there, or don't fit.
+    """
+    if env := agent.get_vec_normalize_env():
+        (size,) = agent.observation_space.shape or ()
+        Statistics.read(tensors, size, source).give(env)
 
 
 class Evaluator:

@@ -12,7 +12,6 @@ import torch
 from msgspec import Meta
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.logger import Logger
 
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import DamageError, InputError, differences
@@ -20,9 +19,8 @@ from jbrep.records import container
 from jbrep.records.container import Tensors
 from jbrep.records.document import Document, document_from
 from jbrep.records.storage import exists
-from jbrep.rl.agent import parameters, statistics_of
-from jbrep.rl.files import Episode, Evaluation, RunSettings
-from jbrep.rl.normalization import Statistics
+from jbrep.rl.agent import parameters, restore_statistics, statistics_of
+from jbrep.rl.files import Episode, Evaluation, RunSettings, last_returns
 from jbrep.rl.settings import MAX_STEPS, Line
 
 MAX_BYTES = 1 << 34
@@ -48,12 +46,14 @@ class History:
         evaluations: of the deterministic policy.
         first_step: the training step from which this process continues.
         earlier_seconds: the wall time that earlier processes took.
+        mean: return of the last evaluation, once there was one.
     """
 
     episodes: list[Episode] = field(default_factory=list)
     evaluations: list[Evaluation] = field(default_factory=list)
     first_step: int = 0
     earlier_seconds: float = 0.0
+    mean: float | None = None
     _started: float = field(default_factory=time.monotonic)
 
     @property
@@ -61,33 +61,22 @@ class History:
         """The wall time so far."""
         return round(self.earlier_seconds + time.monotonic() - self._started, 1)
 
-    def evaluated(self, step: int, returns: NDArray[np.float64], logger: Logger) -> float:
-        """Record an evaluation's returns (e,) after so many steps, and log their mean.
-
-        Returns:
-            The mean.
-        """
+    def evaluated(self, step: int, returns: NDArray[np.float64]) -> None:
+        """Record an evaluation's returns (e,) after so many steps."""
         rounded = returns.round(3).tolist()
         self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(rounded)]
-        mean = float(np.mean(rounded))
-        logger.record("evaluation/mean_return", mean)
-        logger.dump(step)
-        return mean
+        self.mean = float(np.mean(rounded))
 
-    def resume(
-        self, episodes: list[Episode], evaluations: list[Evaluation], seconds: float, step: int
-    ) -> None:
-        """Continue from an earlier process's record, made at that step."""
-        self.episodes, self.evaluations = episodes, evaluations
-        self.earlier_seconds, self.first_step = seconds, step
+    def resume(self, header: "CheckpointHeader") -> None:
+        """Continue from an earlier process's record."""
+        self.episodes, self.evaluations = header.episodes, header.evaluations
+        self.earlier_seconds, self.first_step = header.seconds, header.step
+        if last := last_returns(self.evaluations):
+            self.mean = float(np.mean(last))
 
 
 class StoppedError(Exception):
-    """A run stopped on request, its checkpoint written; `train` resumes it.
-
-    Attributes:
-        step: the training step at which it stopped.
-    """
+    """A run stopped on request after so many steps, its checkpoint written; `train` resumes it."""
 
     def __init__(self, step: int):
         super().__init__(f"stopped after {step:,} steps")
@@ -117,9 +106,7 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
     with torch.no_grad():
         for name, tensor in parameters(agent):
             tensor.copy_(torch.from_numpy(tensors[f"{PARAMETERS}{name}"]))
-    if normalizer := agent.get_vec_normalize_env():
-        (size,) = agent.observation_space.shape or ()
-        Statistics.read(tensors, size, "the checkpoint").give(normalizer)
+    restore_statistics(agent, tensors, "the checkpoint")
     for name in _COUNTERS:
         setattr(agent, name, counters[name])
     agent._num_timesteps_at_start = agent.num_timesteps  # of the rate that TensorBoard shows
@@ -171,14 +158,7 @@ def read_checkpoint(path: Path) -> tuple[Tensors, CheckpointHeader]:
 
 
 class CheckpointFile:
-    """Where a run's snapshots are kept, the last one alone.
-
-    Args:
-        path: of the file.
-        settings: of the run.
-        versions: by package; these and the settings must be equal for a run to resume.
-        history: saved with a snapshot.
-    """
+    """Where a run's snapshots are kept, the last one alone, each with the history of then."""
 
     def __init__(
         self, path: Path, settings: RunSettings, versions: Mapping[str, str], history: History
@@ -213,7 +193,7 @@ class CheckpointFile:
                 f"{self.path} belongs to another configuration: {others}; choose another folder, "
                 "or delete the file to start over"
             )
-        self._history.resume(header.episodes, header.evaluations, header.seconds, header.step)
+        self._history.resume(header)
         return Snapshot(tensors, dict(header.counters))
 
     def write(self, snapshot: Snapshot) -> None:
@@ -246,7 +226,4 @@ class CheckpointFile:
         except InputError:
             raise
         except _MALFORMED:
-            raise self._damaged() from None
-
-    def _damaged(self) -> DamageError:
-        return DamageError(f"{self.path} is damaged: delete it to start over")
+            raise DamageError(f"{self.path} is damaged: delete it to start over") from None

@@ -1,6 +1,6 @@
 """A run's folder: what a run leaves there, written and read."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
@@ -244,6 +244,11 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
             "every step, or more at the last"
         )
     return evaluations
+
+
+def last_returns(evaluations: Sequence[Evaluation]) -> list[float]:
+    """The returns of the last evaluation."""
+    return [row.episode_return for row in evaluations if row.step == evaluations[-1].step]
 
 
 def read_run(folder: Path) -> RunRecord:

@@ -59,24 +59,18 @@ def _opened(file: str, content: bytes) -> tuple[PolicyHeader, Trained]:
     return policy.header, policy.trained()
 
 
-def freeze(source: str, path: Path, folder: Path, file: str) -> Frozen:
+def freeze(source: str, path: Path, file: str) -> Frozen:
     """The policy of a run, or of a policy's file, for a data set.
-
-    One that the data set has already stays, even if the run has gone on since.
 
     Args:
         source: what manifests call it.
         path: the run's folder, or the file.
-        folder: of the data set.
-        file: name of the policy's file in it.
+        file: name of the policy's file in the data set.
 
     Raises:
         InputError: the run has no policy so far, or an encoder that is code.
         DamageError: a file isn't what was written.
     """
-    name = _line(source)
-    if kept := _kept(folder / file, name):
-        return kept
     if is_policy_file(path):
         return Frozen(file, read_file(path, MAX_BYTES))
     if not exists(path / ENCODER):
@@ -84,19 +78,15 @@ def freeze(source: str, path: Path, folder: Path, file: str) -> Frozen:
             f"{source} can't be collected with: its encoder is code, which can't be kept with the "
             "data"
         )
-    return Frozen(file, pack(load_run(path), name))
+    return Frozen(file, pack(load_run(path), _line(source)))
 
 
-def has_kept(source: str, path: Path) -> bool:
-    """Whether a data set has the policy of this run already, in this file."""
-    return _kept(path, _line(source)) is not None
-
-
-def _kept(path: Path, run: str) -> Frozen | None:
+def kept(source: str, path: Path) -> Frozen | None:
+    """The policy that a data set has already in a file, if it is that of the source."""
     if not exists(path):
         return None
-    kept = Frozen(path.name, read_file(path, MAX_BYTES))
-    return kept if kept.settings()["run"] == run else None
+    found = Frozen(path.name, read_file(path, MAX_BYTES))
+    return found if found.settings()["run"] == _line(source) else None
 
 
 def _line(source: str) -> str:

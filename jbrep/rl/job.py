@@ -17,10 +17,11 @@ from jbrep.encoders import Encoder, save
 from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError
 from jbrep.records.commit import commits
-from jbrep.records.storage import exists, write_whole
-from jbrep.rl.agent import statistics_of
+from jbrep.records.storage import exists, read_file, write_whole
+from jbrep.rl.agent import Evaluator, restore_statistics, statistics_of
 from jbrep.rl.checkpoint import CheckpointFile, History
 from jbrep.rl.files import (
+    BEGINNING,
     CHECKPOINT,
     ENCODER,
     EPISODES,
@@ -36,7 +37,7 @@ from jbrep.rl.files import (
     read_run,
     write_rows,
 )
-from jbrep.rl.policy_file import Trained, pack_whole
+from jbrep.rl.policy_file import MAX_BYTES, Trained, pack_whole, read
 from jbrep.rl.policy_zip import policy_zip
 from jbrep.rl.run import Run
 from jbrep.rl.settings import MAX_LINE
@@ -70,13 +71,9 @@ class Session(NamedTuple):
 class Job:
     """A run, and the folder that is its alone.
 
-    Args:
-        run: what to train.
-        folder: it need not exist yet.
-
     Attributes:
         run: what to train.
-        folder: where.
+        folder: where; it need not exist yet.
         encoder: that the run sees its task through.
         settings: of the run, as run.json has them.
         history: what was recorded so far.
@@ -130,10 +127,38 @@ class Job:
         if isinstance(self.encoder, Encoder):
             save(self.encoder, self.folder / ENCODER)
 
-    def logger(self, writers: Sequence[KVWriter] = ()) -> Logger:
-        """What logs to TensorBoard, from the step on at which the run continues."""
+    def prepare(self, agent: BaseAlgorithm, writers: Sequence[KVWriter]) -> None:
+        """Let an untrained agent begin as the run does, and log to TensorBoard and to writers.
+
+        Raises:
+            InputError: the policy that the run begins with can't be read, or doesn't fit.
+            DamageError: that isn't what was written.
+        """
+        if self.settings.begin_from:
+            policy = read(Path(self.run.begin_from) / POLICY, self.settings.begin_from)
+            policy.fill_whole(agent.policy)
+            restore_statistics(agent, policy.tensors, policy.path)
+            write_whole(self.folder / BEGINNING, read_file(policy.path, MAX_BYTES))
         scalars = Scalars(self.folder / "tensorboard", self.history.first_step)
-        return Logger(None, [scalars, *writers])
+        agent.set_logger(Logger(None, [scalars, *writers]))
+
+    @cached_property
+    def evaluator(self) -> Evaluator:
+        """What plays the run's evaluations."""
+        episodes, threads = self.run.evaluation_episodes, self.settings.physics_threads
+        return Evaluator(self.run.task, self.encoder, episodes, num_threads=threads)
+
+    def evaluate(self, agent: BaseAlgorithm) -> None:
+        """Play an agent's deterministic policy, as often as is due, and record and log the returns.
+
+        Raises:
+            NonFiniteActionError, EnvironmentFailedError: as `Evaluator.returns`.
+        """
+        step, logger = agent.num_timesteps, agent.logger
+        returns = self.evaluator.returns(agent, self.settings.episodes_at(step))
+        self.history.evaluated(step, returns)
+        logger.record("evaluation/mean_return", self.history.mean)
+        logger.dump(step)
 
     def end(self, agent: BaseAlgorithm, failure: str) -> RunRecord:
         """Write the run's files.
@@ -146,7 +171,9 @@ class Job:
             The contents of run.json.
         """
         steps = agent.num_timesteps
-        policy = b"" if failure else self._policy(agent)
+        parts = agent.policy, self.run.task, self.encoder, self.settings
+        trained = Trained(*parts, statistics=statistics_of(agent))
+        policy = b"" if failure else pack_whole(trained)
         write_rows(self.folder / EPISODES, self.history.episodes, Episode)
         write_rows(self.folder / EVALUATIONS, self.history.evaluations, Evaluation)
         if policy:
@@ -167,11 +194,6 @@ class Job:
         result.write(self.folder / RUN)  # last: the run has ended where it exists
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
         return result
-
-    def _policy(self, agent: BaseAlgorithm) -> bytes:
-        """The contents of the policy's file."""
-        parts = (agent.policy, self.run.task, self.encoder, self.settings)
-        return pack_whole(Trained(*parts, statistics=statistics_of(agent)))
 
 
 def _one_line(text: str) -> str:

@@ -91,7 +91,8 @@ class Learner(Record, frozen=True, kw_only=True):
             raise InputError(f"base is {base} and preset {preset}: only one may name a preset")
         learner = cls.given(start.algorithm, preset or start.preset, overrides, name)
         _ = learner.hyperparameters
-        if name in _preset_names() and learner != cls.of(name):
+        presets = {base_name(each, its) for its in PRESETS for each in PRESETS[its]}
+        if name in presets and learner != cls.of(name):
             raise InputError(f'it is a preset\'s name: give it another and base = "{base}"')
         return learner
 
@@ -161,7 +162,3 @@ def read_preset(path: Path, algorithm: str) -> tuple[str, dict[str, Any]]:
 def preset_text(learner: Learner) -> str:
     """The text of a preset file with a learner's preset and overrides."""
     return toml_text({learner.algorithm: {"base": learner.preset, **learner.overrides}})
-
-
-def _preset_names() -> list[str]:
-    return [base_name(algorithm, preset) for preset in PRESETS for algorithm in PRESETS[preset]]

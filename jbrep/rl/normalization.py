@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from jbrep.envs.task import Array
 from jbrep.errors import DamageError
 
 CLIP = 10.0  # standard deviations
 _EPSILON = 1e-8  # added to the variance
 _PREFIX = "statistics."  # begins the names of the tensors
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

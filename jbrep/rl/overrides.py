@@ -1,6 +1,5 @@
 """Hyperparameters that a user sets: which there are, what each may be, and the result."""
 
-import inspect
 import json
 import types
 import typing
@@ -18,9 +17,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from jbrep.errors import InputError
-from jbrep.records.record import Finite, Record, converted, shown
+from jbrep.records.record import converted, shown, to_plain
 from jbrep.rl.agent import ACTIVATIONS, make_agent, one_line
-from jbrep.rl.presets import MAX_ENVS, Hyperparameters, NetArch, Noise, get_preset, sb3_class
+from jbrep.rl.presets import Hyperparameters, NetArch, get_preset, parameters_of, sb3_class
 
 _MOST = 10**9  # of any number
 _RANGES: dict[str, tuple[float, float]] = {  # others: from 1 if whole, else from 0
@@ -32,7 +31,6 @@ _RANGES: dict[str, tuple[float, float]] = {  # others: from 1 if whole, else fro
     "log_std_init": (-20, 20),
     "n_critics": (1, 10),
     "n_quantiles": (1, 200),
-    "num_envs": (1, MAX_ENVS),
 }
 _SCHEDULE = Annotated[
     str,
@@ -43,24 +41,7 @@ _FREQUENCY = Annotated[  # of two parts, but msgspec 0.22 crashes on that beside
     tuple[Annotated[int, Meta(ge=1)] | Literal["step", "episode"], ...],
     Meta(min_length=2, max_length=2, title='[1, "episode"]'),
 ]
-_NOISE = Annotated[
-    Noise | None,
-    Meta(
-        title='none, {"kind": "normal", "sigma": 0.1}, or {"kind": "ornstein-uhlenbeck", "mean": '
-        '0, "sigma": 0.3, "theta": 0.15}'
-    ),
-]
-
-
-class _OfAdam(Record, frozen=True):
-    """Arguments of Adam, but for its learning rate."""
-
-    betas: tuple[Finite, Finite] | None = None
-    eps: Finite | None = None
-    weight_decay: Finite | None = None
-
-
-_OWN = ("net_arch", "noise", "normalize", "num_envs", "optimizer_kwargs")
+_OWN = {*Hyperparameters.__struct_fields__} - {"algorithm_kwargs", "policy_kwargs"}
 _REFUSED = {  # arguments that are jbrep's own, with the reason
     "policy": "the policy is always an MlpPolicy",
     "env": "the environment is made from the task",
@@ -115,32 +96,25 @@ def _overridden(algorithm: str, preset: str, text: str) -> Hyperparameters:
     result = get_preset(preset, algorithm)
     for name, value in json.loads(text).items():
         _check_name(algorithm, name)
-        result = result.replace(**_changed(result, algorithm, name, value))
+        result = _changed(result, algorithm, name, value)
     _check_together(result)
     _build(algorithm, result)
     return result
 
 
-def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> dict[str, Any]:
-    """The field of hyperparameters that a setting changes."""
-    if name in _OWN:
-        return {name: _own(before, algorithm, name, value)}
+def _changed(before: Hyperparameters, algorithm: str, name: str, value: Any) -> Hyperparameters:
+    """Hyperparameters with a setting changed."""
     if name in (of_class := _parameters(algorithm)):
         checked = _typed(name, value, of_class[name])
-        return {"algorithm_kwargs": {**before.algorithm_kwargs, name: checked}}
-    return {"policy_kwargs": {**before.policy_kwargs, name: _of_policy(algorithm, name, value)}}
-
-
-def _own(before: Hyperparameters, algorithm: str, name: str, value: Any) -> Any:
-    """The value of a setting that isn't stable-baselines3's."""
-    if name == "net_arch":
-        return _net_arch(algorithm, value)
-    if name == "optimizer_kwargs":
-        converted(value, _OfAdam, name)
-        return {**before.optimizer_kwargs, **value}
-    if name == "noise":
-        return None if value == "none" else converted(value, _NOISE, name)
-    return _typed(name, value, {"normalize": bool, "num_envs": int}[name])
+        return before.replace(algorithm_kwargs={**before.algorithm_kwargs, name: checked})
+    if name not in _OWN:
+        checked = _of_policy(algorithm, name, value)
+        return before.replace(policy_kwargs={**before.policy_kwargs, name: checked})
+    if name == "optimizer_kwargs" and isinstance(value, dict):
+        value = {**before.optimizer_kwargs, **value}
+    after = before.replace(**{name: _or_none(value)})
+    _check_parts(algorithm, after.net_arch)
+    return after
 
 
 def setting_names(algorithm: str) -> list[str]:
@@ -149,9 +123,7 @@ def setting_names(algorithm: str) -> list[str]:
     Raises:
         InputError: unknown algorithm.
     """
-    own = set(_OWN)
-    if not _is_off_policy(algorithm):
-        own.remove("noise")
+    own = _OWN if is_off_policy(algorithm) else _OWN - {"noise"}
     return sorted({*_parameters(algorithm), *_policy_parameters(algorithm), *own})
 
 
@@ -162,8 +134,9 @@ def check_shape(algorithm: str, hyperparameters: Hyperparameters) -> Hyperparame
         InputError: an unknown argument, or a value that it can't have.
     """
     of_class = hyperparameters.algorithm_kwargs
+    _check_parts(algorithm, hyperparameters.net_arch)
     return Hyperparameters(
-        _net_arch(algorithm, hyperparameters.net_arch),
+        hyperparameters.net_arch,
         {name: of_class[name] is True for name in _SHAPING if name in of_class},
         policy_kwargs={
             name: _of_policy(algorithm, name, value)
@@ -186,45 +159,35 @@ def _check_name(algorithm: str, name: str) -> None:
 @cache
 def _parameters(algorithm: str) -> dict[str, Any]:
     """The arguments of an algorithm's class that can be set, with their types."""
-    given = inspect.signature(sb3_class(algorithm)).parameters.values()
-    return {
-        p.name: p.annotation for p in given if p.name not in _REFUSED and not p.name.startswith("_")
-    }
+    left_out = {*_REFUSED, "_init_setup_model"}
+    of_class, _ = parameters_of(algorithm)
+    return {name: each.annotation for name, each in of_class.items() if name not in left_out}
 
 
 @cache
 def _policy_parameters(algorithm: str) -> dict[str, Any]:
     """The same for its policy's class."""
-    policy = sb3_class(algorithm).policy_aliases["MlpPolicy"]
     left_out = {*_NOT_OF_POLICIES, *_REFUSED, *_OWN}
-    given = inspect.signature(policy).parameters.values()
-    return {p.name: p.annotation for p in given if p.name not in left_out}
+    _, of_policy = parameters_of(algorithm)
+    types = {name: each.annotation for name, each in of_policy.items() if name not in left_out}
+    return {**types, "activation_fn": Literal[tuple(ACTIVATIONS)]}
 
 
 def _of_policy(algorithm: str, name: str, value: Any) -> Any:
     known = _policy_parameters(algorithm)
     if name not in known:
         raise InputError(f"the policy of {algorithm} has no argument {name!r}")
-    if name == "activation_fn":
-        if not isinstance(value, str) or value not in ACTIVATIONS:
-            raise InputError(
-                f"{name} is {shown(value)}: it must be one of {', '.join(ACTIVATIONS)}"
-            )
-        return value
     return _typed(name, value, known[name])
 
 
-def _net_arch(algorithm: str, value: Any) -> Any:
-    parts = {"pi", "qf"} if _is_off_policy(algorithm) else {"pi", "vf"}
-    checked = converted(value, NetArch, "net_arch")
-    if isinstance(checked, Mapping) and {*checked} != parts:
-        raise InputError(
-            f"net_arch is {shown(value)}: its parts must be {' and '.join(sorted(parts))}"
-        )
-    return checked
+def _check_parts(algorithm: str, net_arch: NetArch) -> None:
+    parts = ["pi", "qf"] if is_off_policy(algorithm) else ["pi", "vf"]
+    if isinstance(net_arch, Mapping) and sorted(net_arch) != parts:
+        raise InputError(f"net_arch is {shown(net_arch)}: its parts must be {' and '.join(parts)}")
 
 
-def _is_off_policy(algorithm: str) -> bool:
+def is_off_policy(algorithm: str) -> bool:
+    """Whether an algorithm learns from a replay buffer."""
     return issubclass(sb3_class(algorithm), OffPolicyAlgorithm)
 
 
@@ -235,10 +198,13 @@ def _typed(name: str, value: Any, annotation: Any) -> Any:
         InputError: it may not.
     """
     kinds = _kinds(annotation)
-    if value == "none" and types.NoneType in kinds:  # TOML has no null
-        return None
-    result = converted(value, _allowed(name, kinds), name)
-    return list(result) if isinstance(result, tuple) else result
+    value = _or_none(value) if types.NoneType in kinds else value
+    return to_plain(converted(value, _allowed(name, kinds), name))
+
+
+def _or_none(value: Any) -> Any:
+    """A value as TOML has it, which has no null."""
+    return None if value == "none" else value
 
 
 def _kinds(annotation: Any) -> tuple[Any, ...]:

@@ -4,8 +4,6 @@ import io
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.base_class import BaseAlgorithm
-
 from jbrep.encoders import find, load
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.code import make
@@ -13,7 +11,7 @@ from jbrep.encoders.encoder import as_file
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
 from jbrep.records.record import to_plain
-from jbrep.records.storage import exists, read_file, write_whole
+from jbrep.records.storage import exists, read_file
 from jbrep.rl.agent import Spaces, one_line
 from jbrep.rl.checkpoint import PARAMETERS, read_checkpoint, without
 from jbrep.rl.files import (
@@ -162,10 +160,7 @@ def run_encoder(folder: Path, settings: RunSettings) -> BaseEncoder:
 def policy_to_begin_with(folder: Path, settings: RunSettings, latent_size: int) -> str:
     """The SHA-256 of a finished run's policy, once it is sure that a run can begin with it.
 
-    Args:
-        folder: of the finished run.
-        settings: of the run that is to begin.
-        latent_size: of its encoder.
+    That run's folder is given, and the settings and latent size of the one that is to begin.
 
     Raises:
         InputError: the run in the folder isn't finished, or differs in algorithm, network or in
@@ -195,24 +190,3 @@ def _sizes(settings: RunSettings, latent_size: int) -> dict[str, Any]:
         "latent": latent_size,
         "actions": settings.environment.action_size,
     }
-
-
-def begin(agent: BaseAlgorithm, source: Path, sha256: str, folder: Path) -> None:
-    """Give an untrained agent the weights of a finished run's policy, and what normalises its view.
-
-    Args:
-        agent: untrained.
-        source: the folder of the finished run.
-        sha256: of its policy, see `policy_to_begin_with`.
-        folder: of the run that begins, where a copy is kept.
-
-    Raises:
-        InputError: the weights can't be read, or don't fit.
-        DamageError: they aren't what was written.
-    """
-    policy = read(source / POLICY, sha256)
-    policy.fill_whole(agent.policy)
-    if normalizer := agent.get_vec_normalize_env():
-        (size,) = agent.observation_space.shape or ()
-        Statistics.read(policy.tensors, size, policy.path).give(normalizer)
-    write_whole(folder / BEGINNING, read_file(policy.path, MAX_BYTES))

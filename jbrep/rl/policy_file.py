@@ -72,12 +72,7 @@ class Trained(NamedTuple):
         return _finite(deterministic(self.policy, self.task, see, batch_size=1))
 
     def with_weights(self, weights: Tensors, tensors: Tensors, source: Path) -> "Trained":
-        """The policy with these weights, and with statistics from the tensors if it has any.
-
-        Args:
-            weights: of the part that acts, by the names of its parameters.
-            tensors: with those of `Statistics` among them.
-            source: the file that they come from, for messages.
+        """The policy with weights of the part that acts, and with statistics from a file's tensors.
 
         Raises:
             InputError: the weights don't fit the policy.
@@ -106,12 +101,7 @@ def acting(policy: BasePolicy) -> BasePolicy:
 
 
 def fill(policy: BasePolicy, weights: Tensors, path: Path) -> None:
-    """Put weights into a policy or its acting part: all that it has, and no others.
-
-    Args:
-        policy: which they are of.
-        weights: by the names of its parameters.
-        path: of the file that they come from, for messages.
+    """Put weights, by their names, into a policy or its acting part: all it has, and no others.
 
     Raises:
         InputError: they don't fit the policy.
@@ -126,12 +116,7 @@ def fill(policy: BasePolicy, weights: Tensors, path: Path) -> None:
 
 
 def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
-    """The untrained policy of a run; `Trained.with_weights` gives it weights.
-
-    Args:
-        settings: of the run.
-        encoder: of the run.
-        path: where the settings are from, for messages.
+    """The untrained policy of a run, whose settings are from that path.
 
     Raises:
         InputError: the settings can't be those of a run, or the encoder isn't the run's.
@@ -152,11 +137,7 @@ def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
 
 
 def pack(trained: Trained, run: str) -> bytes:
-    """The bytes of a policy's file, to act with alone.
-
-    Args:
-        trained: the policy of a run.
-        run: what the run is called, a line.
+    """The bytes of a policy's file, to act with alone; `run` is what its run is called, a line.
 
     Raises:
         InputError: its encoder is code, which no file can hold.
@@ -221,12 +202,7 @@ class PolicyFile(NamedTuple):
         return without(_ACTING, self.tensors)
 
     def fill_whole(self, policy: BasePolicy) -> None:
-        """Put all weights into a policy, those that only training needs, too.
-
-        Raises:
-            InputError: they don't fit the policy, or the file isn't a run's own.
-            DamageError: as `fill`.
-        """
+        """As `fill`, with the weights that only training needs, too, which a run's own file has."""
         prefix = "" if acting(policy) is policy else "actor."
         acts = {f"{prefix}{name}": values for name, values in self.weights.items()}
         fill(policy, acts | without(_TRAINING, self.tensors), self.path)
@@ -258,11 +234,7 @@ class PolicyFile(NamedTuple):
 
 
 def read(path: Path, sha256: str = "") -> PolicyFile:
-    """Read a policy's file.
-
-    Args:
-        path: of the file.
-        sha256: of the file, if that is known.
+    """Read a policy's file, whose SHA-256 may be known.
 
     Raises:
         InputError: no such file, another kind of file, or another version of the format.

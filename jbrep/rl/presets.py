@@ -1,23 +1,23 @@
 """The hyperparameters of algorithms, and the presets of them, as data."""
 
 from collections.abc import Mapping
+from functools import cache
+from inspect import Parameter, signature
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
+from jbrep.envs.task import Array
 from jbrep.errors import choose
-from jbrep.records.record import Finite, Record
+from jbrep.records.record import Finite, Record, from_plain
 from jbrep.rl.settings import CLASSES, MODERN, PAPER
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.noise import ActionNoise
-
-Array = NDArray[np.float64]
 
 MAX_LAYERS, MAX_UNITS = 8, 1024  # of a policy's network
 MAX_ENVS = 4096
@@ -74,10 +74,24 @@ class OrnsteinUhlenbeckNoise(Record, frozen=True, tag_field="kind", tag="ornstei
 
 
 Noise = NormalNoise | OrnsteinUhlenbeckNoise
+_NOISES = (
+    'none, {"kind": "normal", "sigma": 0.1}, or {"kind": "ornstein-uhlenbeck", "mean": 0, '
+    '"sigma": 0.3, "theta": 0.15}'
+)
+
+
+class _OfAdam(Record, frozen=True):
+    """Arguments of Adam, but for its learning rate."""
+
+    betas: tuple[Finite, Finite] | None = None
+    eps: Finite | None = None
+    weight_decay: Finite | None = None
 
 
 class Hyperparameters(Record, frozen=True):
     """Those of an algorithm; what isn't named keeps stable-baselines3's default.
+
+    All fields but the arguments of stable-baselines3's classes can be set by their names, too.
 
     Attributes:
         net_arch: units of the hidden layers of actor and critic, or of each by its name: pi and
@@ -94,17 +108,24 @@ class Hyperparameters(Record, frozen=True):
     net_arch: NetArch
     algorithm_kwargs: Mapping[str, Any]
     num_envs: Annotated[int, Meta(ge=1, le=MAX_ENVS)] = 1
-    noise: Noise | None = None
+    noise: Annotated[Noise | None, Meta(title=_NOISES)] = None
     optimizer_kwargs: Mapping[str, Any] = {}
     policy_kwargs: Mapping[str, Any] = msgspec.field(
         default_factory=lambda: {"activation_fn": "relu"}
     )
     normalize: bool = False
 
+    def check(self) -> None:
+        """As for `Record`."""
+        from_plain(self.optimizer_kwargs, _OfAdam, "optimizer_kwargs")
+
 
 _SHARED = {"learning_rate": 1e-4, "gamma": 0.99}
 _HIDDEN = (350, 250)
-_ON_POLICY = {"eps": 1e-5}  # of Adam, as stable-baselines3 sets it for PPO and A2C
+_ON_POLICY: dict[str, Any] = {
+    "num_envs": 8,
+    "optimizer_kwargs": {"eps": 1e-5},  # as stable-baselines3 sets it for PPO and A2C
+}
 _PAPER = {
     "ddpg": Hyperparameters(
         _HIDDEN,
@@ -145,15 +166,10 @@ _PAPER = {
             "clip_range_vf": None,
             "n_epochs": 4,
         },
-        num_envs=8,
-        optimizer_kwargs=_ON_POLICY,
+        **_ON_POLICY,
     ),
-    "a2c": Hyperparameters(
-        _HIDDEN, {**_SHARED, "use_rms_prop": False}, num_envs=8, optimizer_kwargs=_ON_POLICY
-    ),
-    "trpo": Hyperparameters(
-        _HIDDEN, {**_SHARED, "n_steps": 256}, num_envs=8, optimizer_kwargs=_ON_POLICY
-    ),
+    "a2c": Hyperparameters(_HIDDEN, {**_SHARED, "use_rms_prop": False}, **_ON_POLICY),
+    "trpo": Hyperparameters(_HIDDEN, {**_SHARED, "n_steps": 256}, **_ON_POLICY),
 }
 
 _OFF_POLICY = {"learning_rate": 3e-4, "learning_starts": 1000, "train_freq": 4}
@@ -168,20 +184,17 @@ _MODERN = {
     "ppo": Hyperparameters(
         (64, 64),
         {"learning_rate": 3e-4, "n_steps": 256, "batch_size": 64, "n_epochs": 10},
-        num_envs=8,
-        optimizer_kwargs=_ON_POLICY,
+        **_ON_POLICY,
     ),
     "a2c": Hyperparameters(
         (64, 64),
         {"learning_rate": 7e-4, "use_rms_prop": False, "n_steps": 8, "gae_lambda": 0.9},
-        num_envs=8,
-        optimizer_kwargs=_ON_POLICY,
+        **_ON_POLICY,
     ),
     "trpo": Hyperparameters(
         (64, 64),
         {"learning_rate": 1e-3, "n_steps": 256, "n_critic_updates": 20, "cg_damping": 0.1},
-        num_envs=8,
-        optimizer_kwargs=_ON_POLICY,
+        **_ON_POLICY,
     ),
 }
 PRESETS = {PAPER: _PAPER, MODERN: _MODERN}
@@ -204,3 +217,10 @@ def sb3_class(algorithm: str) -> "type[BaseAlgorithm]":
         InputError: unknown algorithm.
     """
     return cast("type[BaseAlgorithm]", resolve_name(choose(algorithm, CLASSES, "algorithm")))
+
+
+@cache
+def parameters_of(algorithm: str) -> tuple[Mapping[str, Parameter], Mapping[str, Parameter]]:
+    """What stable-baselines3's class of an algorithm takes, and what that of its policy does."""
+    kind = sb3_class(algorithm)
+    return signature(kind).parameters, signature(kind.policy_aliases["MlpPolicy"]).parameters

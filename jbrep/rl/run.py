@@ -12,6 +12,7 @@ from jbrep.envs.description import as_task
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
+from jbrep.rl.cohort import ALGORITHMS
 from jbrep.rl.cohort.algorithm import check as check_for_cohort
 from jbrep.rl.files import RunSettings
 from jbrep.rl.learner import Learner
@@ -20,14 +21,14 @@ from jbrep.rl.settings import (
     COHORT,
     CPU,
     CUDA,
+    FLOAT32,
     MAX_EPISODES,
     PAPER,
-    PRECISIONS,
+    SB3,
     Name,
     Seed,
     Sha256,
     TrainingSettings,
-    usual_trainer,
 )
 from jbrep.training.trainer import get_device, single_torch_thread
 
@@ -142,10 +143,10 @@ def trainer_of(learner: Learner, settings: TrainingSettings) -> str:
     Raises:
         InputError: the one that is named can't, and another could.
     """
-    trainer = settings.trainer or usual_trainer(learner.algorithm)
+    trainer = settings.trainer or (COHORT if learner.algorithm in ALGORITHMS else SB3)
     if trainer == COHORT:
         check_for_cohort(learner.algorithm, learner.hyperparameters)
-    elif trainer not in PRECISIONS[settings.precision]:
+    elif settings.precision != FLOAT32:
         raise InputError(f"{trainer} has no {settings.precision}: leave the precision out")
     elif settings.device == CUDA:
         raise InputError(f"{trainer} trains on the cpu here: leave the device out")

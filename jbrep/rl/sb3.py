@@ -1,8 +1,6 @@
 """stable-baselines3 as the trainer of one run at a time, for all of its algorithms."""
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,24 +17,20 @@ from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
 from jbrep.records.container import Tensors
 from jbrep.rl import checkpoint
-from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed, unchecked_distributions
+from jbrep.rl.agent import make_agent, make_env, training_seed, unchecked_distributions
 from jbrep.rl.checkpoint import (
     ACTIONS_NOT_FINITE,
     LANES,
     WEIGHTS_NOT_FINITE,
-    CheckpointFile,
     DivergedError,
-    History,
     Snapshot,
     StoppedError,
     without,
 )
-from jbrep.rl.files import Episode, RunRecord, RunSettings
-from jbrep.rl.job import Ended, Job, Session, Watch
-from jbrep.rl.policy import begin
+from jbrep.rl.files import Episode, RunRecord
+from jbrep.rl.job import Ended, Job, Session
 from jbrep.rl.policy_file import acting
 
-_ROLLOUT = ("_last_obs", "_last_episode_starts")
 _UNSCALED = "_last_original_obs"  # before it was normalised
 _EXPLORATION = ("exploration_mat", "exploration_matrices")
 _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -54,28 +48,22 @@ def train_in_turn(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
 
 def _train(job: Job, session: Session) -> RunRecord:
     run, settings = job.run, job.settings
-    chosen = settings.hyperparameters
-    checkpointer = Checkpointer(job.checkpoint, session.save_every, session.stop)
+    chosen, follower = settings.hyperparameters, _Follower(job, session)
     job.keep_encoder()
     seed = training_seed(run.seed)
     env = make_env(run.task, chosen.num_envs, seed, job.encoder, chosen.normalize)
     agent = make_agent(settings.algorithm, chosen, env, run.seed)
     env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
-    if settings.begin_from:
-        begin(agent, Path(run.begin_from), settings.begin_from, job.folder)
-    agent.set_logger(job.logger(session.writers))
-    evaluator = Evaluator(run.task, job.encoder, run.evaluation_episodes)
-    watch = partial(session.watch, job)
-    recorder = Recorder(job.history, evaluator, settings, watch)
-    failure = _learn(agent, run.steps, [recorder, checkpointer])
+    job.prepare(agent, session.writers)
+    failure = _learn(agent, run.steps, follower)
     return job.end(agent, failure)
 
 
-def _learn(agent: BaseAlgorithm, steps: int, callbacks: Sequence[BaseCallback]) -> str:
+def _learn(agent: BaseAlgorithm, steps: int, callback: BaseCallback) -> str:
     """Train up to that step; why training failed, or nothing."""
     try:
         with unchecked_distributions():
-            agent.learn(steps, callback=[*callbacks])
+            agent.learn(steps, callback=callback)
     except (DivergedError, EnvironmentFailedError) as error:
         return str(error)
     except NonFiniteActionError:
@@ -85,53 +73,64 @@ def _learn(agent: BaseAlgorithm, steps: int, callbacks: Sequence[BaseCallback]) 
     return ""
 
 
-class Recorder(BaseCallback):
-    """Records an agent's training: its episodes, evaluations and progress.
+class _Follower(BaseCallback):
+    """Records an agent's training, evaluates its policy, and keeps its checkpoint.
 
     The policy is evaluated before the first step, after the last, and at intervals in between.
+    Training goes on from the run's snapshot, if there is one. Another is taken now and then between
+    rollouts, where an agent's state is complete.
 
-    Args:
-        history: to record in.
-        evaluator: of the policy.
-        settings: of the run that is recorded.
-        watch: called with the progress before each rollout.
+    Raises:
+        InputError: the checkpoint is damaged, or of other settings or versions.
+        StoppedError: (in training) the session is to stop; the checkpoint is written.
     """
 
-    def __init__(self, history: History, evaluator: Evaluator, settings: RunSettings, watch: Watch):
+    def __init__(self, job: Job, session: Session):
         super().__init__()
-        self._history, self._evaluator = history, evaluator
-        self._settings, self._watch = settings, watch
-        self._mean: float | None = None  # return of the last evaluation
+        self._job, self._session = job, session
+        self._snapshot = job.checkpoint.read()
+        self._draws: Tensors = {}  # of the snapshot, until the first rollout
+
+    def _on_training_start(self) -> None:
+        if self._snapshot:
+            self._draws = self._snapshot.tensors
+            with self._job.checkpoint.resuming():
+                restore(self.model, self._snapshot)
+            self._snapshot = None  # a replay buffer can be large
 
     def _on_rollout_start(self) -> None:
         check_finite(self.model)
-        if not self._history.evaluations:
-            self._evaluate()
-        self._watch(self.model.num_timesteps, self._mean)
+        if not self._job.history.evaluations:
+            self._job.evaluate(self.model)
+        self._tell()
+        if self._draws:  # state-dependent noise has just been drawn, for the second time
+            _restore_draws(self.model, self._draws)
+            self._draws = {}
+        stopping, file = self._session.stop(), self._job.checkpoint
+        if stopping or file.is_due(self._session.save_every):
+            file.write(take(self.model))
+        if stopping:
+            raise StoppedError(self.model.num_timesteps)
 
     def _on_step(self) -> bool:
         for lane in np.flatnonzero(self.locals["dones"]).tolist():
             info = self.locals["infos"][lane]
             total, length = float(info["episode"]["r"]), int(info["episode"]["l"])
             diverged = info.get("non_finite", False)
-            self._history.episodes.append(
-                Episode(self.num_timesteps, lane, total, length, diverged)
-            )
-        if self._settings.is_evaluation_due(self.num_timesteps, self.training_env.num_envs):
-            self._evaluate()
+            row = Episode(self.num_timesteps, lane, total, length, diverged)
+            self._job.history.episodes.append(row)
+        if self._job.settings.is_evaluation_due(self.num_timesteps, self.training_env.num_envs):
+            self._job.evaluate(self.model)
         return True
 
     def _on_training_end(self) -> None:
         check_finite(self.model)
-        self._watch(self.model.num_timesteps, self._mean)  # the last evaluation can take minutes
-        self._evaluate()
-        self._watch(self.model.num_timesteps, self._mean)
+        self._tell()  # the last evaluation can take minutes
+        self._job.evaluate(self.model)
+        self._tell()
 
-    def _evaluate(self) -> None:
-        step = self.model.num_timesteps
-        episodes = self._settings.episodes_at(step)
-        returns = self._evaluator.returns(self.model, episodes)
-        self._mean = self._history.evaluated(step, returns, self.logger)
+    def _tell(self) -> None:
+        self._session.watch(self._job, self.model.num_timesteps, self._job.history.mean)
 
 
 def check_finite(agent: BaseAlgorithm) -> None:
@@ -147,60 +146,13 @@ def check_finite(agent: BaseAlgorithm) -> None:
         raise DivergedError(WEIGHTS_NOT_FINITE)
 
 
-class Checkpointer(BaseCallback):
-    """Continues an agent from the run's snapshot, if there is one, and takes one now and then.
-
-    It acts between rollouts, where an agent's state is complete, and comes after the callbacks
-    that add to the history.
-
-    Args:
-        file: of the run's snapshots.
-        save_every: seconds between them.
-        stop: whether to save and stop now.
-
-    Raises:
-        InputError: the checkpoint is damaged, or of other settings or versions.
-        StoppedError: (in training) `stop` said so.
-    """
-
-    def __init__(self, file: CheckpointFile, save_every: float, stop: Callable[[], bool]):
-        super().__init__()
-        self._file, self._save_every, self._stop = file, save_every, stop
-        self._snapshot = file.read()
-        self._draws: Tensors = {}  # of the snapshot, until the first rollout
-
-    def _on_training_start(self) -> None:
-        if self._snapshot:
-            self._draws = self._snapshot.tensors
-            with self._file.resuming():
-                restore(self.model, self._snapshot)
-            self._snapshot = None  # a replay buffer can be large
-
-    def _on_rollout_start(self) -> None:
-        if self._draws:  # state-dependent noise has just been drawn, for the second time
-            _restore_draws(self.model, self._draws)
-            self._draws = {}
-        stopping = self._stop()
-        if stopping or self._file.is_due(self._save_every):
-            self._file.write(take(self.model))
-        if stopping:
-            raise StoppedError(self.model.num_timesteps)
-
-    def _on_step(self) -> bool:
-        return True
-
-
 def take(agent: BaseAlgorithm) -> Snapshot:
     """Take a snapshot of an agent between two rollouts; its tensors share the agent's memory."""
-    monitor, env = _envs(agent)
     kind, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 draws there
     tensors, counters = checkpoint.take(agent)
+    _, env = _envs(agent)
     tensors |= {f"{LANES}{name}": values for name, values in env.state.items()}
-    tensors |= {f"noise.{i}": n.noise_prev for i, n in enumerate(_drifting_noises(agent))}
-    tensors |= {f"rollout.{name}": getattr(agent, name) for name in _ROLLOUT}
-    if agent.get_vec_normalize_env():
-        tensors |= {_UNSCALED: getattr(agent, _UNSCALED)}
-    tensors |= {"returns": monitor.episode_returns, "lengths": monitor.episode_lengths}
+    tensors |= {name: getattr(*place) for name, place in _arrays(agent).items()}
     tensors |= {"torch": torch.get_rng_state().numpy(), "numpy": np.asarray(keys)}
     if noise := _state_dependent_noise(agent):
         tensors |= {name: getattr(noise, name).detach().numpy() for name in _EXPLORATION}
@@ -218,23 +170,33 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
     """Bring an agent that is set up to learn to where the snapshot was taken."""
     checkpoint.restore(agent, snapshot)
     tensors, counters = snapshot
-    monitor, env = _envs(agent)
     if buffer := _buffer(agent):
         buffer.pos, buffer.full = counters["buffer"]
         for name, values in _transitions(buffer).items():
             values[:] = tensors[f"buffer.{name}"]
-    for i, noise in enumerate(_drifting_noises(agent)):
-        noise.noise_prev = tensors[f"noise.{i}"]
-    for name in _ROLLOUT:
-        setattr(agent, name, tensors[f"rollout.{name}"])
-    if agent.get_vec_normalize_env():
-        setattr(agent, _UNSCALED, tensors[_UNSCALED])
-    monitor.episode_returns, monitor.episode_lengths = tensors["returns"], tensors["lengths"]
+    for name, place in _arrays(agent).items():
+        setattr(*place, tensors[name])
+    _, env = _envs(agent)
     env.restore(without(LANES, tensors))
     agent.action_space.np_random.bit_generator.state = counters["action_space"]
     _restore_draws(agent, tensors)
     kind, *rest = counters["numpy"]
     np.random.set_state((kind, tensors["numpy"], *rest))  # noqa: NPY002
+
+
+def _arrays(agent: BaseAlgorithm) -> dict[str, tuple[object, str]]:
+    """Which arrays decide how a rollout goes on: the object that has each, and its attribute."""
+    monitor, _ = _envs(agent)
+    last = ("_last_obs", "_last_episode_starts")
+    places: dict[str, tuple[object, str]] = {f"rollout.{name}": (agent, name) for name in last}
+    if agent.get_vec_normalize_env():
+        places[_UNSCALED] = agent, _UNSCALED
+    for i, noise in enumerate(_drifting_noises(agent)):
+        places[f"noise.{i}"] = noise, "noise_prev"
+    return places | {
+        "returns": (monitor, "episode_returns"),
+        "lengths": (monitor, "episode_lengths"),
+    }
 
 
 def _restore_draws(agent: BaseAlgorithm, tensors: Tensors) -> None:

@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from jbrep.records.record import Record
-from jbrep.rl.cohort import ALGORITHMS
 
 CLASSES = {  # by the names of algorithms
     "ddpg": "stable_baselines3.DDPG",
@@ -17,11 +16,9 @@ CLASSES = {  # by the names of algorithms
     "tqc": "sb3_contrib.TQC",
     "crossq": "sb3_contrib.CrossQ",
 }
-DEVICES = CPU, CUDA = "cpu", "cuda"
+CPU, CUDA = "cpu", "cuda"
 COHORT, SB3 = "cohort", "sb3"
-TRAINERS = {COHORT: tuple(ALGORITHMS), SB3: tuple(CLASSES)}  # and the algorithms that each has
-FLOAT32, BFLOAT16 = "float32", "bfloat16"
-PRECISIONS = {FLOAT32: (COHORT, SB3), BFLOAT16: (COHORT,)}  # and the trainers that have each
+PRECISIONS = FLOAT32, BFLOAT16 = "float32", "bfloat16"
 PAPER, MODERN = "paper", "modern"  # presets; the paper's unless another is named
 MAX_STEPS = 10**12  # of training
 MAX_EPISODES = 10_000  # of an evaluation
@@ -108,8 +105,3 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
 def base_name(algorithm: str, preset: str) -> str:
     """An algorithm with its preset, unless that is the paper's: ddpg, sac-modern."""
     return algorithm if preset == PAPER else f"{algorithm}-{preset}"
-
-
-def usual_trainer(algorithm: str) -> str:
-    """What trains an algorithm unless another trainer is asked for."""
-    return next((name for name, its in TRAINERS.items() if algorithm in its), SB3)

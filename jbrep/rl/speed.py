@@ -6,13 +6,13 @@ from math import gcd
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
 
-from jbrep.rl.agent import Evaluator, make_agent, make_env
+from jbrep.rl.agent import make_agent, make_env
 from jbrep.rl.cohort.cohort import Cohort
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.job import Job
-from jbrep.rl.presets import sb3_class
+from jbrep.rl.overrides import is_off_policy
 from jbrep.rl.run import Run
 from jbrep.rl.settings import COHORT
 from jbrep.training.trainer import single_torch_thread
@@ -27,13 +27,14 @@ def estimate(runs: Sequence[Run]) -> float:
         runs: that can be in one cohort, or one of another trainer.
     """
     first = runs[0]
-    if issubclass(sb3_class(first.learner.algorithm), OffPolicyAlgorithm):
+    if is_off_policy(first.learner.algorithm):
         runs = [run.replace(learner=run.learner.overridden(_at_once(run))) for run in runs]
     with TemporaryDirectory() as folder, single_torch_thread():
         jobs = [Job(run, Path(folder) / str(i)) for i, run in enumerate(runs)]
-        settings = jobs[0].settings
+        settings, evaluator = jobs[0].settings, jobs[0].evaluator
         trial = _together if settings.trainer == COHORT else _alone
-        per_step, per_evaluation = trial(jobs)
+        per_step, agent = trial(jobs)
+        per_evaluation = len(jobs) * _seconds(lambda: evaluator.returns(agent))
     at_end = settings.final_episodes / first.evaluation_episodes
     evaluations = first.steps // first.evaluate_every + at_end
     return first.steps * per_step + evaluations * per_evaluation
@@ -45,29 +46,23 @@ def _at_once(run: Run) -> dict[str, int]:
     every, many = used.get("train_freq"), used.get("gradient_steps")
     if type(every) is not int or type(many) is not int or many < 1:
         return {"learning_starts": 0}
-    shared = gcd(every, many)
-    return {
-        "learning_starts": 0,
-        "train_freq": every // shared,
-        "gradient_steps": many // shared,
-    }
+    every, many = every // gcd(every, many), many // gcd(every, many)
+    return {"learning_starts": 0, "train_freq": every, "gradient_steps": many}
 
 
-def _alone(jobs: Sequence[Job]) -> tuple[float, float]:
-    """Seconds of a step, and of an evaluation."""
+def _alone(jobs: Sequence[Job]) -> tuple[float, BaseAlgorithm]:
+    """Seconds of a step, and an agent."""
     (job,) = jobs
     run, chosen = job.run, job.settings.hyperparameters
     env = make_env(run.task, chosen.num_envs, 0, job.encoder, chosen.normalize)
     agent = make_agent(run.learner.algorithm, chosen, env, 0)
-    evaluator = Evaluator(run.task, job.encoder, run.evaluation_episodes)
     learned = _seconds(lambda: agent.learn(_MIN_STEPS))  # whole rollouts, so at least one
-    return learned / agent.num_timesteps, _seconds(lambda: evaluator.returns(agent))
+    return learned / agent.num_timesteps, agent
 
 
-def _together(jobs: Sequence[Job]) -> tuple[float, float]:
-    """The same of a cohort: a step of each run, an evaluation of each."""
-    members = [Member(job, []) for job in jobs]
-    cohort = Cohort(members)
+def _together(jobs: Sequence[Job]) -> tuple[float, BaseAlgorithm]:
+    """The same of a cohort: a step of each run."""
+    cohort = Cohort([Member(job, []) for job in jobs])
 
     def learn() -> None:
         while cohort.step * len(jobs) < _MIN_STEPS:
@@ -75,7 +70,7 @@ def _together(jobs: Sequence[Job]) -> tuple[float, float]:
                 cohort.act()
             cohort.learn()
 
-    return _seconds(learn) / cohort.step, _seconds(members[0].evaluate) * len(members)
+    return _seconds(learn) / cohort.step, cohort.members[0].agent
 
 
 def _seconds(work: Callable[[], object]) -> float:

@@ -1,13 +1,13 @@
 """A search for settings of an algorithm, by Optuna; each trial is a run for each seed."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import optuna
-from optuna.distributions import CategoricalDistribution, FloatDistribution
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
@@ -15,7 +15,7 @@ from jbrep.errors import DamageError, InputError, differences
 from jbrep.records.lock import exclusive
 from jbrep.records.record import to_plain
 from jbrep.records.storage import make_folder, write_whole
-from jbrep.rl.files import FINISHED, read_evaluations
+from jbrep.rl.files import FINISHED, last_returns, read_evaluations
 from jbrep.rl.job import Job, Session
 from jbrep.rl.learner import preset_text
 from jbrep.rl.overrides import setting_names
@@ -23,8 +23,7 @@ from jbrep.rl.run import Run
 from jbrep.rl.trainers import train_jobs
 
 JOURNAL, BEST = "optuna.journal", "best.toml"
-_RANGES: dict[str, tuple[float, float] | list[Any]] = {  # logarithmic, or choices
-    "learning_rate": (1e-5, 1e-2),
+_CHOICES: dict[str, list[Any]] = {
     "batch_size": [64, 128, 256, 512],
     "gamma": [0.9, 0.95, 0.98, 0.99, 0.995, 0.999],
     "tau": [0.001, 0.005, 0.01, 0.02, 0.05],
@@ -35,6 +34,10 @@ _RANGES: dict[str, tuple[float, float] | list[Any]] = {  # logarithmic, or choic
     "vf_coef": [0.25, 0.5, 1.0],
     "target_kl": [0.005, 0.01, 0.02],
     "net_arch": [[64, 64], [256, 256], [400, 300]],
+}
+_SPACE: dict[str, BaseDistribution] = {
+    "learning_rate": FloatDistribution(1e-5, 1e-2, log=True),
+    **{n: CategoricalDistribution([*map(json.dumps, each)]) for n, each in _CHOICES.items()},
 }
 
 
@@ -107,17 +110,10 @@ def _open(search: dict[str, Any], folder: Path) -> optuna.Study:
     return study
 
 
-def _space(run: Run) -> dict[str, Any]:
+def _space(run: Run) -> dict[str, BaseDistribution]:
     """What is searched: the settings that the algorithm has and the run doesn't set."""
     there, given = setting_names(run.learner.algorithm), run.learner.overrides
-    names = (name for name in _RANGES if name in there and name not in given)
-    return {name: _distribution(_RANGES[name]) for name in names}
-
-
-def _distribution(given: tuple[float, float] | Iterable[Any]) -> Any:
-    if isinstance(given, tuple):
-        return FloatDistribution(given[0], given[1], log=True)
-    return CategoricalDistribution([json.dumps(value) for value in given])  # no lists there
+    return {name: each for name, each in _SPACE.items() if name in there and name not in given}
 
 
 def _overrides(parameters: Mapping[str, Any]) -> dict[str, Any]:
@@ -146,8 +142,7 @@ def _trial(
         if result.status != FINISHED:
             study.tell(number, state=TrialState.FAIL)
             return Trial(number, overrides, None)
-        rows = read_evaluations(job.folder)
-        returns += [row.episode_return for row in rows if row.step == rows[-1].step]
+        returns += last_returns(read_evaluations(job.folder))
     value = float(np.mean(returns))
     study.tell(number, value)
     return Trial(number, overrides, value)

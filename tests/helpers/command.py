@@ -5,9 +5,11 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner
 
 from jbrep.cli import main
+from jbrep.errors import InputError
 from jbrep.study.work import work
 
 
@@ -16,6 +18,21 @@ def jbrep(*arguments):
     result = CliRunner().invoke(main, [str(a) for a in arguments], prog_name="jbrep")
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result
+
+
+def mistake(*arguments):
+    """The one line that a command ends with where it is used wrongly."""
+    told = jbrep(*arguments)
+    assert (told.exit_code, told.output.count("\n")) == (2, 1)
+    return told.output
+
+
+def refused(use, *arguments):
+    """The one line that a user of Python gets."""
+    with pytest.raises(InputError) as error:
+        use(*arguments)
+    assert "\n" not in str(error.value)
+    return str(error.value)
 
 
 def start(*arguments):

@@ -4,7 +4,6 @@ Losses are (n,), one for each agent. Their sum is differentiated: as no agent's 
 weights of another, its gradient is that of each.
 """
 
-import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from torch.utils._pytree import tree_leaves
 from jbrep.errors import InputError
 from jbrep.rl.cohort import ALGORITHMS, get_algorithm
 from jbrep.rl.cohort.networks import Network, Stack
-from jbrep.rl.presets import Hyperparameters, sb3_class
+from jbrep.rl.presets import Hyperparameters, parameters_of
 
 Losses = dict[str, Tensor]  # (n,) each, by the names under which stable-baselines3 logs them
 _SETTINGS = {  # of stable-baselines3 that every algorithm here honours
@@ -52,6 +51,9 @@ class Algorithm(ABC):
 
     def __init__(self, stack: Stack):
         self.mlp = stack.mlp
+        self.critic = stack.networks(lambda each: each.critic.q_networks)
+        self.critic_target = stack.networks(lambda each: each.critic_target.q_networks)
+        self.critic_optimizer = stack.adam(self.critic, lambda each: each.critic.optimizer)
         self.gamma: float = stack.agents[0].gamma
         self.tau: float = stack.agents[0].tau
 
@@ -129,9 +131,7 @@ def check(algorithm: str, hyperparameters: Hyperparameters) -> None:
     if isinstance(of_class.get("train_freq"), list):
         raise InputError(f"a cohort takes train_freq as a number of steps: {_INSTEAD}")
     honoured = {*_SETTINGS, *get_algorithm(algorithm).settings}
-    takes = sb3_class(algorithm)
-    for given, kind in ((of_class, takes), (of_policy, takes.policy_aliases["MlpPolicy"])):
-        parameters = inspect.signature(kind).parameters
+    for given, parameters in zip((of_class, of_policy), parameters_of(algorithm), strict=True):
         for name, value in given.items():
             if name not in honoured and value != parameters[name].default:
                 raise InputError(f"a cohort can't learn with {name} = {value}: {_INSTEAD}")

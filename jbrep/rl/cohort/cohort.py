@@ -8,12 +8,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from jbrep.encoders.base import Float32
 from jbrep.envs.endless import Endless
+from jbrep.envs.task import Array
 from jbrep.rl.agent import training_seed
 from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, LANES, Snapshot, without
 from jbrep.rl.cohort import get_algorithm
 from jbrep.rl.cohort.algorithm import Batch, Losses
-from jbrep.rl.cohort.member import Array, Float32, Member
+from jbrep.rl.cohort.member import Member
 from jbrep.rl.cohort.networks import Stack
 from jbrep.rl.cohort.replay import ReplayBuffer, capacity_of
 from jbrep.rl.job import Job
@@ -22,11 +24,8 @@ from jbrep.rl.job import Job
 class Cohort:
     """n members that act and learn at once.
 
-    Args:
-        members: which can learn together, see `jbrep.rl.cohort.trainer`.
-
     Attributes:
-        members: n.
+        members: which can learn together, see `jbrep.rl.cohort.trainer`.
         step: of training, over the lanes of a member.
     """
 

@@ -4,7 +4,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,21 +14,19 @@ from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import Tensor
 
-from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
+from jbrep.encoders.base import Float32
+from jbrep.envs.lanes import EnvironmentFailedError, Flags, NonFiniteActionError
+from jbrep.envs.task import Array
 from jbrep.records.container import Tensors
 from jbrep.rl import checkpoint
-from jbrep.rl.agent import Evaluator, Spaces, make_agent
+from jbrep.rl.agent import Spaces, make_agent
 from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE, Snapshot, without
 from jbrep.rl.files import Episode
 from jbrep.rl.job import Job
 from jbrep.rl.normalization import normalized
-from jbrep.rl.policy import begin
 from jbrep.rl.presets import Noise
 
-Array = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 Indices = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 _LOG_EVERY = 4  # episodes, as in stable-baselines3
 _RANDOM = "random."  # begins the names of what its random numbers come from
 
@@ -45,11 +42,9 @@ class Member:
         writers: that get what TensorBoard gets.
 
     Attributes:
-        job: the run and its folder.
         agent: without a replay buffer.
         random: its random numbers.
         failure: why it failed; empty while it hasn't.
-        mean: return of the last evaluation, once there was one.
     """
 
     def __init__(self, job: Job, writers: Sequence[KVWriter]):
@@ -57,7 +52,6 @@ class Member:
         kwargs = {**chosen.algorithm_kwargs, "buffer_size": 1}
         small = chosen.replace(noise=None, algorithm_kwargs=kwargs)
         self.job, self.failure = job, ""
-        self.mean: float | None = None
         env = DummyVecEnv([lambda: Spaces(run.task, job.encoder)])
         normalizing = normalized(env) if chosen.normalize else env
         self.agent: Any = make_agent(settings.algorithm, small, normalizing, run.seed)
@@ -69,12 +63,7 @@ class Member:
         self.agent.start_time = time.time_ns()
         self._returns = np.zeros(chosen.num_envs, np.float32)
         self._lengths = np.zeros(chosen.num_envs, np.int32)
-        self._evaluator = Evaluator(
-            run.task, job.encoder, run.evaluation_episodes, num_threads=settings.physics_threads
-        )
-        if settings.begin_from:
-            begin(self.agent, Path(run.begin_from), settings.begin_from, job.folder)
-        self.agent.set_logger(job.logger(writers))
+        job.prepare(self.agent, writers)
 
     @property
     def size(self) -> int:
@@ -129,16 +118,12 @@ class Member:
 
     def evaluate(self) -> None:
         """Play its agent's policy, deterministically."""
-        step = self.agent.num_timesteps
         try:
-            episodes = self.job.settings.episodes_at(step)
-            returns = self._evaluator.returns(self.agent, episodes)
+            self.job.evaluate(self.agent)
         except NonFiniteActionError:
             self.fail(ACTIONS_NOT_FINITE)
         except EnvironmentFailedError as error:
             self.fail(str(error))
-        else:
-            self.mean = self.job.history.evaluated(step, returns, self.agent.logger)
 
     def fail(self, reason: str) -> None:
         """Note why it can't go on; the first reason is kept."""
@@ -150,7 +135,7 @@ class Member:
         random, states = self.random.state
         tensors |= {f"{_RANDOM}{name}": values for name, values in random.items()}
         tensors |= {"returns": self._returns, "lengths": self._lengths}
-        return Snapshot(tensors, {**counters, **states, "mean": self.mean})
+        return Snapshot(tensors, {**counters, **states})
 
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from where a snapshot was taken."""
@@ -158,7 +143,6 @@ class Member:
         tensors, counters = snapshot
         self.random.restore(without(_RANDOM, tensors), counters)
         self._returns, self._lengths = tensors["returns"].copy(), tensors["lengths"].copy()
-        self.mean = counters["mean"]
 
 
 class Random:

@@ -1,21 +1,19 @@
 """Replay buffers of n agents."""
 
-import inspect
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.rl.presets import sb3_class
+from jbrep.encoders.base import Float32
+from jbrep.rl.presets import parameters_of
 from jbrep.rl.run import Run
-
-Float32 = NDArray[np.float32]
 
 
 def capacity_of(run: Run) -> int:
     """The most transitions that a run keeps: no more than it makes, in whole rollouts."""
     chosen = run.learner.hyperparameters
-    usual = inspect.signature(sb3_class(run.learner.algorithm)).parameters
+    usual, _ = parameters_of(run.learner.algorithm)
     size, steps = (
         int(chosen.algorithm_kwargs.get(name, usual[name].default))
         for name in ("buffer_size", "train_freq")

@@ -32,10 +32,7 @@ class SAC(Algorithm):
         (self.actor,) = stack.networks(
             lambda each: [[*each.actor.latent_pi, [each.actor.mu, each.actor.log_std]]]
         )
-        self.critic = stack.networks(lambda each: each.critic.q_networks)
-        self.critic_target = stack.networks(lambda each: each.critic_target.q_networks)
         self.actor_optimizer = stack.adam(self.actor, lambda each: each.actor.optimizer)
-        self.critic_optimizer = stack.adam(self.critic, lambda each: each.critic.optimizer)
         self.ent_coef_optimizer = None  # the coefficient is fixed
         if agent.ent_coef_optimizer is None:
             self.log_ent_coef = stack.numbers(lambda each: each.ent_coef_tensor.log())

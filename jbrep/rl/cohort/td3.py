@@ -28,10 +28,7 @@ class TD3(Algorithm):
         self.target_noise_clip: float = agent.target_noise_clip
         (self.actor,) = stack.networks(lambda each: [each.actor.mu])
         (self.actor_target,) = stack.networks(lambda each: [each.actor_target.mu])
-        self.critic = stack.networks(lambda each: each.critic.q_networks)
-        self.critic_target = stack.networks(lambda each: each.critic_target.q_networks)
         self.actor_optimizer = stack.adam(self.actor, lambda each: each.actor.optimizer)
-        self.critic_optimizer = stack.adam(self.critic, lambda each: each.critic.optimizer)
 
     def explore(self, observation: Tensor, normals: Sequence[Tensor]) -> Tensor:
         """The policy's actions."""

@@ -92,7 +92,7 @@ def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
 
 def _tell(cohort: Cohort, session: Session) -> None:
     for member in cohort.members:
-        session.watch(member.job, cohort.step, member.mean)
+        session.watch(member.job, cohort.step, member.job.history.mean)
 
 
 def _save(cohort: Cohort, session: Session) -> None:
