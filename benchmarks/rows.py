@@ -28,7 +28,7 @@ def make_rows(
     folder.mkdir()
     while not manifest.complete:
         columns = {}
-        for name, spec in manifest.specs().items():
+        for name, spec in manifest.settings.specs().items():
             rows = episodes if name.startswith(EPISODES) else episodes * length
             columns[name] = draw(name, spec.shape(rows)).astype(spec.dtype)
         columns[EPISODES + "length"][:] = length

@@ -8,13 +8,7 @@ import time
 import gymnasium
 import numpy as np
 import pytest
-from command import (
-    jbrep,
-    start,
-    wait_for,
-    wait_for_the_end_of,
-    workers_of,
-)
+from command import jbrep, start, wait_for, wait_for_the_end_of, workers_of
 from small import contents, settings
 
 from jbrep.collect import backends, collect
@@ -303,9 +297,11 @@ def test_mistakes_leave_nothing_behind(change, message, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.fixture
-def nothing_is_made(monkeypatch):
-    """No environment can be made, found or described, as where its package isn't installed."""
+def test_reading_makes_no_environment(tmp_path, monkeypatch):
+    """None can be made, found or described then, as where its package isn't installed."""
+    folder = tmp_path / "hopper"
+    hopper = describe("Hopper-v5", max_episode_steps=30)
+    collect(some(hopper, steps=60), folder, num_threads=1)
 
     def refuse(*arguments, **keywords):
         raise AssertionError("an environment was asked for")
@@ -314,13 +310,6 @@ def nothing_is_made(monkeypatch):
         monkeypatch.setattr(gymnasium, name, refuse)
     monkeypatch.setattr("jbrep.envs.names.import_module", refuse)
     monkeypatch.setattr("jbrep.envs.description._describe", refuse)
-
-
-def test_reading_makes_no_environment(tmp_path, request):
-    folder = tmp_path / "hopper"
-    hopper = describe("Hopper-v5", max_episode_steps=30)
-    collect(some(hopper, steps=60), folder, num_threads=1)
-    request.getfixturevalue("nothing_is_made")
     dataset = Dataset(folder)
     assert dataset.task == hopper
     assert dataset["obs_10"].shape == (len(dataset),)

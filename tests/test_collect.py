@@ -67,9 +67,7 @@ def uneven(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "how",
-    [{"lanes": 1, "num_threads": 1}, {"lanes": 3, "num_threads": 2}, {"lanes": 64}],
-    ids=str,
+    "how", [{"lanes": 1, "num_threads": 1}, {"lanes": 3, "num_threads": 2}, {"lanes": 64}], ids=str
 )
 def test_neither_lanes_nor_threads_change_a_byte(how, uneven, tmp_path):
     collect(small.brief(steps=300, shard_episodes=2), tmp_path / "other", **how)
@@ -312,9 +310,7 @@ def test_a_write_that_reads_back_otherwise_is_refused(collected, tmp_path, monke
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_within_seconds_and_it_says_how_to_go_on(number, tmp_path):
     process = subprocess.Popen(
-        [*COMMAND, "--steps", "5M", "--out", tmp_path / "data"],
-        stderr=subprocess.PIPE,
-        text=True,
+        [*COMMAND, "--steps", "5M", "--out", tmp_path / "data"], stderr=subprocess.PIPE, text=True
     )
     while not (tmp_path / "data" / "shard-00001.h5").exists():  # so that the first counts
         time.sleep(0.1)

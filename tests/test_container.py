@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
+from small import flip_bit
 from tensors import TensorWindows
 
 from jbrep.dae import DAE
@@ -18,12 +19,6 @@ from jbrep.training import checkpoint
 from jbrep.training.trainer import Schedule, Trainer
 
 RANDOM = np.random.default_rng(0)
-
-
-def flip(path, bit):
-    content = bytearray(path.read_bytes())
-    content[bit // 8] ^= 1 << bit % 8
-    path.write_bytes(content)
 
 
 def bits_of_tensors(path, count):
@@ -60,7 +55,7 @@ def test_a_changed_bit_in_a_checkpoint_of_an_encoder_is_noticed(tmp_path):
     checkpoint.save(trainer, {}, path)
     whole = path.read_bytes()
     for bit in bits_of_tensors(path, 32):
-        flip(path, bit)
+        flip_bit(path, bit)
         with pytest.raises(DamageError, match=r"at is damaged .*: delete it to start over"):
             checkpoint.restore(trainer, {}, path)
         path.write_bytes(whole)
@@ -87,11 +82,11 @@ def test_a_changed_bit_in_a_checkpoint_of_a_run_is_noticed(stopped):
     path = folder / CHECKPOINT
     whole = path.read_bytes()
     for bit in bits_of_tensors(path, 32):
-        flip(path, bit)
+        flip_bit(path, bit)
         with pytest.raises(DamageError, match="is damaged"):
             container.read(path, "checkpoint")
         path.write_bytes(whole)
-    flip(path, 8 * len(whole) - 1)
+    flip_bit(path, 8 * len(whole) - 1)
     with pytest.raises(DamageError, match=r"is damaged .*: delete it to start over"):
         train(run, folder)
 

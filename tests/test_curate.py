@@ -3,20 +3,14 @@
 import numpy as np
 import pytest
 import small
-from small import contents, settings
+from small import contents, flip_bit, settings
 
 from jbrep.collect import collect
 from jbrep.collect.derive import derive
 from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
 from jbrep.dataset import DamageError, Dataset
-from jbrep.dataset.manifest import (
-    MANIFEST,
-    commit,
-    open_shard,
-    read_manifest,
-    write_manifest,
-)
+from jbrep.dataset.manifest import MANIFEST, commit, open_shard, read_manifest, write_manifest
 from jbrep.dataset.verify import find_problems
 from jbrep.errors import InputError
 from jbrep.jitterbug import model
@@ -105,10 +99,7 @@ def test_what_can_t_be_derived(collected, copied, tmp_path):
 
 
 def test_a_damaged_source_is_found_before_anything_is_written(copied, tmp_path):
-    path = copied / "shard-00002.h5"
-    content = bytearray(path.read_bytes())
-    content[5000] ^= 4
-    path.write_bytes(content)
+    flip_bit(copied / "shard-00002.h5", 40_002)
     with pytest.raises(DamageError, match=r"shard-00002\.h5 is damaged"):
         derive(copied, "move_to_pose", tmp_path / "derived")
     assert not (tmp_path / "derived").exists()
@@ -124,9 +115,7 @@ def test_repair_leaves_a_whole_data_set_alone(copied):
 
 def test_repair_makes_everything_again_as_it_was(copied, collected):
     (copied / "shard-00001.h5").unlink()
-    content = bytearray((copied / "shard-00003.h5").read_bytes())
-    content[7000] ^= 1
-    (copied / "shard-00003.h5").write_bytes(content)
+    flip_bit(copied / "shard-00003.h5", 56_000)
     (copied / "shard-00004.h5").rename(copied / "shard-00009.h5")
     told = list(repair(copied, lanes=3, num_threads=1))
     assert [line.split("/")[-1] for line in told] == [

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from command import jbrep
-from small import settings
+from small import flip_bit, settings
 
 from jbrep.collect import collect
 from jbrep.collect.repair import repair
@@ -49,6 +49,8 @@ def import_data(given, folder, task=None):
 
 PENDULUM = "Pendulum-v1"
 LENGTHS = (7, 1, 12)  # the middle one is terminated, the last one still going on
+EPISODE = np.repeat([4, 2, 9], LENGTHS)
+STEP = np.concatenate([np.arange(length) for length in LENGTHS])
 
 
 def arrays(sizes=(3, 1), lengths=LENGTHS):
@@ -214,8 +216,7 @@ def plain_table(path, **changes):
     given = arrays()
     columns = {f"joint {i}": given["observations"][:, i] for i in range(3)}
     columns |= {"action_0": given["actions"][:, 0], "reward": given["rewards"].astype(float)}
-    columns |= {"episode": np.repeat([4, 2, 9], LENGTHS)}
-    columns |= {"step": np.concatenate([np.arange(length) for length in LENGTHS])}
+    columns |= {"episode": EPISODE, "step": STEP}
     pq.write_table(pa.table({**columns, **changes}), path)
 
 
@@ -326,10 +327,6 @@ def test_no_code_that_a_minari_data_set_names_is_run(minari_folder, tmp_path, mo
     assert not (tmp_path / "ran").exists()
 
 
-def wrong(**changes):
-    return {**arrays(), **changes}
-
-
 def spoiled(name, place, value):
     values = arrays()[name]
     values[place] = value
@@ -365,21 +362,15 @@ BAD_ARRAYS = {
 def test_bad_arrays_are_refused_and_nothing_is_left(problem, tmp_path):
     pattern = re.escape(problem).replace(r"\.\*", ".*")
     with pytest.raises(InputError, match=pattern) as caught:
-        Dataset.write(tmp_path / "data", **wrong(**BAD_ARRAYS[problem]), task=PENDULUM)
+        Dataset.write(tmp_path / "data", **{**arrays(), **BAD_ARRAYS[problem]}, task=PENDULUM)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
-def gap(name):
-    values = {"episode": np.repeat([4, 2, 9], LENGTHS)}
-    values["step"] = np.concatenate([np.arange(length) for length in LENGTHS])
-    return values[name]
-
-
 BAD_TABLES = {
-    "episode 9 has step 6 where step 5 was expected": {"step": gap("step") + (np.arange(20) > 12)},
+    "episode 9 has step 6 where step 5 was expected": {"step": STEP + (np.arange(20) > 12)},
     "episode 4 goes on after its end, or comes in two parts": {
-        "episode": np.where(np.arange(20) > 14, 4, gap("episode"))
+        "episode": np.where(np.arange(20) > 14, 4, EPISODE)
     },
     "has string in the column 'joint 0'": {"joint 0": ["a"] * 20},
     "empty cells in the column 'step'": {"step": [None, *range(19)]},
@@ -479,9 +470,7 @@ def test_damage_is_noticed_and_nothing_is_simulated_again(written, tmp_path):
     folder = shutil.copytree(written.folder, tmp_path / "copy")
     with pytest.raises(InputError, match=r"copy was imported.*: .* import that again in another"):
         list(replay_problems(Dataset(folder), 1))
-    path = folder / shard_name(0)
-    content = path.read_bytes()
-    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    flip_bit(folder / shard_name(0), -8)
     assert len(list(find_problems(folder))) == 1
     with pytest.raises(InputError, match=r"was imported; import its source, pushes of a"):
         list(repair(folder))

@@ -194,8 +194,7 @@ def test_what_can_t_be_collected_with_is_said_in_one_line(runs, data, tmp_path):
     with pytest.raises(InputError, match="is of face_direction, not of move_to_pose"):
         gather(runs / "jb", tmp_path / "other", task="move_to_pose")
     with pytest.raises(
-        InputError,
-        match="the folder of a run with a policy or checkpoint, or a mixture",
+        InputError, match="the folder of a run with a policy or checkpoint, or a mixture"
     ):
         gather("nothing/here", tmp_path / "other")
     with pytest.raises(InputError, match=r"holds a data set with other settings: task .*, policy"):

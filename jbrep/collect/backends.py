@@ -11,10 +11,8 @@ from jbrep.dataset.schema import Columns
 from jbrep.envs.make import is_batched
 from jbrep.envs.names import import_modules, imported_modules
 from jbrep.envs.recording import Tick
-from jbrep.errors import InputError, choose, first_line
+from jbrep.errors import InputError, first_line
 from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
-
-Backend = Callable[[Simulator], Produce]
 
 
 def local(simulator: Simulator) -> Produce:
@@ -116,13 +114,4 @@ def on_ray(simulator: Simulator) -> Produce:
     return produce
 
 
-_BACKENDS: dict[str, Backend] = {"local": local, "ray": on_ray}
-
-
-def get_backend(name: str) -> Backend:
-    """A place to make shards.
-
-    Raises:
-        InputError: there is none of that name; the message lists them.
-    """
-    return choose(name, _BACKENDS, "backend")
+BACKENDS: dict[str, Callable[[Simulator], Produce]] = {"local": local, "ray": on_ray}

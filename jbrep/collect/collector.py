@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collect.backends import get_backend
+from jbrep.collect.backends import BACKENDS
 from jbrep.collect.policies import Policy, make_policy
 from jbrep.collect.shards import LANES, SHARD_ROWS, Missing, Produce, Simulator
 from jbrep.dataset.manifest import (
@@ -25,7 +25,7 @@ from jbrep.dataset.manifest import (
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.make import is_batched
-from jbrep.errors import InputError, differences
+from jbrep.errors import InputError, choose, differences
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
 from jbrep.records.record import to_plain
@@ -76,7 +76,8 @@ def collect(
     policy.begin(settings.task, [0])  # may refuse the task
     settings = settings.replace(policy=policy.settings())
     check_counts(lanes, num_threads)
-    produce = get_backend(backend)(Simulator(settings, policy, lanes, num_threads))
+    simulator = Simulator(settings, policy, lanes, num_threads)
+    produce = choose(backend, BACKENDS, "backend")(simulator)
     return write_shards(settings, folder, produce, policy.files())
 
 

@@ -55,7 +55,7 @@ def repair(
     check_counts(lanes, num_threads)
     intact = _intact_manifest(folder)
     with exclusive(folder):
-        manifest = before = read_manifest(folder, intact)
+        manifest = read_manifest(folder, intact)
         for path in unlisted_files(manifest, hdf5_files(folder)):
             aside = _set_aside(path)
             yield f"{path} renamed to {aside.name}: it is not one of the data set's shards"
@@ -66,7 +66,7 @@ def repair(
             shards = (*manifest.shards[:shard], entry, *manifest.shards[shard + 1 :])
             manifest = manifest.replace(shards=shards)
             yield f"{folder / shard_name(shard)} restored"
-        if manifest != before or not _is_backed_up(folder, manifest):
+        if not _is_backed_up(folder, manifest):
             write_manifest(folder, manifest)
             yield f"{folder / MANIFEST} and its backup restored"
 

@@ -22,11 +22,11 @@ SHARD_ROWS = 20_000  # of a shard of the usual size, unless a batch makes it
 Array = NDArray[Any]
 
 
+@dataclass
 class Missing:
     """What the shards of a manifest lack."""
 
-    def __init__(self, manifest: Manifest):
-        self.manifest = manifest
+    manifest: Manifest
 
     @property
     def rows(self) -> int:
@@ -115,26 +115,21 @@ class Simulator:
             tick,
             read_states if self.settings.store_state else read_nothing,
         )
-        return _columns(self.settings, recording, episodes, seeds)
+        return self._columns(recording, episodes, seeds)
 
-
-def _columns(
-    settings: DataSettings, recording: Recording, episodes: Array, seeds: Array
-) -> Columns:
-    """The columns of what was recorded, one episode after the other."""
-    length, lanes = recording.length, np.arange(len(episodes))
-    seen: dict[str, Array] = {"observation": recording.observation, **recording.arrays}
-    steps: dict[str, Array] = {"action": recording.action, "reward": recording.reward, **seen}
-    kept = np.arange(len(recording.reward)) < length[:, None]
-    known = {name: each[: kept.shape[1]].swapaxes(0, 1)[kept] for name, each in steps.items()}
-    once: dict[str, Array] = {
-        "episode": episodes,
-        "seed": seeds,
-        "length": length,
-        "terminated": recording.terminated,
-        "truncated": recording.truncated,
-        **{f"initial_{name}": recording.start[name] for name in settings.task.state},
-        **{name: recording.start[name] for name in settings.task.constants},
-        **{f"final_{name}": values[length, lanes] for name, values in seen.items()},
-    }
-    return settings.columns(known | {EPISODES + name: values for name, values in once.items()})
+    def _columns(self, recording: Recording, episodes: Array, seeds: Array) -> Columns:
+        """The columns of what was recorded, one episode after the other."""
+        task, length, lanes = self.settings.task, recording.length, np.arange(len(episodes))
+        seen: dict[str, Array] = {"observation": recording.observation, **recording.arrays}
+        steps: dict[str, Array] = {"action": recording.action, "reward": recording.reward, **seen}
+        kept = np.arange(len(recording.reward)) < length[:, None]
+        known = {name: each[: kept.shape[1]].swapaxes(0, 1)[kept] for name, each in steps.items()}
+        once: dict[str, Array] = {
+            **{"episode": episodes, "seed": seeds, "length": length},
+            **{"terminated": recording.terminated, "truncated": recording.truncated},
+            **{f"initial_{name}": recording.start[name] for name in task.state},
+            **{name: recording.start[name] for name in task.constants},
+            **{f"final_{name}": values[length, lanes] for name, values in seen.items()},
+        }
+        known |= {EPISODES + name: values for name, values in once.items()}
+        return self.settings.columns(known)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 from msgspec import Meta
 
-from jbrep.dataset.schema import EPISODES, Columns, DataSettings, Spec
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.dataset.settings import Digest
 from jbrep.dataset.shard import (
     REPAIR,
@@ -63,7 +63,7 @@ class Manifest(Document, frozen=True, kw_only=True):
         """As for `Record`: the shards' numbers are possible, all but the last one full."""
         if missing := set(_PACKAGES) - set(self.versions):
             raise InputError(f"versions.{min(missing)} is missing")
-        columns, full = set(self.specs()), self.settings.shard_episodes
+        columns, full = set(self.settings.specs()), self.settings.shard_episodes
         for shard, entry in enumerate(self.shards):
             is_last = shard == len(self.shards) - 1
             if not (entry.episodes == full or (is_last and entry.episodes < full)):
@@ -98,10 +98,6 @@ class Manifest(Document, frozen=True, kw_only=True):
         """SHA-256 over the hashes of all columns: it identifies the data."""
         parts = (f"{name} {digest}\n" for e in self.shards for name, digest in e.sha256.items())
         return hashlib.sha256("".join(parts).encode()).hexdigest()
-
-    def specs(self) -> dict[str, Spec]:
-        """The columns of each shard."""
-        return self.settings.specs()
 
     def extended(self, steps: int) -> "Manifest":
         """The manifest of more steps, before what it lacks is collected.
@@ -255,7 +251,7 @@ def open_shard(
             )
         if checked is not None:
             checked.add(state)
-    specs, most = manifest.specs(), manifest.task.max_episode_steps
+    specs, most = manifest.settings.specs(), manifest.task.max_episode_steps
     return Shard(path, content, specs, entry.rows, entry.episodes, most)
 
 

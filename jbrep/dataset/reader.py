@@ -11,13 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.columns import Batches, Column
-from jbrep.dataset.manifest import (
-    check_files,
-    hdf5_files,
-    open_shard,
-    read_manifest,
-    shard_name,
-)
+from jbrep.dataset.manifest import check_files, hdf5_files, open_shard, read_manifest, shard_name
 from jbrep.dataset.scaling import EXTREMA, Scaler, fit_scaler
 from jbrep.dataset.schema import EPISODES, episode_bounds, episode_columns
 from jbrep.dataset.shard import FileState, Shard, file_state
@@ -69,11 +63,10 @@ class Dataset:
     """A collected data set; every shard is checked against the manifest before it is read.
 
     `dataset["observation"]` is a `Column`: one array over all shards that copies only what is
-    asked for. So are the other columns, the groups of
-    features (`dataset["velocity"]`) and the single
-    features (`dataset["velocity_x"]`). While a collector writes, it is the part committed when
-    the data set was opened. A shard that changes on disk is checked again when it is next used;
-    arrays taken from it before are views of the file, and may change with it.
+    asked for. So are the other columns, the groups of features (`dataset["velocity"]`) and the
+    single features (`dataset["velocity_x"]`). While a collector writes, it is the part committed
+    when the data set was opened. A shard that changes on disk is checked again when it is next
+    used; arrays taken from it before are views of the file, and may change with it.
 
     Args:
         folder: that `jbrep collect`, `jbrep data import` or `Dataset.write` wrote.
@@ -203,7 +196,7 @@ class Dataset:
                     *(shard[EPISODES + name] for shard in shards),
                 ]
             )
-            for name, spec in episode_columns(self.manifest.specs()).items()
+            for name, spec in episode_columns(self.manifest.settings.specs()).items()
         }
 
     @cached_property

@@ -8,13 +8,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.dataset.settings import (
-    IMPORTED,
-    MIXTURE,
-    CollectSettings,
-    PolicySettings,
-    check_policy,
-)
+from jbrep.dataset.settings import IMPORTED, MIXTURE, CollectSettings, PolicySettings, check_policy
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain

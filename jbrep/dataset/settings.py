@@ -15,7 +15,6 @@ MAX_LETTERS = 200  # of a text
 MAX_ROOT_SEED = 2**31 - 2  # so that an episode's seed has 63 bits
 
 _MAX_CONSTANTS = 1000
-_OF_FILE = ("file", "sha256")  # of a trained policy: nothing to read for people
 
 Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", title="a SHA-256")]
 _Line = Annotated[str, Meta(max_length=MAX_LETTERS)]
@@ -61,8 +60,7 @@ class _Mixture(Record, frozen=True, kw_only=True):
 
     kind: Literal["mixture"]
     parts: Annotated[
-        tuple[tuple[_Weight, Mapping[str, Any]], ...],
-        Meta(min_length=2, max_length=_MAX_CONSTANTS),
+        tuple[tuple[_Weight, Mapping[str, Any]], ...], Meta(min_length=2, max_length=_MAX_CONSTANTS)
     ]
 
     def check(self) -> None:
@@ -115,6 +113,6 @@ def policy_text(policy: Mapping[str, Any]) -> str:
     """A policy's kind and constants for people: "constant, drive 0.5"."""
     if policy["kind"] == MIXTURE:
         return "; ".join(f"{weight:.3g} of {policy_text(part)}" for weight, part in policy["parts"])
-    hidden = ("kind", *_OF_FILE)
+    hidden = ("kind", "file", "sha256")  # the last two, of a trained policy, say nothing to people
     constants = (f"{name} {value}" for name, value in policy.items() if name not in hidden)
     return ", ".join([policy["kind"], *constants])

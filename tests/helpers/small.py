@@ -34,6 +34,13 @@ def write_again(source, folder):
     return write_shards(manifest.settings, folder, produce).manifest
 
 
+def flip_bit(path, bit):
+    """Change a bit of a file."""
+    content = bytearray(path.read_bytes())
+    content[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(content)
+
+
 def contents(folder):
     """The bytes of all files in a data set's folder."""
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}

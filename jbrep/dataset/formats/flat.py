@@ -1,6 +1,6 @@
 """Rows of many episodes, one after the other, divided into episodes; and arrays in Python."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ def per_episode(name: str, given: Mapping[str, Any]) -> dict[str, Array]:
     return {what: narrow(what, values) for what, values in arrays.items()}
 
 
-def own_names(name: str, names: Iterable[str]) -> dict[str, str]:
+def own_names(name: str, names: Collection[str]) -> dict[str, str]:
     """Which of a source's names stand for which column.
 
     Args:
@@ -57,7 +57,6 @@ def own_names(name: str, names: Iterable[str]) -> dict[str, str]:
         InputError: two names for one column.
     """
     own: dict[str, str] = {}
-    names = set(names)
     for column, aliases in ALIASES.items():
         present = [alias for alias in aliases if alias in names]
         if len(present) > 1:

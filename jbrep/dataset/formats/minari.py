@@ -21,13 +21,7 @@ from minari.namespace import NAMESPACE_METADATA_FILENAME
 from numpy.typing import NDArray
 
 import jbrep.jitterbug.simulation  # noqa: F401  Minari makes the environment: load MuJoCo before
-from jbrep.dataset.formats.episodes import (
-    Incoming,
-    Source,
-    check_kind,
-    label,
-    whole_episode,
-)
+from jbrep.dataset.formats.episodes import Incoming, Source, check_kind, label, whole_episode
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.schema import UNKNOWN_SEED, DataSettings
 from jbrep.envs.description import describe, features_of
@@ -35,8 +29,7 @@ from jbrep.envs.names import find_spec
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line
 from jbrep.progress import Progress
-from jbrep.records.publish import publish_folder, unfinished
-from jbrep.records.storage import exists, read_regular, write_whole
+from jbrep.records.storage import exists, publish_folder, read_regular, unfinished, write_whole
 
 Array = NDArray[Any]
 _ROOT = "MINARI_DATASETS_PATH"  # Minari takes the folder of its data sets from there only

@@ -24,7 +24,7 @@ from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Feature
 from jbrep.errors import InputError
 from jbrep.progress import Progress
-from jbrep.records.publish import publish_file, unfinished
+from jbrep.records.storage import publish_file, unfinished
 
 Array = NDArray[Any]
 _SUFFIX = ".npy"
@@ -150,10 +150,12 @@ def _whole(archive: zipfile.ZipFile, name: str) -> Array:
 
 def _once(archive: zipfile.ZipFile, names: Collection[str]) -> dict[str, Array]:
     """What is known once for each episode."""
-    chosen = {
-        column: alias for column, aliases in _ONCE.items() for alias in aliases if alias in names
+    return {
+        column: _whole(archive, alias)
+        for column, aliases in _ONCE.items()
+        for alias in aliases
+        if alias in names
     }
-    return {column: _whole(archive, name) for column, name in chosen.items()}
 
 
 def _features(archive: zipfile.ZipFile, names: Collection[str]) -> tuple[Feature, ...]:

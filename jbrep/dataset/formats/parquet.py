@@ -12,21 +12,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from jbrep.dataset.formats.episodes import (
-    Rows,
-    Source,
-    check_kind,
-    check_names,
-    label,
-)
+from jbrep.dataset.formats.episodes import Rows, Source, check_kind, check_names, label
 from jbrep.dataset.formats.flat import CHUNK, own_names, per_episode, split
 from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Feature, Task
 from jbrep.errors import InputError, first_line
 from jbrep.progress import Progress
-from jbrep.records.publish import publish_file, unfinished
 from jbrep.records.record import from_plain
-from jbrep.records.storage import exists
+from jbrep.records.storage import exists, publish_file, unfinished
 
 _ACTION = re.compile(r"actions?(_\d+)?")
 _NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former

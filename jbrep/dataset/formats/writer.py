@@ -1,9 +1,8 @@
 """Writing a data set of episodes that were made elsewhere: one pass to see them, one to write."""
 
-from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -18,8 +17,7 @@ from jbrep.envs.description import features_of
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line
 from jbrep.progress import Progress
-from jbrep.records.publish import publish_folder, unfinished
-from jbrep.records.storage import check_space, make_folder
+from jbrep.records.storage import check_space, make_folder, publish_folder, unfinished
 
 _SHARD_ROWS = 20_000
 _MOST_SHARDS = 5_000
@@ -27,32 +25,13 @@ _MOST_SHARDS = 5_000
 Array = NDArray[Any]
 
 
-@dataclass
-class _Survey:
+class _Survey(NamedTuple):
     """What all episodes are like."""
 
-    name: str
-    episodes: int = 0
-    rows: int = 0
-    longest: int = 0
-    size: int = 0
-    low: Array = field(default_factory=lambda: np.empty(0))  # of the actions, (k,)
-    high: Array = field(default_factory=lambda: np.empty(0))
-
-    def add(self, episode: Incoming) -> None:
-        low, high = episode.action.min(axis=0), episode.action.max(axis=0)
-        size = episode.observation.shape[1]
-        if not self.episodes:
-            self.size, self.low, self.high = size, low, high
-        if (size, len(low)) != (self.size, len(self.low)):
-            raise InputError(
-                f"{self.name} has {size} features and {len(low)} numbers in an action in an "
-                f"episode, but {self.size} and {len(self.low)} before: all must be alike"
-            )
-        self.low, self.high = np.minimum(self.low, low), np.maximum(self.high, high)
-        self.episodes += 1
-        self.rows += len(episode.reward)
-        self.longest = max(self.longest, len(episode.reward))
+    lengths: list[int]
+    size: int  # of an observation
+    low: Array  # of the actions, (k,)
+    high: Array
 
 
 def write(source: Source, folder: Path, task: Task | None = None) -> Manifest:
@@ -73,7 +52,7 @@ def write(source: Source, folder: Path, task: Task | None = None) -> Manifest:
         with unfinished(folder) as partial:
             survey = _survey(source)
             settings = _settings(source, survey, _fitting(source, survey, task or source.task))
-            check_space(folder.parent, survey.rows * settings.row_bytes())
+            check_space(folder.parent, settings.steps * settings.row_bytes())
             partial.mkdir()
             manifest = _fill(source, settings, partial)
             publish_folder(partial, folder)
@@ -83,17 +62,28 @@ def write(source: Source, folder: Path, task: Task | None = None) -> Manifest:
 
 
 def _survey(source: Source) -> _Survey:
-    survey = _Survey(source.name)
+    sizes, lengths = (0, 0), list[int]()
+    low: Any = np.inf
+    high: Any = -np.inf
     with Progress(total=source.rows, unit="step", unit_scale=True, desc="read") as progress:
         for episode in source.episodes():
-            survey.add(episode)
-            progress.update(len(episode.reward))
-    if not survey.episodes:
+            found = episode.observation.shape[1], episode.action.shape[1]
+            sizes = sizes if lengths else found
+            if found != sizes:
+                raise InputError(
+                    f"{source.name} has {found[0]} features and {found[1]} numbers in an action in "
+                    f"an episode, but {sizes[0]} and {sizes[1]} before: all must be alike"
+                )
+            low = np.minimum(low, episode.action.min(axis=0))
+            high = np.maximum(high, episode.action.max(axis=0))
+            lengths.append(len(episode.reward))
+            progress.update(lengths[-1])
+    if not lengths:
         raise InputError(
             f"{source.name} has no episode with a step, the last one's observation being the final "
             "one where no other is given"
         )
-    return survey
+    return _Survey(lengths, sizes[0], low, high)
 
 
 def _fitting(source: Source, survey: _Survey, task: Task | None) -> Task:
@@ -106,10 +96,10 @@ def _fitting(source: Source, survey: _Survey, task: Task | None) -> Task:
             f"{source.name} has {sizes[0]} features and {sizes[1]} numbers in an action, but "
             f"{task.name} has {task.size} and {task.action_size}: give the task that it is of"
         )
-    if survey.longest > task.max_episode_steps:
+    if (longest := max(survey.lengths)) > task.max_episode_steps:
         raise InputError(
-            f"{source.name} has an episode of {survey.longest:,} steps, but {task.name} has at "
-            f"most {task.max_episode_steps:,}: give --episode-steps {survey.longest}"
+            f"{source.name} has an episode of {longest:,} steps, but {task.name} has at most "
+            f"{task.max_episode_steps:,}: give --episode-steps {longest}"
         )
     return task.replace(state={}, constants={})
 
@@ -129,7 +119,7 @@ def _from_data(source: Source, survey: _Survey) -> Task:
             features=source.features or tuple(features_of(source.label, box)),
             action_low=tuple(low.tolist()),
             action_high=tuple(high.tolist()),
-            max_episode_steps=max(survey.longest, source.max_episode_steps or 0),
+            max_episode_steps=max(max(survey.lengths), source.max_episode_steps or 0),
             reproducible=False,
         )
     except ValueError as error:
@@ -143,20 +133,22 @@ def _action_bounds(source: Source, survey: _Survey) -> tuple[Array, Array]:
     high = np.where(constant, survey.high + 1, survey.high).astype(np.float64)
     if source.action_bounds is None:
         return low, high
-    given = [np.asarray(bounds, np.float32).astype(np.float64) for bounds in source.action_bounds]
-    return np.where(np.isfinite(given[0]), given[0], low), np.where(
-        np.isfinite(given[1]), given[1], high
+    given = (np.asarray(ends, np.float32).astype(np.float64) for ends in source.action_bounds)
+    below, above = (
+        np.where(np.isfinite(ends), ends, own) for ends, own in zip(given, (low, high), strict=True)
     )
+    return below, above
 
 
 def _settings(source: Source, survey: _Survey, task: Task) -> DataSettings:
-    rows = max(_SHARD_ROWS, survey.rows // _MOST_SHARDS)
+    steps = sum(survey.lengths)
+    rows = max(_SHARD_ROWS, steps // _MOST_SHARDS)
     name = "".join(c if c.isprintable() else "?" for c in source.name)
     return DataSettings(
         task=task,
         policy={"kind": IMPORTED, "source": name[-MAX_LETTERS:]},
-        steps=survey.rows,
-        shard_episodes=max(1, rows * survey.episodes // survey.rows),
+        steps=steps,
+        shard_episodes=max(1, rows * len(survey.lengths) // steps),
     )
 
 
