@@ -26,7 +26,7 @@ from jbrep.stats.runs import RunCurve
 from jbrep.text import table
 
 # verdicts come from p-values and the side of the boundary; intervals would take most of the time
-claims.ratio_of_spreads = lambda curves, level, seed: Interval(
+claims.ratio_of_spreads = lambda curves, level, seed, permutations: Interval(
     np.exp(spread._excess(curves, 0.0)), np.nan, np.nan
 )
 

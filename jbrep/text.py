@@ -4,13 +4,14 @@ import math
 import re
 import shutil
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple, TypeVar
 
 SIGNIFICANT = ",.3g"  # a format for `number`: three digits
 _GAP = "  "  # between columns
 _NUMBER = re.compile(r"[<>]? ?-?[\d,]*\.?\d+(e[-+]?\d+)?( \[.*\]| \(\d+/\d+\))?")
 _NO_NUMBER = re.compile(r"-( \(\d+/\d+\))?")
+_Item = TypeVar("_Item")
 
 
 class Table(NamedTuple):
@@ -25,6 +26,14 @@ class Table(NamedTuple):
     title: str
     header: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
+
+    @classmethod
+    def of(
+        cls, title: str, items: Iterable[_Item], columns: Mapping[str, Callable[[_Item], str]]
+    ) -> "Table":
+        """A row for each item, with what each column shows of it."""
+        rows = [tuple(cell(item) for cell in columns.values()) for item in items]
+        return cls(title, tuple(columns), rows)
 
     @property
     def numeric(self) -> list[bool]:

@@ -15,13 +15,7 @@ from PIL import Image
 
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.evaluate.evaluation import (
-    Evaluation,
-    FeatureError,
-    Prediction,
-    Reconstruction,
-    Score,
-)
+from jbrep.evaluate.evaluation import Evaluation, FeatureError, Prediction, Reconstruction, Score
 from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
 from jbrep.records.document import read_document
 from jbrep.report.figures import behaviour_plots, encoder_plots, study_plots, write
@@ -534,7 +528,7 @@ def test_predictions_stand_by_feature_and_encoder(of_methods):
     assert ("slow-2", 20, "yaw", 0.8, 0.78, 0.8200000000000001) in plot.rows
     axes = drawn(plot).axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()] == [
-        *("yaw", "still", "mean of features", "reward"),
+        *("yaw", "still", "mean of features", "reward")
     ]
     expected = [[0.9, 0.8, 0.1, 0.7], [np.nan] * 4, [0.9, 0.8, 0.1, 0.7], [0.45, 0.4, 0.05, 0.35]]
     np.testing.assert_array_equal(axes.images[0].get_array(), expected)
@@ -585,5 +579,5 @@ def test_losses_stand_by_term_and_divergences_by_unit():
 
 def test_families_differ_in_size_only():
     assert [family(*each) for each in (("dae-8", 8), ("dae-8-s2", 8), ("slow-20", 8))] == [
-        *("dae", "dae-s2", "slow-20"),
+        *("dae", "dae-s2", "slow-20")
     ]

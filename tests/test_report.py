@@ -283,6 +283,12 @@ def test_nothing_in_a_name_is_markup(text, escaped):
     assert escape(text) == escaped
 
 
+def copy_tables(folder, out):
+    out.mkdir(exist_ok=True)
+    for each in TABLES:
+        shutil.copy(folder / each, out / each)
+
+
 def named_otherwise(folder, out, name):
     """A copy of a study's tables in which dae-8 has another name."""
     out.mkdir()
@@ -326,9 +332,7 @@ def test_diagnostics_are_set_against_returns_where_they_are_known(whole, tmp_pat
 
 def test_names_that_are_not_utf_8_are_written_all_the_same(whole, tmp_path):
     folder = Path(f"{tmp_path}/studi\udce9")  # as Linux gives a folder named in Latin-1
-    folder.mkdir()
-    for name in TABLES:
-        shutil.copy(whole / name, folder / name)
+    copy_tables(whole, folder)
     page, summary, text, *_ = write_report(folder)
     assert "<h1>studi?</h1>" in page.read_text()
     assert json.loads(summary.read_text())["study"] == "studi?"
@@ -337,9 +341,7 @@ def test_names_that_are_not_utf_8_are_written_all_the_same(whole, tmp_path):
 
 def test_it_can_be_made_from_the_tables_alone(whole, tmp_path):
     alone = tmp_path / "a-study"
-    alone.mkdir()
-    for name in TABLES:
-        shutil.copy(whole / name, alone / name)
+    copy_tables(whole, alone)
     write_report(alone)
     for name in (PAGE, SUMMARY, MARKDOWN, STATISTICS):
         assert (alone / name).read_bytes() == (whole / name).read_bytes()
@@ -440,16 +442,8 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
         ("runs.json", lambda text: "[]", "runs.json is damaged, or not a jbrep runs file"),
         ("runs.json", lambda text: text.replace("60.0", "NaN"), "runs.json is damaged"),
         ("runs.json", lambda text: text.replace("60.0", "1e999"), "runs.json is damaged"),
-        (
-            "runs.json",
-            lambda text: text.replace('"seed"', '"sead"'),
-            "unknown runs.0..sead",
-        ),
-        (
-            "runs.json",
-            lambda text: text.replace('"failed"', '"lost"'),
-            "is .lost.: it must",
-        ),
+        ("runs.json", lambda text: text.replace('"seed"', '"sead"'), "unknown runs.0..sead"),
+        ("runs.json", lambda text: text.replace('"failed"', '"lost"'), "is .lost.: it must"),
         (
             "runs.json",
             lambda text: text.replace('"size": 16', '"size": -1'),
@@ -479,8 +473,7 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
     ],
 )
 def test_damaged_tables_are_refused(name, change, message, whole, tmp_path):
-    for each in TABLES:
-        shutil.copy(whole / each, tmp_path / each)
+    copy_tables(whole, tmp_path)
     path = tmp_path / name
     if change is None:
         path.unlink()
@@ -511,8 +504,7 @@ def change_one(value, choose):
 
 def test_changed_tables_are_refused_or_shown(whole, tmp_path, monkeypatch):
     """Whatever is read can be put into words; figures are left out here, as they take long."""
-    for each in TABLES:
-        shutil.copy(whole / each, tmp_path / each)
+    copy_tables(whole, tmp_path)
     monkeypatch.setattr(report, "study_plots", lambda *tables: [])
     record = json.loads((whole / "runs.json").read_text())
     choose, refused = random.Random(0), []

@@ -14,9 +14,9 @@ from scipy.stats import (
 )
 
 from jbrep.errors import InputError
-from jbrep.stats.arms import Arm, Frame, measure
-from jbrep.stats.claims import FASTER, LESS_VARIANCE, NOT_WORSE, kept_gain
-from jbrep.stats.intervals import Bounds, Part, mean_within, p_of_sum, sum_within
+from jbrep.stats.arms import Arm, Frame, Sides, measure
+from jbrep.stats.claims import NOT_WORSE, kept_gain
+from jbrep.stats.intervals import Bounds, difference_within, mean_within, p_of_difference
 from jbrep.stats.nested import components
 from jbrep.stats.power import Arms, obstacle
 from jbrep.stats.rules import Planned, Rules, levels, most_failing
@@ -79,7 +79,7 @@ def test_without_bounds_the_interval_of_a_mean_is_student_s():
     values = drawn(3, 2, 9, 0)
     theirs = ttest_1samp(values, 0).confidence_interval(0.9)
     np.testing.assert_allclose(mean_within(values, Bounds(), 0.9)[1:], theirs)
-    p = p_of_sum([Part(1, values)], Bounds(), 2)
+    p = p_of_difference(values, np.zeros(9), Bounds(), 2)
     assert p == pytest.approx(ttest_1samp(values, 2).pvalue, rel=1e-6)
 
 
@@ -88,7 +88,7 @@ def test_intervals_keep_to_what_is_possible(bounds):
     for values in (np.array([1, 2, 900.0]), np.array([999, 998, 100.0]), np.array([0, 1000.0])):
         mean, low, high = mean_within(values, bounds, 0.999)
         assert bounds.low <= low < mean < high <= bounds.high
-        d, low, high = sum_within([Part(1, values), Part(-1, values[::-1])], RETURNS, 0.999)
+        d, low, high = difference_within(values, values[::-1], RETURNS, 0.999)
         assert -1000 <= low < d < high <= 1000
 
 
@@ -104,7 +104,7 @@ def test_intervals_of_bounded_means_cover_the_truth():
     assert x.min() > 0
     one = mean_within(x, RETURNS, 0.95)
     assert 0.92 < np.mean((one.low < 880) & (one.high > 880)) < 0.97
-    two = sum_within([Part(1, x), Part(-0.9, y)], RETURNS, 0.95)
+    two = difference_within(x, y, RETURNS, 0.95, 0.9)
     assert 0.94 < np.mean((two.low < 88) & (two.high > 88)) < 0.98
 
 
@@ -162,17 +162,17 @@ def plain_arm(final):
 
 def test_what_is_kept_of_a_gain_ends_where_its_test_does():
     x, y = plain_arm(drawn(820, 60, 12, 0)), plain_arm(drawn(900, 30, 10, 1))
-    share, low, high = kept_gain(x, y, frame(), 0.95)
+    sides = Sides(x, y, frame())
+    share, low, high = kept_gain(sides, 0.95)
     assert share == pytest.approx((820 - 250) / (900 - 250))
     for end in (low, high):
-        assert NOT_WORSE.p_value(x, y, frame(), end, 0) == pytest.approx(0.05, rel=1e-4)
-    moved = kept_gain(
-        plain_arm(3 * x.final - 7), plain_arm(3 * y.final - 7), frame(still=3 * 250 - 7), 0.95
-    )
-    np.testing.assert_allclose(moved, (share, low, high))
-    assert np.isnan(kept_gain(x, plain_arm(drawn(200, 10, 8, 2)), frame(), 0.95)).all()
+        assert NOT_WORSE.p_value(sides, end, 0) == pytest.approx(0.05, rel=1e-4)
+    moved = (plain_arm(3 * each.final - 7) for each in (x, y))
+    found = kept_gain(Sides(*moved, frame(still=3 * 250 - 7)), 0.95)
+    np.testing.assert_allclose(found, (share, low, high))
+    assert np.isnan(kept_gain(sides._replace(y=plain_arm(drawn(200, 10, 8, 2))), 0.95)).all()
     unsure = plain_arm(np.array([100, 900.0, 120, 880]))
-    assert kept_gain(x, unsure, frame(), 0.95).high == 1000  # as far as is looked
+    assert kept_gain(sides._replace(y=unsure), 0.95).high == 1000  # as far as is looked
 
 
 def test_arms_are_measured_on_one_scale():
@@ -384,10 +384,6 @@ def test_rules_that_contradict_one_another(rules, message):
         Rules(**rules)
 
 
-def test_the_sides_of_claims():
-    assert (NOT_WORSE.side, LESS_VARIANCE.side, FASTER.side) == (1, -1, -1)
-
-
 def test_variance_components_are_those_of_restricted_maximum_likelihood():
     mixed = pytest.importorskip("statsmodels.api").MixedLM
     random = np.random.default_rng(2)
@@ -406,8 +402,6 @@ def test_encoders_that_add_nothing_have_no_variance_below_0():
     returns = np.tile([600.0, 700.0, 800.0], (4, 1))
     found = components(returns)
     assert found.encoders[:2] == found.ratio[:2] == (0, 0)
-    with pytest.raises(InputError, match="two encoders and two runs of each, not 1 times 5"):
-        components(np.zeros((1, 5)))
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.5, 4.0])

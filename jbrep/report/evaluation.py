@@ -38,12 +38,7 @@ _MANY = 8  # quantities from which probes are summed up
 
 
 def evaluation_text(evaluation: Evaluation, width: int | None = None) -> str:
-    """What encoders lose and what their latents keep, a line for each encoder.
-
-    Args:
-        evaluation: of encoders.
-        width: columns to fit; None for lines as long as they come.
-    """
+    """What encoders lose and what their latents keep, a line each, of that width."""
     lost = facts(_lost(evaluation), width or sys.maxsize, indent=0)
     others = _errors(evaluation), _readings(evaluation.encoders), _units(evaluation.encoders)
     return "\n\n".join(
@@ -167,21 +162,15 @@ def _probes(scores: Scores) -> dict[str, str]:
 
 
 def _units(encoders: _Encoders) -> Table:
-    rows = []
-    for label, known in encoders.items():
-        units = known.latent_units
-        rows.append(
-            (
-                label,
-                str(len(units.dead)),
-                number(max(units.saturation) if units.saturation else None, ".0%"),
-                number(units.participation_ratio, ".1f"),
-                number(units.intrinsic_dimension.two_nn, ".1f"),
-                number(units.intrinsic_dimension.mle, ".1f"),
-            )
-        )
-    return Table(
+    return Table.of(
         "Latent units: dead ones, the most saturated one, participation ratio, intrinsic dimension",
-        ("encoder", "dead", "saturated", "participation", "TwoNN", "max. likelihood"),
-        rows,
+        [(label, known.latent_units) for label, known in encoders.items()],
+        {
+            "encoder": lambda each: each[0],
+            "dead": lambda each: str(len(each[1].dead)),
+            "saturated": lambda each: number(max(each[1].saturation, default=None), ".0%"),
+            "participation": lambda each: number(each[1].participation_ratio, ".1f"),
+            "TwoNN": lambda each: number(each[1].intrinsic_dimension.two_nn, ".1f"),
+            "max. likelihood": lambda each: number(each[1].intrinsic_dimension.mle, ".1f"),
+        },
     )

@@ -19,67 +19,54 @@ _AT_ITS_START = r"^[-+=>]|^\d+(?=[.)])"
 def markdown(
     tables: Tables, answers: Sequence[Answer], predictions: Sequence[Table], picture: str
 ) -> str:
-    """The summary, for a README.
-
-    Args:
-        tables: of the study.
-        answers: on each claim.
-        predictions: how well diagnostics predict learning.
-        picture: the main figure's path.
-    """
-    return "\n".join(_lines(tables, answers, predictions, picture))
+    """The summary, for a README, with the path of the main figure."""
+    return "\n\n".join(_parts(tables, answers, predictions, picture)) + "\n"
 
 
-def _lines(
+def _parts(
     tables: Tables, answers: Sequence[Answer], predictions: Sequence[Table], picture: str
 ) -> Iterator[str]:
-    yield from (f"# {escape(tables.name)}", "", escape(facts.outline(tables)), "")
+    yield from (f"# {escape(tables.name)}", escape(facts.outline(tables)))
     if registered := facts.registered(tables):
-        yield from (escape(registered), "")
+        yield escape(registered)
     for notice in facts.notices(tables):
-        yield from (f"> {escape(notice)}", "")
-    yield from (f"**{escape(headline(tables.analysis))}**", "")
+        yield f"> {escape(notice)}"
+    yield f"**{escape(headline(tables.analysis))}**"
     if tables.analysis:
         yield from _findings(tables.analysis, answers)
-        yield from (f"![Returns over training]({picture})", "")
-        yield from _numbers(tables.analysis)
-    for table in predictions:
-        yield from (f"{escape(table.title)}:", "", *_rendered(table), "")
+        yield f"![Returns over training]({picture})"
+        for group in tables.analysis.groups:
+            title = f"{group.name}, with 95 % intervals over runs"
+            yield _titled(label_table(group)._replace(title=title))
+        yield from map(_titled, across_tasks(tables.analysis))
+    yield from map(_titled, predictions)
 
 
 def _findings(analysis: Analysis, answers: Sequence[Answer]) -> Iterator[str]:
     """Verdicts as tables, then in sentences."""
     for group in analysis.groups:
         if group.comparisons:
-            title = f"{group.name}, compared with {analysis.baseline}:"
-            yield from (escape(title), "", *_rendered(matrix(group, analysis.planned)), "")
-            yield from (escape(f"Gains are counted from {reference_words(group)}."), "")
-    for note in notes(analysis.planned):
-        yield from (escape(note), "")
+            title = f"{group.name}, compared with {analysis.baseline}"
+            yield _titled(matrix(group, analysis.planned)._replace(title=title))
+            yield escape(f"Gains are counted from {reference_words(group)}.")
+    yield from map(escape, notes(analysis.planned))
     for answer in answers:
-        estimated = f"{answer.claim!r} is estimated by: {answer.estimand}."
-        yield from (f"**{escape(answer.headline)}.** {escape(estimated)}", "")
+        estimated = f"{answer.claim.name!r} is estimated by: {answer.claim.estimand}."
+        yield f"**{escape(answer.headline)}.** {escape(estimated)}"
         judged = [each for each in answer.findings if each.verdict != EXPLORATORY]
-        for finding in judged:
-            yield f"- {escape(finding.where)}: *{finding.verdict}*. {escape(finding.sentence)}"
         if judged:
-            yield ""
+            yield "\n".join(
+                f"- {escape(each.where)}: *{each.verdict}*. {escape(each.sentence)}"
+                for each in judged
+            )
 
 
-def _numbers(analysis: Analysis) -> Iterator[str]:
-    for group in analysis.groups:
-        yield from (f"{escape(group.name)}, with 95 % intervals over runs:", "")
-        yield from (*_rendered(label_table(group)), "")
-    for table in across_tasks(analysis):
-        yield from (f"{escape(table.title)}:", "", *_rendered(table), "")
-
-
-def _rendered(table: Table) -> list[str]:
-    """The lines of a table, without its title."""
+def _titled(table: Table) -> str:
+    """A table below its title."""
     rule = ["---:" if numbers else "---" for numbers in table.numeric]
     lines = ([_in_a_line(cell) for cell in line] for line in (table.header, *table.rows))
     first, *others = ("| " + " | ".join(line) + " |" for line in lines)
-    return [first, "| " + " | ".join(rule) + " |", *others]
+    return "\n".join((escape(f"{table.title}:"), "", first, f"| {' | '.join(rule)} |", *others))
 
 
 def escape(text: str) -> str:

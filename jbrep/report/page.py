@@ -11,12 +11,11 @@ from markupsafe import Markup
 
 from jbrep.progress import Progress
 from jbrep.records.tables import csv_text
-from jbrep.report import facts
+from jbrep.report import facts, words
 from jbrep.report.figures.plot import Drawing, Plot
 from jbrep.report.figures.style import DARK, PAGE
 from jbrep.report.statistics import across_tasks, group_tables
 from jbrep.report.tables import Tables
-from jbrep.report.words import details, headline, notes, remark, statements
 from jbrep.stats import Analysis
 from jbrep.text import Table
 
@@ -24,40 +23,17 @@ _WIDEST = 1000  # of a figure [CSS pixels]
 _PER_INCH = 96  # CSS pixels: on a narrow screen a figure is shown at its size on paper
 
 
-def page(
-    tables: Tables,
-    plots: Sequence[Plot],
-    predictions: Sequence[Table],
-) -> str:
-    """The page; the content of the tables is shown as text and never runs.
-
-    Args:
-        tables: of the study.
-        plots: figures.
-        predictions: how well diagnostics predict learning.
-    """
-    script = _own("page.js")
+def page(tables: Tables, plots: Sequence[Plot], predictions: Sequence[Table]) -> str:
+    """The page; the content of the tables is shown as text and never runs."""
+    script, analysis = _own("page.js"), tables.analysis
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     return template.from_string(_own("page.html.j2")).render(
-        name=tables.name,
-        outline=facts.outline(tables),
-        registered=facts.registered(tables),
-        notices=facts.notices(tables),
-        headline=headline(tables.analysis),
-        analysis=tables.analysis,
-        claims=statements(tables.analysis.planned) if tables.analysis else [],
-        notes=notes(tables.analysis.planned) if tables.analysis else [],
-        registration=tables.record.registration,
-        remark=remark,
-        details=details,
+        study=tables,
+        facts=facts,
+        words=words,
+        claims=words.statements(analysis.planned) if analysis else [],
         figures=[_figure(plot) for plot in Progress(plots, unit="figure", delay=1, leave=False)],
-        tables=[*(_tables(tables.analysis) if tables.analysis else ()), *predictions],
-        runs=facts.run_tables(tables),
-        packages=facts.package_table(tables),
-        processors=tables.record.processors,
-        encoders=facts.encoder_table(tables),
-        settings=facts.setting_table(tables),
-        reproduce=facts.reproduce(tables),
+        tables=[*(_tables(analysis) if analysis else ()), *predictions],
         style=Markup(_own("page.css")),
         script=Markup(script),
         script_hash=_base64(hashlib.sha256(script.encode()).digest()),

@@ -109,7 +109,7 @@ def _summary(tables: Tables, verdicts: Sequence[Answer]) -> dict[str, Any]:
         "failed": [row[:2] for row in facts.failed_runs(tables).rows],
         "left_out": tables.left_out,
         "claims": {
-            answer.claim: {
+            answer.claim.name: {
                 "counts": answer.counts,
                 "verdicts": [finding._asdict() for finding in answer.findings],
             }

@@ -1,6 +1,8 @@
 """Statistics as tables."""
 
 import math
+from collections.abc import Callable
+from operator import attrgetter
 
 import numpy as np
 
@@ -19,37 +21,27 @@ from jbrep.rl.files import FAILED
 from jbrep.stats.aggregates import Aggregate
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.association import Association
-from jbrep.stats.labels import COMPONENTS, REACHED, RepresentationResult
+from jbrep.stats.comparison import Comparison
+from jbrep.stats.labels import REACHED, RepresentationResult
 from jbrep.stats.power import Prospect
 from jbrep.stats.rules import Planned
-from jbrep.stats.scale import STEPS_TO
+from jbrep.stats.scale import SOLVED
 from jbrep.study.packing import Forecast
 from jbrep.study.tables import by_run
-from jbrep.text import Table, duration, rounded, table, wrapped
+from jbrep.text import SIGNIFICANT, Table, duration, rounded, table, wrapped
 
-_KEY = "representation"
+_KEY, _NAME = "representation", attrgetter("representation")
 _MOST_DIGITS = 9  # after the point
-_SPREADS = ("final_return_sd", "final_return_iqr", "final_return_mad", "risk_across_runs")
 
 
 def statistics_text(analysis: Analysis, width: int | None = None) -> str:
-    """All tables of an analysis: by task and algorithm, then across tasks.
-
-    Args:
-        analysis: of a study.
-        width: that tables must fit, in columns; None for tables of any width.
-    """
+    """All tables of an analysis, by task and algorithm, then across tasks, of that width."""
     tables = [each for group in analysis.groups for each in group_tables(group, analysis)]
     return "\n\n".join(each.text(width) for each in (*tables, *across_tasks(analysis)))
 
 
 def results_text(tables: Tables, width: int | None = None) -> str:
-    """The statistics as tables, or each run's last evaluation where there are none.
-
-    Args:
-        tables: of runs.
-        width: to fit, in columns; None for no limit.
-    """
+    """The statistics as tables of that width, or each run's last evaluation without any."""
     told = statistics_text(tables.analysis, width) if tables.analysis else _last(tables, width)
     return "\n".join((told, *(f"\nno statistics: {line}" for line in tables.left_out)))
 
@@ -89,33 +81,33 @@ def label_table(group: GroupAnalysis) -> Table:
     """
     runs = sum(len(label.seeds) for label in group.labels)
     cut = f"; the comparison {group.cut}" if group.cut else ""
-    solved = [] if math.isnan(group.solved) else [f"to solved ({group.solved:,g})"]
     form = _form(group)
-    rows = [
-        (
-            label.representation,
-            str(len(label.seeds)),
-            str(len(label.failed)),
-            shown(label.numbers["final_return_mean"], form),
-            shown(label.numbers["mean_return_mean"], form),
-            shown(label.numbers["final_return_iqm"], form),
-            *(_steps(label, name) for name in STEPS_TO[: 2 + len(solved)]),
-        )
-        for label in group.labels
-    ]
+    columns: dict[str, Callable[[RepresentationResult], str]] = {
+        _KEY: _NAME,
+        "runs": lambda label: str(len(label.seeds)),
+        "failed": lambda label: str(len(label.failed)),
+        "final return": _number("final_return_mean", form),
+        "mean return": _number("mean_return_mean", form),
+        "IQM of final": _number("final_return_iqm", form),
+        "steps to 50 %": lambda label: _steps(label, "steps_to_50_percent"),
+        "to 90 %": lambda label: _steps(label, "steps_to_90_percent"),
+    }
+    if not math.isnan(group.solved):
+        columns[f"to solved ({group.solved:,g})"] = lambda label: _steps(label, SOLVED)
+    title = f"{group.name}: {runs} runs over {group.grid[-1]:,.0f} steps; 95 % intervals over runs"
+    found = Table.of(f"{title}{cut}", group.labels, columns)
     references = [
-        (policy, "-", "-", shown(each, form), *["-"] * (4 + len(solved)))
+        (policy, "-", "-", shown(each, form), *["-"] * (len(columns) - 4))
         for policy, each in group.references.items()
     ]
-    return Table(
-        f"{group.name}: {runs} runs over {group.grid[-1]:,.0f} steps; 95 % intervals over runs"
-        f"{cut}",
-        (
-            *(_KEY, "runs", "failed", "final return", "mean return", "IQM of final"),
-            *("steps to 50 %", "to 90 %", *solved),
-        ),
-        [*rows, *references],
-    )
+    return found._replace(rows=[*found.rows, *references])
+
+
+def _number(
+    name: str, form: str = SIGNIFICANT
+) -> Callable[[RepresentationResult | Comparison], str]:
+    """A column of one of their numbers."""
+    return lambda each: shown(each.numbers[name], form)
 
 
 def _steps(label: RepresentationResult, name: str) -> str:
@@ -125,67 +117,56 @@ def _steps(label: RepresentationResult, name: str) -> str:
 
 
 def _form(group: GroupAnalysis, more: int = 0) -> str:
-    """A format for returns: three digits of the range of final returns, or whole numbers.
-
-    Args:
-        group: with the returns.
-        more: digits, such as for their spread.
-    """
+    """A format for returns: three digits of the range of final returns, or more of them."""
     width = group.profile_returns[-1] - group.profile_returns[0]
     return f",.{np.clip(2 - math.floor(math.log10(width)), 0, _MOST_DIGITS) + more}f"
 
 
 def _spread_table(group: GroupAnalysis) -> Table:
     form = _form(group, more=1)
-    return Table(
+    return Table.of(
         "Spread of final returns over runs; CVaR is the mean of the worst quarter",
-        (_KEY, "SD", "IQR", "MAD", "CVaR"),
-        [
-            (label.representation, *(shown(label.numbers[name], form) for name in _SPREADS))
-            for label in group.labels
-        ],
+        group.labels,
+        {
+            _KEY: _NAME,
+            "SD": _number("final_return_sd", form),
+            "IQR": _number("final_return_iqr", form),
+            "MAD": _number("final_return_mad", form),
+            "CVaR": _number("risk_across_runs", form),
+        },
     )
 
 
 def _component_table(group: GroupAnalysis) -> Table:
     """A row for each representation of several encoders."""
-    return Table(
+    return Table.of(
         "Variance of final returns: of encoders and of runs",
-        (_KEY, "encoders", "their variance", "variance of runs", "ratio"),
-        [
-            (
-                label.representation,
-                str(label.encoders),
-                *(shown(label.numbers[name]) for name in COMPONENTS),
-            )
-            for label in group.labels
-            if label.encoders > 1
-        ],
+        [label for label in group.labels if label.encoders > 1],
+        {
+            _KEY: _NAME,
+            "encoders": lambda label: str(label.encoders),
+            "their variance": _number("encoder_variance"),
+            "variance of runs": _number("run_variance"),
+            "ratio": _number("encoder_variance_ratio"),
+        },
     )
 
 
 def _comparison_table(group: GroupAnalysis, baseline: str) -> Table:
     """A row for each comparison with the baseline, but for those that wait for a look."""
     form = _form(group)
-    return Table(
+    return Table.of(
         f"Compared with {baseline}",
-        (
-            *(_KEY, "final return", "mean return", "P(improvement)", "variance ratio"),
-            *("by bootstrap", "Brown-Forsythe p"),
-        ),
-        [
-            (
-                comparison.representation,
-                shown(comparison.numbers["final_return_difference"], form),
-                shown(comparison.numbers["mean_return_difference"], form),
-                shown(comparison.numbers["probability_of_improvement"], ".2f"),
-                shown(comparison.numbers["variance_ratio"]),
-                shown(comparison.numbers["variance_ratio_bootstrap"]),
-                probability(comparison.brown_forsythe_p),
-            )
-            for comparison in group.comparisons
-            if comparison.is_open
-        ],
+        [comparison for comparison in group.comparisons if comparison.is_open],
+        {
+            _KEY: _NAME,
+            "final return": _number("final_return_difference", form),
+            "mean return": _number("mean_return_difference", form),
+            "P(improvement)": _number("probability_of_improvement", ".2f"),
+            "variance ratio": _number("variance_ratio"),
+            "by bootstrap": _number("variance_ratio_bootstrap"),
+            "Brown-Forsythe p": lambda comparison: probability(comparison.brown_forsythe_p),
+        },
     )
 
 
@@ -248,19 +229,16 @@ def across_tasks(analysis: Analysis) -> list[Table]:
     for each in analysis.open_aggregates:
         by_algorithm.setdefault(each.algorithm, []).append(each)
     return [
-        Table(
+        Table.of(
             f"{algorithm} across {', '.join(of_algorithm[0].tasks)}: gains over standing still as "
             f"shares of that on {analysis.baseline}; 95 % intervals over runs within tasks",
-            (_KEY, "runs", "IQM", "optimality gap"),
-            [
-                (
-                    each.representation,
-                    f"{each.runs} of each",
-                    shown(each.iqm, ".2f"),
-                    shown(each.optimality_gap, ".2f"),
-                )
-                for each in of_algorithm
-            ],
+            of_algorithm,
+            {
+                _KEY: _NAME,
+                "runs": lambda each: f"{each.runs} of each",
+                "IQM": lambda each: shown(each.iqm, ".2f"),
+                "optimality gap": lambda each: shown(each.optimality_gap, ".2f"),
+            },
         )
         for algorithm, of_algorithm in by_algorithm.items()
     ]
@@ -269,21 +247,17 @@ def across_tasks(analysis: Analysis) -> list[Table]:
 def association_tables(associated: list[Association]) -> list[Table]:
     """How well diagnostics predict learning, a table for each task and algorithm."""
     return [
-        Table(
+        Table.of(
             f"{name}: do diagnostics predict learning? Rank correlation with the final return over "
             "codes, positive where the better value goes with the higher return; 95 % bootstrap "
             "intervals over codes",
-            ("diagnostic", "what it is", "rank correlation", "codes"),
-            [
-                (
-                    each.diagnostic.name,
-                    each.diagnostic.words,
-                    shown(each.correlation, ".2f"),
-                    str(len(each.values)),
-                )
-                for each in associated
-                if each.group.name == name
-            ],
+            [each for each in associated if each.group.name == name],
+            {
+                "diagnostic": lambda each: each.diagnostic.name,
+                "what it is": lambda each: each.diagnostic.words,
+                "rank correlation": lambda each: shown(each.correlation, ".2f"),
+                "codes": lambda each: str(len(each.values)),
+            },
         )
         for name in dict.fromkeys(each.group.name for each in associated)
     ]
@@ -299,8 +273,10 @@ def forecast_text(forecast: Forecast, planned: Planned, width: int | None = None
     parts = [table(("run", "cohort", "time"), rows, width)] if rows else []
     parts.append(wrapped(summary, width))
     if forecast.prospects:
-        header = ("primary cell: claim", "runs", "level", "least p", "power")
-        parts.append(table(header, map(_prospect, forecast.prospects), width))
+        found = [_prospect(each) for each in forecast.prospects]
+        parts.append(
+            table(("primary cell: claim", "runs", "level", "least p", "power"), found, width)
+        )
         parts += [wrapped(each, width) for each in (*notes(planned), EFFECTS)]
     return "\n\n".join(parts)
 

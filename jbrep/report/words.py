@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from jbrep.stats import Analysis
@@ -32,18 +32,18 @@ EFFECTS = (  # of `jbrep.stats.power`
     "varies by an SD of 5, 10 or 20 % of training. Each by itself: claims before it, and runs that "
     "fail to learn, may stop a verdict."
 )
-_STATEMENTS = {  # with a place for the percentage that may be lost
-    NOT_WORSE.name: "Agents on less state lose at most {} of the gain",
-    LESS_VARIANCE.name: "Their training varies less from run to run",
-    FASTER.name: "They learn faster",
-    WITHIN_HALF.name: "They lose at most {} of it",
-}
 _KEPT = "gain over standing still, as a share of that on the full state"
-_ESTIMANDS = {
-    NOT_WORSE.name: _KEPT,
-    LESS_VARIANCE.name: "spread of training curves, as a multiple of that on the full state",
-    FASTER.name: "steps to half of the full agents' gain, beyond what these take",
-    WITHIN_HALF.name: _KEPT,
+_CLAIMS = {  # as a sentence, with a place for the percentage that may be lost; what is estimated
+    NOT_WORSE.name: ("Agents on less state lose at most {} of the gain", _KEPT),
+    LESS_VARIANCE.name: (
+        "Their training varies less from run to run",
+        "spread of training curves, as a multiple of that on the full state",
+    ),
+    FASTER.name: (
+        "They learn faster",
+        "steps to half of the full agents' gain, beyond what these take",
+    ),
+    WITHIN_HALF.name: ("They lose at most {} of it", _KEPT),
 }
 _BESIDE = {  # a claim's verdict: what else is known of it
     "not worse": ("Difference of final returns", "final_return_difference"),
@@ -73,8 +73,7 @@ class Finding(NamedTuple):
 class Answer(NamedTuple):
     """All verdicts of a study on one claim."""
 
-    claim: str
-    estimand: str
+    claim: Statement
     headline: str
     counts: dict[str, int]  # of verdicts
     findings: list[Finding]
@@ -86,8 +85,8 @@ def statements(planned: Planned) -> list[Statement]:
     for name in planned.rules.claims:
         claim = CLAIMS[name]
         percent = f"{100 * (1 - claim.boundary(planned.rules.margin)):.3g} %"
-        sentence = _STATEMENTS[name].format(percent)
-        found.append(Statement(name, sentence, _ESTIMANDS[name], claim.is_ratio))
+        sentence, estimand = _CLAIMS[name]
+        found.append(Statement(name, sentence.format(percent), estimand, claim.is_ratio))
     return found
 
 
@@ -114,7 +113,7 @@ def headline(analysis: Analysis | None) -> str:
     """What was found, in a sentence."""
     if analysis is None:
         return "There are no statistics yet, and so no verdicts."
-    found = list(_all(analysis))
+    found = [each.verdicts for group in analysis.groups for each in group.comparisons]
     if not found:
         return "No reduced state was compared with the full one."
     judged = [verdicts for verdicts in found if verdicts[0].verdict != EXPLORATORY]
@@ -129,10 +128,6 @@ def headline(analysis: Analysis | None) -> str:
     columns = zip(analysis.planned.rules.claims, zip(*judged, strict=True), strict=True)
     parts = [f"{claim!r} {_overall(_counts(each))}" for claim, each in columns]
     return f"In {cells} judged: {'; '.join(parts)}."
-
-
-def _all(analysis: Analysis) -> Iterator[tuple[Verdict, ...]]:
-    return (each.verdicts for group in analysis.groups for each in group.comparisons)
 
 
 def _counts(verdicts: Sequence[Verdict]) -> Counter[str]:
@@ -165,7 +160,7 @@ def _answer(position: int, claim: Statement, analysis: Analysis) -> Answer:
     counts = _counts([each.verdicts[position] for _, each in pairs])
     overall = _overall(counts) if counts else "no reduced state was compared"
     headline = f"{claim.statement}: {overall}"
-    return Answer(claim.name, claim.estimand, headline, dict(counts), findings)
+    return Answer(claim, headline, dict(counts), findings)
 
 
 def _sentence(claim: Statement, verdict: Verdict, name: str, baseline: str) -> str:

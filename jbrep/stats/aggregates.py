@@ -48,9 +48,7 @@ def aggregates(
 ) -> Iterator[Aggregate]:
     """The results of each algorithm and representation that has runs on two tasks or more.
 
-    Args:
-        gains: by algorithm, task and representation, the baseline first, (runs,) each.
-        seed: of the resamples.
+    Gains are by algorithm, task and representation, the baseline first, (runs,) each.
     """
     for algorithm, by_task in gains.items():
         names = dict.fromkeys(name for by_name in by_task.values() for name in by_name)
@@ -89,9 +87,7 @@ def _aggregate(
 def _scores(gains: Sequence[Array], of_baseline: Sequence[Array]) -> Array:
     """The scores of all tasks together, (..., tasks x runs); NaN where the baseline gains nothing.
 
-    Args:
-        gains: for each task, (..., runs).
-        of_baseline: for each task, (..., baseline's runs).
+    Gains are those of each task, (..., runs) and (..., runs of the baseline).
     """
     means = (each.mean(axis=-1, keepdims=True) for each in of_baseline)
     scored = [

@@ -65,6 +65,14 @@ class Arm(NamedTuple):
         return len(self.final)
 
 
+class Sides(NamedTuple):
+    """The arm of a representation, x, against that of the baseline, y, and what holds for both."""
+
+    x: Arm
+    y: Arm
+    frame: Frame
+
+
 def measure(group: Group, seeds: Collection[int]) -> tuple[Frame, dict[str, Arm]]:
     """The frame of a group and the arms of its representations, the baseline first.
 
@@ -116,7 +124,7 @@ def _frame(
 def _arm(
     runs: list[RunCurve], by_encoder: bool, final: Array, curves: Array, grid: Array, frame: Frame
 ) -> Arm:
-    units = _units(runs) if by_encoder else [[number] for number in range(len(runs))]
+    units = of_encoders(runs) if by_encoder else [[number] for number in range(len(runs))]
     time = np.minimum(steps_to(curves, grid, frame.half) - grid[0], frame.steps)
     return Arm(
         final=np.array([final[unit].mean() for unit in units]),
@@ -133,7 +141,7 @@ def _own_encoders(runs: list[RunCurve]) -> bool:
     return len({run.encoder_seed for run in runs} - {None}) >= FEWEST_UNITS
 
 
-def _units(runs: list[RunCurve]) -> list[list[int]]:
+def of_encoders(runs: list[RunCurve]) -> list[list[int]]:
     """The numbers of the runs of each encoder."""
     by_encoder: dict[int | None, list[int]] = {}
     for number, run in enumerate(runs):

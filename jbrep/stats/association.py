@@ -39,14 +39,7 @@ def associations(
     diagnostics: Sequence[Diagnostic],
     seed: int = 0,
 ) -> list[Association]:
-    """Each diagnostic with the final returns of each group, where both are known of some code.
-
-    Args:
-        groups: of a study.
-        diagnosed: values of diagnostics, by name; None for one that isn't known.
-        diagnostics: which ones, in order.
-        seed: of the resamples.
-    """
+    """Each diagnostic with the final returns of each group, where both are known of some code."""
     result = []
     for group in groups:
         returns = {
@@ -67,7 +60,7 @@ def associations(
 
 
 def rank_correlation(x: Array, y: Array, seed: int = 0) -> Interval:
-    """Spearman's rank correlation with its percentile bootstrap interval over pairs.
+    """Spearman's rank correlation of finite x and y, (n,), with its percentile bootstrap interval.
 
     Spearman 1904, "The proof and measurement of association between two things": Pearson's
     correlation of ranks, equal values sharing their mean rank. All is NaN for fewer than five
@@ -76,11 +69,6 @@ def rank_correlation(x: Array, y: Array, seed: int = 0) -> Interval:
     In 300 samples each of normal pairs with correlations of 0, 0.6 and 0.9, the intervals covered
     88, 95 and 71 % for 5 pairs, 95, 96 and 98 % for 8, and 96, 97 and 98 % for 12: of five pairs in
     the same order the interval has no width, which says little.
-
-    Args:
-        x: finite values, (n,).
-        y: as many.
-        seed: of the resamples.
     """
     if len(x) < _FEWEST or np.ptp(x) == 0 or np.ptp(y) == 0:
         return UNDEFINED

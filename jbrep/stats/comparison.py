@@ -11,12 +11,11 @@ from jbrep.stats.claims import EXPLORATORY, NOT_YET, Verdict
 from jbrep.stats.intervals import (
     FEWEST_RUNS,
     LEVEL,
-    UNDEFINED,
     Bounds,
-    Part,
     constant,
+    difference_within,
     percentile,
-    sum_within,
+    unless_few,
     variance_ratio,
 )
 from jbrep.stats.labels import RepresentationResult, median
@@ -58,50 +57,27 @@ def compare(
     bounds: Bounds,
     seed: int,
 ) -> Comparison:
-    """A representation against the baseline.
-
-    Args:
-        label: of the representation.
-        baseline: of the same task and algorithm.
-        verdicts: on the claims.
-        bounds: of returns.
-        seed: of all resampling.
-    """
-    final, final_of_baseline = label.by_run["final_return"], baseline.by_run["final_return"]
-    numbers = {
-        **{
-            f"{name}_difference": _difference(label.by_run[name], baseline.by_run[name], bounds)
-            for name in ("final_return", "mean_return")
-        },
-        "variance_ratio": _unless_few(
-            variance_ratio(final, final_of_baseline), final, final_of_baseline
-        ),
-        "variance_ratio_bootstrap": percentile(
-            _ratio_of_variances, final, final_of_baseline, seed=seed
-        ),
-        "probability_of_improvement": percentile(
-            probability_of_improvement, final, final_of_baseline, seed=seed
-        ),
-    }
+    """A representation against the baseline of the same task and algorithm, by bounded returns."""
+    pairs = {name: (label.by_run[name], baseline.by_run[name]) for name in label.by_run}
+    finals, runs = pairs["final_return"], (len(label.seeds), len(baseline.seeds))
+    numbers = {}
+    for name in ("final_return", "mean_return"):
+        difference = difference_within(*pairs[name], bounds, LEVEL)
+        numbers[f"{name}_difference"] = unless_few(difference, *runs)
+    numbers["variance_ratio"] = unless_few(variance_ratio(*finals), *runs)
+    for name, statistic in (
+        ("variance_ratio_bootstrap", _ratio_of_variances),
+        ("probability_of_improvement", probability_of_improvement),
+    ):
+        numbers[name] = percentile(statistic, *finals, seed=seed)
     for name in STEPS_TO:
-        numbers[f"{name}_ratio"] = percentile(
-            _ratio_of_medians, label.by_run[name], baseline.by_run[name], seed=seed
-        )
+        numbers[f"{name}_ratio"] = percentile(_ratio_of_medians, *pairs[name], seed=seed)
     return Comparison(
         representation=label.representation,
         numbers=numbers,
-        brown_forsythe_p=_brown_forsythe(final, final_of_baseline),
+        brown_forsythe_p=_brown_forsythe(*finals),
         verdicts=verdicts,
     )
-
-
-def _difference(x: Array, y: Array, bounds: Bounds) -> Interval:
-    return _unless_few(sum_within((Part(1, x), Part(-1, y)), bounds, LEVEL), x, y)
-
-
-def _unless_few(interval: Interval, x: Array, y: Array) -> Interval:
-    few = min(len(x), len(y)) < FEWEST_RUNS
-    return UNDEFINED._replace(value=interval.value) if few else interval
 
 
 def probability_of_improvement(x: Array, y: Array) -> Array:

@@ -93,12 +93,7 @@ def on_grid(run: RunCurve, grid: Array) -> Array:
 
 
 def bands(curves: Array, seed: int) -> Curve:
-    """Percentiles and means over runs at each step, from resampling whole curves.
-
-    Args:
-        curves: on the grid, (runs, g).
-        seed: of the resamples.
-    """
+    """Percentiles and means of curves (runs, g) at each step, from resampling whole curves."""
     parts = [
         percentile(iqm, curves.T[first : first + _POINTS], seed=seed)
         for first in range(0, curves.shape[1], _POINTS)
@@ -117,27 +112,21 @@ def final_return(curves: Array, grid: Array) -> Array:
 def final_returns(
     group: Mapping[str, Sequence[RunCurve]], curves: Mapping[str, Array], grid: Array
 ) -> dict[str, Array]:
-    """The final return of each run of each representation, (runs,) each.
+    """The final return of each run of each representation, (runs,) each, from curves (runs, g).
 
     Where all that didn't fail end with an evaluation of more episodes, at the end of the grid, it
     is their mean; else that of the evaluations in the last tenth of the grid. A run that failed
     ends with its failure_return.
-
-    Args:
-        group: runs by representation.
-        curves: of the runs, on the grid, (runs, g) each.
-        grid: training steps, (g,).
     """
     whole = [run for runs in group.values() for run in runs if run.failed_at is None]
     if not whole or any(run.final is None or run.steps[-1] > grid[-1] for run in whole):
         return {name: final_return(each, grid) for name, each in curves.items()}
-    return {
-        name: np.array(
-            [curve[-1] if run.final is None else run.final.mean() for run, curve in each]
-        )
-        for name, runs in group.items()
-        for each in [zip(runs, curves[name], strict=True)]
-    }
+    finals = {}
+    for name, runs in group.items():
+        pairs = zip(runs, curves[name], strict=True)
+        each = [curve[-1] if run.final is None else run.final.mean() for run, curve in pairs]
+        finals[name] = np.array(each)
+    return finals
 
 
 class Compared(NamedTuple):

@@ -45,7 +45,7 @@ as well.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -92,6 +92,11 @@ def percentile(statistic: Callable[..., Array], *samples: Array, seed: int = 0) 
         for q, worst in (((1 - LEVEL) / 2, -np.inf), ((1 + LEVEL) / 2, np.inf))
     )
     return Interval(value, low, high)
+
+
+def unless_few(interval: Interval, *runs: int) -> Interval:
+    """An interval, or its value alone where a sample has fewer runs than FEWEST_RUNS."""
+    return interval if min(runs) >= FEWEST_RUNS else UNDEFINED._replace(value=interval.value)
 
 
 def constant(values: Array) -> NDArray[np.bool_]:
@@ -161,13 +166,6 @@ class Bounds(NamedTuple):
     high: float = np.inf
 
 
-class Part(NamedTuple):
-    """A mean in a sum, times a factor."""
-
-    factor: float
-    values: Array  # a value for each run, (..., n)
-
-
 def mean_within(values: Array, bounds: Bounds, level: float) -> Interval:
     """The mean of (..., n) with its interval, (...); NaN where nothing varies."""
     runs, mean = values.shape[-1], values.mean(axis=-1)
@@ -190,16 +188,18 @@ def mean_within(values: Array, bounds: Bounds, level: float) -> Interval:
         return Interval(mean, *(bounds.low + width / (1 + 1 / each) for each in (low, high)))
 
 
-def sum_within(parts: Sequence[Part], bounds: Bounds, level: float) -> Interval:
-    """The sum of means (...) times their factors, with its interval, (...).
+def difference_within(
+    x: Array, y: Array, bounds: Bounds, level: float, share: float = 1
+) -> Interval:
+    """The mean of x (..., n) less a share of that of y (..., m), with its interval, (...).
 
     What doesn't vary adds nothing to the interval, which is NaN where nothing varies.
     """
-    each = [(part.factor, _known(mean_within(part.values, bounds, level))) for part in parts]
-    value = sum(factor * mean.value for factor, mean in each)
-    downwards = sum((f * (m.value - (m.low if f > 0 else m.high))) ** 2 for f, m in each)
-    upwards = sum((f * (m.value - (m.high if f > 0 else m.low))) ** 2 for f, m in each)
-    low, high = value - np.sqrt(downwards), value + np.sqrt(upwards)
+    of_x, of_y = (_known(mean_within(each, bounds, level)) for each in (x, y))
+    least, most = (of_y.high, of_y.low) if share > 0 else (of_y.low, of_y.high)
+    value = of_x.value - share * of_y.value
+    low = value - np.sqrt((of_x.value - of_x.low) ** 2 + (share * (of_y.value - least)) ** 2)
+    high = value + np.sqrt((of_x.value - of_x.high) ** 2 + (share * (of_y.value - most)) ** 2)
     return Interval(value, *(np.where(low < high, end, np.nan) for end in (low, high)))
 
 
@@ -208,14 +208,14 @@ def _known(mean: Interval) -> Interval:
     return Interval(mean.value, *(np.where(np.isnan(e), mean.value, e) for e in mean[1:]))
 
 
-def p_of_sum(parts: Sequence[Part], bounds: Bounds, boundary: float) -> float:
-    """The two-sided p-value of a sum of means (n,) lying on a boundary, by its intervals.
+def p_of_difference(x: Array, y: Array, bounds: Bounds, boundary: float, share: float = 1) -> float:
+    """The two-sided p-value of a difference of means, of (n,) and (m,), lying on a boundary.
 
     It is 1 minus the level of the interval that ends there; NaN where nothing varies.
     """
 
     def room(p: float) -> float:
-        value, low, high = sum_within(parts, bounds, 1 - p)
+        value, low, high = difference_within(x, y, bounds, 1 - p, share)
         return float(boundary - low if value > boundary else high - boundary)
 
     if np.isnan(room(0.5)):

@@ -6,16 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binomtest, iqr, median_abs_deviation
 
+from jbrep.stats.arms import of_encoders
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.curves import Curve, bands, iqm, mean_return, steps_to
 from jbrep.stats.intervals import (
-    FEWEST_RUNS,
     LEVEL,
     UNDEFINED,
     Bounds,
     deviation,
     mean_within,
     percentile,
+    unless_few,
 )
 from jbrep.stats.nested import components
 from jbrep.stats.reliability import TAIL_OF_RUNS, expected_shortfall, fixed_policy, within_runs
@@ -31,11 +32,8 @@ WITHIN = (  # of one run
     "policy_dispersion",
     "policy_risk",
 )
-COMPONENTS = {  # of the variance of final returns, where each of several encoders has several runs
-    "encoder_variance": "encoders",
-    "run_variance": "runs",
-    "encoder_variance_ratio": "ratio",
-}
+# of the variance of final returns, where each of several encoders has several runs
+COMPONENTS = ("encoder_variance", "run_variance", "encoder_variance_ratio")
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,14 +67,9 @@ class RepresentationResult:
 def describe(
     runs: list[RunCurve], curves: Array, final: Array, scale: Scale, seed: int
 ) -> RepresentationResult:
-    """The results of a representation.
+    """The results of a representation, from its runs in the order of seeds.
 
-    Args:
-        runs: all of the representation, in the order of seeds.
-        curves: of the runs, on the grid of the scale, (runs, g).
-        final: final returns of the runs, (runs,).
-        scale: of the group.
-        seed: of the resamples.
+    The curves are on the grid of the scale, (runs, g); final returns are (runs,).
     """
     grid = scale.grid
     failed = np.array([run.failed_at is not None for run in runs])
@@ -109,20 +102,15 @@ def profile(final_return: Array, returns: Array, seed: int) -> Interval:
 
 def _components(runs: list[RunCurve], final: Array) -> dict[str, Interval]:
     """The variance of encoders and of runs, where each encoder has as many runs, at least two."""
-    by_encoder: dict[int | None, list[float]] = {}
-    for run, each in zip(runs, final.tolist(), strict=True):
-        by_encoder.setdefault(run.encoder_seed, []).append(each)
-    counts = {len(each) for each in by_encoder.values()}
-    if len(by_encoder) < 2 or len(counts) > 1 or counts == {1}:
-        return dict.fromkeys(COMPONENTS, UNDEFINED)
-    found = components(np.array([*by_encoder.values()]))
-    return {name: getattr(found, part) for name, part in COMPONENTS.items()}
+    units = of_encoders(runs)
+    counts = {len(unit) for unit in units}
+    known = len(units) > 1 and len(counts) == 1 and counts != {1}
+    found = components(final[units]) if known else [UNDEFINED] * 3
+    return dict(zip(COMPONENTS, found, strict=True))
 
 
 def _mean(values: Array, bounds: Bounds) -> Interval:
-    if len(values) < FEWEST_RUNS:
-        return UNDEFINED._replace(value=values.mean())
-    return mean_within(values, bounds, LEVEL)
+    return unless_few(mean_within(values, bounds, LEVEL), len(values))
 
 
 def _numbers(by_run: Mapping[str, Array], bounds: Bounds, seed: int) -> dict[str, Interval]:
@@ -161,7 +149,5 @@ def _share_reached(steps: Array) -> Interval:
     if np.isnan(steps).any():
         return UNDEFINED
     reached = int(np.isfinite(steps).sum())
-    if len(steps) < FEWEST_RUNS:
-        return UNDEFINED._replace(value=reached / len(steps))
     ends = binomtest(reached, len(steps)).proportion_ci(LEVEL, method="wilson")
-    return Interval(reached / len(steps), ends.low, ends.high)
+    return unless_few(Interval(reached / len(steps), ends.low, ends.high), len(steps))

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2, f
 
-from jbrep.errors import InputError
 from jbrep.stats.bootstrap import Array, Interval
 
 
@@ -38,17 +37,9 @@ def components(returns: Array, level: float = 0.95) -> Components:
     of Statistical Computation and Simulation 35. As variances aren't negative, none ends below 0.
 
     Args:
-        returns: a row for each encoder, a column for each of its runs, (e, r).
+        returns: a row for each encoder, a column for each of its runs, (e, r): at least two each.
         level: of the intervals.
-
-    Raises:
-        InputError: fewer than two encoders, or runs of each.
     """
-    if returns.ndim != 2 or min(returns.shape) < 2:
-        raise InputError(
-            f"variances of encoders and runs take two encoders and two runs of each, not "
-            f"{' times '.join(map(str, returns.shape))}"
-        )
     encoders, runs = returns.shape
     freedom = encoders - 1, encoders * (runs - 1)
     between = runs * float(returns.mean(axis=1).var(ddof=1))

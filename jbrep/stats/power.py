@@ -8,7 +8,7 @@ import numpy as np
 
 from jbrep.stats.arms import FEWEST_UNITS
 from jbrep.stats.claims import CLAIMS, FASTER, LESS_VARIANCE
-from jbrep.stats.intervals import Bounds, Part, sum_within
+from jbrep.stats.intervals import Bounds, difference_within
 from jbrep.stats.rules import ERROR, Planned, Rules, levels, most_failing
 from jbrep.stats.spread import PERMUTATIONS, Curves, spread_p
 
@@ -64,12 +64,7 @@ def obstacle(rules: Rules, claim: str, arms: Arms) -> str | None:
 
 
 def prospects(planned: Planned, arms: Mapping[str, Arms]) -> Iterator[Prospect]:
-    """What can be found of each claim in each primary cell.
-
-    Args:
-        planned: the rules and seeds of a study.
-        arms: of each primary cell.
-    """
+    """What can be found of each claim in each primary cell, with its planned arms."""
     level = _level(planned)
     for cell in planned.rules.primary:
         for claim in planned.rules.claims:
@@ -101,7 +96,7 @@ def _power_of_means(sd: float, share: float, effect: float, arms: Arms, level: f
     random = np.random.default_rng(0)
     x = random.normal(effect, sd, (_STUDIES, arms.units))
     y = random.normal(0, sd, (_STUDIES, arms.baseline))
-    _, low, _ = sum_within((Part(1, x), Part(-share, y)), Bounds(), 1 - level)
+    _, low, _ = difference_within(x, y, Bounds(), 1 - level, share)
     return float(np.mean(low > 0))
 
 

@@ -38,13 +38,9 @@ def drawdown(curves: Array) -> Array:
 
 
 def within_runs(curves: Array, failed: NDArray[np.bool_]) -> dict[str, Array]:
-    """Dispersion and risk over the training of each run, (runs,) each.
+    """Dispersion and risk over the training of each run, from curves (runs, g), (runs,) each.
 
-    NaN for a failed run, whose constant return would look like steadiness.
-
-    Args:
-        curves: on the grid, (runs, g).
-        failed: which of the runs failed, (runs,).
+    NaN for a run that failed, (runs,): its constant return would look like steadiness.
     """
     steps = np.diff(curves, axis=1)
     fallen = drawdown(curves)
@@ -60,11 +56,7 @@ def within_runs(curves: Array, failed: NDArray[np.bool_]) -> dict[str, Array]:
 def fixed_policy(runs: list[RunCurve], end: float) -> dict[str, Array]:
     """Dispersion and risk over the episodes of each run's last evaluation, (runs,) each.
 
-    NaN for a failed run.
-
-    Args:
-        runs: of one representation.
-        end: the last step of the grid.
+    That is the last one up to a step; NaN for a failed run.
     """
     numbers = {
         "policy_dispersion": np.full(len(runs), np.nan),

@@ -26,8 +26,7 @@ from scipy.stats import binomtest, norm
 
 from jbrep.errors import InputError
 from jbrep.records.record import Record
-from jbrep.stats.arms import FEWEST_UNITS, Arm, Frame, learns, measure
-from jbrep.stats.bootstrap import Interval
+from jbrep.stats.arms import FEWEST_UNITS, Sides, learns, measure
 from jbrep.stats.claims import (
     CLAIMS,
     CONTRADICTED,
@@ -40,7 +39,7 @@ from jbrep.stats.claims import (
     Verdict,
     Verdicts,
 )
-from jbrep.stats.intervals import FEWEST_RUNS, LEVEL, UNDEFINED
+from jbrep.stats.intervals import LEVEL, UNDEFINED, unless_few
 from jbrep.stats.runs import Group, Key
 
 ERROR = 0.05  # the probability that any of a study's verdicts is wrong, two-sided
@@ -126,10 +125,6 @@ class Planned:
     def __call__(self, groups: Mapping[Key, Group], seed: int = 0) -> Verdicts:
         """What is found of each claim, for each representation but the first of each group.
 
-        Args:
-            groups: runs by task and algorithm, then by representation, the baseline first.
-            seed: of all resampling.
-
         Raises:
             InputError: runs of a group have no range of steps in common.
         """
@@ -161,19 +156,15 @@ def _cell_name(key: Key, representation: str) -> str:
 
 
 def _look(
-    cells: Sequence[_Cell],
-    groups: Mapping[Key, Group],
-    planned: Planned,
-    look: int,
-    seed: int,
+    cells: Sequence[_Cell], groups: Mapping[Key, Group], planned: Planned, look: int, seed: int
 ) -> None:
     """Test at a look whatever can be tested; levels that become free are used at once."""
     rules, seeds = planned.rules, planned.seeds[: planned.counts[look]]
     ready = {
-        _cell_name(key, name): measured
+        _cell_name(key, name): _sides(group, name, seeds)
         for key, group in groups.items()
         for name in list(group)[1:]
-        if (measured := _measured(group, name, seeds))
+        if _has_all(group, name, seeds)
     }
     tested = True
     while tested:
@@ -183,7 +174,7 @@ def _look(
                 continue
             claim = CLAIMS[rules.claims[len(cell.verdicts)]]
             level = levels(planned.looks, cell.level)[look]
-            verdict = _tested(claim, *ready[cell.name], planned, level, look + 1, seed)
+            verdict = _tested(claim, ready[cell.name], planned, level, look + 1, seed)
             if verdict.verdict == UNDECIDED:
                 cell.undecided = verdict
                 continue
@@ -200,33 +191,27 @@ def _pass_on(done: _Cell, cells: Sequence[_Cell]) -> None:
         cell.level += done.level / len(others)
 
 
-def _measured(
-    group: Group, representation: str, seeds: Sequence[int]
-) -> tuple[Arm, Arm, Frame] | None:
-    """The arms of a representation and of the baseline, if all runs of the seeds are there."""
+def _has_all(group: Group, name: str, seeds: Sequence[int]) -> bool:
+    """Whether a representation and the baseline have all runs of the seeds."""
+    both = (group[name], next(iter(group.values())))
+    return bool(seeds) and all({run.seed for run in runs}.issuperset(seeds) for runs in both)
+
+
+def _sides(group: Group, name: str, seeds: Collection[int]) -> Sides:
+    """A representation against the baseline, with the runs of some seeds."""
     baseline = next(iter(group))
-    both = {name: group[name] for name in (baseline, representation)}
-    if not seeds or not all({r.seed for r in runs}.issuperset(seeds) for runs in both.values()):
-        return None
-    frame, arms = measure(both, seeds)
-    return arms[representation], arms[baseline], frame
+    frame, arms = measure({each: group[each] for each in (baseline, name)}, seeds)
+    return Sides(arms[name], arms[baseline], frame)
 
 
 def _tested(
-    claim: Claim,
-    x: Arm,
-    y: Arm,
-    frame: Frame,
-    planned: Planned,
-    level: float,
-    look: int,
-    seed: int,
+    claim: Claim, sides: Sides, planned: Planned, level: float, look: int, seed: int
 ) -> Verdict:
-    estimated = _estimated(claim, x, y, frame, planned.rules, seed)
+    estimated = _estimated(claim, sides, planned.rules, seed)
     boundary = estimated.boundary
-    p = claim.p_value(x, y, frame, boundary, seed)
+    p = claim.p_value(sides, boundary, seed)
     direction = claim.side * np.sign(estimated.estimate.value - boundary) if p <= level else 0
-    reason = _reason(claim, x, y, frame, planned.rules, direction, level)
+    reason = _reason(claim, sides, planned.rules, direction, level)
     if reason is None and np.isnan(p):
         reason = "nothing varies from run to run"
     if reason is None and not direction and look < len(planned.counts):
@@ -236,16 +221,15 @@ def _tested(
         verdict={1: SUPPORTED, -1: CONTRADICTED, 0: UNDECIDED}[0 if reason else int(direction)],
         p=p,
         level=level,
-        interval=claim.tested(x, y, frame, 1 - level, seed),
+        interval=claim.tested(sides, 1 - level, seed),
         look=look,
         reason=reason,
     )
 
 
-def _reason(
-    claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, direction: int, level: float
-) -> str | None:
+def _reason(claim: Claim, sides: Sides, rules: Rules, direction: int, level: float) -> str | None:
     """Why there can't be a verdict; None if there can."""
+    x, y, frame = sides
     fewest, what = min(x.units, y.units), "encoders" if x.by_encoder else "runs"
     if fewest < FEWEST_UNITS:
         return f"{fewest} {what}; verdicts take {FEWEST_UNITS}"
@@ -264,20 +248,16 @@ def _reason(
 def most_failing(failing: int, runs: int, level: float) -> float:
     """The exact upper bound on the share of runs that fail (Clopper and Pearson 1934).
 
-    Args:
-        failing: runs that failed.
-        runs: in all.
-        level: of the test that rests on it, so that they err together no more often.
+    The level is that of the test that rests on it, so that they err together no more often.
     """
     test = binomtest(failing, runs, alternative="less")
     return float(test.proportion_ci(1 - level, method="exact").high)
 
 
-def _estimated(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, seed: int) -> Verdict:
+def _estimated(claim: Claim, sides: Sides, rules: Rules, seed: int) -> Verdict:
     """An estimate without a verdict."""
-    estimate = claim.estimate(x, y, frame, LEVEL, seed)
-    if min(x.units, y.units) < FEWEST_RUNS:
-        estimate = Interval(estimate.value, np.nan, np.nan)
+    x, y, _ = sides
+    estimate = unless_few(claim.estimate(sides, LEVEL, seed), x.units, y.units)
     return Verdict(
         claim=claim.name,
         verdict=EXPLORATORY,
@@ -285,7 +265,7 @@ def _estimated(claim: Claim, x: Arm, y: Arm, frame: Frame, rules: Rules, seed: i
         boundary=claim.boundary(rules.margin),
         p=np.nan,
         level=np.nan,
-        interval=Interval(estimate.value, np.nan, np.nan),
+        interval=UNDEFINED._replace(value=estimate.value),
         runs=(x.runs, y.runs),
         encoders=x.units if x.by_encoder else 0,
         look=0,
@@ -297,11 +277,8 @@ def _explored(
     group: Group, name: str, rules: Rules, seeds: Collection[int], seed: int, tested: int = 0
 ) -> tuple[Verdict, ...]:
     """Estimates from runs of some seeds, of each claim but the first, which are tested."""
-    baseline = next(iter(group))
-    frame, arms = measure({each: group[each] for each in (baseline, name)}, seeds)
-    x, y = arms[name], arms[baseline]
-    claims = rules.claims[tested:]
-    return tuple(_estimated(CLAIMS[each], x, y, frame, rules, seed) for each in claims)
+    sides = _sides(group, name, seeds)
+    return tuple(_estimated(CLAIMS[each], sides, rules, seed) for each in rules.claims[tested:])
 
 
 def _whole(
@@ -332,11 +309,9 @@ def _whole(
 
 @lru_cache(256)
 def levels(shares: Sequence[float], level: float) -> tuple[float, ...]:
-    """The two-sided level of the test at each look.
+    """The two-sided level of the test at each look, from shares of the runs that ascend to 1.
 
-    Args:
-        shares: of the runs that are there at each look, ascending to 1.
-        level: of all looks together, two-sided.
+    All looks together have the level that is given, two-sided, too.
     """
     if len(shares) == 1:
         return (level,)

@@ -37,12 +37,8 @@ def reference_of(run: RunCurve, curves: Array) -> float:
     """The return that gains are counted from.
 
     That is what standing still returns where it was measured, else the least possible return of the
-    task where it is known, else the baseline's mean return at the first step of the grid, that is,
-    of its untrained policies.
-
-    Args:
-        run: any of the task.
-        curves: of the baseline's runs on the grid, (runs, g).
+    task where it is known, else the mean return at the first step of the baseline's curves on the
+    grid, (runs, g), that is, of its untrained policies.
     """
     known = (each for each in (run.still, run.return_floor) if each is not None)
     return float(next(known, curves[:, 0].mean()))
@@ -53,8 +49,8 @@ def scale_of(finals: Sequence[Array], curves: Array, grid: Array, run: RunCurve)
 
     Args:
         finals: final returns of each representation's runs, (runs,) each, the baseline first.
-        curves: of the baseline's runs on the grid, (runs, g).
-        grid: training steps, (g,).
+        curves: of the baseline's runs on the grid (g,), (runs, g).
+        grid: training steps.
         run: any of the group.
     """
     reference, solved = reference_of(run, curves), run.solved

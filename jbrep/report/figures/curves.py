@@ -17,20 +17,21 @@ from jbrep.report.figures.style import (
     Limits,
     Looks,
     Styles,
+    draw_policies,
     draw_profile,
+    draw_solved,
     limits,
     panel_grid,
     plain,
     reference,
-    solved_line_style,
     with_runs,
 )
 from jbrep.stats.analysis import Analysis, GroupAnalysis
-from jbrep.study.tables import References, Return, by_run
+from jbrep.study.tables import Return, by_run
 
 Groups = Sequence[GroupAnalysis]
-Evaluated = tuple[str, str, str, int, int]  # task, algorithm, representation, seed, step
 Runs = dict[int, dict[int, float]]  # mean returns of a label, by seed and step
+Played = Mapping[str, Mapping[str, float]]  # mean returns by task and policy that learns nothing
 
 _MOST_ACROSS = 5  # panels of runs side by side
 _TITLE = 0.062  # width of a character in a panel's title [inches]
@@ -43,11 +44,11 @@ _COLUMNS = (
 )
 
 
-def curves(groups: Groups, references: References, looks: Looks) -> Plot:
+def curves(groups: Groups, played: Played, looks: Looks) -> Plot:
     """Every representation on one axis, tasks by algorithms."""
-    extents = _extents(groups, references)
+    extents = _extents(groups, played)
     caption = "Return of the deterministic policy over training: median and 10 to 90 % over n runs."
-    if any(references.get(task) for task in extents):
+    if any(played.get(task) for task in extents):
         caption += " Dashed: means of policies that don't learn, on the same starts."
     solved = {group.solved for group in groups if extents[group.task].contain(group.solved)}
     if solved:
@@ -59,44 +60,44 @@ def curves(groups: Groups, references: References, looks: Looks) -> Plot:
         caption,
         _COLUMNS,
         list(_rows(groups)),
-        lambda: _draw_curves(groups, references, extents, looks),
+        lambda: _draw_curves(groups, played, extents, looks),
     )
 
 
-def _extents(groups: Groups, references: References) -> dict[str, Limits]:
+def _extents(groups: Groups, played: Played) -> dict[str, Limits]:
     """The limits of returns for each task, which its algorithms share."""
     returns = defaultdict[str, list[float]](list)
     for group in groups:
-        played = references.get(group.task, {}).values()
-        returns[group.task] += [float(np.mean(each)) for each in played]
+        returns[group.task] += played.get(group.task, {}).values()
         for label in group.labels:
             returns[group.task] += [*label.curve.p10, *label.curve.p90]
     facts = {group.task: (group.return_floor, group.solved) for group in groups}
     return {task: limits(values, *facts[task]) for task, values in returns.items()}
 
 
-def every_run(returns: Sequence[Return], references: References, looks: Looks) -> Plot:
+def every_run(returns: Sequence[Return], played: Played, looks: Looks) -> Plot:
     """Each run by itself: a row for each task and algorithm, a panel for each representation.
 
-    Args:
-        returns: at least one.
-        references: returns of policies that learn nothing, by task and policy.
-        looks: of the representations, in the order of their panels.
+    Panels come in the order of looks; there is at least one return.
     """
-    means: dict[Evaluated, float] = {}
+    labels: dict[tuple[str, ...], Runs] = defaultdict(dict)  # by task, algorithm, representation
     for (label, seed), by_step in by_run(returns).items():
-        task, algorithm, name = label.rsplit("/", 2)
         fewest = min(map(len, by_step.values()))  # the last evaluation may have more starts
-        for step, each in by_step.items():
-            means[task, algorithm, name, seed, step] = float(np.mean(each[:fewest]))
+        means = {step: float(np.mean(each[:fewest])) for step, each in by_step.items()}
+        labels[tuple(label.rsplit("/", 2))][seed] = means
     return Plot(
         "every_run",
         "Every run",
         "Mean return of each evaluation, a line for each of n runs; thick: their median."
-        + (" Dashed: policies that don't learn, on the same starts." if references else ""),
+        + (" Dashed: policies that don't learn, on the same starts." if played else ""),
         ("task", "algorithm", "representation", "seed", "step", "mean_return"),
-        [(*key, cell(mean)) for key, mean in means.items()],
-        lambda: _draw_runs(means, references, looks),
+        [
+            (*label, seed, step, cell(mean))
+            for label, runs in labels.items()
+            for seed, means in runs.items()
+            for step, mean in means.items()
+        ],
+        lambda: _draw_runs(labels, played, looks),
     )
 
 
@@ -115,11 +116,6 @@ def cell(value: float) -> str:
     return f"{value:.7g}" if np.isfinite(value) else ""
 
 
-def _draw_references(axes: Axes, played: Mapping[str, Sequence[float]]) -> None:
-    for i, (policy, returns) in enumerate(played.items()):
-        axes.axhline(float(np.mean(returns)), label=plain(policy), **reference(i))
-
-
 def names_with_runs(groups: Groups) -> dict[str, str]:
     """Each representation for a legend, with the number of its runs."""
     counts = defaultdict(list)
@@ -130,7 +126,7 @@ def names_with_runs(groups: Groups) -> dict[str, str]:
 
 
 def _draw_curves(
-    groups: Groups, references: References, extents: Mapping[str, Limits], looks: Looks
+    groups: Groups, played: Played, extents: Mapping[str, Limits], looks: Looks
 ) -> Figure:
     """A panel for each task (rows) and algorithm (columns), over steps of training."""
     tasks = list(dict.fromkeys(group.task for group in groups))
@@ -147,9 +143,8 @@ def _draw_curves(
         if group is None:
             axes.set_axis_off()
             continue
-        _draw_references(axes, references.get(group.task, {}))
-        if extents[group.task].contain(group.solved):
-            axes.axhline(group.solved, **solved_line_style())
+        draw_policies(axes.axhline, played.get(group.task, {}))
+        draw_solved(axes.axhline, group.solved, extents[group.task])
         _draw_medians(axes, group, names, look)
         axes.set_title(plain(f"{tasks[i]}{gap}{algorithms[j]}"))
         _training_axes(axes, group.grid[-1], extents[group.task], len(algorithms))
@@ -207,33 +202,30 @@ def _is_broken(handle: Any) -> bool:
     return isinstance(handle, Line2D) and handle.get_linestyle() not in ("-", "None")
 
 
-def _draw_runs(means: Mapping[Evaluated, float], references: References, looks: Looks) -> Figure:
-    runs: dict[tuple[str, ...], Runs] = defaultdict(lambda: defaultdict(dict))  # by label
-    of_task = defaultdict(list)
-    for (task, algorithm, name, seed, step), mean in means.items():
-        runs[task, algorithm, name][seed][step] = mean
-        of_task[task].append(mean)
-    for task, played in references.items():
-        of_task[task] += [float(np.mean(each)) for each in played.values()]
-    look, groups = looks(), list(dict.fromkeys(label[:2] for label in runs))
-    names = [name for name in look if any(label[2] == name for label in runs)]
-    titles = max(len(with_runs(label[2], [len(each)])) for label, each in runs.items())
+def _draw_runs(labels: Mapping[tuple[str, ...], Runs], played: Played, looks: Looks) -> Figure:
+    of_task = {task: list(of_task.values()) for task, of_task in played.items()}
+    lasts: dict[tuple[str, ...], int] = {}  # steps, by task and algorithm
+    for label, runs in labels.items():
+        for means in runs.values():
+            of_task.setdefault(label[0], []).extend(means.values())
+            lasts[label[:2]] = max(lasts.get(label[:2], 0), *means)
+    look, groups = looks(), list(lasts)
+    names = [name for name in look if any(label[2] == name for label in labels)]
+    titles = max(len(with_runs(label[2], [len(each)])) for label, each in labels.items())
     across = min(len(names), _MOST_ACROSS, max(1, int(PAGE / (_TITLE * titles))))
     down = -(-len(names) // across)  # rows of a group
     figure = Figure(figsize=(PAGE, 0.35 + 1.35 * len(groups) * down))
     panels = figure.subplots(len(groups) * down, across, squeeze=False, sharey="row", sharex="row")
     for (i, j), axes in np.ndenumerate(panels.reshape(len(groups), -1)):
         label = (*groups[i], *names[j : j + 1])  # without a name beyond the last
-        if label not in runs:
+        if label not in labels:
             axes.set_axis_off()
             continue
-        _draw_references(axes, references.get(groups[i][0], {}))
-        _draw_label(axes, runs[label], look[names[j]]["color"])
+        draw_policies(axes.axhline, played.get(label[0], {}))
+        _draw_label(axes, labels[label], look[names[j]]["color"])
         group = f"{', '.join(groups[i])}\n" if j == 0 else ""
-        axes.set_title(plain(group) + with_runs(names[j], [len(runs[label])]))
-        last = max(key[4] for key in means if key[:2] == groups[i])
-        extent = limits(of_task[groups[i][0]])
-        _training_axes(axes, last, extent, across)
+        axes.set_title(plain(group) + with_runs(names[j], [len(labels[label])]))
+        _training_axes(axes, lasts[groups[i]], limits(of_task[label[0]]), across)
         is_lowest = i == len(groups) - 1 and j >= len(names) - across
         axes.set_xlabel("training step" if is_lowest else "")
         axes.set_ylabel("" if j % across else "return")

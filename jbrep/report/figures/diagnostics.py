@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 from jbrep.report.figures.curves import below, cell
 from jbrep.report.figures.plot import Plot
@@ -22,12 +23,7 @@ _ROOM = 0.08  # of an axis, at its ends
 
 
 def diagnostics(associations: Sequence[Association], looks: Looks) -> Plot:
-    """How well each diagnostic ranks the codes, and the codes by the main ones.
-
-    Args:
-        associations: at least one.
-        looks: of the representations.
-    """
+    """How well each diagnostic ranks the codes, and the codes by the main ones; of at least one."""
     return Plot(
         "diagnostics",
         "Final return against diagnostics",
@@ -102,51 +98,36 @@ def _draw_codes(axes: Axes, association: Association, group: GroupAnalysis, look
     axes.set(xlim=wide.with_room(_ROOM), ylim=extent.with_room(_ROOM))
     if association.diagnostic.better < 0:
         axes.invert_xaxis()
-    for name, x, y in zip(association.representations, values, returns, strict=True):
+    points = axes.transLimits.transform(np.stack((values, returns), 1)) * _PANEL
+    names = association.representations
+    for name, x, y, place in zip(names, values, returns, _free(names, points), strict=True):
         style = {**look[name], "linestyle": "none"}
         axes.plot(x, y, ms=4, label=plain(name), clip_on=False, **style)
-    places = axes.transLimits.transform(np.stack((values, returns), 1)) * _PANEL
-    names = association.representations
-    for name, x, y, place in zip(names, values, returns, _free(names, places), strict=True):
         if place is not None:
-            _write_name(axes, name, (x, y), place)
+            offset = (72 * place[0], 72 * place[1])
+            text: Any = {"textcoords": "offset points", "size": 5, "va": "center", "ha": "left"}
+            axes.annotate(plain(name), (x, y), offset, **text)
     correlation = association.correlation.value
     known = f" {correlation:.2f}" if np.isfinite(correlation) else ""
     axes.set_title(plain(association.diagnostic.name) + known)
     axes.set_xlabel(plain(fill(association.diagnostic.words, 30)), size=6)
 
 
-def _write_name(axes: Axes, name: str, at: tuple[float, float], place: tuple[float, float]) -> None:
-    offset: Any = tuple(72 * inches for inches in place)
-    axes.annotate(
-        *(plain(name), at, offset), textcoords="offset points", size=5, va="center", ha="left"
-    )
-
-
 def _free(names: Sequence[str], points: Any) -> list[tuple[float, float] | None]:
-    """Where each name can begin, from its point [inches]; None where it would cover something.
+    """Where each name can begin, from its point; None where it would cover something.
 
-    Args:
-        names: in order of precedence.
-        points: of each, (n, 2) [inches].
+    Points (n, 2), and places, are in inches; names come in order of precedence.
     """
-    taken = [(x - _MARKER, y - _MARKER, x + _MARKER, y + _MARKER) for x, y in points]
+    taken = [Bbox(((x - _MARKER, y - _MARKER), (x + _MARKER, y + _MARKER))) for x, y in points]
     places: list[tuple[float, float] | None] = []
     for name, (x, y) in zip(names, points, strict=True):
         width = _CHARACTER * len(name)
-        sides = ((0.05, 0.0), (-0.05 - width, 0.0), (-width / 2, 0.09), (-width / 2, -0.09))
-        for dx, dy in sides:
-            box = (x + dx, y + dy - _LINE / 2, x + dx + width, y + dy + _LINE / 2)
-            inside = box[0] >= 0 and box[1] >= 0 and box[2] <= _PANEL[0] and box[3] <= _PANEL[1]
-            if inside and not any(_overlap(box, other) for other in taken):
+        places.append(None)
+        for dx, dy in ((0.05, 0.0), (-0.05 - width, 0.0), (-width / 2, 0.09), (-width / 2, -0.09)):
+            box = Bbox.from_bounds(x + dx, y + dy - _LINE / 2, width, _LINE)
+            inside = min(box.min) >= 0 and (box.max <= _PANEL).all()
+            if inside and not any(map(box.fully_overlaps, taken)):
                 taken.append(box)
-                places.append((dx, dy))
+                places[-1] = (dx, dy)
                 break
-        else:
-            places.append(None)
     return places
-
-
-def _overlap(a: Sequence[float], b: Sequence[float]) -> bool:
-    """Whether two boxes (left, bottom, right, top) share some area."""
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

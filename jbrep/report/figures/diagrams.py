@@ -161,8 +161,7 @@ def _draw_system(boxes: Sequence[tuple[str, str]], action: str, reduced: str) ->
     last = 1.25 * (len(boxes) - 1) + 0.5
     axes.plot([last, last, 0.5], [0.1, -0.3, -0.3], color=ink(), lw=0.8, solid_capstyle="butt")
     _arrow(axes, (0.5, -0.3), (0.5, 0.1))
-    words = f"action: {action}" if action else "action"
-    axes.text((last + 0.5) / 2, -0.33, words, ha="center", va="top", size=6.5)
+    axes.text((last + 0.5) / 2, -0.33, f"action: {action}", ha="center", va="top", size=6.5)
     return figure
 
 

@@ -32,12 +32,7 @@ _WORDS = {"lipschitz": "Lipschitz"}  # of terms
 
 
 def method_plots(task: str, encoders: Encoders) -> list[Plot]:
-    """A figure of each kind of number that encoders say of themselves; none of what none says.
-
-    Args:
-        task: the name.
-        encoders: of an evaluation, by label.
-    """
+    """A figure of each kind of number that encoders say of themselves; none of what none says."""
     drawn: dict[tuple[str, ...], Callable[[str, Encoders], Plot]] = {
         ("spectrum",): _spectrum,
         ("spectra",): _timescales,
@@ -190,9 +185,7 @@ def _loss_by_horizon(task: str, encoders: Encoders) -> Plot:
 
 def _draw_loss_by_horizon(task: str, encoders: Encoders) -> Figure:
     by_horizon = [e.method["loss_by_horizon"] for e in encoders.values()]
-    parts = list(
-        dict.fromkeys(p for each in by_horizon for losses in each.values() for p in losses)
-    )
+    parts = dict.fromkeys(p for each in by_horizon for losses in each.values() for p in losses)
     figure = Figure(figsize=(PAGE, 2.4))
     panels = figure.subplots(1, len(parts), sharey=True, squeeze=False)[0]
     look = line_styles(encoders)
@@ -286,10 +279,7 @@ def _losses(task: str, encoders: Encoders) -> Plot:
         "filled on held-out episodes. Where they part, the network knows its data by heart. Losses "
         "of different methods can't be compared.",
         ("encoder", *_LOSSES),
-        [
-            (label, *(encoder.method[loss] for loss in _LOSSES))
-            for label, encoder in encoders.items()
-        ],
+        [(label, *(e.method[loss] for loss in _LOSSES)) for label, e in encoders.items()],
         lambda: _draw_losses(task, encoders),
     )
 

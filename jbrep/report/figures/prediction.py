@@ -25,15 +25,7 @@ _LOWEST = -0.1  # R² on an axis
 def heat_map(
     values: Array, rows: Sequence[str], columns: Sequence[str], title: str, label: str
 ) -> Figure:
-    """A cell for each value, from 0 to 1.
-
-    Args:
-        values: R², (rows, columns); NaN where it isn't defined.
-        rows: names.
-        columns: names.
-        title: above the matrix.
-        label: of the colours.
-    """
+    """A cell for each R² (rows, columns), coloured from 0 to 1; NaN where it isn't defined."""
     width = max(COLUMN, 1.7 + 0.29 * len(columns))
     figure = Figure(figsize=(width, 1.0 + 0.16 * len(rows)))
     axes: Axes = figure.subplots()
@@ -51,11 +43,7 @@ def heat_map(
 
 
 def least(scores: Array) -> NDArray[np.int64]:
-    """The features with the least scores, in the order of the observation.
-
-    Args:
-        scores: of each feature, (features,).
-    """
+    """The features with the least scores (features,), in the order of the observation."""
     return np.sort(np.argsort(scores, kind="stable")[:MOST])
 
 
@@ -67,12 +55,7 @@ def bare(axes: Axes) -> None:
 
 
 def prediction_plots(task: str, encoders: Encoders) -> list[Plot]:
-    """Controlled forward prediction of those encoders that it was measured of; none if of none.
-
-    Args:
-        task: the name.
-        encoders: of an evaluation, by label, the full observation among them.
-    """
+    """Controlled forward prediction of those encoders that it was measured of; none if of none."""
     measured = {label: e for label, e in encoders.items() if e.prediction}
     return [_by_feature(task, measured), _by_horizon(task, measured)] if measured else []
 

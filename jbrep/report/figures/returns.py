@@ -1,6 +1,7 @@
 """Final returns, their spread, and learning speed: a point for each run, and intervals."""
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,12 @@ from jbrep.report.figures.style import (
     Limits,
     Looks,
     Styles,
+    draw_policies,
     draw_profile,
+    draw_solved,
     limits,
     mark_cut,
     plain,
-    reference,
-    solved_line_style,
 )
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.bootstrap import Interval
@@ -92,6 +93,10 @@ def _by_run(groups: Groups, value: str, numbers: Sequence[str]) -> Iterator[tupl
                 yield (*key, seed, cell(each), *shared)
 
 
+def _played(group: GroupAnalysis) -> dict[str, float]:
+    return {policy: mean.value for policy, mean in group.references.items()}
+
+
 def _dashed(groups: Groups) -> str:
     return _DASHED if any(group.references for group in groups) else ""
 
@@ -119,11 +124,7 @@ def _draw_final(groups: Groups, looks: Looks) -> Figure:
     figure, panels = _panels(groups, 2, _height(groups))
     look = looks()
     for (left, right), group in zip(panels, groups, strict=True):
-        extent = _extent(group, "final_return", group.solved)
-        if extent.contain(group.solved):
-            left.axhline(group.solved, **solved_line_style())
-        left.set(ylabel="final return", ylim=extent.with_room(_ROOM))
-        _draw_runs(left, group, look, "final_return")
+        extent = _draw_runs(left, group, look, "final_return", group.solved)
         deviations = [label.numbers["final_return_sd"] for label in group.labels]
         _from_zero(right, deviations, extent.width / 2)  # more than of any such returns
         right.set_ylabel("SD over runs")
@@ -138,19 +139,9 @@ def _draw_learning(groups: Groups, looks: Looks) -> Figure:
     figure, panels = _panels(groups, 1, _height(groups))
     look = looks()
     for (axes,), group in zip(panels, groups, strict=True):
-        extent = _extent(group, "mean_return")
-        axes.set(ylabel="mean return", ylim=extent.with_room(_ROOM))
         _draw_runs(axes, group, look, "mean_return")
     below(figure, panels.ravel())
     return figure
-
-
-def _extent(group: GroupAnalysis, value: str, solved: float = np.nan) -> Limits:
-    """The limits of a number of all runs, and of the intervals of its means."""
-    runs = np.concatenate([label.by_run[value] for label in group.labels])
-    means = [label.numbers[f"{value}_mean"] for label in group.labels]
-    runs = np.append(runs, [each.value for each in group.references.values()])
-    return limits(runs, group.return_floor, solved).with_ends(means, group.return_floor)
 
 
 def _from_zero(axes: Axes, intervals: Sequence[Interval], limit: float) -> None:
@@ -161,16 +152,23 @@ def _from_zero(axes: Axes, intervals: Sequence[Interval], limit: float) -> None:
     axes.set_ylim(Limits(0, top).with_room(_ROOM))
 
 
-def _draw_runs(axes: Axes, group: GroupAnalysis, look: Styles, value: str) -> None:
+def _draw_runs(
+    axes: Axes, group: GroupAnalysis, look: Styles, value: str, solved: float = np.nan
+) -> Limits:
     """A point for each run of each representation, and the mean with its interval."""
+    means = [label.numbers[f"{value}_mean"] for label in group.labels]
+    every = chain(_played(group).values(), *(label.by_run[value] for label in group.labels))
+    extent = limits(every, group.return_floor, solved).with_ends(means, group.return_floor)
+    draw_solved(axes.axhline, solved, extent)
+    axes.set(ylabel=value.replace("_", " "), ylim=extent.with_room(_ROOM))
     _name_columns(axes, group)
-    for i, (policy, each) in enumerate(group.references.items()):
-        axes.axhline(each.value, label=plain(policy), **reference(i))
-    for i, label in enumerate(group.labels):
+    draw_policies(axes.axhline, _played(group))
+    for i, (label, mean) in enumerate(zip(group.labels, means, strict=True)):
         style, runs = look[label.representation], label.by_run[value]
         beside = i - 0.22 + np.linspace(-_JITTER, _JITTER, len(runs)) * (len(runs) > 1)
         axes.plot(beside, runs, ".", color=style["color"], ms=4, alpha=0.6, mew=0)
-        _draw_interval(axes, i + 0.16, label.numbers[f"{value}_mean"], style)
+        _draw_interval(axes, i + 0.16, mean, style)
+    return extent
 
 
 def _name_columns(axes: Axes, group: GroupAnalysis) -> None:
@@ -198,11 +196,9 @@ def _draw_profiles(analysis: Analysis, looks: Looks) -> Figure:
         for label in group.labels:
             name, colour = names[label.representation], look[label.representation]["color"]
             draw_profile(axes, group.profile_returns, label.profile, name, colour)
-        for i, (policy, each) in enumerate(group.references.items()):
-            axes.axvline(each.value, label=plain(policy), **reference(i))
+        draw_policies(axes.axvline, _played(group))
         extent = limits(group.profile_returns, solved=group.solved)
-        if extent.contain(group.solved):
-            axes.axvline(group.solved, **solved_line_style())
+        draw_solved(axes.axvline, group.solved, extent)
         axes.set_title(plain(group.name))
         axes.set(xlim=extent.with_room(0.02), xlabel="final return")
     below(figure, panels.ravel())

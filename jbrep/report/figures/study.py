@@ -3,9 +3,11 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 
+import numpy as np
+
 from jbrep.encoders import FULL
 from jbrep.report.figures.claims import claim_plot
-from jbrep.report.figures.curves import across_tasks, curves, every_run
+from jbrep.report.figures.curves import Played, across_tasks, curves, every_run
 from jbrep.report.figures.diagnostics import diagnostics
 from jbrep.report.figures.diagrams import diagrams
 from jbrep.report.figures.plot import Plot
@@ -25,15 +27,7 @@ def study_plots(
     labels: Mapping[str, Label],
     associations: Sequence[Association] = (),
 ) -> list[Plot]:
-    """The figures that the tables of a study allow; a representation has one colour in all.
-
-    Args:
-        analysis: the statistics; None if there are none.
-        returns: returns.csv.
-        references: returns of policies that learn nothing, by task and policy.
-        labels: of runs.json.
-        associations: of diagnostics with final returns.
-    """
+    """The figures that the tables of a study allow; a representation has one colour in all."""
     baseline = analysis.baseline if analysis else FULL
     groups = analysis.groups if analysis else ()
     names = {
@@ -42,9 +36,9 @@ def study_plots(
         *(shared.settings.representation for shared in labels.values()),
     }
     looks = partial(styles, in_order(names, baseline), baseline if baseline in names else None)
-    plots, shown = [], _on_the_same_starts(references, returns)
+    plots, played = [], _on_the_same_starts(references, returns)
     if analysis:
-        plots += [curves(groups, shown, looks), final_return(groups, looks)]
+        plots += [curves(groups, played, looks), final_return(groups, looks)]
         if any(group.comparisons for group in groups):
             plots.append(claim_plot(analysis, looks))
         plots += [learning_rate(groups, looks), profiles(analysis, looks)]
@@ -53,17 +47,17 @@ def study_plots(
     if associations:
         plots.append(diagnostics(associations, looks))
     if returns:
-        plots.append(every_run(returns, shown, looks))
+        plots.append(every_run(returns, played, looks))
     return [*plots, *diagrams(labels, looks)]
 
 
-def _on_the_same_starts(references: References, returns: Sequence[Return]) -> References:
-    """References in the episodes that curves are of; the last evaluation may have more."""
+def _on_the_same_starts(references: References, returns: Sequence[Return]) -> Played:
+    """Means of references in the episodes that curves are of; the last evaluation may have more."""
     fewest: dict[str, int] = {}
     for (label, _), by_step in by_run(returns).items():
         task, count = label.rsplit("/", 2)[0], min(map(len, by_step.values()))
         fewest[task] = min(fewest.get(task, count), count)
     return {
-        task: {policy: each[: fewest.get(task)] for policy, each in of_task.items()}
-        for task, of_task in references.items()
+        task: {policy: float(np.mean(each[: fewest.get(task)])) for policy, each in played.items()}
+        for task, played in references.items()
     }

@@ -81,25 +81,27 @@ def reference(number: int = 0) -> dict[str, Any]:
     return {"color": ink(), "linestyle": dashes, "linewidth": 0.9, "alpha": 0.65}
 
 
-def solved_line_style() -> dict[str, Any]:
-    """The line at the return from which on a task counts as solved."""
-    return {"color": ink(), "linestyle": ":", "linewidth": 0.8, "alpha": 0.65, "label": "solved"}
+def draw_policies(line: Callable[..., Any], returns: Mapping[str, float]) -> None:
+    """A line, by axhline or axvline, at what each policy that doesn't learn returns."""
+    for i, (policy, each) in enumerate(returns.items()):
+        line(each, label=plain(policy), **reference(i))
+
+
+def draw_solved(line: Callable[..., Any], solved: float, extent: "Limits") -> None:
+    """A line, by axhline or axvline, at the return that counts as solved, if it is in sight."""
+    if extent.contain(solved):
+        line(solved, color=ink(), linestyle=":", linewidth=0.8, alpha=0.65, label="solved")
 
 
 def styles(names: Iterable[str], first: str | None = None) -> Styles:
-    """Colour and marker of each name, in the style in use.
-
-    Args:
-        names: in order.
-        first: a name that gets the colour of text.
-    """
+    """Colour and marker of each name in the style in use; the first's colour is that of text."""
     colours = mpl.rcParams["axes.prop_cycle"].by_key()["color"]
     others = [name for name in dict.fromkeys(names) if name != first]
     coloured = {
         name: {"color": _colour(colours, i), "marker": MARKERS[(i + 1) % len(MARKERS)]}
         for i, name in enumerate(others)
     }
-    return {**({first: {"color": ink(), "marker": MARKERS[0]}} if first else {}), **coloured}
+    return {first: {"color": ink(), "marker": MARKERS[0]}, **coloured} if first else coloured
 
 
 def _colour(colours: Sequence[str], number: int) -> str:
@@ -114,22 +116,13 @@ def _colour(colours: Sequence[str], number: int) -> str:
 
 
 def family(label: str, latent: int) -> str:
-    """The label without the latent size, where it ends with that: dae of dae-8, dae-s2 of dae-8-s2.
-
-    Args:
-        label: of an encoder.
-        latent: its size.
-    """
+    """An encoder's label without its latent size, if that is in it: dae-s2 of dae-8-s2."""
     name = EncoderName.parse(label)
     return str(name._replace(latent=None)) if name.latent == latent else label
 
 
 def family_styles(families: Iterable[str]) -> Styles:
-    """Colour and marker of each family, denoising autoencoders first, the full one's that of text.
-
-    Args:
-        families: names, with repeats or without.
-    """
+    """Colour and marker of each family, denoising autoencoders first; the full one is as text."""
     names = sorted(set(families), key=lambda name: (not name.startswith("dae"), name))
     return styles(names, FULL if FULL in names else None)
 
@@ -137,28 +130,20 @@ def family_styles(families: Iterable[str]) -> Styles:
 def line_styles(encoders: Encoders) -> Styles:
     """Of each encoder: colour and marker of its family, and a line that says its latent size."""
     families = {label: family(label, e.latent) for label, e in encoders.items()}
-    look = family_styles(families.values())
     sizes: dict[str, list[int]] = {}
     for label, e in encoders.items():
         sizes.setdefault(families[label], []).append(e.latent)
-    return {
-        label: {
-            **look[families[label]],
-            "linestyle": _LINES[
-                sorted(sizes[families[label]], reverse=True).index(e.latent) % len(_LINES)
-            ],
-        }
-        for label, e in encoders.items()
-    }
+    look, found = family_styles(families.values()), {}
+    for label, name in families.items():
+        place = sorted(sizes[name], reverse=True).index(encoders[label].latent)
+        found[label] = {**look[name], "linestyle": _LINES[place % len(_LINES)]}
+    return found
 
 
 def panel_grid(count: int, height: float, above: float = 0.0) -> tuple[Figure, Sequence[Axes]]:
-    """A figure with so many panels in rows of up to three, a page wide; of one, a column.
+    """A figure of panels in rows of up to three, a page wide; of one, a column.
 
-    Args:
-        count: of panels, at least 1.
-        height: of a row [inches].
-        above: room for a title over all of them [inches].
+    Rows have that height, with room above for a title over all of them [inches].
     """
     across = min(_ACROSS, count)
     rows = -(-count // across)
@@ -183,12 +168,8 @@ def with_runs(name: str, counts: Collection[int]) -> str:
 def mark_cut(axes: Axes, axis: str, at: float, values: Sequence[float], colour: str) -> None:
     """Mark each edge of a panel beyond which values lie with a triangle that points outwards.
 
-    Args:
-        axes: the panel, with its final limits.
-        axis: that the values are on: x or y.
-        at: place on the other axis.
-        values: such as the ends of an interval; NaN is none.
-        colour: of the triangle.
+    The values, of which NaN is none, are on an axis, x or y, at a place on the other one. The
+    panel has its final limits.
     """
     low, high = axes.get_xlim() if axis == "x" else axes.get_ylim()
     cut = {low: any(value < low for value in values), high: any(value > high for value in values)}
@@ -215,19 +196,13 @@ class Limits(NamedTuple):
         return self.low <= value <= self.high
 
     def with_room(self, share: float) -> tuple[float, float]:
-        """The ends with some more on either side, for whole markers.
-
-        Args:
-            share: of the width.
-        """
+        """The ends with a share of the width more on either side, for whole markers."""
         return self.low - share * self.width, self.high + share * self.width
 
     def with_ends(self, intervals: Iterable[Interval], floor: float = np.nan) -> "Limits":
         """The limits with the ends of intervals, but not far beyond, nor below the floor.
 
-        Args:
-            intervals: such as of means; their ends may be NaN.
-            floor: the least possible value; NaN if there is none.
+        NaN is no end, and no floor.
         """
         least, most = self.with_room(_BEYOND)
         values = np.array([[each.value, each.low, each.high] for each in intervals], float)
@@ -239,12 +214,8 @@ def limits(returns: Iterable[float], floor: float = np.nan, solved: float = np.n
     """From the least return, or from the floor if it is known, to the largest.
 
     The return from which on a task counts as solved is within the limits unless it is so far off
-    that the returns would fill less than a third of the axis.
-
-    Args:
-        returns: of which those that aren't finite, or beyond any return, don't count.
-        floor: the least possible return; NaN if unknown.
-        solved: NaN if unknown.
+    that the returns would fill less than a third of the axis. Returns that aren't finite, or beyond
+    any return, don't count; NaN is a floor, or a solved return, that isn't known.
     """
     values = np.array([*returns, floor], float)
     values = values[np.abs(values) <= LARGEST_RETURN]
