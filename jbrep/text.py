@@ -15,17 +15,11 @@ _Item = TypeVar("_Item")
 
 
 class Table(NamedTuple):
-    """A table to read, in a terminal, in Markdown or on a page.
+    """A table to read, in a terminal, in Markdown or on a page."""
 
-    Attributes:
-        title: that stands above it.
-        header: a name for each column.
-        rows: a cell for each column.
-    """
-
-    title: str
-    header: tuple[str, ...]
-    rows: Sequence[tuple[str, ...]]
+    title: str  # that stands above it, if it has one
+    header: tuple[str, ...]  # a name for each column
+    rows: Sequence[tuple[str, ...]]  # a cell for each column
 
     @classmethod
     def of(
@@ -45,7 +39,8 @@ class Table(NamedTuple):
 
     def text(self, width: int | None = None) -> str:
         """The title and the table for a terminal of that width, in columns; None for any."""
-        return f"{wrapped(self.title, width)}\n\n{table(self.header, self.rows, width)}"
+        cells = table(self.header, self.rows, width)
+        return f"{wrapped(self.title, width)}\n\n{cells}" if self.title else cells
 
 
 def wrapped(text: str, width: int | None) -> str:

@@ -134,22 +134,22 @@ def package_table(tables: Tables) -> Table:
 
 def encoder_table(tables: Tables) -> Table:
     """A row for each label."""
-    rows = [_encoder_row(label, shared) for label, shared in tables.record.labels.items()]
+    rows = []
+    for label, shared in tables.record.labels.items():
+        encoder, fingerprint = shared.encoder, shared.settings.encoder
+        error, states = encoder.shown.held_out_mse, encoder.shown.train_rows
+        rows.append(
+            (
+                label,
+                encoder.name,
+                _layers(encoder),
+                "-" if error is None else f"{error:.2g}",
+                "-" if states is None else f"{states:,}",
+                fingerprint if fingerprint == EACH_ITS_OWN else fingerprint[:12],
+            )
+        )
     header = ("runs", "encoder", "layers", "held-out error", "training states", "SHA-256")
     return Table("Encoders", header, rows)
-
-
-def _encoder_row(label: str, shared: Label) -> tuple[str, ...]:
-    encoder, fingerprint = shared.encoder, shared.settings.encoder
-    error, rows = encoder.shown.held_out_mse, encoder.shown.train_rows
-    return (
-        label,
-        encoder.name,
-        _layers(encoder),
-        "-" if error is None else f"{error:.2g}",
-        "-" if rows is None else f"{rows:,}",
-        fingerprint if fingerprint == EACH_ITS_OWN else fingerprint[:12],
-    )
 
 
 def _layers(encoder: EncoderFacts) -> str:

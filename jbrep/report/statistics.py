@@ -23,7 +23,6 @@ from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.association import Association
 from jbrep.stats.comparison import Comparison
 from jbrep.stats.labels import REACHED, RepresentationResult
-from jbrep.stats.power import Prospect
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import SOLVED
 from jbrep.study.packing import Forecast
@@ -273,20 +272,17 @@ def forecast_text(forecast: Forecast, planned: Planned, width: int | None = None
     parts = [table(("run", "cohort", "time"), rows, width)] if rows else []
     parts.append(wrapped(summary, width))
     if forecast.prospects:
-        found = [_prospect(each) for each in forecast.prospects]
-        parts.append(
-            table(("primary cell: claim", "runs", "level", "least p", "power"), found, width)
+        found = Table.of(
+            "",
+            forecast.prospects,
+            {
+                "primary cell: claim": lambda each: f"{each.cell}: {each.claim}",
+                "runs": lambda each: f"{each.arms.units} and {each.arms.baseline}",
+                "level": lambda each: probability(each.level),
+                "least p": lambda each: probability(each.least_p),
+                "power": lambda each: ", ".join(f"{100 * power:.0f} %" for power in each.power),
+            },
         )
+        parts.append(found.text(width))
         parts += [wrapped(each, width) for each in (*notes(planned), EFFECTS)]
     return "\n\n".join(parts)
-
-
-def _prospect(prospect: Prospect) -> tuple[str, ...]:
-    """What could be found of a claim in a primary cell."""
-    return (
-        f"{prospect.cell}: {prospect.claim}",
-        f"{prospect.arms.units} and {prospect.arms.baseline}",
-        probability(prospect.level),
-        probability(prospect.least_p),
-        ", ".join(f"{100 * power:.0f} %" for power in prospect.power),
-    )

@@ -20,26 +20,17 @@ SCORES = np.linspace(0, 1.2, 61)  # at which profiles are evaluated
 
 @dataclass(frozen=True, eq=False)
 class Aggregate:
-    """A representation's runs on several tasks, with one algorithm.
-
-    Args:
-        algorithm: its name.
-        representation: its name.
-        tasks: their names; those where agents on the full state gain nothing are left out.
-        runs: on each task: the first of those with more.
-        iqm: interquartile mean of scores, with its 95 % interval.
-        optimality_gap: mean of what scores lack to 1, with its 95 % interval.
-        scores: where the profile is evaluated, (k,).
-        profile: the share of runs with a score above each of these, averaged over tasks, (k,).
-    """
+    """A representation's runs on several tasks, with one algorithm."""
 
     algorithm: str
     representation: str
+    # their names; those where agents on the full state gain nothing are left out
     tasks: tuple[str, ...]
-    runs: int
-    iqm: Interval
-    optimality_gap: Interval
-    scores: Array
+    runs: int  # on each task: the first of those with more
+    iqm: Interval  # interquartile mean of scores, with its 95 % interval
+    optimality_gap: Interval  # mean of what scores lack to 1, with its 95 % interval
+    scores: Array  # where the profile is evaluated, (k,)
+    # the share of runs with a score above each of these, averaged over tasks, (k,)
     profile: Interval
 
 

@@ -23,37 +23,23 @@ References = Mapping[str, Mapping[str, Sequence[float]]]  # returns by task and 
 
 @dataclass(frozen=True, eq=False)
 class GroupAnalysis:
-    """The results for one task and algorithm.
-
-    Args:
-        task: the task's name.
-        algorithm: the algorithm's name.
-        grid: training steps at which runs are compared, (g,).
-        cut: which evaluations the grid leaves out, in words; None if it leaves out none.
-        return_floor: the least possible return of the task; NaN if unknown.
-        return_ceiling: the largest possible one; NaN if unknown.
-        failure_return: what a failed run counts as from the step of failure on.
-        reference: the return that gains are counted from, as in `Scale`.
-        references: mean returns of policies that don't learn, each with its 95 % interval over
-            starts.
-        thresholds: the return to reach for each of STEPS_TO; NaN where there is none.
-        profile_returns: where performance profiles are evaluated, ascending, (k,).
-        labels: results of each representation, the baseline first.
-        comparisons: of the other representations with the baseline, in the same order.
-    """
+    """The results for one task and algorithm."""
 
     task: str
     algorithm: str
-    grid: Array
-    cut: str | None
-    return_floor: float
-    return_ceiling: float
-    failure_return: float
-    reference: float
+    grid: Array  # training steps at which runs are compared, (g,)
+    cut: str | None  # which evaluations the grid leaves out, in words; None if it leaves out none
+    return_floor: float  # the least possible return of the task; NaN if unknown
+    return_ceiling: float  # the largest possible one; NaN if unknown
+    failure_return: float  # what a failed run counts as from the step of failure on
+    reference: float  # the return that gains are counted from, as in `Scale`
+    # mean returns of policies that don't learn, each with its 95 % interval over starts
     references: Mapping[str, Interval]
+    # the return to reach for each of STEPS_TO; NaN where there is none
     thresholds: Mapping[str, float]
-    profile_returns: Array
-    labels: tuple[RepresentationResult, ...]
+    profile_returns: Array  # where performance profiles are evaluated, ascending, (k,)
+    labels: tuple[RepresentationResult, ...]  # results of each representation, the baseline first
+    # of the other representations with the baseline, in the same order
     comparisons: tuple[Comparison, ...]
 
     @property
@@ -69,21 +55,13 @@ class GroupAnalysis:
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """The results of a study.
+    """The results of a study."""
 
-    Args:
-        baseline: the representation that the others are compared with.
-        seed: of all resampling.
-        planned: what reached the verdicts.
-        groups: by task and algorithm.
-        aggregates: results across tasks, where an algorithm learned several.
-    """
-
-    baseline: str
-    seed: int
-    planned: Planned
-    groups: tuple[GroupAnalysis, ...]
-    aggregates: tuple[Aggregate, ...]
+    baseline: str  # the representation that the others are compared with
+    seed: int  # of all resampling
+    planned: Planned  # what reached the verdicts
+    groups: tuple[GroupAnalysis, ...]  # by task and algorithm
+    aggregates: tuple[Aggregate, ...]  # results across tasks, where an algorithm learned several
 
     @property
     def open_aggregates(self) -> list[Aggregate]:

@@ -18,23 +18,14 @@ _RESOLUTION = 0.01  # of that gain, of differences between curves
 
 
 class Frame(NamedTuple):
-    """What the runs of a task and algorithm are held to.
+    """What the runs of a task and algorithm are held to."""
 
-    Attributes:
-        still: the mean return of standing still.
-        half: the return half-way from there to the baseline's mean final return.
-        bounds: of returns.
-        steps: of training.
-        weights: of the evaluations in a mean over training, (g,), with a sum of 1.
-        resolution: of differences between curves.
-    """
-
-    still: float
-    half: float
-    bounds: Bounds
-    steps: float
-    weights: Array
-    resolution: float
+    still: float  # the mean return of standing still
+    half: float  # the return half-way from there to the baseline's mean final return
+    bounds: Bounds  # of returns
+    steps: float  # of training
+    weights: Array  # of the evaluations in a mean over training, (g,), with a sum of 1
+    resolution: float  # of differences between curves
 
 
 class Arm(NamedTuple):
@@ -42,22 +33,14 @@ class Arm(NamedTuple):
 
     A unit is what is independent of the others: a run, or an encoder with its runs if each of many
     encoders has its own.
-
-    Attributes:
-        final: the mean final return of each unit, (u,).
-        time: the mean of its runs' steps to the frame's half, at most all of training, (u,).
-        curves: the first run of each unit over training, (u, g).
-        runs: how many there are.
-        learnt: of how many units all runs end above the frame's half.
-        by_encoder: whether units are encoders.
     """
 
-    final: Array
-    time: Array
-    curves: Array
-    runs: int
-    learnt: int
-    by_encoder: bool
+    final: Array  # the mean final return of each unit, (u,)
+    time: Array  # the mean of its runs' steps to the frame's half, at most all of training, (u,)
+    curves: Array  # the first run of each unit over training, (u, g)
+    runs: int  # how many there are
+    learnt: int  # of how many units all runs end above the frame's half
+    by_encoder: bool  # whether units are encoders
 
     @property
     def units(self) -> int:

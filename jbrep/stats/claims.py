@@ -25,34 +25,21 @@ class Verdict:
 
     No claim is supported or contradicted by fewer than FEWEST_UNITS units on either side.
 
-    Args:
-        claim: its name.
-        verdict: SUPPORTED, CONTRADICTED, UNDECIDED, NOT_YET or EXPLORATORY.
-        estimate: with its 95 % interval; without one for three runs or fewer.
-        boundary: that the estimate is held against.
-        p: two-sided, of lying on the boundary; NaN where there is none.
-        level: of the last test, two-sided; NaN if there was none.
-        interval: of 1 minus that level.
-        runs: of the representation and of the baseline that count.
-        encoders: how many of the representation are the units of the test; 0 if its runs are.
-        look: how many looks had come when it was decided or last tested; 0 if none.
-        reason: why it is not decided, if not because the estimate is too rough.
-
     Raises:
         ValueError: it decides by too few units.
     """
 
     claim: str
-    verdict: str
-    estimate: Interval
-    boundary: float
-    p: float
-    level: float
-    interval: Interval
-    runs: tuple[int, int]
-    encoders: int
-    look: int
-    reason: str | None
+    verdict: str  # SUPPORTED, CONTRADICTED, UNDECIDED, NOT_YET or EXPLORATORY
+    estimate: Interval  # with its 95 % interval; without one for three runs or fewer
+    boundary: float  # that the estimate is held against
+    p: float  # two-sided, of lying on the boundary; NaN where there is none
+    level: float  # of the last test, two-sided; NaN if there was none
+    interval: Interval  # of 1 minus that level
+    runs: tuple[int, int]  # of the representation and of the baseline that count
+    encoders: int  # how many of the representation are the units of the test; 0 if its runs are
+    look: int  # how many looks had come when it was decided or last tested; 0 if none
+    reason: str | None  # why it is not decided, if not because the estimate is too rough
 
     def __post_init__(self) -> None:
         fewest = min(self.encoders or self.runs[0], self.runs[1])
@@ -64,26 +51,19 @@ Verdicts = Mapping[Key, Mapping[str, tuple[Verdict, ...]]]  # then by representa
 
 
 class Claim(NamedTuple):
-    """A claim that runs on less state, x, support or contradict against those of the baseline, y.
+    """A claim that runs on less state, x, support or contradict against the baseline's, y."""
 
-    Attributes:
-        name: in a few words.
-        side: 1 if an estimate above the boundary speaks for the claim, -1 if one below does.
-        boundary: of the estimate, given the margin.
-        estimate: from both sides, the level of the interval and a seed.
-        tested: the same with the interval that the test itself keeps.
-        p_value: two-sided, of the estimand lying on the boundary, from sides, boundary and seed.
-        is_ratio: whether the estimate is a ratio, whose logarithm is symmetrical.
-        limits_failures: whether runs that fail to learn may forbid a verdict for the claim.
-    """
-
-    name: str
-    side: int
-    boundary: Callable[[float], float]
+    name: str  # in a few words
+    side: int  # 1 if an estimate above the boundary speaks for the claim, -1 if one below does
+    boundary: Callable[[float], float]  # of the estimate, given the margin
+    # from both sides, the level of the interval and a seed
     estimate: Callable[[Sides, float, int], Interval]
+    # the same with the interval that the test itself keeps
     tested: Callable[[Sides, float, int], Interval]
+    # two-sided, of the estimand lying on the boundary, from sides, boundary and seed
     p_value: Callable[[Sides, float, int], float]
-    is_ratio: bool = False
+    is_ratio: bool = False  # whether the estimate is a ratio, whose logarithm is symmetrical
+    # whether runs that fail to learn may forbid a verdict for the claim
     limits_failures: bool = False
 
 

@@ -24,20 +24,13 @@ from jbrep.stats.scale import STEPS_TO
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A representation against the baseline.
-
-    Args:
-        representation: its name.
-        numbers: differences, ratios and the probability of improvement, by name, each with its
-            95 % interval.
-        brown_forsythe_p: of equal variances of final returns; NaN where it is undefined.
-        verdicts: one for each claim.
-    """
+    """A representation against the baseline."""
 
     representation: str
+    # differences, ratios and the probability of improvement, by name, each with its 95 % interval
     numbers: Mapping[str, Interval]
-    brown_forsythe_p: float
-    verdicts: tuple[Verdict, ...]
+    brown_forsythe_p: float  # of equal variances of final returns; NaN where it is undefined
+    verdicts: tuple[Verdict, ...]  # one for each claim
 
     @property
     def is_open(self) -> bool:

@@ -20,21 +20,15 @@ _POINTS = 64  # of the grid at a time, to keep the resamples in memory
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Mean returns of a representation's runs at each step of the grid, (g,) each.
+    """Mean returns of a representation's runs at each step of the grid, (g,) each."""
 
-    Args:
-        p10: 10th percentile over runs; the others likewise.
-        mean: over runs.
-        iqm: interquartile mean over runs with its 95 % interval.
-    """
-
-    p10: Array
+    p10: Array  # 10th percentile over runs; the others likewise
     p25: Array
     p50: Array
     p75: Array
     p90: Array
-    mean: Array
-    iqm: Interval
+    mean: Array  # over runs
+    iqm: Interval  # interquartile mean over runs with its 95 % interval
 
 
 def iqm(values: Array) -> Array:
@@ -130,19 +124,13 @@ def final_returns(
 
 
 class Compared(NamedTuple):
-    """The runs of a group where they are compared.
+    """The runs of a group where they are compared."""
 
-    Attributes:
-        grid: training steps, (g,).
-        cut: which evaluations it leaves out, in words; None if it leaves out none.
-        curves: of each representation's runs on the grid, (runs, g), the baseline first.
-        finals: the final return of each of these runs, (runs,).
-    """
-
-    grid: Array
-    cut: str | None
+    grid: Array  # training steps, (g,)
+    cut: str | None  # which evaluations it leaves out, in words; None if it leaves out none
+    # of each representation's runs on the grid, (runs, g), the baseline first
     curves: dict[str, Array]
-    finals: dict[str, Array]
+    finals: dict[str, Array]  # the final return of each of these runs, (runs,)
 
 
 def compared(group: Group) -> Compared:

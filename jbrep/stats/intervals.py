@@ -146,12 +146,9 @@ def _moments(values: Array) -> tuple[Array, Array]:
     """Sums over (..., n) of fourth powers about a trimmed mean, and of squares about the mean."""
     n = values.shape[-1]
     # for five runs Bonett trims half of them off each end, that is, all but the median
-    centre = np.median(values, axis=-1) if n < 6 else trim_mean(values, _trimmed(n), axis=-1)
+    trimmed = 0.5 / math.sqrt(max(n - 4, 2))
+    centre = np.median(values, axis=-1) if n < 6 else trim_mean(values, trimmed, axis=-1)
     return ((values - centre[..., None]) ** 4).sum(axis=-1), n * values.var(axis=-1)
-
-
-def _trimmed(n: int) -> float:
-    return 1 / (2 * math.sqrt(n - 4))
 
 
 def _log_error(kurtosis: Array, n: int) -> Array:

@@ -38,29 +38,17 @@ COMPONENTS = ("encoder_variance", "run_variance", "encoder_variance_ratio")
 
 @dataclass(frozen=True, eq=False)
 class RepresentationResult:
-    """The runs of one representation, with one task and algorithm.
+    """The runs of one representation, with one task and algorithm."""
 
-    Args:
-        representation: what the agent observed.
-        settings: that all runs share.
-        seeds: of the runs, in ascending order.
-        failed: seeds of the runs that failed.
-        encoders: how many they have among them.
-        curve: over the grid of the group.
-        by_run: numbers of each run by name, (runs,) each, in the order of seeds.
-        numbers: of all runs by name, each with its 95 % interval.
-        profile: the share of runs whose final return is above each of the group's
-            profile_returns, (k,).
-    """
-
-    representation: str
-    settings: str
-    seeds: tuple[int, ...]
-    failed: tuple[int, ...]
-    encoders: int
-    curve: Curve
-    by_run: Mapping[str, Array]
-    numbers: Mapping[str, Interval]
+    representation: str  # what the agent observed
+    settings: str  # that all runs share
+    seeds: tuple[int, ...]  # of the runs, in ascending order
+    failed: tuple[int, ...]  # seeds of the runs that failed
+    encoders: int  # how many they have among them
+    curve: Curve  # over the grid of the group
+    by_run: Mapping[str, Array]  # numbers of each run by name, (runs,) each, in the order of seeds
+    numbers: Mapping[str, Interval]  # of all runs by name, each with its 95 % interval
+    # the share of runs whose final return is above each of the group's profile_returns, (k,)
     profile: Interval
 
 

@@ -15,17 +15,11 @@ from jbrep.stats.bootstrap import Array, Interval
 
 
 class Components(NamedTuple):
-    """Variances, each with its interval.
+    """Variances, each with its interval."""
 
-    Attributes:
-        encoders: of what encoders add.
-        runs: of what runs add.
-        ratio: of the first to the second.
-    """
-
-    encoders: Interval
-    runs: Interval
-    ratio: Interval
+    encoders: Interval  # of what encoders add
+    runs: Interval  # of what runs add
+    ratio: Interval  # of the first to the second
 
 
 def components(returns: Array, level: float = 0.95) -> Components:

@@ -21,17 +21,11 @@ _LEAST_PERMUTATIONS = 999
 
 
 class Arms(NamedTuple):
-    """How many runs are planned of a representation and of the baseline.
+    """How many runs are planned of a representation and of the baseline."""
 
-    Attributes:
-        runs: of the representation.
-        units: its encoders, if they are the units of tests, else its runs.
-        baseline: runs of the full observation.
-    """
-
-    runs: int
-    units: int
-    baseline: int
+    runs: int  # of the representation
+    units: int  # its encoders, if they are the units of tests, else its runs
+    baseline: int  # runs of the full observation
 
 
 class Prospect(NamedTuple):

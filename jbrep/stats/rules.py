@@ -97,15 +97,10 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
 
 @dataclass(frozen=True)
 class Planned:
-    """Verdicts by rules on the runs that were planned; others are exploratory.
+    """Verdicts by rules on the runs that were planned; others are exploratory."""
 
-    Args:
-        rules: of the study.
-        seeds: of the planned runs, in their order.
-    """
-
-    rules: Rules = field(default_factory=Rules)
-    seeds: tuple[int, ...] = ()
+    rules: Rules = field(default_factory=Rules)  # of the study
+    seeds: tuple[int, ...] = ()  # of the planned runs, in their order
 
     @cached_property
     def looks(self) -> tuple[float, ...]:

@@ -17,19 +17,14 @@ _POINTS = 50  # of a performance profile, about, or half as many: round numbers
 
 
 class Scale(NamedTuple):
-    """What all representations of a task and algorithm are measured by.
+    """What all representations of a task and algorithm are measured by."""
 
-    Args:
-        grid: training steps at which runs are compared, (g,).
-        reference: the return that gains are counted from, as `reference_of` has it.
-        thresholds: the return to reach for each of STEPS_TO, NaN where there is none.
-        profile_returns: at which performance profiles are evaluated, (k,): round numbers that
-            enclose all final returns.
-    """
-
-    grid: Array
-    reference: float
+    grid: Array  # training steps at which runs are compared, (g,)
+    reference: float  # the return that gains are counted from, as `reference_of` has it
+    # the return to reach for each of STEPS_TO, NaN where there is none
     thresholds: Mapping[str, float]
+    # at which performance profiles are evaluated, (k,): round numbers that enclose all final
+    # returns
     profile_returns: Array
 
 

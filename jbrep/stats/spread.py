@@ -23,19 +23,12 @@ _AT_ONCE = 1 << 22  # numbers in memory
 
 
 class Curves(NamedTuple):
-    """What two groups of runs are compared by.
+    """What two groups of runs are compared by."""
 
-    Attributes:
-        x: curves of one, (n, g).
-        y: curves of the other, (m, g).
-        weights: of the g evaluations in a mean over training, with a sum of 1.
-        resolution: in units of return, above 0.
-    """
-
-    x: Array
-    y: Array
-    weights: Array
-    resolution: float
+    x: Array  # curves of one, (n, g)
+    y: Array  # curves of the other, (m, g)
+    weights: Array  # of the g evaluations in a mean over training, with a sum of 1
+    resolution: float  # in units of return, above 0
 
 
 def log_spread(curves: Array, weights: Array, resolution: float) -> Array:

@@ -209,6 +209,10 @@ def _losses_of(encoder: Diagnostics, part: str) -> dict[str, float]:
 
 def _loss_by_term(task: str, encoders: Encoders) -> Plot:
     """The held-out loss of smooth decision processes, term by term."""
+    terms = {
+        label: {_WORDS.get(term, term): loss for term, loss in e.method["loss_by_term"].items()}
+        for label, e in encoders.items()
+    }
     return _by_name(
         task,
         "loss_by_term",
@@ -216,15 +220,10 @@ def _loss_by_term(task: str, encoders: Encoders) -> Plot:
         "Terms of the loss on held-out windows, unweighted: the squared error of the standardised "
         "reward, 1 for no prediction; that of the next code; and by how much the networks are "
         "steeper than they may be.",
-        {label: _terms(e.method["loss_by_term"]) for label, e in encoders.items()},
+        terms,
         ("term", "loss on held-out windows"),
         lambda: {name: {**look, "linestyle": ""} for name, look in line_styles(encoders).items()},
     )
-
-
-def _terms(losses: Mapping[str, float]) -> dict[str, float]:
-    """Losses by what the terms are called."""
-    return {_WORDS.get(term, term): loss for term, loss in losses.items()}
 
 
 def _divergence(task: str, encoders: Encoders) -> Plot:

@@ -24,23 +24,14 @@ _UNDATED: dict[str, dict[str, Any]] = {  # the same bytes each time
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """A figure to be drawn.
+    """A figure to be drawn."""
 
-    Args:
-        name: of its files.
-        title: a few words.
-        caption: what the figure shows.
-        columns: of the table that it is drawn from.
-        rows: of that table.
-        draw: makes the figure in the style in use.
-    """
-
-    name: str
-    title: str
-    caption: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-    draw: Callable[[], Figure]
+    name: str  # of its files
+    title: str  # a few words
+    caption: str  # what the figure shows
+    columns: Sequence[str]  # of the table that it is drawn from
+    rows: Sequence[Sequence[Any]]  # of that table
+    draw: Callable[[], Figure]  # makes the figure in the style in use
 
     @cached_property
     def on_paper(self) -> "Drawing":
