@@ -168,7 +168,7 @@ def _units(encoders: _Encoders) -> Table:
         {
             "encoder": lambda each: each[0],
             "dead": lambda each: str(len(each[1].dead)),
-            "saturated": lambda each: number(max(each[1].saturation, default=None), ".0%"),
+            "saturated": lambda each: number(max(each[1].saturation or (), default=None), ".0%"),
             "participation": lambda each: number(each[1].participation_ratio, ".1f"),
             "TwoNN": lambda each: number(each[1].intrinsic_dimension.two_nn, ".1f"),
             "max. likelihood": lambda each: number(each[1].intrinsic_dimension.mle, ".1f"),
