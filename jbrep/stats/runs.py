@@ -68,7 +68,7 @@ class RunCurve:
     failure_return: float | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.seed, Integral) or isinstance(self.seed, bool):
+        if not _is_whole(self.seed):
             raise self._error(f"its seed is {self.seed!r}", "it must be a whole number")
         given, returns = np.asarray(self.steps), np.asarray(self.returns, float)
         if given.size and not np.issubdtype(given.dtype, np.integer):
@@ -163,6 +163,10 @@ class RunCurve:
 
     def _error(self, wrong: str, expected: str) -> InputError:
         return InputError(f"run {self.label}, seed {self.seed}: {wrong}; {expected}")
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 Group = dict[str, list[RunCurve]]  # runs by seed, under their representation

@@ -125,7 +125,7 @@ def _free(names: Sequence[str], points: Any) -> list[tuple[float, float] | None]
         places.append(None)
         for dx, dy in ((0.05, 0.0), (-0.05 - width, 0.0), (-width / 2, 0.09), (-width / 2, -0.09)):
             box = Bbox.from_bounds(x + dx, y + dy - _LINE / 2, width, _LINE)
-            inside = min(box.min) >= 0 and (box.max <= _PANEL).all()
+            inside = min(box.min) >= 0 and np.all(box.max <= np.array(_PANEL))
             if inside and not any(map(box.fully_overlaps, taken)):
                 taken.append(box)
                 places[-1] = (dx, dy)
