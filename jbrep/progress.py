@@ -32,10 +32,6 @@ class Progress(tqdm):
         is_bar = sys.stderr is not None and sys.stderr.isatty()
         super().set_postfix(*args, refresh=refresh and is_bar, **values)
 
-    def set_postfix_str(self, s: str = "", refresh: bool = False) -> None:
-        """The same, as text."""
-        super().set_postfix_str(s, refresh=refresh)
-
 
 class _Log:
     """A stream that tqdm's bars are written to as lines: nothing returns to a line's start."""

@@ -77,7 +77,10 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
     assert re.search(r"4 runs to go, 0 done; [\d.]+ \w+ on one core, [\d.]+ \w+ with 2 ", told)
     for arguments, message in (
         (("studies/none.toml",), "no study at studies/none.toml"),
-        (("studies/demo.toml", "--backend", "slurm"), "unknown backend 'slurm'"),
+        (
+            ("studies/demo.toml", "--backend", "slurm"),
+            "unknown backend 'slurm': choose one of local, ray",
+        ),
         (("README.md",), "README.md is not valid TOML"),
         (("studies/paper.toml", "--width", 0), "'--width': 0 is not in the range"),
         (("studies/paper.toml", "--width", 1000, "--workers", 9), "the width is 1000: 9 cohorts"),
@@ -234,7 +237,7 @@ def test_help_says_which_kind_takes_which_setting_in_80_columns(monkeypatch):
 
 def test_a_data_set_from_collecting_to_exporting(tmp_path):
     data, derived = tmp_path / "data", tmp_path / "derived"
-    arguments = ("collect", "--task", "face_direction", "--steps", "2k", "--store-state")
+    arguments = ("collect", "--task", "face_direction", "--steps", "1.1k", "--store-state")
     told = jbrep(*arguments, "--shard-episodes", 1, "--out", data).output
     assert "2 episodes of face_direction, 2,000 rows, 0.7 MB in" in told
     assert re.search(r"2,000 rows in \d+ s, [\d,]+ a second", told)
@@ -264,12 +267,6 @@ def test_steps_may_be_written_in_many_ways(text, steps):
     assert COUNT.convert(text, None, None) == steps
 
 
-def test_a_part_of_an_episode_makes_a_whole_one(tmp_path):
-    out = tmp_path / "data"
-    result = jbrep("collect", "--task", "move_to_pose", "--steps", "1.1k", "--out", out)
-    assert "2 episodes of move_to_pose, 2,000 rows" in result.output
-
-
 @pytest.mark.parametrize("text", ["many", "1.5", "k", "1e999", "nan"])
 def test_steps_that_are_no_number_are_refused(text, tmp_path):
     result = jbrep("collect", "--task", "move_to_pose", "--steps", text, "--out", tmp_path / "x")
@@ -277,25 +274,20 @@ def test_steps_that_are_no_number_are_refused(text, tmp_path):
     assert "write it as 5000000, 5_000_000, 5e6 or 5M" in result.output
 
 
-def test_a_missing_extra_is_named(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "torch", None)
-    for name in [n for n in sys.modules if n.startswith(("jbrep.dae", "jbrep.methods.fit"))]:
+@pytest.mark.parametrize(
+    ("package", "extra", "users", "command"),
+    [
+        ("torch", "learn", ("jbrep.dae", "jbrep.methods.fit"), "train-dae --latent 8 --data {}"),
+        ("pyarrow", "export", "jbrep.dataset.formats.parquet", "data export {} --to parquet"),
+    ],
+)
+def test_a_missing_extra_is_named(package, extra, users, command, monkeypatch, tmp_path, collected):
+    monkeypatch.setitem(sys.modules, package, None)
+    for name in [name for name in sys.modules if name.startswith(users)]:
         monkeypatch.delitem(sys.modules, name)
-    result = jbrep("train-dae", "--data", tmp_path, "--latent", 8, "--out", tmp_path / "x")
-    assert (result.exit_code, result.output) == (
-        2,
-        "Error: this needs torch: pip install 'jbrep[learn]'\n",
-    )
-
-
-def test_a_missing_package_for_an_export_is_named(monkeypatch, tmp_path, collected):
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    monkeypatch.delitem(sys.modules, "jbrep.dataset.formats.parquet", raising=False)
-    result = jbrep("data", "export", collected, "--to", "parquet", "--out", tmp_path / "x")
-    assert (result.exit_code, result.output) == (
-        2,
-        "Error: this needs pyarrow: pip install 'jbrep[export]'\n",
-    )
+    result = jbrep(*command.format(collected).split(), "--out", tmp_path / "x")
+    message = f"Error: this needs {package}: pip install 'jbrep[{extra}]'\n"
+    assert (result.exit_code, result.output) == (2, message)
 
 
 def test_help_loads_nothing_heavy():

@@ -37,8 +37,9 @@ from jbrep.play import jitterbug
 from jbrep.play.jitterbug import reward_terms
 from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode
+from jbrep.records.tables import write_rows
 from jbrep.rl import Run
-from jbrep.rl.files import Evaluation, read_evaluations, write_rows
+from jbrep.rl.files import Evaluation, read_evaluations
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
 DAE = "jbrep/encoders/shipped/face_direction/dae-4.safetensors"

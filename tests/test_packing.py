@@ -24,7 +24,7 @@ STUDY = Study(
 def packs_of(tmp_path, workers, width=None, **changes):
     """The packs of a study."""
     plan = Plan(STUDY.replace(**changes), tmp_path)
-    packs = packed(plan, plan.cells, workers, width)
+    packs = packed(plan, workers, width)
     assert sorted(c.name for pack in packs for c in pack) == sorted(c.name for c in plan.cells)
     for pack in packs:
         assert len({(cell.task, cell.learner.name) for cell in pack}) == 1
@@ -66,10 +66,10 @@ def test_memory_limits_the_width(tmp_path, monkeypatch):
     assert bytes_of_one == 1_000_000 * (16 + 1 + 16 + 1 + 1) * 4
     gib = 1 << 30
     monkeypatch.setattr(os, "sysconf", {"SC_PHYS_PAGES": 4, "SC_PAGE_SIZE": gib}.__getitem__)
-    packs = packed(plan, plan.cells, 2)
+    packs = packed(plan, 2)
     assert max(map(len, packs)) == 4  # of 19 features, 0.9 GiB
     with pytest.raises(InputError, match="the width is 5: 2 cohorts of 4 agents are the most that"):
-        packed(plan, plan.cells, 2, 5)
+        packed(plan, 2, 5)
 
 
 def test_the_last_worker_decides():
@@ -83,7 +83,7 @@ def test_a_gpu_has_one_wide_cohort_at_a_time(tmp_path, monkeypatch):
     assert usual_workers(plan) == cpu_count()
     monkeypatch.setattr(Plan, "device", "cuda")
     assert usual_workers(plan) == 1
-    assert [len(pack) for pack in packed(plan, plan.cells, 1)] == [60, 60]
+    assert [len(pack) for pack in packed(plan, 1)] == [60, 60]
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_codes_that_are_larger_than_the_observation_take_more_memory(tmp_path, m
     gib = 1 << 30
     monkeypatch.setattr(os, "sysconf", {"SC_PHYS_PAGES": 4, "SC_PAGE_SIZE": gib}.__getitem__)
     wide = Plan(study.replace(representations=("full", "noise-64")), tmp_path)
-    assert max(map(len, packed(wide, wide.cells, 2))) == 1  # 0.5 GiB each, of 0.9
+    assert max(map(len, packed(wide, 2))) == 1  # 0.5 GiB each, of 0.9
 
 
 def test_codes_that_are_larger_than_the_observation_have_packs_of_their_own(tmp_path):

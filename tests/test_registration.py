@@ -133,7 +133,7 @@ def test_a_study_with_primary_cells_is_registered_when_it_begins(tmp_path):
     plan = Plan(study, tmp_path / "study")
     assert run_study(plan, in_this_process, 1) == 0
     again = Plan(study, tmp_path / "study")
-    judging = again.registration.planned
+    judging = again.registration.registered.planned
     assert (judging.rules.primary, judging.seeds) == (tuple(primary["primary"]), seeds)
     for path in (tmp_path / "study").rglob(RUN):
         settings = json.loads(path.read_text())["settings"]

@@ -17,7 +17,7 @@ from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.evaluate.table import DIAGNOSTICS, SCALARS, Diagnosed, write_diagnostics
 from jbrep.play.sources import find_episode
-from jbrep.records.tables import write_csv
+from jbrep.records.tables import write_csv, write_rows
 from jbrep.report import report, write_report
 from jbrep.report.facts import reproduce, setting_table
 from jbrep.report.figures import study_plots, write
@@ -26,7 +26,7 @@ from jbrep.report.page import page as page_of
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, STATISTICS, SUMMARY
 from jbrep.report.tables import read_tables
 from jbrep.report.words import answers, headline
-from jbrep.rl.files import ENCODER, Evaluation, write_rows
+from jbrep.rl.files import ENCODER, Evaluation
 from jbrep.stats.claims import CLAIMS
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan

@@ -196,11 +196,6 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
     assert "1.0 h" not in told.stdout
 
 
-def test_a_study_that_is_not_there(tmp_path):
-    with pytest.raises(InputError, match="no study at"):
-        read_study(tmp_path / "none.toml")
-
-
 def test_a_study_is_read_without_its_environments(tmp_path, monkeypatch):
     """Their package may be gone by then."""
     monkeypatch.setattr("jbrep.study.plan.describe", None)
@@ -416,17 +411,17 @@ def test_a_stopped_study_leaves_checkpoints_and_no_workers(tmp_path):
 
 def test_progress_is_a_line_for_each_run_where_there_is_no_terminal(done, capsys, monkeypatch):
     outcomes = [Outcome(cell.name, "finished", "1.0 min") for cell in done.cells[:3]]
-    with Progress(done, done.cells) as progress:
-        progress.report(outcomes[0])
-        progress.report(outcomes[1])
-        monkeypatch.setattr(sys, "stderr", None)  # closed
-        progress.report(outcomes[2])
-        with Path("/dev/full").open("w") as full:
-            monkeypatch.setattr(sys, "stderr", full)
-            progress.report(Outcome(done.cells[3].name, "failed", "loss is nan"))
-            monkeypatch.undo()
-            with suppress(OSError):
-                full.close()
+    progress = Progress(done, done.cells)
+    progress.report(outcomes[0])
+    progress.report(outcomes[1])
+    monkeypatch.setattr(sys, "stderr", None)  # closed
+    progress.report(outcomes[2])
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stderr", full)
+        progress.report(Outcome(done.cells[3].name, "failed", "loss is nan"))
+        monkeypatch.undo()
+        with suppress(OSError):
+            full.close()
     told = capsys.readouterr()
     assert told.out == ""
     assert told.err.splitlines() == [
@@ -519,16 +514,6 @@ def test_the_long_table_holds_every_evaluation(done):
         assert (len(returns), each) == (10, pytest.approx(np.mean(returns)))
 
 
-def test_a_single_seed_gives_its_returns_and_says_why_no_more(done, tmp_path):
-    source = done.folder_of(done.cells[0])
-    for name in (RUN, "evaluations.csv"):
-        (tmp_path / name).write_bytes((source / name).read_bytes())
-    conclude(tmp_path)
-    results = read_tables(tmp_path)
-    assert results.analysis is None
-    assert "one run has ended, at least two are needed" in results.left_out[0]
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -551,12 +536,9 @@ def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
         read_runs(tmp_path)
 
 
-def test_no_run_and_no_backend(tmp_path):
+def test_a_folder_without_runs_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"no finished run below .* train one with jbrep rl"):
         read_runs(tmp_path)
-    told = jbrep("study", written(tmp_path), "--backend", "slurm")
-    message = "Error: unknown backend 'slurm': choose one of local, ray\n"
-    assert (told.exit_code, told.stderr) == (2, message)
 
 
 def test_the_runs_below_a_folder_behave_as_one_policy(done):

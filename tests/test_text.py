@@ -18,7 +18,6 @@ import jbrep.progress as p
 with p.Progress(total=3) as bar:
     bar.update()
     bar.set_postfix(error=1)
-    bar.set_postfix_str("late")
 """
 
 

@@ -10,8 +10,9 @@ from made_up import write_record
 from jbrep.dataset import Dataset
 from jbrep.encoders import load
 from jbrep.envs import describe
+from jbrep.records.tables import write_rows
 from jbrep.rl import Run
-from jbrep.rl.files import EPISODES, Episode, write_rows
+from jbrep.rl.files import EPISODES, Episode
 
 ROOT = Path(__file__).parent.parent
 FACE, MOVE = "face_direction", "move_in_direction"

@@ -1,6 +1,5 @@
 """Verdicts on cohorts against stable-baselines3, of made-up returns whose truth is known."""
 
-import csv
 import shutil
 import subprocess
 import sys
@@ -8,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from jbrep.records.tables import write_rows
 from jbrep.study.record import RECORD
-from jbrep.study.tables import COLUMNS, RETURNS
+from jbrep.study.tables import RETURNS, Return
 
 SEEDS, STEPS, EPISODES = 20, (5_000, 10_000), 10
 ARMS = {  # mean and standard deviation of runs
@@ -29,15 +29,13 @@ def write_arm(folder, mean, spread, rng):
     shutil.copy(Path("results/confirm") / RECORD, folder)
     runs = rng.standard_normal(SEEDS)
     of_runs = mean + spread * (runs - runs.mean()) / runs.std(ddof=1)
-    with (folder / RETURNS).open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for seed, of_run in enumerate(of_runs):
-            for step in STEPS:
-                for episode in range(EPISODES):
-                    writer.writerow(
-                        ("face_direction", algorithm, "full", seed, step, episode, of_run)
-                    )
+    rows = (
+        Return("face_direction", algorithm, "full", seed, step, episode, float(of_run))
+        for seed, of_run in enumerate(of_runs)
+        for step in STEPS
+        for episode in range(EPISODES)
+    )
+    write_rows(folder / RETURNS, rows, Return)
 
 
 def test_verdicts_go_by_the_rule(tmp_path):

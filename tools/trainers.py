@@ -17,7 +17,7 @@ from scipy.stats import norm, permutation_test, ttest_ind
 from jbrep.errors import InputError
 from jbrep.records.document import read_document
 from jbrep.records.storage import write_whole
-from jbrep.records.tables import read_csv
+from jbrep.records.tables import read_rows
 from jbrep.report.figures import write
 from jbrep.report.figures.curves import curves
 from jbrep.report.figures.style import styles
@@ -26,7 +26,7 @@ from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.intervals import variance_ratio
 from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.tables import COLUMNS, RETURNS, Return
+from jbrep.study.tables import RETURNS, Return
 from jbrep.text import rounded, table
 
 SB3, *COHORTS = ARMS = ("sb3", "float32", "bfloat16")
@@ -151,7 +151,7 @@ def read_arm(folder: Path, arm: str) -> list[RunCurve]:
     if failed := [run.seed for run in record.runs if run.status != FINISHED]:
         raise InputError(f"{folder}: the runs of the seeds {failed} failed")
     returns: dict[int, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in (Return(*cells) for cells in read_csv(folder / RETURNS, COLUMNS)):
+    for row in read_rows(folder / RETURNS, Return):
         returns[row.seed][row.step].append(row.episode_return)
     return [
         RunCurve(

@@ -1,7 +1,7 @@
 """Collecting data sets, and working with them."""
 
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -9,11 +9,11 @@ from typing import Any
 import click
 
 from jbrep.cli.base import (
+    PATH,
     RESUMES,
     as_json,
     echo_json,
     echo_text,
-    example,
     on_stop,
     say,
     stoppable,
@@ -35,11 +35,11 @@ _lanes = click.option(
     show_default=True,
     help="Environments of a batch, stepped at once.",
 )
-_data = click.argument("data", type=click.Path(path_type=Path))
+_data = click.argument("data", type=PATH)
 
 
-@click.command(epilog=example("jbrep collect --task face_direction --steps 5M --out data/face"))
-@task_options()
+@click.command(epilog="Example: jbrep collect --task face_direction --steps 5M --out data/face")
+@task_options
 @record_options(CollectSettings, shard_episodes=None)
 @click.option(
     "--policy",
@@ -52,7 +52,7 @@ _data = click.argument("data", type=click.Path(path_type=Path))
 @_lanes
 @_threads
 @click.option("--backend", default="local", show_default=True, help="local, or ray for a cluster.")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="A folder.")
+@click.option("--out", required=True, type=PATH, help="A folder.")
 def collect(
     steps: int,
     seed: int,
@@ -93,7 +93,7 @@ def collect(
     settings = settings.replace(shard_episodes=shard_episodes)
     _tell_kept(out, settings.policy)
     with stoppable(RESUMES):
-        _report(out, run(settings, out, lanes, threads, backend, actor))
+        _report(out, *run(settings, out, lanes, threads, backend, actor))
 
 
 def _tell_kept(out: Path, policy: Mapping[str, Any]) -> None:
@@ -104,9 +104,8 @@ def _tell_kept(out: Path, policy: Mapping[str, Any]) -> None:
             say(f"{known}, which {out / part['file']} keeps", err=True)
 
 
-def _report(out: Path, written: Any) -> None:
+def _report(out: Path, manifest: Any, rows: int, seconds: float) -> None:
     """Print what the folder holds now, and how fast it was written."""
-    manifest, rows, seconds = written
     _report_size(out, manifest)
     if rows:
         click.echo(f"{rows:,} rows in {seconds:,.0f} s, {rows / seconds:,.0f} a second")
@@ -127,7 +126,7 @@ def data() -> None:
     """Inspect, repair, derive, import and export data sets."""
 
 
-@data.command(epilog=example("jbrep data info data/face"))
+@data.command(epilog="Example: jbrep data info data/face")
 @_data
 @as_json
 def info(data: Path, as_json: bool) -> None:
@@ -141,7 +140,7 @@ def info(data: Path, as_json: bool) -> None:
     echo_text(card(Dataset(data), terminal_width()))
 
 
-@data.command(epilog=example("jbrep data verify data/face --replay 50"))
+@data.command(epilog="Example: jbrep data verify data/face --replay 50")
 @_data
 @click.option("--replay", default=0, help="Episodes to simulate again and compare bit for bit.")
 @import_option
@@ -156,16 +155,10 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
     from jbrep.dataset import Dataset
     from jbrep.dataset.verify import find_problems
 
-    problems = 0
-    for problem in find_problems(data):
-        say(problem)
-        problems += 1
-    if not problems:
-        dataset = Dataset(data)
-        for problem in replay_problems(dataset, replay, threads):
-            say(problem)
-            problems += 1
-    if problems:
+    if _say_all(find_problems(data)):
+        ctx.exit(1)
+    dataset = Dataset(data)
+    if _say_all(replay_problems(dataset, replay, threads)):
         ctx.exit(1)
     manifest = dataset.manifest
     shards = f"{len(manifest.shards)} shard{'s' if len(manifest.shards) != 1 else ''}"
@@ -175,7 +168,16 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
         click.echo(f"{replay} episodes simulated again: equal in every bit")
 
 
-@data.command(epilog=example("jbrep data repair data/face"))
+def _say_all(lines: Iterable[str]) -> bool:
+    """Print lines as they come; whether there were any."""
+    any_said = False
+    for line in lines:
+        say(line)
+        any_said = True
+    return any_said
+
+
+@data.command(epilog="Example: jbrep data repair data/face")
 @_data
 @import_option
 @_lanes
@@ -186,22 +188,19 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
     from jbrep.play.sources import kept_policy
 
     with stoppable(RESUMES):
-        repaired = False
-        for line in run(data, lanes, threads, kept_policy(data)):
-            say(line)
-            repaired = True
+        repaired = _say_all(run(data, lanes, threads, kept_policy(data)))
     if not repaired:
         say(f"{data} is whole: nothing to repair")
 
 
 @data.command(
-    epilog=example("jbrep data derive data/face --task move_in_direction --out data/move")
+    epilog="Example: jbrep data derive data/face --task move_in_direction --out data/move"
 )
 @_data
 @click.option("--task", required=True, help="The task to observe and reward.")
 @record_options(CollectSettings, "store_state")
 @_threads
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="A folder.")
+@click.option("--out", required=True, type=PATH, help="A folder.")
 def derive(data: Path, task: str, store_state: bool, threads: int | None, out: Path) -> None:
     """Make another task's data set from the same motion.
 
@@ -212,14 +211,14 @@ def derive(data: Path, task: str, store_state: bool, threads: int | None, out: P
     from jbrep.collect.derive import derive as run
 
     with stoppable(RESUMES):
-        _report(out, run(data, task, out, store_state, threads))
+        _report(out, *run(data, task, out, store_state, threads))
 
 
-@data.command(epilog=example("jbrep data export data/face --to parquet --out face.parquet"))
+@data.command(epilog="Example: jbrep data export data/face --to parquet --out face.parquet")
 @_data
 @import_option
 @click.option("--to", required=True, help="minari, parquet or npz.")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="A new file or folder.")
+@click.option("--out", required=True, type=PATH, help="A new file or folder.")
 def export(data: Path, to: str, out: Path) -> None:
     """Write a data set in another tool's format.
 
@@ -235,10 +234,10 @@ def export(data: Path, to: str, out: Path) -> None:
         click.echo(f"open it with {run(Dataset(data), to, out)}")
 
 
-@data.command("import", epilog=example("jbrep data import D4RL/hopper/expert-v0 --out data/hopper"))
+@data.command("import", epilog="Example: jbrep data import D4RL/hopper/expert-v0 --out data/hopper")
 @click.argument("source")
-@task_options()
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="A new folder.")
+@task_options
+@click.option("--out", required=True, type=PATH, help="A new folder.")
 def import_(source: str, out: Path, **options: Any) -> None:
     """Make a data set of one that was made elsewhere.
 

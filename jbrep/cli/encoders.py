@@ -6,19 +6,19 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from jbrep.cli.base import (
+    PATH,
     Variadic,
     as_json,
     data_option,
     echo_json,
     echo_paths,
     echo_text,
-    example,
     say,
     stoppable,
 )
 from jbrep.cli.environment import given_task, needed_task, task_options
 from jbrep.errors import InputError
-from jbrep.text import terminal_width
+from jbrep.text import facts, r2_text, table, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.encoders import Encoder
@@ -28,9 +28,8 @@ if TYPE_CHECKING:
 
 @click.command(
     cls=Variadic,
-    epilog=example(
-        "jbrep evaluate --encoder dae-8 encoders/face/pca-8.safetensors --data data/face"
-    ),
+    epilog="Example: jbrep evaluate --encoder dae-8 encoders/face/pca-8.safetensors "
+    "--data data/face",
 )
 @click.option(
     "--encoder",
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     "--out",
     default="evaluation",
     show_default=True,
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="A folder for evaluation.json and figures.",
 )
 @click.option(
@@ -124,7 +123,7 @@ _COLUMNS = {name: name for name in ("forward", "rewarded", "reward", "value", "a
 _COLUMNS["times_pca"] = "error"
 
 
-@encoder.command("list", epilog=example("jbrep encoder list --task face_direction"))
+@encoder.command("list", epilog="Example: jbrep encoder list --task face_direction")
 @click.option("--task", help="One of the Jitterbug's; all of them by default.")
 @as_json
 def list_shipped(task: str | None, as_json: bool) -> None:
@@ -135,7 +134,6 @@ def list_shipped(task: str | None, as_json: bool) -> None:
     from jbrep.evaluate.table import SCALARS
     from jbrep.jitterbug.tasks import TASKS
     from jbrep.methods.registry import METHODS
-    from jbrep.text import facts, r2_text, table
 
     if task is not None and task not in TASKS:
         raise InputError(f"no encoder ships for {task}: only for {', '.join(TASKS)}")
@@ -185,9 +183,9 @@ def _with_diagnostics(task: "Task") -> "list[tuple[str, Encoder, Values]]":
 _which = click.argument("encoder")
 
 
-@encoder.command(epilog=example("jbrep encoder info dae-8 --task face_direction"))
+@encoder.command(epilog="Example: jbrep encoder info dae-8 --task face_direction")
 @_which
-@task_options()
+@task_options
 @as_json
 def info(encoder: str, as_json: bool, **options: Any) -> None:
     """Show what an encoder is and where it comes from.
@@ -209,11 +207,11 @@ def info(encoder: str, as_json: bool, **options: Any) -> None:
 
 
 @encoder.command(
-    epilog=example("jbrep encoder export dae-8 --task face_direction --out dae-8.onnx")
+    epilog="Example: jbrep encoder export dae-8 --task face_direction --out dae-8.onnx"
 )
 @_which
-@task_options()
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="A new .onnx file.")
+@task_options
+@click.option("--out", required=True, type=PATH, help="A new .onnx file.")
 def export(encoder: str, out: Path, **options: Any) -> None:
     """Write an encoder, with its decoder, as ONNX.
 
@@ -240,19 +238,18 @@ def export(encoder: str, out: Path, **options: Any) -> None:
 
 @encoder.command(
     "import",
-    epilog=example(
-        "jbrep encoder import model.onnx --task face_direction --out encoders/mine.safetensors"
-    ),
+    epilog="Example: jbrep encoder import model.onnx --task face_direction "
+    "--out encoders/mine.safetensors",
 )
-@click.argument("model", type=click.Path(path_type=Path))
-@task_options()
+@click.argument("model", type=PATH)
+@task_options
 @click.option(
     "--decoder",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="A model from latents back to observations, if MODEL has no reconstruction.",
 )
 @click.option("--name", help="What tables will call it; by default the name of the file.")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="A new encoder file.")
+@click.option("--out", required=True, type=PATH, help="A new encoder file.")
 def import_model(
     model: Path, decoder: Path | None, name: str | None, out: Path, **options: Any
 ) -> None:

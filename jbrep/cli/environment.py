@@ -1,77 +1,61 @@
 """Which environment a command is about, and the command that says what it is."""
 
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from jbrep.cli.base import POSITIVE
+from jbrep.cli.base import PATH, POSITIVE, as_json, echo_json, echo_text, with_options
 from jbrep.errors import InputError
-
-if TYPE_CHECKING:
-    from jbrep.envs.task import Task
-from jbrep.cli.base import as_json, echo_json, echo_text, example
 from jbrep.records.record import to_plain
 from jbrep.text import terminal_width
 
-_Command = TypeVar("_Command", bound=Callable[..., Any])
-_TASK = click.option(
-    "--task", help="One of the Jitterbug's, such as face_direction, or a Gymnasium id: Hopper-v5."
-)
+if TYPE_CHECKING:
+    from jbrep.envs.task import Task
+
 _ARGUMENTS = ("env", "episode_steps", "features")
 
 
-def import_option(command: _Command) -> _Command:
-    """The option --import, which takes effect before the command begins."""
+def _import(context: click.Context, option: click.Parameter, modules: tuple[str, ...]) -> None:
+    if modules:
+        from jbrep.envs.names import import_modules
 
-    def imported(context: click.Context, option: click.Parameter, modules: tuple[str, ...]) -> None:
-        if modules:
-            from jbrep.envs.names import import_modules
+        import_modules(modules)
 
-            import_modules(modules)
 
-    return click.option(
-        "--import",
+import_option = click.option(
+    "--import",
+    multiple=True,
+    metavar="MODULE",
+    expose_value=False,
+    is_eager=True,  # it takes effect before the command begins
+    callback=_import,
+    help="Import a module that registers environments; this runs its code.",
+)
+_argument_options = with_options(
+    click.option(
+        "--env",
         multiple=True,
-        metavar="MODULE",
-        expose_value=False,
-        is_eager=True,
-        callback=imported,
-        help="Import a module that registers environments; this runs its code.",
-    )(command)
-
-
-def task_options(named: bool = True) -> Callable[[_Command], _Command]:
-    """The options from which `given_task` makes a task; --task is left out unless `named`."""
-    options = (
-        *([_TASK] if named else []),
-        click.option(
-            "--env",
-            multiple=True,
-            metavar="NAME=VALUE",
-            help="An argument of the environment, such as g=1.6; may be repeated.",
-        ),
-        click.option(
-            "--episode-steps",
-            type=POSITIVE,
-            help="The time limit of an episode; the environment's own by default.",
-        ),
-        click.option(
-            "--features",
-            type=click.Path(path_type=Path),
-            help="A TOML file with names, units and ranges of the features.",
-        ),
-        import_option,
-    )
-
-    def decorate(command: _Command) -> _Command:
-        for option in reversed(options):
-            command = option(command)
-        return command
-
-    return decorate
+        metavar="NAME=VALUE",
+        help="An argument of the environment, such as g=1.6; may be repeated.",
+    ),
+    click.option(
+        "--episode-steps",
+        type=POSITIVE,
+        help="The time limit of an episode; the environment's own by default.",
+    ),
+    click.option(
+        "--features", type=PATH, help="A TOML file with names, units and ranges of the features."
+    ),
+    import_option,
+)
+task_options = with_options(  # from which `given_task` makes a task
+    click.option(
+        "--task",
+        help="One of the Jitterbug's, such as face_direction, or a Gymnasium id: Hopper-v5.",
+    ),
+    _argument_options,
+)
 
 
 def needed_task(options: dict[str, Any]) -> "Task":
@@ -92,11 +76,8 @@ def needed_task(options: dict[str, Any]) -> "Task":
 
 def given_task(options: dict[str, Any]) -> "Task | None":
     """The same where a task may be left out, with all that would be said of it."""
-    if any(options[option] for option in ("task", *_ARGUMENTS)):
-        return needed_task(options)
-    for option in ("task", *_ARGUMENTS):
-        del options[option]
-    return None
+    said = any(options[option] for option in ("task", *_ARGUMENTS))
+    return needed_task(options) if said else None
 
 
 def parse_arguments(given: tuple[str, ...], option: str = "--env") -> dict[str, Any]:
@@ -117,9 +98,9 @@ def parse_arguments(given: tuple[str, ...], option: str = "--env") -> dict[str, 
     return arguments
 
 
-@click.command(epilog=example("jbrep env Hopper-v5"))
+@click.command(epilog="Example: jbrep env Hopper-v5")
 @click.argument("task")
-@task_options(named=False)
+@_argument_options
 @as_json
 def env(as_json: bool, **options: Any) -> None:
     """Say what a task is.

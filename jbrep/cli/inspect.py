@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, example, say, stoppable
+from jbrep.cli.base import COUNT, PATH, say, stoppable
 from jbrep.cli.environment import given_task, task_options
 from jbrep.errors import InputError
 
@@ -19,10 +19,10 @@ _ADDRESS = "127.0.0.1"
 _KEEPER = ("sh", "-c", "read -r _; kill 0")
 
 
-@click.command(epilog=example("jbrep inspect data/face --episode 3 --encoder dae-8 --view"))
+@click.command(epilog="Example: jbrep inspect data/face --episode 3 --encoder dae-8 --view")
 @click.argument("source", required=False)
 @click.option("--episode", type=COUNT, help="Its number, from 0; 0 if not given.")
-@task_options()
+@task_options
 @click.option(
     "--encoder",
     help="A file, a name that ships, or code, mymodule:MyEncoder; a run's own if not given.",
@@ -30,13 +30,11 @@ _KEEPER = ("sh", "-c", "read -r _; kill 0")
 @click.option("--traverse", is_flag=True, help="Show what each unit of the latent moves.")
 @click.option(
     "--data",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="A data set, to fit an encoder's forecasts to; if not given SOURCE where it is one, else "
     "the episode shown.",
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="An .rrd file; one in inspect/ if not given."
-)
+@click.option("--out", type=PATH, help="An .rrd file; one in inspect/ if not given.")
 @click.option("--view", is_flag=True, help="Open it in the Rerun viewer.")
 @click.option(
     "--serve",

@@ -6,12 +6,17 @@ from typing import Any, TypeVar
 import click
 from msgspec import NODEFAULT, inspect
 
-from jbrep.cli.base import COUNT
+from jbrep.cli.base import COUNT, with_options
 from jbrep.records.keys import Key, keys_of
 from jbrep.records.record import Record
 from jbrep.records.words import bare
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
+_TYPES: dict[type[inspect.Type], click.ParamType[Any]] = {
+    inspect.IntType: COUNT,
+    inspect.FloatType: click.FLOAT,
+    inspect.BoolType: click.BOOL,
+}
 
 
 def record_options(
@@ -27,32 +32,22 @@ def record_options(
     Returns:
         A decorator of a command, which gets an argument with the name of each field.
     """
-    keys = {key.field: key for key in keys_of(kind)}
-    chosen = [keys[name] for name in names or keys]
-
-    def decorate(command: _Command) -> _Command:
-        for key in reversed(chosen):
-            command = _option(key._replace(**_changed(key, defaults)))(command)
-        return command
-
-    return decorate
-
-
-def _changed(key: Key, defaults: dict[str, Any]) -> dict[str, Any]:
-    return {"default": defaults[key.field]} if key.field in defaults else {}
+    keys = {
+        key.field: key._replace(default=defaults.get(key.field, key.default))
+        for key in keys_of(kind)
+    }
+    return with_options(*(_option(keys[name]) for name in names or keys))
 
 
 def _option(key: Key) -> Callable[[_Command], _Command]:
     node = bare(key.kind)
-    is_list = isinstance(node, inspect.CollectionType)
     default = f"  [default: {key.default_in_words}]" if key.default_in_words else ""
     has_default = key.default is not NODEFAULT
     return click.option(
         f"--{key.name.replace('_', '-')}",
         key.field,
-        type=_type(bare(node.item_type) if isinstance(node, inspect.CollectionType) else node),
+        type=_TYPES.get(type(node), click.STRING),
         is_flag=isinstance(node, inspect.BoolType),
-        multiple=is_list,
         metavar=_choices(node),
         required=not has_default,
         default=key.default if has_default else None,
@@ -65,14 +60,3 @@ def _choices(node: inspect.Type) -> str | None:
     if isinstance(node, inspect.LiteralType):
         return f"[{'|'.join(str(value) for value in node.values if value)}]"
     return None
-
-
-def _type(node: inspect.Type) -> click.ParamType[Any]:
-    match node:
-        case inspect.IntType():
-            return COUNT
-        case inspect.FloatType():
-            return click.FLOAT
-        case inspect.BoolType():
-            return click.BOOL
-    return click.STRING

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from jbrep.cli.base import (
+    PATH,
     POSITIVE,
     as_json,
     echo_json,
     echo_paths,
     echo_text,
-    example,
     interval_of,
     percentiles,
     say,
@@ -19,6 +19,7 @@ from jbrep.cli.base import (
 )
 from jbrep.cli.environment import given_task, task_options
 from jbrep.errors import InputError
+from jbrep.text import table, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.envs.task import Task
@@ -27,13 +28,13 @@ if TYPE_CHECKING:
 _TASK = "face_direction"
 
 
-@click.command(epilog=example("jbrep evaluate-policy runs/a --episodes 100"))
+@click.command(epilog="Example: jbrep evaluate-policy runs/a --episodes 100")
 @click.argument("policy")
 @click.option(
     "--episodes", default=20, show_default=True, type=POSITIVE, help="How many, the same each time."
 )
 @click.option("--trust", is_flag=True, help="Read a zip file from elsewhere, which can run code.")
-@task_options()
+@task_options
 @click.option("--algorithm", default="sac", show_default=True, help="Of a zip file.")
 @click.option(
     "--encoder",
@@ -100,41 +101,32 @@ def _find(
     policy: str, task: "Task | None", algorithm: str, encoder: str | None, trust: bool
 ) -> "Player":
     """The policy of a run, by name, or in a zip file."""
-    from jbrep.encoders import find
+    from jbrep.encoders import FULL, find
     from jbrep.envs.description import describe
-    from jbrep.play.sources import (
-        as_player,
-        find_player,
-        is_by_name,
-        is_trained,
-        policy_names,
-        run_folder,
-    )
+    from jbrep.play import sources
     from jbrep.records.storage import exists
 
-    path = Path(policy)
-    folder = run_folder(policy)
-    if is_by_name(policy):
+    path, folder = Path(policy), sources.run_folder(policy)
+    if sources.is_by_name(policy):
         task = task or describe(_TASK)
-    if is_trained(policy) or (exists(path) and path.is_dir()):
+    if sources.is_trained(policy) or (exists(path) and path.is_dir()):
         if encoder and not (folder and encoder == _code_of(folder)):
             raise InputError(
                 f"{policy} is a trained policy, which has its own encoder: leave out --encoder"
             )
-        return find_player(policy, task)
-    if is_by_name(policy):
-        player = find_player(policy, task)
+        return sources.find_player(policy, task)
+    if sources.is_by_name(policy):
+        player = sources.find_player(policy, task)
         return player.with_reconstruction(find(encoder, player.task)) if encoder else player
     if not exists(path):
         raise InputError(
             f"no policy at {policy}: a folder of jbrep rl is needed, a zip file of "
-            f"stable-baselines3, or a name: {policy_names()}"
+            f"stable-baselines3, or a name: {sources.policy_names()}"
         )
-    from jbrep.encoders import FULL
     from jbrep.rl.policy import load_zip  # imports torch
 
     task = task or describe(_TASK)
-    return as_player(policy, load_zip(path, task, algorithm, encoder or FULL, trust))
+    return sources.as_player(policy, load_zip(path, task, algorithm, encoder or FULL, trust))
 
 
 def _code_of(folder: Path) -> str | None:
@@ -144,7 +136,7 @@ def _code_of(folder: Path) -> str | None:
     return run_settings(folder).encoder_code
 
 
-@click.command(epilog=example("jbrep policies"))
+@click.command(epilog="Example: jbrep policies")
 @as_json
 def policies(as_json: bool) -> None:
     """Show the trained policies that ship.
@@ -153,7 +145,6 @@ def policies(as_json: bool) -> None:
     trained --task face_direction --out walk.mp4.
     """
     from jbrep.rl.shipped import SHIPPED, shipped
-    from jbrep.text import table, terminal_width
 
     ships = shipped()
     if as_json:
@@ -179,14 +170,14 @@ def policies(as_json: bool) -> None:
     return click.echo(f"\nreturns: median [10 %, 90 %] of the same {episodes} episodes")
 
 
-@click.command(epilog=example("jbrep behaviour runs/full runs/dae-4 --out behaviour"))
+@click.command(epilog="Example: jbrep behaviour runs/full runs/dae-4 --out behaviour")
 @click.argument("policies", nargs=-1, required=True)
-@task_options()
+@task_options
 @click.option("--episodes", default=100, show_default=True, type=POSITIVE, help="Of each run.")
 @click.option(
     "--target-yaw", default=45.0, show_default=True, help="Where every target points [degrees]."
 )
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="A folder.")
+@click.option("--out", required=True, type=PATH, help="A folder.")
 def behaviour(
     policies: tuple[str, ...], episodes: int, target_yaw: float, out: Path, **options: Any
 ) -> None:
@@ -200,7 +191,6 @@ def behaviour(
 
     from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
     from jbrep.report.figures import behaviour_plots, write
-    from jbrep.text import table, terminal_width
 
     yaw, task = np.deg2rad(target_yaw), given_task(options)
     with stoppable("the same command starts again"):

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, example, say, stoppable
+from jbrep.cli.base import COUNT, PATH, say, stoppable
 from jbrep.cli.environment import given_task, task_options
 
 
@@ -27,13 +27,11 @@ class _Size(click.ParamType[tuple[int, int]]):
 
 
 @click.command(
-    epilog=example("jbrep render heuristic --task move_to_pose --speed 0.25 --out bug.mp4")
+    epilog="Example: jbrep render heuristic --task move_to_pose --speed 0.25 --out bug.mp4"
 )
 @click.argument("sources", nargs=-1, required=True)
-@click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="A new file, .mp4 or .gif."
-)
-@task_options()
+@click.option("--out", required=True, type=PATH, help="A new file, .mp4 or .gif.")
+@task_options
 @click.option("--episode", default=0, show_default=True, type=COUNT, help="Its number, from 0.")
 @click.option(
     "--camera",

@@ -3,15 +3,25 @@
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from jbrep.cli.base import COUNT, RESUMES, STOP_SIGNALS, example, interval_of, on_stop, say
+from jbrep.cli.base import (
+    COUNT,
+    PATH,
+    POSITIVE,
+    RESUMES,
+    STOP_SIGNALS,
+    interval_of,
+    on_stop,
+    say,
+    with_options,
+)
 from jbrep.cli.environment import needed_task, parse_arguments, task_options
 from jbrep.cli.options import record_options
 from jbrep.rl.settings import CLASSES, TrainingSettings
@@ -22,54 +32,43 @@ if TYPE_CHECKING:
 
     from jbrep.rl import Run
     from jbrep.rl.job import Job
-from jbrep.cli.base import POSITIVE
 
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 _NOT_REPRODUCIBLE = (
     "{} is not reproducible: the same seed gives other numbers the next time, and a run that is "
     "stopped can't be resumed"
 )
-
-
-_Command = TypeVar("_Command", bound=Callable[..., Any])
-
-
-def learner_options(command: _Command) -> _Command:
-    """What learns, with which settings, and on what; `given_run` reads them."""
-    options = (
-        click.option(
-            "--algorithm", default="sac", show_default=True, help=f"One of {', '.join(CLASSES)}."
-        ),
-        click.option(
-            "--preset",
-            default="paper",
-            show_default=True,
-            help="Its settings: paper, modern, or a TOML file with a table for each algorithm.",
-        ),
-        click.option(
-            "--set",
-            "overrides",
-            multiple=True,
-            metavar="NAME=VALUE",
-            help="A setting other than the preset's, by stable-baselines3's name, such as "
-            "learning_rate=3e-4, net_arch=[64,64] or learning_rate=linear:3e-4; may be repeated.",
-        ),
-        click.option(
-            "--normalize",
-            is_flag=True,
-            help="Normalise what the agent sees by its running mean and variance.",
-        ),
-        click.option(
-            "--encoder",
-            default="full",
-            show_default=True,
-            help="A file, a shipped encoder's name, or code as module:Class, which is run; full is "
-            "the whole observation, scaled alike.",
-        ),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
+learner_options = with_options(  # which `given_run` reads
+    click.option(
+        "--algorithm", default="sac", show_default=True, help=f"One of {', '.join(CLASSES)}."
+    ),
+    click.option(
+        "--preset",
+        default="paper",
+        show_default=True,
+        help="Its settings: paper, modern, or a TOML file with a table for each algorithm.",
+    ),
+    click.option(
+        "--set",
+        "overrides",
+        multiple=True,
+        metavar="NAME=VALUE",
+        help="A setting other than the preset's, by stable-baselines3's name, such as "
+        "learning_rate=3e-4, net_arch=[64,64] or learning_rate=linear:3e-4; may be repeated.",
+    ),
+    click.option(
+        "--normalize",
+        is_flag=True,
+        help="Normalise what the agent sees by its running mean and variance.",
+    ),
+    click.option(
+        "--encoder",
+        default="full",
+        show_default=True,
+        help="A file, a shipped encoder's name, or code as module:Class, which is run; full is "
+        "the whole observation, scaled alike.",
+    ),
+)
 
 
 def given_run(options: dict[str, Any], **others: Any) -> "Run":
@@ -94,9 +93,9 @@ def given_run(options: dict[str, Any], **others: Any) -> "Run":
 
 
 @click.command(
-    epilog=example("jbrep rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a")
+    epilog="Example: jbrep rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a"
 )
-@task_options()
+@task_options
 @learner_options
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
 @record_options(TrainingSettings)
@@ -114,9 +113,7 @@ def given_run(options: dict[str, Any], **others: Any) -> "Run":
     metavar="PROJECT",
     help="Log to Weights & Biases, too; WANDB_MODE=offline keeps it in the folder.",
 )
-@click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="A folder for this run."
-)
+@click.option("--out", required=True, type=PATH, help="A folder for this run.")
 @click.pass_context
 def rl(context: click.Context, /, out: Path, project: str | None, **options: Any) -> None:
     """Train and evaluate one agent.
@@ -215,20 +212,16 @@ def stop_signals() -> Iterator[list[int]]:
 
 
 @click.command(
-    epilog=example(
-        "jbrep tune --task face_direction --algorithm sac --preset modern --trials 20 --steps 20k "
-        "--out runs/tune"
-    )
+    epilog="Example: jbrep tune --task face_direction --algorithm sac --preset modern --trials 20 "
+    "--steps 20k --out runs/tune"
 )
-@task_options()
+@task_options
 @learner_options
 @click.option("--trials", default=20, show_default=True, type=POSITIVE, help="In all.")
 @click.option("--seeds", default=1, show_default=True, type=POSITIVE, help="Runs of each trial.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of the search and runs.")
 @record_options(TrainingSettings, "steps", "evaluation_episodes", steps=20_000)
-@click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="A folder for this search."
-)
+@click.option("--out", required=True, type=PATH, help="A folder for this search.")
 @click.pass_context
 def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **options: Any) -> None:
     """Search for an algorithm's settings with Optuna.

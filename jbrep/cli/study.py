@@ -5,25 +5,25 @@ from pathlib import Path
 import click
 
 from jbrep.cli.base import (
+    PATH,
     RESUMES,
     Variadic,
     as_json,
     echo_json,
     echo_paths,
     echo_text,
-    example,
     say,
     stoppable,
 )
 from jbrep.cli.environment import import_option
+from jbrep.text import terminal_width
 
 _COUNT = click.IntRange(1, 1024)
-_PATH = click.Path(path_type=Path)
 
 
-@click.command(epilog=example("jbrep study studies/demo.toml --out runs/demo"))
-@click.argument("study", type=_PATH)
-@click.option("--out", type=_PATH, help="A folder.  [default: runs/NAME of the STUDY]")
+@click.command(epilog="Example: jbrep study studies/demo.toml --out runs/demo")
+@click.argument("study", type=PATH)
+@click.option("--out", type=PATH, help="A folder.  [default: runs/NAME of the STUDY]")
 @click.option(
     "--workers",
     type=_COUNT,
@@ -72,7 +72,6 @@ def study(
     from jbrep.study.packing import forecast
     from jbrep.study.registration import REGISTRATION
     from jbrep.study.runner import BACKENDS
-    from jbrep.text import terminal_width
 
     plan = Plan(read_study(study), out or Path("runs") / study.stem)
     run = choose(backend, BACKENDS, "backend")
@@ -97,8 +96,8 @@ def study(
         context.exit(1)
 
 
-@click.command(cls=Variadic, epilog=example("jbrep report runs/demo"))
-@click.argument("folder", type=_PATH)
+@click.command(cls=Variadic, epilog="Example: jbrep report runs/demo")
+@click.argument("folder", type=PATH)
 @click.option(
     "--evaluation",
     multiple=True,
@@ -109,7 +108,7 @@ def study(
 @click.option(
     "--across-trainers", is_flag=True, help="Compare runs of different trainers or precisions, too."
 )
-@click.option("--out", type=_PATH, help="A folder for it.  [default: the study's own]")
+@click.option("--out", type=PATH, help="A folder for it.  [default: the study's own]")
 @as_json
 def report(
     folder: Path,
@@ -130,7 +129,6 @@ def report(
     from jbrep.report.tables import read_tables
     from jbrep.study.results import conclude, has_runs
     from jbrep.study.tables import add_diagnostics
-    from jbrep.text import terminal_width
 
     ran = has_runs(folder)
     paths = conclude(folder) if ran else []

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from msgspec import inspect
 
-from jbrep.cli.base import POSITIVE, RESUMES, Variadic, data_option, example, stoppable
+from jbrep.cli.base import POSITIVE, RESUMES, Variadic, data_option, stoppable
 from jbrep.errors import InputError, choose
 from jbrep.records.keys import Key, keys_of
 from jbrep.records.words import bare
@@ -162,7 +162,7 @@ def _making(command: Callable[..., None]) -> Callable[..., None]:
 
 @click.command(
     cls=_Dae,
-    epilog=example("jbrep train-dae --data data/face --latent 12 8 4 --out encoders/face"),
+    epilog="Example: jbrep train-dae --data data/face --latent 12 8 4 --out encoders/face",
 )
 @_making
 def train_dae(**options: Any) -> None:
@@ -176,9 +176,8 @@ def train_dae(**options: Any) -> None:
 
 @click.command(
     cls=_Making,
-    epilog=example(
-        "jbrep train-encoder --kind slow --data data/face --latent 8 --out encoders/face"
-    ),
+    epilog="Example: jbrep train-encoder --kind slow --data data/face --latent 8 "
+    "--out encoders/face",
 )
 @click.option("--kind", required=True, help="One of those below.")
 @_making

@@ -136,7 +136,7 @@ def _fill(
             missing.manifest = manifest
             progress.update(manifest.rows - progress.n)
             size = sum(entry.bytes for entry in manifest.shards)
-            progress.set_postfix_str(f"{size / 1e6:,.0f} MB on disk")
+            progress.set_postfix_str(f"{size / 1e6:,.0f} MB on disk", refresh=False)
             if manifest.complete:
                 break
             if len(manifest.shards) == _MAX_SHARDS:

@@ -4,11 +4,12 @@ import csv
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 from jbrep.errors import DamageError
 from jbrep.records.storage import read_regular, write_whole
 
+_Row = TypeVar("_Row", bound=NamedTuple)
 Columns = Mapping[str, Callable[[str], Any]]  # by their names: what their cells are
 
 _MAX_BYTES = 1 << 28
@@ -55,6 +56,37 @@ def read_csv(path: Path, columns: Columns) -> list[tuple[Any, ...]]:
         ]
     except (ValueError, csv.Error):
         raise DamageError(f"{path} is damaged or cut short") from None
+
+
+def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -> None:
+    """Write a table whose columns are the fields of its rows: text, counts and numbers.
+
+    Raises:
+        InputError: it can't be written.
+    """
+    write_csv(path, [*map(_column, kind._fields)], ([*map(_cell, row)] for row in rows))
+
+
+def read_rows(path: Path, kind: type[_Row]) -> list[_Row]:
+    """What `write_rows` wrote.
+
+    Raises:
+        InputError: it can't be read.
+        DamageError: it isn't such a table.
+    """
+    cells: dict[type, Callable[[str], Any]] = {str: str, int: count, float: finite}
+    columns = {_column(name): cells[of] for name, of in kind.__annotations__.items()}
+    return [kind._make(row) for row in read_csv(path, columns)]
+
+
+def _cell(value: str | float) -> str | int:
+    if isinstance(value, float):
+        return f"{value:.3f}"
+    return value if isinstance(value, str) else int(value)
+
+
+def _column(field: str) -> str:
+    return field.removeprefix("episode_")  # of episode_return, as return is a word of Python's
 
 
 def count(cell: str) -> int:

@@ -7,13 +7,13 @@ from jbrep.errors import InputError
 from jbrep.evaluate.table import DIAGNOSTICS, by_label, read_diagnostics
 from jbrep.records.document import read_document
 from jbrep.records.storage import exists
-from jbrep.records.tables import read_csv
+from jbrep.records.tables import read_rows
 from jbrep.stats import Analysis
 from jbrep.stats.rules import Planned
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.registration import REGISTRATION, read_registration
 from jbrep.study.results import found
-from jbrep.study.tables import COLUMNS, RETURNS, References, Return, read_references
+from jbrep.study.tables import RETURNS, References, Return, read_references
 
 
 class Tables(NamedTuple):
@@ -48,10 +48,10 @@ def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
     registered = record.registration.sha256 if record.registration else None
     if registered != (registration.sha256 if registration else None):
         raise InputError(f"{folder}: {RECORD} is of another registration than {REGISTRATION}")
-    returns = [Return(*row) for row in read_csv(folder / RETURNS, COLUMNS)]
+    returns = read_rows(folder / RETURNS, Return)
     rows = read_diagnostics(folder / DIAGNOSTICS) if exists(folder / DIAGNOSTICS) else []
     references = read_references(folder)
-    planned = registration.planned if registration else Planned()
+    planned = registration.registered.planned if registration else Planned()
     statistics = found(record, returns, references, planned, across_trainers)
     name = folder.resolve().name.encode(errors="replace").decode()
     return Tables(name, record, returns, references, by_label(rows), *statistics)

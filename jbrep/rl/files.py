@@ -1,6 +1,6 @@
 """A run's folder: what a run leaves there, written and read."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
@@ -15,7 +15,7 @@ from jbrep.records.commit import Commits
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
-from jbrep.records.tables import count, finite, read_csv, write_csv
+from jbrep.records.tables import read_rows
 from jbrep.rl.presets import Hyperparameters
 from jbrep.rl.settings import (
     CLASSES,
@@ -207,16 +207,6 @@ def is_policy_file(path: Path) -> bool:
     return path.suffix == POLICY_SUFFIX and container.format_of(path) == PolicyHeader.format
 
 
-def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -> None:
-    """Write a long table as CSV."""
-    columns = [name.removeprefix("episode_") for name in kind._fields]
-    write_csv(path, columns, ([_cell(value) for value in row] for row in rows))
-
-
-def _cell(value: float) -> str | int:
-    return f"{value:.3f}" if isinstance(value, float) else int(value)
-
-
 def read_evaluations(folder: Path) -> list[Evaluation]:
     """The evaluations of a run: ascending steps, each with the same episodes from 0.
 
@@ -227,8 +217,7 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
         DamageError: it is not such a table.
     """
     path = folder / EVALUATIONS
-    rows = read_csv(path, {"step": count, "episode": count, "return": finite})
-    evaluations = [Evaluation(*row) for row in rows]
+    evaluations = read_rows(path, Evaluation)
     by_step = [(step, [*of_step]) for step, of_step in groupby(evaluations, lambda row: row.step)]
     steps, counts = [step for step, _ in by_step], [len(of_step) for _, of_step in by_step]
     if (

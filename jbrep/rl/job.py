@@ -18,6 +18,7 @@ from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError
 from jbrep.records.commit import commits
 from jbrep.records.storage import exists, read_file, write_whole
+from jbrep.records.tables import write_rows
 from jbrep.rl.agent import Evaluator, restore_statistics, statistics_of
 from jbrep.rl.checkpoint import CheckpointFile, History
 from jbrep.rl.files import (
@@ -35,7 +36,6 @@ from jbrep.rl.files import (
     Evaluation,
     RunRecord,
     read_run,
-    write_rows,
 )
 from jbrep.rl.policy_file import MAX_BYTES, Trained, pack_whole, read
 from jbrep.rl.policy_zip import policy_zip

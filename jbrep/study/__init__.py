@@ -1,15 +1,10 @@
 """A grid of runs, from a TOML file or from Python: prepared, run side by side, registered."""
 
-from typing import TYPE_CHECKING
-
-from jbrep.lazy import exports
-
-if TYPE_CHECKING:
-    from jbrep.stats.rules import Rules
-    from jbrep.study.config import Data, Study, read_study
-    from jbrep.study.plan import Plan
-    from jbrep.study.results import conclude
-    from jbrep.study.runner import register_study, run_study
+from jbrep.stats.rules import Rules
+from jbrep.study.config import Data, Study, read_study
+from jbrep.study.plan import Plan
+from jbrep.study.results import conclude
+from jbrep.study.runner import register_study, run_study
 
 __all__ = [
     "Data",
@@ -21,17 +16,3 @@ __all__ = [
     "register_study",
     "run_study",
 ]
-
-__getattr__ = exports(
-    __name__,
-    {
-        "Data": "config",
-        "Plan": "plan",
-        "Rules": "config",
-        "Study": "config",
-        "conclude": "results",
-        "read_study": "config",
-        "register_study": "runner",
-        "run_study": "runner",
-    },
-)

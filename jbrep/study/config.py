@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,7 +29,6 @@ from jbrep.study.representations import (
     ByName,
     Given,
     Representation,
-    name_of,
     read_representation,
 )
 from jbrep.text import slug
@@ -143,8 +143,9 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         """As for `Record`."""
         for name in ("tasks", "algorithms", "representations", "seeds"):
             values = list(getattr(self, name))
-            names = map(name_of, values) if name == "representations" else values
-            if len(set(map(repr, names))) < len(values):
+            if name == "representations":
+                values = [each.name for each in self.observed]
+            if len(set(values)) < len(values):
                 raise InputError(f"{name} is {values}: it must have each once")
         self._check_tasks()
         for algorithm in self.algorithms:
@@ -201,11 +202,9 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     def _check_verdicts(self) -> None:
         """Check that what is to be decided is there, and that the runs could decide it."""
         cells = {
-            "/".join((task, algorithm, name)): each
-            for task in self.tasks
-            for algorithm in self.algorithms
-            for name, each in ((each.name, each) for each in self.observed)
-            if name != FULL
+            f"{task}/{algorithm}/{each.name}": each
+            for task, algorithm, each in product(self.tasks, self.algorithms, self.observed)
+            if each.name != FULL
         }
         short = {full: name for name, full in SHORT_NAMES.items()}
         if self.verdicts.primary and (long := [task for task in self.tasks if task in short]):

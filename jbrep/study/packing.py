@@ -38,8 +38,8 @@ def usual_workers(plan: Plan) -> int:
     return cpu_count() if plan.device == CPU else 1
 
 
-def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = None) -> list[Pack]:
-    """Runs in packs, one for a worker at a time: the longest first, of these the first runs'.
+def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
+    """The runs to go in packs, one for a worker at a time: the longest first, then the first.
 
     Runs of one task and learner can be in one pack if their trainer is the cohort; those that
     observe more numbers than their task has, only with others that observe as many. The number of
@@ -47,7 +47,6 @@ def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = 
 
     Args:
         plan: of the study.
-        cells: the runs to go.
         workers: how many packs go on at a time.
         width: the most runs in a pack; by default as many as memory holds, and no more than pay.
 
@@ -56,7 +55,7 @@ def packed(plan: Plan, cells: Iterable[Cell], workers: int, width: int | None = 
     """
     groups, alone = defaultdict[tuple[str, str, int], list[Cell]](list), []
     place, observed = {}, {}
-    for number, cell in enumerate(cells):
+    for number, cell in enumerate(plan.unfinished):
         place[cell.name] = number
         if trainer_of(cell.learner, plan.study) == COHORT:
             seen = cell.task, cell.representation.name
@@ -89,10 +88,10 @@ def _most(plan: Plan, cell: Cell, observed: int, workers: int) -> int:
 def _observed(plan: Plan, cell: Cell) -> int:
     """Numbers that a cohort has for each observation of a run: those of its task at least."""
     run, seen = plan.run(cell), cell.representation
-    to_make = seen.training.get("latent", 0) if isinstance(seen, ByName) else 0
+    size = int(seen.training.get("latent", 0)) if isinstance(seen, ByName) else 0
     with suppress(InputError):  # the study has yet to make it
-        return max(run.task.size, run.find_encoder().latent_size)
-    return max(run.task.size, int(to_make))
+        size = run.find_encoder().latent_size
+    return max(run.task.size, size)
 
 
 def _split(group: Sequence[Cell], most: int) -> list[Pack]:
@@ -132,8 +131,8 @@ def forecast(plan: Plan, workers: int | None = None, width: int | None = None) -
         InputError: as `run_study`, as far as that is known beforehand.
     """
     check(plan)
-    workers, unfinished = workers or usual_workers(plan), plan.unfinished
-    packs = packed(plan, unfinished, workers, width)
+    workers = workers or usual_workers(plan)
+    packs = packed(plan, workers, width)
     examples = {_kind(pack): pack for pack in packs}
     seconds = {
         kind: estimate([_example(plan.run(cell)) for cell in pack])
@@ -145,7 +144,7 @@ def forecast(plan: Plan, workers: int | None = None, width: int | None = None) -
     arms = {cell.label: plan.study.arms(cell.representation) for cell in plan.cells}
     return Forecast(
         runs=[(cell, i + 1, each[i]) for i, pack in enumerate(packs) for cell in pack],
-        done=len(plan.cells) - len(unfinished),
+        done=len(plan.cells) - sum(map(len, packs)),
         seconds=sum(each),
         elapsed=until_done(each, workers),
         workers=workers,

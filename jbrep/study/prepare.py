@@ -39,24 +39,20 @@ def check(plan: Plan) -> None:
             folder = _existing(data, name)
             check_same(task, Dataset(folder).task, f"the data set {folder}")
             _check_fits(plan, name, folder, 0)
-        for representation in _by_name(plan):
+        for each in _by_name(plan):
+            latent = int(each.training.get("latent", 0))
             if data is None:
-                _check_shipped(representation, task)
-            elif _is_too_large(representation, task):
+                _check_shipped(each, task)
+            elif get_method(each.kind).reduces and latent >= task.size:
                 raise InputError(
-                    f"{representation.name} doesn't reduce the {task.size} features of "
-                    f"{name}: choose a smaller latent size"
+                    f"{each.name} doesn't reduce the {task.size} features of {name}: choose a "
+                    "smaller latent size"
                 )
     _check_own(plan)
 
 
 def _by_name(plan: Plan) -> list[ByName]:
     return [each for each in plan.study.observed if isinstance(each, ByName)]
-
-
-def _is_too_large(representation: ByName, task: Task) -> bool:
-    method = get_method(representation.kind)
-    return method.reduces and int(representation.training.get("latent", 0)) >= task.size
 
 
 def _check_own(plan: Plan) -> None:
@@ -125,9 +121,8 @@ def _fits(plan: Plan, number: int) -> Iterator[tuple[str, str, Mapping[str, Any]
     """Names, kinds and settings of the encoders that are made from the data set of that number."""
     assert plan.study.data is not None
     for representation in _by_name(plan):
-        for name, fit in representation.fits.items():
-            if fit.number % plan.study.data.sets == number:
-                yield name, representation.kind, fit.settings
+        for name, settings in representation.fits[number :: plan.study.data.sets]:
+            yield name, representation.kind, settings
 
 
 def _collect(plan: Plan, data: Data, task: str, number: int) -> Path:

@@ -70,11 +70,7 @@ class EncoderFacts(Record, frozen=True, kw_only=True):
     metrics: Mapping[str, Any] = {}  # of the training
 
     def check(self) -> None:
-        """Check what reports show.
-
-        Raises:
-            InputError: a part isn't of its type.
-        """
+        """As for `Record`: check what reports show."""
         _ = self.shown
 
     @cached_property
@@ -129,11 +125,7 @@ class RunsRecord(Document, frozen=True, kw_only=True):
     runs: list[RunFacts]
 
     def check(self) -> None:
-        """Check that its parts fit together.
-
-        Raises:
-            InputError: they don't.
-        """
+        """As for `Record`."""
         if not self.runs:
             raise InputError("it has no finished run")
         if "jbrep" not in (*self.versions, {})[0]:
@@ -162,28 +154,27 @@ def runs_record(folder: Path, ended: Mapping[Path, RunRecord]) -> RunsRecord:
         InputError: a file is damaged.
     """
     order = in_order((run.settings.representation for run in ended.values()), FULL)
-    runs = dict(sorted(ended.items(), key=lambda item: _sort_key(item[1].settings, order)))
-    labels: dict[str, dict[Path, RunRecord]] = {}
-    for each, run in runs.items():
-        labels.setdefault(run.settings.label, {})[each] = run
+    by_label: dict[str, dict[Path, RunRecord]] = {}
+    for each, run in sorted(ended.items(), key=lambda item: _sort_key(item[1].settings, order)):
+        by_label.setdefault(run.settings.label, {})[each] = run
+    runs = [run for of_label in by_label.values() for run in of_label.values()]
+    labels = {label: _label(of_label) for label, of_label in by_label.items()}
     plan = read_plan(folder)
+    unfinished = {each.name: plan.folder_of(each) for each in plan.unfinished} if plan else {}
     return RunsRecord(
         study=plan.study if plan else None,
-        registration=_registration(plan, runs.values()) if plan else None,
-        missing={c.name: read_progress(plan.folder_of(c))[0] for c in plan.unfinished}
-        if plan
-        else {},
-        versions=_distinct(dict(run.versions) for run in runs.values()),
-        processors=_distinct(run.cpu for run in runs.values()),
-        labels={label: _label(of_label) for label, of_label in labels.items()},
-        runs=[_run(run, labels[run.settings.label]) for run in runs.values()],
+        registration=_registration(plan, runs) if plan else None,
+        missing={name: read_progress(each)[0] for name, each in unfinished.items()},
+        versions=_distinct(dict(run.versions) for run in runs),
+        processors=_distinct(run.cpu for run in runs),
+        labels=labels,
+        runs=[_run(run, labels[run.settings.label].settings) for run in runs],
     )
 
 
-def _run(run: RunRecord, of_label: Mapping[Path, RunRecord]) -> RunFacts:
-    """What is told of a run; its label has the settings of the first of its runs."""
-    first = next(iter(of_label.values()))
-    settings, shared = (to_plain(_shared_settings(each.settings)) for each in (run, first))
+def _run(run: RunRecord, of_label: LabelSettings) -> RunFacts:
+    """What is told of a run besides the settings of its label."""
+    settings, shared = map(to_plain, (_shared_settings(run.settings), of_label))
     return RunFacts(
         label=run.settings.label,
         seed=run.settings.seed,
@@ -214,7 +205,7 @@ def _shared_settings(settings: RunSettings) -> LabelSettings:
 
 
 def _label(runs: Mapping[Path, RunRecord]) -> Label:
-    """What the runs of a label share, by folder."""
+    """What the runs of a label share, by folder; its settings are those of the first."""
     settings = _shared_settings(next(iter(runs.values())).settings)
     folders = list(runs) if settings.encoder == EACH_ITS_OWN else list(runs)[:1]
     encoder = _common([_encoder(each, runs[each]) for each in folders])
@@ -258,14 +249,10 @@ def _shared(value: Any, others: Sequence[Any]) -> Any:
 
 def _registration(plan: Plan, runs: Collection[RunRecord]) -> RegistrationFacts | None:
     """When a study was registered, and how what ran differs from that; None if it wasn't."""
-    registered = plan.registration
-    if registered is None:
+    if (found := plan.registration) is None:
         return None
-    return RegistrationFacts(
-        sha256=registered.sha256,
-        date=registered.date,
-        deviations=registered.deviations(plan.study, runs),
-    )
+    deviations = found.deviations(plan.study, runs)
+    return RegistrationFacts(sha256=found.sha256, date=found.date, deviations=deviations)
 
 
 def _distinct(values: Iterable[_Value]) -> list[_Value]:

@@ -15,7 +15,6 @@ from jbrep.records.record import from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.files import RunRecord
 from jbrep.rl.job import packages
-from jbrep.stats.rules import Planned
 from jbrep.study.config import Study
 
 REGISTRATION = "registration.json"
@@ -35,11 +34,7 @@ class Registration(Document, frozen=True, kw_only=True):
     commits: dict[str, str]
 
     def check(self) -> None:
-        """Check the hash, and that a study was registered.
-
-        Raises:
-            InputError: the file was changed, or there is no study in it.
-        """
+        """As for `Record`: check the hash, and that a study was registered."""
         if _hash(to_plain(self)) != self.sha256:
             raise InputError(
                 "it was changed after it was written: restore it, or choose another folder"
@@ -50,11 +45,6 @@ class Registration(Document, frozen=True, kw_only=True):
     def registered(self) -> Study:
         """The study."""
         return from_plain(self.study, Study, "study")
-
-    @property
-    def planned(self) -> Planned:
-        """What reaches verdicts: the rules that were registered, on the seeds that were."""
-        return Planned(self.registered.verdicts, self.registered.seeds)
 
     @classmethod
     def of(cls, study: Study, encoders: Mapping[str, str]) -> "Registration":

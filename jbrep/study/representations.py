@@ -5,7 +5,7 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from msgspec import Meta
 
@@ -78,13 +78,6 @@ class Representation(Record, frozen=True, kw_only=True):
         return [counts[i] for i in range(self.encoders)] if self.encoders else [*counts.values()]
 
 
-class Fit(NamedTuple):
-    """An encoder that the study trains."""
-
-    number: int  # among the encoders of its representation
-    settings: Mapping[str, Any]  # of its method
-
-
 class ByName(Representation, frozen=True, kw_only=True):
     """The whole observation, or an encoder that ships or that the study trains.
 
@@ -98,28 +91,25 @@ class ByName(Representation, frozen=True, kw_only=True):
 
     def encoder(self, task: str, seed: int, made: Path | None) -> str:
         """As for `Representation`."""
-        stem = self._stem(self.encoder_seed(seed))
-        return self.name if made is None else str(made / f"{stem}{SUFFIX}")
+        if made is None:
+            return self.name
+        name, _ = self.fits[self.encoder_seed(seed) or 0]
+        return str(made / f"{name}{SUFFIX}")
 
     @property
-    def fits(self) -> dict[str, Fit]:
-        """The encoders that the study trains, by their names."""
+    def fits(self) -> list[tuple[str, dict[str, Any]]]:
+        """The name and settings of each encoder, in the order of their numbers."""
         if self.encoders is None:
-            return {self._stem(None): Fit(0, self.training)}
-        return {
-            self._stem(number): Fit(
-                number, {**self.training, "seed": number} if self.is_drawn else self.training
-            )
-            for number in range(self.encoders)
-        }
+            return [(self.name, self.training)]
+        return [
+            (of_seed(self.name, n), {**self.training, **({"seed": n} if self.is_drawn else {})})
+            for n in range(self.encoders)
+        ]
 
     @property
     def is_drawn(self) -> bool:
         """Whether an encoder depends on a seed, and not on the data alone."""
         return get_method(self.kind).takes("seed")
-
-    def _stem(self, number: int | None) -> str:
-        return self.name if number is None else of_seed(self.name, number)
 
 
 class ByFile(Representation, frozen=True, kw_only=True):
@@ -213,11 +203,6 @@ def read_representation(given: Given, training: Mapping[str, Any]) -> Representa
         return _of_table(given, training)
     except InputError as error:
         raise InputError(f"representation {given.get('name', 'without a name')}: {error}") from None
-
-
-def name_of(given: Given) -> Any:
-    """The name of a representation as a study's file gives it."""
-    return given if isinstance(given, str) else given.get("name")
 
 
 def _of_table(given: Mapping[str, Any], training: Mapping[str, Any]) -> Representation:

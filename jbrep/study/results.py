@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,21 +14,14 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
-from jbrep.records.tables import write_csv
+from jbrep.records.tables import write_rows
 from jbrep.rl.files import FAILED, RUN, RunRecord, read_evaluations, read_run, runs_below
 from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import STILL
 from jbrep.study.plan import STUDY
-from jbrep.study.record import (
-    RECORD,
-    LabelSettings,
-    RunFacts,
-    RunsRecord,
-    runs_record,
-)
+from jbrep.study.record import RECORD, LabelSettings, RunFacts, RunsRecord, runs_record
 from jbrep.study.tables import (
-    COLUMNS,
     RETURNS,
     References,
     Return,
@@ -39,13 +31,6 @@ from jbrep.study.tables import (
 )
 
 Ended = dict[Path, RunRecord]  # what run.json says of each run that has ended, by folder
-
-
-class Found(NamedTuple):
-    """What the statistics say of runs."""
-
-    analysis: Analysis | None  # None where there are too few runs, or runs that can't be compared
-    left_out: list[str]  # what there are no statistics of, and why
 
 
 def conclude(folder: Path) -> list[Path]:
@@ -64,7 +49,7 @@ def conclude(folder: Path) -> list[Path]:
     paths = [folder / RETURNS, folder / RECORD]
     references = write_references(_tasks(ended.values()), folder)
     record, rows = runs_record(folder, ended), list(_returns(ended))
-    write_csv(paths[0], [*COLUMNS], ((*row[:-1], f"{row.episode_return:.3f}") for row in rows))
+    write_rows(paths[0], rows, Return)
     record.write(paths[1])
     return [*paths, references] if references else paths
 
@@ -75,7 +60,7 @@ def found(
     references: References,
     planned: Planned,
     across_trainers: bool = False,
-) -> Found:
+) -> tuple[Analysis | None, list[str]]:
     """The statistics of what the tables of a study say, if its runs allow any.
 
     Args:
@@ -84,6 +69,10 @@ def found(
         references: references.csv.
         planned: what reaches verdicts.
         across_trainers: compare runs of different trainers, too.
+
+    Returns:
+        The statistics, None where there are too few runs, or runs that can't be compared; and what
+        there are none of, and why.
 
     Raises:
         InputError: a run has returns that it can't have.
@@ -94,9 +83,9 @@ def found(
     compared, left_out = _comparable(runs)
     try:
         analysis = analyse(compared, planned, references=references) if compared else None
-        return Found(analysis, left_out)
+        return analysis, left_out
     except InputError as error:
-        return Found(None, [*left_out, str(error)])
+        return None, [*left_out, str(error)]
 
 
 def read_runs(folder: Path) -> list[RunCurve]:
@@ -154,15 +143,11 @@ def _tasks(runs: Iterable[RunRecord]) -> Iterable[tuple[Task, int]]:
 
 def _returns(ended: Ended) -> Iterator[Return]:
     """A row for each episode of each evaluation, by label, seed and step."""
-    for folder, run in sorted(ended.items(), key=lambda item: _order(item[1])):
-        settings = run.settings
+    runs = ((run.settings, folder) for folder, run in ended.items())
+    for settings, folder in sorted(runs, key=lambda run: (run[0].label, run[0].seed)):
         key = settings.task, settings.learner, settings.representation, settings.seed
         for row in read_evaluations(folder):
             yield Return(*key, *row)
-
-
-def _order(run: RunRecord) -> tuple[str, int]:
-    return run.settings.label, run.settings.seed
 
 
 def _curves(

@@ -121,7 +121,7 @@ def run_study(
     """
     check(plan)
     workers, unfinished = workers or usual_workers(plan), plan.unfinished
-    packs = packed(plan, unfinished, workers, width)
+    packs = packed(plan, workers, width)
     make_folder(plan.folder)
     with exclusive(plan.folder):
         plan.write()
@@ -132,15 +132,11 @@ def run_study(
             Job(plan.run(cell), plan.folder_of(cell)).clear()
         if not unfinished:
             return 0
-        statuses = Counter[str]()
-        with (
-            Progress(plan, unfinished) as progress,
-            closing(backend(plan, packs, workers)) as outcomes,
-        ):
+        progress = Progress(plan, unfinished)
+        with progress.live, closing(backend(plan, packs, workers)) as outcomes:
             for outcome in outcomes:
                 progress.report(outcome)
-                statuses[outcome.status] += 1
-    return statuses[CRASHED]
+    return progress.counts[CRASHED]
 
 
 def register_study(plan: Plan) -> Registration:
@@ -159,40 +155,37 @@ class Progress:
     Args:
         plan: the study.
         unfinished: the runs to go.
+
+    Attributes:
+        live: a context that shows the table.
+        counts: how many runs have ended, by status.
     """
 
     def __init__(self, plan: Plan, unfinished: Iterable[Cell]):
         self._plan = plan
         self._unfinished = {cell.name: cell for cell in unfinished}
-        self._counts = Counter[str](
+        self.counts = Counter[str](
             read_run(plan.folder_of(cell)).status
             for cell in plan.cells
             if cell.name not in self._unfinished
         )
         self._start, self._ended = time.monotonic(), 0  # runs that ended since then
         self._steps_before = self._steps_under_way()
-        self._live: AbstractContextManager[object] = nullcontext()
+        self.live: AbstractContextManager[object] = nullcontext()
         if sys.stderr is not None and sys.stderr.isatty():
-            self._live = Live(
+            self.live = Live(
                 console=Console(stderr=True),
                 get_renderable=self._table,
                 refresh_per_second=1,
                 transient=True,
             )
 
-    def __enter__(self) -> "Progress":
-        self._live.__enter__()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._live.__exit__(None, None, None)
-
     def report(self, outcome: Outcome) -> None:
         """Count a run that has ended, and print a line."""
-        self._counts[outcome.status] += 1
+        del self._unfinished[outcome.name]
+        self.counts[outcome.status] += 1
         self._ended += 1
         total = len(self._plan.cells)
-        del self._unfinished[outcome.name]
         number = total - len(self._unfinished)
         say(f"{number}/{total} {outcome.name} {outcome.status}: {outcome.message}")
 
@@ -209,7 +202,7 @@ class Progress:
         return table
 
     def _summary(self) -> str:
-        counts = [f"{self._counts[status]} {status}" for status in (FINISHED, FAILED, CRASHED)]
+        counts = [f"{self.counts[status]} {status}" for status in (FINISHED, FAILED, CRASHED)]
         return ", ".join([*counts, f"{len(self._unfinished)} to go, {self._time_left()} left"])
 
     def _steps_under_way(self) -> int:

@@ -3,7 +3,7 @@
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jbrep.encoders import FULL
 from jbrep.envs.task import Task
@@ -21,22 +21,15 @@ from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.play.sources import find_player
 from jbrep.records.document import read_document
 from jbrep.records.storage import exists
-from jbrep.records.tables import Columns, count, finite, read_csv, write_csv
+from jbrep.records.tables import read_rows, write_csv
 from jbrep.stats.scale import STILL
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.text import slug
 
 RETURNS = "returns.csv"
-COLUMNS: Columns = {  # of the long table of returns
-    **{"task": str, "algorithm": str, "representation": str},
-    **{"seed": count, "step": count, "episode": count, "return": finite},
-}
-
 REFERENCE_RETURNS = "references.csv"
 RANDOM, HAND_WRITTEN = "random", "hand-written"
 _POLICIES = {STILL: "still", RANDOM: "uniform", HAND_WRITTEN: "heuristic"}
-_REFERENCE_COLUMNS: Columns = {"task": str, "policy": str, "episode": count, "return": finite}
-_Reference = tuple[Any, ...]  # task, policy, episode, return
 References = dict[str, dict[str, list[float]]]  # returns by task and policy
 
 _TASK = "{task}"  # in an evaluation's path: the task's name as in folders
@@ -51,6 +44,15 @@ class Return(NamedTuple):
     representation: str
     seed: int
     step: int
+    episode: int
+    episode_return: float
+
+
+class _Reference(NamedTuple):
+    """A row of references.csv: an episode of a reference policy."""
+
+    task: str
+    policy: str
     episode: int
     episode_return: float
 
@@ -81,7 +83,7 @@ def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | 
         DamageError: what is there isn't such a file.
     """
     path = folder / REFERENCE_RETURNS
-    there = _references(path)
+    there = _there(path)
     rows = [
         row
         for task, episodes in sorted(tasks, key=lambda each: each[0].name)
@@ -93,7 +95,7 @@ def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | 
         path.unlink(missing_ok=True)
         return None
     if rows != there:
-        write_csv(path, [*_REFERENCE_COLUMNS], rows)
+        write_csv(path, ("task", "policy", "episode", "return"), rows)
     return path
 
 
@@ -104,20 +106,20 @@ def read_references(folder: Path) -> References:
         DamageError: it isn't what was written.
     """
     found: References = {}
-    for task, policy, _, each in _references(folder / REFERENCE_RETURNS):
-        found.setdefault(task, {}).setdefault(policy, []).append(each)
+    for row in _there(folder / REFERENCE_RETURNS):
+        found.setdefault(row.task, {}).setdefault(row.policy, []).append(row.episode_return)
     return found
 
 
-def _references(path: Path) -> list[_Reference]:
+def _there(path: Path) -> list[_Reference]:
     """What the file has; nothing if there is none."""
-    return read_csv(path, _REFERENCE_COLUMNS) if exists(path) else []
+    return read_rows(path, _Reference) if exists(path) else []
 
 
 def _kept(there: list[_Reference], task: Task, policy: str, episodes: int) -> list[_Reference]:
     """The rows of a task and policy, if they are those wanted."""
-    own = [row for row in there if row[:2] == (task.name, policy)]
-    return own if [row[2] for row in own] == [*range(episodes)] else []
+    own = [row for row in there if (row.task, row.policy) == (task.name, policy)]
+    return own if [row.episode for row in own] == [*range(episodes)] else []
 
 
 def _played(task: Task, policy: str, episodes: int) -> list[_Reference]:
@@ -125,7 +127,8 @@ def _played(task: Task, policy: str, episodes: int) -> list[_Reference]:
         returns = find_player(_POLICIES[policy], task).returns(episodes)
     except (InputError, ModuleNotFoundError):  # reports don't need the environments
         return []
-    return [(task.name, policy, i, round(float(each), 3)) for i, each in enumerate(returns)]
+    rounded = (round(float(each), 3) for each in returns)
+    return [_Reference(task.name, policy, *row) for row in enumerate(rounded)]
 
 
 def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:

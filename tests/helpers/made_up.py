@@ -4,19 +4,11 @@ import matplotlib as mpl
 import numpy as np
 
 from jbrep.encoders import find, save
+from jbrep.records.tables import write_rows
 from jbrep.report.figures.style import PAPER
 from jbrep.rl.agent import Spaces, make_agent, parameters
 from jbrep.rl.checkpoint import CheckpointFile, History, Snapshot
-from jbrep.rl.files import (
-    CHECKPOINT,
-    ENCODER,
-    FAILED,
-    FINISHED,
-    RUN,
-    Evaluation,
-    RunRecord,
-    write_rows,
-)
+from jbrep.rl.files import CHECKPOINT, ENCODER, FAILED, FINISHED, RUN, Evaluation, RunRecord
 from jbrep.rl.job import packages
 from jbrep.rl.learner import Learner
 from jbrep.rl.overrides import check_shape
