@@ -437,7 +437,7 @@ def test_tables_fit_the_terminal(done):
 def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     path = written(tmp_path)
     out = shutil.copytree(done.folder, tmp_path / "out")
-    monkeypatch.setattr("jbrep.study.runner.run_study", lambda *given: 2)
+    monkeypatch.setattr("jbrep.study.run_study", lambda *given: 2)
     monkeypatch.setattr("jbrep.report.report.write_report_of", lambda tables, out: [])
     told = jbrep("study", path, "--out", out)
     assert told.exit_code == 1
