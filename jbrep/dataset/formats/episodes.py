@@ -91,7 +91,6 @@ def whole_episode(where: str, given: Mapping[str, ArrayLike], **once: Any) -> It
     observation = arrays["observation"]
     if len(observation) == len(arrays["reward"]) + 1 and "final_observation" not in once:
         arrays["observation"], once["final_observation"] = observation[:-1], observation[-1]
-    check_lengths(where, {name: len(values) for name, values in arrays.items()})
     check_arrays(where, arrays)
     if "final_observation" in once:
         check_arrays(where, {"final_observation": np.asarray(once["final_observation"])[None]})
@@ -245,8 +244,8 @@ def check_lengths(name: str, lengths: Mapping[str, int], unit: str = "rows") -> 
     Raises:
         InputError: two differ.
     """
-    (first, expected), *others = lengths.items()
-    for what, length in others:
+    first, expected = next(iter(lengths.items()), ("", 0))
+    for what, length in lengths.items():
         if length != expected:
             raise InputError(
                 f"{name} has {expected:,} {unit} of {first}s, and {length:,} of {what}s: they must "
@@ -254,10 +253,11 @@ def check_lengths(name: str, lengths: Mapping[str, int], unit: str = "rows") -> 
             )
 
 
-def check_arrays(name: str, arrays: Mapping[str, Array]) -> None:
-    """`check_kind` of arrays with rows."""
-    for what, values in arrays.items():
-        check_kind(name, what, values.dtype, values.shape[1:])
+def check_arrays(name: str, arrays: Mapping[str, Any], unit: str = "rows") -> None:
+    """`check_lengths` and `check_kind` of arrays, or of what has their types and shapes."""
+    check_lengths(name, {what: (*each.shape, 0)[0] for what, each in arrays.items()}, unit)
+    for what, each in arrays.items():
+        check_kind(name, what, each.dtype, each.shape[1:])
 
 
 def check_kind(name: str, what: str, dtype: np.dtype[Any], row: Sequence[int] = ()) -> None:

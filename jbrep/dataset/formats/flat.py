@@ -39,10 +39,10 @@ def per_episode(name: str, given: Mapping[str, Any]) -> dict[str, Array]:
             far as they are known.
 
     Raises:
-        InputError: one holds what can't be imported.
+        InputError: one holds what can't be imported, or two are of different lengths.
     """
     arrays = {what: plain(name, what, values) for what, values in given.items()}
-    check_arrays(name, arrays)
+    check_arrays(name, arrays, "episodes")
     return {what: narrow(what, values) for what, values in arrays.items()}
 
 
@@ -163,7 +163,6 @@ def source_of(columns: Mapping[str, Any], once: Mapping[str, Any], name: str) ->
         return _listed(name, given, known)
     arrays = {what: plain(name, what, values) for what, values in given.items()}
     rows = len(arrays["reward"])
-    check_lengths(name, {what: len(values) for what, values in arrays.items()})
     check_arrays(name, arrays)
     checked_once = per_episode(name, known)
 

@@ -11,14 +11,7 @@ from typing import IO, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.dataset.formats.episodes import (
-    Rows,
-    Source,
-    check_kind,
-    check_lengths,
-    check_names,
-    label,
-)
+from jbrep.dataset.formats.episodes import Rows, Source, check_arrays, check_names, label
 from jbrep.dataset.formats.flat import CHUNK, own_names, per_episode, split
 from jbrep.dataset.reader import Dataset
 from jbrep.envs.task import Feature
@@ -101,10 +94,7 @@ def open_source(given: str) -> Source:
                     pass
         own = own_names(given, stored)
         check_names(given, own)
-        lengths = {column: (*stored[name].shape, 0)[0] for column, name in own.items()}
-        check_lengths(given, lengths)
-        for column, name in own.items():
-            check_kind(given, column, stored[name].dtype, stored[name].shape[1:])
+        check_arrays(given, {column: stored[name] for column, name in own.items()})
         known = per_episode(given, _once(archive, stored))
         features = _features(archive, stored)
     return Source(
@@ -112,7 +102,7 @@ def open_source(given: str) -> Source:
         label(path.stem),
         lambda: split(given, _chunks(path, own), known),
         features=features,
-        rows=lengths["reward"],
+        rows=math.prod(stored[own["reward"]].shape[:1]),
     )
 
 
