@@ -233,12 +233,10 @@ def forged(encoder, path, **changes):
             "tensor high holds a number that is not finite or not below",
         ),
         ({"low": np.zeros(15, np.float32)}, r"tensor low has shape \(15,\), expected \(16,\)"),
-        ({"low": np.zeros((), np.float32)}, r"tensor low has shape \(\), expected \(16,\)"),
         (
             {"low": np.zeros((16, 1), np.float32)},
             r"tensor low has shape \(16, 1\), expected \(16,\)",
         ),
-        ({"high": np.zeros(15, np.float32)}, r"tensor high has shape \(15,\), expected \(16,\)"),
         (
             {"decoder.0.weight": np.full((16, 3), 3e38, np.float32)},
             "not finite or not below 1e\\+12",

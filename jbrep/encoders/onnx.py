@@ -20,10 +20,7 @@ from jbrep.records.storage import exists, write_whole
 _OPSET, _IR_VERSION = 17, 8
 _LATER = 20, 9  # the same for models with GELU
 _OPERATORS = {  # by NumPy's names
-    **{
-        name: name.capitalize()
-        for name in ("add", "cos", "equal", "floor", "greater", "less", "sin")
-    },
+    **{n: n.capitalize() for n in ("add", "cos", "equal", "floor", "greater", "less", "sin")},
     **{"subtract": "Sub", "multiply": "Mul", "divide": "Div", "matmul": "MatMul"},
     **{"absolute": "Abs", "arctan": "Atan", "maximum": "Max"},
 }
@@ -51,7 +48,10 @@ class _Graph:
 
 
 class _Rows(NDArrayOperatorsMixin):
-    """Numbers (rows, width) in a model: what NumPy does with them becomes part of the model."""
+    """Numbers (rows, width) in a model: what NumPy does with them becomes part of the model.
+
+    A function of NumPy that an encoder comes to use must be added here.
+    """
 
     def __init__(self, graph: _Graph, name: str, width: int):
         self.graph, self.name, self.width = graph, name, width
