@@ -161,9 +161,9 @@ def deterministic(policy: BasePolicy, task: Task, see: See, batch_size: int | No
     return act
 
 
-def seeing(encoder: BaseEncoder, statistics: Statistics | None) -> See:
+def seeing(encode: See, statistics: Statistics | None) -> See:
     """What a policy sees of observations: an encoder's latents, perhaps normalised."""
-    return lambda rows: statistics(encoder.encode(rows)) if statistics else encoder.encode(rows)
+    return lambda rows: statistics(encode(rows)) if statistics else encode(rows)
 
 
 def statistics_of(agent: BaseAlgorithm) -> Statistics | None:
@@ -214,7 +214,7 @@ class Evaluator:
             NonFiniteActionError: the policy's actions are not finite.
             EnvironmentFailedError: the environment fails in the middle of an episode.
         """
-        see = seeing(self._encoder, statistics_of(agent))
+        see = seeing(self._encoder.encode, statistics_of(agent))
         act = deterministic(agent.policy, self._lanes.task, see)
         at_once = self._lanes.num_lanes
         count = at_once if episodes is None else episodes

@@ -101,9 +101,9 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
         """The label with the seed: face_direction/sac-modern/dae-8/seed-0."""
         return f"{self.label}/seed-{self.seed}"
 
-    def is_evaluation_due(self, step: int, lanes: int) -> bool:
+    def is_evaluation_due(self, step: int) -> bool:
         """Whether the policy is to be evaluated after so many steps, which aren't all."""
-        return step % self.evaluate_every < lanes and step < self.steps
+        return step % self.evaluate_every < self.hyperparameters.num_envs and step < self.steps
 
     def episodes_at(self, step: int) -> int:
         """Of the evaluation after so many steps."""

@@ -64,7 +64,7 @@ _REFUSED = {  # arguments that are jbrep's own, with the reason
     "rollout_buffer_kwargs": "a checkpoint needs the usual buffer",
 }
 _NOT_OF_POLICIES = {"observation_space", "action_space", "lr_schedule", "use_sde", "net_arch"}
-_SHAPING = ("use_sde",)  # arguments of algorithms that decide which weights a policy has
+_SHAPING = "use_sde"  # the argument of algorithms that decides which weights a policy has
 
 
 def overridden(algorithm: str, preset: str, overrides: Mapping[str, Any]) -> Hyperparameters:
@@ -137,7 +137,7 @@ def check_shape(algorithm: str, hyperparameters: Hyperparameters) -> Hyperparame
     _check_parts(algorithm, hyperparameters.net_arch)
     return Hyperparameters(
         hyperparameters.net_arch,
-        {name: of_class[name] is True for name in _SHAPING if name in of_class},
+        {_SHAPING: of_class[_SHAPING] is True} if _SHAPING in of_class else {},
         policy_kwargs={
             name: _of_policy(algorithm, name, value)
             for name, value in hyperparameters.policy_kwargs.items()
@@ -197,9 +197,8 @@ def _typed(name: str, value: Any, annotation: Any) -> Any:
     Raises:
         InputError: it may not.
     """
-    kinds = _kinds(annotation)
-    value = _or_none(value) if types.NoneType in kinds else value
-    return to_plain(converted(value, _allowed(name, kinds), name))
+    value = _or_none(value) if types.NoneType in typing.get_args(annotation) else value
+    return to_plain(converted(value, _allowed(name, annotation), name))
 
 
 def _or_none(value: Any) -> Any:
@@ -207,15 +206,11 @@ def _or_none(value: Any) -> Any:
     return None if value == "none" else value
 
 
-def _kinds(annotation: Any) -> tuple[Any, ...]:
-    """The types of a union, or the only one."""
-    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
-    return typing.get_args(annotation) if is_union else (annotation,)
-
-
 @cache
-def _allowed(name: str, kinds: tuple[Any, ...]) -> Any:
-    """What JSON may say of a parameter of that name and these types."""
+def _allowed(name: str, annotation: Any) -> Any:
+    """What JSON may say of a parameter of that name and type."""
+    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+    kinds = typing.get_args(annotation) if is_union else (annotation,)
     least, most = _RANGES.get(name, (1 if int in kinds else 0, _MOST))
     bounds = Meta(ge=least, le=most)
     as_json = {int: Annotated[int, bounds], float: Annotated[float, bounds], types.NoneType: _NONE}

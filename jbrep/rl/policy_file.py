@@ -59,16 +59,13 @@ class Trained(NamedTuple):
 
         The actor raises an InputError for actions that are not finite.
         """
-        return _finite(deterministic(self.policy, self.task, seeing(self.encoder, self.statistics)))
+        see = seeing(self.encoder.encode, self.statistics)
+        return _finite(deterministic(self.policy, self.task, see))
 
     def one_by_one(self) -> Actor:
         """The same with an encoder in torch, in one episode at a time."""
-        encode, statistics = self.encoder.encode, self.statistics
-
-        def see(row: NDArray[np.float32]) -> NDArray[np.float32]:
-            seen: NDArray[np.float32] = encode(torch.from_numpy(row)).numpy()
-            return statistics(seen) if statistics else seen
-
+        encode = self.encoder.encode
+        see = seeing(lambda row: encode(torch.from_numpy(row)).numpy(), self.statistics)
         return _finite(deterministic(self.policy, self.task, see, batch_size=1))
 
     def with_weights(self, weights: Tensors, tensors: Tensors, source: Path) -> "Trained":

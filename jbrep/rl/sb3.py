@@ -119,7 +119,7 @@ class _Follower(BaseCallback):
             diverged = info.get("non_finite", False)
             row = Episode(self.num_timesteps, lane, total, length, diverged)
             self._job.history.episodes.append(row)
-        if self._job.settings.is_evaluation_due(self.num_timesteps, self.training_env.num_envs):
+        if self._job.settings.is_evaluation_due(self.num_timesteps):
             self._job.evaluate(self.model)
         return True
 

@@ -56,14 +56,13 @@ def shipped() -> list[Shipped]:
     Raises:
         DamageError: a file that ships isn't what was written.
     """
-    return [_described(task, returns) for task, returns in _read_returns().items()]
-
-
-def _described(task: str, returns: Returns) -> Shipped:
-    path = file_of(task)
-    header = document_from(container.read(path, "policy")[1], path, PolicyHeader)
-    names = (header.settings.representation, header.settings.learner)
-    return Shipped(task, *names, header.step, returns)
+    found = []
+    for task, returns in _read_returns().items():
+        path = file_of(task)
+        header = document_from(container.read(path, "policy")[1], path, PolicyHeader)
+        names = (header.settings.representation, header.settings.learner)
+        found.append(Shipped(task, *names, header.step, returns))
+    return found
 
 
 def write_returns(played: Mapping[str, Returns], folder: Path = FOLDER) -> None:

@@ -174,11 +174,6 @@ class Cohort:
         for member in self.members:
             member.agent._n_updates = self._n_updates
 
-    @property
-    def is_evaluation_due(self) -> bool:
-        """Whether policies are to be evaluated at this step, which isn't the last."""
-        return self.members[0].job.settings.is_evaluation_due(self.step, self._lanes)
-
     def evaluate(self) -> None:
         """Let each member play its policy that hasn't failed."""
         self.write_to_agents()

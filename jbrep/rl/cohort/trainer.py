@@ -62,9 +62,9 @@ def _cohort(begun: Sequence[_Begun], session: Session) -> Cohort:
 
 
 def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
-    everyone = cohort.members
+    everyone, first = cohort.members, cohort.members[0].job
     try:
-        if not everyone[0].job.history.evaluations:
+        if not first.history.evaluations:
             cohort.evaluate()
         while cohort.goes_on:
             yield from map(_end, cohort.failed)
@@ -73,7 +73,7 @@ def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
             _save(cohort, session)
             for _ in range(cohort.rollout):
                 cohort.act()
-                if cohort.is_evaluation_due:
+                if first.settings.is_evaluation_due(cohort.step):
                     cohort.evaluate()
             cohort.learn()
         _tell(cohort, session)  # the last evaluation can take minutes
