@@ -342,13 +342,6 @@ def test_nothing_is_said_between_looks():
     assert later.level == pytest.approx(0.048, abs=1e-3)
 
 
-def test_runs_beyond_the_plan_do_not_count():
-    late = [*BETTER, *(curve(0, seed=seed, name="dae-12") for seed in range(20, 30))]
-    found = verdicts([*FULL, *(curve(900, seed=s) for s in range(20, 30))], late, seeds=range(20))
-    assert found["dae-12"][0].runs == (20, 20)
-    assert found["dae-12"][0].verdict == "supported"
-
-
 def test_cells_share_the_level_and_pass_it_on():
     other = "face_direction/ddpg/dae-8"
     rough = arm("dae-8", drawn(850, 70, 20, 5))

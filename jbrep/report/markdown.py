@@ -13,7 +13,6 @@ from jbrep.text import Table
 
 # what would be read as markup: an underscore within a word and a bracket without a link are not
 _WITHIN_A_LINE = r"[\\`*<|~#]|&(?=[#\w])|(?<!\w)_|_(?!\w)|!(?=\[)|\](?=[(\[:])"
-_AT_ITS_START = r"^[-+=>]|^\d+(?=[.)])"
 
 
 def markdown(
@@ -71,14 +70,10 @@ def _titled(table: Table) -> str:
 
 def escape(text: str) -> str:
     """Text on one line in which nothing is markup."""
-    return re.sub(_AT_ITS_START, lambda match: _escaped(match[0]), _in_a_line(text))
+    line = re.sub(r"^[-+=>]", r"\\\g<0>", _in_a_line(text))
+    return re.sub(r"^\d+(?=[.)])", r"\g<0>\\", line)
 
 
 def _in_a_line(text: str) -> str:
     """The same, for text that begins no line."""
     return re.sub(_WITHIN_A_LINE, r"\\\g<0>", " ".join(text.split()))
-
-
-def _escaped(markup: str) -> str:
-    """With a backslash before the character, or after a list's number."""
-    return f"{markup}\\" if markup.isdigit() else f"\\{markup}"
