@@ -97,8 +97,12 @@ def _opengl() -> str:
 
 def _packages(extra: str, purpose: str) -> Finding:
     """Whether all requirements of an extra are installed, in versions that fit."""
-    name, asked = extra or "core", list(_requirements(extra))
-    wrong = [f"{r.name} {v} ({r.specifier} is needed)" for r, v in asked if v and not _fits(r, v)]
+    name, asked = extra or "core", [(each, _installed(each)) for each in _required(extra)]
+    wrong = [
+        f"{r.name} {v} ({r.specifier} is needed)"
+        for r, v in asked
+        if v and not r.specifier.contains(v, prereleases=True)
+    ]
     missing = [r.name for r, v in asked if not v]
     if not wrong and not missing:
         return Finding(name, f"{purpose}: {', '.join(f'{r.name} {v}' for r, v in asked)}")
@@ -108,17 +112,12 @@ def _packages(extra: str, purpose: str) -> Finding:
     return Finding(name, said, is_wrong=bool(wrong) or not extra)
 
 
-def _fits(requirement: Requirement, found: str) -> bool:
-    return requirement.specifier.contains(found, prereleases=True)
-
-
-def _requirements(extra: str) -> Iterator[tuple[Requirement, str]]:
-    """The requirements of an extra, each with the installed version, empty if there is none."""
-    for requirement in _required(extra):
-        try:
-            yield requirement, version(requirement.name)
-        except PackageNotFoundError:
-            yield requirement, ""
+def _installed(requirement: Requirement) -> str:
+    """The version that is there; empty if there is none."""
+    try:
+        return version(requirement.name)
+    except PackageNotFoundError:
+        return ""
 
 
 def _required(extra: str) -> Iterator[Requirement]:

@@ -16,7 +16,7 @@ from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.registration import REGISTRATION, _hash, read_registration
 from jbrep.study.results import conclude
-from jbrep.study.runner import BACKENDS, register_study, run_study
+from jbrep.study.runner import register_study, run_study
 
 TINIER = TINY.replace(representations=("full",), seeds=(0, 1))
 
@@ -140,14 +140,3 @@ def test_a_study_with_primary_cells_is_registered_when_it_begins(tmp_path):
         assert settings["registration"] == again.registration.sha256
     (again.folder / REGISTRATION).unlink()
     assert Plan(study, tmp_path / "study").registration is None
-
-
-def test_a_study_begins_under_its_registration(tmp_path, monkeypatch):
-    monkeypatch.setitem(BACKENDS, "local", in_this_process)
-    command = ("study", written(tmp_path), "--out", tmp_path / "out")
-    assert jbrep(*command, "--register").exit_code == 0
-    written(tmp_path, "steps = 90")
-    refused = jbrep(*command)
-    assert refused.exit_code == 2
-    assert "holds the study registered on" in refused.stderr
-    assert not list(Path(tmp_path / "out").rglob(RUN))

@@ -501,19 +501,6 @@ def test_one_study_at_a_time(done):
         run_study(done, on_this_machine, 1)
 
 
-def test_the_long_table_holds_every_evaluation(done):
-    lines = tables(done.folder)[0].decode().splitlines()
-    assert lines[0] == "task,algorithm,representation,seed,step,episode,return"
-    assert len(lines) == 1 + 4 * (1 + 10)
-    assert lines[1].startswith("face_direction,a2c,full,0,0,0,")
-    (group,) = statistics(read_tables(done.folder).analysis)["groups"]
-    final = group["labels"][0]["by_run"]["final_return"]
-    at_end = [line.split(",") for line in lines[1:] if ",full," in line and ",80," in line]
-    for seed, each in enumerate(final):
-        returns = [float(row[-1]) for row in at_end if row[3] == str(seed)]
-        assert (len(returns), each) == (10, pytest.approx(np.mean(returns)))
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [

@@ -365,15 +365,6 @@ def test_settings_of_encoders_are_checked_with_the_data(own, message, tmp_path, 
         with_own(own)
 
 
-def test_own_files_beside_those_that_the_study_trains(tmp_path):
-    study = with_own("pca-4", PATTERN, data=Data(steps=200))
-    plan = Plan(study, tmp_path / "it")
-    prepare(plan)
-    assert {path.stem for path in plan.folder.rglob("*.safetensors")} == {"full", "pca-4"}
-    names = {find(plan.run(cell).encoder, TASK).name for cell in plan.cells}
-    assert names == {"full", "pca-4", "pca-8", "random-8"}
-
-
 @pytest.mark.parametrize(
     ("own", "message"),
     [

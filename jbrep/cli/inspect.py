@@ -4,7 +4,6 @@ import os
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -73,18 +72,18 @@ def inspect(
     if view:
         _run_viewer(path)
     if serve:
-        page, recording = _free_ports(2)
+        page, recording = _free_ports()
         click.echo(f"http://{_ADDRESS}:{page}/?url=rerun%2Bhttp://{_ADDRESS}:{recording}/proxy")
         click.echo("Ctrl-C stops it")
         ports = ("--web-viewer-port", str(page), "--port", str(recording))
         _run_viewer(path, "--serve-web", *ports)
 
 
-def _free_ports(count: int) -> list[int]:
+def _free_ports() -> tuple[int, int]:
     """Unused ports: on one in use, Rerun would connect to the program that listens there."""
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.create_server((_ADDRESS, 0))) for _ in range(count)]
-        return [each.getsockname()[1] for each in sockets]
+    anything = (_ADDRESS, 0)
+    with socket.create_server(anything) as one, socket.create_server(anything) as other:
+        return one.getsockname()[1], other.getsockname()[1]
 
 
 def _run_viewer(path: Path, *options: str) -> None:
