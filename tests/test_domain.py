@@ -102,12 +102,6 @@ def test_equal_seeds_give_equal_episodes_and_others_differ(task):
     assert not np.array_equal(tape(3)[0], tape(4)[0])
 
 
-def test_starts_are_random(task):
-    environment = load(task, task_kwargs={"random": 42})
-    one, other = environment.reset().observation, environment.reset().observation
-    assert any(not np.array_equal(one[name], other[name]) for name in one)
-
-
 def test_no_feature_is_constant(task):
     some = episodes(load(task), count=2, steps=60)
     steps = [np.concatenate(list(step.observation.values())) for step in some]

@@ -122,11 +122,8 @@ def test_sizes_joint_order_and_options(model):
         np.testing.assert_array_equal(getattr(model.opt, name), getattr(default, name))
     np.testing.assert_array_equal(model.qpos0[:7], [0, 0, 0.035, 1, 0, 0, 0])
     np.testing.assert_array_equal(model.geom("floor").size[:2], [0.5, 0.5])
-    assert {model.camera(i).name for i in range(model.ncam)} == {
-        "overhead",
-        "tracking",
-        "egocentric",
-    }
+    cameras = {model.camera(i).name for i in range(model.ncam)}
+    assert cameras == {"overhead", "tracking", "egocentric"}
 
 
 @needs_egl

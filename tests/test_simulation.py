@@ -63,16 +63,6 @@ def test_a_reset_leaves_nothing_of_the_episode_before():
     np.testing.assert_array_equal(first, episode())
 
 
-def test_copied_data_are_the_lane_s():
-    simulation = Simulation(get_task("move_to_pose"), 3, 1)
-    simulation.reset(range(3), [np.random.default_rng(i) for i in range(3)])
-    simulation.step(np.ones((3, 1)))
-    data = simulation.copy_data(2)
-    np.testing.assert_array_equal(data.qpos, simulation.readings.qpos[2])
-    np.testing.assert_array_equal(data.body("jitterbug").xmat, simulation.readings.rotation[2])
-    np.testing.assert_allclose(data.geom("target").xpos, simulation.readings.target_position[2])
-
-
 def drive(simulation, steps=60):
     """Observations under the same drive in all lanes, (T, n, d)."""
     tape = []
@@ -189,8 +179,9 @@ def test_a_state_without_bodies_leaves_the_lanes_theirs():
     np.testing.assert_array_equal(simulation.state["body"], [7, 7])
 
 
-def test_a_lane_s_model_is_that_of_its_body():
+def test_a_lane_s_model_and_data_are_those_of_its_body():
     simulation = with_bodies(range(2), "random")
+    simulation.step(np.ones((2, 1)))
     for lane, number in enumerate(simulation.state["body"].astype(int)):
         model = simulation.model_of(lane)
         assert model is simulation.model_of(lane)
@@ -199,6 +190,8 @@ def test_a_lane_s_model_is_that_of_its_body():
         expected = mujoco.MjData(own)
         expected.qpos[:] = simulation.readings.qpos[lane]
         mujoco.mj_kinematics(own, expected)
+        target = simulation.readings.target_position[lane]
+        np.testing.assert_allclose(data.geom("target").xpos, target)
         for robot in (data, expected):
             robot.geom("target").xpos[:] = robot.geom("target_pointer").xpos[:] = 0
         np.testing.assert_array_equal(model.geom_size, own.geom_size)

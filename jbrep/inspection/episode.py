@@ -9,7 +9,7 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.inspection.blueprint import episode_layout, series_pages
 from jbrep.inspection.directions import name_directions, send_directions
 from jbrep.inspection.fan import fan_pages, make_fan, send_fan
-from jbrep.inspection.forecast import Examples, from_rollout
+from jbrep.inspection.forecast import Examples
 from jbrep.inspection.recording import Recording
 from jbrep.inspection.robot import Robot
 from jbrep.inspection.scene import send_ghost, send_scene
@@ -38,7 +38,8 @@ def record_episode(
     """
     task, motion = rollout.task, rollout.motion
     content = (rollout.observation, rollout.action, *([motion.qpos] if motion else []))
-    examples = examples or from_rollout(rollout)
+    if examples is None:
+        examples = Examples([rollout.observation], [rollout.action], "this same episode")
     fan = make_fan(rollout, encoder, examples) if encoder else None
     about = provenance(rollout, encoder, fan.about if fan else "")
     recording = Recording(rollout.name, about, *content)

@@ -1,6 +1,6 @@
 """The next steps as an encoder's code predicts them, for several sequences of actions."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -177,7 +177,9 @@ def _send_lines(
     path = states[..., [fan.names.index(each) for each in _POSITION]]
     turned = states[:, -1, [fan.names.index(each) for each in _HEADING]]
     ahead = _ARROW * size * np.column_stack((turned, np.zeros(len(turned))))
-    entity, look = f"{FAN}/{name}", (_COLOURS.get(name, GREY), _LINE * size)
-    strips, ends = path.astype(np.float32), path[:, -1]
-    recording.send_moving(entity, times, rr.LineStrips3D, *look, strips=strips)
-    recording.send_moving(entity, times, rr.Arrows3D, *look, origins=ends, vectors=ahead)
+    lines = rr.LineStrips3D.columns(strips=path.astype(np.float32))
+    arrows = rr.Arrows3D.columns(origins=path[:, -1], vectors=ahead)
+    recording.send_columns(f"{FAN}/{name}", times, lines, arrows)
+    look: dict[str, Any] = {"colors": [_COLOURS.get(name, GREY)], "radii": [_LINE * size]}
+    shapes = (rr.LineStrips3D.from_fields(**look), rr.Arrows3D.from_fields(**look))
+    recording.send(f"{FAN}/{name}", *shapes)

@@ -13,7 +13,6 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Array, Task
 from jbrep.evaluate.regression import Predictor, ridge
 from jbrep.evaluate.truth import state
-from jbrep.play.rollout import Rollout
 
 HORIZONS = (5, 10, 15, 20)  # steps ahead
 _FEWEST = 50  # windows to fit a horizon to
@@ -36,11 +35,6 @@ class Examples(NamedTuple):
     observations: list[NDArray[np.float32]]
     actions: list[NDArray[np.floating]]
     source: str
-
-
-def from_rollout(rollout: Rollout) -> Examples:
-    """The episode that is shown, where there is nothing else."""
-    return Examples([rollout.observation], [rollout.action], "this same episode")
 
 
 def from_dataset(dataset: Dataset, shown: int | None = None) -> Examples | None:

@@ -228,9 +228,7 @@ class JitterbugTask:
         return np.array([_TURN, tilt, tilt, self.target_radius, _TURN, self.target_yaw]).T
 
     def describe(
-        self,
-        arguments: Mapping[str, Any] | None = None,
-        max_episode_steps: int | None = None,
+        self, arguments: Mapping[str, Any] | None = None, max_episode_steps: int | None = None
     ) -> Task:
         """The task as plain data.
 

@@ -201,8 +201,7 @@ def find_untrained(folder: Path, task: Task) -> Player:
     """
     from jbrep.rl.policy import load_untrained  # imports torch
 
-    player = as_player(f"{folder}, before training", load_untrained(folder))
-    return player._replace(task=task)
+    return as_player(f"{folder}, before training", load_untrained(folder), task)
 
 
 def _trained(source: str, task: Task | None, encoder: Any) -> Player:
@@ -215,8 +214,7 @@ def _trained(source: str, task: Task | None, encoder: Any) -> Player:
     _check_task(name, trained.task, task)
     if trained.step is not None:
         name = f"{name} at step {trained.step:,}"
-    player = as_player(name, trained)
-    return player._replace(task=task) if task else player
+    return as_player(name, trained, task)
 
 
 def _check_task(source: str, own: Task, given: Task | None) -> None:
@@ -227,11 +225,11 @@ def _check_task(source: str, own: Task, given: Task | None) -> None:
         check_same(given, own, source)
 
 
-def as_player(name: str, trained: "Trained") -> Player:
-    """A trained policy with a name."""
+def as_player(name: str, trained: "Trained", task: Task | None = None) -> Player:
+    """A trained policy with a name; its own task is played if none is given."""
     return Player(
         name,
-        trained.task,
+        task or trained.task,
         trained.begin,
         trained.representation,
         trained.evaluation_episodes,
