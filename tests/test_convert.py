@@ -294,6 +294,7 @@ def single(value):
     return np.array(value, np.float32)
 
 
+DEEP = "; ".join(f"y{i + 1} = Relu y{i}" for i in range(9))
 CHAINS = {
     "gemm": ([node("y = Gemm x w b", alpha=0.5, beta=2.0)], {"w": f32(16, 3), "b": single(2)}),
     "transposed": (
@@ -386,6 +387,10 @@ def test_a_decoder_of_its_own(tmp_path):
         (("a = Relu x; y = Relu nothing",), "no ONNX model that can be read"),
         (("y = Relu x; y = Relu x",), "no ONNX model that can be read"),
         (([node(f"y{i} = Relu x") for i in range(1001)],), "more than 1000 nodes"),
+        (
+            (f"y0 = MatMul x w; {DEEP}", {"w": f32(16, 4096)}, ("x", (1, 16)), "y9"),
+            "its layers have more than 67,108,864 numbers",
+        ),
     ],
 )
 def test_a_model_that_is_no_chain_is_refused_by_name(given, message, tmp_path):

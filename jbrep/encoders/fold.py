@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 _HALF = np.concatenate((np.linspace(0, 8, 65)[1:], np.geomspace(8, 100, 40)))
 _PROBES: Array = np.concatenate((-_HALF[::-1], [0], _HALF))  # of functions of one number
 _PRECISION = 1e-6  # to which a function must be an activation
+_MOST_NUMBERS = 1 << 26  # in layers: few nodes of a stranger's model can make many
 _MOST_NAMED = 8  # operations in a message
 _MOST_FORMS = 4  # of a value: a GELU written out needs two
 
@@ -72,8 +73,14 @@ class Chain:
         return Chain(self.width, self.ended, (weight * factor[:, None], bias * factor + shift))
 
     def activate(self, name: str) -> "Chain":
-        """Add an activation, which ends a layer."""
+        """Add an activation, which ends a layer.
+
+        Raises:
+            InputError: the layers become too large.
+        """
         weight, bias = self._affine()
+        if sum(layer.weight.size for layer in self.ended) + weight.size > _MOST_NUMBERS:
+            raise InputError(f"its layers have more than {_MOST_NUMBERS:,} numbers")
         single = np.asarray(weight, np.float32, order="C"), np.float32(bias + 0.0)  # no -0.0
         return Chain(self.width, (*self.ended, Layer(*single, name)))
 

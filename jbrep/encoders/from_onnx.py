@@ -3,6 +3,7 @@
 Models may be strangers': they are bounded, and read from regular files of one folder alone.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -69,12 +70,13 @@ def _layers(path: Path, size: int) -> tuple[tuple[Layer, ...], tuple[Layer, ...]
                 f"it has the outputs {', '.join(outputs)}: expected one, or {LATENT} and "
                 f"{RECONSTRUCTION}"
             )
+        uses = Counter(name for node in model.graph.node for name in node.input)
         nodes, values = iter(model.graph.node), _Values({start: fold.given(size)})
         if len(outputs) == 1:
-            return _fold(nodes, values, outputs[0], constants), ()
-        layers = _fold(nodes, values, LATENT, constants)
+            return _fold(nodes, values, outputs[0], constants, uses), ()
+        layers = _fold(nodes, values, LATENT, constants, uses)
         values = {**dict.fromkeys(values), LATENT: fold.given(len(layers[-1].bias))}
-        return layers, _fold(nodes, values, RECONSTRUCTION, constants)
+        return layers, _fold(nodes, values, RECONSTRUCTION, constants, uses)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -173,9 +175,16 @@ def _input(graph: onnx.GraphProto, constants: Constants, size: int) -> str:
 
 
 def _fold(
-    nodes: Iterable[onnx.NodeProto], values: _Values, end: str, constants: Constants
+    nodes: Iterable[onnx.NodeProto],
+    values: _Values,
+    end: str,
+    constants: Constants,
+    uses: Counter[str],
 ) -> tuple[Layer, ...]:
-    """The layers that lead to a value, by the nodes up to its own; values and constants grow."""
+    """The layers that lead to a value, by the nodes up to its own; values and constants grow.
+
+    What no later node uses is dropped: it may be large.
+    """
     for node in nodes:
         said = f"{node.op_type} ({node.name or node.output[0]})"[:_MOST_LETTERS]
         if node.domain not in ("", "ai.onnx"):
@@ -192,6 +201,10 @@ def _fold(
         except (IndexError, TypeError, ValueError, KeyError) as error:
             raise InputError(refusal(said, first_line(error))) from None
         values[node.output[0]] = fold.take(said, action, given.values)
+        uses.subtract(node.input)
+        for name in node.input:
+            if not uses[name]:
+                values.pop(name, None)
         if node.output[0] == end:
             break
     return fold.layers_to(values.get(end))
