@@ -152,6 +152,7 @@ FOLLOWED = [
     ("ddpg", "paper", {}),
     ("td3", "modern", {}),
     ("sac", "modern", {"num_envs": 2, "normalize": True}),
+    ("td3", "wide", {"num_envs": 4}),
 ]
 
 

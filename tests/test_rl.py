@@ -32,7 +32,7 @@ from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, POLICY, read_evalu
 from jbrep.rl.policy import load_run, load_zip
 from jbrep.rl.presets import PRESETS, get_preset, sb3_class
 from jbrep.rl.sb3 import restore, take
-from jbrep.rl.settings import CLASSES, COHORT, SB3
+from jbrep.rl.settings import COHORT, SB3
 
 STEPS = 100  # of an episode: little depends on its length
 TASK = describe("face_direction", max_episode_steps=STEPS)
@@ -106,8 +106,10 @@ def test_the_later_versions_settings_reach_sac_and_td3():
     assert td3.train_freq.frequency == 1000
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("algorithm", CLASSES)
+@pytest.mark.parametrize(
+    ("algorithm", "preset"),
+    [(algorithm, name) for name, its in PRESETS.items() for algorithm in its],
+)
 def test_every_preset_makes_an_agent_with_adam(algorithm, preset):
     agent = agent_of(algorithm, preset)
     optimizers = [
@@ -435,12 +437,16 @@ def test_a_zip_file_from_elsewhere_needs_trust(tmp_path):
     [
         ({"task": "fly"}, "unknown task"),
         ({"algorithm": "dqn"}, "unknown algorithm 'dqn': choose one of ddpg"),
-        ({"preset": "best"}, "unknown preset 'best': choose one of paper, modern"),
+        ({"preset": "best"}, "unknown preset 'best': choose one of paper, modern, wide"),
+        (
+            {"preset": "wide"},
+            "preset wide is for ddpg, td3, sac, tqc, crossq, not a2c: choose one of paper, modern",
+        ),
         ({"encoder": "dae-9"}, "no encoder 'dae-9'"),
         ({"seed": 2**31}, "seed is 2147483648: it must be a whole number from 0"),
         ({"steps": 0}, "steps is 0: it must be a whole number from 1 to 1,000,000,000,000"),
         ({"steps": 10**23}, f"steps is {10**23}: it must be"),
-        ({"evaluate_every": 0}, "evaluate_every is 0"),
+        ({"evaluate_every": -1}, "evaluate_every is -1"),
         ({"evaluation_episodes": 10_001}, "evaluation_episodes is 10001: .* 1 to 10,000"),
         ({"evaluation_episodes": 3, "final_episodes": 2}, "final_episodes is 2: .* as many as"),
     ],
@@ -450,3 +456,18 @@ def test_what_cannot_be_run_is_refused(change, message, tmp_path):
     with pytest.raises(InputError, match=message):
         train(Run.of(**{**usual, **change}), tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_evaluations_take_a_small_share_of_a_run_with_the_defaults():
+    """At most 15 % of its steps; and short runs aren't evaluated all the time."""
+    run = Run.of(task="face_direction", preset="wide")
+    settings = run.settings(run.find_encoder())
+    assert (settings.evaluate_every, settings.final_episodes) == (100_000, 50)
+    lanes = settings.hyperparameters.num_envs
+    steps = range(0, settings.steps, lanes)
+    times = sum(map(settings.is_evaluation_due, steps))
+    assert times == 10
+    episodes = times * settings.evaluation_episodes + settings.final_episodes
+    assert episodes * run.task.max_episode_steps <= 0.15 * settings.steps
+    short = run.replace(steps=50_000)
+    assert short.settings(short.find_encoder()).evaluate_every == 10_000

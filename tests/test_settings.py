@@ -217,6 +217,7 @@ def test_a_preset_file_can_say_none(tmp_path):
 
 def test_learners_of_tables():
     assert Learner.of_table("ddpg", {}) == Learner.of("ddpg")
+    assert Learner.of_table("sac-wide", {}).hyperparameters.num_envs == 64
     mine = Learner.of_table("my-sac", {"base": "sac-modern", "gamma": 0.9})
     assert (mine.algorithm, mine.preset, mine.overrides) == ("sac", "modern", {"gamma": 0.9})
     assert Learner.of_table("my-sac", mine.table) == mine

@@ -46,7 +46,7 @@ learner_options = with_options(  # which `given_run` reads
         "--preset",
         default="paper",
         show_default=True,
-        help="Its settings: paper, modern, or a TOML file with a table for each algorithm.",
+        help="Its settings: paper, modern, wide, or a TOML file with a table for each algorithm.",
     ),
     click.option(
         "--set",
@@ -220,7 +220,9 @@ def stop_signals() -> Iterator[list[int]]:
 @click.option("--trials", default=20, show_default=True, type=POSITIVE, help="In all.")
 @click.option("--seeds", default=1, show_default=True, type=POSITIVE, help="Runs of each trial.")
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of the search and runs.")
-@record_options(TrainingSettings, "steps", "evaluation_episodes", steps=20_000)
+@record_options(
+    TrainingSettings, "steps", "evaluation_episodes", steps=20_000, evaluation_episodes=10
+)
 @click.option("--out", required=True, type=PATH, help="A folder for this search.")
 @click.pass_context
 def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **options: Any) -> None:

@@ -27,6 +27,7 @@ from jbrep.rl.settings import (
     Name,
     Seed,
     Sha256,
+    Steps,
     TrainingSettings,
 )
 
@@ -60,6 +61,7 @@ class SharedSettings(TrainingSettings, frozen=True, kw_only=True):
     hyperparameters: Hyperparameters  # the preset's, overridden
     representation: Name  # what tables call that which the agent observes
     encoder_code: Line | None  # module:Class, if it is code that no file can hold
+    evaluate_every: Steps
     final_episodes: Episodes
     trainer: Literal["cohort", "sb3"]
     device: Literal["cpu", "cuda"]

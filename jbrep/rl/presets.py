@@ -11,9 +11,9 @@ import numpy as np
 from msgspec import Meta
 
 from jbrep.envs.task import Array
-from jbrep.errors import choose
+from jbrep.errors import InputError, choose
 from jbrep.records.record import Finite, Record, from_plain
-from jbrep.rl.settings import CLASSES, MODERN, PAPER
+from jbrep.rl.settings import CLASSES, MODERN, PAPER, WIDE
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -197,17 +197,44 @@ _MODERN = {
         **_ON_POLICY,
     ),
 }
-PRESETS = {PAPER: _PAPER, MODERN: _MODERN}
+
+_MANY_ROBOTS = {  # few gradient steps: one for 16 steps of a robot
+    "learning_rate": 1e-3,
+    "gamma": 0.99,
+    "buffer_size": 1_000_000,
+    "learning_starts": 12_800,
+    "train_freq": 1,
+    "gradient_steps": 4,
+    "batch_size": 512,
+}
+_WIDE = {
+    name: Hyperparameters((128, 128), _MANY_ROBOTS, num_envs=64, noise=noise)
+    for name, noise in {
+        "ddpg": NormalNoise(sigma=0.2),
+        "td3": NormalNoise(sigma=0.2),
+        "sac": None,
+        "tqc": None,
+        "crossq": None,
+    }.items()
+}
+PRESETS = {PAPER: _PAPER, MODERN: _MODERN, WIDE: _WIDE}
 
 
 def get_preset(preset: str, algorithm: str) -> Hyperparameters:
     """The hyperparameters of an algorithm in the preset of that name.
 
     Raises:
-        InputError: no preset or algorithm of that name; the message lists them.
+        InputError: no preset or algorithm of that name, or the preset has none of that algorithm;
+            the message lists those that there are.
     """
     choose(algorithm, CLASSES, "algorithm")
-    return choose(preset, PRESETS, "preset")[algorithm]
+    of_preset = choose(preset, PRESETS, "preset")
+    if algorithm not in of_preset:
+        raise InputError(
+            f"the preset {preset} is for {', '.join(of_preset)}, not {algorithm}: choose one of "
+            f"{', '.join(name for name, its in PRESETS.items() if algorithm in its)}"
+        )
+    return of_preset[algorithm]
 
 
 def sb3_class(algorithm: str) -> "type[BaseAlgorithm]":

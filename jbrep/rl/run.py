@@ -32,7 +32,9 @@ from jbrep.rl.settings import (
 )
 from jbrep.training.trainer import get_device, single_torch_thread
 
-_FINAL = 10  # times as many episodes as the other evaluations, if a run doesn't say how many
+# where a run doesn't say: evaluations before the last, steps between them, and how many times as
+# many episodes the last has
+_EVALUATIONS, _APART, _FINAL = 10, 10_000, 10
 
 
 class Run(TrainingSettings, frozen=True, kw_only=True):
@@ -77,7 +79,7 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
         Args:
             task: itself, or its name.
             algorithm: one of stable-baselines3's, such as sac.
-            preset: its hyperparameters: paper, modern, or a TOML file.
+            preset: its hyperparameters: paper, modern, wide, or a TOML file.
             overrides: hyperparameters that are set differently, as with --set.
             others: fields of a run.
 
@@ -111,6 +113,7 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
         shared |= {
             "trainer": trainer,
             "device": str(get_device(self.device).type) if trainer == COHORT else CPU,
+            "evaluate_every": self.evaluate_every or max(self.steps // _EVALUATIONS, _APART),
             "final_episodes": self.final_episodes
             or min(_FINAL * self.evaluation_episodes, MAX_EPISODES),
         }

@@ -19,7 +19,7 @@ CLASSES = {  # by the names of algorithms
 CPU, CUDA = "cpu", "cuda"
 COHORT, SB3 = "cohort", "sb3"
 PRECISIONS = FLOAT32, BFLOAT16 = "float32", "bfloat16"
-PAPER, MODERN = "paper", "modern"  # presets; the paper's unless another is named
+PAPER, MODERN, WIDE = "paper", "modern", "wide"  # presets; the paper's unless another is named
 MAX_STEPS = 10**12  # of training
 MAX_EPISODES = 10_000  # of an evaluation
 
@@ -57,15 +57,23 @@ Episodes = Annotated[int, Meta(ge=1, le=MAX_EPISODES)]
 class TrainingSettings(Record, frozen=True, kw_only=True):
     """How agents are trained and evaluated: what all runs of a study share."""
 
-    steps: Annotated[Steps, Meta(description="Of training.")] = 100_000
-    evaluate_every: Annotated[Steps, Meta(description="In steps of training.")] = 10_000
+    steps: Annotated[Steps, Meta(description="Of training.")] = 1_000_000
+    evaluate_every: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=MAX_STEPS,
+            description="In steps of training.",
+            extra={"default": "a tenth of all, at least 10,000"},
+        ),
+    ] = 0
     evaluation_episodes: Annotated[
         Episodes,
         Meta(
             description="Of the deterministic policy, each time, from starts that training doesn't "
             "use."
         ),
-    ] = 10
+    ] = 5
     final_episodes: Annotated[
         int,
         Meta(

@@ -36,7 +36,7 @@ def estimate(runs: Sequence[Run]) -> float:
         per_step, agent = trial(jobs)
         per_evaluation = len(jobs) * _seconds(lambda: evaluator.returns(agent))
     at_end = settings.final_episodes / first.evaluation_episodes
-    evaluations = first.steps // first.evaluate_every + at_end
+    evaluations = first.steps // settings.evaluate_every + at_end
     return first.steps * per_step + evaluations * per_evaluation
 
 
