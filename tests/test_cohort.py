@@ -5,6 +5,8 @@ from itertools import count
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.logger import Logger
 from torch.nn import functional
 
@@ -20,6 +22,7 @@ from jbrep.rl.cohort.algorithm import Batch
 from jbrep.rl.cohort.cohort import Cohort
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.cohort.networks import Stack
+from jbrep.rl.cohort.replay import Ahead, ReplayBuffer
 from jbrep.rl.job import Job, Session
 from jbrep.rl.overrides import overridden
 from jbrep.rl.presets import PRESETS
@@ -70,7 +73,9 @@ def drawn(agent, seed, draws):
     normals = [torch.empty(ROWS, 1).normal_() for _ in range(draws)]
     np.random.seed(seed)  # noqa: NPY002
     torch.manual_seed(seed)
-    return Batch(wide[0], rows.actions, wide[1], rows.rewards, rows.dones), normals
+    usual = torch.full_like(rows.rewards, agent.gamma)
+    discounts = usual if rows.discounts is None else rows.discounts
+    return Batch(wide[0], rows.actions, wide[1], rows.rewards, rows.dones, discounts), normals
 
 
 VARIANTS = [
@@ -79,6 +84,8 @@ VARIANTS = [
     ("sac", "modern", {"ent_coef": "auto_0.2", "target_entropy": -0.5}),
     ("td3", "modern", {"policy_delay": 3, "activation_fn": "elu", "net_arch": [20, 10]}),
     ("sac", "modern", {"learning_rate": "linear:1e-3", "optimizer_kwargs": {"weight_decay": 0.1}}),
+    ("sac", "modern", {"n_steps": 3}),
+    ("td3", "modern", {"n_steps": 5}),
 ]
 
 
@@ -153,6 +160,7 @@ FOLLOWED = [
     ("td3", "modern", {}),
     ("sac", "modern", {"num_envs": 2, "normalize": True}),
     ("td3", "wide", {"num_envs": 4}),
+    ("sac", "modern", {"num_envs": 2, "n_steps": 3}),
 ]
 
 
@@ -175,8 +183,8 @@ def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, t
         steps, size = len(rows), run.find_encoder().latent_size
         first = slice(0, 100 // run.learner.hyperparameters.num_envs)
         np.testing.assert_array_equal(buffer.observations[first], rows[first, :, :size])
-        np.testing.assert_array_equal(buffer.rewards[first], rows[first, :, -2])
-        np.testing.assert_allclose(buffer.rewards[:steps], rows[..., -2], atol=1e-5)
+        np.testing.assert_array_equal(buffer.rewards[first], rows[first, :, -3])
+        np.testing.assert_allclose(buffer.rewards[:steps], rows[..., -3], atol=1e-5)
         for (name, there), (_, here) in zip(
             parameters(agent), parameters(members[number].agent), strict=True
         ):
@@ -191,6 +199,29 @@ def alone(run):
     env.seed(seed)
     agent.set_logger(Logger(None, []))
     return agent.learn(run.steps)
+
+
+@pytest.mark.parametrize("added", [7, 10, 23])
+def test_transitions_of_several_steps_are_those_of_stable_baselines3(added):
+    """Over the ends of episodes, of the buffer and of what has been added."""
+    space, random = spaces.Box(-1, 1, (1,), np.float32), np.random.default_rng(added)
+    theirs = NStepReplayBuffer(20, space, space, n_envs=2, n_steps=4, gamma=0.9)
+    ours = ReplayBuffer(1, 2, 20, 1, 1, Ahead(4, 0.9))
+    for _ in range(added):
+        seen, action, final = random.random((3, 1, 2, 1), np.float32)
+        reward, ended = random.random((2,), np.float32), random.random(2) < 0.2
+        terminated = ended & (random.random(2) < 0.5)
+        flags = np.stack((terminated, ended), 1)[None]
+        ours.add(seen, action, final, reward[None, :, None], flags)
+        infos = [{"TimeLimit.truncated": each} for each in ended & ~terminated]
+        theirs.add(seen[0], final[0], action[0], reward, ended, infos)
+    np.random.seed(0)  # noqa: NPY002 - stable-baselines3 draws there
+    expected, drawn = theirs.sample(100), np.random.RandomState(0)
+    steps = drawn.randint(0, ours.filled, size=100)
+    sampled = ours.sample(steps[None], drawn.randint(0, 2, size=100)[None])
+    names = ("observations", "actions", "next_observations", "rewards", "dones", "discounts")
+    for name, (values,) in zip(names, sampled, strict=True):
+        np.testing.assert_array_equal(values, getattr(expected, name), err_msg=name)
 
 
 class Huge:
@@ -243,7 +274,7 @@ def check(run):
         ({"trainer": "sb3", "device": "cuda"}, "sb3 trains on the cpu here: leave the device out"),
         ({"precision": "half"}, "precision is 'half': it must be one of"),
         ({"device": "cuda"}, "no device 'cuda' on this machine: choose auto or cpu"),
-        ({"overrides": {"n_steps": 3}}, "n_steps = 3: add --trainer sb3"),
+        ({"overrides": {"sde_sample_freq": 3}}, "sde_sample_freq = 3: add --trainer sb3"),
     ],
 )
 def test_what_no_cohort_can_do_is_refused(settings, message):

@@ -135,7 +135,7 @@ class CheckpointHeader(Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep checkpoint"
-    format_version = 1
+    format_version = 2
 
     settings: RunSettings
     versions: Mapping[Line, Line]

@@ -22,19 +22,20 @@ from jbrep.rl.presets import Hyperparameters, parameters_of
 Losses = dict[str, Tensor]  # (n,) each, by the names under which stable-baselines3 logs them
 _SETTINGS = {  # of stable-baselines3 that every algorithm here honours
     *("batch_size", "buffer_size", "gamma", "gradient_steps", "learning_rate", "learning_starts"),
-    *("stats_window_size", "tau", "train_freq", "activation_fn", "n_critics"),
+    *("n_steps", "stats_window_size", "tau", "train_freq", "activation_fn", "n_critics"),
 }
 _INSTEAD = 'add --trainer sb3, or trainer = "sb3" to a study'
 
 
 class Batch(NamedTuple):
-    """Transitions from each agent's own replay buffer."""
+    """Transitions of n_steps from each agent's own replay buffer, or to an episode's end."""
 
     observation: Tensor  # (n, b, d)
     action: Tensor  # (n, b, k), in [-1, 1]
     next_observation: Tensor  # (n, b, d)
-    reward: Tensor  # (n, b, 1)
+    reward: Tensor  # (n, b, 1); the discounted sum of those on the way
     terminated: Tensor  # (n, b, 1); 1 where a state ended the episode, else 0
+    discount: Tensor  # (n, b, 1); of the next observation's value
 
 
 class Algorithm(ABC):
@@ -54,7 +55,6 @@ class Algorithm(ABC):
         self.critic = stack.networks(lambda each: each.critic.q_networks)
         self.critic_target = stack.networks(lambda each: each.critic_target.q_networks)
         self.critic_optimizer = stack.adam(self.critic, lambda each: each.critic.optimizer)
-        self.gamma: float = stack.agents[0].gamma
         self.tau: float = stack.agents[0].tau
 
     @abstractmethod
@@ -83,7 +83,7 @@ class Algorithm(ABC):
 
     def td_target(self, batch: Batch, next_value: Tensor) -> Tensor:
         """Reward and discounted value of the next state, (n, b, 1)."""
-        return batch.reward + (1 - batch.terminated) * self.gamma * next_value
+        return batch.reward + (1 - batch.terminated) * batch.discount * next_value
 
     def td_error(self, critic: Sequence[Network], batch: Batch, target: Tensor) -> Tensor:
         """The sum of the mean squared errors of a critic's networks, (n,)."""

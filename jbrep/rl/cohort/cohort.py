@@ -17,7 +17,7 @@ from jbrep.rl.cohort import get_algorithm
 from jbrep.rl.cohort.algorithm import Batch, Losses
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.cohort.networks import Stack
-from jbrep.rl.cohort.replay import ReplayBuffer, capacity_of
+from jbrep.rl.cohort.replay import Ahead, ReplayBuffer, capacity_of
 from jbrep.rl.job import Job
 
 
@@ -37,7 +37,9 @@ class Cohort:
         self._lanes, self._steps = settings.hyperparameters.num_envs, settings.steps
         self._size = padded_size(job)
         sizes = self._size, task.action_size
-        self._replay = ReplayBuffer(len(members), self._lanes, capacity_of(job.run), *sizes)
+        ahead = Ahead(self._shared.n_steps, self._shared.gamma)
+        capacity = capacity_of(job.run)
+        self._replay = ReplayBuffer(len(members), self._lanes, capacity, *sizes, ahead)
         self._endless = Endless(task, len(members) * self._lanes, settings.physics_threads)
         self._device = torch.device(settings.device)
         agents = [member.agent for member in members]
@@ -68,8 +70,8 @@ class Cohort:
         observation = final = self._encode(moved.observation)
         if ended.any():
             final = np.where(ended[..., None], self._encode(moved.final), observation)
-        closed = (ended & terminated)[..., None]
-        self._replay.add(self._observation, scaled, final, reward[..., None], closed)
+        flags = np.stack((ended & terminated, ended), axis=2)
+        self._replay.add(self._observation, scaled, final, reward[..., None], flags)
         self._observation = observation
         self._update_statistics()
         diverged = self._by_member(moved.diverged)

@@ -1,11 +1,13 @@
 """Replay buffers of n agents."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.encoders.base import Float32
+from jbrep.envs.lanes import Flags
 from jbrep.rl.presets import parameters_of
 from jbrep.rl.run import Run
 
@@ -29,7 +31,14 @@ def memory_of(run: Run, observed: int) -> int:
 
 def _sizes(observation: int, action: int) -> tuple[int, ...]:
     """Numbers in the parts of a transition."""
-    return observation, action, observation, 1, 1
+    return observation, action, observation, 1, 1, 1
+
+
+class Ahead(NamedTuple):
+    """How far transitions look ahead that are learned from."""
+
+    n_steps: int
+    gamma: float
 
 
 class ReplayBuffer:
@@ -43,13 +52,16 @@ class ReplayBuffer:
         capacity: transitions of each agent.
         observation: numbers in an observation.
         action: numbers in an action.
+        ahead: how far those that are sampled look.
 
     Attributes:
         added: steps since the start.
     """
 
-    def __init__(self, agents: int, lanes: int, capacity: int, observation: int, action: int):
-        self._sizes, self.added = _sizes(observation, action), 0
+    def __init__(
+        self, agents: int, lanes: int, capacity: int, observation: int, action: int, ahead: Ahead
+    ):
+        self._sizes, self.added, self._ahead = _sizes(observation, action), 0, ahead
         self._steps = max(capacity // lanes, 1)
         self._rows = np.empty((agents, self._steps, lanes, sum(self._sizes)), np.float32)
 
@@ -68,15 +80,35 @@ class ReplayBuffer:
         for agent, each in enumerate(rows):
             self._rows[agent, : len(each)] = each
 
-    def add(self, *columns: Float32) -> None:
-        """Add a step of each lane: observation, action, next observation, reward, terminated.
+    def add(self, *columns: Float32 | Flags) -> None:
+        """Add a step of each lane: observation, action, next observation, reward, flags.
 
-        The shapes are (n, lanes, ...).
+        The shapes are (n, lanes, ...); flags say whether a state ended the episode, and whether it
+        ended.
         """
         self._rows[:, self.added % self._steps] = np.concatenate(columns, axis=2)
         self.added += 1
 
     def sample(self, steps: NDArray[np.int64], lanes: NDArray[np.int64]) -> list[Float32]:
-        """Those that `add` was given in steps and lanes, (n, b) each; (n, b, ...) each."""
-        rows = self._rows[np.arange(len(steps))[:, None], steps, lanes]
+        """Transitions of n_steps from steps and lanes, (n, b) each, as a `Batch` has them.
+
+        One is shorter where its episode ends, or where the newest step is. Its reward is the
+        discounted sum of those on the way.
+        """
+        agents, ahead = np.arange(len(steps))[:, None, None], np.arange(self._ahead.n_steps)
+        places = (steps[..., None] + ahead) % self._steps
+        rows = self._rows[agents, places, lanes[..., None]]  # (n, b, n_steps, width)
+        ends = (rows[..., -1] > 0) | (places == (self.added - 1) % self._steps)
+        last = np.where(ends.any(2), ends.argmax(2), len(ahead) - 1)[..., None]  # (n, b, 1)
+        discounts = self._ahead.gamma ** ahead.astype(np.float32)
+        reward = np.where(ahead <= last, rows[..., -3] * discounts, 0).sum(2, keepdims=True)
+        discount = self._ahead.gamma ** (last + 1).astype(np.float32)
+        observation, action, *_ = self._split(rows[:, :, 0])
+        *_, final, _, terminated, _ = self._split(
+            np.take_along_axis(rows, last[..., None], 2)[:, :, 0]
+        )
+        return [observation, action, final, reward, terminated, discount]
+
+    def _split(self, rows: Float32) -> list[Float32]:
+        """The parts of transitions, (n, b, ...) each."""
         return np.split(rows, np.cumsum(self._sizes)[:-1], axis=2)
