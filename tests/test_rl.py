@@ -1,6 +1,7 @@
 """One run: settings, files, evaluation, kills and stops, failures, and files from elsewhere."""
 
 import hashlib
+import io
 import json
 import pickle
 import re
@@ -12,6 +13,7 @@ import time
 import zipfile
 from contextlib import closing, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,6 +30,7 @@ from jbrep.errors import InputError
 from jbrep.records import container
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
+from jbrep.rl.checkpoint import History
 from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, POLICY, read_evaluations, read_run
 from jbrep.rl.policy import load_run, load_zip
 from jbrep.rl.presets import PRESETS, get_preset, sb3_class
@@ -328,15 +331,62 @@ def test_a_second_signal_ends_the_command_at_once():
     assert "Ctrl-C again ends at once" in process.stderr
 
 
+def made_up_job(*means):
+    """A run whose evaluations had these mean returns."""
+    history = History()
+    for number, mean in enumerate(means):
+        history.evaluated(1000 * number, np.array([mean - 1, mean + 1]))
+    return SimpleNamespace(history=history)
+
+
+class Terminal(io.StringIO):
+    """A terminal with Unicode or without."""
+
+    def __init__(self, encoding):
+        super().__init__()
+        self._encoding = encoding
+
+    encoding = property(lambda self: self._encoding)
+
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(
+    ("encoding", "means", "course"),
+    [
+        ("utf-8", [], "-"),
+        ("utf-8", [50.0], "▁ 50.0"),
+        ("utf-8", [-20.0, 50.0, 85.0, 120.0, 50.0], "▁▅▆█▅ 50.0"),
+        ("utf-8", [*range(100), 10_000.0], "▁▁▁▁▁▁▁▁▂█ 10,000"),
+        ("ascii", [0.0, 50.0], "50.0"),
+    ],
+)
+def test_a_terminal_shows_the_course_of_the_return(encoding, means, course, monkeypatch):
+    terminal = Terminal(encoding)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with closing(_Bar(5_000_000, "sac on a-long-name-of-an-encoder")) as bar:
+        bar.show(made_up_job(), 1000, None)
+        bar._progress.start_t -= 36_000  # seconds
+        bar.show(made_up_job(*means), 100_000, None)
+        bar._progress.refresh()
+        line = terminal.getvalue().split("\r")[-1].rstrip()
+        assert len(line) < 80
+        assert line.startswith("sac on a-long...: 100k/5.00M, 2.75/s, ")
+        assert line.endswith(f" left, returns={course}")
+
+
 def test_the_rate_after_resuming_counts_the_steps_since():
+    job = made_up_job()
     with closing(_Bar(1000, "sac")) as bar:
-        bar.show(None, 500, None)
-        bar.show(None, 600, 1.0)
+        bar.show(job, 500, None)
+        bar.show(job, 600, 1.0)
         assert (bar._progress.n, bar._progress.initial) == (600, 500)
-        bar.show(None, 1000, 1.0)
-        assert bar._progress.postfix == "evaluation=final one under way"
-        bar.show(None, 1000, 2.0)
-        assert bar._progress.postfix == "evaluation=2.00"
+        bar.show(job, 1000, 1.0)
+        assert bar._progress.postfix == "returns=final ones under way"
+        job.history.evaluated(1000, np.array([1.5, 2.5]))
+        bar.show(job, 1000, 2.0)
+        assert bar._progress.postfix == "returns=2.00"
     trained, resumed = agent_of("a2c").learn(80), agent_of("a2c").learn(40)
     restore(resumed, take(trained))
     assert resumed.num_timesteps == resumed._num_timesteps_at_start == 80

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from jbrep.text import duration, facts, slug, table
+from jbrep.text import duration, facts, slug, sparkline, table
 
 HEADER = ("encoder", "error", "ratio", "worst feature")
 ROWS = [("dae-8", "0.01", "1.10", "velocity_x"), ("dae-12", "0.002", "1.05", "motor_angle")]
@@ -19,6 +19,12 @@ with p.Progress(total=3) as bar:
     bar.update()
     bar.set_postfix(error=1)
 """
+
+
+def test_a_curve_goes_from_the_least_to_the_largest():
+    assert sparkline([3, 10, 6.5, float("inf")], 5) == "▁█▅"
+    assert sparkline([0, 2, 8, 8, 7], 2) == "▁█"  # means of 1 and 7.67
+    assert (sparkline([5, 5], 5), sparkline([], 5)) == ("▁▁", "")
 
 
 def test_a_table_without_a_width_is_whole():

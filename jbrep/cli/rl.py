@@ -3,7 +3,7 @@
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -25,7 +25,7 @@ from jbrep.cli.base import (
 from jbrep.cli.environment import needed_task, parse_arguments, task_options
 from jbrep.cli.options import record_options
 from jbrep.rl.settings import CLASSES, TrainingSettings
-from jbrep.text import rounded
+from jbrep.text import rounded, sparkline
 
 if TYPE_CHECKING:
     from stable_baselines3.common.logger import KVWriter
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from jbrep.rl.job import Job
 
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
+_LINE = "{desc}: {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"  # on a terminal
+_NAME, _CURVE = 16, 10  # letters and blocks in it, at most
 _NOT_REPRODUCIBLE = (
     "{} is not reproducible: the same seed gives other numbers the next time, and a run that is "
     "stopped can't be resumed"
@@ -165,14 +167,18 @@ def _writers(project: str | None, job: "Job") -> "list[KVWriter]":
 
 
 class _Bar:
-    """A progress bar that starts at the step from which the run starts or resumes."""
+    """A line of progress, from the step on at which the run starts or resumes.
+
+    On a terminal it has a curve of the evaluations' mean returns, and fits 80 columns.
+    """
 
     def __init__(self, steps: int, name: str):
-        self._steps, self._name = steps, name
+        self._steps = steps
+        self._name = name if len(name) <= _NAME else f"{name[: _NAME - 3]}..."
         self._progress: Any = None
 
     def show(self, job: "Job", step: int, mean: float | None) -> None:
-        """Show the steps so far and the mean return of the last evaluation.
+        """Show the steps so far and the mean returns of the evaluations.
 
         The final evaluation can take minutes: all steps are told before it, and after it again.
         """
@@ -180,16 +186,28 @@ class _Bar:
 
         if self._progress is None:
             self._progress = Progress(
-                total=self._steps, initial=step, desc=self._name, unit="step", delay=0.5
+                total=self._steps,
+                initial=step,
+                desc=self._name,
+                unit="",
+                unit_scale=True,
+                delay=0.5,
+                bar_format=_LINE,
             )
         is_final = self._progress.n < self._steps <= step
         self._progress.update(step - self._progress.n)
-        evaluation = "-" if mean is None else rounded(mean)[0]
-        shown = "final one under way" if is_final else evaluation
-        self._progress.set_postfix(evaluation=shown, refresh=is_final)
+        shown = "final ones under way" if is_final else self._course(job.history.means)
+        self._progress.set_postfix(returns=shown, refresh=is_final)
+
+    def _course(self, means: Sequence[float]) -> str:
+        """The last mean return, after a curve of all where there are Unicode's blocks."""
+        if not means:
+            return "-"
+        curve = "" if self._progress.ascii else sparkline(means, _CURVE)
+        return f"{curve} {rounded(means[-1])[0]}".strip()
 
     def close(self) -> None:
-        """End the bar's line."""
+        """End the line."""
         if self._progress is not None:
             self._progress.close()
 

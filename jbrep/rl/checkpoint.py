@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -20,7 +21,7 @@ from jbrep.records.container import Tensors
 from jbrep.records.document import Document, document_from
 from jbrep.records.storage import exists
 from jbrep.rl.agent import parameters, restore_statistics, statistics_of
-from jbrep.rl.files import Episode, Evaluation, RunSettings, last_returns
+from jbrep.rl.files import Episode, Evaluation, RunSettings
 from jbrep.rl.settings import MAX_STEPS, Line
 
 MAX_BYTES = 1 << 34
@@ -46,14 +47,14 @@ class History:
         evaluations: of the deterministic policy.
         first_step: the training step from which this process continues.
         earlier_seconds: the wall time that earlier processes took.
-        mean: return of the last evaluation, once there was one.
+        means: returns of the evaluations.
     """
 
     episodes: list[Episode] = field(default_factory=list)
     evaluations: list[Evaluation] = field(default_factory=list)
     first_step: int = 0
     earlier_seconds: float = 0.0
-    mean: float | None = None
+    means: list[float] = field(default_factory=list)
     _started: float = field(default_factory=time.monotonic)
 
     @property
@@ -61,18 +62,23 @@ class History:
         """The wall time so far."""
         return round(self.earlier_seconds + time.monotonic() - self._started, 1)
 
+    @property
+    def mean(self) -> float | None:
+        """The mean return of the last evaluation, once there was one."""
+        return self.means[-1] if self.means else None
+
     def evaluated(self, step: int, returns: NDArray[np.float64]) -> None:
         """Record an evaluation's returns (e,) after so many steps."""
         rounded = returns.round(3).tolist()
         self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(rounded)]
-        self.mean = float(np.mean(rounded))
+        self.means.append(float(np.mean(rounded)))
 
     def resume(self, header: "CheckpointHeader") -> None:
         """Continue from an earlier process's record."""
         self.episodes, self.evaluations = header.episodes, header.evaluations
         self.earlier_seconds, self.first_step = header.seconds, header.step
-        if last := last_returns(self.evaluations):
-            self.mean = float(np.mean(last))
+        by_step = groupby(self.evaluations, lambda each: each.step)
+        self.means = [float(np.mean([e.episode_return for e in own])) for _, own in by_step]
 
 
 class StoppedError(Exception):

@@ -195,7 +195,7 @@ class Progress:
             table.add_column(name, justify="left" if name == "running" else "right")
         for cell in list(self._unfinished.values()):
             step, mean = read_progress(self._plan.folder_of(cell))
-            last = mean if step < self._plan.study.steps else "final one under way"
+            last = mean if step < self._plan.study.steps else "final ones under way"
             if step:
                 table.add_row(cell.name, f"{step:,} of {self._plan.study.steps:,}", last)
         table.caption = self._summary()
