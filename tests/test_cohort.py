@@ -161,6 +161,7 @@ FOLLOWED = [
     ("sac", "modern", {"num_envs": 2, "normalize": True}),
     ("td3", "wide", {"num_envs": 4}),
     ("sac", "modern", {"num_envs": 2, "n_steps": 3}),
+    ("td3", "modern", {"num_envs": 2, "noise": {"kind": "coloured"}}),
 ]
 
 

@@ -32,6 +32,7 @@ from jbrep.study.plan import Plan, read_plan
 from jbrep.study.results import conclude
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
+PINK = {"kind": "coloured", "beta": 1, "sigma": 0.2}
 SMALL = {"net_arch": [8], "learning_starts": 10, "train_freq": 5, "batch_size": 8}
 QUICK = {
     "task": TASK,
@@ -115,8 +116,14 @@ def test_settings_reach_the_agent():
         (
             "sac",
             {"noise": {"kind": "pink"}},
-            "noise.kind is 'pink': it must be one of normal, ornstein",
+            "noise.kind is 'pink': it must be one of normal, ornstein-uhlenbeck, coloured",
         ),
+        (
+            "sac",
+            {"noise": {"kind": "coloured", "beta": 2.5}},
+            "noise.beta is 2.5: it must be a number from 0 to 2",
+        ),
+        ("sac", {"n_steps": 0}, "n_steps is 0: it must be a whole number from 1"),
         (
             "sac",
             {"optimizer_kwargs": {"lr": 1}},
@@ -247,14 +254,14 @@ def resumed(run, folder, stop_at=40):
 @pytest.mark.parametrize(
     ("algorithm", "overrides"),
     [
-        ("tqc", SMALL),
+        ("tqc", {**SMALL, "num_envs": 2, "noise": PINK}),
         ("crossq", {**SMALL, "renorm_warmup_steps": 2}),
         ("sac", {**SMALL, "use_sde": True, "n_steps": 2}),
         (
             "ppo",
             {"n_steps": 10, "batch_size": 20, "num_envs": 2, "use_sde": True, "normalize": True},
         ),
-        ("td3", {**SMALL, "learning_rate": "linear:0.01"}),
+        ("td3", {**SMALL, "learning_rate": "linear:0.01", "noise": PINK}),
     ],
 )
 def test_a_stopped_run_resumes_to_the_same_bytes_whatever_its_settings(
@@ -267,7 +274,8 @@ def test_a_stopped_run_resumes_to_the_same_bytes_whatever_its_settings(
     for name in ("episodes.csv", "evaluations.csv", POLICY):
         whole, stopped = (tmp_path / each / name for each in ("whole", "stopped"))
         assert whole.read_bytes() == stopped.read_bytes(), name
-    sb3_class(algorithm).load(tmp_path / "whole" / POLICY_ZIP, device="cpu")
+    there = sb3_class(algorithm).load(tmp_path / "whole" / POLICY_ZIP, device="cpu")
+    assert getattr(there, "action_noise", None) is None  # whose class only jbrep has
     check_last_evaluation(tmp_path / "whole")
 
 

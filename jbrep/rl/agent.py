@@ -65,14 +65,26 @@ def training_seed(seed: int) -> int:
 
 
 def make_agent(
-    algorithm: str, hyperparameters: Hyperparameters, env: VecEnv | Spaces, seed: int
+    algorithm: str,
+    hyperparameters: Hyperparameters,
+    env: VecEnv | Spaces,
+    seed: int,
+    episode_steps: int = 1000,
 ) -> BaseAlgorithm:
-    """An untrained agent on the CPU, with its optimisers' state allocated."""
+    """An untrained agent on the CPU, with its optimisers' state allocated.
+
+    Args:
+        algorithm: a key of CLASSES.
+        hyperparameters: of the agent.
+        env: where it acts.
+        seed: of weights and of what it draws.
+        episode_steps: of the longest episode, for noise that is drawn for an episode at once.
+    """
     of_class = {name: _argument(v) for name, v in hyperparameters.algorithm_kwargs.items()}
     of_policy, of_adam = hyperparameters.policy_kwargs, hyperparameters.optimizer_kwargs
     if hyperparameters.noise:
         size = np.prod(env.action_space.shape or (), dtype=int)
-        of_class["action_noise"] = hyperparameters.noise.make(int(size))
+        of_class["action_noise"] = hyperparameters.noise.make(int(size), episode_steps)
     agent = sb3_class(algorithm)(
         "MlpPolicy",
         env,

@@ -107,6 +107,11 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
         """Whether the policy is to be evaluated after so many steps, which aren't all."""
         return step % self.evaluate_every < self.hyperparameters.num_envs and step < self.steps
 
+    @property
+    def episode_steps(self) -> int:
+        """That an agent takes in the longest episode."""
+        return self.environment.max_episode_steps
+
     def episodes_at(self, step: int) -> int:
         """Of the evaluation after so many steps."""
         return self.final_episodes if step >= self.steps else self.evaluation_episodes

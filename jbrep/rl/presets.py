@@ -7,22 +7,19 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
-from jbrep.envs.task import Array
 from jbrep.errors import InputError, choose
 from jbrep.records.record import Finite, Record, from_plain
+from jbrep.rl.noise import EXAMPLES, Noise, NormalNoise, OrnsteinUhlenbeckNoise
 from jbrep.rl.settings import CLASSES, MODERN, PAPER, WIDE
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
-    from stable_baselines3.common.noise import ActionNoise
 
 MAX_LAYERS, MAX_UNITS = 8, 1024  # of a policy's network
 MAX_ENVS = 4096
 LINEAR = "linear:"  # before the number from which a schedule falls to 0
-_DT = 1e-2  # stable-baselines3's unit of time for a step
 
 Layers = Annotated[
     tuple[Annotated[int, Meta(ge=1, le=MAX_UNITS)], ...], Meta(max_length=MAX_LAYERS)
@@ -35,49 +32,6 @@ NetArch = Annotated[
         "of such lists"
     ),
 ]
-
-
-class NormalNoise(Record, frozen=True, tag_field="kind", tag="normal"):
-    """Independent Gaussian noise on each number of an action, with mean 0."""
-
-    sigma: Finite
-
-    def make(self, size: int) -> "ActionNoise":
-        """The noise on actions of so many numbers, as a stable-baselines3 object."""
-        from stable_baselines3.common.noise import NormalActionNoise
-
-        return NormalActionNoise(np.zeros(size), np.full(size, self.sigma))
-
-    def after(self, previous: Array, generator: np.random.RandomState) -> Array:
-        """The next noise as that object draws it; zeros come before an episode's first."""
-        return generator.normal(0, self.sigma, previous.shape)
-
-
-class OrnsteinUhlenbeckNoise(Record, frozen=True, tag_field="kind", tag="ornstein-uhlenbeck"):
-    """Noise that drifts back to its mean, starting from 0 in each episode."""
-
-    mean: Finite
-    sigma: Finite
-    theta: Finite
-
-    def make(self, size: int) -> "ActionNoise":
-        """As for `NormalNoise`; stable-baselines3 takes a step for 0.01 units of time."""
-        from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
-
-        mean, sigma = np.full(size, self.mean), np.full(size, self.sigma)
-        return OrnsteinUhlenbeckActionNoise(mean, sigma, self.theta)
-
-    def after(self, previous: Array, generator: np.random.RandomState) -> Array:
-        """As for `NormalNoise`."""
-        pull = self.theta * (self.mean - previous) * _DT
-        return previous + pull + self.sigma * np.sqrt(_DT) * generator.normal(size=previous.shape)
-
-
-Noise = NormalNoise | OrnsteinUhlenbeckNoise
-_NOISES = (
-    'none, {"kind": "normal", "sigma": 0.1}, or {"kind": "ornstein-uhlenbeck", "mean": 0, '
-    '"sigma": 0.3, "theta": 0.15}'
-)
 
 
 class _OfAdam(Record, frozen=True):
@@ -108,7 +62,7 @@ class Hyperparameters(Record, frozen=True):
     net_arch: NetArch
     algorithm_kwargs: Mapping[str, Any]
     num_envs: Annotated[int, Meta(ge=1, le=MAX_ENVS)] = 1
-    noise: Annotated[Noise | None, Meta(title=_NOISES)] = None
+    noise: Annotated[Noise | None, Meta(title=EXAMPLES)] = None
     optimizer_kwargs: Mapping[str, Any] = {}
     policy_kwargs: Mapping[str, Any] = msgspec.field(
         default_factory=lambda: {"activation_fn": "relu"}

@@ -10,13 +10,18 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
-from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+from stable_baselines3.common.noise import (
+    ActionNoise,
+    OrnsteinUhlenbeckActionNoise,
+    VectorizedActionNoise,
+)
 from stable_baselines3.common.vec_env import VecMonitor
 
 from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
 from jbrep.records.container import Tensors
 from jbrep.rl import checkpoint
+from jbrep.rl.action_noise import ColouredActionNoise
 from jbrep.rl.agent import make_agent, make_env, training_seed, unchecked_distributions
 from jbrep.rl.checkpoint import (
     ACTIONS_NOT_FINITE,
@@ -31,6 +36,10 @@ from jbrep.rl.files import Episode, RunRecord
 from jbrep.rl.job import Ended, Job, Session
 from jbrep.rl.policy_file import acting
 
+_MEMORIES: dict[type, str] = {  # of noises that depend on what was drawn before
+    OrnsteinUhlenbeckActionNoise: "noise_prev",
+    ColouredActionNoise: "memory",
+}
 _UNSCALED = "_last_original_obs"  # before it was normalised
 _EXPLORATION = ("exploration_mat", "exploration_matrices")
 _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -52,7 +61,7 @@ def _train(job: Job, session: Session) -> RunRecord:
     job.keep_encoder()
     seed = training_seed(run.seed)
     env = make_env(run.task, chosen.num_envs, seed, job.encoder, chosen.normalize)
-    agent = make_agent(settings.algorithm, chosen, env, run.seed)
+    agent = make_agent(settings.algorithm, chosen, env, run.seed, settings.episode_steps)
     env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
     job.prepare(agent, session.writers)
     failure = _learn(agent, run.steps, follower)
@@ -191,8 +200,9 @@ def _arrays(agent: BaseAlgorithm) -> dict[str, tuple[object, str]]:
     places: dict[str, tuple[object, str]] = {f"rollout.{name}": (agent, name) for name in last}
     if agent.get_vec_normalize_env():
         places[_UNSCALED] = agent, _UNSCALED
-    for i, noise in enumerate(_drifting_noises(agent)):
-        places[f"noise.{i}"] = noise, "noise_prev"
+    for i, noise in enumerate(_noises(agent)):
+        if memory := _MEMORIES.get(type(noise)):
+            places[f"noise.{i}"] = noise, memory
     return places | {
         "returns": (monitor, "episode_returns"),
         "lengths": (monitor, "episode_lengths"),
@@ -233,8 +243,7 @@ def _transitions(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
     return {name: getattr(buffer, name)[:size] for name in _TRANSITIONS}
 
 
-def _drifting_noises(agent: BaseAlgorithm) -> list[OrnsteinUhlenbeckActionNoise]:
-    """The action noise of each lane, where it depends on its last value."""
+def _noises(agent: BaseAlgorithm) -> list[ActionNoise]:
+    """The action noise of each lane, if there is any."""
     noise = getattr(agent, "action_noise", None)
-    noises = noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]
-    return [n for n in noises if isinstance(n, OrnsteinUhlenbeckActionNoise)]
+    return noise.noises if isinstance(noise, VectorizedActionNoise) else [noise] if noise else []

@@ -55,7 +55,7 @@ def _alone(jobs: Sequence[Job]) -> tuple[float, BaseAlgorithm]:
     (job,) = jobs
     run, chosen = job.run, job.settings.hyperparameters
     env = make_env(run.task, chosen.num_envs, 0, job.encoder, chosen.normalize)
-    agent = make_agent(run.learner.algorithm, chosen, env, 0)
+    agent = make_agent(run.learner.algorithm, chosen, env, 0, job.settings.episode_steps)
     learned = _seconds(lambda: agent.learn(_MIN_STEPS))  # whole rollouts, so at least one
     return learned / agent.num_timesteps, agent
 

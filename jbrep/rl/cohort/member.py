@@ -23,11 +23,12 @@ from jbrep.rl.agent import Spaces, make_agent
 from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE, Snapshot, without
 from jbrep.rl.files import Episode
 from jbrep.rl.job import Job
+from jbrep.rl.noise import Memory, Noise, beginning
 from jbrep.rl.normalization import normalized
-from jbrep.rl.presets import Noise
 
 Indices = NDArray[np.int64]
 _LOG_EVERY = 4  # episodes, as in stable-baselines3
+_NOISE = "noise."  # begins the names of what lanes remember of it
 _RANDOM = "random."  # begins the names of what its random numbers come from
 
 
@@ -56,7 +57,8 @@ class Member:
         normalizing = normalized(env) if chosen.normalize else env
         self.agent: Any = make_agent(settings.algorithm, small, normalizing, run.seed)
         self._normalizer: VecNormalize | None = self.agent.get_vec_normalize_env()
-        self.random = Random(self.agent.action_space, chosen.num_envs, chosen.noise)
+        steps = settings.episode_steps
+        self.random = Random(self.agent.action_space, chosen.num_envs, chosen.noise, steps)
         self.agent._total_timesteps = run.steps
         self.agent.ep_info_buffer = deque(maxlen=self.agent._stats_window_size)
         self.agent.ep_success_buffer = deque()
@@ -154,15 +156,18 @@ class Random:
         actions: the agent's space of actions, from which random ones are drawn.
         lanes: of the run.
         noise: on actions.
+        steps: of the longest episode.
     """
 
-    def __init__(self, actions: spaces.Space[Any], lanes: int, noise: Noise | None):
+    def __init__(self, actions: spaces.Space[Any], lanes: int, noise: Noise | None, steps: int):
         self._actions, self._lanes, self._noise = actions, lanes, noise
         self._numpy = np.random.RandomState()
         self._numpy.set_state(np.random.get_state())  # noqa: NPY002 - stable-baselines3 seeded it
         self._torch = torch.Generator()
         self._torch.set_state(torch.get_rng_state())
-        self._last_noise = np.zeros((lanes, *(actions.shape or ())))
+        (self._size,) = actions.shape or ()
+        self._steps = steps
+        self._memory: Memory = beginning(lanes, self._size)
 
     def actions(self) -> Float32:
         """Uniformly distributed ones, (lanes, k)."""
@@ -171,12 +176,12 @@ class Random:
     def noise(self) -> Float32:
         """Noise on actions that are scaled to [-1, 1], (lanes, k)."""
         if self._noise:
-            self._last_noise = self._noise.after(self._last_noise, self._numpy)
-        return self._last_noise.astype(np.float32)
+            self._memory = self._noise.after(self._memory, self._steps, self._numpy)
+        return np.array([each[0] for each in self._memory], np.float32)
 
     def reset_noise(self, lane: int) -> None:
-        """Let a lane's noise start at zero again."""
-        self._last_noise[lane] = 0
+        """Let a lane's noise start as in its first episode."""
+        (self._memory[lane],) = beginning(1, self._size)
 
     def sample_indices(self, filled: int, size: int) -> tuple[Indices, Indices]:
         """The steps and lanes of a batch from a replay buffer with so many steps, (size,) each."""
@@ -192,7 +197,8 @@ class Random:
         """What `restore` takes: tensors, and plain JSON."""
         kind, keys, *rest = self._numpy.get_state()
         torchs, actions = self._torch.get_state(), self._actions.np_random.bit_generator.state
-        tensors = {"numpy": np.asarray(keys), "torch": torchs.numpy(), "noise": self._last_noise}
+        tensors = {"numpy": np.asarray(keys), "torch": torchs.numpy()}
+        tensors |= {f"{_NOISE}{lane}": each for lane, each in enumerate(self._memory)}
         return tensors, {"numpy": (kind, *rest), "actions": actions}
 
     def restore(self, tensors: Tensors, counters: Mapping[str, Any]) -> None:
@@ -200,5 +206,5 @@ class Random:
         kind, *rest = counters["numpy"]
         self._numpy.set_state((kind, tensors["numpy"], *rest))
         self._torch.set_state(torch.from_numpy(tensors["torch"]))
-        self._last_noise = tensors["noise"].copy()
+        self._memory = [tensors[f"{_NOISE}{lane}"] for lane in range(self._lanes)]
         self._actions.np_random.bit_generator.state = counters["actions"]
