@@ -15,7 +15,7 @@ from test_study import TOML
 from jbrep.cli import main
 from jbrep.cli.base import COUNT
 from jbrep.encoders import find, load, save
-from jbrep.encoders.shipped import full
+from jbrep.encoders.shipped import unlearned
 from jbrep.envs import describe
 from jbrep.evaluate.table import SCALARS, Diagnosed, write_diagnostics
 from jbrep.jitterbug.tasks import TASKS
@@ -200,7 +200,7 @@ def test_the_encoders_that_ship_are_listed(monkeypatch, tmp_path):
     folder = tmp_path / "face_direction"
     folder.mkdir()
     task = describe("face_direction")
-    save(full(task), folder / "full.safetensors")
+    save(unlearned(task), folder / "full.safetensors")
     for name in ("pca-8", "pca-4"):
         shutil.copy(Path("jbrep/encoders/shipped/face_direction", f"{name}.safetensors"), folder)
     given = {"forward": 0.512, "rewarded": 0.25, "reward": None}
@@ -230,7 +230,10 @@ def test_help_says_which_kind_takes_which_setting_in_80_columns(monkeypatch):
     said = " ".join(text.split())
     for name, method in METHODS.items():
         assert f"{name} {method.words()}" in said
-    for line in ("--lags VALUE... Steps from now to later, one or several. [slow", "[all but full"):
+    for line in (
+        "--lags VALUE... Steps from now to later, one or several. [slow",
+        "--on VALUE What is encoded:",
+    ):
         assert line in said
     assert "[default: extrema]" in said
 

@@ -10,6 +10,7 @@ import gymnasium
 import pytest
 
 from jbrep.cli import main
+from jbrep.coordinates import make_coordinates
 from jbrep.encoders.header import EncoderHeader
 from jbrep.envs import describe
 from jbrep.records.keys import key_table
@@ -65,10 +66,17 @@ def test_the_studies_are_studies(block):
 def test_the_features_are_those_of_the_environment_shown(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(*ENVIRONMENT.values, "block", "exec"), {})
-    (features,) = FEATURES
-    (tmp_path / "features.toml").write_text(features.values[0])
-    task = describe("Cart-v0", features=tmp_path / "features.toml")
+    cart, turning = sorted((block.values[0] for block in FEATURES), key=lambda text: "kind" in text)
+    path = tmp_path / "features.toml"
+    path.write_text(cart)
+    task = describe("Cart-v0", features=path)
     assert [(f.name, f.unit) for f in task.features] == [("position", "m"), ("speed", "m/s")]
+    path.write_text(turning + cart[cart.rindex("[[features]]") :])  # the heading in place of x
+    assert make_coordinates(describe("Cart-v0", features=path), "coordinates").names == (
+        "heading.cos",
+        "heading.sin",
+        "speed",
+    )
     assert (task.reward_high, task.timestep, task.reproducible) == (0, 0.1, True)
 
 

@@ -261,8 +261,8 @@ def forged(encoder, path, **changes):
         ({"header": {"environment": 7}}, "environment is 7: it must be a table"),
         ({"header": {"environment": {}}}, "environment.id is missing"),
         ({"header": {"task": "Ant-v5"}}, "unknown task: it must be one of kind, name, environment"),
-        ({"header": {"format_version": 3}}, "has version 3 .*: this jbrep reads version 4 alone"),
-        ({"header": {"format_version": 5}}, "has version 5"),
+        ({"header": {"format_version": 4}}, "has version 4 .*: this jbrep reads version 5 alone"),
+        ({"header": {"format_version": 6}}, "has version 6"),
         ({"header": {"format_version": -1}}, "its format version is -1"),
         ({"header": {"format": "other"}}, "not a jbrep encoder file"),
     ],
@@ -278,7 +278,7 @@ def test_a_forgery_is_refused_and_the_tensor_named(encoder, changes, message, tm
         ({"name": "My encoder"}, "name is 'My encoder': it must be lower-case letters"),
         ({"metrics": {"held_out_mse": float("nan")}}, "all numbers finite"),
         ({"data": {"rows": object()}}, "it must be plain JSON"),
-        ({"angles": ("wing",)}, "wing is no feature of face_direction"),
+        ({"keep": ("velocity_x",) * 2}, "what it keeps must be different features"),
     ],
 )
 def test_a_header_that_no_file_can_have_is_refused(changes, message):

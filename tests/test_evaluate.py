@@ -316,8 +316,8 @@ def test_every_task_has_its_quantities():
 def test_any_other_robots_truth_is_every_feature():
     features = [
         make_feature("height", "m", -1, 1, bounded=True),
-        make_feature("yaw", "rad", -np.pi, np.pi, bounded=True),
-        make_feature("turns", "rad", -np.pi, np.pi),
+        make_feature("yaw", "rad", -np.pi, np.pi, bounded=True, kind="angle"),
+        make_feature("turns", "rad", -np.pi, np.pi, kind="angle"),
         make_feature("knee", "rad", -0.5, 0.5, bounded=True),
         make_feature("unknown"),
     ]

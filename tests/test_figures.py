@@ -318,12 +318,12 @@ def test_diagrams_have_the_real_sizes(plots):
 def test_diagrams_show_what_any_method_does():
     slow = label_of(
         *(describe("face_direction"), "slow", [(8, "linear")], [(17, "linear")], "slow", 9),
-        **{"latent": 8, "lags": [10], "scaling": "standard", "angles": True},
+        **{"latent": 8, "lags": [10], "scaling": "standard", "on": "angles"},
         keep=["angle_to_target"],
     )
     diagrams = study_plots(None, [], {}, {"x": slow})
     of_system, of_layers = (plot.rows for plot in diagrams)
-    assert ("observation", "16 features, standard scaling, angles as sine and cosine") in of_system
+    assert ("observation", "16 features, angles, standard scaling") in of_system
     assert ("latent", "9 numbers") in of_system  # eight and the one that passes around
     assert of_layers[0] == ("slow", "encoder", 0, 8, "linear")
     (axes,) = drawn(diagrams[1]).axes

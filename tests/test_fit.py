@@ -26,6 +26,7 @@ from jbrep.dataset.scaling import SCALINGS
 from jbrep.encoders import load
 from jbrep.errors import InputError
 from jbrep.methods import fit
+from jbrep.methods.controls import Full
 from jbrep.methods.fit import Fitter
 from jbrep.methods.held_out import ratio_to_pca
 from jbrep.methods.registry import METHODS, name_of, read_name
@@ -42,7 +43,7 @@ RECONSTRUCTING = ("full", "pca", "random", "untrained", "ae", "dae")
 def how(kind="dae", **changes):
     """Settings of a short training, as far as that method takes them."""
     short = {"latent": 4, "epochs": 3, "batch_size": 500, "features": "velocity_*"}
-    short |= {"latent": 20} if kind == "noise" else {}
+    short |= {"latent": 20} if kind in ("noise", "ofe") else {}
     short |= changes
     return {name: value for name, value in short.items() if METHODS[kind].takes(name)}
 
@@ -55,13 +56,17 @@ def test_every_kind_has_the_error_that_its_file_says(data, kind, tmp_path):
     assert fitted.path.name == f"{encoder.name}.safetensors"
     assert encoder.name.startswith(kind)
     rows = data.dataset["observation"][data.test]
-    lost = (encoder.decode(encoder.encode(rows)) - rows) / data.scaler.half_width
-    expected = np.mean(lost.astype(float) ** 2)
-    assert encoder.header.metrics["held_out_mse"] == pytest.approx(expected, rel=1e-5)
+    error = (encoder.decode(encoder.encode(rows)) - rows) / data.scaler.half_width
+    if kind == "symmetry":  # which leaves out where the robot is
+        assert encoder.header.metrics["held_out_mse"] < 1e-6
+    else:
+        expected = np.mean(error.astype(float) ** 2)
+        assert encoder.header.metrics["held_out_mse"] == pytest.approx(expected, rel=1e-5)
     assert encoder.header.data["fingerprint"] == data.dataset.manifest.fingerprint
     assert encoder.header.data["train_rows"] == 4000
     own = set(METHODS[kind].__struct_fields__) - set(USUAL)
-    assert set(encoder.header.training) == own | ({"codes"} if kind == "forward" else set())
+    unusual = {"forward": {"codes"}, "coordinates": {"on"}, "symmetry": {"on"}}
+    assert set(encoder.header.training) == own | unusual.get(kind, set())
     bytes_before = fitted.path.read_bytes()
     again = Fitter(data, tmp_path).fit(kind, **how(kind))
     assert not again.is_new
@@ -75,13 +80,15 @@ def test_every_method_is_registered():
                 assert METHODS[method.name] is method
 
 
-@pytest.mark.parametrize("method", [m for m in METHODS.values() if not m.takes("features")])
+@pytest.mark.parametrize(
+    "method", [m for m in METHODS.values() if not m.takes("features") and not issubclass(m, Full)]
+)
 def test_a_name_says_the_settings_that_it_was_made_of(method):
     choices = {
         "latent": (8,),
         "architecture": ("paper", "deep", "64x32"),
         "scaling": SCALINGS,
-        "angles": (False, True),
+        "on": ("observation", "angles", "symmetry"),
         "codes": ("raw", "standard", "white"),
     }
     taken = {name: values for name, values in choices.items() if method.takes(name)}
@@ -335,7 +342,9 @@ def test_mistakes_are_named(data, tmp_path):
         for latent in (16, 17):
             with pytest.raises(InputError, match=f"latent size is {latent}: .* from 1 to 15"):
                 fitter.fit(kind, latent=latent)
-    with pytest.raises(InputError, match="unknown kind 'vea': choose one of full, subset"):
+    with pytest.raises(
+        InputError, match="unknown kind 'vea': choose one of full, coordinates, symmetry, subset"
+    ):
         fitter.fit("vea")
     with pytest.raises(InputError, match="without noise is a plain autoencoder: use the kind ae"):
         fitter.fit("dae", **how(noise=0))

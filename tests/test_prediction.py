@@ -9,8 +9,8 @@ import torch
 from sklearn.metrics import r2_score
 from wide import make_feature, make_task
 
+from jbrep.coordinates import wrapped
 from jbrep.dataset import Column, Dataset, ScaledDataset
-from jbrep.dataset.scaling import wrapped
 from jbrep.encoders import Encoder, Layer
 from jbrep.encoders.header import EncoderHeader
 from jbrep.errors import InputError
@@ -266,7 +266,7 @@ def test_regressions_side_by_side_are_of_their_own_values():
 
 
 def test_angles_change_by_all_that_they_turn():
-    spin = make_feature("spin", "rad", -np.pi, np.pi, True)
+    spin = make_feature("spin", "rad", -np.pi, np.pi, True, "angle")
     task = make_task([spin, make_feature("place")], "Top-v0")
     turned = np.array([0, 1, 2.5, 4, 7, 6, 4])
     rows = np.stack((wrapped(turned + 3), turned), axis=1).astype(np.float32)

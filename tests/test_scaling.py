@@ -1,4 +1,4 @@
-"""Scalings, angles as sine and cosine, limits and features around the layers, in every library."""
+"""Scalings, coordinates, limits and features around the layers, in every library."""
 
 import json
 
@@ -8,6 +8,7 @@ import pytest
 import torch
 from wide import make_feature, make_task
 
+from jbrep.coordinates import make_coordinates, wrapped
 from jbrep.dataset import Column, Scaler
 from jbrep.dataset.scaling import fit_scaler
 from jbrep.encoders import Encoder, Layer, load, save
@@ -77,23 +78,32 @@ def layer(inputs, outputs, activation):
     return Layer(weight.astype(np.float32), np.float32([0.1] * outputs), activation)
 
 
-def encoder(angles=ANGLES, clip=1.5, keep=("angle_to_target", "velocity_x"), layers=True):
+def encoder(on="angles", clip=1.5, keep=("angle_to_target", "velocity_x"), layers=True):
     """From 16 features to a code of 3 and what is kept, and back."""
-    low = np.float32([feature.low for feature in TASK.features])
-    high = np.float32([feature.high for feature in TASK.features])
-    low[15] += 2  # so that the middle of an angle isn't 0
-    scaler = Scaler(low, high, angles, clip)
+    coordinates = make_coordinates(TASK, on)
+    features = coordinates.features if coordinates else TASK.features
+    ends = np.float32([(feature.low, feature.high) for feature in features]).T
+    scaler = Scaler(*ends, coordinates, clip)
     metrics = {"held_out_mse": 0.1}
     header = EncoderHeader(kind="dae", name="it-3", environment=TASK, metrics=metrics)
     parts = (layer(scaler.size, 3, "tanh"),), (layer(3, scaler.size, "tanh"),)
     return Encoder(header, scaler, *(parts if layers else ((), ())), keep if layers else ())
 
 
+def difference(rows, others):
+    """In half widths, of angles the shorter way round."""
+    off = (rows - others).astype(np.float64)
+    off[:, ANGLES] = wrapped(off[:, ANGLES])
+    return np.abs(off / TASK.unscale(np.ones(16)).clip(0.05))
+
+
 VARIANTS = (
     {},
     {"keep": ()},
-    {"angles": (), "clip": None},
-    {"angles": (13,), "clip": None, "layers": False},
+    {"on": "observation", "clip": None},
+    {"clip": None, "layers": False},
+    {"on": "coordinates", "clip": None, "keep": ("velocity", "motor_angle.sin")},
+    {"on": "symmetry", "clip": None, "layers": False},
 )
 
 
@@ -104,8 +114,9 @@ def test_numpy_torch_and_onnx_agree_beyond_the_ranges_too(changes, tmp_path):
     again = load(tmp_path / "it")
     assert again.fingerprint == it.fingerprint
     assert again.header == it.header
-    rows = (3 * it.scaler.half_width * RANDOM.normal(size=(500, 16))).astype(np.float32)
-    rows[0], rows[1, list(ANGLES)] = 0, (np.pi, -np.pi / 2)
+    rows = TASK.unscale(3 * RANDOM.normal(size=(500, 16))).astype(np.float32)
+    rows[:, 3:7] /= np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
+    rows[1, list(ANGLES)] = (np.pi, -np.pi / 2)
     code, back = it.encode(rows), it.decode(it.encode(rows))
     given = torch.from_numpy(rows).requires_grad_()
     there = again.encode(given)
@@ -117,15 +128,14 @@ def test_numpy_torch_and_onnx_agree_beyond_the_ranges_too(changes, tmp_path):
     for theirs in (there.detach().numpy(), latent):
         np.testing.assert_allclose(theirs, code, rtol=1e-5, atol=1e-5)
     for theirs in (again.decode(there).detach().numpy(), reconstruction):
-        off = np.abs(it.scaler.error(theirs, back))
-        assert off.max() < 1e-4
-    if it.header.angles or it.kept:
+        assert difference(theirs, back).max() < 1e-4
+    if it.header.coordinates or it.kept:
         with pytest.raises(InputError, match=r"(Gather|Clip) \(.*\)"):
             convert(tmp_path / "it.onnx", TASK, None, "mine")
 
 
 def test_atan2_of_onnx_in_every_direction(tmp_path):
-    it = encoder(angles=(13,), clip=None, layers=False)
+    it = encoder(clip=None, layers=False)
     export(it, tmp_path / "it.onnx")
     session = onnxruntime.InferenceSession(tmp_path / "it.onnx")
     rows = np.zeros((4001, 16), np.float32)
@@ -136,15 +146,15 @@ def test_atan2_of_onnx_in_every_direction(tmp_path):
 
 
 def test_an_observation_survives_sine_and_cosine_and_what_is_kept_survives_the_layers():
-    rows = (encoder().scaler.half_width * RANDOM.uniform(-1, 1, (200, 16))).astype(np.float32)
+    rows = TASK.unscale(RANDOM.uniform(-1, 1, (200, 16))).astype(np.float32)
     whole = encoder(clip=None, layers=False)
     assert whole.latent_size == 18
-    assert np.abs(whole.scaler.error(whole.decode(whole.encode(rows)), rows)).max() < 1e-5
+    assert difference(whole.decode(whole.encode(rows)), rows).max() < 1e-5
     it = encoder()
     assert it.latent_size == 3 + 3  # an angle is two numbers
     code = it.encode(rows)
     np.testing.assert_array_equal(code[:, 3:], it.scaler.scale(rows)[:, it.kept])
-    lost = np.abs(it.scaler.error(it.decode(code), rows))
+    lost = difference(it.decode(code), rows)
     assert lost[:, [7, 15]].max() < 1e-5
     assert lost[:, 0].max() > 0.1
     many = rows * np.float32(1e4)
@@ -154,17 +164,16 @@ def test_an_observation_survives_sine_and_cosine_and_what_is_kept_survives_the_l
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"angles": ["wing"]}, "wing is no feature of face_direction"),
-        ({"angles": ["motor_angle", "motor_angle"]}, "angles must be different features"),
-        ({"angles": "motor_angle"}, "angles is 'motor_angle': it must be a list of text"),
-        ({"angles": []}, r"tensor encoder.0.weight has shape \(3, 18\), expected \(3, 16\)"),
-        ({"angles": ["motor_angle"]}, "tensor encoder.0.weight has shape"),
+        ({"coordinates": [["a", "circle", ["wing"], True, 0.0]]}, "a takes wing, which face_dir"),
+        ({"coordinates": "motor_angle"}, "coordinates is 'motor_angle': it must be a list"),
+        ({"coordinates": []}, r"tensor low has shape \(18,\), expected \(16,\)"),
+        ({"coordinates": [["a", "same", ["velocity_x"], True, 0.0]]}, "tensor low has shape"),
         ({"clip": 0.5}, "clip is 0.5: it must be a number from 1 to 1"),
         ({"clip": True}, "clip is True: it must be a number"),
         ({"clip": "1"}, "clip is '1': it must be a number"),
         ({"clip": 10**400}, "clip is 1000.*: it must be a number"),
-        ({"keep": ["wing"]}, "wing is no feature"),
-        ({"keep": ["velocity_x"] * 2}, "its keep must be different features"),
+        ({"keep": ["wing"]}, "no feature 'wing': face_direction has"),
+        ({"keep": ["velocity_x"] * 2}, "what it keeps must be different features"),
         ({"keep": [1]}, r"keep\[0\] is 1: it must be text"),
     ],
 )
@@ -178,6 +187,6 @@ def test_a_header_that_contradicts_its_tensors_is_one_line(changes, message, tmp
 
 
 def test_a_limit_is_part_of_the_fingerprint():
-    plain, limited = (encoder(angles=(), clip=clip, keep=()) for clip in (None, 2.0))
+    plain, limited = (encoder(on="observation", clip=clip, keep=()) for clip in (None, 2.0))
     assert (plain.header.clip, limited.header.clip) == (None, 2)
     assert limited.fingerprint != plain.fingerprint

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from jbrep.coordinates import make_coordinates
 from jbrep.encoders import Encoder
 from jbrep.encoders.layers import run
 from jbrep.errors import InputError
 from jbrep.methods.fit import Fitter
+from jbrep.methods.held_out import lost as lost_rows
 from jbrep.methods.linear import dense
 from jbrep.methods.shape import complete
 from jbrep.training.method import Made
@@ -60,16 +62,18 @@ def test_a_unit_that_says_nothing_can_be_scaled_but_not_whitened(data, rows, mad
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize(("kind", "angles"), [("pca", False), ("slow", True), ("dae", False)])
-def test_what_is_kept_passes_exactly_and_the_method_never_saw_it(data, kind, angles, tmp_path):
-    keep = ("angle_to_target", "velocity_x")
+@pytest.mark.parametrize(
+    ("kind", "on"), [("pca", "observation"), ("slow", "angles"), ("dae", "observation")]
+)
+def test_what_is_kept_passes_exactly_and_the_method_never_saw_it(data, kind, on, tmp_path):
+    keep, angles = ("angle_to_target", "velocity_x"), 2 * (on == "angles")
     how = {"epochs": 1} if kind == "dae" else {}
     fitted = Fitter(data, tmp_path).fit(
-        kind, latent=4, keep="velocity_x,angle_to_target", angles=angles, **how
+        kind, latent=4, keep="velocity_x,angle_to_target", on=on, **how
     )
     it: Encoder = fitted.encoder
     assert set(it.header.keep) == set(keep)
-    assert it.latent_size == 4 + 2 + angles
+    assert it.latent_size == 4 + 2 + angles // 2
     observed = data.dataset["observation"][data.test]
     code, scaled = it.encode(observed), it.scaler.scale(observed)
     np.testing.assert_array_equal(code[:, 4:], scaled[:, it.kept])
@@ -77,11 +81,11 @@ def test_what_is_kept_passes_exactly_and_the_method_never_saw_it(data, kind, ang
     other[:, [7, 15]] += 0.5
     np.testing.assert_array_equal(it.encode(other)[:, :4], code[:, :4])
     assert not it.encoder[0].weight[:, it.kept].any()
-    lost = it.scaler.error(it.decode(code), observed)
+    lost = lost_rows(it, observed, data)
     assert np.abs(lost[:, [7, 15]]).max() < 1e-5
-    rest = data.rescaled(angles=angles, without=keep)
-    assert len(rest.names) == rest.size == 14 + angles
-    assert not set(rest.names) & set(keep)
+    rest = data.rescaled(coordinates=make_coordinates(data.task, on), without=keep)
+    assert len(rest.names) == rest.size == 14 + angles // 2
+    assert not any(name.startswith(keep) for name in rest.names)
     if kind == "pca":
         values = np.linalg.eigvalsh(rest.moments.covariance)[::-1]
         variances = np.linalg.eigvalsh(

@@ -167,7 +167,7 @@ def test_the_linear_forward_code_is_reduced_rank_regression(data, weights):
 
 @pytest.mark.parametrize("kind", ["slow", "vamp", "linear-forward"])
 def test_the_file_has_the_spectrum(data, kind, tmp_path):
-    encoder = Fitter(data, tmp_path).fit(kind, latent=4, angles=True).encoder
+    encoder = Fitter(data, tmp_path).fit(kind, latent=4, on="angles").encoder
     spectrum = encoder.header.metrics["spectrum"]
     assert encoder.name == f"{kind}-angles-4"
     assert len(spectrum) == 18

@@ -35,9 +35,11 @@ def test_a_subset_is_the_scaled_features_in_order(data, fit, observations):
 
 
 def test_a_subset_of_an_angle_is_its_sine_and_cosine(fit, observations):
-    code = fit("subset", features="motor_angle", angles=True).encode(observations)
+    code = fit("subset", features="motor_angle", on="angles", scaling="nominal").encode(
+        observations
+    )
     angle = observations[:, 13]
-    np.testing.assert_allclose(code, np.column_stack((np.sin(angle), np.cos(angle))), atol=1e-6)
+    np.testing.assert_allclose(code, np.column_stack((np.cos(angle), np.sin(angle))), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +50,7 @@ def test_a_subset_of_an_angle_is_its_sine_and_cosine(fit, observations):
         ("subset", {"features": "position_x,speed_*"}, r"no feature 'speed_\*'"),
         ("subset", {"features": "position_*", "latent": 3}, "subset takes no latent"),
         ("noise", {"latent": 16}, "latent size is 16: with 16 features .* at least 17"),
-        ("noise", {"latent": 18, "angles": True}, "with 18 features .* at least 19"),
+        ("noise", {"latent": 18, "on": "angles"}, "with 18 features .* at least 19"),
         ("noise", {"latent": 20, "keep": "position_x"}, "leave keep out"),
     ],
 )

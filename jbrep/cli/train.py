@@ -69,6 +69,8 @@ class _Making(Variadic):
         said = {", ".join(each): default for default, each in kinds.items()}
         if len(kinds) == 1 and len(others) <= _FEW:
             said = {f"all but {', '.join(others)}" if others else "default": next(iter(kinds))}
+        elif not others and len(most := max(kinds.values(), key=len)) > _FEW:
+            said = {"others" if each == most else ", ".join(each): d for d, each in kinds.items()}
         parts = [f"{who}: {default}" if default else who for who, default in said.items()]
         return f"  [{'; '.join(parts)}]"
 

@@ -50,7 +50,7 @@ class Manifest(Document, frozen=True, kw_only=True):
     """What has been committed to a data set's folder."""
 
     format: ClassVar[str] = "jbrep data set"
-    format_version: ClassVar[int] = 2
+    format_version: ClassVar[int] = 3
     max_bytes: ClassVar[int] = 1 << 25  # each shard takes 1.5 kB of it
     indent: ClassVar[int] = 1
 

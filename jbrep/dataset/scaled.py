@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from jbrep.coordinates import Coordinates
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import EXTREMA, fit_scaler
+from jbrep.envs.task import Feature
 from jbrep.errors import InputError
 
 
@@ -60,7 +62,7 @@ class ScaledDataset:
     def rescaled(
         self,
         scaling: str = EXTREMA,
-        angles: bool = False,
+        coordinates: Coordinates | None = None,
         clip: float | None = None,
         without: Collection[str] = (),
     ) -> "ScaledDataset":
@@ -68,23 +70,19 @@ class ScaledDataset:
 
         Args:
             scaling: a key of jbrep.dataset.scaling.SCALINGS.
-            angles: whether angles become sine and cosine.
+            coordinates: of the observations, in their place; None for these themselves.
             clip: scaled values stay within [-clip, clip]; None for no limit.
-            without: features that rows don't have.
+            without: features or coordinates that rows don't have, or groups of such coordinates.
 
         Raises:
             InputError: the task has no usual ranges, or no such feature.
         """
-        names = self.task.feature_names
-        if unknown := [name for name in without if name not in names]:
-            raise InputError(f"no feature {unknown[0]!r}: {self.task.name} has {', '.join(names)}")
         other = copy(self)
         other.__dict__.pop("moments", None)
         column = self.dataset["observation"]
-        other.scaler = fit_scaler(scaling, self.task, column, self.train, angles, clip)
-        other.used = np.array(
-            [i for i, name in enumerate(other.scaled_names) if name not in without], int
-        )
+        other.scaler = fit_scaler(scaling, self.task, column, self.train, coordinates, clip)
+        left_out = set(other.scaler.places(without, self.task))
+        other.used = np.array([i for i in range(other.scaler.size) if i not in left_out], int)
         return other
 
     def __repr__(self) -> str:
@@ -96,15 +94,15 @@ class ScaledDataset:
         return len(self.used)
 
     @property
-    def scaled_names(self) -> tuple[str, ...]:
-        """The feature that each scaled number is of; an angle comes twice."""
-        names = self.task.feature_names
-        return names + tuple(names[i] for i in self.scaler.angles)
+    def features(self) -> tuple[Feature, ...]:
+        """What each number of a scaled row is: a feature of the observation, or a coordinate."""
+        every = self.scaler.features(self.task)
+        return tuple(every[i] for i in self.used)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The feature that each number of a scaled row is of."""
-        return tuple(self.scaled_names[i] for i in self.used)
+        """The names of these."""
+        return tuple(feature.name for feature in self.features)
 
     @property
     def constant_features(self) -> tuple[str, ...]:
@@ -119,7 +117,8 @@ class ScaledDataset:
         return any((part != first).any() for part in parts)
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
-        return tuple(np.array(self.task.feature_names)[which].tolist())
+        names = [feature.name for feature in self.scaler.features(self.task)]
+        return tuple(np.array(names)[which].tolist())
 
     def observations(self, rows: NDArray[np.int64]) -> Iterator[NDArray[np.float32]]:
         """Observations of the rows in physical units, in order, in chunks (n, d)."""

@@ -1,15 +1,14 @@
-"""Scaling observations to about [-1, 1], and angles to their sine and cosine."""
+"""Scaling observations, or coordinates of them, to about [-1, 1]."""
 
-import math
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.coordinates import Coordinates
 from jbrep.dataset.columns import Column
 from jbrep.envs.task import Feature, Task
 from jbrep.errors import InputError
@@ -26,87 +25,74 @@ _MAX_MAGNITUDE = 1e12  # of a usual range, beyond which scaling would leave noth
 
 @dataclass(frozen=True, eq=False)
 class Scaler:
-    """Scales each feature so that two values become -1 and 1, and a constant one to 0.
+    """Scales each number so that two values become -1 and 1, and a constant one to 0.
 
-    Its numbers are NumPy arrays or torch tensors, as are the values that it takes.
+    Its numbers are NumPy arrays or torch tensors, as are the observations that it takes.
 
     Attributes:
-        low: the values that become -1, (d,).
-        high: the values that become 1, (d,).
-        angles: places of features that become their sine; their cosines follow all features.
+        low: the values that become -1, (m,).
+        high: the values that become 1, (m,).
+        coordinates: what is scaled; None for the observations themselves.
         clip: scaled values stay within [-clip, clip]; None for no limit.
     """
 
     low: Any
     high: Any
-    angles: tuple[int, ...] = ()
+    coordinates: Coordinates | None = None
     clip: float | None = None
 
     @cached_property
     def half_width(self) -> Any:
-        """What each feature is divided by, (d,); 1 for a constant one."""
+        """What each number is divided by, (m,); 1 for a constant one."""
         half_width = (self.high - self.low) / 2
         half_width[half_width == 0] = 1
         return half_width
 
     @cached_property
     def centre(self) -> Any:
-        """The value of each feature that is scaled to 0, (d,)."""
+        """The value of each number that is scaled to 0, (m,)."""
         return (self.high + self.low) / 2
 
     @property
     def size(self) -> int:
-        """Numbers that an observation becomes: d, and one more for each angle."""
-        return len(self.low) + len(self.angles)
+        """Numbers m that an observation becomes."""
+        return len(self.low)
 
-    def scale(self, values: Any) -> Any:
-        """Physical units (..., d) to scaled ones (..., size).
+    def features(self, task: Task) -> tuple[Feature, ...]:
+        """What the scaled numbers of a task are."""
+        return self.coordinates.features if self.coordinates else task.features
+
+    def parts(self, task: Task) -> tuple[str, ...]:
+        """What each of them is part of: a feature, or a part of the coordinates."""
+        return self.coordinates.sources if self.coordinates else task.feature_names
+
+    def places(self, names: Iterable[str], task: Task) -> list[int]:
+        """Places of the scaled numbers with these names, or of the parts with these.
+
+        Raises:
+            InputError: there are none of a name.
+        """
+        own, parts = [each.name for each in self.features(task)], self.parts(task)
+        wanted = dict.fromkeys(names)
+        if unknown := [name for name in wanted if name not in own and name not in parts]:
+            known = ", ".join(dict.fromkeys((*parts, *own)))
+            raise InputError(f"no feature {unknown[0]!r}: {task.name} has {known}")
+        each = enumerate(zip(own, parts, strict=True))
+        return [i for i, (name, part) in each if name in wanted or part in wanted]
+
+    def scale(self, observation: Any) -> Any:
+        """Observations (..., d) in physical units to scaled numbers (..., m).
 
         Values outside [low, high] go beyond [-1, 1], as far as the limit allows.
         """
+        values = self.coordinates.forward(observation) if self.coordinates else observation
         scaled = (values - self.centre) / self.half_width
-        if self.clip is not None:
-            scaled = scaled.clip(-self.clip, self.clip)
-        if not self.angles:
-            return scaled
-        library, angles = library_of(values), list(self.angles)
-        turned = values[..., angles]
-        scaled[..., angles] = library.sin(turned)
-        return library.concatenate((scaled, library.cos(turned)), -1)
+        return scaled if self.clip is None else scaled.clip(-self.clip, self.clip)
 
     def unscale(self, scaled: Any) -> Any:
-        """Scaled values (..., size) to physical units (..., d): the inverse of `scale`.
-
-        An angle lies within half a turn of the middle of its range.
-        """
-        size = len(self.low)
-        values = scaled[..., :size] * self.half_width + self.centre
-        if self.angles:
-            library, angles = library_of(scaled), list(self.angles)
-            turned = library.arctan2(scaled[..., angles], scaled[..., size:])
-            values[..., angles] = wrapped(turned - self.centre[angles]) + self.centre[angles]
-        return values
-
-    def error(self, values: Any, others: Any) -> Any:
-        """The difference of values (..., d) from others, in half widths.
-
-        Of angles that become sine and cosine it is the one round the circle.
-        """
-        difference = values - others
-        if self.angles:
-            angles = list(self.angles)
-            difference[..., angles] = wrapped(difference[..., angles])
-        return difference / self.half_width
-
-
-def wrapped(angle: Any) -> Any:
-    """Angles [rad] within half a turn of 0."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi
-
-
-def library_of(values: Any) -> Any:
-    """The library of an array: NumPy, or torch."""
-    return sys.modules["torch"] if type(values).__module__ == "torch" else np
+        """Scaled numbers (..., m) to observations (..., d): the inverse of `scale`."""
+        values = scaled * self.half_width + self.centre
+        return self.coordinates.inverse(values) if self.coordinates else values
 
 
 def fit_scaler(
@@ -114,29 +100,46 @@ def fit_scaler(
     task: Task,
     column: Column,
     rows: Rows,
-    angles: bool = False,
+    coordinates: Coordinates | None = None,
     clip: float | None = None,
 ) -> Scaler:
-    """A scaling of observations.
+    """A scaling of observations, or of their coordinates.
 
     Args:
         scaling: a key of SCALINGS.
         task: of the observations.
         column: of observations (N, d).
         rows: that it is fitted to.
-        angles: whether angles become sine and cosine.
+        coordinates: of the observations; None for these themselves.
         clip: scaled values stay within [-clip, clip]; None for no limit.
 
     Raises:
         InputError: the task has no usual range of a feature, where that is needed.
     """
-    low, high = SCALINGS[scaling](task, column, rows)
-    places = tuple(i for i, each in enumerate(task.features) if angles and each.is_angle)
-    return Scaler(low.astype(np.float32), high.astype(np.float32), places, clip)
+    low, high = SCALINGS[scaling](_Values(task, column, coordinates), rows)
+    return Scaler(low.astype(np.float32), high.astype(np.float32), coordinates, clip)
 
 
-def _extrema(task: Task, column: Column, rows: Rows) -> Range:
-    return extrema(column.parts(rows))
+class _Values(NamedTuple):
+    """Observations of a data set, or coordinates of them."""
+
+    task: Task
+    column: Column  # of observations (N, d)
+    coordinates: Coordinates | None
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """What the numbers are."""
+        return self.coordinates.features if self.coordinates else self.task.features
+
+    def parts(self, rows: Rows) -> Iterator[NDArray[Any]]:
+        """The numbers of rows, in parts (n, m)."""
+        parts = self.column.parts(rows)
+        return map(self.coordinates.forward, parts) if self.coordinates else parts
+
+
+def _extrema(values: _Values, rows: Rows) -> Range:
+    return extrema(values.parts(rows))
 
 
 def extrema(parts: Iterable[NDArray[Any]]) -> Range:
@@ -146,11 +149,12 @@ def extrema(parts: Iterable[NDArray[Any]]) -> Range:
     return np.min(low, axis=0), np.max(high, axis=0)
 
 
-def _nominal(task: Task, column: Column, rows: Rows) -> Range:
-    ranges = [usual_range(feature) for feature in task.features]
-    if missing := [f.name for f, r in zip(task.features, ranges, strict=True) if r is None]:
+def _nominal(values: _Values, rows: Rows) -> Range:
+    ranges = [usual_range(feature) for feature in values.features]
+    if missing := [f.name for f, r in zip(values.features, ranges, strict=True) if r is None]:
         raise InputError(
-            f"{task.name} has no usual range of {missing[0]}: choose another scaling than nominal"
+            f"{values.task.name} has no usual range of {missing[0]}: choose another scaling than "
+            "nominal"
         )
     low, high = np.array(ranges).T
     return low, high
@@ -164,8 +168,8 @@ def usual_range(feature: Feature) -> tuple[float, float] | None:
     return (feature.low, feature.high) if -_MAX_MAGNITUDE < low < high < _MAX_MAGNITUDE else None
 
 
-def _standard(task: Task, column: Column, rows: Rows) -> Range:
-    mean, std = mean_and_std(column.parts(rows))
+def _standard(values: _Values, rows: Rows) -> Range:
+    mean, std = mean_and_std(values.parts(rows))
     return mean - _DEVIATIONS * std, mean + _DEVIATIONS * std
 
 
@@ -182,15 +186,15 @@ def mean_and_std(parts: Iterable[NDArray[Any]]) -> Range:
     return first + mean, np.sqrt(np.maximum(squares / count - mean**2, 0))
 
 
-def _robust(task: Task, column: Column, rows: Rows) -> Range:
+def _robust(values: _Values, rows: Rows) -> Range:
     step = -(-len(rows) // _SAMPLED)
-    values = np.concatenate(list(column.parts(rows[::step])))
-    low, median, high = np.quantile(values.astype(np.float64), _QUANTILES, axis=0)
+    sampled = np.concatenate(list(values.parts(rows[::step])))
+    low, median, high = np.quantile(sampled.astype(np.float64), _QUANTILES, axis=0)
     half_width = (high - low) / 2
     return median - half_width, median + half_width
 
 
-SCALINGS: dict[str, Callable[[Task, Column, Rows], Range]] = {
+SCALINGS: dict[str, Callable[[_Values, Rows], Range]] = {
     EXTREMA: _extrema,  # minimum and maximum
     "nominal": _nominal,  # the task's usual ranges
     "standard": _standard,  # the mean, and three standard deviations to either side

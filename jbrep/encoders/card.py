@@ -7,7 +7,7 @@ from typing import Any
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.layers import Layer
-from jbrep.envs.task import Task
+from jbrep.envs.task import Feature, Task
 from jbrep.text import facts, table
 
 _RECORDS = ("training", "data", "metrics", "versions")
@@ -33,7 +33,7 @@ def describe(encoder: BaseEncoder, source: str) -> dict[str, Any]:
     }
     if not isinstance(encoder, Encoder):
         return {**told, "decodes": encoder.can_decode, "sha256": encoder.fingerprint}
-    ranges = zip(task.features, encoder.scaler.low, encoder.scaler.high, strict=True)
+    ranges = zip(_read(encoder), encoder.scaler.low, encoder.scaler.high, strict=True)
     return {
         **told,
         "encoder": _layers(encoder.encoder),
@@ -73,9 +73,14 @@ def card(encoder: BaseEncoder, source: str, width: int) -> str:
     }
     rows = [
         (str(feature), f"{f['low']:.4g}", f"{f['high']:.4g}")
-        for feature, f in zip(encoder.task.features, told["features"], strict=True)
+        for feature, f in zip(_read(encoder), told["features"], strict=True)
     ]
     return f"{encoder.name}\n{facts(lines, width)}\n\n{table(('feature', 'low', 'high'), rows)}"
+
+
+def _read(encoder: Encoder) -> tuple[Feature, ...]:
+    """What it scales and encodes."""
+    return encoder.scaler.features(encoder.task)
 
 
 def arguments_of(task: Task) -> str:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.coordinates import library_of
 from jbrep.dataset import Scaler
-from jbrep.dataset.scaling import library_of
 from jbrep.encoders.base import BaseEncoder, OwnEncoder
 from jbrep.encoders.header import IMPORTED, MAX_MAGNITUDE, EncoderHeader
 from jbrep.encoders.layers import ACTIVATIONS, MAX_UNITS, Layer, run
@@ -99,15 +99,14 @@ class Encoder(BaseEncoder):
         self.scaler, self.encoder, self.decoder = scaler, encoder, decoder
         self._check(keep)
         self.header = header.replace(
-            angles=[self.task.feature_names[i] for i in scaler.angles],
+            coordinates=scaler.coordinates.parts if scaler.coordinates else (),
             clip=scaler.clip,
             keep=keep,
             encoder=[layer.activation for layer in encoder],
             decoder=[layer.activation for layer in decoder],
         )
         code = len(encoder[-1].bias) if encoder else scaler.size
-        scaled = (*self.task.feature_names, *self.header.angles)
-        self.kept = [i for i, name in enumerate(scaled) if name in keep]
+        self.kept = scaler.places(keep, self.task)
         self.latent_size = code + len(self.kept)
         self.can_decode = bool(decoder) or not encoder
         identifying = {n: v for n, v in self.header.as_json().items() if n != "commits"}
@@ -117,9 +116,7 @@ class Encoder(BaseEncoder):
 
     def _check(self, keep: tuple[str, ...]) -> None:
         for name in ("low", "high"):
-            _check_tensor(name, getattr(self.scaler, name), (self.size,))
-        if not all(0 <= i < self.size for i in self.scaler.angles):
-            raise InputError("its angles must be different features")
+            _check_tensor(name, getattr(self.scaler, name), (len(self.scaler.features(self.task)),))
         if keep and not self.encoder:
             raise InputError("features can pass around layers, where there are some")
         sizes = [self.scaler.size]
@@ -197,6 +194,8 @@ class Encoder(BaseEncoder):
 
     def scale(self, observation: Float32) -> Float32:
         """Scale observations (..., d) linearly, as its training data were."""
+        if self.scaler.coordinates:
+            return super().scale(observation)
         return (observation - self.scaler.centre) / self.scaler.half_width
 
     def _prepare(self, values: Any, size: int, what: str) -> tuple[Any, Arrays]:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from jbrep.coordinates import Coordinates
 from jbrep.dataset import Scaler
 from jbrep.encoders.encoder import Encoder, Layers
 from jbrep.encoders.header import HELD_OUT_MSE, IMPORTED, EncoderHeader
@@ -66,8 +67,8 @@ def unpack(path: Path, tensors: Tensors, header: dict[str, Any]) -> Encoder:
 def _encoder(header: EncoderHeader, tensors: Tensors) -> Encoder:
     _check_metrics(header)
     encoder, decoder = (_layers(part, getattr(header, part), tensors) for part in _PARTS)
-    angles = tuple(map(header.environment.feature_names.index, header.angles))
-    scaler = Scaler(_take(tensors, "low"), _take(tensors, "high"), angles, header.clip)
+    made = Coordinates(header.environment, header.coordinates) if header.coordinates else None
+    scaler = Scaler(_take(tensors, "low"), _take(tensors, "high"), made, header.clip)
     if tensors:
         raise InputError(f"unexpected tensor {min(tensors)}")
     return Encoder(header, scaler, encoder, decoder, header.keep)

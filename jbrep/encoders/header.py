@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar
 
 from msgspec import Meta
 
+from jbrep.coordinates import Part
 from jbrep.encoders.names import Name
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
@@ -22,11 +23,11 @@ _Words = tuple[str, ...]
 class EncoderHeader(Document, frozen=True):
     """The header of an encoder's file.
 
-    The fields from `angles` on follow from the encoder; whoever makes one leaves them out.
+    The fields from `coordinates` on follow from the encoder; whoever makes one leaves them out.
     """
 
     format: ClassVar[str] = "jbrep encoder"
-    format_version: ClassVar[int] = 4
+    format_version: ClassVar[int] = 5
 
     kind: Annotated[str, Meta(description="The method that made it, `full` or `imported`.")]
     name: Annotated[Name, Meta(description="What tables call it, such as `dae-8`.")]
@@ -49,16 +50,22 @@ class EncoderHeader(Document, frozen=True):
         dict[str, Any],
         Meta(description="`held_out_mse`, on all held-out rows; what its method says of its fit."),
     ] = {}
-    angles: Annotated[
-        _Words,
-        Meta(description="Features that become sine, in their place, and cosine, after all."),
+    coordinates: Annotated[
+        tuple[Part, ...],
+        Meta(
+            description="What is scaled and encoded in place of the features: name, formula, what "
+            "it is of, whether it is shown, soft length; see coordinates.md."
+        ),
     ] = ()
     clip: Annotated[
         Annotated[float, Meta(ge=1, le=MAX_MAGNITUDE, title="a number from 1 to 1e12")] | None,
         Meta(description="The limit of scaled values."),
     ] = None
     keep: Annotated[
-        _Words, Meta(description="Features that pass around the layers and follow the code.")
+        _Words,
+        Meta(
+            description="Features, or coordinates, that pass around the layers and follow the code."
+        ),
     ] = ()
     encoder: Annotated[_Words, Meta(description="The activation after each layer.")] = ()
     decoder: Annotated[_Words, Meta(description="The same of the decoder.")] = ()
@@ -69,9 +76,5 @@ class EncoderHeader(Document, frozen=True):
             json.dumps(to_plain(self), allow_nan=False)
         except (TypeError, ValueError, RecursionError):
             raise InputError("it must be plain JSON, all numbers finite") from None
-        for name in (*self.angles, *self.keep):
-            if name not in self.environment.feature_names:
-                raise InputError(f"{name} is no feature of {self.environment.name}")
-        for field in ("angles", "keep"):
-            if len(set(names := getattr(self, field))) < len(names):
-                raise InputError(f"its {field} must be different features")
+        if len(set(self.keep)) < len(self.keep):
+            raise InputError("what it keeps must be different features")

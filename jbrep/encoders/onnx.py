@@ -20,9 +20,12 @@ from jbrep.records.storage import exists, write_whole
 _OPSET, _IR_VERSION = 17, 8
 _LATER = 20, 9  # the same for models with GELU
 _OPERATORS = {  # by NumPy's names
-    **{n: n.capitalize() for n in ("add", "cos", "equal", "floor", "greater", "less", "sin")},
+    **{
+        name: name.capitalize()
+        for name in ("add", "cos", "equal", "floor", "greater", "less", "sin", "sqrt")
+    },
     **{"subtract": "Sub", "multiply": "Mul", "divide": "Div", "matmul": "MatMul"},
-    **{"absolute": "Abs", "arctan": "Atan", "maximum": "Max"},
+    **{"absolute": "Abs", "arctan": "Atan", "maximum": "Max", "negative": "Neg"},
 }
 
 
@@ -71,7 +74,7 @@ class _Rows(NDArrayOperatorsMixin):
         return self.made(_OPERATORS[ufunc.__name__], *inputs, width=width)
 
     def __array_function__(self, function: Any, types: Any, args: Any, options: Any) -> Any:
-        if function is np.concatenate:
+        if function in (np.concatenate, np.stack):  # a column is one number wide here
             return self.made("Concat", *args[0], width=sum(v.width for v in args[0]), axis=1)
         return self.made({np.where: "Where"}[function], *args)
 
@@ -80,16 +83,10 @@ class _Rows(NDArrayOperatorsMixin):
         return self.made("Clip", self, least, most)
 
     def __getitem__(self, key: Any) -> "_Rows":
-        places = np.arange(self.width)[key[-1]]
+        places = np.atleast_1d(np.arange(self.width)[key[-1]])
         if np.array_equal(places, np.arange(self.width)):
             return self
         return self.made("Gather", self, places, width=len(places), axis=1)
-
-    def __setitem__(self, key: Any, values: "_Rows") -> None:
-        places = np.arange(self.width)
-        places[key[-1]] = self.width + np.arange(values.width)
-        both = self.made("Concat", self, values, width=self.width + values.width, axis=1)
-        self.name = both[..., places].name
 
     @property
     def activations(self) -> Mapping[str, Callable[["_Rows"], "_Rows"]]:

@@ -1,10 +1,12 @@
-"""Encoders by name: those that ship with the package, and the whole observation of any task."""
+"""Encoders by name: those that ship with the package, and those that need no data."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jbrep.coordinates import OBSERVATION, System, make_coordinates
+from jbrep.coordinates.invariance import check_invariant
 from jbrep.dataset import Scaler
 from jbrep.dataset.scaling import usual_range
 from jbrep.encoders.base import BaseEncoder, as_encoder
@@ -18,7 +20,12 @@ from jbrep.errors import InputError
 from jbrep.records.storage import exists
 
 _FOLDER = Path(__file__).parent / "shipped"
-_SCALINGS = {  # of the whole observation, by the word for it in the header
+_UNLEARNED: dict[str, System] = {  # encoders that are made of any task, and what they are on
+    FULL: OBSERVATION,
+    "coordinates": "coordinates",
+    "symmetry": "symmetry",
+}
+_SCALINGS = {  # of these, by the word for it in the header
     "ranges": "scaled by the usual ranges",
     "some ranges": "scaled by the usual ranges where they are known",
     "none": "unscaled",
@@ -30,27 +37,39 @@ def names(task: Task) -> tuple[str, ...]:
     return tuple(_files(task))
 
 
-def full(task: Task) -> Encoder:
-    """The encoder that leaves a task's observation as it is, but for its scaling.
+def unlearned(task: Task, name: str = FULL) -> Encoder:
+    """The encoder that leaves a task's observation as it is, but for its scaling; or coordinates.
 
-    The usual range of a feature becomes [-1, 1]; a feature without one keeps its physical units.
+    The usual range of a number becomes [-1, 1]; one without keeps its physical units.
+
+    Args:
+        task: whose observations it reads.
+        name: full, coordinates or symmetry.
+
+    Raises:
+        InputError: the task has no such coordinates, or no such symmetry.
     """
-    ranges = [usual_range(feature) for feature in task.features]
+    coordinates = make_coordinates(task, _UNLEARNED[name])
+    if coordinates and name == "symmetry":
+        check_invariant(coordinates)
+    features = coordinates.features if coordinates else task.features
+    ranges = [usual_range(feature) for feature in features]
     known = sum(each is not None for each in ranges)
-    scaling = "ranges" if known == task.size else "some ranges" if known else "none"
+    scaling = "ranges" if known == len(features) else "some ranges" if known else "none"
     low, high = np.array([each or (-1, 1) for each in ranges], np.float32).T
     training, metrics = {"scaling": scaling}, {HELD_OUT_MSE: 0.0}
     header = EncoderHeader(
-        kind=FULL, name=FULL, environment=task, training=training, metrics=metrics
+        kind=name, name=name, environment=task, training=training, metrics=metrics
     )
-    return Encoder(header, Scaler(low, high), (), ())
+    return Encoder(header, Scaler(low, high, coordinates), (), ())
 
 
 def find(name: Any, task: Task | str) -> BaseEncoder:
     """The encoder that ships for a task, or a task's name, under that name, or the one in a file.
 
-    A shipped name takes precedence; write ./dae-8 for a file of that name. `full` is there for
-    every task: where none ships, its features are scaled by their usual ranges, if they have any.
+    A shipped name takes precedence; write ./dae-8 for a file of that name. `full`, `coordinates`
+    and `symmetry` are there for every task whose features allow them: where none ships, they are
+    scaled by usual ranges, as far as there are any.
     A name such as mymodule:MyEncoder is of code (see `jbrep.encoders.code`); anything but a name is
     an encoder itself, or a user's own (see `jbrep.encoders.base.as_encoder`).
 
@@ -66,7 +85,7 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
     if is_code(name):
         return make(name, task)
     if _is_made(name, task):
-        return full(task)
+        return unlearned(task, str(name))
     path = _files(task).get(str(name)) or Path(name)
     if not exists(path):
         ships = ", ".join(names(task))
@@ -107,7 +126,7 @@ def source_of(name: str | Path, task: Task | None) -> str:
     if is_code(name):
         return f"{name}, code"
     if task and _is_made(name, task):
-        return f"{name}, {_SCALINGS[full(task).header.training['scaling']]}"
+        return f"{name}, {_SCALINGS[unlearned(task, str(name)).header.training['scaling']]}"
     return f"{name}, shipped" if task and str(name) in _files(task) else str(name)
 
 
@@ -127,8 +146,8 @@ def shipped_folder(task: Task) -> Path:
 
 
 def _is_made(name: str | Path, task: Task) -> bool:
-    """Whether the name is of the whole observation of a task for which that doesn't ship."""
-    return str(name) == FULL and FULL not in _files(task)
+    """Whether the name is of an encoder that needs no data and doesn't ship for a task."""
+    return str(name) in _UNLEARNED and str(name) not in _files(task)
 
 
 def _files(task: Task) -> dict[str, Path]:

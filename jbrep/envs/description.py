@@ -15,8 +15,19 @@ from msgspec.structs import asdict
 from numpy.typing import NDArray
 
 from jbrep.envs.make import creator, make_env
+from jbrep.envs.mujoco import with_kinds
 from jbrep.envs.names import find_spec
-from jbrep.envs.task import NARROW_SEEDS, WIDE_SEEDS, EpisodeSteps, Feature, SeedBits, Task, Word
+from jbrep.envs.task import (
+    NARROW_SEEDS,
+    WIDE_SEEDS,
+    EpisodeSteps,
+    Feature,
+    Frame,
+    Kind,
+    SeedBits,
+    Task,
+    Word,
+)
 from jbrep.errors import InputError, kind_and_line
 from jbrep.records.record import Finite, Record, converted, from_plain
 from jbrep.records.toml import read_toml
@@ -91,7 +102,7 @@ def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | N
         return Task(
             id=env_id,
             name=env_id,
-            features=tuple(features_of(env_id, env.observation_space)),
+            features=with_kinds(fresh, list(features_of(env_id, env.observation_space))),
             action_low=tuple((-_below(-action.low)).tolist()),
             action_high=tuple(_below(action.high).tolist()),
             max_episode_steps=limit,
@@ -237,6 +248,9 @@ class _FeatureChanges(Record, frozen=True):
     low: Finite | None = None
     high: Finite | None = None
     group: Word | None = None
+    bounded: bool | None = None
+    kind: Kind | None = None
+    frame: Frame | None = None
 
 
 class _TaskChanges(Record, frozen=True):

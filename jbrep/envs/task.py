@@ -46,6 +46,14 @@ _Group = Annotated[
     ),
 ]
 _Unit = Annotated[str, Meta(max_length=40)]
+Kind = Literal["scalar", "angle", "quaternion", "vector", "offset", "point"]
+Frame = Literal["", "world", "body", "heading"]
+SPATIAL: Mapping[Kind, range] = {  # kinds of several features, a group of their own; of how many
+    "quaternion": range(4, 5),
+    "vector": range(2, 4),
+    "offset": range(2, 4),
+    "point": range(2, 4),
+}
 _Positive = Annotated[float, Meta(gt=0, le=1e12)]
 _Arrays = Mapping[Word, Annotated[int, Meta(ge=1, le=_MAX_FEATURES)]]
 _Bounds = Annotated[tuple[Finite, ...], Meta(min_length=1, max_length=_MAX_ACTIONS)]
@@ -54,7 +62,15 @@ SHORT_NAMES: dict[str, str] = {}  # ids of tasks by other names; a robot that sh
 
 
 class Feature(Record, frozen=True, array_like=True):
-    """One number of an observation."""
+    """One number of an observation.
+
+    Its kind says how it changes when the robot, or the world, is turned and shifted: a `scalar`
+    doesn't; an `angle` is in rad; a `quaternion` is the four numbers w, x, y, z that turn the body
+    into the world; a `vector`, such as a velocity or a force, is turned; an `offset` from one place
+    to another is turned, too, and has a length and a direction; a `point` in the world is turned
+    and shifted. The last three are x and y, or x, y and z, in the frame of the world, the body, or
+    its heading (turned about the vertical only).
+    """
 
     name: Word
     unit: _Unit = ""
@@ -62,20 +78,49 @@ class Feature(Record, frozen=True, array_like=True):
     high: Finite | None = None
     bounded: bool = False  # whether it never leaves that range
     group: _Group = ""  # of the features that belong together
+    kind: Kind = "scalar"
+    frame: Frame = ""  # of an angle: world, or relative to something
 
     def check(self) -> None:
         """As for `Record`."""
         if not self.unit.isprintable():
             raise InputError(f"the unit of {self.name} must be a word")
+        if self.kind == "angle":
+            self._check_angle()
+        elif self.kind in ("vector", "offset", "point") and not self.frame:
+            raise InputError(
+                f"{self.name} is a {self.kind}: its frame must be world, body or heading"
+            )
+        elif self.kind == "point" and self.frame != "world":
+            raise InputError(
+                f"{self.name} is a point in the {self.frame}'s frame: it must be one in the world, "
+                "or an offset"
+            )
         _check_range(self.name, self.low, self.high)
+
+    def _check_angle(self) -> None:
+        if self.unit not in ("rad", ""):
+            raise InputError(f"{self.name} is an angle in {self.unit}: it must be in rad")
+        if self.frame not in ("", "world"):
+            raise InputError(f"{self.name} is an angle: its frame must be world, or left out")
+        if self.bounded and not self.is_full_turn:
+            raise InputError(
+                f"{self.name} is an angle that stays in its range, which must be a full turn: from "
+                "-pi to pi, or from 0 to 2 pi; or say that it isn't bounded"
+            )
 
     def __str__(self) -> str:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     @property
     def is_angle(self) -> bool:
+        """Whether it is an angle."""
+        return self.kind == "angle"
+
+    @property
+    def is_full_turn(self) -> bool:
         """Whether it jumps from one end of its range to the other, a full turn apart."""
-        if self.unit != "rad" or not self.bounded or self.low is None or self.high is None:
+        if not self.is_angle or not self.bounded or self.low is None or self.high is None:
             return False
         return math.isclose(self.high - self.low, 2 * math.pi, rel_tol=0.01)
 
@@ -133,6 +178,8 @@ class Task(Record, frozen=True):
             raise InputError("its features must have different names")
         if sum(place.stop - place.start for place in self.groups.values()) != self.size:
             raise InputError("features of a group must stand side by side")
+        for name, place in self.groups.items():
+            _check_group(name, self.features[place])
         if self.state.keys() & self.constants.keys():
             raise InputError("the arrays that move and those that don't must have different names")
         _check_range("a reward", self.reward_low, self.reward_high)
@@ -212,6 +259,19 @@ class Task(Record, frozen=True):
 def _check_range(name: str, low: float | None, high: float | None) -> None:
     if low is not None and high is not None and low > high:
         raise InputError(f"the range of {name} is from {low:g} to {high:g}: swap them")
+
+
+def _check_group(name: str, features: tuple[Feature, ...]) -> None:
+    """Check the number of features of a vector, point or quaternion, which is a group by itself."""
+    kinds = {(each.kind, each.frame) for each in features}
+    kind = next((kind for kind, _ in sorted(kinds) if kind in SPATIAL), None)
+    if kind is None:
+        return
+    if len(kinds) > 1:
+        raise InputError(f"{name} has features beside those of its {kind}: give them another group")
+    if len(features) not in (counts := SPATIAL[kind]):
+        expected = " or ".join(map(str, counts))
+        raise InputError(f"{name} is a {kind} of {len(features)} numbers: it must have {expected}")
 
 
 def _usual_range(feature: Feature) -> tuple[float, float]:

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.coordinates import wrapped
 from jbrep.dataset import Column, ScaledDataset
-from jbrep.dataset.scaling import wrapped
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.task import Task
 from jbrep.evaluate.evaluation import Prediction
@@ -139,7 +139,7 @@ def changes(
         ahead: steps.
     """
     change = np.subtract(observation[rows + ahead], observation[rows], dtype=np.float64)
-    angles = [feature.is_angle for feature in task.features]
+    angles = [feature.is_full_turn for feature in task.features]
     if any(angles):
         seen = (observation[rows + step][:, angles] for step in range(ahead + 1))
         turns = (wrapped(np.subtract(b, a, dtype=np.float64)) for a, b in pairwise(seen))

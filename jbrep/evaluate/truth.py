@@ -65,7 +65,7 @@ def _truth(task: Task) -> _Truth:
 
 
 def _angles(task: Task) -> frozenset[str]:
-    return frozenset(feature.name for feature in task.features if feature.is_angle)
+    return frozenset(feature.name for feature in task.features if feature.is_full_turn)
 
 
 def _features(task: Task, observation: ArrayLike) -> Columns:

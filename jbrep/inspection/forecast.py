@@ -149,7 +149,7 @@ def windows(
     Returns:
         The code now with the actions until then, (w, l + k * m), and the code's change, (w, l).
     """
-    angles = [feature.is_angle for feature in task.features]
+    angles = [feature.is_full_turn for feature in task.features]
     turned = np.abs(observation[ahead:, angles] - observation[:-ahead, angles])
     smooth = (turned <= np.pi).all(axis=1)
     actions = next_actions(action, ahead)[smooth]

@@ -168,6 +168,10 @@ class JitterbugEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._observation = self._simulation.observe()[0]
         return self._view(self._observation), reward, False, diverged, {"non_finite": diverged}
 
+    def quarter_turn(self, shift: tuple[float, float]) -> None:
+        """Turn robot and target by a quarter about the vertical axis, then shift both [m]."""
+        self._simulation.quarter_turn(shift)
+
     def render(self) -> Any:
         """A frame, as Gymnasium's own MuJoCo environments give it.
 

@@ -8,6 +8,7 @@ from mujoco.batch import Batch
 from numpy.typing import ArrayLike, NDArray
 
 from jbrep.envs.lanes import check_counts
+from jbrep.envs.mujoco import turned, turned_quaternion
 from jbrep.jitterbug import bodies, model
 from jbrep.jitterbug.tasks import QUATERNION, Array, JitterbugTask, Readings, yaw_direction
 
@@ -150,6 +151,17 @@ class Simulation:
         self.target_quaternion[:] = target_quaternion
         self._warmstart[:] = warmstart
         self._forward(lanes)
+
+    def quarter_turn(self, shift: tuple[float, float]) -> None:
+        """Turn robots and targets by a quarter about the vertical axis, then shift them [m]."""
+        state = self.state
+        for name in ("qpos", "target_position"):
+            state[name][:, :2] = turned(state[name][:, :2]) + shift
+        for name in ("qvel", "warmstart"):
+            state[name][:, :2] = turned(state[name][:, :2])
+        for quaternion in (state["qpos"][:, QUATERNION], state["target_quaternion"]):
+            quaternion[:] = turned_quaternion(quaternion)
+        self.restore(**state)
 
     def _drawn(self, number: int) -> bodies.Body | None:
         return None if number == bodies.PUBLISHED else bodies.draw(number, self._materials)

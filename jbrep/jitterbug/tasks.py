@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.envs.task import SHORT_NAMES, Feature, Task
+from jbrep.envs.task import SHORT_NAMES, Feature, Frame, Kind, Task
 from jbrep.errors import choose
 
 Array = NDArray[np.float64]
@@ -125,41 +125,62 @@ class Observable:
 
 
 def _observable(
-    name: str, axes: str, unit: str, highs: tuple[float, ...], read: Callable[[Readings], Array]
+    name: str,
+    axes: str,
+    unit: str,
+    highs: tuple[float, ...],
+    read: Callable[[Readings], Array],
+    kind: Kind = "scalar",
+    frame: Frame = "",
 ) -> Observable:
     names = [f"{name}_{axis}" for axis in axes.split()] or [name]
     bounded = unit in ("rad", "1")  # wrapped angles and unit quaternions
     features = (
-        Feature(each, unit, -float(high), float(high), bounded, name)
+        Feature(each, unit, -float(high), float(high), bounded, name, kind, frame)
         for each, high in zip(names, highs, strict=True)
     )
     return Observable(name, tuple(features), read)
 
 
-_POSITION = Observable(
-    "position",
-    (
-        Feature("position_x", "m", -2.0, 2.0, group="position"),
-        Feature("position_y", "m", -2.0, 2.0, group="position"),
-        Feature("position_z", "m", 0.0, 0.1, group="position"),
+def _position(kind: Kind) -> Observable:
+    """Where the bug is: a point, or an offset from the origin if that counts in its task."""
+    ranges = {"position_x": (-2.0, 2.0), "position_y": (-2.0, 2.0), "position_z": (0.0, 0.1)}
+    features = (
+        Feature(name, "m", low, high, False, "position", kind, "world")
+        for name, (low, high) in ranges.items()
+    )
+    return Observable("position", tuple(features), lambda r: r.qpos[:, POSITION])
+
+
+_MOTION = (
+    _observable(
+        "orientation", "w x y z", "1", (1, 1, 1, 1), lambda r: r.qpos[:, QUATERNION], "quaternion"
     ),
-    lambda r: r.qpos[:, POSITION],
-)
-_SHARED = (
-    _POSITION,
-    _observable("orientation", "w x y z", "1", (1, 1, 1, 1), lambda r: r.qpos[:, QUATERNION]),
-    _observable("velocity", "x y z", "m/s", (1, 1, 1), lambda r: r.qvel[:, VELOCITY]),
-    _observable("angular_velocity", "x y z", "rad/s", (35, 35, 35), lambda r: r.qvel[:, SPIN]),
-    _observable("motor_angle", "", "rad", (np.pi,), lambda r: r.motor_angle[:, None]),
+    _observable(
+        "velocity", "x y z", "m/s", (1, 1, 1), lambda r: r.qvel[:, VELOCITY], "vector", "world"
+    ),
+    _observable(
+        "angular_velocity",
+        "x y z",
+        "rad/s",
+        (35, 35, 35),
+        lambda r: r.qvel[:, SPIN],
+        "vector",
+        "body",
+    ),
+    _observable("motor_angle", "", "rad", (np.pi,), lambda r: r.motor_angle[:, None], "angle"),
     _observable("motor_velocity", "", "rad/s", (180,), lambda r: r.qvel[:, MOTOR_QVEL, None]),
 )
+_SHARED = (_position("point"), *_MOTION)
 _ANGLE_TO_TARGET = _observable(
-    "angle_to_target", "", "rad", (np.pi,), lambda r: r.angle_to_target[:, None]
+    "angle_to_target", "", "rad", (np.pi,), lambda r: r.angle_to_target[:, None], "angle"
 )
 _TARGET_VELOCITY = _observable(
     "velocity_in_target_frame", "x y z", "m/s", (1, 1, 1), lambda r: r.velocity_in_target_frame
 )
-_TARGET_POSITION = _observable("target", "x y z", "m", (3, 3, 0.1), lambda r: r.target_in_bug_frame)
+_TARGET_POSITION = _observable(
+    "target", "x y z", "m", (3, 3, 0.1), lambda r: r.target_in_bug_frame, "offset", "body"
+)
 
 
 # Each term equals the call of `dm_control.utils.rewards.tolerance` in its docstring, with fewer
@@ -286,7 +307,7 @@ class JitterbugTask:
 TASKS = {
     task.name: task
     for task in (
-        JitterbugTask("move_from_origin", "easy", _SHARED, (away_term,)),
+        JitterbugTask("move_from_origin", "easy", (_position("offset"), *_MOTION), (away_term,)),
         JitterbugTask(
             "face_direction",
             "easy",

@@ -12,7 +12,7 @@ from jbrep.errors import InputError
 from jbrep.methods.linear import dense, linear_code
 from jbrep.training.method import ClosedForm, Coded, Made, Network
 from jbrep.training.network import get_architecture, layers, stacks
-from jbrep.training.settings import Architecture, Names, Seed
+from jbrep.training.settings import Architecture, Names, On, Seed
 
 _FREQUENCY = 1000  # [rad] that a phase turns while a scaled feature goes from 0 to 1
 
@@ -22,9 +22,31 @@ class Full(ClosedForm, frozen=True, kw_only=True):
 
     name: ClassVar[str] = FULL
 
+    def check(self) -> None:
+        """As for `Record`."""
+        super().check()
+        if self.on != self.defaults()["on"]:
+            raise InputError(f"{self.name} is on {self.defaults()['on']}: for another, see --kind")
+
     def make(self, data: ScaledDataset) -> Made:
         """As for `ClosedForm`."""
         return Made((), ())
+
+
+class InCoordinates(Full, frozen=True, kw_only=True):
+    """The observation in coordinates that fit the robot, scaled."""
+
+    name: ClassVar[str] = "coordinates"
+
+    on: On = "coordinates"
+
+
+class InSymmetry(Full, frozen=True, kw_only=True):
+    """The same without what shifting and turning the world changes."""
+
+    name: ClassVar[str] = "symmetry"
+
+    on: On = "symmetry"
 
 
 class Subset(ClosedForm, frozen=True, kw_only=True):
@@ -38,9 +60,11 @@ class Subset(ClosedForm, frozen=True, kw_only=True):
 
     def resolved(self, data: ScaledDataset) -> Self:
         """With the names of the features that match the patterns."""
-        names, chosen = data.task.feature_names, set()
+        names, chosen = data.names, set()
+        parts = [data.scaler.parts(data.task)[i] for i in data.used]
         for pattern in self.features:
-            matching = [name for name in names if fnmatchcase(name, pattern)]
+            each = zip(names, parts, strict=True)
+            matching = [n for n, part in each if fnmatchcase(n, pattern) or part == pattern]
             if not matching:
                 raise InputError(
                     f"no feature {pattern!r}: {data.task.name} has {', '.join(names)}; "
@@ -87,7 +111,7 @@ class Noise(Coded, ClosedForm, frozen=True, kw_only=True):
         weight = _FREQUENCY * generator.normal(size=shape)
         phase = generator.uniform(-np.pi, np.pi, size=len(weight))
         nothing = dense(np.zeros(shape[::-1]), np.zeros(data.size))
-        return Made((dense(weight, phase, "sin"),), (nothing,), keep=data.task.feature_names)
+        return Made((dense(weight, phase, "sin"),), (nothing,), keep=data.names)
 
 
 class Random(Coded, ClosedForm, frozen=True, kw_only=True):

@@ -8,7 +8,10 @@ from typing import Any, NamedTuple
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
+from jbrep.coordinates import OBSERVATION, make_coordinates
+from jbrep.coordinates.invariance import check_invariant
 from jbrep.dataset import ScaledDataset
+from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import Encoder, load, save
 from jbrep.encoders.file import SUFFIX
 from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader
@@ -153,10 +156,10 @@ class Fitter:
 
     def _scaled_data(self, method: Method) -> ScaledDataset:
         """The data as a method sees them."""
-        key = method.scaling, method.angles, method.clip, method.keep
+        key = method.scaling, method.on, method.leave_out, method.clip, method.keep
         if key not in self._scaled:
-            usual = ("extrema", False, None, ())
-            self._scaled[key] = self._data if key == usual else self._data.rescaled(*key)
+            usual = (EXTREMA, OBSERVATION, (), None, ())
+            self._scaled[key] = self._data if key == usual else self._rescaled(method)
         data = self._scaled[key]
         try:
             header = EncoderHeader(kind=method.name, name=method.name, environment=data.task)
@@ -166,6 +169,12 @@ class Fitter:
                 f"the observations in {data.dataset.folder} are too large to be encoded: {error}"
             ) from None
         return data
+
+    def _rescaled(self, method: Method) -> ScaledDataset:
+        coordinates = make_coordinates(self._data.task, method.on, method.leave_out)
+        if coordinates and method.on == "symmetry":
+            check_invariant(coordinates)
+        return self._data.rescaled(method.scaling, coordinates, method.clip, method.keep)
 
     def _train_alone(self, plan: Plan, method: Learned) -> bool:
         """Train while no other process does, unless one has finished it; whether one has."""

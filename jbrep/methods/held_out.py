@@ -1,11 +1,11 @@
 """How well encoders reconstruct held-out rows, and how they compare with PCA."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.coordinates import wrapped
 from jbrep.dataset import ScaledDataset
 from jbrep.encoders import Encoder
 from jbrep.encoders.base import BaseEncoder
@@ -30,7 +30,8 @@ def lost(
 ) -> NDArray[np.float32]:
     """What a reconstruction of rows (n, d) lacks, in half widths of the features in the data.
 
-    An encoder that takes angles as sine and cosine is judged round the circle.
+    An encoder on coordinates is judged by what these tell of the rows: angles round the circle, and
+    a robot that symmetry puts at the origin as it stands there.
 
     Args:
         encoder: that can decode.
@@ -38,11 +39,14 @@ def lost(
         data: whose scaling counts.
         given: rows that are encoded in their place, such as corrupted ones.
     """
-    scaler = data.scaler
-    if isinstance(encoder, Encoder):
-        scaler = replace(scaler, angles=encoder.scaler.angles)
     back = encoder.decode(encoder.encode(rows if given is None else given))
-    return scaler.error(back, rows)
+    coordinates = encoder.scaler.coordinates if isinstance(encoder, Encoder) else None
+    if coordinates is None:
+        return (back - rows) / data.scaler.half_width
+    error = back - coordinates.inverse(coordinates.forward(rows))
+    turning = [i for i, each in enumerate(data.task.features) if each.is_full_turn]
+    error[:, turning] = wrapped(error[:, turning])
+    return error / data.scaler.half_width
 
 
 def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:

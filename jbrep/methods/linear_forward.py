@@ -7,9 +7,9 @@ from typing import Annotated, ClassVar
 import numpy as np
 from msgspec import Meta
 
+from jbrep.coordinates import wrapped
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
-from jbrep.dataset.scaling import wrapped
 from jbrep.errors import InputError
 from jbrep.methods.linear import Directions, direction_code, whitening
 from jbrep.methods.passes import Array, blocks
@@ -142,14 +142,8 @@ def nothing_varies(data: ScaledDataset, kind: str) -> InputError:
 
 def turns(data: ScaledDataset) -> Array:
     """The length of a full turn of each scaled number that is an angle, (size,); else infinite."""
-    coded = set(data.scaler.angles)
-    whole = [
-        2 * math.pi / data.scaler.half_width[i]
-        if i < data.task.size and i not in coded and data.task.features[i].is_angle
-        else math.inf
-        for i in data.used
-    ]
-    return np.array(whole)
+    turn = [2 * math.pi if each.is_full_turn else math.inf for each in data.features]
+    return np.array(turn) / data.scaler.half_width[data.used]
 
 
 def change(now: Array, then: Array, turn: Array) -> Array:

@@ -2,10 +2,11 @@
 
 from collections.abc import Iterator
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from msgspec.structs import asdict
 
+from jbrep.coordinates import System
 from jbrep.dataset.scaling import EXTREMA, SCALINGS
 from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose
@@ -23,6 +24,8 @@ _FILES = (  # of methods; each may have several
     "jbrep.methods.forward",
     "jbrep.methods.self_prediction",
     "jbrep.methods.deepmdp",
+    "jbrep.methods.ofe",
+    "jbrep.methods.fourier",
 )
 
 
@@ -36,7 +39,7 @@ def _methods(file: str) -> Iterator[type[Method]]:
 METHODS: dict[str, type[Method]] = {each.name: each for file in _FILES for each in _methods(file)}
 _WORDS: dict[str, tuple[str, Any]] = {  # in names, of settings that aren't the usual ones
     **{name: ("scaling", name) for name in SCALINGS if name != EXTREMA},
-    "angles": ("angles", True),
+    **{system: ("on", system) for system in get_args(System)},
     "raw": ("codes", "raw"),
     "unit": ("codes", "standard"),
     "white": ("codes", "white"),

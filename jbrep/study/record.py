@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
+from jbrep.coordinates import OBSERVATION
 from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import FULL, load
 from jbrep.encoders.base import OWN
@@ -50,7 +51,7 @@ class ShownFacts(Record, frozen=True, kw_only=True, forbid_unknown_fields=False)
 
     noise: float | None = None  # standard deviation of the corruption in training
     scaling: str = EXTREMA  # of the features
-    angles: bool = False  # whether each angle is encoded as its sine and cosine
+    on: str = OBSERVATION  # what is encoded: the observation, or coordinates of it
     keep: tuple[str, ...] = ()  # features that pass around the encoder
     train_rows: Count | None = None
     held_out_mse: float | None = None

@@ -14,7 +14,16 @@ from jbrep.records.record import Record, default_of, from_text, to_plain
 from jbrep.records.words import bare, type_of
 from jbrep.training.network import check_size, get_architecture
 from jbrep.training.objective import Layers, Objective, feature_weights
-from jbrep.training.settings import Angles, Architecture, Clip, Codes, Keep, Latent, Scaling
+from jbrep.training.settings import (
+    Architecture,
+    Clip,
+    Codes,
+    Keep,
+    Latent,
+    LeaveOut,
+    On,
+    Scaling,
+)
 
 
 class Made(NamedTuple):
@@ -39,7 +48,8 @@ class Method(Record, frozen=True, kw_only=True):
     reduces: ClassVar[bool] = False  # whether its code must be smaller than the observation
 
     scaling: Scaling = "extrema"
-    angles: Angles = False
+    on: On = "observation"
+    leave_out: LeaveOut = ()
     clip: Clip = None
 
     @property

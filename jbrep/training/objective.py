@@ -91,14 +91,13 @@ def feature_weights(data: ScaledDataset, weights: Mapping[str, float]) -> Tensor
     Raises:
         InputError: a weight of an unknown feature or one that isn't encoded, or none above 0.
     """
-    if unknown := [name for name in weights if name not in data.names]:
-        if unknown[0] in data.task.feature_names:
-            raise InputError(
-                f"{unknown[0]} passes around the encoder unchanged: it can't have a weight"
-            )
-        known = ", ".join(dict.fromkeys(data.names))  # angles come twice
-        raise InputError(f"a weight of {unknown[0]!r}, which is no feature: there are {known}")
-    values = torch.tensor([float(weights.get(name, 1)) for name in data.names])
+    values = torch.ones(data.scaler.size)
+    for name, weight in weights.items():
+        places = data.scaler.places((name,), data.task)
+        if not set(places) & set(data.used):
+            raise InputError(f"{name} passes around the encoder unchanged: it can't have a weight")
+        values[places] = float(weight)
+    values = values[torch.from_numpy(data.used)]
     if not values.any():
         raise InputError("all weights of features are 0: give at least one above 0")
     return values if weights else None

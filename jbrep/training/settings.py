@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from jbrep.coordinates import INGREDIENTS, Ingredient, System
 from jbrep.encoders.layers import MAX_UNITS
 
 MAX_HORIZON = 1000  # steps ahead
@@ -14,7 +15,20 @@ Scaling = Annotated[
     Literal["extrema", "nominal", "standard", "robust"],
     Meta(description="What becomes -1 and 1: extrema, nominal, standard or robust."),
 ]
-Angles = Annotated[bool, Meta(description="Take angles as sine and cosine.")]
+On = Annotated[
+    System,
+    Meta(
+        description="What is encoded: the observation; angles, the same with each as cosine and "
+        "sine; coordinates, without jumps; or symmetry, without what turning the world changes."
+    ),
+]
+LeaveOut = Annotated[
+    tuple[Ingredient, ...],
+    Meta(
+        title=f"some of {', '.join(INGREDIENTS)}",
+        description=f"Ingredients that coordinates have not: {', '.join(INGREDIENTS)}.",
+    ),
+]
 Clip = Annotated[
     Annotated[float, Meta(ge=1, le=10**6)] | None,
     Meta(title="a number from 1 to 1,000,000", description="Limit of scaled values, at least 1."),

@@ -11,9 +11,9 @@ SPREADS = {0: 0, 1: 1e8, 2: 1e-8}  # of the first features; about 1 of the other
 PLANE = 5  # dimensions in which nearly all variation lies
 
 
-def make_feature(name, unit="", low=None, high=None, bounded=False):
+def make_feature(name, unit="", low=None, high=None, bounded=False, kind="scalar"):
     """A feature as a task has it."""
-    return Feature(name, unit, low, high, bounded)
+    return Feature(name, unit, low, high, bounded, kind=kind)
 
 
 def make_task(features, name="Humanoid-v5"):

@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
+from jbrep.coordinates import OBSERVATION
 from jbrep.dataset.scaling import EXTREMA
 from jbrep.envs.task import Task
 from jbrep.report.figures.plot import Plot
@@ -129,7 +130,7 @@ def system(shared: Label, looks: Looks) -> Plot:
 
 def _scaled(facts: ShownFacts) -> str:
     how = "scaled to [-1, 1]" if facts.scaling == EXTREMA else f"{facts.scaling} scaling"
-    return f"{how}, angles as sine and cosine" if facts.angles else how
+    return how if facts.on == OBSERVATION else f"{facts.on}, {how}"
 
 
 def _action(task: Task) -> str:

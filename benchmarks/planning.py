@@ -1,0 +1,114 @@
+"""What the physics allows: planning on the true model, beside the hand-written policies.
+
+    python benchmarks/planning.py --episodes 10 --task move_to_pose
+
+Predictive sampling (Howell et al. 2022, arXiv 2212.00541): at every replanning, many copies of the
+robot are simulated for a while, half of them with the last plan and coloured noise, half with the
+hand-written policy and such noise; the drives of the best copy are carried out. It sees the true
+state and simulates the true physics, which no agent can: a reference, not a rival.
+"""
+
+import argparse
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+from jbrep.jitterbug.heuristics import HEURISTICS
+from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS, Array, JitterbugTask
+
+COPIES, HORIZON, HELD = 32, 60, 10  # robots; steps that they look ahead; steps until replanning
+SIGMA, KEEP = 0.4, 0.8  # of the noise on drives, and how much of it stays from step to step
+
+
+class Planned(NamedTuple):
+    """An episode that was planned."""
+
+    planned: float  # its return
+    written: float  # that of the hand-written policy from the same start
+    seconds: float
+    steps: int  # of robots that were simulated
+
+
+class Planner:
+    """Chooses drives by simulating copies of a robot."""
+
+    def __init__(self, task: JitterbugTask, copies: int, horizon: int, seed: int):
+        self.copies, self.horizon, self.steps = copies, horizon, 0
+        self._policy = HEURISTICS[task.name]
+        self._robots = Simulation(task, copies)
+        self._random = np.random.default_rng(seed)
+        self._plan = np.zeros(horizon)
+
+    def drives(self, state: dict[str, Array], count: int) -> Array:
+        """The next drives of a robot in that state, (count,)."""
+        robots, copies = self._robots, self.copies
+        robots.restore(**{name: np.repeat(each, copies, 0) for name, each in state.items()})
+        noise, total = np.zeros((copies, 1)), np.zeros(copies)
+        quiet = np.ones((copies, 1))
+        quiet[[0, copies // 2]] = 0  # the last plan, and the hand-written policy, as they are
+        taken = np.empty((self.horizon, copies))
+        for step in range(self.horizon):
+            noise = KEEP * noise + np.sqrt(1 - KEEP**2) * SIGMA * self._random.normal(
+                size=noise.shape
+            )
+            drive = self._policy(robots.observe())
+            drive[: copies // 2] = self._plan[step]
+            drive = np.clip(drive + quiet * noise, -1, 1)
+            diverged = robots.step(drive)
+            total += np.where(diverged, -np.inf, robots.reward())
+            taken[step] = drive[:, 0]
+        self.steps += self.horizon * copies
+        best = taken[:, int(total.argmax())]
+        self._plan = np.concatenate((best[count:], np.zeros(count)))
+        return best[:count]
+
+
+def plan(task: JitterbugTask, seed: int, copies: int, horizon: int, held: int) -> Planned:
+    """Play an episode by planning, and by the hand-written policy."""
+    began, robot = time.perf_counter(), Simulation(task, 1, 1)
+    robot.reset([0], [np.random.default_rng(seed)])
+    planner, planned = Planner(task, copies, horizon, seed), 0.0
+    for _ in range(0, EPISODE_STEPS, held):
+        for drive in planner.drives(robot.state, held):
+            robot.step(np.array([[drive]]))
+            planned += float(robot.reward()[0])
+    seconds, written = time.perf_counter() - began, 0.0
+    robot.reset([0], [np.random.default_rng(seed)])
+    for _ in range(EPISODE_STEPS):
+        robot.step(HEURISTICS[task.name](robot.observe()))
+        written += float(robot.reward()[0])
+    return Planned(planned, written, seconds, planner.steps)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--task", nargs="*", default=list(TASKS))
+    for name, default in (
+        ("episodes", 10),
+        ("copies", COPIES),
+        ("horizon", HORIZON),
+        ("held", HELD),
+    ):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    given = parser.parse_args()
+    print(
+        f"returns of {given.episodes} episodes, median [least, most]; {given.copies} copies look "
+        f"{given.horizon} steps ahead every {given.held} steps\n"
+    )
+    print("| task | planned | hand-written | minutes an episode | robot-steps a step |")
+    print("|---|---|---|---|---|")
+    for name in given.task:
+        each = [
+            plan(TASKS[name], seed, given.copies, given.horizon, given.held)
+            for seed in range(given.episodes)
+        ]
+        columns = np.array(each).T
+        cells = [f"{np.median(c):.0f} [{c.min():.0f}, {c.max():.0f}]" for c in columns[:2]]
+        minutes, cost = columns[2].mean() / 60, columns[3].mean() / EPISODE_STEPS
+        print(f"| {name} | {cells[0]} | {cells[1]} | {minutes:.1f} | {cost:.0f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

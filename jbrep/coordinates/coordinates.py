@@ -1,0 +1,231 @@
+"""Coordinates as data: which formulas, of which features, in which order."""
+
+import math
+import sys
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Annotated, Any, Literal, NamedTuple
+
+from msgspec import Meta
+
+from jbrep.coordinates.formulas import FORMULAS, Columns, Formula
+from jbrep.envs.task import Feature, Task, Word
+from jbrep.errors import InputError
+from jbrep.records.record import Record
+
+_MAX_NUMBERS = 4096
+_Soft = Annotated[float, Meta(ge=0, le=1e12)]
+
+
+class Part(Record, frozen=True, array_like=True):
+    """A formula, applied to some features or to what earlier parts gave."""
+
+    name: Word  # of what it gives, with an ending for each number
+    formula: Literal[
+        "same", "circle", "tilt", "heading", "attitude", "body", "turned", "polar", "difference"
+    ]
+    of: tuple[Word, ...]
+    shown: bool = True  # whether what it gives is among the coordinates
+    soft: _Soft = 0.0  # length at which a polar coordinate leaves its corner
+
+    def check(self) -> None:
+        """As for `Record`."""
+        if len(self.of) != self._formula.takes:
+            raise InputError(
+                f"{self.name}, {self.formula}, takes {self._formula.takes} numbers, but is given "
+                f"{len(self.of)}"
+            )
+        if self.formula == "polar" and not self.soft:
+            raise InputError(f"the soft length of {self.name} is 0: it must be positive")
+
+    @property
+    def _formula(self) -> Formula:
+        return FORMULAS[self.formula]
+
+    @property
+    def gives(self) -> tuple[str, ...]:
+        """Names of the numbers that it gives."""
+        return tuple(f"{self.name}.{end}" if end else self.name for end in self._formula.gives)
+
+    @property
+    def solved(self) -> tuple[str, ...]:
+        """Names of the numbers that its inverse gives."""
+        return self.of[: self._formula.solves]
+
+    @property
+    def beside(self) -> tuple[str, ...]:
+        """Names of the numbers that its inverse needs besides those that it gives."""
+        return self.of[self._formula.solves :]
+
+
+class _Step(NamedTuple):
+    """A formula on the way back from coordinates to features."""
+
+    part: Part
+    is_inverse: bool
+
+
+class Coordinates:
+    """A fixed map from a task's observations to other numbers, and the way back if there is one.
+
+    Observations and coordinates are NumPy arrays or torch tensors, with the numbers along the last
+    axis. None of the formulas jumps, except where a body stands on its head.
+
+    Args:
+        task: whose observations they are calculated from.
+        parts: in order; each takes features, or what earlier parts give.
+
+    Attributes:
+        task, parts: as given.
+        names: of all coordinates, in order.
+        sources: the part that each coordinate is of, by name.
+
+    Raises:
+        InputError: a part takes what isn't known, or two give the same.
+    """
+
+    def __init__(self, task: Task, parts: tuple[Part, ...]):
+        self.task, self.parts = task, parts
+        shown = [part for part in parts if part.shown]
+        self.names = tuple(name for part in shown for name in part.gives)
+        self.sources = tuple(part.name for part in shown for _ in part.gives)
+        self._check()
+        self._way_back = list(self._steps_back())
+
+    def _check(self) -> None:
+        given, known = (
+            [name for part in self.parts for name in part.gives],
+            {*self.task.feature_names},
+        )
+        if not self.names:
+            raise InputError("none of the coordinates is shown")
+        if len(given) > _MAX_NUMBERS:
+            raise InputError(f"there are {len(given):,} coordinates: the limit is {_MAX_NUMBERS:,}")
+        if len(set(given)) < len(given):
+            raise InputError("two parts of the coordinates give the same name")
+        for part in self.parts:
+            if missing := [name for name in part.of if name not in known]:
+                raise InputError(f"{part.name} takes {missing[0]}, which {self.task.name} hasn't")
+            known.update(part.gives)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def forward(self, observation: Any) -> Any:
+        """Observations (..., d) in physical units as coordinates (..., m)."""
+        library = library_of(observation)
+        known = {name: observation[..., i] for i, name in enumerate(self.task.feature_names)}
+        for part in self.parts:
+            _calculate(library, _Step(part, False), known)
+        return library.stack([known[name] for name in self.names], -1)
+
+    def inverse(self, coordinates: Any) -> Any:
+        """Coordinates (..., m) as observations (..., d) in physical units.
+
+        Features that the coordinates don't tell are 0; a heading that they don't tell is along the
+        world's x axis; a quaternion has a w that isn't negative, an angle is in the range of its
+        feature, or else within half a turn of 0.
+        """
+        library = library_of(coordinates)
+        known = {name: coordinates[..., i] for i, name in enumerate(self.names)}
+        for step in self._way_back:
+            if isinstance(step, str):
+                known[step] = coordinates[..., 0] * 0
+            else:
+                _calculate(library, step, known)
+        return library.stack([_in_range(known[each.name], each) for each in self.task.features], -1)
+
+    @cached_property
+    def lost(self) -> tuple[str, ...]:
+        """Features that the inverse doesn't give back, such as a position in the world."""
+        tilted = {name for part in self.parts if part.formula == "tilt" for name in part.of}
+        return tuple(n for n in self.task.feature_names if n in tilted or n in self._way_back)
+
+    def _steps_back(self) -> Iterator["_Step | str"]:
+        """Steps that lead from coordinates to features; the name of a feature sets it to 0."""
+        known = set(self.names)
+        for name in (None, *self.task.feature_names):
+            if name is not None and name not in known:
+                yield name
+                known.add(name)
+            yield from self._allowed(known)
+
+    def _allowed(self, known: set[str]) -> Iterator[_Step]:
+        """All steps that what is known allows; adds to it."""
+        before = None
+        while before != len(known):
+            before = len(known)
+            for part in self.parts:
+                ways = (
+                    (True, {*part.gives, *part.beside}, part.solved),
+                    (False, {*part.of}, part.gives),
+                )
+                for is_inverse, needs, gives in ways:
+                    if needs <= known and not known.issuperset(gives):
+                        yield _Step(part, is_inverse)
+                        known.update(gives)
+
+    @cached_property
+    def features(self) -> tuple[Feature, ...]:
+        """The coordinates as features: their names, units, and usual ranges where known."""
+        known = {each.name: each for each in self.task.features}
+        for part in self.parts:
+            of = [known[name] for name in part.of]
+            known |= zip(part.gives, _described(part, of), strict=True)
+        return tuple(known[name] for name in self.names)
+
+
+def _described(part: Part, of: list[Feature]) -> list[Feature]:
+    """What a part gives, as features."""
+    if part.formula == "same":
+        return [of[0].replace(name=part.name)]
+    of = of[: 2 if part.formula in ("turned", "polar", "difference") else 3]
+    sizes = [
+        max(-each.low, each.high) for each in of if each.low is not None and each.high is not None
+    ]
+    most = max(sizes) if len(sizes) == len(of) else None
+    if part.formula == "difference" and most is not None:
+        most *= 2
+    unit, plain = of[0].unit, part.formula in ("circle", "tilt", "heading", "attitude")
+    made = []
+    for name in part.gives:
+        if plain or (part.formula == "polar" and not name.endswith(".length")):
+            made.append(Feature(name=name, low=-1.0, high=1.0, bounded=True))
+        elif most is None:
+            made.append(Feature(name=name, unit=unit))
+        else:
+            low = 0.0 if part.formula == "polar" else -most
+            made.append(Feature(name=name, unit=unit, low=low, high=most))
+    return made
+
+
+def _calculate(library: Any, step: _Step, known: dict[str, Any]) -> None:
+    part, formula = step.part, FORMULAS[step.part.formula]
+    takes, gives = (
+        (part.gives + part.beside, part.solved) if step.is_inverse else (part.of, part.gives)
+    )
+    columns: Columns = [known[name] for name in takes]
+    made = formula.inverse if step.is_inverse else formula.forward
+    assert made is not None  # else it would solve nothing
+    for name, column in zip(gives, made(library, columns, part.soft), strict=True):
+        known.setdefault(name, column)
+
+
+def _in_range(values: Any, feature: Feature) -> Any:
+    """An angle in its feature's range, or within half a turn of 0; other values as they are."""
+    if not feature.is_angle:
+        return values
+    middle = 0.0
+    if feature.is_full_turn and feature.low is not None and feature.high is not None:
+        middle = (feature.high + feature.low) / 2
+    return wrapped(values - middle) + middle
+
+
+def wrapped(angle: Any) -> Any:
+    """Angles [rad] within half a turn of 0."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def library_of(values: Any) -> Any:
+    """The library of an array: NumPy, or torch."""
+    return sys.modules["torch" if type(values).__module__ == "torch" else "numpy"]

@@ -1,0 +1,155 @@
+"""The formulas of coordinates, column by column: for NumPy, torch and whatever else calculates.
+
+Each takes the library (of sin, cos, sqrt and arctan2) and a list of columns, and gives columns.
+Quaternions are (w, x, y, z) and turn vectors of the body into the world.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+Columns = list[Any]
+_UPSIDE_DOWN = 1e-6  # of w^2 + z^2, below which a tilt says nothing of a heading
+
+
+class Formula(NamedTuple):
+    """A map of some numbers to others, and the way back.
+
+    Attributes:
+        takes: how many numbers.
+        gives: endings of the names of those that it gives.
+        forward: (library, columns, soft) to columns.
+        solves: how many of the numbers that it takes, from the first on, `inverse` gives back.
+        inverse: (library, what it gave and then the other numbers that it takes, soft) to columns.
+    """
+
+    takes: int
+    gives: tuple[str, ...]
+    forward: Callable[[Any, Columns, float], Columns]
+    solves: int = 0
+    inverse: Callable[[Any, Columns, float], Columns] | None = None
+
+
+def _same(library: Any, columns: Columns, soft: float) -> Columns:
+    return columns
+
+
+def _circle(library: Any, columns: Columns, soft: float) -> Columns:
+    (angle,) = columns
+    return [library.cos(angle), library.sin(angle)]
+
+
+def _angle(library: Any, columns: Columns, soft: float) -> Columns:
+    cosine, sine = columns
+    return [library.arctan2(sine, cosine)]
+
+
+def _tilt(library: Any, columns: Columns, soft: float) -> Columns:
+    """The world's z axis in the body's frame: where up is, minus the direction of gravity."""
+    w, x, y, z = columns
+    return [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z]
+
+
+def _heading(library: Any, columns: Columns, soft: float) -> Columns:
+    """Cosine and sine of the turn about the vertical, times cos^2 of half the tilt."""
+    w, _, _, z = columns
+    return [w * w - z * z, 2 * w * z]
+
+
+def _attitude(library: Any, columns: Columns, soft: float) -> Columns:
+    return _tilt(library, columns, soft) + _heading(library, columns, soft)
+
+
+def _quaternion(library: Any, columns: Columns, soft: float) -> Columns:
+    """The unit quaternion of a tilt and a heading, w not negative."""
+    up_x, up_y, up_z, cosine, sine = columns
+    share = abs(1 + up_z) / 2 + _UPSIDE_DOWN  # w^2 + z^2
+    half = library.arctan2(sine, cosine) / 2
+    root = library.sqrt(share)
+    w, z = root * library.cos(half), root * library.sin(half)
+    x, y = (z * up_x + w * up_y) / (2 * share), (z * up_y - w * up_x) / (2 * share)
+    norm = library.sqrt(w * w + x * x + y * y + z * z)
+    return [w / norm, x / norm, y / norm, z / norm]
+
+
+def _upright(library: Any, columns: Columns, soft: float) -> Columns:
+    """The quaternion of a tilt, heading along the world's x axis."""
+    nothing = columns[0] * 0
+    return _quaternion(library, [*columns, nothing + 1, nothing], soft)
+
+
+def _rotate(v: Columns, q: Columns, sign: int) -> Columns:
+    """A vector turned by a quaternion, or by its inverse if the sign is -1."""
+    (a, b, c), (w, x, y, z) = v, q
+    w = sign * w
+    p, q1, r = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
+    return [
+        a + 2 * (y * r - z * q1),
+        b + 2 * (z * p - x * r),
+        c + 2 * (x * q1 - y * p),
+    ]
+
+
+def _into_body(library: Any, columns: Columns, soft: float) -> Columns:
+    return _rotate(columns[:3], columns[3:], -1)
+
+
+def _into_world(library: Any, columns: Columns, soft: float) -> Columns:
+    return _rotate(columns[:3], columns[3:], 1)
+
+
+def _turned(library: Any, columns: Columns, soft: float) -> Columns:
+    """A planar vector turned back by the angle of another one, times the other's length.
+
+    Of two directions: cosine and sine of their difference.
+    """
+    x, y, cosine, sine = columns
+    return [x * cosine + y * sine, y * cosine - x * sine]
+
+
+def _turned_back(library: Any, columns: Columns, soft: float) -> Columns:
+    x, y, cosine, sine = columns
+    size = cosine * cosine + sine * sine + _UPSIDE_DOWN
+    return [(x * cosine - y * sine) / size, (y * cosine + x * sine) / size]
+
+
+def _polar(library: Any, columns: Columns, soft: float) -> Columns:
+    """Length and direction, without the corner that they have at 0.
+
+    With R = sqrt(x^2 + y^2 + soft^2): R - soft, x / R, y / R.
+    """
+    x, y = columns
+    length = library.sqrt(x * x + y * y + soft * soft)
+    return [length - soft, x / length, y / length]
+
+
+def _planar(library: Any, columns: Columns, soft: float) -> Columns:
+    length, x, y = columns
+    return [x * (length + soft), y * (length + soft)]
+
+
+def _difference(library: Any, columns: Columns, soft: float) -> Columns:
+    x, y, other_x, other_y = columns
+    return [x - other_x, y - other_y]
+
+
+def _sum(library: Any, columns: Columns, soft: float) -> Columns:
+    x, y, other_x, other_y = columns
+    return [x + other_x, y + other_y]
+
+
+_AXES = "x", "y", "z"
+_PLANE = "x", "y"
+_TURN = "cos", "sin"
+_UP = "up_x", "up_y", "up_z"
+
+FORMULAS: dict[str, Formula] = {
+    "same": Formula(1, ("",), _same, 1, _same),
+    "circle": Formula(1, _TURN, _circle, 1, _angle),
+    "tilt": Formula(4, _UP, _tilt, 4, _upright),
+    "heading": Formula(4, _TURN, _heading),
+    "attitude": Formula(4, (*_UP, *_TURN), _attitude, 4, _quaternion),
+    "body": Formula(7, _AXES, _into_body, 3, _into_world),
+    "turned": Formula(4, _TURN, _turned, 2, _turned_back),
+    "polar": Formula(2, ("length", *_TURN), _polar, 2, _planar),
+    "difference": Formula(4, _PLANE, _difference, 2, _sum),
+}

@@ -1,0 +1,79 @@
+"""Whether a task is the same wherever its robot stands and however it is turned: tried out."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces.utils import flatten
+
+from jbrep.coordinates.coordinates import Coordinates
+from jbrep.envs.make import make_env
+from jbrep.envs.mujoco import quarter_turn
+from jbrep.envs.task import Array, Task
+from jbrep.errors import InputError
+
+_SEEDS, _BEFORE, _AFTER = 3, 10, 5  # episodes; steps before the turn and after it
+_SAME = 1e-5  # relative difference of rewards and coordinates, as float32 rounds them
+_SHIFT = (0.5, -0.25)  # [m]
+
+
+def check_invariant(coordinates: Coordinates) -> None:
+    """Make sure that turning and shifting the robot changes neither coordinates nor rewards.
+
+    Two robots are played alike; then one of them is turned by a quarter and, if the task has points
+    in the world, shifted, with the targets that the environment moves along.
+
+    Raises:
+        InputError: they change, or it can't be tried.
+    """
+    task = coordinates.task
+    envs = [make_env(task.id, task.arguments, task.max_episode_steps) for _ in range(2)]
+    names, compared = (*coordinates.names, "the reward"), 0
+    try:
+        for seed in range(_SEEDS):
+            for observations, rewards in _played(envs, task, seed):
+                seen = np.column_stack((coordinates.forward(observations), rewards))
+                apart = np.abs(seen[0] - seen[1]) / np.maximum(np.abs(seen).max(axis=0), 1)
+                compared += 1
+                worst = int(apart.argmax())
+                if apart[worst] > _SAME:
+                    raise InputError(
+                        f"{task.name} isn't the same for a turned robot: {names[worst]} is "
+                        f"{seen[0][worst]:.4g} without a quarter turn and {seen[1][worst]:.4g} "
+                        "after one; use coordinates in place of symmetry"
+                    )
+    finally:
+        for env in envs:
+            env.close()
+    if not compared:
+        raise InputError(
+            f"symmetry can't be tried on {task.name}: its episodes under random actions end within "
+            f"{_BEFORE} steps; use coordinates"
+        )
+
+
+def _played(
+    envs: Sequence[gymnasium.Env[Any, Any]], task: Task, seed: int
+) -> Iterator[tuple[Array, Array]]:
+    """Observations (2, d) and rewards (2,) of some steps of a robot, and of the same one turned."""
+    random = np.random.default_rng(seed)
+    shift = _SHIFT if any(each.kind == "point" for each in task.features) else (0.0, 0.0)
+    for env in envs:
+        env.reset(seed=seed)
+    for step in range(_BEFORE + _AFTER):
+        if step == _BEFORE and not quarter_turn(envs[1], shift):
+            raise InputError(
+                f"symmetry can't be tried on {task.name}: its robot isn't a free body of MuJoCo's, "
+                "and its environment has no quarter_turn; use coordinates"
+            )
+        action = random.uniform(task.action_low, task.action_high).astype(np.float32)
+        moved = [env.step(action) for env in envs]
+        if step >= _BEFORE:
+            seen = [
+                flatten(env.observation_space, each[0])
+                for env, each in zip(envs, moved, strict=True)
+            ]
+            yield np.array(seen, np.float64), np.array([each[1] for each in moved], np.float64)
+        if any(each[2] or each[3] for each in moved):
+            return

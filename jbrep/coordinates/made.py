@@ -1,0 +1,208 @@
+"""Systems of coordinates, made from what a task says of its features."""
+
+from collections.abc import Collection, Iterator
+from functools import cached_property
+from itertools import combinations
+from typing import Any, Literal, get_args
+
+from jbrep.coordinates.coordinates import Coordinates, Part
+from jbrep.envs.task import SPATIAL, Feature, Task
+from jbrep.errors import InputError
+
+System = Literal["observation", "angles", "coordinates", "symmetry"]
+Ingredient = Literal["angles", "attitude", "body", "distance", "phases"]
+SYSTEMS: tuple[System, ...] = get_args(System)
+INGREDIENTS: tuple[Ingredient, ...] = get_args(Ingredient)
+OBSERVATION: System = "observation"
+_NEEDED = frozenset(("attitude", "body"))  # without which nothing is invariant
+_SOFT = 0.01  # length at which a distance leaves its corner: this share of its usual range
+_Names = tuple[str, ...]
+_Features = tuple[Feature, ...]
+
+
+def make_coordinates(
+    task: Task, system: System, leave_out: Collection[Ingredient] = ()
+) -> Coordinates | None:
+    """A task's coordinates, from the kinds of its features.
+
+    Args:
+        task: says what its features are.
+        system: `observation` for the features as they are; `angles` with each angle as cosine and
+            sine; `coordinates` with all ingredients; `symmetry` without what shifting and turning
+            the world changes.
+        leave_out: of the last two: `angles` (cosine and sine), `attitude` (a quaternion as tilt and
+            heading), `body` (vectors of the world in the body's frame), `distance` (length and
+            direction of offsets), `phases` (differences of angles and directions that turn wholly).
+
+    Returns:
+        The coordinates; None for the observation itself.
+
+    Raises:
+        InputError: the task's features don't allow them; or an ingredient that is needed or that
+            isn't there is left out.
+    """
+    if leave_out and system in (OBSERVATION, "angles"):
+        raise InputError(f"nothing can be left out of {system}: give coordinates or symmetry")
+    if system == OBSERVATION:
+        return None
+    invariant = system == "symmetry"
+    if invariant and (needed := _NEEDED & set(leave_out)):
+        raise InputError(f"{min(needed)} can't be left out of symmetry: nothing else is invariant")
+    used = {"angles"} if system == "angles" else set(INGREDIENTS) - set(leave_out)
+    made = Coordinates(task, tuple(_Maker(task, used, invariant).parts()))
+    if invariant and list(made.parts) == _Maker(task, used, False).parts():
+        raise InputError(
+            f"{task.name} has no feature that says where its robot is in the world or how it is "
+            "turned, so symmetry has nothing to leave out: use coordinates"
+        )
+    if made.names == task.feature_names:
+        raise InputError(
+            f"{task.name} has no features of which {system} would be anything else than the "
+            "observation: say of what kinds they are, with --features FILE.toml"
+        )
+    return made
+
+
+class _Maker:
+    """Makes the parts of a task's coordinates, one kind of features at a time.
+
+    Args:
+        task: whose features they are made of.
+        used: ingredients.
+        invariant: whether to leave out what shifting and turning the world changes.
+
+    Raises:
+        InputError: the task has no attitude, or several, where one is needed.
+    """
+
+    def __init__(self, task: Task, used: Collection[str], invariant: bool):
+        self._task, self._used, self._invariant = task, used, invariant
+        self._parts: list[Part] = []
+        self._directions: list[tuple[str, _Names]] = []  # that turn wholly, as cosine and sine
+        self._place: _Names = ()  # x and y of the first point in the world
+        self._quaternion = self._only(lambda each: each.kind == "quaternion")
+        self._yaw = self._only(lambda each: each.kind == "angle" and each.frame == "world")
+
+    def _only(self, fits: Any) -> _Names:
+        """The features that fit, of one body."""
+        found = [tuple(each.name for each in unit) for unit in _units(self._task) if fits(unit[0])]
+        if self._invariant and len(found) > 1:
+            raise InputError(
+                f"{self._task.name} has several attitudes, of {found[0][0]} and {found[1][0]}: "
+                "only the symmetry of one body is known"
+            )
+        return found[0] if found else ()
+
+    def parts(self) -> list[Part]:
+        """All parts, in the order of the features; phases come last."""
+        makers = {
+            "scalar": self._same,
+            "angle": self._angle,
+            "quaternion": self._attitude,
+            "vector": self._vector,
+            "offset": self._offset,
+            "point": self._point,
+        }
+        for unit in _units(self._task):
+            makers[unit[0].kind](unit)
+        if "phases" in self._used:
+            for (name, turn), (other, other_turn) in combinations(self._directions, 2):
+                self._add(f"{name}-{other}", "turned", (*turn, *other_turn))
+        return self._parts
+
+    def _add(
+        self, name: str, formula: Any, of: _Names, shown: bool = True, soft: float = 0
+    ) -> _Names:
+        part = Part(name=name, formula=formula, of=of, shown=shown, soft=soft)
+        self._parts.append(part)
+        return part.gives
+
+    @cached_property
+    def _heading(self) -> _Names:
+        """Cosine and sine of the body's heading in the world, hidden; none if it has none."""
+        if self._quaternion:
+            return self._add(f"{self._quaternion[0]}.heading", "heading", self._quaternion, False)
+        if self._yaw:
+            return self._add(f"{self._yaw[0]}.heading", "circle", self._yaw, False)
+        return ()
+
+    def _same(self, unit: _Features) -> _Names:
+        return sum((self._add(each.name, "same", (each.name,)) for each in unit), ())
+
+    def _angle(self, unit: _Features) -> None:
+        (angle,), name = unit, unit[0].name
+        if angle.frame == "world" and self._invariant:
+            if self._quaternion:  # else it is the heading itself
+                turn = self._add(f"{name}.world", "circle", (name,), False)
+                self._add(name, "turned", (*turn, *self._heading))
+        elif "angles" not in self._used:
+            self._same(unit)
+        else:
+            turn = self._add(name, "circle", (name,))
+            if angle.is_full_turn and angle.frame != "world":
+                self._directions.append((name, turn))
+
+    def _attitude(self, unit: _Features) -> None:
+        if "attitude" in self._used and unit[0].name == self._quaternion[0]:
+            self._add(_word(unit), "tilt" if self._invariant else "attitude", self._quaternion)
+        else:
+            self._same(unit)
+
+    def _vector(self, unit: _Features) -> _Names:
+        """A vector in the body's frame, if it is one of the world; the names of its numbers."""
+        if unit[0].frame != "world" or "body" not in self._used:
+            return self._same(unit)
+        names = tuple(each.name for each in unit)
+        if len(names) == 3 and self._quaternion:
+            return self._add(_word(unit), "body", (*names, *self._quaternion))
+        if self._heading:
+            return self._add(_word(unit), "turned", (*names[:2], *self._heading)) + self._same(
+                unit[2:]
+            )
+        if self._invariant:
+            raise InputError(
+                f"{self._task.name} has {_word(unit)} in the world, but no feature says how its "
+                "body is turned: symmetry needs a quaternion, or an angle in the world"
+            )
+        return self._same(unit)
+
+    def _offset(self, unit: _Features) -> None:
+        self._polar(_word(unit), self._vector(unit)[:2], unit[0])
+
+    def _polar(self, name: str, plane: _Names, like: Feature) -> None:
+        if "distance" in self._used:
+            soft = _SOFT * (like.high or 1.0)
+            _, *turn = self._add(f"{name}_at", "polar", plane, soft=soft)
+            self._directions.append((f"{name}_at", tuple(turn)))
+
+    def _point(self, unit: _Features) -> None:
+        names = tuple(each.name for each in unit)
+        if not self._invariant:
+            self._same(unit)
+            return
+        self._same(unit[2:])  # the height
+        if not self._place:
+            self._place = names[:2]
+            return
+        apart = self._add(f"{_word(unit)}.apart", "difference", (*names[:2], *self._place), False)
+        if not self._heading:
+            raise InputError(
+                f"{self._task.name} has {_word(unit)} in the world, but no feature says how its "
+                "body is turned: symmetry needs a quaternion, or an angle in the world"
+            )
+        plane = self._add(_word(unit), "turned", (*apart, *self._heading))
+        self._polar(_word(unit), plane, unit[0])
+
+
+def _units(task: Task) -> Iterator[_Features]:
+    """The features that belong together: those of a vector or quaternion, each other by itself."""
+    for place in task.groups.values():
+        group = task.features[place]
+        if group[0].kind in SPATIAL:
+            yield group
+        else:
+            yield from ((each,) for each in group)
+
+
+def _word(unit: _Features) -> str:
+    return unit[0].group or unit[0].name

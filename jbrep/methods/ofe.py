@@ -1,0 +1,152 @@
+"""OFENet: a code larger than the observation, from which the next observation follows."""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import torch
+from msgspec import Meta
+from torch import Tensor, nn
+
+from jbrep.dataset import ScaledDataset
+from jbrep.encoders.layers import Layer
+from jbrep.errors import InputError
+from jbrep.methods.linear import dense
+from jbrep.methods.passes import Array
+from jbrep.training.method import Learned
+from jbrep.training.network import seeded
+from jbrep.training.objective import Layers, Objective
+from jbrep.training.settings import BatchSize, Epochs, LearningRate, Seed
+from jbrep.training.windows import Windows
+
+
+class OFE(Learned, frozen=True, kw_only=True):
+    """The observation with features beside it, from which the next one follows (OFENet)."""
+
+    name: ClassVar[str] = "ofe"
+    reduces: ClassVar[bool] = False
+
+    blocks: Annotated[
+        int, Meta(ge=1, le=32, description="Layers, each of which sees all that come before.")
+    ] = 4
+    epochs: Epochs = 12
+    batch_size: BatchSize = None
+    learning_rate: LearningRate = 1e-3
+    seed: Seed = 0
+
+    def check_data(self, data: ScaledDataset) -> None:
+        """As for `Method`."""
+        super().check_data(data)
+        if self.latent < data.size + self.blocks:
+            raise InputError(
+                f"latent size is {self.latent}: with {data.size} features, which are part of the "
+                f"code, and {self.blocks} blocks it must be at least {data.size + self.blocks}"
+            )
+
+    def objective(self, data: ScaledDataset) -> Objective:
+        """As for `Learned`."""
+        return OFEObjective(self, data)
+
+
+class DenseBlocks(nn.Module):
+    """Layers of which each adds units to all numbers before it (DenseNet): [x, h1, h2, ...].
+
+    A unit is silu(batch norm(w . numbers before)), as in OFENet.
+
+    Args:
+        size: numbers that the first layer takes.
+        widths: units that each layer adds.
+    """
+
+    def __init__(self, size: int, widths: Sequence[int]):
+        super().__init__()
+        self.linears, self.norms = nn.ModuleList(), nn.ModuleList()
+        for width in widths:
+            self.linears.append(nn.Linear(size, width))
+            self.norms.append(nn.BatchNorm1d(width))
+            size += width
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Numbers (n, size) with all units after them."""
+        for linear, norm in zip(self.linears, self.norms, strict=True):
+            units = nn.functional.silu(norm(linear(values)))
+            values = torch.cat((values, units), 1)
+        return values
+
+    def layers(self) -> Layers:
+        """The same as a chain of dense layers, in evaluation.
+
+        Numbers pass through a layer's activation as x = silu(x) - silu(-x).
+        """
+        chain: list[Layer] = []
+        restore: Array | None = None  # from what a layer gives to the numbers that it stands for
+        for linear, norm in zip(self.linears, self.norms, strict=True):
+            weight, bias = _folded(linear, norm)
+            same = np.eye(weight.shape[1])
+            rows = np.vstack((same, -same, weight))
+            shift = np.concatenate((np.zeros(2 * len(same)), bias))
+            chain.append(dense(rows if restore is None else rows @ restore, shift, "silu"))
+            restore = np.block(
+                [
+                    [same, -same, np.zeros((len(same), len(weight)))],
+                    [np.zeros((len(weight), 2 * len(same))), np.eye(len(weight))],
+                ]
+            )
+        assert restore is not None  # there is a block
+        return (*chain, dense(restore, np.zeros(len(restore))))
+
+
+def _folded(linear: Any, norm: Any) -> tuple[Array, Array]:
+    """Weight and bias of a linear layer with its batch norm, in evaluation."""
+    weight, bias, mean, variance, scale, shift = (
+        each.detach().cpu().double().numpy()
+        for each in (
+            linear.weight,
+            linear.bias,
+            norm.running_mean,
+            norm.running_var,
+            norm.weight,
+            norm.bias,
+        )
+    )
+    factor = scale / np.sqrt(variance + norm.eps)
+    return weight * factor[:, None], (bias - mean) * factor + shift
+
+
+class OFEObjective(Objective):
+    """The mean squared error of the next row, from features of row and action (Ota et al. 2020).
+
+    z = blocks(x) of a row, then the next row is linear in more blocks of (z, action).
+    """
+
+    horizon = 1
+
+    def __init__(self, method: OFE, data: ScaledDataset):
+        super().__init__()
+        self._size = data.size
+        parts = np.array_split(np.zeros(method.latent - data.size), method.blocks)
+        widths = [len(part) for part in parts]
+        inputs = method.latent + data.task.action_size
+        with seeded(method.seed):
+            self.blocks = DenseBlocks(data.size, widths)
+            self.encoder = nn.Sequential(self.blocks)
+            self.beside_action = DenseBlocks(inputs, widths)
+            self.next_row = nn.Linear(inputs + sum(widths), data.size)
+
+    def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
+        """Rows (n, size), actions (n, k), and the next rows (n, size)."""
+        actions = windows.actions(numbers).flatten(1)
+        return windows.rows(numbers), actions, windows.rows(numbers, 1)
+
+    def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
+        """As for `Objective`."""
+        now, actions, after = batch
+        known = self.beside_action(torch.cat((self.encoder(now), actions), 1))
+        error: Tensor = (self.next_row(known) - after).square().mean()
+        return error
+
+    def layers(self) -> tuple[Layers, Layers | None]:
+        """As for `Objective`; the decoder takes the row out of the code."""
+        encoder = self.blocks.layers()
+        rows = np.eye(self._size, len(encoder[-1].bias))
+        return encoder, (dense(rows, np.zeros(self._size)),)

@@ -1,0 +1,277 @@
+"""Coordinates: the same state without jumps, the way back, and what turning the world leaves."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+
+from jbrep.coordinates import INGREDIENTS, Coordinates, make_coordinates
+from jbrep.coordinates.coordinates import Part
+from jbrep.coordinates.invariance import check_invariant
+from jbrep.envs.description import describe
+from jbrep.envs.mujoco import turned_quaternion
+from jbrep.envs.task import Feature
+from jbrep.errors import InputError
+from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.tasks import TASKS
+from jbrep.records.record import from_plain, to_plain
+
+TASK = TASKS["move_to_pose"].plain
+ANGLES = ("motor_angle", "angle_to_target")
+
+
+def states(task, count=200, seed=0):
+    """Observations with any attitude and all angles."""
+    random = np.random.default_rng(seed)
+    rows = task.unscale(random.uniform(-1, 1, (count, task.size)))
+    quaternion = random.normal(size=(count, 4))
+    quaternion *= np.sign(quaternion[:, :1]) / np.linalg.norm(quaternion, axis=1, keepdims=True)
+    rows[:, task.groups["orientation"]] = quaternion
+    return rows
+
+
+def turn(rows, task, angle, shift=(0.0, 0.0)):
+    """The same robot and target, turned about the vertical and shifted."""
+    rows, groups = rows.copy(), task.groups
+    rotation = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    for name in ("position", "velocity"):
+        plane = slice(groups[name].start, groups[name].start + 2)
+        rows[:, plane] = rows[:, plane] @ rotation + (shift if name == "position" else 0)
+    w, x, y, z = rows[:, groups["orientation"]].T
+    cosine, sine = np.cos(angle / 2), np.sin(angle / 2)
+    rows[:, groups["orientation"]] = np.column_stack(
+        (cosine * w - sine * z, cosine * x - sine * y, cosine * y + sine * x, cosine * z + sine * w)
+    )
+    return rows
+
+
+@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("system", ["angles", "coordinates"])
+def test_coordinates_lose_nothing(name, system):
+    task = TASKS[name].plain
+    made, rows = make_coordinates(task, system), states(TASKS[name].plain)
+    assert not made.lost
+    np.testing.assert_allclose(made.inverse(made.forward(rows)), rows, atol=2e-4)
+
+
+@pytest.mark.parametrize("system", ["coordinates", "symmetry"])
+def test_nothing_jumps_where_an_angle_or_a_quaternion_does(system):
+    made, row = make_coordinates(TASK, system), states(TASK, 1)
+    yaw, orientation = 1e-4, TASK.groups["orientation"]
+    before, after = row.copy(), row.copy()
+    for name in ANGLES:
+        before[:, TASK.groups[name]], after[:, TASK.groups[name]] = np.pi - 1e-4, -np.pi + 1e-4
+    after[:, orientation] *= -1  # the same attitude
+    after = turn(after, TASK, yaw)
+    near = np.abs(made.forward(after) - made.forward(before)).max()
+    assert near < 0.02
+    assert np.abs(after - before).max() > 6
+
+
+def test_a_distance_has_no_corner_at_the_target():
+    made = make_coordinates(TASK, "coordinates")
+    target = TASK.groups["target"].start
+    line = np.repeat(states(TASK, 1), 201, axis=0)
+    line[:, target] = np.linspace(-0.1, 0.1, 201)
+    line[:, target + 1] = 0
+    seen = made.forward(line)[
+        :, [made.names.index("target_at.length"), made.names.index("target_at.cos")]
+    ]
+    bends = np.abs(np.diff(seen, 2, axis=0)).max(axis=0)
+    steps = np.abs(np.diff(seen, axis=0)).max(axis=0)
+    assert (bends < 0.1 * steps).all()  # of |x| and its sign, a bend would be 1 or 2 steps
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_symmetry_is_what_turning_and_shifting_leaves(name):
+    task = TASKS[name].plain
+    made, rows = make_coordinates(task, "symmetry"), states(TASKS[name].plain)
+    shift = (0, 0) if name == "move_from_origin" else (1.5, -0.7)
+    for angle in (0.3, -2.5, np.pi):
+        other = turn(rows, task, angle, shift)
+        np.testing.assert_allclose(made.forward(other), made.forward(rows), atol=1e-9)
+    seen = make_coordinates(task, "coordinates").forward(turn(rows, task, 1.0))
+    assert np.abs(seen - make_coordinates(task, "coordinates").forward(rows)).max() > 0.1
+
+
+def test_symmetry_gives_back_the_robot_at_the_origin_heading_along_x():
+    made, rows = make_coordinates(TASK, "symmetry"), states(TASK)
+    back = made.inverse(made.forward(rows))
+    np.testing.assert_allclose(made.forward(back), made.forward(rows), atol=2e-4)
+    np.testing.assert_array_equal(back[:, :2], 0)
+    np.testing.assert_allclose(back[:, TASK.groups["orientation"].stop - 1], 0, atol=1e-9)
+    assert set(made.lost) == {"position_x", "position_y", *TASK.feature_names[3:7]}
+
+
+def test_a_turned_robot_moves_alike_until_chaos_parts_them():
+    made, task = make_coordinates(TASK, "symmetry"), TASKS["move_to_pose"]
+    one, other = (Simulation(task, 3, 1) for _ in range(2))
+    for simulation in (one, other):
+        simulation.reset(range(3), [np.random.default_rng(seed) for seed in range(3)])
+    other.quarter_turn((0.4, -2.0))
+    random = np.random.default_rng(0)
+    for _ in range(50):
+        action = random.uniform(-1, 1, (3, 1))
+        one.step(action)
+        other.step(action)
+        codes = (made.forward(each.observe()) for each in (one, other))
+        np.testing.assert_allclose(*codes, atol=1e-6)
+        np.testing.assert_allclose(one.reward(), other.reward(), atol=1e-9)
+    assert np.abs(one.readings.qpos - other.readings.qpos).max() > 0.3
+
+
+def test_torch_gives_the_same_and_gradients():
+    made, rows = make_coordinates(TASK, "coordinates"), states(TASK)
+    tensor = torch.tensor(rows, requires_grad=True)
+    seen = made.forward(tensor)
+    np.testing.assert_allclose(seen.detach(), made.forward(rows))
+    back = made.inverse(seen)
+    np.testing.assert_allclose(back.detach(), made.inverse(made.forward(rows)))
+    back.sum().backward()
+    assert torch.isfinite(tensor.grad).all()
+
+
+@pytest.mark.parametrize(
+    ("ingredient", "gone"),
+    [
+        ("angles", "motor_angle.cos"),
+        ("attitude", "orientation.up_x"),
+        ("body", "velocity.x"),
+        ("distance", "target_at.length"),
+        ("phases", "motor_angle-angle_to_target.cos"),
+    ],
+)
+def test_each_ingredient_can_be_left_out(ingredient, gone):
+    assert ingredient in INGREDIENTS
+    whole, rows = make_coordinates(TASK, "coordinates"), states(TASK)
+    made = make_coordinates(TASK, "coordinates", [ingredient])
+    assert gone in whole.names
+    assert gone not in made.names
+    np.testing.assert_allclose(made.inverse(made.forward(rows)), rows, atol=2e-4)
+
+
+def test_coordinates_are_features_with_ranges():
+    described = {each.name: each for each in make_coordinates(TASK, "coordinates").features}
+    assert described["velocity.x"] == Feature("velocity.x", "m/s", -1.0, 1.0)
+    assert described["motor_angle.sin"] == Feature("motor_angle.sin", "", -1.0, 1.0, True)
+    assert described["target_at.length"] == Feature("target_at.length", "m", 0.0, 3.0)
+    assert described["position_z"] == TASK.features[2]
+
+
+def test_kinds_follow_from_mujocos_model():
+    ant = describe("Ant-v5")
+    assert Counter((each.kind, each.frame) for each in ant.features) == {
+        ("scalar", ""): 87,  # the height among them, whose x and y aren't seen
+        ("quaternion", ""): 4,
+        ("angle", ""): 8,
+        ("vector", "world"): 3,
+        ("vector", "body"): 3,
+    }
+    assert [each.kind for each in ant.features[:6]] == ["scalar", *["quaternion"] * 4, "angle"]
+    swimmer = describe("Swimmer-v5").features
+    assert [(each.kind, each.frame) for each in swimmer[:5]] == [
+        ("angle", "world"),
+        ("angle", ""),
+        ("angle", ""),
+        ("vector", "world"),
+        ("vector", "world"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("env", "said"),
+    [
+        ("Ant-v5", "Ant-v5 isn't the same for a turned robot: the reward is"),
+        ("Swimmer-v5", "the reward"),
+    ],
+)
+def test_symmetry_is_tried_not_believed(env, said):
+    task = describe(env)
+    with pytest.raises(InputError, match=said):
+        check_invariant(make_coordinates(task, "symmetry"))
+
+
+def test_the_jitterbugs_symmetry_holds():
+    for each in TASKS.values():
+        check_invariant(make_coordinates(each.plain, "symmetry"))
+
+
+@pytest.mark.parametrize(
+    ("feature", "said"),
+    [
+        ({"unit": "deg", "kind": "angle"}, "a is an angle in deg: it must be in rad"),
+        (
+            {"unit": "rad", "kind": "angle", "low": -1.0, "high": 1.0, "bounded": True},
+            "a is an angle that stays in its range, which must be a full turn",
+        ),
+        ({"kind": "angle", "frame": "body"}, "its frame must be world, or left out"),
+        ({"kind": "vector"}, "a is a vector: its frame must be world, body or heading"),
+        ({"kind": "point", "frame": "body"}, "a is a point in the body's frame"),
+        ({"kind": "spinor"}, "kind is 'spinor': it must be one of angle, offset, point"),
+    ],
+)
+def test_a_feature_that_cant_be(feature, said):
+    with pytest.raises(InputError, match=said):
+        Feature("a", **feature)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "said"),
+    [
+        (["quaternion"] * 3, "g is a quaternion of 3 numbers: it must have 4"),
+        (["quaternion"] * 5, "g is a quaternion of 5 numbers"),
+        (["vector"] * 4, "g is a vector of 4 numbers: it must have 2 or 3"),
+        (["vector", "vector", "scalar"], "g has features beside those of its vector"),
+    ],
+)
+def test_a_group_that_cant_be(kinds, said):
+    frame = {"vector": "body"}
+    features = [
+        Feature(f"f{i}", group="g", kind=kind, frame=frame.get(kind, ""))
+        for i, kind in enumerate(kinds)
+    ]
+    with pytest.raises(InputError, match=said):
+        TASK.replace(features=features)
+
+
+@pytest.mark.parametrize(
+    ("system", "leave_out", "said"),
+    [
+        ("symmetry", ["body"], "body can't be left out of symmetry"),
+        ("angles", ["phases"], "nothing can be left out of angles"),
+    ],
+)
+def test_what_cant_be_left_out(system, leave_out, said):
+    with pytest.raises(InputError, match=said):
+        make_coordinates(TASK, system, leave_out)
+
+
+def test_a_task_whose_features_say_nothing():
+    plain = TASK.replace(features=[each.replace(kind="scalar", frame="") for each in TASK.features])
+    with pytest.raises(InputError, match="no features of which coordinates would be anything else"):
+        make_coordinates(plain, "coordinates")
+    with pytest.raises(InputError, match="symmetry has nothing to leave out"):
+        make_coordinates(plain, "symmetry")
+
+
+def test_a_strangers_coordinates_are_checked():
+    parts = make_coordinates(TASK, "symmetry").parts
+    plain = to_plain(parts)
+    assert from_plain(plain, tuple[Part, ...]) == parts
+    for spoiled, said in (
+        ([*plain, plain[0]], "two parts of the coordinates give the same name"),
+        ([[*plain[0][:1], "exec", *plain[0][2:]]], "'exec': it must be one of attitude, body"),
+        ([["a", "circle", ["x", "y"], True, 0.0]], "a, circle, takes 1 numbers, but is given 2"),
+        ([["a", "polar", ["x", "y"], True, 0.0]], "the soft length of a is 0"),
+        ([["a", "same", ["target_x"], False, 0.0]], "none of the coordinates is shown"),
+        ([["../a", "same", ["x"], True, 0.0]], "must be a letter, then letters"),
+        ([["a", "same", ["height"], True, 0.0]], "a takes height, which move_to_pose hasn't"),
+    ):
+        with pytest.raises(InputError, match=said):
+            Coordinates(TASK, from_plain(spoiled, tuple[Part, ...]))
+
+
+def test_a_quarter_turn_is_one():
+    quaternion = turned_quaternion(np.array([[1.0, 0, 0, 0]]))
+    np.testing.assert_allclose(quaternion, [[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])
