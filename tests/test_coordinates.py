@@ -9,6 +9,7 @@ import torch
 from jbrep.coordinates import INGREDIENTS, Coordinates, make_coordinates
 from jbrep.coordinates.coordinates import Part
 from jbrep.coordinates.invariance import check_invariant
+from jbrep.coordinates.placing import placed
 from jbrep.envs.description import describe
 from jbrep.envs.mujoco import turned_quaternion
 from jbrep.envs.task import Feature
@@ -102,6 +103,16 @@ def test_symmetry_gives_back_the_robot_at_the_origin_heading_along_x():
     np.testing.assert_array_equal(back[:, :2], 0)
     np.testing.assert_allclose(back[:, TASK.groups["orientation"].stop - 1], 0, atol=1e-9)
     assert set(made.lost) == {"position_x", "position_y", *TASK.feature_names[3:7]}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_robot_is_put_back_where_it_stood(name):
+    task = TASKS[name].plain
+    made, rows = make_coordinates(task, "symmetry"), states(TASKS[name].plain)
+    back = placed(task, made.inverse(made.forward(rows)), rows)
+    quaternion = back[:, task.groups["orientation"]]
+    quaternion *= np.sign((quaternion * rows[:, task.groups["orientation"]]).sum(1, keepdims=True))
+    np.testing.assert_allclose(back, rows, atol=1e-3)
 
 
 def test_a_turned_robot_moves_alike_until_chaos_parts_them():

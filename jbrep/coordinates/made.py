@@ -80,30 +80,20 @@ class _Maker:
         self._parts: list[Part] = []
         self._directions: list[tuple[str, _Names]] = []  # that turn wholly, as cosine and sine
         self._place: _Names = ()  # x and y of the first point in the world
-        self._quaternion = self._only(lambda each: each.kind == "quaternion")
-        self._yaw = self._only(lambda each: each.kind == "angle" and each.frame == "world")
-
-    def _only(self, fits: Any) -> _Names:
-        """The features that fit, of one body."""
-        found = [tuple(each.name for each in unit) for unit in _units(self._task) if fits(unit[0])]
-        if self._invariant and len(found) > 1:
-            raise InputError(
-                f"{self._task.name} has several attitudes, of {found[0][0]} and {found[1][0]}: "
-                "only the symmetry of one body is known"
-            )
-        return found[0] if found else ()
+        self._attitude = attitude_of(task)
+        self._quaternion = self._attitude if len(self._attitude) == 4 else ()
 
     def parts(self) -> list[Part]:
         """All parts, in the order of the features; phases come last."""
         makers = {
             "scalar": self._same,
             "angle": self._angle,
-            "quaternion": self._attitude,
+            "quaternion": self._tilt,
             "vector": self._vector,
             "offset": self._offset,
             "point": self._point,
         }
-        for unit in _units(self._task):
+        for _, unit in units(self._task):
             makers[unit[0].kind](unit)
         if "phases" in self._used:
             for (name, turn), (other, other_turn) in combinations(self._directions, 2):
@@ -120,19 +110,18 @@ class _Maker:
     @cached_property
     def _heading(self) -> _Names:
         """Cosine and sine of the body's heading in the world, hidden; none if it has none."""
-        if self._quaternion:
-            return self._add(f"{self._quaternion[0]}.heading", "heading", self._quaternion, False)
-        if self._yaw:
-            return self._add(f"{self._yaw[0]}.heading", "circle", self._yaw, False)
-        return ()
+        if not self._attitude:
+            return ()
+        formula = "heading" if self._quaternion else "circle"
+        return self._add(f"{self._attitude[0]}.heading", formula, self._attitude, False)
 
     def _same(self, unit: _Features) -> _Names:
         return sum((self._add(each.name, "same", (each.name,)) for each in unit), ())
 
     def _angle(self, unit: _Features) -> None:
-        (angle,), name = unit, unit[0].name
+        angle, name = unit[0], unit[0].name
         if angle.frame == "world" and self._invariant:
-            if self._quaternion:  # else it is the heading itself
+            if self._attitude != (name,):  # else it is the heading itself
                 turn = self._add(f"{name}.world", "circle", (name,), False)
                 self._add(name, "turned", (*turn, *self._heading))
         elif "angles" not in self._used:
@@ -142,9 +131,14 @@ class _Maker:
             if angle.is_full_turn and angle.frame != "world":
                 self._directions.append((name, turn))
 
-    def _attitude(self, unit: _Features) -> None:
-        if "attitude" in self._used and unit[0].name == self._quaternion[0]:
+    def _tilt(self, unit: _Features) -> None:
+        if "attitude" in self._used and tuple(each.name for each in unit) == self._quaternion:
             self._add(_word(unit), "tilt" if self._invariant else "attitude", self._quaternion)
+        elif self._invariant:
+            raise InputError(
+                f"{self._task.name} has several attitudes, {_word(unit)} among them: symmetry is "
+                "that of one body"
+            )
         else:
             self._same(unit)
 
@@ -194,14 +188,24 @@ class _Maker:
         self._polar(_word(unit), plane, unit[0])
 
 
-def _units(task: Task) -> Iterator[_Features]:
-    """The features that belong together: those of a vector or quaternion, each other by itself."""
+def units(task: Task) -> Iterator[tuple[slice, _Features]]:
+    """The features that belong together, with their places: a vector's, or one by itself."""
     for place in task.groups.values():
-        group = task.features[place]
-        if group[0].kind in SPATIAL:
-            yield group
+        if task.features[place.start].kind in SPATIAL:
+            yield place, task.features[place]
         else:
-            yield from ((each,) for each in group)
+            yield from (
+                (slice(i, i + 1), (task.features[i],)) for i in range(place.start, place.stop)
+            )
+
+
+def attitude_of(task: Task) -> tuple[str, ...]:
+    """The features that say how a body is turned: a quaternion, or an angle in the world."""
+    every = [unit for _, unit in units(task)]
+    turned = [unit for unit in every if unit[0].kind == "quaternion"] or [
+        unit for unit in every if unit[0].kind == "angle" and unit[0].frame == "world"
+    ]
+    return tuple(each.name for each in turned[0]) if turned else ()
 
 
 def _word(unit: _Features) -> str:

@@ -49,6 +49,11 @@ class BaseEncoder(ABC):
         kind = type(self).__name__
         return f"{kind}({self.name}, {self.task.name}, {self.size} to {self.latent_size})"
 
+    @property
+    def is_invariant(self) -> bool:
+        """Whether it doesn't tell where a robot is, so that all are decoded at the origin."""
+        return False
+
     @abstractmethod
     def encode(self, observation: Any) -> Any:
         """Encode observations (..., d) in physical units as latents (..., l)."""

@@ -226,6 +226,11 @@ class Encoder(BaseEncoder):
             self._on[device] = Arrays(scaler, encoder, decoder, self.kept)
         return self._on[device]
 
+    @property
+    def is_invariant(self) -> bool:
+        """As for `BaseEncoder`."""
+        return self.scaler.coordinates is not None and bool(self.scaler.coordinates.lost)
+
     def check_task(self, task: Task) -> None:
         """As for `BaseEncoder`; other arguments, such as another body of the robot, will do."""
         check_same(task, self.task, self.name)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jbrep.coordinates.placing import placed
 from jbrep.encoders.base import BaseEncoder
 from jbrep.inspection.blueprint import episode_layout, series_pages
 from jbrep.inspection.directions import name_directions, send_directions
@@ -52,6 +53,8 @@ def record_episode(
     if encoder:
         latent = encoder.encode(rollout.observation)
         decoded = encoder.decode(latent).astype(np.float64) if encoder.can_decode else None
+        if decoded is not None and encoder.is_invariant:
+            decoded = placed(task, decoded, rollout.observation)
         send_encoding(recording, times, rollout, encoder, latent, decoded)
         if decoded is not None and robot and motion and jitterbug_task(task):
             send_ghost(recording, robot, times, task, motion, decoded)
