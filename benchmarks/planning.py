@@ -18,7 +18,8 @@ from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import EPISODE_STEPS, TASKS, Array, JitterbugTask
 
-COPIES, HORIZON, HELD = 32, 60, 10  # robots; steps that they look ahead; steps until replanning
+COPIES, HORIZON, HELD = 16, 80, 10  # robots; steps that they look ahead; steps until replanning
+TAIL, BEYOND = 20, 100  # the mean reward of the last steps counts for so many beyond the horizon
 SIGMA, KEEP = 0.4, 0.8  # of the noise on drives, and how much of it stays from step to step
 
 
@@ -45,7 +46,7 @@ class Planner:
         """The next drives of a robot in that state, (count,)."""
         robots, copies = self._robots, self.copies
         robots.restore(**{name: np.repeat(each, copies, 0) for name, each in state.items()})
-        noise, total = np.zeros((copies, 1)), np.zeros(copies)
+        noise, rewards = np.zeros((copies, 1)), np.empty((self.horizon, copies))
         quiet = np.ones((copies, 1))
         quiet[[0, copies // 2]] = 0  # the last plan, and the hand-written policy, as they are
         taken = np.empty((self.horizon, copies))
@@ -57,10 +58,11 @@ class Planner:
             drive[: copies // 2] = self._plan[step]
             drive = np.clip(drive + quiet * noise, -1, 1)
             diverged = robots.step(drive)
-            total += np.where(diverged, -np.inf, robots.reward())
+            rewards[step] = np.where(diverged, -np.inf, robots.reward())
             taken[step] = drive[:, 0]
         self.steps += self.horizon * copies
-        best = taken[:, int(total.argmax())]
+        value = rewards.sum(axis=0) + BEYOND * rewards[-TAIL:].mean(axis=0)
+        best = taken[:, int(value.argmax())]
         self._plan = np.concatenate((best[count:], np.zeros(count)))
         return best[:count]
 
