@@ -19,6 +19,7 @@ from jbrep.study.record import EACH_ITS_OWN, EncoderFacts, Label
 from jbrep.study.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, number, slug
 
+RUNNING = "running mean and variance"  # of what agents see, where they normalise it
 _NOT_SHOWN = ("task", "representation", "encoder", "encoder_code")  # among the settings
 _OPTIONS = ("task", "algorithm", "preset", *TrainingSettings.__struct_fields__)  # of jbrep rl
 
@@ -39,6 +40,33 @@ def outline(tables: Tables) -> str:
         f"failed; up to {max(run.steps for run in runs):,} steps each."
         + (f" With {', '.join(own)}, {EACH_ITS_OWN}." if own else "")
     )
+
+
+def full_scaling(tables: Tables) -> str:
+    """How the full state is scaled, in a sentence; empty where no agent sees it."""
+    labels = tables.record.labels.values()
+    full = [each for each in labels if each.settings.representation == FULL]
+    if not full:
+        return ""
+    ways = {
+        RUNNING if each.settings.hyperparameters.normalize else each.encoder.shown.scaling
+        for each in full
+    }
+    rows, others = (
+        {e.encoder.shown.train_rows for e in labels if (e in full) == is_full} - {None}
+        for is_full in (True, False)
+    )
+    told = f"The full state is scaled by {' or '.join(sorted(ways))}"
+    if rows:
+        told += f" of {_states(rows)} states"
+    if rows and others - rows:
+        made = f"codes are made of {_states(others)}"
+        told += f", {made}: so they differ by more than what they leave out"
+    return f"{told}."
+
+
+def _states(counts: set[int | None]) -> str:
+    return " or ".join(f"{count:,}" for count in sorted(filter(None, counts)))
 
 
 def registered(tables: Tables) -> str:

@@ -26,8 +26,7 @@ def _parts(
     tables: Tables, answers: Sequence[Answer], predictions: Sequence[Table], picture: str
 ) -> Iterator[str]:
     yield from (f"# {escape(tables.name)}", escape(facts.outline(tables)))
-    if registered := facts.registered(tables):
-        yield escape(registered)
+    yield from map(escape, filter(None, (facts.full_scaling(tables), facts.registered(tables))))
     for notice in facts.notices(tables):
         yield f"> {escape(notice)}"
     yield f"**{escape(headline(tables.analysis))}**"
