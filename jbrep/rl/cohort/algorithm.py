@@ -113,10 +113,20 @@ def optimizer_step(optimizer: Optimizer) -> Iterator[None]:
     optimizer.zero_grad()
 
 
-def polyak_update(weights: Any, targets: Any, tau: float) -> None:
-    """Move the weights of target networks towards those of others by a share of the distance."""
-    for weight, target in zip(tree_leaves(weights), tree_leaves(targets), strict=True):
-        target.lerp_(weight, tau)
+class Following:
+    """The weights of target networks that follow those of others.
+
+    Args:
+        weights: of networks.
+        targets: the same of their targets.
+    """
+
+    def __init__(self, weights: Any, targets: Any):
+        self._weights, self._targets = tree_leaves(weights), tree_leaves(targets)
+
+    def move(self, tau: float) -> None:
+        """Move the targets' weights by a share of the distance."""
+        torch._foreach_lerp_(self._targets, self._weights, tau)
 
 
 def check(algorithm: str, hyperparameters: Hyperparameters) -> None:

@@ -91,7 +91,8 @@ def _one_by_one(left: Tensor, right: Tensor) -> Tensor:
     A processor sums a product of a batch differently if it has one member, or many.
     """
     products = left.new_empty(len(left), left.shape[1], right.shape[2])
-    for a, b, product in zip(left, right, products, strict=True):
+    each = zip(left.unbind(), right.unbind(), products.unbind(), strict=True)
+    for a, b, product in each:
         torch.mm(a, b, out=product)
     return products
 
