@@ -290,6 +290,16 @@ def test_members_do_not_depend_on_their_companions(done, tmp_path):
     assert_same(tmp_path, done)
 
 
+@pytest.mark.parametrize("trainer", ["cohort", "sb3"])
+def test_threads_that_step_robots_change_no_byte(trainer, tmp_path):
+    run = runs(80, "wide", algorithm="td3", overrides={"num_envs": 4}, trainer=trainer)[0]
+    for threads, folder in ((1, tmp_path / "one" / "0"), (3, tmp_path / "three" / "0")):
+        job = Job(run, folder, threads)
+        assert job.threads_for(2) == min(threads, 2)
+        [*_] = train_jobs([job], Session())
+    assert_same(tmp_path / "three", tmp_path / "one", "0")
+
+
 @pytest.mark.parametrize("rollouts", [0, 30])
 def test_a_stopped_cohort_goes_on_to_the_same_bytes(rollouts, done, tmp_path):
     asked = count()

@@ -125,6 +125,8 @@ def rl(context: click.Context, /, out: Path, project: str | None, **options: Any
     resumes from it, to the same result.
     """
     with stop_signals() as received:
+        from joblib import cpu_count
+
         from jbrep.encoders.shipped import source_of
         from jbrep.rl import StoppedError
         from jbrep.rl.files import EVALUATIONS, RUN, last_returns, read_evaluations
@@ -132,7 +134,7 @@ def rl(context: click.Context, /, out: Path, project: str | None, **options: Any
         from jbrep.rl.trainers import train_jobs
 
         run = given_run(options)
-        job = Job(run, out)
+        job = Job(run, out, cpu_count())
         source = source_of(run.encoder, run.task)
         if not run.task.reproducible:
             click.echo(_NOT_REPRODUCIBLE.format(run.task.name), err=True)

@@ -40,10 +40,15 @@ ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
 
 
 def make_env(
-    task: Task, num_envs: int, seed: int, encoder: BaseEncoder, normalize: bool = False
+    task: Task,
+    num_envs: int,
+    seed: int,
+    encoder: BaseEncoder,
+    normalize: bool = False,
+    num_threads: int = 1,
 ) -> VecEnv:
-    """Lanes of a task seen through an encoder, stepped on one thread."""
-    env = VecMonitor(JitterbugVecEnv(task, num_envs, seed, encoder, num_threads=1))
+    """Lanes of a task seen through an encoder, stepped on so many threads."""
+    env = VecMonitor(JitterbugVecEnv(task, num_envs, seed, encoder, num_threads))
     return normalized(env) if normalize else env
 
 

@@ -116,11 +116,6 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
         """Of the evaluation after so many steps."""
         return self.final_episodes if step >= self.steps else self.evaluation_episodes
 
-    @property
-    def physics_threads(self) -> int | None:
-        """Threads that step the robots: one where each core has a process, else all (None)."""
-        return 1 if self.device == "cpu" else None
-
     def differing(self, wanted: "RunSettings") -> str:
         """How they differ from those of the run at hand, for a message; empty if they don't."""
         return differences(_flat(self), _flat(wanted))

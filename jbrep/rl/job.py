@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
+from joblib import cpu_count
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 from torch.utils.tensorboard import SummaryWriter
@@ -40,7 +41,7 @@ from jbrep.rl.files import (
 from jbrep.rl.policy_file import MAX_BYTES, Trained, pack_whole, read
 from jbrep.rl.policy_zip import policy_zip
 from jbrep.rl.run import Run
-from jbrep.rl.settings import MAX_LINE
+from jbrep.rl.settings import CPU, MAX_LINE
 
 Watch = Callable[[int, float | None], None]  # steps so far; mean return of the last evaluation
 Ended = tuple["Job", RunRecord]
@@ -74,6 +75,7 @@ class Job:
     Attributes:
         run: what to train.
         folder: where; it need not exist yet.
+        threads: that may step its robots; gradient steps take one.
         encoder: that the run sees its task through.
         settings: of the run, as run.json has them.
         history: what was recorded so far.
@@ -82,11 +84,20 @@ class Job:
         InputError: as `Run.settings`.
     """
 
-    def __init__(self, run: Run, folder: Path):
-        self.run, self.folder = run, folder
+    def __init__(self, run: Run, folder: Path, threads: int = 1):
+        self.run, self.folder, self.threads = run, folder, threads
         self.encoder = run.find_encoder()
         self.settings = run.settings(self.encoder)
         self.history = History()
+
+    def anew(self) -> "Job":
+        """The same with nothing recorded yet."""
+        return Job(self.run, self.folder, self.threads)
+
+    def threads_for(self, lanes: int) -> int:
+        """How many threads step so many of its robots; no bit depends on it."""
+        is_alone = self.settings.device != CPU  # studies have a process for each core otherwise
+        return min(cpu_count() if is_alone else self.threads, lanes)
 
     @property
     def result(self) -> RunRecord | None:
@@ -145,7 +156,8 @@ class Job:
     @cached_property
     def evaluator(self) -> Evaluator:
         """What plays the run's evaluations."""
-        episodes, threads = self.run.evaluation_episodes, self.settings.physics_threads
+        episodes = self.run.evaluation_episodes
+        threads = self.threads_for(episodes)
         return Evaluator(self.run.task, self.encoder, episodes, num_threads=threads)
 
     def evaluate(self, agent: BaseAlgorithm) -> None:

@@ -60,7 +60,9 @@ def _train(job: Job, session: Session) -> RunRecord:
     chosen, follower = settings.hyperparameters, _Follower(job, session)
     job.keep_encoder()
     seed = training_seed(run.seed)
-    env = make_env(run.task, chosen.num_envs, seed, job.encoder, chosen.normalize)
+    lanes = chosen.num_envs
+    threads = job.threads_for(lanes)
+    env = make_env(run.task, lanes, seed, job.encoder, chosen.normalize, threads)
     agent = make_agent(settings.algorithm, chosen, env, run.seed, settings.episode_steps)
     env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
     job.prepare(agent, session.writers)

@@ -40,7 +40,8 @@ class Cohort:
         ahead = Ahead(self._shared.n_steps, self._shared.gamma)
         capacity = capacity_of(job.run)
         self._replay = ReplayBuffer(len(members), self._lanes, capacity, *sizes, ahead)
-        self._endless = Endless(task, len(members) * self._lanes, settings.physics_threads)
+        lanes = len(members) * self._lanes
+        self._endless = Endless(task, lanes, job.threads_for(lanes))
         self._device = torch.device(settings.device)
         agents = [member.agent for member in members]
         self._stack = Stack(agents, self._size, settings.precision, settings.device)

@@ -83,7 +83,7 @@ def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
     except EnvironmentFailedError as error:
         cohort.member_of(error.lane).fail(str(error))
         yield from map(_end, cohort.failed)
-        others = [Job(m.job.run, m.job.folder) for m in cohort.members if not m.failure]
+        others = [m.job.anew() for m in cohort.members if not m.failure]
         yield from train_together(others, session)  # from their checkpoints
     finally:
         for member in everyone:
