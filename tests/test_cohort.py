@@ -161,7 +161,8 @@ FOLLOWED = [
     ("sac", "modern", {"num_envs": 2, "normalize": True}),
     ("td3", "wide", {"num_envs": 4}),
     ("sac", "modern", {"num_envs": 2, "n_steps": 3}),
-    ("td3", "modern", {"num_envs": 2, "noise": {"kind": "coloured"}}),
+    ("td3", "modern", {"num_envs": 2, "noise": {"kind": "coloured"}, "action_repeat": 2}),
+    ("sac", "modern", {"n_steps": 3, "action_repeat": 3, "noise": {"kind": "coloured"}}),
 ]
 
 
@@ -169,7 +170,8 @@ FOLLOWED = [
 def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, tmp_path):
     """The same bits until the first gradient step; ten steps later, the same weights nearly."""
     settings = {"learning_starts": 100, **overrides}
-    made = runs(110, preset, algorithm=algorithm, overrides=settings)
+    steps = 110 * overrides.get("action_repeat", 1)
+    made = runs(steps, preset, algorithm=algorithm, overrides=settings)
     members = [Member(Job(run, tmp_path / str(run.seed)), []) for run in made]
     cohort = Cohort(members)
     while cohort.goes_on:
@@ -195,11 +197,13 @@ def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, t
 def alone(run):
     """What stable-baselines3 makes of a run."""
     preset, seed = run.learner.hyperparameters, training_seed(run.seed)
-    env = make_env(run.task, preset.num_envs, seed, run.find_encoder(), preset.normalize)
-    agent = make_agent(run.learner.algorithm, preset, env, run.seed)
+    how = preset.normalize, 1, preset.action_repeat
+    env = make_env(run.task, preset.num_envs, seed, run.find_encoder(), *how)
+    steps = preset.agent_steps(run.task.max_episode_steps)
+    agent = make_agent(run.learner.algorithm, preset, env, run.seed, steps)
     env.seed(seed)
     agent.set_logger(Logger(None, []))
-    return agent.learn(run.steps)
+    return agent.learn(preset.agent_steps(run.steps))
 
 
 @pytest.mark.parametrize("added", [7, 10, 23])

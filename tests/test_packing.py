@@ -63,7 +63,7 @@ def test_a_width_is_not_passed_and_what_has_no_cohort_goes_alone(tmp_path):
 def test_memory_limits_the_width(tmp_path, monkeypatch):
     plan = Plan(STUDY.replace(algorithms=("sac-modern",), steps=1_000_000), tmp_path)
     bytes_of_one = memory_of(plan.run(plan.cells[0]), 16)
-    assert bytes_of_one == 1_000_000 * (16 + 1 + 16 + 1 + 1) * 4
+    assert bytes_of_one == 1_000_000 * (16 + 1 + 16 + 1 + 1 + 1) * 4
     gib = 1 << 30
     monkeypatch.setattr(os, "sysconf", {"SC_PHYS_PAGES": 4, "SC_PAGE_SIZE": gib}.__getitem__)
     packs = packed(plan, 2)

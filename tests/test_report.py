@@ -456,8 +456,8 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
         ),
         (
             "runs.json",
-            lambda text: text.replace('version": 1', 'version": 2'),
-            "this jbrep reads version 1 alone",
+            lambda text: text.replace('version": 2', 'version": 1'),
+            "this jbrep reads version 2 alone",
         ),
         ("returns.csv", lambda text: text.replace("full,3,1000", "full,3,0"), "differ in their ep"),
         ("returns.csv", lambda text: text.replace("full,3,", "full,9,"), "of evaluations is 0"),
@@ -521,7 +521,7 @@ def test_changed_tables_are_refused_or_shown(whole, tmp_path, monkeypatch):
 def test_a_run_of_a_newer_jbrep_is_named(tmp_path):
     plan = make_study(tmp_path / "new", left=11)
     path = plan.folder_of(plan.cells[0]) / "run.json"
-    path.write_text(path.read_text().replace('version": 3', 'version": 7'))
+    path.write_text(path.read_text().replace('version": 4', 'version": 7'))
     with pytest.raises(InputError, match=r"run\.json has version 7 of the jbrep run format"):
         conclude(plan.folder)
 

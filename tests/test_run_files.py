@@ -154,8 +154,8 @@ def test_every_field_of_a_run_is_checked(run):
     ("content", "message"),
     [
         (b"[]", "it must be an object"),
-        (b'{"format": "jbrep run", "format_version": 3}', "is missing"),
-        (b'{"format": "jbrep run", "format_version": 2}', "version 2 of the jbrep run format"),
+        (b'{"format": "jbrep run", "format_version": 4}', "is missing"),
+        (b'{"format": "jbrep run", "format_version": 3}', "version 3 of the jbrep run format"),
     ],
 )
 def test_a_run_file_of_anything_else(content, message, run):

@@ -33,6 +33,7 @@ from jbrep.study.results import conclude
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
 PINK = {"kind": "coloured", "beta": 1, "sigma": 0.2}
+HELD = {"action_repeat": 3, "n_steps": 2}
 SMALL = {"net_arch": [8], "learning_starts": 10, "train_freq": 5, "batch_size": 8}
 QUICK = {
     "task": TASK,
@@ -250,18 +251,17 @@ def resumed(run, folder, stop_at=40):
     return folder
 
 
-@pytest.mark.filterwarnings("ignore:`n_steps=2` is ignored")  # in stable-baselines3's `load`
 @pytest.mark.parametrize(
     ("algorithm", "overrides"),
     [
-        ("tqc", {**SMALL, "num_envs": 2, "noise": PINK}),
+        ("tqc", {**SMALL, "num_envs": 2, "noise": PINK, "action_repeat": 2}),
         ("crossq", {**SMALL, "renorm_warmup_steps": 2}),
         ("sac", {**SMALL, "use_sde": True, "n_steps": 2}),
         (
             "ppo",
             {"n_steps": 10, "batch_size": 20, "num_envs": 2, "use_sde": True, "normalize": True},
         ),
-        ("td3", {**SMALL, "learning_rate": "linear:0.01", "noise": PINK}),
+        ("td3", {**SMALL, "learning_rate": "linear:0.01", "noise": PINK, **HELD}),
     ],
 )
 def test_a_stopped_run_resumes_to_the_same_bytes_whatever_its_settings(

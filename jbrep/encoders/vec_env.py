@@ -44,14 +44,16 @@ class JitterbugVecEnv(VecEnv):
             observation.
         num_threads: threads to step the lanes on; None takes one for each core.
         max_episode_steps: the time limit of a task given by its name [steps].
+        action_repeat: control steps for which each action is held, fewer where an episode ends
+            before; a step of the environment, whose reward is their sum.
 
     Attributes:
         task: the task.
         lanes: the episodes under way.
 
     When an episode ends, `infos[i]` holds `terminal_observation` and `TimeLimit.truncated`, whether
-    it ended without a terminal state; the Jitterbug's also `non_finite`, whether its physics
-    diverged.
+    it ended without a terminal state, and `control_steps`, its length; the Jitterbug's also
+    `non_finite`, whether its physics diverged.
 
     Raises:
         InputError: unknown task, a number below 1, an encoder made for other features or that
@@ -70,6 +72,7 @@ class JitterbugVecEnv(VecEnv):
         encoder: Any = None,
         num_threads: int | None = None,
         max_episode_steps: int | None = None,
+        action_repeat: int = 1,
     ):
         if isinstance(task, str):
             task = describe(task, max_episode_steps=max_episode_steps)
@@ -77,7 +80,7 @@ class JitterbugVecEnv(VecEnv):
             raise InputError(f"{task.name} is described with its time limit: describe it anew")
         self.task = task
         self._encoder = None if encoder is None else as_encoder(encoder, task)
-        self._endless = Endless(task, num_envs, num_threads)
+        self._endless = Endless(task, num_envs, num_threads, action_repeat)
         self.lanes = self._endless.lanes
         observation_space, action_space = agent_spaces(task, self._encoder)
         self._low, self._high = np.array(task.action_low), np.array(task.action_high)
@@ -102,7 +105,7 @@ class JitterbugVecEnv(VecEnv):
         self._actions = np.minimum(np.maximum(checked, self._low), self._high)
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Take one step in every lane; where an episode ends, start the next."""
+        """Hold the actions for a step of every lane; where an episode ends, start the next."""
         moved = self._endless.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if moved.ended.any():

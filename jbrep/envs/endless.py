@@ -1,20 +1,23 @@
 """Lanes that never stop: where an episode ends, the next one begins."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from jbrep.envs.lanes import Flags, Lanes, State
+from jbrep.envs.lanes import Flags, Lanes, State, Step
 from jbrep.envs.task import Array, Task
+from jbrep.errors import InputError
 
 
 class Moved(NamedTuple):
-    """What a step of n lanes led to."""
+    """What an action in each of n lanes led to."""
 
     observation: Array  # (n, d); the first of the next episode where one ended
     final: Array  # (n, d); the last one of the episode that ended, else the same
-    reward: Array  # (n,)
+    reward: Array  # (n,), the sum while the action was held
+    length: NDArray[np.int64]  # (n,) steps of the episode so far, or of the one that ended
     ended: Flags  # (n,)
     terminated: Flags  # (n,) whether a state ended it
     non_finite: Flags | None  # (n,) whether the physics diverged, where the environment says so
@@ -24,9 +27,12 @@ class Moved(NamedTuple):
         """Whether the physics is known to have diverged, (n,)."""
         return np.zeros_like(self.ended) if self.non_finite is None else self.non_finite
 
-    def told(self, lane: int) -> dict[str, bool]:
-        """What an environment says of the end of a lane's episode, by its own names."""
-        return {} if self.non_finite is None else {"non_finite": bool(self.non_finite[lane])}
+    def told(self, lane: int) -> dict[str, Any]:
+        """What there is to say of the end of a lane's episode, some of it by its environment."""
+        told: dict[str, Any] = {"control_steps": int(self.length[lane])}
+        if self.non_finite is not None:
+            told["non_finite"] = bool(self.non_finite[lane])
+        return told
 
 
 class Endless:
@@ -40,13 +46,17 @@ class Endless:
         task: whose environment is made.
         num_lanes: n.
         num_threads: as for `Lanes`.
+        repeat: steps for which each action is held; fewer where an episode ends before.
 
     Attributes:
         lanes: the episodes under way.
     """
 
-    def __init__(self, task: Task, num_lanes: int, num_threads: int | None = None):
+    def __init__(self, task: Task, num_lanes: int, num_threads: int | None = None, repeat: int = 1):
+        if repeat < 1:
+            raise InputError(f"the action repeat is {repeat}: it must be at least 1")
         self.lanes = Lanes(task, num_lanes, num_threads)
+        self._repeat = repeat
         self._seeds = np.zeros(num_lanes, np.int64)
         self._episodes = np.zeros(num_lanes, np.int64)  # k of each lane's episode
 
@@ -59,19 +69,32 @@ class Endless:
         return self._start(range(self.lanes.num_lanes))
 
     def step(self, actions: Array) -> Moved:
-        """Take a step in every lane; actions (n, k).
+        """Hold an action in every lane for its steps; actions (n, k).
 
         Raises:
             InputError, NonFiniteActionError, EnvironmentFailedError: as `Lanes.step`.
         """
-        step, ended = self.lanes.step(actions), self.lanes.ended
-        observation, non_finite = step.observation, self.lanes.info.get("non_finite")
+        step, reward, non_finite = self._hold(actions)
+        ended, observation, length = self.lanes.ended, step.observation, self.lanes.steps
         if ended.any():
             numbers = np.flatnonzero(ended).tolist()
             self._episodes[numbers] += 1
             observation = self._start(numbers)
-        final, reward, terminated = step.observation, step.reward, step.terminated
-        return Moved(observation, final, reward, ended, terminated, non_finite)
+        final, terminated = step.observation, step.terminated
+        return Moved(observation, final, reward, length, ended, terminated, non_finite)
+
+    def _hold(self, actions: Array) -> tuple[Step, Array, Flags | None]:
+        """The last step, the sum of rewards, and whether the physics diverged in any."""
+        lanes, total, diverged = self.lanes, np.zeros(self.lanes.num_lanes), None
+        for _ in range(self._repeat):
+            active = lanes.active
+            step = lanes.step(actions)
+            total += step.reward
+            if (now := lanes.info.get("non_finite")) is not None:
+                diverged = now if diverged is None else np.where(active, now, diverged)
+            if not lanes.num_active:
+                break
+        return step, total, diverged
 
     @property
     def state(self) -> State:

@@ -122,6 +122,11 @@ class Lanes:
         """Whether each lane's episode has ended, (n,)."""
         return ~self.active
 
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """That each lane's episode has had so far, (n,)."""
+        return self._steps.copy()
+
     def reset(self, lanes: Sequence[int], seeds: Sequence[int]) -> Array:
         """Start an episode in each of the lanes, with its seed.
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,22 @@ def play(lanes: Lanes, act: Actor) -> Iterator[Played]:
         observation, active = lanes.observation, lanes.active
         action = act(observation)
         yield Played(observation, action, active, lanes.step(action))
+
+
+def held(act: Actor, repeat: int) -> Actor:
+    """The actor that lets another choose an action and holds it for so many steps in all lanes.
+
+    Lanes must be at the start of their episodes when it first acts.
+    """
+    step, chosen = count(), np.empty(0)
+
+    def choose_or_hold(observation: Array) -> NDArray[Any]:
+        nonlocal chosen
+        if next(step) % repeat == 0:
+            chosen = act(observation)
+        return chosen
+
+    return choose_or_hold
 
 
 def open_loop(actions: Iterable[NDArray[Any]]) -> Actor:

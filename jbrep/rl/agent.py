@@ -4,7 +4,7 @@ import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from operator import attrgetter
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -19,7 +19,7 @@ from torch.distributions import Distribution
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.vec_env import JitterbugVecEnv, agent_spaces
 from jbrep.envs.lanes import Lanes
-from jbrep.envs.recording import Actor, episode_returns
+from jbrep.envs.recording import Actor, episode_returns, held
 from jbrep.envs.task import Array, Task
 from jbrep.records.container import Tensors
 from jbrep.records.record import to_plain
@@ -46,10 +46,11 @@ def make_env(
     encoder: BaseEncoder,
     normalize: bool = False,
     num_threads: int = 1,
+    action_repeat: int = 1,
 ) -> VecEnv:
     """Lanes of a task seen through an encoder, stepped on so many threads."""
-    env = VecMonitor(JitterbugVecEnv(task, num_envs, seed, encoder, num_threads))
-    return normalized(env) if normalize else env
+    lanes = JitterbugVecEnv(task, num_envs, seed, encoder, num_threads, None, action_repeat)
+    return normalized(VecMonitor(lanes)) if normalize else VecMonitor(lanes)
 
 
 def one_line(error: Exception) -> str:
@@ -78,6 +79,8 @@ def make_agent(
 ) -> BaseAlgorithm:
     """An untrained agent on the CPU, with its optimisers' state allocated.
 
+    Its `action_repeat` is for whoever plays its policy, and in policy.zip.
+
     Args:
         algorithm: a key of CLASSES.
         hyperparameters: of the agent.
@@ -90,7 +93,7 @@ def make_agent(
     if hyperparameters.noise:
         size = np.prod(env.action_space.shape or (), dtype=int)
         of_class["action_noise"] = hyperparameters.noise.make(int(size), episode_steps)
-    agent = sb3_class(algorithm)(
+    agent: Any = sb3_class(algorithm)(
         "MlpPolicy",
         env,
         seed=seed,
@@ -106,7 +109,13 @@ def make_agent(
     for _, part in trained_parts(agent):
         if isinstance(part, torch.optim.Optimizer):
             allocate_adam_state(part)
-    return agent
+    agent.action_repeat = hyperparameters.action_repeat
+    return cast("BaseAlgorithm", agent)
+
+
+def action_repeat(agent: BaseAlgorithm) -> int:
+    """Control steps for which each action of an agent is held; 1 if it doesn't say."""
+    return int(getattr(agent, "action_repeat", 1))
 
 
 def _argument(value: Any) -> Any:
@@ -232,8 +241,9 @@ class Evaluator:
             EnvironmentFailedError: the environment fails in the middle of an episode.
         """
         see = seeing(self._encoder.encode, statistics_of(agent))
-        act = deterministic(agent.policy, self._lanes.task, see)
+        act, repeat = deterministic(agent.policy, self._lanes.task, see), action_repeat(agent)
         at_once = self._lanes.num_lanes
         count = at_once if episodes is None else episodes
         seeds = range(self._seed, self._seed + count, at_once)
-        return np.concatenate([episode_returns(self._lanes, act, s) for s in seeds])[:count]
+        returns = [episode_returns(self._lanes, held(act, repeat), seed) for seed in seeds]
+        return np.concatenate(returns)[:count]

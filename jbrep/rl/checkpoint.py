@@ -207,7 +207,7 @@ class CheckpointFile:
         header = CheckpointHeader(
             settings=self._settings,
             versions=self._versions,
-            step=snapshot.counters["num_timesteps"],
+            step=self._settings.control_steps(snapshot.counters["num_timesteps"]),
             episodes=self._history.episodes,
             evaluations=self._history.evaluations,
             seconds=self._history.seconds,

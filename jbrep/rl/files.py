@@ -105,12 +105,22 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
 
     def is_evaluation_due(self, step: int) -> bool:
         """Whether the policy is to be evaluated after so many steps, which aren't all."""
-        return step % self.evaluate_every < self.hyperparameters.num_envs and step < self.steps
+        at_once = self.control_steps(self.hyperparameters.num_envs)
+        return step % self.evaluate_every < at_once and step < self.steps
+
+    @property
+    def agent_steps(self) -> int:
+        """Of training, as its agent counts them."""
+        return self.hyperparameters.agent_steps(self.steps)
+
+    def control_steps(self, agent_steps: int) -> int:
+        """An agent's steps as runs count them: each for all control steps that hold its action."""
+        return agent_steps * self.hyperparameters.action_repeat
 
     @property
     def episode_steps(self) -> int:
         """That an agent takes in the longest episode."""
-        return self.environment.max_episode_steps
+        return self.hyperparameters.agent_steps(self.environment.max_episode_steps)
 
     def episodes_at(self, step: int) -> int:
         """Of the evaluation after so many steps."""
@@ -135,7 +145,7 @@ class RunRecord(Document, frozen=True, kw_only=True):
     """run.json: a run that has ended."""
 
     format = "jbrep run"
-    format_version = 3
+    format_version = 4
     max_bytes = 1 << 22
 
     status: Literal["finished", "failed"]
@@ -167,7 +177,7 @@ class PolicyHeader(Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep policy"
-    format_version = 2
+    format_version = 3
 
     settings: RunSettings
     encoder: dict[str, Any] | None
@@ -182,7 +192,7 @@ class Episode(NamedTuple):
     step: int  # of training, over all lanes, at its end
     lane: int
     episode_return: float
-    length: int  # steps
+    length: int  # control steps
     diverged: bool  # whether its physics did, which ended it
 
 

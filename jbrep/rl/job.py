@@ -20,7 +20,7 @@ from jbrep.errors import InputError
 from jbrep.records.commit import commits
 from jbrep.records.storage import exists, read_file, write_whole
 from jbrep.records.tables import write_rows
-from jbrep.rl.agent import Evaluator, restore_statistics, statistics_of
+from jbrep.rl.agent import Evaluator, action_repeat, restore_statistics, statistics_of
 from jbrep.rl.checkpoint import CheckpointFile, History
 from jbrep.rl.files import (
     BEGINNING,
@@ -36,6 +36,7 @@ from jbrep.rl.files import (
     Episode,
     Evaluation,
     RunRecord,
+    RunSettings,
     read_run,
 )
 from jbrep.rl.policy_file import MAX_BYTES, Trained, pack_whole, read
@@ -151,7 +152,7 @@ class Job:
             restore_statistics(agent, policy.tensors, policy.path)
             write_whole(self.folder / BEGINNING, read_file(policy.path, MAX_BYTES))
         scalars = Scalars(self.folder / "tensorboard", self.history.first_step)
-        agent.set_logger(Logger(None, [scalars, *writers]))
+        agent.set_logger(_Logger(self.settings, [scalars, *writers]))
 
     @cached_property
     def evaluator(self) -> Evaluator:
@@ -166,11 +167,15 @@ class Job:
         Raises:
             NonFiniteActionError, EnvironmentFailedError: as `Evaluator.returns`.
         """
-        step, logger = agent.num_timesteps, agent.logger
+        step, logger = self.step_of(agent), agent.logger
         returns = self.evaluator.returns(agent, self.settings.episodes_at(step))
         self.history.evaluated(step, returns)
         logger.record("evaluation/mean_return", self.history.mean)
-        logger.dump(step)
+        logger.dump(agent.num_timesteps)
+
+    def step_of(self, agent: BaseAlgorithm) -> int:
+        """Of training, in control steps."""
+        return self.settings.control_steps(agent.num_timesteps)
 
     def end(self, agent: BaseAlgorithm, failure: str) -> RunRecord:
         """Write the run's files.
@@ -182,9 +187,9 @@ class Job:
         Returns:
             The contents of run.json.
         """
-        steps = agent.num_timesteps
+        steps = self.step_of(agent)
         parts = agent.policy, self.run.task, self.encoder, self.settings
-        trained = Trained(*parts, statistics=statistics_of(agent))
+        trained = Trained(*parts, None, statistics_of(agent), action_repeat(agent))
         policy = b"" if failure else pack_whole(trained)
         write_rows(self.folder / EPISODES, self.history.episodes, Episode)
         write_rows(self.folder / EVALUATIONS, self.history.evaluations, Evaluation)
@@ -220,6 +225,18 @@ def _cpu() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+class _Logger(Logger):
+    """stable-baselines3's, that tells writers control steps instead of its agent's."""
+
+    def __init__(self, settings: RunSettings, writers: list[KVWriter]):
+        super().__init__(None, writers)
+        self._settings = settings
+
+    def dump(self, step: int = 0) -> None:
+        """Write what was recorded, after so many steps of the agent."""
+        super().dump(self._settings.control_steps(step))
 
 
 class Scalars(TensorBoardOutputFormat):

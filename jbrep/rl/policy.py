@@ -12,7 +12,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists, read_file
-from jbrep.rl.agent import Spaces, one_line
+from jbrep.rl.agent import Spaces, action_repeat, one_line
 from jbrep.rl.checkpoint import PARAMETERS, read_checkpoint, without
 from jbrep.rl.files import (
     BEGINNING,
@@ -126,7 +126,8 @@ def load_zip(path: Path, task: Task, algorithm: str, encoder: str, trust: bool) 
         reason = one_line(error)
         raise InputError(f"{path} is no {algorithm} policy for {task.name}: {reason}") from None
     statistics = Statistics.read(tensors, seen.latent_size, path) if tensors else None
-    return Trained(agent.policy, task, seen, statistics=statistics)
+    repeat = action_repeat(agent)
+    return Trained(agent.policy, task, seen, statistics=statistics, action_repeat=repeat)
 
 
 def _untrained(folder: Path, settings: RunSettings, given: Any) -> Trained:

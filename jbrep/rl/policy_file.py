@@ -17,7 +17,7 @@ from stable_baselines3.common.policies import BasePolicy
 from jbrep.encoders import Encoder
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.file import unpack as unpack_encoder
-from jbrep.envs.recording import Actor
+from jbrep.envs.recording import Actor, held
 from jbrep.envs.task import Array, Task
 from jbrep.errors import DamageError, InputError
 from jbrep.records import container
@@ -43,6 +43,7 @@ class Trained(NamedTuple):
     settings: RunSettings | None = None  # none of a file from elsewhere
     step: int | None = None  # of training, if it is not over
     statistics: Statistics | None = None  # by which it normalises what it sees, if it does
+    action_repeat: int = 1  # control steps for which each of its actions is held
 
     @property
     def representation(self) -> str:
@@ -55,18 +56,21 @@ class Trained(NamedTuple):
         return self.settings.evaluation_episodes if self.settings else 1
 
     def begin(self, task: Task, seeds: Any) -> Actor:
-        """Act deterministically; nothing is drawn.
+        """Act deterministically in episodes that begin now; nothing is drawn.
 
         The actor raises an InputError for actions that are not finite.
         """
         see = seeing(self.encoder.encode, self.statistics)
-        return _finite(deterministic(self.policy, self.task, see))
+        return self._held(deterministic(self.policy, self.task, see))
 
     def one_by_one(self) -> Actor:
         """The same with an encoder in torch, in one episode at a time."""
         encode = self.encoder.encode
         see = seeing(lambda row: encode(torch.from_numpy(row)).numpy(), self.statistics)
-        return _finite(deterministic(self.policy, self.task, see, batch_size=1))
+        return self._held(deterministic(self.policy, self.task, see, batch_size=1))
+
+    def _held(self, act: Actor) -> Actor:
+        return held(_finite(act), self.action_repeat)
 
     def with_weights(self, weights: Tensors, tensors: Tensors, source: Path) -> "Trained":
         """The policy with weights of the part that acts, and with statistics from a file's tensors.
@@ -130,7 +134,8 @@ def build(settings: RunSettings, encoder: BaseEncoder, path: Path) -> Trained:
             f"no policy can be made from the settings of the run: {one_line(error)}"
         ) from None
     statistics = Statistics.untrained(encoder.latent_size) if shape.normalize else None
-    return Trained(agent.policy, task, encoder, settings, statistics=statistics)
+    repeat = settings.hyperparameters.action_repeat
+    return Trained(agent.policy, task, encoder, settings, None, statistics, repeat)
 
 
 def pack(trained: Trained, run: str) -> bytes:

@@ -15,6 +15,10 @@ from stable_baselines3.common.save_util import data_to_json
 from jbrep.rl.agent import statistics_of
 
 STATISTICS = "observation_statistics.safetensors"  # by which an agent normalises what it sees
+_OF_TRAINING = {
+    "action_noise",  # which may be jbrep's own
+    "replay_buffer_class",  # `load` finds the one for n_steps, and warns of one that is given
+}
 _OF_THIS_PROCESS = {  # wall times, and where the environment was: `load` starts with defaults
     "_last_episode_starts",
     "_last_obs",
@@ -30,11 +34,11 @@ def policy_zip(agent: BaseAlgorithm) -> bytes:
     """A zip file that the algorithm's `load` takes, as its `save` writes it.
 
     Unlike there, members carry a fixed date, whatever the clock says, and nothing in them depends
-    on the process or the machine. Noise on actions is left out, as it may be jbrep's own.
-    Statistics by which the agent normalises what it sees are a member that `load` leaves alone.
+    on the process or the machine. Statistics by which the agent normalises what it sees are a
+    member that `load` leaves alone.
     """
     names, variables = agent._get_torch_save_params()
-    left_out = {*agent._excluded_save_params(), *_OF_THIS_PROCESS, "action_noise"}
+    left_out = {*agent._excluded_save_params(), *_OF_THIS_PROCESS, *_OF_TRAINING}
     left_out |= {name.partition(".")[0] for name in (*names, *variables)}
     data = {name: value for name, value in vars(agent).items() if name not in left_out}
     statistics = statistics_of(agent)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 MAX_LAYERS, MAX_UNITS = 8, 1024  # of a policy's network
 MAX_ENVS = 4096
+MAX_REPEAT = 1000
 LINEAR = "linear:"  # before the number from which a schedule falls to 0
 
 Layers = Annotated[
@@ -57,6 +58,8 @@ class Hyperparameters(Record, frozen=True):
         optimizer_kwargs: arguments of Adam.
         policy_kwargs: arguments of the policy's class; activation_fn by its name.
         normalize: whether the agent sees its input by the running mean and variance.
+        action_repeat: control steps for which each action is held, which are one step of the agent;
+            what else counts steps here counts the agent's.
     """
 
     net_arch: NetArch
@@ -68,10 +71,15 @@ class Hyperparameters(Record, frozen=True):
         default_factory=lambda: {"activation_fn": "relu"}
     )
     normalize: bool = False
+    action_repeat: Annotated[int, Meta(ge=1, le=MAX_REPEAT)] = 1
 
     def check(self) -> None:
         """As for `Record`."""
         from_plain(self.optimizer_kwargs, _OfAdam, "optimizer_kwargs")
+
+    def agent_steps(self, control_steps: int) -> int:
+        """The fewest steps of an agent that are so many control steps, or more."""
+        return -(-control_steps // self.action_repeat)
 
 
 _SHARED = {"learning_rate": 1e-4, "gamma": 0.99}

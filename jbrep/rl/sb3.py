@@ -61,12 +61,12 @@ def _train(job: Job, session: Session) -> RunRecord:
     job.keep_encoder()
     seed = training_seed(run.seed)
     lanes = chosen.num_envs
-    threads = job.threads_for(lanes)
-    env = make_env(run.task, lanes, seed, job.encoder, chosen.normalize, threads)
+    how = chosen.normalize, job.threads_for(lanes), chosen.action_repeat
+    env = make_env(run.task, lanes, seed, job.encoder, *how)
     agent = make_agent(settings.algorithm, chosen, env, run.seed, settings.episode_steps)
     env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
     job.prepare(agent, session.writers)
-    failure = _learn(agent, run.steps, follower)
+    failure = _learn(agent, settings.agent_steps, follower)
     return job.end(agent, failure)
 
 
@@ -121,16 +121,16 @@ class _Follower(BaseCallback):
         if stopping or file.is_due(self._session.save_every):
             file.write(take(self.model))
         if stopping:
-            raise StoppedError(self.model.num_timesteps)
+            raise StoppedError(self._job.step_of(self.model))
 
     def _on_step(self) -> bool:
+        step = self._job.step_of(self.model)
         for lane in np.flatnonzero(self.locals["dones"]).tolist():
             info = self.locals["infos"][lane]
-            total, length = float(info["episode"]["r"]), int(info["episode"]["l"])
-            diverged = info.get("non_finite", False)
-            row = Episode(self.num_timesteps, lane, total, length, diverged)
+            total, length = float(info["episode"]["r"]), info["control_steps"]
+            row = Episode(step, lane, total, length, info.get("non_finite", False))
             self._job.history.episodes.append(row)
-        if self._job.settings.is_evaluation_due(self.num_timesteps):
+        if self._job.settings.is_evaluation_due(step):
             self._job.evaluate(self.model)
         return True
 
@@ -141,7 +141,7 @@ class _Follower(BaseCallback):
         self._tell()
 
     def _tell(self) -> None:
-        self._session.watch(self._job, self.model.num_timesteps, self._job.history.mean)
+        self._session.watch(self._job, self._job.step_of(self.model), self._job.history.mean)
 
 
 def check_finite(agent: BaseAlgorithm) -> None:

@@ -57,13 +57,15 @@ Episodes = Annotated[int, Meta(ge=1, le=MAX_EPISODES)]
 class TrainingSettings(Record, frozen=True, kw_only=True):
     """How agents are trained and evaluated: what all runs of a study share."""
 
-    steps: Annotated[Steps, Meta(description="Of training.")] = 1_000_000
+    steps: Annotated[Steps, Meta(description="Control steps of training, over all robots.")] = (
+        1_000_000
+    )
     evaluate_every: Annotated[
         int,
         Meta(
             ge=0,
             le=MAX_STEPS,
-            description="In steps of training.",
+            description="In control steps of training.",
             extra={"default": "a tenth of all, at least 10,000"},
         ),
     ] = 0

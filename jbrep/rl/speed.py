@@ -54,10 +54,11 @@ def _alone(jobs: Sequence[Job]) -> tuple[float, BaseAlgorithm]:
     """Seconds of a step, and an agent."""
     (job,) = jobs
     run, chosen = job.run, job.settings.hyperparameters
-    env = make_env(run.task, chosen.num_envs, 0, job.encoder, chosen.normalize)
+    how = chosen.normalize, 1, chosen.action_repeat
+    env = make_env(run.task, chosen.num_envs, 0, job.encoder, *how)
     agent = make_agent(run.learner.algorithm, chosen, env, 0, job.settings.episode_steps)
     learned = _seconds(lambda: agent.learn(_MIN_STEPS))  # whole rollouts, so at least one
-    return learned / agent.num_timesteps, agent
+    return learned / job.step_of(agent), agent
 
 
 def _together(jobs: Sequence[Job]) -> tuple[float, BaseAlgorithm]:

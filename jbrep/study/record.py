@@ -113,7 +113,7 @@ class RunsRecord(Document, frozen=True, kw_only=True):
     """runs.json."""
 
     format = "jbrep runs"
-    format_version = 1
+    format_version = 2
     max_bytes = 1 << 28
     indent = 1
 

@@ -26,22 +26,22 @@ class Cohort:
 
     Attributes:
         members: which can learn together, see `jbrep.rl.cohort.trainer`.
-        step: of training, over the lanes of a member.
+        agent_step: of training, over the lanes of a member.
     """
 
     def __init__(self, members: Sequence[Member]):
         job = members[0].job
         settings, task = job.settings, job.run.task
-        self.members, self.step, self._n_updates = members, 0, 0
+        self.members, self.agent_step, self._n_updates = members, 0, 0
         self._shared: Any = members[0].agent  # its settings are those of all
-        self._lanes, self._steps = settings.hyperparameters.num_envs, settings.steps
+        self._settings, self._lanes = settings, settings.hyperparameters.num_envs
         self._size = padded_size(job)
         sizes = self._size, task.action_size
         ahead = Ahead(self._shared.n_steps, self._shared.gamma)
         capacity = capacity_of(job.run)
         self._replay = ReplayBuffer(len(members), self._lanes, capacity, *sizes, ahead)
-        lanes = len(members) * self._lanes
-        self._endless = Endless(task, lanes, job.threads_for(lanes))
+        lanes, repeat = len(members) * self._lanes, settings.hyperparameters.action_repeat
+        self._endless = Endless(task, lanes, job.threads_for(lanes), repeat)
         self._device = torch.device(settings.device)
         agents = [member.agent for member in members]
         self._stack = Stack(agents, self._size, settings.precision, settings.device)
@@ -50,6 +50,11 @@ class Cohort:
         seeds = [training_seed(m.job.run.seed) + i for m in members for i in range(self._lanes)]
         self._observation = self._encode(self._endless.reset(seeds))
         self._update_statistics()
+
+    @property
+    def step(self) -> int:
+        """Of training, in control steps."""
+        return self._settings.control_steps(self.agent_step)
 
     @property
     def rollout(self) -> int:
@@ -65,7 +70,7 @@ class Cohort:
         scaled, space = self._choose_actions(), self._shared.action_space
         action = self._shared.policy.unscale_action(scaled).clip(space.low, space.high)
         moved = self._endless.step(action.reshape(-1, action.shape[2]).astype(float))
-        self.step += self._lanes
+        self.agent_step += self._lanes
         ended, terminated = self._by_member(moved.ended), self._by_member(moved.terminated)
         reward = self._by_member(moved.reward).astype(np.float32)
         observation = final = self._encode(moved.observation)
@@ -75,18 +80,18 @@ class Cohort:
         self._replay.add(self._observation, scaled, final, reward[..., None], flags)
         self._observation = observation
         self._update_statistics()
-        diverged = self._by_member(moved.diverged)
-        for member, *own in zip(self.members, reward, ended, diverged, strict=True):
+        length, diverged = self._by_member(moved.length), self._by_member(moved.diverged)
+        for member, *own in zip(self.members, reward, length, ended, diverged, strict=True):
             member.record(*own)
 
     def learn(self) -> None:
         """Take the gradient steps that follow a rollout."""
-        if self.step <= self._shared.learning_starts:
+        if self.agent_step <= self._shared.learning_starts:
             return
         steps = self._shared.gradient_steps
         if steps < 0:  # as many as were collected
             steps = self.rollout * self._lanes
-        rate = self._shared.lr_schedule(1 - self.step / self._steps)
+        rate = self._shared.lr_schedule(1 - self.agent_step / self._settings.agent_steps)
         self._stack.set_learning_rate(rate)
         self._log_losses([self.update(number) for number in range(steps)])
 
@@ -108,7 +113,7 @@ class Cohort:
     def _choose_actions(self) -> Float32:
         """Actions scaled to [-1, 1], (n, lanes, k), rounded as stable-baselines3 rounds them."""
         policy = self._shared.policy
-        if self.step < self._shared.learning_starts:
+        if self.agent_step < self._shared.learning_starts:
             actions = np.stack([member.random.actions() for member in self.members])
         else:
             normals = self._normals(self._algorithm.normals_to_explore, self._lanes)
@@ -192,7 +197,8 @@ class Cohort:
     @property
     def goes_on(self) -> bool:
         """Whether there are steps to go, and members to take them."""
-        return self.step < self._steps and len(self.failed) < len(self.members)
+        wanted = self._settings.agent_steps
+        return self.agent_step < wanted and len(self.failed) < len(self.members)
 
     def member_of(self, lane: int) -> Member:
         """Whose lane of all it is."""
@@ -227,7 +233,7 @@ class Cohort:
         for member, snapshot in zip(self.members, snapshots, strict=True):
             member.restore(snapshot)
         self._stack.read_from_agents()
-        self.step, self._n_updates = self._shared.num_timesteps, self._shared._n_updates
+        self.agent_step, self._n_updates = self._shared.num_timesteps, self._shared._n_updates
         tensors = [each.tensors for each in snapshots]
         self._observation = np.stack([each["observation"] for each in tensors])
         self._replay.restore([each["replay"] for each in tensors], snapshots[0].counters["added"])

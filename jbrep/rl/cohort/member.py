@@ -59,7 +59,7 @@ class Member:
         self._normalizer: VecNormalize | None = self.agent.get_vec_normalize_env()
         steps = settings.episode_steps
         self.random = Random(self.agent.action_space, chosen.num_envs, chosen.noise, steps)
-        self.agent._total_timesteps = run.steps
+        self.agent._total_timesteps = settings.agent_steps
         self.agent.ep_info_buffer = deque(maxlen=self.agent._stats_window_size)
         self.agent.ep_success_buffer = deque()
         self.agent.start_time = time.time_ns()
@@ -87,17 +87,22 @@ class Member:
             return observation
         return np.asarray(self._normalizer.normalize_obs(observation))
 
-    def record(self, reward: Float32, ended: Flags, diverged: Flags) -> None:
-        """Record a step of its lanes, (lanes,) each, and log every few episodes."""
+    def record(
+        self, reward: Float32, length: NDArray[np.int64], ended: Flags, diverged: Flags
+    ) -> None:
+        """Record a step of its lanes, (lanes,) each, and log every few episodes.
+
+        Lengths are those of episodes so far in control steps.
+        """
         agent, before = self.agent, self.agent._episode_num // _LOG_EVERY
         agent.num_timesteps += len(reward)
         self._returns += reward
         self._lengths += 1
         for lane in np.flatnonzero(ended).tolist():
-            total, length = float(self._returns[lane]), int(self._lengths[lane])
-            row = Episode(agent.num_timesteps, lane, total, length, bool(diverged[lane]))
+            total, step = float(self._returns[lane]), self.job.step_of(agent)
+            row = Episode(step, lane, total, int(length[lane]), bool(diverged[lane]))
             self.job.history.episodes.append(row)
-            agent.ep_info_buffer.append({"r": total, "l": length})
+            agent.ep_info_buffer.append({"r": total, "l": int(self._lengths[lane])})
             agent._episode_num += 1
             self._returns[lane] = self._lengths[lane] = 0
             self.random.reset_noise(lane)

@@ -21,7 +21,7 @@ def capacity_of(run: Run) -> int:
         for name in ("buffer_size", "train_freq")
     )
     rollout = steps * chosen.num_envs
-    return min(size, -(-run.steps // rollout) * rollout)
+    return min(size, -(-chosen.agent_steps(run.steps) // rollout) * rollout)
 
 
 def memory_of(run: Run, observed: int) -> int:
