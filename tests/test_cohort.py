@@ -16,7 +16,14 @@ from jbrep.envs.endless import Endless
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
 from jbrep.rl import Run, StoppedError
-from jbrep.rl.agent import make_agent, make_env, parameters, trained_parts, training_seed
+from jbrep.rl.agent import (
+    ACTIVATIONS,
+    make_agent,
+    make_env,
+    parameters,
+    trained_parts,
+    training_seed,
+)
 from jbrep.rl.cohort import ALGORITHMS, get_algorithm
 from jbrep.rl.cohort.algorithm import Batch
 from jbrep.rl.cohort.cohort import Cohort
@@ -81,6 +88,7 @@ def drawn(agent, seed, draws):
 VARIANTS = [
     *((algorithm, preset, {}) for preset in PRESETS for algorithm in ALGORITHMS),
     ("sac", "modern", {"ent_coef": 0.1}),
+    *(("ddpg", "modern", {"activation_fn": name}) for name in ACTIVATIONS),
     ("sac", "modern", {"ent_coef": "auto_0.2", "target_entropy": -0.5}),
     ("td3", "modern", {"policy_delay": 3, "activation_fn": "elu", "net_arch": [20, 10]}),
     ("sac", "modern", {"learning_rate": "linear:1e-3", "optimizer_kwargs": {"weight_decay": 0.1}}),

@@ -8,15 +8,16 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd import Function
-from torch.nn import Linear, Module, ReLU
+from torch.nn import Linear, Module, functional
 from torch.optim import Adam
 from torch.utils._pytree import tree_leaves
 
 from jbrep.rl.settings import CPU, FLOAT32
 from jbrep.training.trainer import allocate_adam_state
 
+_ALL = 1 << 30  # networks at once
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam
 
 
@@ -30,71 +31,112 @@ class Layer(NamedTuple):
 Network = list[Layer]
 
 
+class Activation(NamedTuple):
+    """A function between layers, and its gradient."""
+
+    function: Callable[[Tensor], Tensor]  # it may overwrite what it is given
+    gradient: Callable[[Tensor, Tensor, Tensor], Tensor]  # from that of its output, input, output
+
+
+_aten = torch.ops.aten
+_ACTIVATIONS: dict[type[Module], Activation] = {
+    nn.ReLU: Activation(torch.relu_, lambda g, _, y: _aten.threshold_backward(g, y, 0)),
+    nn.Tanh: Activation(torch.tanh, lambda g, _, y: _aten.tanh_backward(g, y)),
+    nn.ELU: Activation(functional.elu, lambda g, x, _: _aten.elu_backward(g, 1, 1, 1, False, x)),
+    nn.GELU: Activation(functional.gelu, lambda g, x, _: _aten.gelu_backward(g, x)),
+    nn.SiLU: Activation(functional.silu, lambda g, x, _: _aten.silu_backward(g, x)),
+    nn.LeakyReLU: Activation(
+        functional.leaky_relu, lambda g, x, _: _aten.leaky_relu_backward(g, x, 0.01, False)
+    ),
+}
+
+
 class MLP(NamedTuple):
     """How networks compute."""
 
-    activation: Callable[[Tensor], Tensor]  # of hidden layers; it may overwrite what it is given
-    cast: Callable[[Tensor], Tensor]  # each factor, once, however many products it is in
+    activation: Activation  # of hidden layers
+    cast: Callable[[Tensor], Tensor]  # each factor of a product
     multiply: Callable[[Tensor, Tensor], Tensor]  # (n, b, in) and (n, in, out), both cast
+    together: int  # how many networks compute at once
 
     def __call__(self, network: Network, inputs: Tensor) -> Tensor:
         """The outputs (n, b, out) of networks on inputs (n, b, in)."""
-        *hidden, last = network
-        for layer in hidden:
-            inputs = self.activation(_Affine.apply(inputs, *layer, self))
-        outputs: Tensor = _Affine.apply(inputs, *last, self)
+        outputs: Tensor = _Compute.apply(
+            inputs, self, *(each for layer in network for each in layer)
+        )
         return outputs
 
 
-class _Affine(Function):
-    """Affine layers, and their gradients, by the products of an MLP."""
+class _Done(NamedTuple):
+    """What a layer's gradient is made from; both factors as they were cast."""
+
+    inputs: Tensor
+    weight: Tensor
+    before: Tensor  # the activation, if there is one
+    after: Tensor
+
+
+class _Compute(Function):
+    """Networks, and their gradients: some from layer to layer, then the next.
+
+    So what a layer leaves is still in the processor's cache when the next one takes it.
+    """
 
     @staticmethod
-    def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor, mlp: MLP) -> Tensor:
-        inputs, weight = map(mlp.cast, (inputs, weight))
-        ctx.save_for_backward(inputs, weight)
-        ctx.mlp = mlp
-        return mlp.multiply(inputs, weight).add_(bias)
+    def forward(ctx: Any, inputs: Tensor, mlp: MLP, *weights: Tensor) -> Tensor:
+        ctx.mlp, ctx.parts = mlp, []
+        every = (each.split(mlp.together) for each in (inputs, *weights))
+        for values, *own in zip(*every, strict=True):
+            done, last = list[_Done](), len(own) - 2
+            for i in range(0, len(own), 2):
+                factors = mlp.cast(values), mlp.cast(own[i])
+                before = values = mlp.multiply(*factors).add_(own[i + 1])
+                if i < last:
+                    values = mlp.activation.function(before)
+                done.append(_Done(*factors, before, values))
+            ctx.parts.append(done)
+        return torch.cat([done[-1].after for done in ctx.parts])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        inputs, weight = ctx.saved_tensors
-        of_inputs, of_layer, *_ = ctx.needs_input_grad
-        factor, multiply = ctx.mlp.cast(gradient), ctx.mlp.multiply
-        return (
-            multiply(factor, weight.mT) if of_inputs else None,
-            multiply(inputs.mT, factor) if of_layer else None,
-            gradient.sum(1, keepdim=True) if of_layer else None,
-            None,
-        )
+        mlp, (of_inputs, _, of_weights, *_) = ctx.mlp, ctx.needs_input_grad
+        every = []
+        for own, done in zip(gradient.split(mlp.together), ctx.parts, strict=True):
+            gradients = list[Tensor]()
+            for i, layer in reversed([*enumerate(done)]):
+                if layer is not done[-1]:
+                    own = mlp.activation.gradient(own, layer.before, layer.after)
+                factor = mlp.cast(own)
+                if of_weights:
+                    of_weight = mlp.multiply(layer.inputs.mT, factor)
+                    gradients += [own.sum(1, keepdim=True), of_weight]
+                if i > 0 or of_inputs:
+                    own = mlp.multiply(factor, layer.weight.mT)
+            every.append([own, *reversed(gradients)])
+        of_input, *of_each = map(torch.cat, zip(*every, strict=True))
+        nothing = [None] * (len(ctx.needs_input_grad) - 2)
+        return of_input if of_inputs else None, None, *(of_each or nothing)
 
 
 def make_mlp(activation: Module, precision: str, device: torch.device) -> MLP:
-    """How networks compute with a precision of products, on a device."""
-    function = torch.relu_ if isinstance(activation, ReLU) else activation
-    multiply = torch.bmm if device.type == "cuda" else _one_by_one
+    """How networks compute with a precision of products, on a device.
+
+    A processor computes each network by itself: it sums a product of a batch differently if that
+    has one member, or many.
+    """
+    function = _ACTIVATIONS[type(activation)]
+    on_gpu = device.type == "cuda"
+    together = _ALL if on_gpu else 1
     if precision == FLOAT32:
-        return MLP(function, lambda values: values, multiply)
-    if device.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported():
-        return MLP(function, Tensor.bfloat16, lambda a, b: multiply(a, b).float())
-    return MLP(function, _rounded, lambda a, b: _rounded(multiply(a, b)))
+        return MLP(function, lambda values: values, torch.bmm, together)
+    if on_gpu or torch.ops.mkldnn._is_mkldnn_bf16_supported():
+        return MLP(function, Tensor.bfloat16, lambda a, b: torch.bmm(a, b).float(), together)
+    return MLP(function, _rounded, lambda a, b: _rounded(torch.bmm(a, b)), together)
 
 
 def _rounded(values: Tensor) -> Tensor:
     """To bfloat16, kept as they were: products of such factors are exact in float32."""
     return values.bfloat16().to(values.dtype)
-
-
-def _one_by_one(left: Tensor, right: Tensor) -> Tensor:
-    """Products of matrices, each by itself: its bits don't depend on how many there are.
-
-    A processor sums a product of a batch differently if it has one member, or many.
-    """
-    products = left.new_empty(len(left), left.shape[1], right.shape[2])
-    each = zip(left.unbind(), right.unbind(), products.unbind(), strict=True)
-    for a, b, product in each:
-        torch.mm(a, b, out=product)
-    return products
 
 
 Modules = Iterable[Module | list[Linear]]  # of an agent's network; several can be one layer
