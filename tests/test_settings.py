@@ -99,7 +99,11 @@ def test_settings_reach_the_agent():
     [
         ("sac", {"learning_rat": 1}, "sac has no setting 'learning_rat': did you mean learning_ra"),
         ("ppo", {"tau": 0.1}, "ppo has no setting 'tau': it has activation_fn, "),
-        ("sac", {"xyz": 1}, "sac has no setting 'xyz': it has activation_fn, batch_size"),
+        (
+            "sac",
+            {"xyz": 1},
+            "sac has no setting 'xyz': it has action_repeat, activation_fn, batch_size",
+        ),
         ("sac", {"device": "cuda"}, "device can't be set: give it by --device"),
         ("a2c", {"use_rms_prop": True}, "use_rms_prop can't be set: the optimiser is always Adam"),
         (
@@ -146,7 +150,11 @@ def test_every_setting_of_every_algorithm_takes_stable_baselines3_s_own_value():
     for algorithm in CLASSES:
         kind = sb3_class(algorithm)
         agent = agent_of(algorithm, {})
-        names = {*setting_names(algorithm)} & {*vars(agent)} - {"noise", "target_entropy"}
+        names = {*setting_names(algorithm)} & {*vars(agent)} - {
+            "noise",
+            "action_repeat",
+            "target_entropy",
+        }
         plain = {
             name: value
             for name in names
