@@ -5,7 +5,6 @@ VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2
 READY_DEMO := $(VENV)/.ready-$(VERSION)-for-the-demo
 READY := $(VENV)/.ready-$(VERSION)
 DEMO := demo
-DEMO_RUN := $(DEMO)/study/runs/face_direction/small-sac/forward-8/seed-0
 STUDIES := $(shell sed -n 's/^\([a-z-]*\) *;.*/\1/p' studies/judged.txt)
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
@@ -27,17 +26,18 @@ $(READY_DEMO): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[learn,view]'
 	@touch $@
 
-demo: $(READY_DEMO) ## the whole job in minutes: collect, train and judge encoders, learn on codes and the full state
+demo: $(READY_DEMO) ## the whole job in minutes: collect, train and judge encoders, learn, report, record
 	rm -rf $(DEMO)
 	$(BIN)/jbrep collect --task face_direction --steps 20k --out $(DEMO)/data
 	$(BIN)/jbrep data info $(DEMO)/data
 	$(BIN)/jbrep train-dae --data $(DEMO)/data --latent 12 8 4 --out $(DEMO)/encoders
 	$(BIN)/jbrep evaluate --encoder $(addprefix $(DEMO)/encoders/,$(addsuffix .safetensors,dae-12 dae-8 dae-4)) forward-8 --data $(DEMO)/data --out $(DEMO)/evaluation
 	$(BIN)/jbrep study studies/demo.toml --out $(DEMO)/study
-	$(BIN)/jbrep inspect $(DEMO_RUN) --out $(DEMO)/forward-8.rrd
+	$(BIN)/jbrep rl --task face_direction --preset wide --encoder symmetry --steps 100k --out $(DEMO)/run
+	$(BIN)/jbrep inspect $(DEMO)/run --out $(DEMO)/run.rrd
 	@echo
 	@echo "the report: $(DEMO)/study/report.html"
-	@echo "an agent at work on its code: $(BIN)/rerun $(DEMO)/forward-8.rrd"
+	@echo "an agent that has learned to turn: $(BIN)/rerun $(DEMO)/run.rrd"
 
 test: $(READY) ## the test suite
 	$(BIN)/python -m pytest
