@@ -65,8 +65,10 @@ def card(encoder: BaseEncoder, source: str, width: int) -> str:
     if not isinstance(encoder, Encoder):
         decodes = "yes" if encoder.can_decode else "no"
         return f"{encoder.name}\n{facts({**lines, 'decodes': decodes}, width)}"
+    if coordinates := encoder.scaler.coordinates:
+        lines["encodes"] = f"{len(coordinates)} coordinates of the features"
     lines |= {
-        "encoder": _shape(encoder.size, told["encoder"]),
+        "encoder": _shape(encoder.scaler.size, told["encoder"]),
         "decoder": _shape(encoder.latent_size, told["decoder"]) if encoder.can_decode else "none",
         **{name: _listed(told[name]) for name in _RECORDS if told[name]},
         "sha256": told["sha256"],

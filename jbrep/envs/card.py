@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from jbrep.envs.task import Feature, Task
 from jbrep.text import facts, table
 
-_HEADER = ("feature", "unit", "usual range")
+_HEADER = ("feature", "unit", "usual range", "kind")
 _MOST_FEATURES = 60  # shown
 
 
@@ -63,4 +63,5 @@ def _range(low: float | None, high: float | None) -> str:
 def _cells(feature: Feature) -> tuple[str, ...]:
     known = feature.low is not None or feature.high is not None
     usual = _range(feature.low, feature.high) if known else "-"
-    return feature.name, feature.unit or "-", usual
+    kind = ", ".join(filter(None, (feature.kind, feature.frame)))
+    return feature.name, feature.unit or "-", usual, kind
