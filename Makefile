@@ -58,6 +58,7 @@ bench: $(READY) ## speed as ratios in one run, and what the hand-written policie
 	$(BIN)/python benchmarks/methods.py
 	$(BIN)/python benchmarks/learning.py
 	$(BIN)/python benchmarks/cohorts.py
+	$(BIN)/python benchmarks/wide.py
 	$(BIN)/python benchmarks/inspection.py
 	$(BIN)/python benchmarks/heuristics.py
 	$(BIN)/python benchmarks/environments.py

@@ -17,7 +17,6 @@ from torch.utils._pytree import tree_leaves
 from jbrep.rl.settings import CPU, FLOAT32
 from jbrep.training.trainer import allocate_adam_state
 
-_ALL = 1 << 30  # networks at once
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam
 
 
@@ -57,7 +56,7 @@ class MLP(NamedTuple):
     activation: Activation  # of hidden layers
     cast: Callable[[Tensor], Tensor]  # each factor of a product
     multiply: Callable[[Tensor, Tensor], Tensor]  # (n, b, in) and (n, in, out), both cast
-    together: int  # how many networks compute at once
+    together: bool  # whether all networks compute at once
 
     def __call__(self, network: Network, inputs: Tensor) -> Tensor:
         """The outputs (n, b, out) of networks on inputs (n, b, in)."""
@@ -85,7 +84,8 @@ class _Compute(Function):
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, mlp: MLP, *weights: Tensor) -> Tensor:
         ctx.mlp, ctx.parts = mlp, []
-        every = (each.split(mlp.together) for each in (inputs, *weights))
+        parts = 1 if mlp.together else len(inputs)
+        every = (each.chunk(parts) for each in (inputs, *weights))
         for values, *own in zip(*every, strict=True):
             done, last = list[_Done](), len(own) - 2
             for i in range(0, len(own), 2):
@@ -101,7 +101,7 @@ class _Compute(Function):
     def backward(ctx: Any, gradient: Tensor) -> Any:
         mlp, (of_inputs, _, of_weights, *_) = ctx.mlp, ctx.needs_input_grad
         every = []
-        for own, done in zip(gradient.split(mlp.together), ctx.parts, strict=True):
+        for own, done in zip(gradient.chunk(len(ctx.parts)), ctx.parts, strict=True):
             gradients = list[Tensor]()
             for i, layer in reversed([*enumerate(done)]):
                 if layer is not done[-1]:
@@ -126,12 +126,11 @@ def make_mlp(activation: Module, precision: str, device: torch.device) -> MLP:
     """
     function = _ACTIVATIONS[type(activation)]
     on_gpu = device.type == "cuda"
-    together = _ALL if on_gpu else 1
     if precision == FLOAT32:
-        return MLP(function, lambda values: values, torch.bmm, together)
+        return MLP(function, lambda values: values, torch.bmm, on_gpu)
     if on_gpu or torch.ops.mkldnn._is_mkldnn_bf16_supported():
-        return MLP(function, Tensor.bfloat16, lambda a, b: torch.bmm(a, b).float(), together)
-    return MLP(function, _rounded, lambda a, b: _rounded(torch.bmm(a, b)), together)
+        return MLP(function, Tensor.bfloat16, lambda a, b: torch.bmm(a, b).float(), on_gpu)
+    return MLP(function, _rounded, lambda a, b: _rounded(torch.bmm(a, b)), on_gpu)
 
 
 def _rounded(values: Tensor) -> Tensor:
