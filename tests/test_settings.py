@@ -98,7 +98,7 @@ def test_settings_reach_the_agent():
     ("algorithm", "settings", "message"),
     [
         ("sac", {"learning_rat": 1}, "sac has no setting 'learning_rat': did you mean learning_ra"),
-        ("ppo", {"tau": 0.1}, "ppo has no setting 'tau': it has activation_fn, "),
+        ("ppo", {"tau": 0.1}, "ppo has no setting 'tau': it has action_repeat, activation_fn, "),
         (
             "sac",
             {"xyz": 1},
