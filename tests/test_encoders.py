@@ -465,7 +465,7 @@ def test_a_name_that_ships_takes_precedence_over_a_file(encoder, tmp_path, monke
     assert find("dae-8", TASK).latent_size == 8
     assert find("./dae-8", TASK).latent_size == 3
     with pytest.raises(
-        InputError, match=r"no encoder 'dae-9': .* ships for face_direction: dae-12"
+        InputError, match=r"no encoder 'dae-9': .* ships for face_direction: coordinates, dae-12"
     ):
         find("dae-9", TASK)
     with pytest.raises(InputError, match="made for face_direction"):
