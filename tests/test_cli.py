@@ -29,8 +29,8 @@ COMMANDS = sorted({*main.commands} - {*GROUPS}) + [
 
 def test_a_run_from_training_to_its_returns(tmp_path):
     run = tmp_path / "runs" / "dae-8"
-    settings = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 40)
-    settings += ("--episode-steps", 100)
+    settings = ("--task", "face_direction", "--algorithm", "a2c", "--preset", "paper")
+    settings += ("--steps", 40, "--episode-steps", 100)
     for _ in range(2):  # the second time it is over
         given = (*settings, "--encoder", "dae-8", "--evaluation-episodes", 1, "--out", run)
         assert "returns on dae-8 at the end: " in jbrep("rl", *given).output
@@ -63,8 +63,10 @@ def test_a_run_that_fails_says_why_and_ends_with_1(tmp_path, monkeypatch):
     preset = get_preset("paper", "a2c")
     wild = preset.replace(algorithm_kwargs={**preset.algorithm_kwargs, "learning_rate": 1e30})
     monkeypatch.setitem(PRESETS["paper"], "a2c", wild)
-    run = ("--task", "face_direction", "--algorithm", "a2c", "--steps", 200)
-    failed = jbrep("rl", *run, "--evaluation-episodes", 1, "--out", tmp_path / "run")
+    run = ("--task", "face_direction", "--algorithm", "a2c", "--preset", "paper")
+    failed = jbrep(
+        "rl", *run, "--steps", 200, "--evaluation-episodes", 1, "--out", tmp_path / "run"
+    )
     assert failed.exit_code == 1
     assert re.search(r"the run failed: .* after [\d,]+ steps; see .*run\.json", failed.stderr)
 

@@ -184,7 +184,7 @@ def of(*place, **changes):
     ("change", "message"),
     [
         (of(format_version=1), "has version 1 of the jbrep data set format: this jbrep reads"),
-        (of(format_version=3), "has version 3 of the jbrep data set format: this jbrep reads"),
+        (of(format_version=2), "has version 2 of the jbrep data set format: this jbrep reads"),
         (of(format_version=0), "its format version is 0"),
         (of(format_version=-1), "its format version is -1"),
         (of(format="other"), "is damaged"),

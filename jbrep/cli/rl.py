@@ -46,9 +46,9 @@ learner_options = with_options(  # which `given_run` reads
     ),
     click.option(
         "--preset",
-        default="paper",
-        show_default=True,
-        help="Its settings: paper, modern, wide, or a TOML file with a table for each algorithm.",
+        default="",
+        help="Its settings: paper, modern, wide, or a TOML file with a table for each algorithm.  "
+        "[default: wide, or modern where that has none]",
     ),
     click.option(
         "--set",
@@ -85,7 +85,9 @@ def given_run(options: dict[str, Any], **others: Any) -> "Run":
     """
     from jbrep.encoders.code import import_code
     from jbrep.rl import Run
+    from jbrep.rl.presets import usual_preset
 
+    options["preset"] = options["preset"] or usual_preset(options["algorithm"])
     overrides = parse_arguments(options.pop("overrides"), "--set")
     if options.pop("normalize"):
         overrides["normalize"] = True

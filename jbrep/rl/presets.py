@@ -182,6 +182,11 @@ _WIDE = {
 PRESETS = {PAPER: _PAPER, MODERN: _MODERN, WIDE: _WIDE}
 
 
+def usual_preset(algorithm: str) -> str:
+    """The preset that commands take if none is named: many robots, where it has the algorithm."""
+    return WIDE if algorithm in _WIDE else MODERN
+
+
 def get_preset(preset: str, algorithm: str) -> Hyperparameters:
     """The hyperparameters of an algorithm in the preset of that name.
 
