@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from jbrep.rl.action_noise import ColouredActionNoise
 from jbrep.rl.noise import ColouredNoise, beginning
 
 STEPS = 1000
@@ -29,7 +28,7 @@ def test_coloured_noise_has_its_spectrum_and_spread(beta):
 
 
 def test_a_lane_draws_its_next_episode_when_the_last_is_over_or_cut_short():
-    noise = ColouredActionNoise(ColouredNoise(), 2, 4)
+    noise = ColouredNoise().make(2, 4)
     np.random.seed(0)  # noqa: NPY002 - stable-baselines3 draws there
     first, *_, fifth = [noise() for _ in range(5)]
     noise.reset()

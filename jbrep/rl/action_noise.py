@@ -1,5 +1,6 @@
-"""Coloured noise as stable-baselines3 takes it."""
+"""Noise with a memory as stable-baselines3 takes it."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -7,33 +8,30 @@ from numpy.typing import NDArray
 from stable_baselines3.common.noise import ActionNoise
 
 from jbrep.envs.task import Array
-from jbrep.rl.noise import ColouredNoise, beginning
 
 
-class ColouredActionNoise(ActionNoise):
-    """Coloured noise in one lane, drawn from the generator that stable-baselines3 draws from.
+class RememberedNoise(ActionNoise):
+    """Noise in one lane, drawn from the generator that stable-baselines3 draws from.
 
     Args:
-        noise: what it is like.
+        after: what follows a memory, with numbers of a generator.
         size: numbers in an action.
-        steps: of the longest episode.
 
     Attributes:
         memory: the noise of now, and what is drawn for later, (m, size).
     """
 
-    def __init__(self, noise: ColouredNoise, size: int, steps: int):
+    def __init__(self, after: Callable[[Array, np.random.RandomState], Array], size: int):
         super().__init__()
-        self._noise, self._steps, self._size = noise, steps, size
+        self._after, self._size = after, size
         self.memory: Array
         self.reset()
 
     def __call__(self) -> NDArray[Any]:
         """The noise of the next step, (size,)."""
-        generator = np.random.mtrand._rand
-        (self.memory,) = self._noise.after([self.memory], self._steps, generator)
+        self.memory = self._after(self.memory, np.random.mtrand._rand)
         return self.memory[0].astype(np.float32)
 
     def reset(self) -> None:
         """Start another episode."""
-        (self.memory,) = beginning(1, self._size)
+        self.memory = np.zeros((1, self._size))

@@ -4,6 +4,7 @@ Each lane has a memory, (m, k): the noise of now, then what is drawn for later a
 before an episode's first step.
 """
 
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -81,13 +82,19 @@ class ColouredNoise(Record, frozen=True, tag_field="kind", tag="coloured"):
 
     def make(self, size: int, steps: int) -> "ActionNoise":
         """As for `NormalNoise`."""
-        from jbrep.rl.action_noise import ColouredActionNoise
+        from jbrep.rl.action_noise import RememberedNoise
 
-        return ColouredActionNoise(self, size, steps)
+        return RememberedNoise(partial(self._next, steps=steps), size)
 
     def after(self, memory: Memory, steps: int, generator: np.random.RandomState) -> Memory:
         """As for `NormalNoise`."""
-        return [m[1:] if len(m) > 1 else self._drawn(m.shape[1], steps, generator) for m in memory]
+        return [self._next(each, generator, steps) for each in memory]
+
+    def _next(self, memory: Array, generator: np.random.RandomState, steps: int) -> Array:
+        """What one lane remembers a step later."""
+        if len(memory) > 1:
+            return memory[1:]
+        return self._drawn(memory.shape[1], steps, generator)
 
     def _drawn(self, size: int, steps: int, generator: np.random.RandomState) -> Array:
         """The noise of an episode, (steps, size)."""

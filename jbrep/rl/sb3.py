@@ -21,7 +21,7 @@ from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
 from jbrep.records.container import Tensors
 from jbrep.rl import checkpoint
-from jbrep.rl.action_noise import ColouredActionNoise
+from jbrep.rl.action_noise import RememberedNoise
 from jbrep.rl.agent import make_agent, make_env, training_seed, unchecked_distributions
 from jbrep.rl.checkpoint import (
     ACTIONS_NOT_FINITE,
@@ -38,7 +38,7 @@ from jbrep.rl.policy_file import acting
 
 _MEMORIES: dict[type, str] = {  # of noises that depend on what was drawn before
     OrnsteinUhlenbeckActionNoise: "noise_prev",
-    ColouredActionNoise: "memory",
+    RememberedNoise: "memory",
 }
 _UNSCALED = "_last_original_obs"  # before it was normalised
 _EXPLORATION = ("exploration_mat", "exploration_matrices")
