@@ -560,8 +560,9 @@ def test_a_robot_without_mujoco_shows_its_signals(short):
 def test_hundreds_of_features_are_many_plots_of_few_lines(short):
     rollout, found = short("Humanoid-v5")
     plots = {path: entity for path, entity in found.items() if path.startswith("/observation/")}
-    assert len(plots) == -(-rollout.task.size // MOST_LINES)
-    assert {len(names(entity)) for entity in plots.values()} <= {11, 12}
+    groups = rollout.task.groups.values()
+    assert len(plots) == sum(-(-(place.stop - place.start) // MOST_LINES) for place in groups)
+    assert max(len(names(entity)) for entity in plots.values()) <= MOST_LINES
     together = np.concatenate([scalars(plots[path]) for path in plots], axis=1)
     assert sorted(together[5]) == sorted(rollout.observation[5].astype(float))
     assert {"/action_0-7", "/action_8-16"} <= {*found}
