@@ -19,6 +19,7 @@ from jbrep.dataset import ScaledDataset, Scaler
 from jbrep.dataset.scaled import sample
 from jbrep.encoders import Encoder, Layer, find, save
 from jbrep.encoders.header import EncoderHeader
+from jbrep.encoders.shipped import unlearned
 from jbrep.errors import InputError
 from jbrep.evaluate import diagnose, diagnosis
 from jbrep.evaluate.diagnosis import seen, write
@@ -554,3 +555,11 @@ def test_other_features_are_refused(data):
     permuted = data.task.replace(features=tuple(reversed(data.task.features)))
     with pytest.raises(InputError, match="it-4 was made for other features of face_direction"):
         diagnose({"it": make(data, ((), ()), task=permuted)}, data)
+
+
+def test_what_symmetry_leaves_out_is_no_success(data):
+    """A robot that is decoded at the origin isn't one whose position was kept."""
+    errors = reconstruction(unlearned(data.task, "symmetry"), HeldOut(data))
+    r2 = {each.name: each.r2.value for each in errors.features}
+    assert {r2[name] for name in ("position_x", "position_y", "orientation_z")} == {None}
+    assert r2["motor_angle"] > 0.999

@@ -50,9 +50,9 @@ class BaseEncoder(ABC):
         return f"{kind}({self.name}, {self.task.name}, {self.size} to {self.latent_size})"
 
     @property
-    def is_invariant(self) -> bool:
-        """Whether it doesn't tell where a robot is, so that all are decoded at the origin."""
-        return False
+    def untold(self) -> tuple[str, ...]:
+        """Features that symmetry leaves out, such as where a robot is; decoded, it is at 0."""
+        return ()
 
     @abstractmethod
     def encode(self, observation: Any) -> Any:

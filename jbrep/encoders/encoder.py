@@ -227,9 +227,9 @@ class Encoder(BaseEncoder):
         return self._on[device]
 
     @property
-    def is_invariant(self) -> bool:
+    def untold(self) -> tuple[str, ...]:
         """As for `BaseEncoder`."""
-        return self.scaler.coordinates is not None and bool(self.scaler.coordinates.lost)
+        return self.scaler.coordinates.lost if self.scaler.coordinates else ()
 
     def check_task(self, task: Task) -> None:
         """As for `BaseEncoder`; other arguments, such as another body of the robot, will do."""

@@ -1,6 +1,6 @@
 """What an encoder and its decoder lose, from clean and from corrupted observations."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from jbrep.evaluate.evaluation import (
     EpisodeError,
     FeatureError,
     Reconstruction,
+    Score,
     score,
     scores,
 )
@@ -30,6 +31,7 @@ NOISES = (0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # of features scaled to [-1, 1]
 _QUANTILES = (0.5, 0.9, 0.99, 0.999, 1)
 _CORRUPTED_ROWS = 100_000
 _WORST = 5
+_NONE = Score(None, None, None)
 
 
 class _Losses(NamedTuple):
@@ -57,7 +59,7 @@ def reconstruction(encoder: BaseEncoder, held_out: HeldOut) -> Reconstruction:
         mse=score(bootstrap(_mean, losses.means, held_out.row_counts)),
         pca_mse=score(bootstrap(_mean, pca, held_out.row_counts)),
         ratio_to_pca=score(bootstrap(_mean, losses.means, pca)) if is_smaller else None,
-        features=_by_feature(losses.sums, held_out),
+        features=_by_feature(losses.sums, held_out, encoder.untold),
         quantiles=dict(zip(map(str, _QUANTILES), quantiles, strict=True)),
         worst_episodes=_worst(losses.by_row, held_out),
     )
@@ -135,7 +137,8 @@ def _linear(data: ScaledDataset, layers: tuple[Layers, Layers]) -> Encoder:
     return Encoder(header, data.scaler, *layers)
 
 
-def _by_feature(sums: Array, held_out: HeldOut) -> tuple[FeatureError, ...]:
+def _by_feature(sums: Array, held_out: HeldOut, untold: Sequence[str]) -> tuple[FeatureError, ...]:
+    """The error of each feature; no R^2 of those that an encoder leaves out."""
     data, rows = held_out.data, held_out.row_counts
     total, squares = held_out.variation
     width = data.scaler.half_width.astype(float)
@@ -144,6 +147,9 @@ def _by_feature(sums: Array, held_out: HeldOut) -> tuple[FeatureError, ...]:
     r2 = scores(
         bootstrap(lambda e, t, s, n: r_squared(e, variation(t, s, n)), sums, total, squares, rows)
     )
+    r2 = [
+        _NONE if f.name in untold else each for f, each in zip(data.task.features, r2, strict=True)
+    ]
     return tuple(
         FeatureError(name=f.name, unit=f.unit, mse=mse[i], rmse_physical=rmse[i], r2=r2[i])
         for i, f in enumerate(data.task.features)
