@@ -45,7 +45,9 @@ _argument_options = with_options(
         help="The time limit of an episode; the environment's own by default.",
     ),
     click.option(
-        "--features", type=PATH, help="A TOML file with names, units and ranges of the features."
+        "--features",
+        type=PATH,
+        help="A TOML file with names, units, ranges and kinds of the features.",
     ),
     import_option,
 )

@@ -93,10 +93,8 @@ class Coordinates:
         self._way_back = list(self._steps_back())
 
     def _check(self) -> None:
-        given, known = (
-            [name for part in self.parts for name in part.gives],
-            {*self.task.feature_names},
-        )
+        given = [name for part in self.parts for name in part.gives]
+        known = {*self.task.feature_names}
         if not self.names:
             raise InputError("none of the coordinates is shown")
         if len(given) > _MAX_NUMBERS:

@@ -1,6 +1,6 @@
 """Whether a task is the same wherever its robot stands and however it is turned: tried out."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import gymnasium
@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium.spaces.utils import flatten
 
 from jbrep.coordinates.coordinates import Coordinates
+from jbrep.coordinates.made import Ingredient, System, make_coordinates
 from jbrep.envs.make import make_env
 from jbrep.envs.mujoco import quarter_turn
 from jbrep.envs.task import Array, Task
@@ -16,6 +17,20 @@ from jbrep.errors import InputError
 _SEEDS, _BEFORE, _AFTER = 3, 10, 5  # episodes; steps before the turn and after it
 _SAME = 1e-5  # relative difference of rewards and coordinates, as float32 rounds them
 _SHIFT = (0.5, -0.25)  # [m]
+
+
+def tried_coordinates(
+    task: Task, system: System, leave_out: Collection[Ingredient] = ()
+) -> Coordinates | None:
+    """As `make_coordinates`, but symmetry is tried out.
+
+    Raises:
+        InputError: as `make_coordinates` and `check_invariant`.
+    """
+    made = make_coordinates(task, system, leave_out)
+    if made and system == "symmetry":
+        check_invariant(made)
+    return made
 
 
 def check_invariant(coordinates: Coordinates) -> None:

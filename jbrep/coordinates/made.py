@@ -154,11 +154,15 @@ class _Maker:
                 unit[2:]
             )
         if self._invariant:
-            raise InputError(
-                f"{self._task.name} has {_word(unit)} in the world, but no feature says how its "
-                "body is turned: symmetry needs a quaternion, or an angle in the world"
-            )
+            raise self._unturned(unit)
         return self._same(unit)
+
+    def _unturned(self, unit: _Features) -> InputError:
+        """The mistake of a vector in the world of a body that may be turned in any way."""
+        return InputError(
+            f"{self._task.name} has {_word(unit)} in the world, but no feature says how its "
+            "body is turned: symmetry needs a quaternion, or an angle in the world"
+        )
 
     def _offset(self, unit: _Features) -> None:
         self._polar(_word(unit), self._vector(unit)[:2], unit[0])
@@ -180,10 +184,7 @@ class _Maker:
             return
         apart = self._add(f"{_word(unit)}.apart", "difference", (*names[:2], *self._place), False)
         if not self._heading:
-            raise InputError(
-                f"{self._task.name} has {_word(unit)} in the world, but no feature says how its "
-                "body is turned: symmetry needs a quaternion, or an angle in the world"
-            )
+            raise self._unturned(unit)
         plane = self._add(_word(unit), "turned", (*apart, *self._heading))
         self._polar(_word(unit), plane, unit[0])
 

@@ -28,7 +28,7 @@ Values = TypeVar("Values")  # a NumPy array, or a torch tensor
 class Arrays(NamedTuple):
     """An encoder's arrays, all NumPy's or all torch tensors on one device, and what it computes.
 
-    Written once for NumPy, torch and ONNX: whatever is to come before the scaling belongs here.
+    Written once for NumPy, torch and ONNX.
 
     Attributes:
         scaler: of observations.

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from jbrep.coordinates import OBSERVATION, System, make_coordinates
-from jbrep.coordinates.invariance import check_invariant
+from jbrep.coordinates import OBSERVATION, Coordinates, System, make_coordinates
+from jbrep.coordinates.invariance import tried_coordinates
 from jbrep.dataset import Scaler
 from jbrep.dataset.scaling import usual_range
 from jbrep.encoders.base import BaseEncoder, as_encoder
@@ -49,9 +49,11 @@ def unlearned(task: Task, name: str = FULL) -> Encoder:
     Raises:
         InputError: the task has no such coordinates, or no such symmetry.
     """
-    coordinates = make_coordinates(task, _UNLEARNED[name])
-    if coordinates and name == "symmetry":
-        check_invariant(coordinates)
+    return _scaled(task, name, tried_coordinates(task, _UNLEARNED[name]))
+
+
+def _scaled(task: Task, name: str, coordinates: Coordinates | None) -> Encoder:
+    """The encoder that only scales, by usual ranges as far as they are known."""
     features = coordinates.features if coordinates else task.features
     ranges = [usual_range(feature) for feature in features]
     known = sum(each is not None for each in ranges)
@@ -126,7 +128,8 @@ def source_of(name: str | Path, task: Task | None) -> str:
     if is_code(name):
         return f"{name}, code"
     if task and _is_made(name, task):
-        return f"{name}, {_SCALINGS[unlearned(task, str(name)).header.training['scaling']]}"
+        made = _scaled(task, str(name), make_coordinates(task, _UNLEARNED[str(name)]))
+        return f"{name}, {_SCALINGS[made.header.training['scaling']]}"
     return f"{name}, shipped" if task and str(name) in _files(task) else str(name)
 
 

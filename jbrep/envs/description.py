@@ -51,7 +51,7 @@ def describe(
         name: one of the Jitterbug's tasks, or an id in Gymnasium's registry.
         arguments: of the environment, plain JSON.
         max_episode_steps: the time limit [steps]; the registered one if not given.
-        features: a TOML file with names, units and ranges, see docs/environments.md.
+        features: a TOML file with names, units, ranges and kinds, see docs/environments.md.
 
     Raises:
         InputError: an unknown task, an environment that can't be made, actions or observations

@@ -65,7 +65,7 @@ def with_kinds(env: gymnasium.Env[Any, Any], features: Sequence[Feature]) -> tup
     if physics is None:
         return tuple(features)
     quantities = dict(_quantities(physics.model))
-    observations, states = _played(env, physics)
+    observations, states = _played(env)
     found = [_match(column, states, quantities) for column in observations.T]
     return tuple(_described(features, found))
 
@@ -119,7 +119,7 @@ def _planar_root(model: mujoco.MjModel) -> tuple[int, int, int] | None:
     return None
 
 
-def _played(env: gymnasium.Env[Any, Any], physics: Physics) -> tuple[Array, Array]:
+def _played(env: gymnasium.Env[Any, Any]) -> tuple[Array, Array]:
     """Observations (n, d) and states (n, nq + nv) of some episodes under random actions."""
     observations, states = [], []
     space: Any = env.action_space

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
-from jbrep.coordinates import OBSERVATION, make_coordinates
-from jbrep.coordinates.invariance import check_invariant
+from jbrep.coordinates import OBSERVATION
+from jbrep.coordinates.invariance import tried_coordinates
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import Encoder, load, save
@@ -171,9 +171,7 @@ class Fitter:
         return data
 
     def _rescaled(self, method: Method) -> ScaledDataset:
-        coordinates = make_coordinates(self._data.task, method.on, method.leave_out)
-        if coordinates and method.on == "symmetry":
-            check_invariant(coordinates)
+        coordinates = tried_coordinates(self._data.task, method.on, method.leave_out)
         return self._data.rescaled(method.scaling, coordinates, method.clip, method.keep)
 
     def _train_alone(self, plan: Plan, method: Learned) -> bool:
