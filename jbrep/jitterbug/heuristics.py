@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jbrep.jitterbug.tasks import Array, get_task, wrap
+from jbrep.coordinates import wrapped
+from jbrep.jitterbug.tasks import Array, get_task
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def walk_toward(state: dict[str, Array], bearing: Array, walk: Walk) -> Array:
     speed = state["motor_velocity"]
     spin_x, spin_y, spin_z = np.split(state["angular_velocity"], 3, axis=1)
     bearing = bearing - walk.ahead * spin_z
-    error = wrap(state["motor_angle"] - walk.late * speed - bearing)
+    error = wrapped(state["motor_angle"] - walk.late * speed - bearing)
     rise = walk.rise * state["velocity"][:, 2:]
     nod = walk.nod * (np.cos(bearing) * spin_x + np.sin(bearing) * spin_y)
     along = walk.keep + walk.push * np.cos(error) + rise + nod

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.coordinates import wrapped
 from jbrep.envs.task import SHORT_NAMES, Feature, Frame, Kind, Task
 from jbrep.errors import choose
 
@@ -37,11 +38,6 @@ _UPRIGHT_MARGIN = 0.5  # in the cosine of the tilt
 _POSITION_MARGIN = 0.05  # [m]
 _VALUE_AT_MARGIN = 0.1
 _TARGET_SPEED = 0.1  # [m/s]
-
-
-def wrap(angle: Array) -> Array:
-    """The same angle in [-pi, pi)."""
-    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
 
 
 def yaw_direction(quaternion: Array) -> Array:
@@ -72,7 +68,7 @@ class Readings:
     @property
     def motor_angle(self) -> Array:
         """Where the weight points in the bug's frame, 0 forward, counter-clockwise, (n,)."""
-        return wrap(self.qpos[:, MOTOR_QPOS] + np.pi / 2)
+        return wrapped(self.qpos[:, MOTOR_QPOS] + np.pi / 2)
 
     @cached_property
     def angle_to_target(self) -> Array:
