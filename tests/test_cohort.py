@@ -280,7 +280,7 @@ def check(run):
         ({"trainer": "cohort", "algorithm": "ppo"}, "cohorts train ddpg, td3, sac, not ppo: add"),
         ({"overrides": {"use_sde": True}}, "can't learn with use_sde = True: add --trainer sb3"),
         (
-            {"overrides": {"train_freq": [1, "episode"]}},
+            {"preset": "modern", "overrides": {"train_freq": [1, "episode"]}},
             "takes train_freq as a number of steps: add",
         ),
         ({"trainer": "sb3", "precision": "bfloat16"}, "sb3 has no bfloat16: leave the precision"),

@@ -66,7 +66,9 @@ def test_a_changed_bit_in_a_checkpoint_of_an_encoder_is_noticed(tmp_path):
 def stopped(tmp_path_factory):
     """A run that has written a checkpoint, and the folder that has it."""
     folder = tmp_path_factory.mktemp("stopped") / "run"
-    run = Run.of(task="face_direction", algorithm="a2c", steps=40, evaluation_episodes=1)
+    run = Run.of(
+        task="face_direction", algorithm="a2c", steps=40, evaluation_episodes=1, preset="paper"
+    )
 
     def watch(step, mean):
         if (folder / CHECKPOINT).exists():

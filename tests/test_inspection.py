@@ -695,7 +695,9 @@ def write_study(folder):
             failed = (representation, seed) == ("dae-8", 1)
             run = folder / "runs" / representation / f"seed-{seed}"
             run.mkdir(parents=True)
-            settings = Run.of(task="face_direction", encoder=representation, steps=300, seed=seed)
+            settings = Run.of(
+                task="face_direction", encoder=representation, steps=300, seed=seed, preset="paper"
+            )
             end = {"steps": 150, "reason": "it failed"} if failed else {"steps": 300}
             write_record(run, settings, **end)
             steps = (0, 100) if failed else (0, 100, 200, 300)
@@ -736,7 +738,9 @@ def test_training_curves_are_the_evaluations(tmp_path):
 @pytest.mark.parametrize("name", ["dae-4", "full"])
 def test_a_run_under_way_shows_its_checkpoint_and_its_own_encoder(name, tmp_path):
     task = describe("face_direction", max_episode_steps=50)
-    write_checkpoint(tmp_path, Run.of(task, "a2c", encoder=name, evaluation_episodes=1), 12_000)
+    write_checkpoint(
+        tmp_path, Run.of(task, "a2c", encoder=name, evaluation_episodes=1, preset="paper"), 12_000
+    )
     shown = read(inspect(str(tmp_path), out=tmp_path / "it.rrd"))
     assert f"# {tmp_path} at step 12,000" in text(shown["/provenance"])
     assert ("/world/ghost/jitterbug" in shown) == (name == "dae-4")

@@ -92,7 +92,7 @@ def test_a_gpu_has_one_wide_cohort_at_a_time(tmp_path, monkeypatch):
 )
 def test_trials_take_rollouts_as_short_as_can_be(algorithm, short):
     """The paper's TD3 takes a thousand gradient steps after as many steps."""
-    run = Run.of(task="face_direction", algorithm=algorithm)
+    run = Run.of(task="face_direction", algorithm=algorithm, preset="paper")
     found = speed._at_once(run)
     assert {"learning_starts": 0, **short}.items() <= found.items()
     run = run.replace(learner=run.learner.overridden(found))

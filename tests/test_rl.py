@@ -42,7 +42,7 @@ TASK = describe("face_direction", max_episode_steps=STEPS)
 QUICK = {"task": TASK, "evaluation_episodes": 1}
 # to evaluate the text of a run
 IMPORTS = "from jbrep.envs import Feature, Task; from jbrep.rl.learner import Learner"
-SHORT = Run.of(algorithm="a2c", encoder="dae-8", steps=80, **QUICK)
+SHORT = Run.of(algorithm="a2c", encoder="dae-8", steps=80, **QUICK, preset="paper")
 
 
 def agent_of(algorithm, preset="paper", encoder="dae-8"):
@@ -245,7 +245,7 @@ def test_a_run_that_another_process_has_just_finished_is_left_alone(short, tmp_p
 
 
 KILLED = {
-    "ddpg": Run.of(algorithm="ddpg", encoder="dae-8", steps=300, **QUICK),
+    "ddpg": Run.of(algorithm="ddpg", encoder="dae-8", steps=300, **QUICK, preset="paper"),
     "sac": Run.of(task="Hopper-v5", preset="modern", steps=1100, evaluation_episodes=1),
 }
 
@@ -399,7 +399,7 @@ def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
     kwargs = {**preset.algorithm_kwargs, "learning_rate": 1e30}
     wild = preset.replace(algorithm_kwargs=kwargs)
     monkeypatch.setitem(PRESETS["paper"], algorithm, wild)
-    run = Run.of(algorithm=algorithm, steps=4096, **QUICK)
+    run = Run.of(algorithm=algorithm, steps=4096, **QUICK, preset="paper")
     result = train(run, tmp_path / "wild")
     assert result.status == FAILED
     assert "loss is" in result.reason or "not finite" in result.reason
@@ -413,7 +413,9 @@ def test_a_run_that_diverges_is_marked_failed(algorithm, tmp_path, monkeypatch):
 @pytest.mark.parametrize("trainer", [COHORT, SB3])
 def test_a_run_tells_all_its_steps_before_its_last_evaluation(trainer, tmp_path):
     told = []
-    run = Run.of(algorithm="ddpg", steps=1200, evaluate_every=600, trainer=trainer, **QUICK)
+    run = Run.of(
+        algorithm="ddpg", steps=1200, evaluate_every=600, trainer=trainer, **QUICK, preset="paper"
+    )
     train(run, tmp_path / "run", lambda *each: told.append(each))
     evaluations = read_evaluations(tmp_path / "run")
     means = [np.mean([e.episode_return for e in evaluations if e.step == s]) for s in (600, 1200)]

@@ -63,7 +63,7 @@ def episodes_of(folder):
     ids=lambda given: getattr(given, "slug", given),
 )
 def test_every_algorithm_learns_on_any_task(algorithm, task, short_rollouts, tmp_path):
-    run = Run.of(task=task, algorithm=algorithm, steps=150, evaluation_episodes=1)
+    run = Run.of(task=task, algorithm=algorithm, steps=150, evaluation_episodes=1, preset="paper")
     result = train(run, tmp_path)
     assert result.status == "finished", result.reason
     assert result.settings.task == task.name
@@ -119,7 +119,7 @@ def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, tas
 
 
 def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
-    run = Run.of(task=FAILING, algorithm="a2c", steps=800, evaluation_episodes=1)
+    run = Run.of(task=FAILING, algorithm="a2c", steps=800, evaluation_episodes=1, preset="paper")
     result = train(run, tmp_path)
     assert result.status == FAILED
     where = f"failed at step 7 of the episode with seed {training_seed(0) + 3}"
@@ -143,7 +143,7 @@ def test_the_command_says_that_an_environment_failed(tmp_path):
 
 
 def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
-    run = Run.of(task=CART, algorithm="a2c", steps=320, evaluation_episodes=1)
+    run = Run.of(task=CART, algorithm="a2c", steps=320, evaluation_episodes=1, preset="paper")
     with pytest.raises(StoppedError):
         train(run, tmp_path, stop=iter((False, True)).__next__)
     before = (tmp_path / CHECKPOINT).read_bytes()
@@ -167,7 +167,7 @@ def test_an_environment_that_is_not_reproducible(tmp_path):
     assert told.stderr.startswith("Test/Cart-v0 is not reproducible: ")
     assert told.stderr.count("\n") == 1
     drifting = describe(cart.ID, {"drifts": True})
-    run = Run.of(task=drifting, algorithm="a2c", steps=80, evaluation_episodes=1)
+    run = Run.of(task=drifting, algorithm="a2c", steps=80, evaluation_episodes=1, preset="paper")
     with pytest.raises(StoppedError):
         train(run, tmp_path / "stopped", stop=iter((False, True)).__next__)
     with pytest.raises(InputError, match="Test/Cart-v0 is not reproducible here"):

@@ -37,7 +37,7 @@ SHORT = {
 def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     task = describe("face_direction", max_episode_steps=200)
-    short = {"steps": 64, "evaluation_episodes": 2, "final_episodes": 2}
+    short = {"preset": "paper", "steps": 64, "evaluation_episodes": 2, "final_episodes": 2}
     train(Run.of(task, "a2c", encoder="dae-8", **short), folder)
     return folder
 

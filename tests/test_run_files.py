@@ -43,7 +43,9 @@ from jbrep.rl.policy_file import read
 from jbrep.study.results import conclude
 
 TASK = describe("face_direction")
-SETTINGS = Run.of(task=TASK, algorithm="a2c", encoder="dae-8", steps=80, evaluation_episodes=1)
+SETTINGS = Run.of(
+    task=TASK, algorithm="a2c", encoder="dae-8", steps=80, evaluation_episodes=1, preset="paper"
+)
 
 
 @pytest.fixture(scope="module")
@@ -305,7 +307,9 @@ def test_a_checkpoint_s_policy_is_the_agent_s_at_that_step(trained, tmp_path):
 
 @pytest.mark.parametrize("algorithm", ["ddpg", "sac", "td3", "ppo", "trpo"])
 def test_the_checkpoint_of_every_algorithm_is_played(algorithm, tmp_path):
-    agent = write_checkpoint(tmp_path, Run.of(TASK, algorithm, encoder="dae-8", seed=3), step=7)
+    agent = write_checkpoint(
+        tmp_path, Run.of(TASK, algorithm, encoder="dae-8", seed=3, preset="paper"), step=7
+    )
     playing = load_run(tmp_path)
     assert playing.step == 7
     seen = np.random.default_rng(0).uniform(-1, 1, (5, 8)).astype(np.float32)

@@ -543,7 +543,9 @@ def test_a_run_is_drawn_before_and_after_training_with_the_same_body(done):
     assert find_untrained(run, other).task == find_player(str(run), other).task == other
     task, _ = observe([str(run)], other, 1, 0.5)
     assert task == other
-    train(Run.of(other, "a2c", steps=80, evaluation_episodes=1), done.folder / "other")
+    train(
+        Run.of(other, "a2c", steps=80, evaluation_episodes=1, preset="paper"), done.folder / "other"
+    )
     with pytest.raises(InputError, match="with another body or time limit than the policies bef"):
         observe([str(run), str(done.folder / "other")], None, 1, 0.5)
 

@@ -48,6 +48,7 @@ NET = "my_encoders:Net"
 SHARED = {
     "task": describe(TASK, {}, 50),
     "algorithm": "a2c",
+    "preset": "paper",
     "steps": 80,
     "evaluate_every": 80,
     "evaluation_episodes": 1,

@@ -60,7 +60,7 @@ def test_the_best_agent_is_the_best_at_the_end_of_training(tmp_path):
     for seed, late in ((0, 300.0), (1, 500.0), (2, 400.0)):
         folder = tmp_path / "study" / str(seed)
         folder.mkdir(parents=True)
-        run = Run.of(FACE, "sac", seed=seed, steps=1000)
+        run = Run.of(FACE, "sac", seed=seed, steps=1000, preset="paper")
         write_record(folder, run)
         rows = [Episode(500, 0, 900.0 - late, 100, False), Episode(1000, 0, late, 100, False)]
         write_rows(folder / EPISODES, rows, Episode)

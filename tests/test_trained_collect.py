@@ -46,7 +46,7 @@ def runs(tmp_path_factory):
             for each in path.parent.glob("*.safetensors"):
                 shutil.copy(each, under_way)
 
-    usual = {"evaluation_episodes": 1, "evaluate_every": 80}
+    usual = {"preset": "paper", "evaluation_episodes": 1, "evaluate_every": 80}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(container, "write", keep)
         train(

@@ -85,9 +85,7 @@ def given_run(options: dict[str, Any], **others: Any) -> "Run":
     """
     from jbrep.encoders.code import import_code
     from jbrep.rl import Run
-    from jbrep.rl.presets import usual_preset
 
-    options["preset"] = options["preset"] or usual_preset(options["algorithm"])
     overrides = parse_arguments(options.pop("overrides"), "--set")
     if options.pop("normalize"):
         overrides["normalize"] = True

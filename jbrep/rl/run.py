@@ -17,13 +17,13 @@ from jbrep.rl.cohort.algorithm import check as check_for_cohort
 from jbrep.rl.files import RunSettings
 from jbrep.rl.learner import Learner
 from jbrep.rl.policy import policy_to_begin_with
+from jbrep.rl.presets import usual_preset
 from jbrep.rl.settings import (
     COHORT,
     CPU,
     CUDA,
     FLOAT32,
     MAX_EPISODES,
-    PAPER,
     SB3,
     Name,
     Seed,
@@ -70,7 +70,7 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
         cls,
         task: Task | str,
         algorithm: str = "sac",
-        preset: str = PAPER,
+        preset: str = "",
         overrides: Mapping[str, Any] = {},
         **others: Any,
     ) -> "Run":
@@ -79,14 +79,15 @@ class Run(TrainingSettings, frozen=True, kw_only=True):
         Args:
             task: itself, or its name.
             algorithm: one of stable-baselines3's, such as sac.
-            preset: its hyperparameters: paper, modern, wide, or a TOML file.
+            preset: its hyperparameters: paper, modern, wide, or a TOML file; if empty, that which
+                serves a newcomer best, wide or modern.
             overrides: hyperparameters that are set differently, as with --set.
             others: fields of a run.
 
         Raises:
             InputError: an unknown name, or a value that can't be used.
         """
-        learner = Learner.given(algorithm, preset, overrides)
+        learner = Learner.given(algorithm, preset or usual_preset(algorithm), overrides)
         return cls(task=as_task(task), learner=learner, **others)
 
     def find_encoder(self) -> BaseEncoder:
