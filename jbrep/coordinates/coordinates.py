@@ -2,10 +2,13 @@
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
 from msgspec import Meta
 
 from jbrep.coordinates.formulas import FORMULAS, Columns, Formula
@@ -14,6 +17,7 @@ from jbrep.errors import InputError
 from jbrep.records.record import Record
 
 _MAX_NUMBERS = 4096
+_PLAIN = SimpleNamespace(sin=math.sin, cos=math.cos, sqrt=math.sqrt, arctan2=math.atan2)
 _Soft = Annotated[float, Meta(ge=0, le=1e12)]
 
 
@@ -112,10 +116,32 @@ class Coordinates:
     def forward(self, observation: Any) -> Any:
         """Observations (..., d) in physical units as coordinates (..., m)."""
         library = library_of(observation)
+        if library is np and np.ndim(observation) == 1:
+            with suppress(ArithmeticError, ValueError):  # of infinities, which NumPy passes on
+                return np.array(self._of_one(np.asarray(observation).tolist()), observation.dtype)
         known = {name: observation[..., i] for i, name in enumerate(self.task.feature_names)}
         for part in self.parts:
             _calculate(library, _Step(part, False), known)
         return library.stack([known[name] for name in self.names], -1)
+
+    def _of_one(self, numbers: list[float]) -> list[float]:
+        """The coordinates (m,) of one observation (d,), several times as fast as in arrays."""
+        steps, shown = self._program
+        for forward, places, soft in steps:
+            numbers += forward(_PLAIN, [numbers[i] for i in places], soft)
+        return [numbers[i] for i in shown]
+
+    @cached_property
+    def _program(self) -> tuple[list[tuple[Callable[..., Columns], list[int], float]], list[int]]:
+        """The formulas with the places of what each takes, and the places of the coordinates.
+
+        Places are among the observation's numbers and, after them, all that the formulas give.
+        """
+        names, steps = [*self.task.feature_names], []
+        for part in self.parts:
+            steps.append((FORMULAS[part.formula].forward, [*map(names.index, part.of)], part.soft))
+            names += part.gives
+        return steps, [*map(names.index, self.names)]
 
     def inverse(self, coordinates: Any) -> Any:
         """Coordinates (..., m) as observations (..., d) in physical units.

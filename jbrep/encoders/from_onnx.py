@@ -337,6 +337,7 @@ _ACTIONS: dict[str, Callable[[_Node], Action]] = {  # of one value, the first in
     "Gelu": _gelu,
     "Swish": lambda node: with_slope("silu", node.number("alpha", 1)),
     "Elu": lambda node: operation("elu", VALUE, node.number("alpha", 1)),
+    "LeakyRelu": lambda node: operation("leaky_relu", VALUE, node.number("alpha", 0.01)),
 }
 _SHAPES: dict[str, Callable[[Any, tuple[int, ...]], Any]] = {  # of constants
     "Reshape": lambda value, shape: value.reshape(

@@ -180,6 +180,7 @@ _MODULES: dict[type[nn.Module], Callable[[Any], tuple[Any, ...]]] = {  # operati
     nn.SiLU: lambda m: ("silu", VALUE),
     nn.GELU: lambda m: ("gelu", VALUE, m.approximate),
     nn.ELU: lambda m: ("elu", VALUE, m.alpha),
+    nn.LeakyReLU: lambda m: ("leaky_relu", VALUE, m.negative_slope),
     nn.Softplus: lambda m: ("softplus", VALUE, m.beta, m.threshold),
     nn.LayerNorm: lambda m: ("layer_norm", VALUE, m.normalized_shape, *_affine(m), m.eps),
     nn.BatchNorm1d: lambda m: (

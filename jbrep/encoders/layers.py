@@ -81,6 +81,7 @@ ACTIVATIONS: Mapping[str, Callable[[Any], Any]] = {  # for NumPy arrays
     "gelu-tanh": _gelu_tanh,  # their approximation of it
     "silu": lambda values: values * _sigmoid(values),
     "elu": lambda values: np.where(values > 0, values, np.expm1(np.minimum(values, 0))),
+    "leaky-relu": lambda values: np.maximum(values, 0.01 * values),
     "softplus": lambda values: np.logaddexp(values, 0),
     "sin": np.sin,
     LAYER_NORM: _layer_norm,
@@ -99,6 +100,7 @@ def _torch() -> Mapping[str, Callable[[Any], Any]]:
         "relu": lambda values: values.clip(min=0),
         **{name: getattr(torch, name) for name in ("tanh", "sigmoid", "sin")},
         **{name: getattr(functional, name) for name in ("gelu", "silu", "elu", "softplus")},
+        "leaky-relu": functional.leaky_relu,
         "gelu-tanh": lambda values: functional.gelu(values, approximate="tanh"),
         LAYER_NORM: lambda values: functional.layer_norm(values, values.shape[-1:], eps=EPSILON),
         AVG_L1_NORM: lambda v: v / v.abs().mean(-1, keepdim=True).clip(min=LEAST_NORM),

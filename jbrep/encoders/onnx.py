@@ -117,6 +117,7 @@ _ACTIVATIONS: Mapping[str, Callable[[_Rows], _Rows]] = {
     "gelu-tanh": _node("Gelu", approximate="tanh"),
     "silu": lambda values: values * values.made("Sigmoid", values),
     "elu": _node("Elu", alpha=1.0),
+    "leaky-relu": _node("LeakyRelu", alpha=0.01),
     LAYER_NORM: lambda v: v.made("LayerNormalization", v, np.ones(v.width), epsilon=EPSILON),
     AVG_L1_NORM: lambda v: v / np.maximum(abs(v) @ np.full((v.width, 1), 1 / v.width), LEAST_NORM),
 }

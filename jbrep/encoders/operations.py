@@ -118,6 +118,12 @@ def _elu(values: Any, alpha: float = 1.0, inplace: bool = False) -> Action:
     return _activation("elu")
 
 
+def _leaky_relu(values: Any, negative_slope: float = 0.01, inplace: bool = False) -> Action:
+    if not math.isclose(negative_slope, 0.01, rel_tol=1e-6):  # ONNX has it in single precision
+        raise InputError(f"its slope is {negative_slope:g}: only 0.01 can be converted")
+    return _activation("leaky-relu")
+
+
 def _softplus(values: Any, beta: float = 1, threshold: float = _USUAL_THRESHOLD) -> Action:
     if threshold < _USUAL_THRESHOLD:
         raise InputError(f"its threshold is {threshold:g}: it must be {_USUAL_THRESHOLD}")
@@ -210,6 +216,7 @@ _OPERATIONS: dict[str, Callable[..., Action]] = {  # of one value, the first arg
     **{name: partial(_activation, name) for name in ("relu", "tanh", "sigmoid", "silu", "sin")},
     "gelu": _gelu,
     "elu": _elu,
+    "leaky_relu": _leaky_relu,
     "softplus": _softplus,
     "linear": _linear,
     "matmul": lambda values, right: _linear(values, np.transpose(right)),

@@ -1,0 +1,171 @@
+"""Trained policies as functions of what a robot's sensors say, in NumPy alone."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jbrep.encoders.base import BaseEncoder
+from jbrep.encoders.encoder import Encoder
+from jbrep.encoders.fold import Chain
+from jbrep.encoders.layers import Layer, run
+from jbrep.errors import InputError
+from jbrep.records.container import Tensors
+from jbrep.rl.files import RunSettings
+from jbrep.rl.normalization import Statistics
+
+_HIDDEN = "latent_pi.", "mlp_extractor.policy_net.", "mu."  # sequences, numbered from 0
+_LAST = "mu", "action_net"  # single layers after them
+_ON_POLICY = "ppo", "a2c", "trpo"  # whose actions are clipped; those of others are squashed
+_RENORM_EPSILON = 1e-3  # that CrossQ's batch renormalisation adds to the variance
+
+
+class Controller:
+    """A trained policy that takes observations as the robot gives them, and gives actions.
+
+    It does all that belongs to the policy: scaling, encoder, running normalisation, network,
+    bounds, and holding each action for as many calls as it was trained with.
+
+        controller = jbrep.load_policy("runs/a")
+        action = controller(observation)
+
+    Args:
+        settings: of the run.
+        encoder: the run's.
+        weights: of the part of the policy that acts, by stable-baselines3's names.
+        statistics: by which the policy normalises what it sees, if it does.
+
+    Attributes:
+        task: says what the observation's numbers and the action's are: names, units, ranges.
+        encoder: what the network sees is its latent.
+        network: layers from there to the actions before they are squashed or clipped.
+        action_repeat: calls for which an action is held.
+
+    Raises:
+        InputError: a policy that isn't a chain of layers, as with gSDE.
+    """
+
+    def __init__(
+        self,
+        settings: RunSettings,
+        encoder: BaseEncoder,
+        weights: Tensors,
+        statistics: Statistics | None = None,
+    ):
+        self.task, self.encoder, self.statistics = settings.environment, encoder, statistics
+        self.action_repeat = settings.hyperparameters.action_repeat
+        self.network = network_of(settings, encoder.latent_size, weights)
+        self._is_squashed = settings.algorithm not in _ON_POLICY
+        self._low, self._high = (
+            np.array(bound, np.float32) for bound in (self.task.action_low, self.task.action_high)
+        )
+        self._one_row = isinstance(encoder, Encoder)
+        self.reset()
+
+    def __repr__(self) -> str:
+        size, actions = self.task.size, self.task.action_size
+        return f"Controller({self.task.name}: {size} numbers to {actions}, {self.encoder.name})"
+
+    def reset(self) -> None:
+        """Begin another episode: the next call chooses an action."""
+        self._calls, self._held = 0, np.empty(0, np.float32)
+
+    def __call__(self, observation: ArrayLike) -> NDArray[np.float32]:
+        """The action (k,) at an observation (d,) in the units of the task's features.
+
+        Several robots may be given at once, (n, d), for (n, k).
+
+        Raises:
+            InputError: observations of another size; or the action isn't finite, as where an
+                observation isn't.
+        """
+        if self._calls % self.action_repeat == 0:
+            self._held = self._chosen(np.asarray(observation, np.float32))
+        self._calls += 1
+        return self._held.copy()
+
+    def _chosen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        if observation.ndim == 1 and not self._one_row:
+            return self._chosen(observation[None])[0]
+        seen = self.encoder.encode(observation)
+        action = self.actions(self.statistics(seen) if self.statistics else seen)
+        if not np.isfinite(action).all():
+            raise InputError("the policy's action is not finite: see what it observed")
+        return action
+
+    def actions(self, seen: Any) -> Any:
+        """Actions (..., k) of what the network sees (..., l): arrays, or rows of a model."""
+        chosen, low, high = run(self.network, seen), self._low, self._high
+        if self._is_squashed:
+            chosen = low + (0.5 * (high - low)) * (np.tanh(chosen) + 1)
+        return np.minimum(np.maximum(chosen, low), high)
+
+
+def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[Layer, ...]:
+    """The layers of a policy from what it sees to its most likely action, not yet squashed.
+
+    Args:
+        settings: of the run.
+        inputs: numbers that it sees.
+        weights: of the part that acts, by stable-baselines3's names.
+
+    Raises:
+        InputError: it isn't such a chain of layers.
+    """
+    shape = settings.hyperparameters
+    if shape.algorithm_kwargs.get("use_sde") or shape.policy_kwargs.get("use_sde"):
+        raise InputError("a policy with use_sde isn't a chain of layers: it can't be taken out")
+    activation = str(shape.policy_kwargs["activation_fn"]).replace("_", "-")
+    chain = Chain(inputs)
+    for prefix in _HIDDEN:
+        parts = _numbered(prefix, weights)
+        for number, tensors in sorted(parts.items()):
+            chain = _added(chain, tensors)
+            last = prefix == "mu." and number == max(parts)
+            if "weight" in tensors and not last:
+                chain = chain.activate(activation)
+    for name in _LAST:
+        if f"{name}.weight" in weights:
+            chain = chain.affine(weights[f"{name}.weight"], weights[f"{name}.bias"])
+    return chain.layers()
+
+
+def _numbered(prefix: str, weights: Tensors) -> dict[int, dict[str, NDArray[Any]]]:
+    """The tensors of the layers of a sequence, by their places in it."""
+    parts: dict[int, dict[str, NDArray[Any]]] = {}
+    for name, values in weights.items():
+        number, _, what = name.removeprefix(prefix).partition(".")
+        if name.startswith(prefix) and number.isdecimal():
+            parts.setdefault(int(number), {})[what] = values
+    return parts
+
+
+def _added(chain: Chain, tensors: Mapping[str, NDArray[Any]]) -> Chain:
+    """The chain with a dense layer's affine map, or with CrossQ's batch renormalisation."""
+    if "weight" in tensors:
+        return chain.affine(tensors["weight"], tensors["bias"])
+    factor = tensors["scale"] / np.sqrt(tensors["ra_var"].astype(np.float64) + _RENORM_EPSILON)
+    return chain.scale(factor, tensors["bias"] - tensors["ra_mean"] * factor)
+
+
+def load_policy(source: str | Path, encoder: Any = None) -> Controller:
+    """The policy of a run, as a function of observations.
+
+    Args:
+        source: the folder of a run, finished or under way, or a policy's file.
+        encoder: the object that the run was made with, if its encoder is a user's own.
+
+    Raises:
+        InputError: no run or policy there, or one that can't be taken out; as `load_run`.
+        DamageError: a file isn't what was written.
+    """
+    from jbrep.rl.policy import load_run  # imports torch
+    from jbrep.rl.policy_file import acting, read
+
+    path = Path(source)
+    trained = read(path).trained() if path.is_file() else load_run(path, encoder)
+    assert trained.settings is not None
+    weights = {name: each.numpy() for name, each in acting(trained.policy).state_dict().items()}
+    return Controller(trained.settings, trained.encoder, weights, trained.statistics)

@@ -1,0 +1,132 @@
+"""Policies as functions of observations: they act as the runs that they were taken from."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from jbrep.encoders import find
+from jbrep.envs.description import describe
+from jbrep.envs.lanes import Lanes
+from jbrep.errors import InputError
+from jbrep.rl import Run, train
+from jbrep.rl.controller import Controller, load_policy
+from jbrep.rl.normalization import Statistics
+from jbrep.rl.policy_file import acting, build
+from jbrep.rl.settings import CLASSES
+from jbrep.rl.shipped import find as find_shipped
+
+TASK = describe("move_to_pose", max_episode_steps=200)
+SETTINGS = {
+    **{name: {"net_arch": [24, 16]} for name in CLASSES},
+    "td3": {"net_arch": [24], "activation_fn": "leaky_relu", "action_repeat": 3},
+    "ppo": {"net_arch": [24, 16], "activation_fn": "tanh", "normalize": True},
+    "a2c": {"net_arch": [], "normalize": True},
+    "crossq": {"net_arch": [24, 16], "activation_fn": "elu", "action_repeat": 2},
+}
+
+
+def randomised(algorithm, encoder, task=TASK):
+    """An untrained policy with weights and statistics that nothing in it can hide."""
+    run = Run.of(task, algorithm, overrides=SETTINGS[algorithm], encoder=encoder)
+    known = run.find_encoder()
+    trained = build(run.settings(known), known, Path("here"))
+    random = np.random.default_rng(4)
+    for name, values in acting(trained.policy).state_dict().items():
+        if values.is_floating_point():
+            drawn = random.normal(size=values.shape) / (values.shape[-1] + 4) ** 0.5
+            positive = name.endswith(("scale", "var"))
+            values.copy_(torch.from_numpy(np.abs(drawn) + 0.5 if positive else drawn))
+    if trained.statistics is None:
+        return trained
+    size = known.latent_size
+    statistics = Statistics(random.normal(size=size), random.uniform(0.5, 2, size), 100.0)
+    return trained._replace(statistics=statistics)
+
+
+def controller_of(trained):
+    weights = {name: each.numpy() for name, each in acting(trained.policy).state_dict().items()}
+    return Controller(trained.settings, trained.encoder, weights, trained.statistics)
+
+
+def difference_over_an_episode(trained, controller, steps=200):
+    """The greatest difference between the actions of both, of which the policy's are carried out.
+
+    The spread of these actions is given, too: a policy of one action would be like any other.
+    """
+    lanes = Lanes(trained.task, 1)
+    lanes.reset([0], [3])
+    act, pairs = trained.begin(trained.task, [3]), []
+    for _ in range(steps):
+        ours, theirs = controller(lanes.observation[0]), act(lanes.observation)[0]
+        pairs.append((ours, theirs))
+        lanes.step(theirs[None])
+    ours, theirs = map(np.array, zip(*pairs, strict=True))
+    return np.abs(ours - theirs).max(), theirs.std()
+
+
+@pytest.mark.parametrize("algorithm", CLASSES)
+@pytest.mark.parametrize("encoder", ["full", "symmetry", "dae-8"])
+def test_a_controller_acts_as_its_run(algorithm, encoder):
+    trained = randomised(algorithm, encoder)
+    worst, spread = difference_over_an_episode(trained, controller_of(trained))
+    assert worst < 2e-6
+    assert spread > 1e-3
+
+
+def test_it_holds_actions_and_begins_again(tmp_path):
+    controller = controller_of(randomised("td3", "full"))
+    rows = np.random.default_rng(0).normal(size=(5, TASK.size))
+    first, *others = (controller(row) for row in rows)
+    assert [np.array_equal(first, each) for each in others] == [True, True, False, False]
+    controller.reset()
+    assert not np.array_equal(controller(rows[4]), others[-1])
+    first[:] = 9  # what the caller does with an action changes none that follows
+    assert np.abs(controller(rows[0])).max() <= 1
+
+
+def test_several_robots_at_once_are_like_one_after_the_other():
+    controller = controller_of(randomised("sac", "symmetry"))
+    rows = np.random.default_rng(0).normal(size=(3, TASK.size))
+    one_by_one = np.array([controller(row) for row in rows])
+    np.testing.assert_allclose(controller(rows), one_by_one, atol=1e-6)
+    assert one_by_one.std() > 0.01
+
+
+def test_units_of_the_actuators_are_those_of_the_task():
+    """Pendulum's torque is from -2 to 2 N m."""
+    task = describe("Pendulum-v1", max_episode_steps=50)
+    trained = randomised("sac", "full", task)
+    worst, spread = difference_over_an_episode(trained, controller_of(trained), 50)
+    assert worst < 4e-6
+    assert spread > 1e-3
+
+
+def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
+    class Doubled(torch.nn.Module):
+        def forward(self, rows):
+            return torch.cat([rows, rows.sin()], -1)  # no chain of layers
+
+    task, encoder = describe("Pendulum-v1", max_episode_steps=20), Doubled()
+    quick = {"steps": 64, "evaluation_episodes": 1, "final_episodes": 1}
+    train(Run.of(task, "a2c", encoder=encoder, **quick), tmp_path / "own")
+    assert load_policy(tmp_path / "own", encoder)([0.0, 1.0, 0.0]).shape == (1,)
+    with pytest.raises(InputError, match="a run on a Python object needs it again"):
+        load_policy(tmp_path / "own")
+    shipped = find_shipped(describe("face_direction"))
+    controller = load_policy(shipped)
+    assert repr(controller) == "Controller(face_direction: 16 numbers to 1, full)"
+
+
+def test_what_it_cannot_act_on_is_refused():
+    controller = controller_of(randomised("sac", "full"))
+    with pytest.raises(InputError, match=f"takes observations of {TASK.size} numbers, but got"):
+        controller([0.0])
+    with pytest.raises(InputError, match="the policy's action is not finite"):
+        controller(np.full(TASK.size, np.nan))
+    run = Run.of(TASK, "sac", overrides={"use_sde": True}, trainer="sb3")
+    encoder = find("full", TASK)
+    trained = build(run.settings(encoder), encoder, Path("here"))
+    with pytest.raises(InputError, match="use_sde"):
+        controller_of(trained)
