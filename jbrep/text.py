@@ -145,6 +145,11 @@ def number(value: float | None, form: str) -> str:
     return format(value, f"z{form}")  # no negative zero
 
 
+def counted(number: int, noun: str) -> str:
+    """So many of something: 1 shard, 2,000 shards."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def r2_text(value: float | None) -> str:
     """An R², or a dash for None; less than nothing isn't told apart: <0."""
     return "<0" if value is not None and round(value, 2) < 0 else number(value, ".2f")

@@ -346,6 +346,8 @@ def test_a_wide_robot_can_be_judged(tmp_path, monkeypatch):
     assert gtc.dimensions.keys() == everything.correlation.dimensions.keys()
     assert all(everything.probes[f"obs_{i}"][0] > 0.8 for i in range(1, 70))
     shown = evaluation_text(evaluation, 100)
+    assert "What each lacks can't be said: " in shown
+    shown = evaluation_text(evaluation, 100, everything=True)
     assert "14 of its 70 dimensions" in " ".join(shown.split())
     assert re.search(r"probes, mean +worst probe", shown)
     assert max(map(len, shown.splitlines())) <= 100
@@ -523,18 +525,24 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
     chosen = ("--encoder", "dae-4", "./dae-4", "full")
     command = ("evaluate", *chosen, "--data", collected, "--out", "judged")
     shown = jbrep(*command).stdout
-    assert shown.startswith("dae-4, shipped\n./dae-4\nfull, shipped\n\nWhether a controller")
+    assert shown.startswith("Which code serves can't be said: in these 1,000 held-out steps even")
+    assert "Judged: dae-4, shipped; ./dae-4; full, shipped." in shown
+    assert "--all shows" in shown
     assert max(map(len, shown.splitlines())) <= 80
+    assert len(shown.splitlines()) <= 32
     evaluation = read_document(Path("judged", EVALUATION), Evaluation)
-    whole = evaluation_text(evaluation)
-    assert set(whole.split()) < set(shown.split())
-    assert max(map(len, whole.splitlines())) > 80
+    whole = evaluation_text(evaluation, 80, everything=True)
+    assert whole.startswith(shown.partition("\n\nJudged")[0])
+    assert "KNN-MSE" in whole
     monkeypatch.setattr(diagnosis, "diagnose", lambda encoders, data, policy: evaluation)
     again = jbrep(*command, "--json")
     assert json.loads(again.stdout) == json.loads(Path("judged", EVALUATION).read_text())
     labels = ["full", "dae-4, shipped", "./dae-4", "full, shipped"]
     assert list(evaluation.encoders) == labels
-    assert "dae-4, shipped\n./dae-4\nfull, shipped\n" in again.stderr
+    assert "dae-4, shipped; ./dae-4; full, shipped" in again.stderr
+    Path("file").touch()
+    refused = jbrep(*command[:-1], "file")  # before anything is judged
+    assert (refused.exit_code, "can't make the folder file" in refused.stderr) == (2, True)
 
 
 def test_whether_an_encoder_may_have_seen_the_episodes(data):

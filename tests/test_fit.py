@@ -294,18 +294,26 @@ def test_the_header_has_the_batch_size_that_was_chosen(data, tmp_path):
     assert training["batch_size"] == 128
 
 
-def test_the_command_takes_sizes_in_any_form_and_warns_of_what_is_worse_than_pca(
-    collected, tmp_path
+def test_the_command_takes_sizes_in_any_form_and_says_what_each_is_good_for(
+    collected, tmp_path, monkeypatch
 ):
+    monkeypatch.setenv("COLUMNS", "80")
     out = ("--data", collected, "--out", tmp_path / "it")
-    result = jbrep("train-dae", "--latent", "5,4", 3, "--epochs", 1, *out)
-    lines = result.stdout.splitlines()
-    assert [line.partition(":")[0] for line in lines] == ["dae-5", "dae-4", "dae-3"]
-    assert all(re.search(r"error [.\d]+, [.\d]+ times PCA's", line) for line in lines)
-    assert "warning: dae-3 reconstructs worse than PCA with as many components" in result.stderr
-    again = jbrep("train-encoder", "--kind", "random", "--latent", "3,", *out)
-    assert "times PCA's" in again.stdout
-    assert "warning" not in again.stderr
+    told = jbrep("train-dae", "--latent", "5,4", 3, "--epochs", 1, *out).stdout
+    assert max(map(len, told.splitlines())) <= 80
+    assert re.findall(r"^([\w-]+): reconstructs", told, re.MULTILINE) == ["dae-5", "dae-4", "dae-3"]
+    assert re.search(r"worse than\s+PCA: [.\d]+ times its\s+error", told)
+    assert "train for more --epochs" in " ".join(told.split())
+    for kind, expected in (
+        ("pca", r"reconstructs held-out states with a mean squared error of 0\.\d+"),
+        ("slow", r"changes slowly: units correlate [01]\.\d\d to -?0\.\d\d with themselves"),
+        ("linear-forward", r"keeps \d+% of what a linear code can tell of what comes next"),
+        ("random", r"jbrep evaluate shows what it keeps"),
+    ):
+        told = " ".join(
+            jbrep("train-encoder", "--kind", kind, "--latent", "3,", *out).stdout.split()
+        )
+        assert re.match(f"{kind}-3: {expected}", told), told
     assert jbrep("train-encoder", "--kind", "full", *out).exit_code == 0
     assert load(tmp_path / "it" / "full.safetensors").name == "full"
     for nonsense in ("8x", ",", "8,,4", "8;4"):

@@ -289,8 +289,8 @@ def test_an_encoder_without_decoder_is_evaluated_but_for_what_it_loses():
     probe = own["whole"].probes["obs_1"].value
     assert probe == pytest.approx(own["full"].probes["obs_1"].value, rel=1e-6)
     assert (own["module"].kind, own["module"].latent) == ("own", 6)
-    shown = evaluation_text(evaluation)
-    assert re.search(r"^half +2( +-){5} *$", shown.partition("\n\n")[2], re.MULTILINE)
+    shown = evaluation_text(evaluation, everything=True)
+    assert re.search(r"^half +2( +-){5} *$", shown, re.MULTILINE)
     plots = {plot.name: plot for plot in encoder_plots(evaluation)}
     assert {row[0] for row in plots["error_by_feature"].rows} == {"whole"}
     assert {row[0] for row in plots["latent_correlation"].rows} == {"half", "whole", "module"}
@@ -314,8 +314,10 @@ def test_evaluate_takes_code(tmp_path, monkeypatch):
     command = ("evaluate", "--data", "data/sample/face_direction", "--out", tmp_path, *chosen)
     told = jbrep(*command)
     assert told.exit_code == 0, told.output
-    assert "test_own:Half, code\ntest_own:make_half, code\ndae-8, shipped\n" in told.output
-    assert "note: test_own:Half may have seen these episodes" in told.output
+    assert "Judged: test_own:Half, code; test_own:make_half, code; dae-8, shipped." in " ".join(
+        told.output.split()
+    )
+    assert "Perhaps not new to these episodes: test_own:Half, test_own:make_half" in told.output
     assert "dae-8, shipped is given twice: leave one out" in mistake(*command, "dae-8")
 
 

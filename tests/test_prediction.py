@@ -32,6 +32,7 @@ from jbrep.evaluate.regression import Problem, beside, fit
 from jbrep.evaluate.table import headline
 from jbrep.play.sources import find_good_policy
 from jbrep.report.evaluation import evaluation_text, in_words
+from jbrep.report.serving import serving
 
 NAMES = ("place", "speed", "load", "idle")
 STEPS, EPISODES = 60, 200
@@ -173,10 +174,30 @@ def test_what_the_reward_depends_on_counts_by_how_much_it_does(evaluation, held_
 
 def test_an_evaluation_is_told_in_one_screen(evaluation):
     shown = evaluation_text(evaluation, 80)
-    first = shown.partition("Error on")[0]
     assert max(map(len, shown.splitlines())) <= 80
-    assert len(first.splitlines()) < 30
-    assert re.search(r"without load +load \((<0|0\.\d\d)\)\nwithout idle +nothing", first)
+    assert len(shown.splitlines()) < 24
+    assert shown.startswith("without idle should serve a controller: it tells the change of what")
+    assert re.search(r"without load +load \((<0|0\.\d\d)\)\nwithout idle +nothing", shown)
+
+
+def test_nothing_is_said_where_it_cannot_be(evaluation):
+    codes = {name: evaluation.encoders[name] for name in ("full", "without load", "noise")}
+    assert serving(evaluation.replace(encoders=codes)).startswith(
+        "No code should serve as the full observation does. without load comes nearest: it tells "
+    )
+    full = codes["full"]
+    unknown = Score(None, None, None)
+    still = {k: ahead.replace(reward=unknown) for k, ahead in full.prediction.items()}
+    constant = evaluation.replace(
+        needs=dict.fromkeys(evaluation.needs, 0.0),
+        encoders=codes | {"full": full.replace(prediction=still)},
+    )
+    told = evaluation_text(constant)
+    assert "can't be said: the reward is the same in all held-out steps" in told
+    assert not re.search(r"noise +nothing", told)
+    blind = {k: a.replace(rewarded=unknown, reward=unknown, mean=unknown) for k, a in still.items()}
+    nothing = evaluation.replace(encoders=codes | {"full": full.replace(prediction=blind)})
+    assert serving(nothing).startswith("Which code serves can't be said: in these")
     assert evaluation.encoders["without load"].method == {"spectrum": [3.0, 1.0]}
 
 
@@ -318,4 +339,4 @@ def test_needs_pass_from_what_is_rewarded_to_what_moves_it(held_out):
 
 def test_features_have_names_for_readers():
     assert in_words("face_direction", "angular_velocity_z") == "rate of yaw"
-    assert in_words("Other-v0", "angular_velocity_z") == "angular velocity z"
+    assert in_words("Other-v0", "angular_velocity_z") == "angular_velocity_z"

@@ -27,17 +27,18 @@ def peace(tmp_path_factory):
 def test_states_become_encoders_and_diagnostics(peace):
     folder, said = peace
     assert "4 episodes of face_direction, 2,000 rows" in said["collect"]
-    assert "dae-4: held-out mean squared error" in said["train-dae"]
+    assert "dae-4: reconstructs held-out states" in said["train-dae"]
     data, encoders = folder / "data", folder / "encoders"
     pca = ("--kind", "pca", "--data", data, "--latent", 8, 4, "--out", encoders)
-    assert "pca-8: held-out mean squared error" in jbrep("train-encoder", *pca).output
+    assert "pca-8: reconstructs held-out states" in jbrep("train-encoder", *pca).output
     paths = [encoders / f"{name}.safetensors" for name in ("dae-4", "pca-4")]
-    assert "dae-4.safetensors, already complete" in jbrep(*stages(folder)["train-dae"]).output
+    again = jbrep(*stages(folder)["train-dae"]).output
+    assert "dae-4.safetensors, already complete" in " ".join(again.split())
     assert "16 -> 4 tanh" in jbrep("encoder", "info", paths[0]).output
     told = jbrep("encoder", "export", paths[0], "--out", folder / "it.onnx").output
     assert f"onnxruntime.InferenceSession('{folder / 'it.onnx'}')" in told
     told = jbrep("evaluate", "--encoder", *paths, "--data", data, "--out", folder / "judged")
-    for label in ("full", "dae-4", "pca-4", "judged/evaluation.json", "error_by_feature.png"):
+    for label in ("full", "dae-4", "pca-4", "judged/evaluation.json and ", " figures beside"):
         assert label in told.output
     assert (folder / "judged" / "error_by_latent.png").exists()
     judged = json.loads((folder / "judged" / "evaluation.json").read_text())

@@ -80,7 +80,7 @@ def evaluate(files: list[Path], data: Path, results: Path) -> None:
         (results / EVALUATION).unlink(missing_ok=True)
         options = ("--encoder", *map(str, files), "--data", str(data), "--out", str(results))
         subprocess.run([sys.executable, "-m", "jbrep", "evaluate", *options], check=True)
-    text = evaluation_text(read_document(results / EVALUATION, Evaluation))
+    text = evaluation_text(read_document(results / EVALUATION, Evaluation), 100, True)
     (results / "tables.txt").write_text(text + "\n")
 
 

@@ -21,7 +21,7 @@ from jbrep.cli.base import (
 from jbrep.cli.environment import given_task, import_option, needed_task, task_options
 from jbrep.cli.options import record_options
 from jbrep.dataset.settings import TRAINED, CollectSettings, parts_of
-from jbrep.text import terminal_width
+from jbrep.text import counted, terminal_width
 
 _threads = click.option(
     "--threads",
@@ -161,7 +161,7 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
     if _say_all(replay_problems(dataset, replay, threads)):
         ctx.exit(1)
     manifest = dataset.manifest
-    shards = f"{len(manifest.shards)} shard{'s' if len(manifest.shards) != 1 else ''}"
+    shards = counted(len(manifest.shards), "shard")
     unfinished = "" if manifest.complete else "; unfinished"
     say(f"{data}: no problems in {len(dataset):,} rows, {shards}{unfinished}")
     if replay:

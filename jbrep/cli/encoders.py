@@ -1,5 +1,6 @@
 """Judging and looking at encoders."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,18 +12,20 @@ from jbrep.cli.base import (
     as_json,
     data_option,
     echo_json,
-    echo_paths,
     echo_text,
+    printable,
     say,
     stoppable,
 )
 from jbrep.cli.environment import given_task, needed_task, task_options
 from jbrep.errors import InputError
-from jbrep.text import facts, r2_text, table, terminal_width
+from jbrep.text import facts, r2_text, table, terminal_width, wrapped
 
 if TYPE_CHECKING:
     from jbrep.encoders import Encoder
+    from jbrep.encoders.base import BaseEncoder
     from jbrep.envs.task import Task
+    from jbrep.evaluate.evaluation import Evaluation
     from jbrep.evaluate.table import Values
 
 
@@ -50,11 +53,22 @@ if TYPE_CHECKING:
     help="That does the task well: a run's folder, or a policy by name. By default the task's "
     "hand-written policy, if it has one.",
 )
+@click.option(
+    "--all",
+    "everything",
+    is_flag=True,
+    help="Show errors, probes and units, too; evaluation.json always has them.",
+)
 @as_json
 def evaluate(
-    encoder: tuple[str, ...], data: Path, out: Path, policy: str | None, as_json: bool
+    encoder: tuple[str, ...],
+    data: Path,
+    out: Path,
+    policy: str | None,
+    everything: bool,
+    as_json: bool,
 ) -> None:
-    """Show what encoders lose and keep, side by side.
+    """Show which encoders serve a controller, and what each lacks.
 
     Judged on the held-out episodes: how well they predict the state and the reward, what they say
     of a good policy's value and action, linear and nonlinear probes, reconstruction, corruption,
@@ -63,12 +77,12 @@ def evaluate(
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders import find
-    from jbrep.encoders.card import arguments_of
     from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import source_of
     from jbrep.evaluate.diagnosis import write
     from jbrep.evaluate.evaluation import EVALUATION
     from jbrep.play.sources import find_good_policy
+    from jbrep.records.storage import check_writable
     from jbrep.report.evaluation import evaluation_text
     from jbrep.report.figures import encoder_plots
     from jbrep.report.figures import write as write_plots
@@ -81,25 +95,42 @@ def evaluate(
     labels = _labels([each.name for each in encoders], sources)
     if twice := {label for label in labels if labels.count(label) > 1}:
         raise InputError(f"{min(twice)} is given twice: leave one out")
+    check_writable(out)
     labelled = dict(zip(labels, encoders, strict=True))
     with stoppable("the same command starts over"):
         evaluation = write(labelled, scaled, out, find_good_policy(policy, scaled.task))
         pictures = write_plots(encoder_plots(evaluation), out)
-    for label, source in zip(labels, sources, strict=True):
-        line = source if source.startswith(label) else f"{label}: {source}"
-        arguments = arguments_of(labelled[label].task)
-        say(f"{line}, made with {arguments}" if arguments else line, err=as_json)
-    for label, seen in evaluation.seen.items():
-        if seen == "maybe":
-            say(
-                f"note: {label} may have seen these episodes: the data it was trained on has the "
-                "same seed, or isn't known",
-                err=as_json,
-            )
+    width = terminal_width()
+    told = _notes(labelled, dict(zip(labels, sources, strict=True)), evaluation)
+    notes = [wrapped(printable(note), width) for note in told]
     if as_json:
+        click.echo("\n".join(notes), err=True)
         return echo_json(evaluation.as_json())
-    click.echo(f"\n{evaluation_text(evaluation, terminal_width())}")
-    return echo_paths((out / EVALUATION, *pictures))
+    click.echo(evaluation_text(evaluation, width, everything) + "\n")
+    click.echo("\n".join(notes))
+    more = "" if everything else "; --all shows errors, probes and units"
+    beside = f" and {len(pictures)} figures beside it" if pictures else ""
+    return say(f"\n{out / EVALUATION}{beside}{more}")
+
+
+def _notes(
+    encoders: "Mapping[str, BaseEncoder]", sources: Mapping[str, str], evaluation: "Evaluation"
+) -> list[str]:
+    """Where encoders come from, and which may have seen the episodes that they were judged on."""
+    from jbrep.encoders.card import arguments_of
+
+    taken = []
+    for label, source in sources.items():
+        line = source if source.startswith(label) else f"{label}: {source}"
+        arguments = arguments_of(encoders[label].task)
+        taken.append(f"{line}, made with {arguments}" if arguments else line)
+    notes = [f"Judged: {'; '.join(taken)}."]
+    if maybe := [label for label, seen in evaluation.seen.items() if seen == "maybe"]:
+        notes.append(
+            f"Perhaps not new to these episodes: {', '.join(maybe)}, whose training data has the "
+            "same seed or isn't known."
+        )
+    return notes
 
 
 def _labels(names: list[str], sources: list[str]) -> list[str]:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 import click
 from msgspec import inspect
 
-from jbrep.cli.base import POSITIVE, RESUMES, Variadic, data_option, stoppable
+from jbrep.cli.base import POSITIVE, RESUMES, Variadic, data_option, printable, stoppable
 from jbrep.errors import InputError, choose
 from jbrep.records.keys import Key, keys_of
 from jbrep.records.words import bare
+from jbrep.text import terminal_width, wrapped
 
 if TYPE_CHECKING:
     from jbrep.dataset import ScaledDataset
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from jbrep.training.method import Method
 
 _FEW = 3  # kinds: where only so many don't take a setting, help names those
-_POOR = 1.5  # times PCA's error, from which a trained autoencoder deserves a warning
-_RECONSTRUCTING = ("ae", "dae")
 
 
 class _Making(Variadic):
@@ -170,8 +169,8 @@ def _making(command: Callable[..., None]) -> Callable[..., None]:
 def train_dae(**options: Any) -> None:
     """Train denoising autoencoders.
 
-    They learn from 80 % of the episodes, with the paper's settings by default; their error on the
-    others is compared with PCA's. Ctrl-C keeps the best so far, and the same command resumes.
+    They learn from 80 % of the episodes, with the paper's settings by default, and are compared
+    with PCA on the others. Ctrl-C keeps the best so far, and the same command resumes.
     """
     _fit("dae", **options)
 
@@ -186,7 +185,8 @@ def train_dae(**options: Any) -> None:
 def train_encoder(kind: str, **options: Any) -> None:
     """Make encoders of any kind.
 
-    They learn from 80 % of the episodes. Each kind takes only some of the settings.
+    They learn from 80 % of the episodes, and say how good they are at what their kind is for. Each
+    kind takes only some of the settings.
     """
     _fit(kind, **options)
 
@@ -243,20 +243,10 @@ def _named(
 
 
 def _report(fitted: "Fitted", data: "ScaledDataset") -> None:
-    """Say how an encoder that was fitted to that data compares with PCA."""
-    from jbrep.encoders.header import HELD_OUT_MSE
-    from jbrep.methods.held_out import ratio_to_pca
+    """Say whether an encoder that was fitted to that data is good at what its kind is for."""
+    from jbrep.methods.purpose import purpose
 
     encoder, path, is_new = fitted
-    ratio = ratio_to_pca(encoder, data)
-    comparison = "" if ratio is None else f", {ratio:.2f} times PCA's"
-    click.echo(
-        f"{encoder.name}: held-out mean squared error {encoder.header.metrics[HELD_OUT_MSE]:.5f}"
-        f"{comparison} (features scaled to [-1, 1]); {path}{'' if is_new else ', already complete'}"
-    )
-    if ratio is not None and ratio > _POOR and encoder.kind in _RECONSTRUCTING:
-        click.echo(
-            f"warning: {encoder.name} reconstructs worse than PCA with as many components: train "
-            "for more --epochs, on more data, or with another --learning-rate or --batch-size",
-            err=True,
-        )
+    told = purpose(encoder, data) or "jbrep evaluate shows what it keeps"
+    line = f"{encoder.name}: {told}; {path}{'' if is_new else ', already complete'}"
+    click.echo(wrapped(printable(line), terminal_width()))

@@ -9,7 +9,7 @@ from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import extrema, mean_and_std
 from jbrep.dataset.settings import policy_text
 from jbrep.envs.task import Task
-from jbrep.text import facts, number, table
+from jbrep.text import counted, facts, number, table
 
 _HEADER = ("feature", "unit", "min", "mean", "max", "std", "nominal")
 
@@ -50,7 +50,7 @@ def card(dataset: Dataset, width: int = 80) -> str:
         "rows": f"{about['rows']:,}",
         "episodes": _episodes_line(about),
         "columns": ", ".join(about["columns"]),
-        "files": f"{about['shards']:,} shards, {about['bytes'] / 1e6:,.1f} MB"
+        "files": f"{counted(about['shards'], 'shard')}, {about['bytes'] / 1e6:,.1f} MB"
         + ("" if about["complete"] else f"; unfinished, {about['steps']:,} rows were asked for"),
         "made with": ", ".join(f"{name} {version}" for name, version in about["versions"].items()),
         "fingerprint": about["fingerprint"],

@@ -1,7 +1,7 @@
 """Slow features and VAMP: linear codes from covariances of now with some steps later."""
 
-from collections.abc import Callable
-from typing import Annotated, ClassVar
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from msgspec import Meta
@@ -90,6 +90,13 @@ class Slow(Directions, frozen=True, kw_only=True):
 
     lags: Lags = (10,)
 
+    @classmethod
+    def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
+        """As for `Method`."""
+        first, *others = metrics["spectrum"][:latent]
+        last = f" to {others[-1]:.2f}" if others else ""
+        return f"changes slowly: units correlate {first:.2f}{last} with themselves a lag later"
+
     def make(self, data: ScaledDataset) -> Made:
         """As for `ClosedForm`."""
         lagged = Lagged(data, self.lags, data.size, lambda block: block.later(0))
@@ -133,6 +140,13 @@ class Vamp(Directions, frozen=True, kw_only=True):
     name: ClassVar[str] = "vamp"
 
     lags: Lags = (10,)
+
+    @classmethod
+    def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
+        """As for `Method`."""
+        first, *others = metrics["spectrum"][:latent]
+        last = f" to {others[-1]:.2f}" if others else ""
+        return f"tells the state a lag later: units correlate {first:.2f}{last} with it"
 
     def make(self, data: ScaledDataset) -> Made:
         """As for `ClosedForm`."""

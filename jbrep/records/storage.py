@@ -3,6 +3,7 @@
 import os
 import shutil
 import stat
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -67,6 +68,20 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"can't make the folder {folder}: {error.strerror or error}") from None
+
+
+def check_writable(folder: Path) -> None:
+    """Make a folder unless it exists, and see that files can be written into it.
+
+    Raises:
+        InputError: it can't be made, or not be written into.
+    """
+    make_folder(folder)
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"can't write into {folder}: {error.strerror or error}") from None
 
 
 def check_space(folder: Path, needed: int) -> None:

@@ -7,7 +7,8 @@ from jbrep.encoders import FULL
 from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Scores
 from jbrep.evaluate.table import headline
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.text import Table, facts, interval, number, r2_text, wrapped
+from jbrep.report.serving import lacking, serving, unreadable, untold
+from jbrep.text import Table, counted, facts, interval, number, r2_text, wrapped
 
 _Encoders = Mapping[str, Diagnostics]  # by label
 
@@ -22,7 +23,7 @@ _WORDS = {
     "angular_velocity_z": "rate of yaw",
 }
 
-_SERVES = {  # of the headline
+_COLUMNS = {  # of the headline
     "forward": "the features' change over 10 steps, from code and actions",
     "rewarded": "of that, what the reward depends on",
     "reward": "the mean reward of these steps",
@@ -30,61 +31,77 @@ _SERVES = {  # of the headline
     "action": "the action",
 }
 _OF_POLICY = ("value", "action")
-_LOST = (
-    "What a controller needs and the code loses (R² of reading it below .5), the most needed first"
+_LACKING = (
+    "What each lacks of what a controller needs (R² of reading it below .5), the most needed first"
 )
 _NOISE = 0.1  # the level of corruption that is shown
 _MANY = 8  # quantities from which probes are summed up
 
 
-def evaluation_text(evaluation: Evaluation, width: int | None = None) -> str:
-    """What encoders lose and what their latents keep, a line each, of that width."""
-    lost = facts(_lost(evaluation), width or sys.maxsize, indent=0)
-    others = _errors(evaluation), _readings(evaluation.encoders), _units(evaluation.encoders)
-    return "\n\n".join(
-        (
-            _served(evaluation).text(width),
-            wrapped(_LOST, width),
-            lost,
-            *(t.text(width) for t in others),
-        )
+def evaluation_text(
+    evaluation: Evaluation, width: int | None = None, everything: bool = False
+) -> str:
+    """Which codes serve and what each lacks, in lines of that width; everything else if wanted."""
+    parts = [
+        wrapped(serving(evaluation), width),
+        _headline(evaluation).text(width),
+        _lacking(evaluation, width),
+    ]
+    if everything:
+        encoders = evaluation.encoders
+        tables = _errors(evaluation), _readings(encoders), _units(encoders)
+        parts += [each.text(width) for each in tables]
+    return "\n\n".join(parts)
+
+
+def _headline(evaluation: Evaluation) -> Table:
+    """What tells codes that serve from others: columns of which anything is known."""
+    data = evaluation.data
+    numbers = {label: headline(known) for label, known in evaluation.encoders.items()}
+    shown = [c for c in _COLUMNS if any(each[c] is not None for each in numbers.values())]
+    explained = "; ".join(
+        f"{name}: {_COLUMNS[name]}" + (f" of {evaluation.policy}" if name in _OF_POLICY else "")
+        for name in shown
     )
-
-
-def _served(evaluation: Evaluation) -> Table:
-    """What tells codes that serve from others."""
-    policy = evaluation.policy
-    shown = {name: words for name, words in _SERVES.items() if policy or name not in _OF_POLICY}
-    rows = []
-    for label, known in evaluation.encoders.items():
-        numbers = headline(known)
-        rows.append((label, str(known.latent), *(r2_text(numbers[name]) for name in shown)))
-    explained = "; ".join(f"{name}: {words}" for name, words in shown.items())
     return Table(
-        f"Whether a controller can work with the code: held-out R², nonlinear (1: all, 0: nothing)."
-        f" {explained[0].upper()}{explained[1:]}{f' of {policy}' if policy else ''}",
-        ("encoder", "l", *shown),
-        rows,
+        f"R² on {counted(data.test_episodes, 'held-out episode')} ({data.test_rows:,} steps), "
+        f"nonlinear (1: all, 0: nothing). {explained}",
+        ("encoder", "size", *shown),
+        [
+            (
+                label,
+                str(evaluation.encoders[label].latent),
+                *(r2_text(each[name]) for name in shown),
+            )
+            for label, each in numbers.items()
+        ],
     )
 
 
-def _lost(evaluation: Evaluation) -> dict[str, str]:
-    """What each code loses of what a controller needs."""
+def _lacking(evaluation: Evaluation, width: int | None) -> str:
+    """What each code lacks of what a controller needs, as far as that can be said."""
+    if reason := untold(evaluation):
+        return wrapped(f"What each lacks can't be said: {reason}.", width)
+    task = evaluation.data.task
     lines = {}
-    for label, known in evaluation.encoders.items():
-        lost: dict[str, float] = {}
-        for each in known.loses:
-            lost.setdefault(in_words(evaluation.data.task, each.name), each.kept)
-        more = len(lost) - _MANY
-        some = [f"{words} ({r2_text(kept)})" for words, kept in list(lost.items())[:_MANY]]
+    for label, features in lacking(evaluation).items():
+        said: dict[str, float] = {}
+        for each in features:
+            said.setdefault(in_words(task, each.name), each.kept)
+        more = len(said) - _MANY
+        some = [f"{words} ({r2_text(kept)})" for words, kept in list(said.items())[:_MANY]]
         lines[label] = ", ".join(some) + (f" and {more} more" if more > 0 else "") or "nothing"
-    return lines
+    told = f"{wrapped(_LACKING, width)}\n\n{facts(lines, width or sys.maxsize, indent=0)}"
+    if unread := dict.fromkeys(in_words(task, each.name) for each in unreadable(evaluation)):
+        nor = f"Not even from the full observation can be read here: {', '.join(unread)}."
+        told += f"\n\n{wrapped(nor, width)}"
+    return told
 
 
 def in_words(task: str, feature: str) -> str:
     """What to call a feature to a reader; several of the Jitterbug's share their words."""
     words = _WORDS if task in TASKS else {}
-    return words.get(feature, feature.replace("_", " "))
+    return words.get(feature, feature)
 
 
 def _errors(evaluation: Evaluation) -> Table:
@@ -112,7 +129,7 @@ def _errors(evaluation: Evaluation) -> Table:
             )
         )
     return Table(
-        f"Error on {data.test_episodes:,} held-out episodes of {data.task} "
+        f"Error on {counted(data.test_episodes, 'held-out episode')} of {data.task} "
         f"({data.test_rows:,} rows), features scaled to [-1, 1], with 95 % intervals over "
         "episodes",
         (*header, "worst feature, R²"),
@@ -150,7 +167,7 @@ def _readings(encoders: _Encoders) -> Table:
 def _probes(scores: Scores) -> dict[str, str]:
     """R² of each quantity; of many, of those that vary, the mean and the least."""
     if len(scores) <= _MANY:
-        return {name.replace("_", " "): r2_text(score.value) for name, score in scores.items()}
+        return {name: r2_text(score.value) for name, score in scores.items()}
     known = {name: score.value for name, score in scores.items() if score.value is not None}
     if not known:
         return {"probes, mean": "-", "worst probe": "-"}

@@ -102,6 +102,16 @@ class Method(Record, frozen=True, kw_only=True):
         each = {field.name: default_of(field) for field in fields(cls)}
         return {name: default for name, default in each.items() if default is not NODEFAULT}
 
+    @classmethod
+    def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
+        """How good an encoder is at what the method is for, in words; empty if that isn't known.
+
+        Args:
+            metrics: of the encoder's header.
+            latent: size of its code.
+        """
+        return ""
+
     @property
     def training(self) -> dict[str, Any]:
         """Its settings as plain JSON; of those that every method has, only what is unusual."""

@@ -1,0 +1,112 @@
+"""Which codes serve a controller as the full observation does, in a sentence."""
+
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+
+from jbrep.encoders import FULL
+from jbrep.evaluate.evaluation import Evaluation, Lost
+from jbrep.evaluate.table import headline
+from jbrep.text import r2_text
+
+_MEASURES = {  # the first that the full observation tells anything of counts
+    "rewarded": "the change of what the reward depends on",
+    "reward": "the reward",
+    "forward": "what the features change by",
+}
+_TOLD = 0.1  # R² of it from the full observation, at least
+_AS_GOOD = 0.9  # the share of that from which a code serves as well
+
+
+class _Measured(NamedTuple):
+    """How well each code, and the full observation, tell what comes next."""
+
+    what: str
+    r2: Mapping[str, float]  # of codes, the best first
+    full: float
+
+
+def serving(evaluation: Evaluation) -> str:
+    """Which codes serve, or which comes nearest, or why that can't be said."""
+    measured = _measured(evaluation)
+    if measured is None:
+        return (
+            f"Which code serves can't be said: in these {evaluation.data.test_rows:,} held-out "
+            "steps even the full observation tells next to nothing of what comes next. Judge them "
+            "on more data."
+        )
+    if not measured.r2:
+        return f"The full observation alone: R² {r2_text(measured.full)} of {measured.what}."
+    good = [label for label, r2 in measured.r2.items() if r2 >= _AS_GOOD * measured.full]
+    if not good:
+        nearest, r2 = next(iter(measured.r2.items()))
+        return (
+            f"No code should serve as the full observation does. {nearest} comes nearest: it tells "
+            f"{_told(measured, [r2])}."
+        )
+    told = _told(measured, [measured.r2[label] for label in good])
+    if len(good) == 1:
+        answer = f"{good[0]} should serve a controller: it tells {told}."
+    else:
+        smallest = min(good, key=lambda label: evaluation.encoders[label].latent)
+        answer = (
+            f"{_listed(good)} should serve a controller: each tells {told}. The smallest is "
+            f"{smallest}."
+        )
+    lost = [label for label in good if lacking(evaluation)[label]]
+    return (
+        f"{answer} But see what {_listed(lost)} {'lacks' if len(lost) == 1 else 'lack'}."
+        if lost
+        else answer
+    )
+
+
+def _told(measured: _Measured, r2: Collection[float]) -> str:
+    """What is told, and how well, beside the full observation."""
+    numbers = " to ".join(dict.fromkeys((r2_text(min(r2)), r2_text(max(r2)))))
+    return (
+        f"{measured.what} over the next 10 steps with an R² of {numbers} (the full one: "
+        f"{r2_text(measured.full)})"
+    )
+
+
+def _listed(names: list[str]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def _measured(evaluation: Evaluation) -> _Measured | None:
+    """By the first measure that the full observation tells anything of; None if there is none."""
+    numbers = {label: headline(known) for label, known in evaluation.encoders.items()}
+    for name, what in _MEASURES.items():
+        full = numbers[FULL][name]
+        if full is not None and full >= _TOLD:
+            known = {label: each[name] or 0.0 for label, each in numbers.items() if label != FULL}
+            ranked = sorted(known, key=lambda label: -known[label])
+            return _Measured(what, {label: known[label] for label in ranked}, full)
+    return None
+
+
+def untold(evaluation: Evaluation) -> str:
+    """Why nothing is known of what a controller needs; empty if something is."""
+    if any(evaluation.needs.values()):
+        return ""
+    full = evaluation.encoders[FULL].prediction
+    if not full:
+        return "episodes are too short to look ahead"
+    if all(ahead.reward.value is None for ahead in full.values()):
+        return "the reward is the same in all held-out steps, and no --policy says what it looks at"
+    return "the reward of these steps can't be predicted, and no --policy says what it looks at"
+
+
+def unreadable(evaluation: Evaluation) -> tuple[Lost, ...]:
+    """What a controller needs and can't be read from the full observation itself."""
+    return evaluation.encoders[FULL].loses
+
+
+def lacking(evaluation: Evaluation) -> dict[str, list[Lost]]:
+    """What each code lacks that the full observation has, the most needed first."""
+    beyond = {each.name for each in unreadable(evaluation)}
+    return {
+        label: [each for each in known.loses if each.name not in beyond]
+        for label, known in evaluation.encoders.items()
+        if label != FULL
+    }
