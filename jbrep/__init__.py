@@ -1,38 +1,109 @@
 """jbrep: reduced-order representations of an underactuated robot, and what they do to learning.
 
+    jbrep.collect("face_direction", "data/face", steps=100_000)
+    jbrep.train_encoder("data/face", "encoders", kind="dae", latent=8)
+    jbrep.train("face_direction", "runs/a", encoder="encoders/dae-8.safetensors")
+
 Importing it registers the Jitterbug's environments with Gymnasium; nothing heavy is loaded until
 it is used.
 """
 
+import sys
+from importlib import import_module
+from importlib.metadata import version
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import wrapt
 
 from jbrep.lazy import exports
 
 if TYPE_CHECKING:
+    from jbrep.api import (
+        collect,
+        evaluate,
+        load_policy,
+        report,
+        study,
+        train,
+        train_encoder,
+    )
+    from jbrep.dataset.reader import Dataset
     from jbrep.encoders.encoder import Encoder
     from jbrep.encoders.vec_env import JitterbugVecEnv
     from jbrep.encoders.wrapper import Encoded
     from jbrep.envs.description import describe
     from jbrep.envs.lanes import Lanes
     from jbrep.envs.task import Feature, Task
+    from jbrep.study.config import Study
 
-__all__ = ["Encoded", "Encoder", "Feature", "JitterbugVecEnv", "Lanes", "Task", "describe"]
+__all__ = [
+    "Dataset",
+    "Encoded",
+    "Encoder",
+    "Feature",
+    "JitterbugVecEnv",
+    "Lanes",
+    "Study",
+    "Task",
+    "collect",
+    "describe",
+    "evaluate",
+    "load_policy",
+    "report",
+    "study",
+    "train",
+    "train_encoder",
+]
 
-__getattr__ = exports(
+_MODULES = "collect", "evaluate", "report", "study"  # that are functions, too
+
+_load = exports(
     __name__,
     {
+        **dict.fromkeys(("load_policy", "train", "train_encoder"), "api"),
+        "Dataset": "dataset.reader",
         "Encoded": "encoders.wrapper",
         "Encoder": "encoders.encoder",
         "Feature": "envs.task",
         "JitterbugVecEnv": "encoders.vec_env",
         "Lanes": "envs.lanes",
+        "Study": "study.config",
         "Task": "envs.task",
         "describe": "envs.description",
     },
 )
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f"{__name__}.{name}")
+    return version(__name__) if name == "__version__" else _load(name)
+
+
+def __dir__() -> list[str]:
+    return sorted((*globals(), *__all__, "__version__"))
+
+
+class _Callable(ModuleType):
+    """A module that is a function of `jbrep.api`, too."""
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        return getattr(import_module("jbrep.api"), self.__name__.partition(".")[2])(
+            *args, **options
+        )
+
+
+class _Package(ModuleType):
+    """This package, in which some modules can be called as soon as they are imported."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _MODULES and isinstance(value, ModuleType):
+            value.__class__ = _Callable
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
 
 
 def _register(_gymnasium: ModuleType) -> None:

@@ -15,7 +15,6 @@ from typing import Any, NoReturn, TextIO, TypeVar
 import click
 
 from jbrep.errors import InputError
-from jbrep.text import rounded
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -251,17 +250,3 @@ def echo_json(value: Any) -> None:
 def echo_paths(paths: Iterable[Path]) -> None:
     """Print where files are, after an empty line."""
     click.echo("\n" + "\n".join(printable(str(path)) for path in paths))
-
-
-def percentiles(returns: Iterable[float]) -> dict[str, float]:
-    """The median of returns, and their 10 and 90 %."""
-    import numpy as np
-
-    low, median, high = np.percentile([*returns], (10, 50, 90)).tolist()
-    return {"median": median, "percentile_10": low, "percentile_90": high}
-
-
-def interval_of(returns: Iterable[float]) -> str:
-    """The same for a reader: 812 [650, 901]."""
-    median, low, high = rounded(*percentiles(returns).values())
-    return f"{median} [{low}, {high}]"

@@ -12,14 +12,12 @@ from jbrep.cli.base import (
     echo_json,
     echo_paths,
     echo_text,
-    interval_of,
-    percentiles,
     say,
     stoppable,
 )
 from jbrep.cli.environment import given_task, task_options
 from jbrep.errors import InputError
-from jbrep.text import table, terminal_width
+from jbrep.text import interval_of, percentiles, table, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.envs.task import Task

@@ -17,7 +17,6 @@ from jbrep.cli.base import (
     POSITIVE,
     RESUMES,
     STOP_SIGNALS,
-    interval_of,
     on_stop,
     say,
     with_options,
@@ -25,7 +24,7 @@ from jbrep.cli.base import (
 from jbrep.cli.environment import needed_task, parse_arguments, task_options
 from jbrep.cli.options import record_options
 from jbrep.rl.settings import CLASSES, TrainingSettings
-from jbrep.text import rounded, sparkline
+from jbrep.text import interval_of, rounded, sparkline
 
 if TYPE_CHECKING:
     from stable_baselines3.common.logger import KVWriter

@@ -1,0 +1,108 @@
+"""jbrep from Python: functions with the words of the commands."""
+
+import inspect
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import jbrep
+from jbrep import api
+from jbrep.cli import main
+from jbrep.errors import InputError
+
+QUICK = {"steps": 64, "evaluate_every": 64, "evaluation_episodes": 1, "final_episodes": 3}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """A folder with data and two encoders of them."""
+    folder = tmp_path_factory.mktemp("home")
+    task = jbrep.describe("face_direction", max_episode_steps=40)
+    data = jbrep.collect(task, folder / "data", 400, seed=3)
+    assert len(data) == 400
+    jbrep.train_encoder(data, folder / "encoders", "pca", latent=4)
+    return folder
+
+
+def test_from_states_to_a_policy(home):
+    data = jbrep.Dataset(home / "data")
+    encoder = jbrep.train_encoder(home / "data", home / "encoders", "pca", latent=4)
+    assert (encoder.name, encoder.latent_size) == ("pca-4", 4)
+    agent = jbrep.train(data.task, home / "run", algorithm="a2c", encoder=encoder, **QUICK)
+    assert agent.returns.shape == (3,)
+    assert repr(agent).startswith("Agent(a2c-modern on pca-4, face_direction: ")
+    assert repr(agent).endswith(f"median [10 %, 90 %] of 3 episodes; '{home}/run')")
+    policy = jbrep.load_policy(home / "run")
+    row = data["observation"][0]
+    np.testing.assert_array_equal(policy(row), agent.policy(row))
+
+
+def test_encoders_are_judged_by_names_and_as_a_dictionary(home):
+    path = home / "encoders/pca-4.safetensors"
+    by_name = jbrep.evaluate([path, lambda rows: rows[:, :2]], home / "data")
+    assert [*by_name.encoders] == ["full", "pca-4", "function"]
+    named = jbrep.evaluate({"mine": path}, jbrep.Dataset(home / "data"), home / "evaluation")
+    assert (home / "evaluation/evaluation.json").exists()
+    assert named.encoders["mine"].reconstruction == by_name.encoders["pca-4"].reconstruction
+    with pytest.raises(InputError, match="pca-4 is given twice: give encoders as a dictionary"):
+        jbrep.evaluate([path, path], home / "data")
+
+
+def test_a_study_without_a_file(home):
+    study = jbrep.Study(
+        tasks=("Pendulum-v1",),
+        episode_steps=20,
+        algorithms=("a2c-modern",),
+        representations=("full",),
+        seeds=(0, 1),
+        **QUICK,
+    )
+    found = jbrep.study(study, home / "study", workers=1)
+    assert {row.seed for row in found.returns} == {0, 1}
+    assert found.page.exists()
+    assert "Pendulum-v1" in repr(found)
+    again = jbrep.report(home / "study", out=home / "elsewhere")
+    assert again.page == home / "elsewhere/report.html"
+    assert again.returns == found.returns
+
+
+@pytest.mark.parametrize(
+    ("function", "command"),
+    [
+        ("collect", "collect"),
+        ("train_encoder", "train-encoder"),
+        ("train", "rl"),
+        ("study", "study"),
+    ],
+)
+def test_functions_have_the_defaults_of_the_commands(function, command):
+    given = {each.name: each.default for each in main.commands[command].params}
+    signature = inspect.signature(getattr(api, function)).parameters
+    usual = {name: given[name] for name in signature if type(given.get(name)) in (int, str, bool)}
+    assert usual
+    for name, value in usual.items():
+        assert signature[name].default in (value, None), name
+
+
+def test_modules_are_functions_too_and_nothing_heavy_is_imported():
+    code = (
+        "import sys, jbrep; assert not {'torch', 'numpy', 'gymnasium'} & {*sys.modules};"
+        "assert {*jbrep.__all__} <= {*dir(jbrep)} and jbrep.__version__;"
+        "import jbrep.collect.shards; assert callable(jbrep.collect);"
+        "from jbrep import report; print(report.report.PAGE, callable(report))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "report.html True\n"
+    for name in jbrep.__all__:
+        assert callable(getattr(jbrep, name))
+
+
+def test_a_command_and_its_function_write_the_same_bytes(home, tmp_path):
+    given = "collect --task face_direction --episode-steps 40 --steps 400 --seed 3"
+    arguments = [*given.split(), "--out", str(tmp_path / "data")]
+    CliRunner().invoke(main, arguments, catch_exceptions=False)
+    (shard,) = (tmp_path / "data").glob("*.h5")
+    assert shard.read_bytes() == (home / "data" / shard.name).read_bytes()
