@@ -65,7 +65,7 @@ def test_every_kind_has_the_error_that_its_file_says(data, kind, tmp_path):
     assert encoder.header.data["fingerprint"] == data.dataset.manifest.fingerprint
     assert encoder.header.data["train_rows"] == 4000
     own = set(METHODS[kind].__struct_fields__) - set(USUAL)
-    unusual = {"forward": {"codes"}, "coordinates": {"on"}, "symmetry": {"on"}}
+    unusual = {"forward": {"codes"}, "coordinates": {"on", "scaling"}, "symmetry": {"on", "scaling"}}
     assert set(encoder.header.training) == own | unusual.get(kind, set())
     bytes_before = fitted.path.read_bytes()
     again = Fitter(data, tmp_path).fit(kind, **how(kind))

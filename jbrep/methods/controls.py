@@ -12,7 +12,7 @@ from jbrep.errors import InputError
 from jbrep.methods.linear import dense, linear_code
 from jbrep.training.method import ClosedForm, Coded, Made, Network
 from jbrep.training.network import get_architecture, layers, stacks
-from jbrep.training.settings import Architecture, Names, On, Seed
+from jbrep.training.settings import Architecture, Names, On, Scaling, Seed
 
 _FREQUENCY = 1000  # [rad] that a phase turns while a scaled feature goes from 0 to 1
 
@@ -34,11 +34,15 @@ class Full(ClosedForm, frozen=True, kw_only=True):
 
 
 class InCoordinates(Full, frozen=True, kw_only=True):
-    """The observation in coordinates that fit the robot, scaled."""
+    """The observation in coordinates that fit the robot, scaled.
+
+    Usually by three standard deviations: a velocity's extrema are those of rare shocks.
+    """
 
     name: ClassVar[str] = "coordinates"
 
     on: On = "coordinates"
+    scaling: Scaling = "standard"
 
 
 class InSymmetry(Full, frozen=True, kw_only=True):
@@ -47,6 +51,7 @@ class InSymmetry(Full, frozen=True, kw_only=True):
     name: ClassVar[str] = "symmetry"
 
     on: On = "symmetry"
+    scaling: Scaling = "standard"
 
 
 class Subset(ClosedForm, frozen=True, kw_only=True):

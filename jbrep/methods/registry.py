@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, get_args
 from msgspec.structs import asdict
 
 from jbrep.coordinates import System
-from jbrep.dataset.scaling import EXTREMA, SCALINGS
+from jbrep.dataset.scaling import SCALINGS
 from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose
 from jbrep.training.method import Method
@@ -38,7 +38,7 @@ def _methods(file: str) -> Iterator[type[Method]]:
 
 METHODS: dict[str, type[Method]] = {each.name: each for file in _FILES for each in _methods(file)}
 _WORDS: dict[str, tuple[str, Any]] = {  # in names, of settings that aren't the usual ones
-    **{name: ("scaling", name) for name in SCALINGS if name != EXTREMA},
+    **{name: ("scaling", name) for name in SCALINGS},
     **{system: ("on", system) for system in get_args(System)},
     "raw": ("codes", "raw"),
     "unit": ("codes", "standard"),
