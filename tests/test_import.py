@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import gymnasium
 import h5py
 import numpy as np
+import pandas
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -137,6 +138,20 @@ def test_a_described_task_brings_its_names_and_bounds(tmp_path):
     assert dataset.task == describe(PENDULUM)
     alone = Dataset.write(tmp_path / "alone", **arrays(), source=PENDULUM)
     check_same(describe(PENDULUM), alone.task, "an encoder")  # so it works there
+
+
+def test_a_data_frame_names_the_features(tmp_path):
+    given = arrays()
+    names = [f"joint_{i}" for i in range(given["observations"].shape[1])]
+    given["observations"] = pandas.DataFrame(given["observations"], columns=names)
+    given["rewards"] = pandas.Series(given["rewards"])
+    dataset = Dataset.write(tmp_path / "data", **given)
+    assert dataset.task.feature_names == tuple(names)
+    np.testing.assert_array_equal(dataset["joint_1"][0], given["observations"]["joint_1"][0])
+    given["observations"] = given["observations"].rename(columns={"joint_1": "joint 1 [rad]"})
+    with pytest.raises(InputError, match=r"'joint 1 \[rad\]'"):
+        Dataset.write(tmp_path / "other", **given)
+    assert not (tmp_path / "other").exists()
 
 
 def test_shards_are_of_the_usual_size_and_hold_many_chunks(tmp_path):

@@ -13,6 +13,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from judged import diagnostics
 from rerun.chunk import RrdReader
+from sklearn.decomposition import PCA
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 from wide import wide
@@ -102,6 +105,22 @@ class Unscaled(nn.Module):
         return observation.sum(1, keepdim=True).repeat(1, 2) / 2
 
 
+def test_a_transformer_of_scikit_learn_is_an_encoder():
+    rows = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
+    fitted = make_pipeline(StandardScaler(), PCA(2)).fit(rows)
+    encoder = as_encoder(fitted, describe("Pendulum-v1"))
+    assert (encoder.name, encoder.latent_size) == ("Pipeline", 2)
+    np.testing.assert_allclose(encoder.encode(rows), fitted.transform(rows), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        encoder.decode(encoder.encode(rows)),
+        fitted.inverse_transform(fitted.transform(rows)),
+        rtol=1e-4,
+        atol=1e-5,
+    )
+    with pytest.raises(InputError, match=r"PCA failed: NotFittedError: .*"):
+        as_encoder(PCA(2), describe("Pendulum-v1"))
+
+
 def read(path):
     """The entities of a recording."""
     return {chunk.entity_path for chunk in RrdReader(path).stream()}
@@ -176,10 +195,10 @@ class _Growing(nn.Module):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (only(), "Odd has no `encode` and can't be called: it is no encoder"),
+        (only(), "Odd has neither `encode` nor `transform` and can't be called: it is no encoder"),
         (Half, "Half is a class: give an object, such as Half()"),
-        (7, "int has no `encode`"),
-        (only(encode=7), "Odd has no `encode` and can't be called"),
+        (7, "int has neither `encode`"),
+        (only(encode=7), "Odd has neither `encode` nor `transform` and can't be called"),
         (_Failing(), "_Failing failed at its latent_size: NotImplementedError: say how many"),
         (
             nn.Module(),
@@ -253,8 +272,8 @@ def test_code_is_a_class_or_a_function_that_makes_an_encoder_or_is_one(name):
         ("no_such_module:Net", "can't import no_such_module: ModuleNotFoundError"),
         ("test_own:Net", "can't make the encoder test_own:Net: AttributeError"),
         ("test_own:Spoilt", "can't make the encoder test_own:Spoilt: TypeError"),
-        ("test_own:ROWS", "ndarray has no `encode` and can't be called"),
-        ("abc:ABC", "ABC has no `encode` and can't be called"),
+        ("test_own:ROWS", "ndarray has neither `encode` nor `transform` and can't be called"),
+        ("abc:ABC", "ABC has neither `encode` nor `transform` and can't be called"),
     ],
 )
 def test_code_that_makes_no_encoder(name, message):

@@ -92,7 +92,8 @@ def as_encoder(given: Any, task: Task) -> BaseEncoder:
     """An encoder from whatever encodes, for a task's observations.
 
     Args:
-        given: an encoder of jbrep; an object with `encode`, or any function; or a torch module.
+        given: an encoder of jbrep; an object with `encode`, or any function; a torch module; or a
+            fitted transformer of scikit-learn.
         task: whose observations it is to read.
 
     Raises:
@@ -105,6 +106,8 @@ def as_encoder(given: Any, task: Task) -> BaseEncoder:
 
 class OwnEncoder(BaseEncoder):
     """A user's own encoder: an object with `encode`, a function, or a torch module.
+
+    A transformer of scikit-learn that was fitted has `transform` and `inverse_transform` instead.
 
     It gets float32 observations (n, d) in physical units and returns latents (n, l), each of which
     depends on its own observation alone. Both are copied, so that it may do as it likes with them.
@@ -133,10 +136,14 @@ class OwnEncoder(BaseEncoder):
         if isinstance(given, type):
             raise InputError(f"{self.name} is a class: give an object, such as {self.name}()")
         self.given = given
-        self._encode, self._decode = self._has("encode", given), self._has("decode")
+        self._encode = self._has("encode") or self._has("transform", given)
+        self._decode = self._has("decode") or self._has("inverse_transform")
         self.can_decode = callable(self._decode)
         if not callable(self._encode):
-            raise InputError(f"{self.name} has no `encode` and can't be called: it is no encoder")
+            raise InputError(
+                f"{self.name} has neither `encode` nor `transform` and can't be called: it is no "
+                "encoder"
+            )
         latents = self._apply(self._encode, self._probes, None)
         self.latent_size = latents.shape[1]
         if (declared := self._has("latent_size", self.latent_size)) != self.latent_size:

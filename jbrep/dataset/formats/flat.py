@@ -22,7 +22,7 @@ from jbrep.dataset.formats.episodes import (
     plain,
     whole_episode,
 )
-from jbrep.envs.task import MAX_EPISODE_STEPS
+from jbrep.envs.task import MAX_EPISODE_STEPS, Feature
 from jbrep.errors import InputError
 
 Array = NDArray[Any]
@@ -171,7 +171,16 @@ def source_of(columns: Mapping[str, Any], once: Mapping[str, Any], name: str) ->
         chunks = ({n: v[start : start + CHUNK] for n, v in arrays.items()} for start in starts)
         return split(name, chunks, checked_once)
 
-    return Source(name, label(name), episodes, rows=rows)
+    features = _named(columns["observation"])
+    return Source(name, label(name), episodes, features=features, rows=rows)
+
+
+def _named(observations: Any) -> tuple[Feature, ...]:
+    """The features that the columns of a data frame name; none of an array, or of bare numbers."""
+    names = [*getattr(observations, "columns", ())]
+    if not all(isinstance(each, str) for each in names):
+        return ()
+    return tuple(Feature(name=each) for each in names)
 
 
 def _listed(name: str, columns: Mapping[str, Any], once: dict[str, Any]) -> Source:
@@ -187,4 +196,6 @@ def _listed(name: str, columns: Mapping[str, Any], once: dict[str, Any]) -> Sour
             )
             yield from whole_episode(f"{name}: episode {number}", own, **ends)
 
-    return Source(name, label(name), episodes, rows=sum(map(len, columns["reward"])))
+    features = _named(next(iter(columns["observation"]), None))
+    rows = sum(map(len, columns["reward"]))
+    return Source(name, label(name), episodes, features=features, rows=rows)
