@@ -95,7 +95,7 @@ def study(truth: Truth, runs: int, seed: int) -> dict[str, list[RunCurve]]:
             total_steps=int(STEPS[-1]),
             return_floor=0,
             return_ceiling=MOST,
-            still=STILL,
+            reference=STILL,
         )
 
     arms = (("full", truth.full), (OTHER, truth.other))

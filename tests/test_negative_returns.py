@@ -141,7 +141,7 @@ def test_what_counts_as_solved_is_unknown_and_not_made_up(analysis, group):
     assert "to 90 %" in text
     assert "nan" not in text
     what = f"the mean return of untrained policies, {group.reference:,.0f}."
-    assert f"Gains are counted from {what}" in text
+    assert f"Gains are counted over {what}" in text
 
 
 def test_each_verdict_can_be_reached(analysis):

@@ -34,7 +34,7 @@ def curve(end, time=50_000, seed=0, name="full", **facts):
     """A run that stands still at 250 until it goes up within 10,000 steps to its final return."""
     rise = np.clip((STEPS - time) / 10_000 + 0.5, 0, 1)
     returns = 250 + (end - 250) * rise[:, None] + np.zeros((1, 3))
-    usual = {"return_floor": 0, "return_ceiling": 1000, "still": 250, "total_steps": 100_000}
+    usual = {"return_floor": 0, "return_ceiling": 1000, "reference": 250, "total_steps": 100_000}
     return RunCurve(*KEY, name, seed, "", STEPS, returns, **(usual | facts))
 
 
@@ -151,7 +151,7 @@ def replace_x(curves, x):
 
 
 def frame(**changes):
-    usual = {"still": 250, "half": 575, "bounds": Bounds(), "steps": 1e5}
+    usual = {"reference": 250, "half": 575, "bounds": Bounds(), "steps": 1e5}
     return Frame(**(usual | changes), weights=np.ones(1), resolution=1.0)
 
 
@@ -168,7 +168,7 @@ def test_what_is_kept_of_a_gain_ends_where_its_test_does():
     for end in (low, high):
         assert NOT_WORSE.p_value(sides, end, 0) == pytest.approx(0.05, rel=1e-4)
     moved = (plain_arm(3 * each.final - 7) for each in (x, y))
-    found = kept_gain(Sides(*moved, frame(still=3 * 250 - 7)), 0.95)
+    found = kept_gain(Sides(*moved, frame(reference=3 * 250 - 7)), 0.95)
     np.testing.assert_allclose(found, (share, low, high))
     assert np.isnan(kept_gain(sides._replace(y=plain_arm(drawn(200, 10, 8, 2))), 0.95)).all()
     unsure = plain_arm(np.array([100, 900.0, 120, 880]))

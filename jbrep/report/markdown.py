@@ -46,7 +46,7 @@ def _findings(analysis: Analysis, answers: Sequence[Answer]) -> Iterator[str]:
         if group.comparisons:
             title = f"{group.name}, compared with {analysis.baseline}"
             yield _titled(matrix(group, analysis.planned)._replace(title=title))
-            yield escape(f"Gains are counted from {reference_words(group)}.")
+            yield escape(f"Gains are counted over {reference_words(group)}.")
     yield from map(escape, notes(analysis.planned))
     for answer in answers:
         estimated = f"{answer.claim.name!r} is estimated by: {answer.claim.estimand}."

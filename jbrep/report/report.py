@@ -87,7 +87,7 @@ def statistics(analysis: Analysis) -> dict[str, Any]:
     """All statistics for programs; an interval is [value, low, high], None if not finite."""
     return {
         "format": "jbrep statistics",
-        "format_version": 3,
+        "format_version": 4,
         "baseline": analysis.baseline,
         "seed": analysis.seed,
         "claims": [claim._asdict() for claim in statements(analysis.planned)],

@@ -10,6 +10,7 @@ from jbrep.report.tables import Tables
 from jbrep.report.words import (
     EFFECTS,
     notes,
+    over,
     probability,
     reference_words,
     remark,
@@ -67,7 +68,7 @@ def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[Table]:
     if group.comparisons:
         judged = any(comparison.is_judged for comparison in group.comparisons)
         table = _verdict_table(group) if judged else _estimate_table(group, analysis.planned)
-        how = (*notes(analysis.planned), f"Gains are counted from {reference_words(group)}.")
+        how = (*notes(analysis.planned), f"Gains are counted over {reference_words(group)}.")
         tables.append(table._replace(title=f"{table.title}. {' '.join(how)}"))
     return tables
 
@@ -229,8 +230,9 @@ def across_tasks(analysis: Analysis) -> list[Table]:
         by_algorithm.setdefault(each.algorithm, []).append(each)
     return [
         Table.of(
-            f"{algorithm} across {', '.join(of_algorithm[0].tasks)}: gains over standing still as "
-            f"shares of that on {analysis.baseline}; 95 % intervals over runs within tasks",
+            f"{algorithm} across {', '.join(of_algorithm[0].tasks)}: gains over "
+            f"{over(analysis.planned.rules)} as shares of that on {analysis.baseline}; 95 % "
+            "intervals over runs within tasks",
             of_algorithm,
             {
                 _KEY: _NAME,

@@ -19,7 +19,7 @@ from jbrep.stats.claims import (
     Verdict,
 )
 from jbrep.stats.comparison import Comparison
-from jbrep.stats.rules import ERROR, Planned
+from jbrep.stats.rules import ERROR, Planned, Rules
 from jbrep.stats.scale import STILL
 from jbrep.study.record import RegistrationFacts
 from jbrep.text import SIGNIFICANT, interval, number
@@ -32,7 +32,8 @@ EFFECTS = (  # of `jbrep.stats.power`
     "varies by an SD of 5, 10 or 20 % of training. Each by itself: claims before it, and runs that "
     "fail to learn, may stop a verdict."
 )
-_KEPT = "gain over standing still, as a share of that on the full state"
+_KEPT = "gain over {over}, as a share of that on the full state"
+_OVER = {"blind": "the best policy that doesn't look", "still": "standing still"}
 _CLAIMS = {  # as a sentence, with a place for the percentage that may be lost; what is estimated
     NOT_WORSE.name: ("Agents on less state lose at most {} of the gain", _KEPT),
     LESS_VARIANCE.name: (
@@ -79,6 +80,11 @@ class Answer(NamedTuple):
     findings: list[Finding]
 
 
+def over(rules: Rules) -> str:
+    """What gains are counted over."""
+    return _OVER[rules.gains_over]
+
+
 def statements(planned: Planned) -> list[Statement]:
     """What is claimed, in the order of the tests."""
     found = []
@@ -86,7 +92,8 @@ def statements(planned: Planned) -> list[Statement]:
         claim = CLAIMS[name]
         percent = f"{100 * (1 - claim.boundary(planned.rules.margin)):.3g} %"
         sentence, estimand = _CLAIMS[name]
-        found.append(Statement(name, sentence.format(percent), estimand, claim.is_ratio))
+        estimated = estimand.format(over=over(planned.rules))
+        found.append(Statement(name, sentence.format(percent), estimated, claim.is_ratio))
     return found
 
 
@@ -206,7 +213,7 @@ def details(
     rows = [
         ("Claim", claim.statement),
         ("Estimand", claim.estimand),
-        ("Gains are counted from", reference_words(group)),
+        ("Gains are counted over", reference_words(group)),
     ]
     if not math.isnan(verdict.estimate.value):
         rows.append(("Estimate with 95 % interval", shown(verdict.estimate)))
@@ -243,9 +250,11 @@ def _deviations(registration: RegistrationFacts | None) -> str:
 
 
 def reference_words(group: GroupAnalysis) -> str:
-    """What gains are counted from."""
-    if STILL in group.references:
+    """What gains are counted over."""
+    if group.reference_policy == STILL:
         what = "what standing still returns"
+    elif group.reference_policy:
+        what = f"what the best policy that doesn't look returns ({group.reference_policy})"
     elif not math.isnan(group.return_floor):
         what = "the least possible return"
     else:

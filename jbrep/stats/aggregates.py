@@ -1,9 +1,9 @@
 """Results across tasks, with intervals from resampling runs within each task.
 
 After Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice".
-A run's score is its gain over standing still as a share of the mean gain on the full state, so that
-tasks can be put together: 0 is no better than standing still, 1 as good as the full state, whose
-runs are resampled, too.
+A run's score is its gain over the best policy that doesn't look as a share of the mean gain on the
+full state, so that tasks can be put together: 0 is no better than not looking, 1 as good as the
+full state, whose runs are resampled, too.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,7 +24,7 @@ class Aggregate:
 
     algorithm: str
     representation: str
-    # their names; those where agents on the full state gain nothing are left out
+    # their names; those where agents on the full state don't surely learn are left out
     tasks: tuple[str, ...]
     runs: int  # on each task: the first of those with more
     iqm: Interval  # interquartile mean of scores, with its 95 % interval

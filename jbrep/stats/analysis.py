@@ -13,8 +13,8 @@ from jbrep.stats.claims import Verdict
 from jbrep.stats.comparison import Comparison, compare
 from jbrep.stats.curves import compared
 from jbrep.stats.intervals import LEVEL, mean_within
-from jbrep.stats.labels import RepresentationResult, describe
-from jbrep.stats.rules import Planned
+from jbrep.stats.labels import YES, RepresentationResult, describe
+from jbrep.stats.rules import Planned, Rules
 from jbrep.stats.runs import Group, RunCurve, groups
 from jbrep.stats.scale import SOLVED, scale_of
 
@@ -32,7 +32,9 @@ class GroupAnalysis:
     return_floor: float  # the least possible return of the task; NaN if unknown
     return_ceiling: float  # the largest possible one; NaN if unknown
     failure_return: float  # what a failed run counts as from the step of failure on
-    reference: float  # the return that gains are counted from, as in `Scale`
+    reference: float  # the return that gains are counted over, as in `Scale`
+    blind: float  # the return that shows whether agents learned, as in `Scale`
+    reference_policy: str | None  # the policy that returns it; None if no policy's return is known
     # mean returns of policies that don't learn, each with its 95 % interval over starts
     references: Mapping[str, Interval]
     # the return to reach for each of STEPS_TO; NaN where there is none
@@ -91,10 +93,10 @@ def analyse(
         InputError: runs that can't be compared, or would mislead; see jbrep.stats.runs.groups.
     """
     planned = planned or Planned()
-    by_group = groups(runs, baseline)
+    by_group, played = groups(runs, baseline), references or {}
     verdicts = planned(by_group, seed)
     analysed = tuple(
-        _analyse_group(group, verdicts[key], (references or {}).get(key[0], {}), seed)
+        _analyse_group(group, verdicts[key], played.get(key[0], {}), planned.rules, seed)
         for key, group in by_group.items()
     )
     return Analysis(
@@ -110,11 +112,17 @@ def _analyse_group(
     group: Group,
     verdicts: Mapping[str, tuple[Verdict, ...]],
     references: Mapping[str, Sequence[float]],
+    rules: Rules,
     seed: int,
 ) -> GroupAnalysis:
     first = next(iter(group.values()))[0]
+    played = {
+        policy: mean_within(np.array(returns), first.bounds, LEVEL)
+        for policy, returns in references.items()
+    }
+    means = {policy: float(each.value) for policy, each in played.items()}
     grid, cut, curves, finals = compared(group)
-    scale = scale_of(list(finals.values()), next(iter(curves.values())), grid, first)
+    scale = scale_of(list(finals.values()), next(iter(curves.values())), grid, first, means)
     baseline, *others = (
         describe(runs, curves[name], finals[name], scale, seed) for name, runs in group.items()
     )
@@ -125,10 +133,8 @@ def _analyse_group(
         return_floor=_or_nan(first.return_floor),
         return_ceiling=_or_nan(first.return_ceiling),
         failure_return=_or_nan(first.failure_return),
-        references={
-            policy: mean_within(np.array(returns), first.bounds, LEVEL)
-            for policy, returns in references.items()
-        },
+        references=played,
+        reference_policy=rules.reference(means),
         labels=(baseline, *others),
         comparisons=tuple(
             compare(each, baseline, verdicts[each.representation], first.bounds, seed)
@@ -139,11 +145,11 @@ def _analyse_group(
 
 
 def _gains(groups: Sequence[GroupAnalysis]) -> dict[str, dict[str, dict[str, Array]]]:
-    """What each run gains, by algorithm, task and representation, where the baseline gains."""
+    """What each run gains, by algorithm, task and representation, where the baseline learns."""
     gains: dict[str, dict[str, dict[str, Array]]] = {}
     for group in groups:
         finals = {each.representation: each.by_run["final_return"] for each in group.labels}
-        if next(iter(finals.values())).mean() > group.reference:
+        if group.labels[0].learnt == YES:
             gains.setdefault(group.algorithm, {})[group.task] = {
                 name: each - group.reference for name, each in finals.items()
             }

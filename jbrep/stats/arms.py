@@ -8,7 +8,7 @@ import numpy as np
 
 from jbrep.stats.bootstrap import Array
 from jbrep.stats.curves import compared, steps_to
-from jbrep.stats.intervals import LEVEL, Bounds, mean_within
+from jbrep.stats.intervals import Bounds, surely_above
 from jbrep.stats.runs import Group, RunCurve, with_failure_returns
 from jbrep.stats.scale import reference_of
 
@@ -20,7 +20,7 @@ _RESOLUTION = 0.01  # of that gain, of differences between curves
 class Frame(NamedTuple):
     """What the runs of a task and algorithm are held to."""
 
-    still: float  # the mean return of standing still
+    reference: float  # the return that gains are counted over
     half: float  # the return half-way from there to the baseline's mean final return
     bounds: Bounds  # of returns
     steps: float  # of training
@@ -79,9 +79,8 @@ def measure(group: Group, seeds: Collection[int]) -> tuple[Frame, dict[str, Arm]
 
 
 def learns(arm: Arm, frame: Frame) -> bool:
-    """Whether runs end above standing still, beyond chance."""
-    mean, low, _ = mean_within(arm.final, frame.bounds, LEVEL)
-    return bool((mean if np.isnan(low) else low) > frame.still)  # NaN where all end alike
+    """Whether runs end above what gains are counted over, beyond chance."""
+    return surely_above(arm.final, frame.reference, frame.bounds)
 
 
 def _frame(
@@ -89,14 +88,14 @@ def _frame(
 ) -> Frame:
     (first, *_), *_ = group.values()
     of_baseline = next(iter(finals.values()))
-    still = reference_of(first, curves)
-    gain = max(float(of_baseline.mean()) - still, 0.0)
+    reference = reference_of(first, curves)
+    gain = max(float(of_baseline.mean()) - reference, 0.0)
     widths = np.diff(grid)
     weights = (np.append(widths, 0) + np.append(0, widths)) / 2
     largest = max(float(np.abs(each).max()) for each in finals.values())
     return Frame(
-        still=still,
-        half=still + _HALF * gain,
+        reference=reference,
+        half=reference + _HALF * gain,
         bounds=first.bounds,
         steps=float(grid[-1] - grid[0]),
         weights=weights / weights.sum(),

@@ -68,21 +68,21 @@ class Claim(NamedTuple):
 
 
 def kept_gain(sides: Sides, level: float, seed: int = 0) -> Interval:
-    """The gain of x over standing still as a share of that of y, with its interval.
+    """The gain of x over the reference as a share of that of y, with its interval.
 
-    The interval has the shares c with which the interval of mean(x) - c mean(y) has what standing
-    still would give (Fieller 1954), as far as they are looked for: an end is 1,000 or -1,000
+    The interval has the shares c with which the interval of mean(x) - c mean(y) has what the
+    reference would give (Fieller 1954), as far as they are looked for: an end is 1,000 or -1,000
     where y may not gain anything.
     """
     x, y, frame = sides
-    gained, of_y = x.final.mean() - frame.still, y.final.mean() - frame.still
+    gained, of_y = x.final.mean() - frame.reference, y.final.mean() - frame.reference
     if of_y <= 0:
         return UNDEFINED
     value = float(gained / of_y)
 
     def room(share: float, direction: int) -> float:
         _, low, high = difference_within(x.final, y.final, frame.bounds, level, share)
-        return float((low if direction < 0 else high) - (1 - share) * frame.still) * direction
+        return float((low if direction < 0 else high) - (1 - share) * frame.reference) * direction
 
     return Interval(value, *(_end(room, value, direction) for direction in (-1, 1)))
 
@@ -101,8 +101,8 @@ def _end(room: Callable[[float, int], float], value: float, direction: int) -> f
 
 def _kept_p(sides: Sides, boundary: float, seed: int) -> float:
     x, y, frame = sides
-    still = (1 - boundary) * frame.still
-    return p_of_difference(x.final, y.final, frame.bounds, still, boundary)
+    none_gained = (1 - boundary) * frame.reference
+    return p_of_difference(x.final, y.final, frame.bounds, none_gained, boundary)
 
 
 def time_lost(sides: Sides, level: float, seed: int = 0) -> Interval:

@@ -185,6 +185,13 @@ def mean_within(values: Array, bounds: Bounds, level: float) -> Interval:
         return Interval(mean, *(bounds.low + width / (1 + 1 / each) for each in (low, high)))
 
 
+def surely_above(values: Array, least: float, bounds: Bounds) -> bool:
+    """Whether a mean lies above a number: its interval does, or each of few values (n,)."""
+    if len(values) < FEWEST_RUNS or constant(values):
+        return bool(values.min() > least)
+    return bool(mean_within(values, bounds, LEVEL).low > least)
+
+
 def difference_within(
     x: Array, y: Array, bounds: Bounds, level: float, share: float = 1
 ) -> Interval:

@@ -16,6 +16,7 @@ from jbrep.stats.intervals import (
     deviation,
     mean_within,
     percentile,
+    surely_above,
     unless_few,
 )
 from jbrep.stats.nested import components
@@ -23,6 +24,7 @@ from jbrep.stats.reliability import TAIL_OF_RUNS, expected_shortfall, fixed_poli
 from jbrep.stats.runs import RunCurve
 from jbrep.stats.scale import STEPS_TO, Scale
 
+YES, NO, UNCLEAR = "yes", "no", "unclear"
 REACHED = {name: name.replace("steps_to", "reached") for name in STEPS_TO}
 WITHIN = (  # of one run
     "dispersion_across_time",
@@ -45,6 +47,8 @@ class RepresentationResult:
     seeds: tuple[int, ...]  # of the runs, in ascending order
     failed: tuple[int, ...]  # seeds of the runs that failed
     encoders: int  # how many they have among them
+    # whether they end above the best policy that doesn't look: yes, no, or unclear
+    learnt: str
     curve: Curve  # over the grid of the group
     by_run: Mapping[str, Array]  # numbers of each run by name, (runs,) each, in the order of seeds
     numbers: Mapping[str, Interval]  # of all runs by name, each with its 95 % interval
@@ -75,11 +79,18 @@ def describe(
         seeds=tuple(int(run.seed) for run in runs),
         failed=tuple(int(run.seed) for run in runs if run.failed_at is not None),
         encoders=len({run.encoder_seed for run in runs}),
+        learnt=_learnt(final, scale.blind, runs[0].bounds),
         curve=bands(curves, seed),
         by_run=by_run,
         numbers={**_numbers(by_run, runs[0].bounds, seed), **_components(runs, final)},
         profile=profile(by_run["final_return"], scale.profile_returns, seed),
     )
+
+
+def _learnt(final: Array, blind: float, bounds: Bounds) -> str:
+    if surely_above(final, blind, bounds):
+        return YES
+    return UNCLEAR if final.mean() > blind else NO
 
 
 def profile(final_return: Array, returns: Array, seed: int) -> Interval:

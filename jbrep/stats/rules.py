@@ -16,7 +16,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -41,7 +41,9 @@ from jbrep.stats.claims import (
 )
 from jbrep.stats.intervals import LEVEL, UNDEFINED, unless_few
 from jbrep.stats.runs import Group, Key
+from jbrep.stats.scale import STILL, best_blind
 
+NOTHING_LEARNT = "agents on the full state didn't learn"
 ERROR = 0.05  # the probability that any of a study's verdicts is wrong, two-sided
 _USUAL_LOOKS = (0.5, 1.0)
 _Share = Annotated[float, Meta(gt=0, lt=1)]
@@ -76,6 +78,13 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
             "default half of them and all, or all alone where half are too few for a verdict."
         ),
     ] = ()
+    gains_over: Annotated[
+        Literal["blind", "still"],
+        Meta(
+            description="What gains are counted over: the best policy that doesn't look, or "
+            "standing still."
+        ),
+    ] = "blind"
 
     def check(self) -> None:
         """Check what no field can say alone."""
@@ -93,6 +102,12 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
                 f"claims are {list(self.claims)}: each may be there once, and {NOT_WORSE.name!r} "
                 "comes first, as agents that learn nothing vary little"
             )
+
+    def reference(self, returns: Mapping[str, float]) -> str | None:
+        """The policy that gains are counted over, of those whose returns are known."""
+        if self.gains_over == "still":
+            return STILL if STILL in returns else None
+        return best_blind(returns)
 
 
 @dataclass(frozen=True)
@@ -229,7 +244,7 @@ def _reason(claim: Claim, sides: Sides, rules: Rules, direction: int, level: flo
     if fewest < FEWEST_UNITS:
         return f"{fewest} {what}; verdicts take {FEWEST_UNITS}"
     if not learns(y, frame):
-        return "agents on the full state didn't learn"
+        return NOTHING_LEARNT
     if claim.limits_failures and direction > 0:
         most = most_failing(x.units - x.learnt, x.units, level)
         if most > rules.failing:
@@ -251,8 +266,10 @@ def most_failing(failing: int, runs: int, level: float) -> float:
 
 def _estimated(claim: Claim, sides: Sides, rules: Rules, seed: int) -> Verdict:
     """An estimate without a verdict."""
-    x, y, _ = sides
-    estimate = unless_few(claim.estimate(sides, LEVEL, seed), x.units, y.units)
+    x, y, frame = sides
+    compares = learns(y, frame)
+    estimate = claim.estimate(sides, LEVEL, seed) if compares else UNDEFINED
+    estimate = unless_few(estimate, x.units, y.units)
     return Verdict(
         claim=claim.name,
         verdict=EXPLORATORY,
@@ -264,7 +281,7 @@ def _estimated(claim: Claim, sides: Sides, rules: Rules, seed: int) -> Verdict:
         runs=(x.runs, y.runs),
         encoders=x.units if x.by_encoder else 0,
         look=0,
-        reason=None,
+        reason=None if compares else NOTHING_LEARNT,
     )
 
 

@@ -37,7 +37,8 @@ class RunCurve:
         failed_at: training step at which the run failed; None if it didn't.
         return_floor: the least possible return of an episode of the task; None if unknown.
         return_ceiling: the largest possible one; None if unknown.
-        still: the mean return of standing still on the starts of evaluation; None if unknown.
+        reference: the return that gains are counted over, on the starts of evaluation: that of the
+            best policy that doesn't look; None if unknown.
         solved: the return from which on the task counts as solved; None if unknown.
         trainer: what trained it, and how exactly; equal for all runs that are compared.
         final: the returns of the last evaluation, if it has more episodes than the others, (f,).
@@ -60,7 +61,7 @@ class RunCurve:
     failed_at: int | None = None
     return_floor: float | None = None
     return_ceiling: float | None = None
-    still: float | None = None
+    reference: float | None = None
     solved: float | None = None
     trainer: str = ""
     final: Array | None = None
@@ -97,7 +98,7 @@ class RunCurve:
             object.__setattr__(self, name, value)
 
     def _check_bounds(self, returns: Array) -> None:
-        for what in ("return_floor", "return_ceiling", "still", "solved", "failure_return"):
+        for what in ("return_floor", "return_ceiling", "reference", "solved", "failure_return"):
             value = getattr(self, what)
             if value is not None and not abs(value) <= LARGEST_RETURN:
                 raise self._error(f"its {what} is {value}", "give a number, or None if unknown")
@@ -248,7 +249,7 @@ def _check_task(runs: list[RunCurve], name: str) -> None:
             f"{name}: its runs are of different trainers: {', '.join(trainers)}; report those of "
             "one, or all with --across-trainers"
         )
-    for what in ("return_floor", "return_ceiling", "still", "solved"):
+    for what in ("return_floor", "return_ceiling", "reference", "solved"):
         values = sorted({str(getattr(run, what)) for run in runs})
         if len(values) > 1:
             raise InputError(

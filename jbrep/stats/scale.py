@@ -7,11 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.stats.bootstrap import Array
+from jbrep.stats.intervals import surely_above
 from jbrep.stats.runs import RunCurve
 
 SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the gain of the baseline's median run
 SOLVED = "steps_to_solved"
-STILL = "standing still"  # the policy that gains are counted from, among those that don't learn
+STILL, LOOKING = "standing still", "hand-written"  # of policies that don't learn; one looks
 STEPS_TO = (*(f"steps_to_{name}" for name in SHARES), SOLVED)
 _POINTS = 50  # of a performance profile, about, or half as many: round numbers
 
@@ -20,7 +21,8 @@ class Scale(NamedTuple):
     """What all representations of a task and algorithm are measured by."""
 
     grid: Array  # training steps at which runs are compared, (g,)
-    reference: float  # the return that gains are counted from, as `reference_of` has it
+    reference: float  # the return that gains are counted over, as `reference_of` has it
+    blind: float  # the mean return of the best policy that doesn't look, else the reference
     # the return to reach for each of STEPS_TO, NaN where there is none
     thresholds: Mapping[str, float]
     # at which performance profiles are evaluated, (k,): round numbers that enclose all final
@@ -28,18 +30,30 @@ class Scale(NamedTuple):
     profile_returns: Array
 
 
-def reference_of(run: RunCurve, curves: Array) -> float:
-    """The return that gains are counted from.
+def best_blind(returns: Mapping[str, float]) -> str | None:
+    """The best of policies that don't look at anything, by mean return; None if there is none."""
+    blind = [policy for policy in returns if policy != LOOKING]
+    return max(blind, key=returns.__getitem__) if blind else None
 
-    That is what standing still returns where it was measured, else the least possible return of the
-    task where it is known, else the mean return at the first step of the baseline's curves on the
-    grid, (runs, g), that is, of its untrained policies.
+
+def reference_of(run: RunCurve, curves: Array) -> float:
+    """The return that gains are counted over.
+
+    That is the run's own reference where it is known, else the least possible return of the task,
+    else the mean return at the first step of the baseline's curves on the grid, (runs, g), that is,
+    of its untrained policies.
     """
-    known = (each for each in (run.still, run.return_floor) if each is not None)
+    known = (each for each in (run.reference, run.return_floor) if each is not None)
     return float(next(known, curves[:, 0].mean()))
 
 
-def scale_of(finals: Sequence[Array], curves: Array, grid: Array, run: RunCurve) -> Scale:
+def scale_of(
+    finals: Sequence[Array],
+    curves: Array,
+    grid: Array,
+    run: RunCurve,
+    policies: Mapping[str, float],
+) -> Scale:
     """The scale of a group of runs.
 
     Args:
@@ -47,14 +61,17 @@ def scale_of(finals: Sequence[Array], curves: Array, grid: Array, run: RunCurve)
         curves: of the baseline's runs on the grid (g,), (runs, g).
         grid: training steps.
         run: any of the group.
+        policies: mean returns of policies that don't learn.
     """
-    reference, solved = reference_of(run, curves), run.solved
-    gain = float(np.median(finals[0])) - reference
-    shares = [reference + share * gain if gain > 0 else np.nan for share in SHARES.values()]
+    reference, solved, best = reference_of(run, curves), run.solved, best_blind(policies)
+    gained = surely_above(finals[0], reference, run.bounds)
+    gain = float(np.median(finals[0])) - reference if gained else np.nan
+    shares = [reference + share * gain for share in SHARES.values()]
     thresholds = (*shares, np.nan if solved is None else float(solved))
     return Scale(
         grid=grid,
         reference=reference,
+        blind=policies[best] if best else reference,
         thresholds=dict(zip(STEPS_TO, thresholds, strict=True)),
         profile_returns=_round_numbers(np.concatenate(finals), run.return_floor),
     )

@@ -138,6 +138,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         ),
     ] = ()
     verdicts: Rules = Rules()
+    title: Annotated[str, Meta(max_length=200, description="What its report is called.")] = ""
 
     def check(self) -> None:
         """As for `Record`."""

@@ -24,7 +24,15 @@ from jbrep.text import slug
 from jbrep.training.trainer import get_device
 
 STUDY = "study.json"
-_GRID = ("tasks", "algorithms", "representations", "seeds", "learners", "evaluations")  # may change
+_GRID = (  # may change
+    "tasks",
+    "algorithms",
+    "representations",
+    "seeds",
+    "learners",
+    "evaluations",
+    "title",
+)
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,14 @@ class Registration(Document, frozen=True, kw_only=True):
 
     @cached_property
     def registered(self) -> Study:
-        """The study."""
-        return from_plain(self.study, Study, "study")
+        """The study; verdicts that don't say what gains are counted over count over standing still.
+
+        All did when the first studies were registered.
+        """
+        study = from_plain(self.study, Study, "study")
+        if not study.verdicts.primary or "gains_over" in self.study["verdicts"]:
+            return study
+        return study.replace(verdicts=study.verdicts.replace(gains_over="still"))
 
     @classmethod
     def of(cls, study: Study, encoders: Mapping[str, str]) -> "Registration":
@@ -54,8 +60,8 @@ class Registration(Document, frozen=True, kw_only=True):
             study: its settings.
             encoders: the SHA-256 of those that are there, by the name of the run.
         """
-        facts = {
-            "study": to_plain(study),
+        facts: dict[str, Any] = {
+            "study": _explicit(study),
             "encoders": dict(encoders),
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "versions": packages(),
@@ -64,9 +70,10 @@ class Registration(Document, frozen=True, kw_only=True):
         return cls(sha256=_hash(facts), **facts)
 
     def differences(self, study: Study) -> str:
-        """How a study differs from the registered one, but for seeds that were added."""
+        """How a study differs from the registered one, but for its title and added seeds."""
         kept = [seed for seed in study.seeds if seed in self.registered.seeds]
-        return differences(to_plain(self.registered), {**to_plain(study), "seeds": kept})
+        known = {**to_plain(study), "seeds": kept, "title": self.registered.title}
+        return differences(to_plain(self.registered), known)
 
     def deviations(self, study: Study, runs: Collection[RunRecord]) -> list[str]:
         """How what ran differs from what was registered, in sentences.
@@ -102,6 +109,14 @@ def read_registration(folder: Path) -> Registration | None:
     """
     path = folder / REGISTRATION
     return read_document(path, Registration) if exists(path) else None
+
+
+def _explicit(study: Study) -> dict[str, Any]:
+    """A study as it is registered: its verdicts say what gains are counted over."""
+    plain = to_plain(study)
+    if study.verdicts.primary:
+        plain["verdicts"]["gains_over"] = study.verdicts.gains_over
+    return plain
 
 
 def _listed(values: Iterable[object]) -> str:

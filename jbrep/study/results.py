@@ -17,8 +17,7 @@ from jbrep.records.storage import exists
 from jbrep.records.tables import write_rows
 from jbrep.rl.files import FAILED, RUN, RunRecord, read_evaluations, read_run, runs_below
 from jbrep.stats import Analysis, RunCurve, analyse
-from jbrep.stats.rules import Planned
-from jbrep.stats.scale import STILL
+from jbrep.stats.rules import Planned, Rules
 from jbrep.study.plan import STUDY
 from jbrep.study.record import RECORD, LabelSettings, RunFacts, RunsRecord, runs_record
 from jbrep.study.tables import (
@@ -77,7 +76,7 @@ def found(
     Raises:
         InputError: a run has returns that it can't have.
     """
-    runs = _curves(record, returns, references)
+    runs = _curves(record, returns, references, planned.rules)
     if across_trainers:
         runs = [replace(run, trainer="") for run in runs]
     compared, left_out = _comparable(runs)
@@ -95,7 +94,8 @@ def read_runs(folder: Path) -> list[RunCurve]:
         InputError: there is none, or a file of one is damaged.
     """
     ended = _ended(folder)
-    return _curves(runs_record(folder, ended), _returns(ended), read_references(folder))
+    record, references = runs_record(folder, ended), read_references(folder)
+    return _curves(record, _returns(ended), references, Rules())
 
 
 def has_runs(folder: Path) -> bool:
@@ -151,28 +151,35 @@ def _returns(ended: Ended) -> Iterator[Return]:
 
 
 def _curves(
-    record: RunsRecord, returns: Iterable[Return], references: References
+    record: RunsRecord, returns: Iterable[Return], references: References, rules: Rules
 ) -> list[RunCurve]:
     """The runs of a study, from its tables."""
     evaluated = by_run(returns)
+    counted_over = {task: _reference(played, rules) for task, played in references.items()}
     return [
-        _curve(run, record.settings_of(run), evaluated.get((run.label, run.seed), {}), references)
+        _curve(run, record.settings_of(run), evaluated.get((run.label, run.seed), {}), counted_over)
         for run in record.runs
     ]
+
+
+def _reference(played: Mapping[str, Sequence[float]], rules: Rules) -> float | None:
+    """The return that gains are counted over, from those of policies that don't learn."""
+    means = {policy: float(np.mean(returns)) for policy, returns in played.items()}
+    policy = rules.reference(means)
+    return means[policy] if policy else None
 
 
 def _curve(
     run: RunFacts,
     shared: LabelSettings,
     by_step: Mapping[int, list[float]],
-    references: References,
+    counted_over: Mapping[str, float | None],
 ) -> RunCurve:
     """A run, from its settings without the seed, and the returns of its evaluations by step."""
     task, settings = shared.environment, to_plain(shared)
     trainer = [settings.pop(name) for name in ("trainer", "precision", "device")]
     steps = sorted(by_step)
     returns = [by_step[step] for step in steps]
-    still = references.get(task.name, {}).get(STILL)
     episodes = min(map(len, returns), default=0)  # the last evaluation may have more
     if any(len(each) > episodes for each in returns[:-1]):
         raise InputError(f"run {run.label}, seed {run.seed}: evaluations differ in their episodes")
@@ -188,7 +195,7 @@ def _curve(
         failed_at=run.steps if run.status == FAILED else None,
         return_floor=task.return_floor,
         return_ceiling=task.return_ceiling,
-        still=float(np.mean(still)) if still else None,
+        reference=counted_over.get(task.name),
         solved=task.solved_return,
         trainer=" ".join(trainer),
         final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,

@@ -22,14 +22,13 @@ from jbrep.play.sources import find_player
 from jbrep.records.document import read_document
 from jbrep.records.storage import exists
 from jbrep.records.tables import read_rows, write_csv
-from jbrep.stats.scale import STILL
+from jbrep.stats.scale import LOOKING, STILL
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.text import slug
 
 RETURNS = "returns.csv"
 REFERENCE_RETURNS = "references.csv"
-RANDOM, HAND_WRITTEN = "random", "hand-written"
-_POLICIES = {STILL: "still", RANDOM: "uniform", HAND_WRITTEN: "heuristic"}
+_POLICIES = {STILL: "still", "random": "uniform", LOOKING: "heuristic"}
 References = dict[str, dict[str, list[float]]]  # returns by task and policy
 
 _TASK = "{task}"  # in an evaluation's path: the task's name as in folders
@@ -88,7 +87,7 @@ def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | 
         row
         for task, episodes in sorted(tasks, key=lambda each: each[0].name)
         for policy in _POLICIES
-        if policy != HAND_WRITTEN or task.name in HEURISTICS
+        if policy != LOOKING or task.name in HEURISTICS
         for row in _kept(there, task, policy, episodes) or _played(task, policy, episodes)
     ]
     if not rows:

@@ -26,6 +26,7 @@ from jbrep.report.figures.style import (
     reference,
     with_runs,
 )
+from jbrep.report.words import over
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.study.tables import Return, by_run
 
@@ -247,9 +248,9 @@ def across_tasks(analysis: Analysis, looks: Looks) -> Plot:
     return Plot(
         "across_tasks",
         "Across tasks",
-        f"The share of n runs on each task whose gain over standing still is above a share of that "
-        f"on {analysis.baseline} (dashed: as good), averaged over tasks, with its 95 % bootstrap "
-        "interval (Agarwal et al. 2021).",
+        f"The share of n runs on each task whose gain over {over(analysis.planned.rules)} is above "
+        f"a share of that on {analysis.baseline} (dashed: as good), averaged over tasks, with its "
+        "95 % bootstrap interval (Agarwal et al. 2021).",
         ("algorithm", "representation", "tasks", "score", "share", "low", "high"),
         [
             (each.algorithm, each.representation, ", ".join(each.tasks), *map(cell, row))
