@@ -8,6 +8,7 @@ from jbrep.cli.encoders import encoder, evaluate
 from jbrep.cli.environment import env
 from jbrep.cli.inspect import inspect
 from jbrep.cli.policies import behaviour, evaluate_policy, policies
+from jbrep.cli.policy import policy
 from jbrep.cli.render import render
 from jbrep.cli.rl import rl, tune
 from jbrep.cli.study import report, study
@@ -38,7 +39,7 @@ def doctor(context: click.Context) -> None:
 
 
 for _command in (
-    *(env, collect, data, train_dae, train_encoder, evaluate, encoder, rl, tune, policies),
+    *(env, collect, data, train_dae, train_encoder, evaluate, encoder, rl, tune, policies, policy),
     *(evaluate_policy, behaviour, study, report, inspect, render, doctor),
 ):
     main.add_command(_command)

@@ -7,6 +7,7 @@ changes.
 
 from jbrep.coordinates.coordinates import Coordinates as Coordinates
 from jbrep.coordinates.coordinates import Part as Part
+from jbrep.coordinates.coordinates import is_torch as is_torch
 from jbrep.coordinates.coordinates import library_of as library_of
 from jbrep.coordinates.coordinates import wrapped as wrapped
 from jbrep.coordinates.made import INGREDIENTS as INGREDIENTS

@@ -116,9 +116,9 @@ class Coordinates:
     def forward(self, observation: Any) -> Any:
         """Observations (..., d) in physical units as coordinates (..., m)."""
         library = library_of(observation)
-        if library is np and np.ndim(observation) == 1:
+        if isinstance(observation, np.ndarray) and observation.ndim == 1:
             with suppress(ArithmeticError, ValueError):  # of infinities, which NumPy passes on
-                return np.array(self._of_one(np.asarray(observation).tolist()), observation.dtype)
+                return np.array(self._of_one(observation.tolist()), observation.dtype)
         known = {name: observation[..., i] for i, name in enumerate(self.task.feature_names)}
         for part in self.parts:
             _calculate(library, _Step(part, False), known)
@@ -252,4 +252,9 @@ def wrapped(angle: Any) -> Any:
 
 def library_of(values: Any) -> Any:
     """The library of an array: NumPy, or torch."""
-    return sys.modules["torch" if type(values).__module__ == "torch" else "numpy"]
+    return sys.modules["torch" if is_torch(values) else "numpy"]
+
+
+def is_torch(values: Any) -> bool:
+    """Whether they are a torch tensor, of any class; torch isn't imported for the answer."""
+    return type(values).__module__.partition(".")[0] == "torch"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.coordinates import library_of
+from jbrep.coordinates import is_torch, library_of
 from jbrep.dataset import Scaler
 from jbrep.encoders.base import BaseEncoder, OwnEncoder
 from jbrep.encoders.header import IMPORTED, MAX_MAGNITUDE, EncoderHeader
@@ -200,7 +200,7 @@ class Encoder(BaseEncoder):
 
     def _prepare(self, values: Any, size: int, what: str) -> tuple[Any, Arrays]:
         """Values as float32, and this encoder's arrays on the device that they are on."""
-        if type(values).__module__ == "torch":
+        if is_torch(values):
             values, arrays = values.float(), self._on_device(values.device)
         else:
             values, arrays = np.asarray(values, np.float32), self.arrays

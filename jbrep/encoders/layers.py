@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jbrep.coordinates import is_torch
+
 MAX_UNITS = 4096  # in a layer
 
 LAYER_NORM = "layer-norm"
@@ -40,7 +42,7 @@ def activate(name: str, values: Any) -> Any:
     `layer-norm` is over the units, without weights of its own: an affine map after it has them.
     `avg-l1-norm` divides them by their average magnitude (Fujimoto et al. 2023).
     """
-    if type(values).__module__ == "torch":
+    if is_torch(values):
         return _torch()[name](values)
     return getattr(values, "activations", ACTIVATIONS)[name](values)
 

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,8 @@ _OPERATORS = {  # by NumPy's names
         for name in ("add", "cos", "equal", "floor", "greater", "less", "sin", "sqrt")
     },
     **{"subtract": "Sub", "multiply": "Mul", "divide": "Div", "matmul": "MatMul"},
-    **{"absolute": "Abs", "arctan": "Atan", "maximum": "Max", "negative": "Neg"},
+    **{"absolute": "Abs", "arctan": "Atan", "negative": "Neg"},
+    **{"maximum": "Max", "minimum": "Min"},
 }
 
 
@@ -140,28 +141,44 @@ def export(encoder: Encoder, path: Path) -> None:
 
 def model(encoder: Encoder) -> onnx.ModelProto:
     """The ONNX model, checked."""
-    graph, sizes = _Graph(), {"latent": encoder.latent_size}
-    latent = encoder.arrays.encode(_Rows(graph, "observation", encoder.size))
-    graph.node("Identity", latent, output="latent")
-    if encoder.can_decode:
-        sizes["reconstruction"] = encoder.size
-        back = encoder.arrays.decode(_Rows(graph, "latent", encoder.latent_size))
-        graph.node("Identity", back, output="reconstruction")
-    later = any("gelu" in layer.activation for layer in (*encoder.encoder, *encoder.decoder))
+
+    def outputs(observation: Any) -> Iterator[tuple[str, Any]]:
+        latent = encoder.arrays.encode(observation)
+        yield "latent", latent
+        if encoder.can_decode:
+            yield "reconstruction", encoder.arrays.decode(latent)
+
+    return traced(encoder.name, encoder.size, outputs, encoder.header.as_json())
+
+
+def traced(
+    name: str,
+    size: int,
+    outputs: Callable[[Any], Iterable[tuple[str, Any]]],
+    metadata: Mapping[str, Any],
+) -> onnx.ModelProto:
+    """The model of a computation in NumPy, checked.
+
+    Args:
+        name: of the graph.
+        size: numbers of an observation, the model's input.
+        outputs: what is computed of observations (rows, size): values with their names.
+        metadata: plain JSON, which the model has as its property jbrep.
+    """
+    graph, described = _Graph(), []
+    for output, rows in outputs(_Rows(graph, "observation", size)):
+        graph.node("Identity", rows, output=output)
+        described.append(_described(output, rows.width))
+    later = any(node.op_type == "Gelu" for node in graph.nodes)
     opset, ir_version = _LATER if later else (_OPSET, _IR_VERSION)
+    inputs = [_described("observation", size)]
     made = helper.make_model(
-        helper.make_graph(
-            graph.nodes,
-            encoder.name,
-            [_described("observation", encoder.size)],
-            [_described(name, size) for name, size in sizes.items()],
-            graph.constants,
-        ),
+        helper.make_graph(graph.nodes, name, inputs, described, graph.constants),
         opset_imports=[helper.make_opsetid("", opset)],
         ir_version=ir_version,
         producer_name="jbrep",
     )
-    helper.set_model_props(made, {"jbrep": json.dumps(encoder.header.as_json())})
+    helper.set_model_props(made, {"jbrep": json.dumps(metadata)})
     onnx.checker.check_model(made, full_check=True)
     return made
 

@@ -2,24 +2,69 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jbrep.coordinates import library_of
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.fold import Chain
-from jbrep.encoders.layers import Layer, run
+from jbrep.encoders.layers import Layer, activate, run
 from jbrep.errors import InputError
 from jbrep.records.container import Tensors
 from jbrep.rl.files import RunSettings
-from jbrep.rl.normalization import Statistics
+from jbrep.rl.normalization import CLIP, Statistics
 
 _HIDDEN = "latent_pi.", "mlp_extractor.policy_net.", "mu."  # sequences, numbered from 0
 _LAST = "mu", "action_net"  # single layers after them
 _ON_POLICY = "ppo", "a2c", "trpo"  # whose actions are clipped; those of others are squashed
 _RENORM_EPSILON = 1e-3  # that CrossQ's batch renormalisation adds to the variance
+
+
+class Acting(NamedTuple):
+    """What a policy computes with, all NumPy's arrays or all torch tensors.
+
+    Written once for NumPy, torch and ONNX.
+
+    Attributes:
+        statistics: mean (l,) and standard deviation (l,) of what the network sees, if it is
+            normalised by them.
+        network: layers to the actions before they are squashed or clipped.
+        low, high: bounds of the actions, (k,).
+        is_squashed: whether actions are squashed into their bounds; others are clipped.
+    """
+
+    statistics: tuple[Any, Any] | None
+    network: tuple[Layer, ...]
+    low: Any
+    high: Any
+    is_squashed: bool
+
+    def in_torch(self) -> "Acting":
+        """The same with torch tensors."""
+        from torch import tensor
+
+        return Acting(
+            self.statistics and (tensor(self.statistics[0]), tensor(self.statistics[1])),
+            tuple(Layer(tensor(w), tensor(b), activation) for w, b, activation in self.network),
+            tensor(self.low),
+            tensor(self.high),
+            self.is_squashed,
+        )
+
+    def actions(self, seen: Any) -> Any:
+        """Actions (..., k) of latents (..., l): arrays, torch tensors, or rows of a model."""
+        if self.statistics:
+            mean, deviation = self.statistics
+            seen = ((seen - mean) / deviation).clip(-CLIP, CLIP)
+        chosen = run(self.network, seen)
+        if self.is_squashed:
+            half = 0.5 * (self.high - self.low)
+            chosen = (activate("tanh", chosen) + 1) * half + self.low
+        library = library_of(chosen)
+        return library.minimum(library.maximum(chosen, self.low), self.high)
 
 
 class Controller:
@@ -38,9 +83,10 @@ class Controller:
         statistics: by which the policy normalises what it sees, if it does.
 
     Attributes:
+        settings: of the run.
         task: says what the observation's numbers and the action's are: names, units, ranges.
         encoder: what the network sees is its latent.
-        network: layers from there to the actions before they are squashed or clipped.
+        acting: what is computed of that.
         action_repeat: calls for which an action is held.
 
     Raises:
@@ -54,12 +100,14 @@ class Controller:
         weights: Tensors,
         statistics: Statistics | None = None,
     ):
-        self.task, self.encoder, self.statistics = settings.environment, encoder, statistics
+        self.settings, self.task, self.encoder = settings, settings.environment, encoder
         self.action_repeat = settings.hyperparameters.action_repeat
-        self.network = network_of(settings, encoder.latent_size, weights)
-        self._is_squashed = settings.algorithm not in _ON_POLICY
-        self._low, self._high = (
-            np.array(bound, np.float32) for bound in (self.task.action_low, self.task.action_high)
+        self.acting = Acting(
+            statistics=statistics.arrays if statistics else None,
+            network=network_of(settings, encoder.latent_size, weights),
+            low=np.array(self.task.action_low, np.float32),
+            high=np.array(self.task.action_high, np.float32),
+            is_squashed=settings.algorithm not in _ON_POLICY,
         )
         self._one_row = isinstance(encoder, Encoder)
         self.reset()
@@ -89,18 +137,10 @@ class Controller:
     def _chosen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         if observation.ndim == 1 and not self._one_row:
             return self._chosen(observation[None])[0]
-        seen = self.encoder.encode(observation)
-        action = self.actions(self.statistics(seen) if self.statistics else seen)
+        action = self.acting.actions(self.encoder.encode(observation))
         if not np.isfinite(action).all():
             raise InputError("the policy's action is not finite: see what it observed")
         return action
-
-    def actions(self, seen: Any) -> Any:
-        """Actions (..., k) of what the network sees (..., l): arrays, or rows of a model."""
-        chosen, low, high = run(self.network, seen), self._low, self._high
-        if self._is_squashed:
-            chosen = low + (0.5 * (high - low)) * (np.tanh(chosen) + 1)
-        return np.minimum(np.maximum(chosen, low), high)
 
 
 def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[Layer, ...]:

@@ -67,6 +67,12 @@ class Statistics:
         """Themselves by names, for a file."""
         return {_PREFIX + name: np.asarray(value) for name, value in vars(self).items()}
 
+    @property
+    def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Mean and standard deviation (size,), as an agent's input is normalised by them."""
+        deviation = np.sqrt(self.variance + _EPSILON)
+        return self.mean.astype(np.float32), deviation.astype(np.float32)
+
     def __call__(self, seen: NDArray[np.float32]) -> NDArray[np.float32]:
         """What an agent sees, (n, size), normalised as in training."""
         scaled = (seen - self.mean) / np.sqrt(self.variance + _EPSILON)

@@ -1,0 +1,74 @@
+"""Taking a policy out, for a robot, and checking what was taken out."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from jbrep.cli.base import PATH, POSITIVE, say
+from jbrep.cli.environment import given_task, task_options
+from jbrep.text import interval_of
+
+
+@click.group()
+def policy() -> None:
+    """Export a trained policy for a robot, and check the file."""
+
+
+@policy.command(epilog="Example: jbrep policy export runs/a --out controller.onnx")
+@click.argument("run", type=PATH)
+@click.option(
+    "--format",
+    "form",
+    default="onnx",
+    show_default=True,
+    help="onnx, or torch for a program of torch.export.",
+)
+@click.option("--out", required=True, type=PATH, help="A new file.")
+def export(run: Path, form: str, out: Path) -> None:
+    """Write a policy as one model, from raw observations to actions.
+
+    RUN is the folder of a run, or a policy's file. Scaling, encoder, running normalisation, network
+    and bounds are all in the model; names, units, ranges and the rate are in its metadata. Each
+    action is to be held for as many control steps as the run's action_repeat says.
+    """
+    from jbrep.rl.controller import load_policy
+    from jbrep.rl.export import described
+    from jbrep.rl.export import export as write
+
+    controller = load_policy(run)
+    write(controller, out, form)
+    said, task = described(controller), controller.task
+    rate = "" if said["rate"] is None else f", {said['rate']:g} times a second"
+    say(f"{out}: {task.size} numbers of {task.name} to {task.action_size}{rate}")
+    if form == "onnx":
+        click.echo(f"check it with jbrep policy check {out} --run {run}")
+    else:
+        click.echo(f"open it with torch.export.load({str(out)!r}).module()")
+
+
+@policy.command(epilog="Example: jbrep policy check controller.onnx --run runs/a")
+@click.argument("model", type=PATH)
+@click.option("--run", type=PATH, help="That it was taken from, to play beside it.")
+@click.option("--episodes", default=20, show_default=True, type=POSITIVE, help="How many.")
+@task_options
+def check(model: Path, run: Path | None, episodes: int, **options: Any) -> None:
+    """Play an exported policy in its environment.
+
+    MODEL is an ONNX file that jbrep policy export wrote. It plays the episodes that every run is
+    evaluated on; with --run, that run plays the same ones.
+    """
+    import numpy as np
+
+    from jbrep.play.exported import exported_player
+    from jbrep.play.sources import find_player
+
+    beside = find_player(str(run), given_task(options)) if run else None
+    player = exported_player(model, beside.task if beside else given_task(options))
+    returns = player.returns(episodes)
+    say(f"{player.task.name}, {model}: {interval_of(returns)}, median [10 %, 90 %] of {episodes}")
+    if beside:
+        theirs = beside.returns(episodes)
+        apart = float(np.abs(returns - theirs).max())
+        said = f"{beside.name}: {interval_of(theirs)}"
+        say(f"{said}; no episode's return differs by more than {apart:.3g}")

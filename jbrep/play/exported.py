@@ -1,0 +1,75 @@
+"""Policies in exported files, played as a robot would run them."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from jbrep.envs.recording import Actor, held
+from jbrep.envs.task import Array, Task
+from jbrep.errors import DamageError, InputError, first_line
+from jbrep.play.player import Player
+from jbrep.records.storage import read_file
+from jbrep.rl.policy_file import MAX_BYTES
+
+
+class Described(msgspec.Struct):
+    """What playing needs of what an exported policy says of itself."""
+
+    task: str
+    action_repeat: Annotated[int, Meta(ge=1)]
+
+
+def read_exported(path: Path) -> tuple[Any, Described]:
+    """The session of onnxruntime that computes a policy's actions, and what the file says of it.
+
+    Raises:
+        InputError: no such file, or no policy that `jbrep policy export` wrote.
+        DamageError: it can't be read.
+    """
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    try:
+        session = onnxruntime.InferenceSession(read_file(path, MAX_BYTES), options)
+    except InputError:
+        raise
+    except Exception as error:  # of several classes
+        raise DamageError(f"{path} is no ONNX model that can be run: {first_line(error)}") from None
+    text = session.get_modelmeta().custom_metadata_map.get("jbrep", "")
+    try:
+        return session, msgspec.json.decode(text, type=Described)
+    except (msgspec.DecodeError, msgspec.ValidationError):
+        raise InputError(f"{path} isn't a policy that jbrep policy export wrote") from None
+
+
+def exported_player(path: Path, task: Task | None = None) -> Player:
+    """The policy in a file, to play its own task or one with the same features.
+
+    Raises:
+        InputError: as `read_exported`, or the task has other features or actions.
+    """
+    from jbrep.envs.description import describe
+
+    session, said = read_exported(path)
+    known = task or describe(said.task)
+    (given,), (made,) = session.get_inputs(), session.get_outputs()
+    sizes = given.shape[1], made.shape[1]
+    if sizes != (known.size, known.action_size):
+        raise InputError(
+            f"{path} takes {sizes[0]} numbers and gives {sizes[1]}, but {known.name} observes "
+            f"{known.size} and acts by {known.action_size}: give its --task"
+        )
+
+    def act(observation: Array) -> NDArray[Any]:
+        (action,) = session.run([made.name], {given.name: observation.astype("float32")})
+        return action
+
+    def begin(task: Task, seeds: Any) -> Actor:
+        return held(act, said.action_repeat)
+
+    return Player(str(path), known, begin)

@@ -1,0 +1,96 @@
+"""Policies for a robot: a file that any runtime of ONNX, or torch alone, computes actions with."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from jbrep.encoders.encoder import Encoder
+from jbrep.errors import InputError, choose
+from jbrep.records.record import to_plain
+from jbrep.records.storage import exists, write_whole
+from jbrep.rl.controller import Controller
+
+
+def export(controller: Controller, path: Path, form: str = "onnx") -> None:
+    """Write a policy as one model from observations, as the robot gives them, to actions.
+
+    Its input is `observation`, (rows, d) float32 in the units of the task's features; its output is
+    `action`, (rows, k) in those of the actuators. `described` is in its metadata, as `jbrep`. Each
+    action is to be held for `action_repeat` control steps, which is for the caller to do.
+
+    Args:
+        controller: of the policy.
+        path: a new file.
+        form: onnx, or torch for a program of torch.export (.pt2).
+
+    Raises:
+        InputError: another form, the encoder is code, or the file exists already.
+    """
+    write = choose(form, _FORMS, "format")
+    if not isinstance(controller.encoder, Encoder):
+        raise InputError(
+            f"the encoder {controller.encoder.name} is code, which a model can't hold: give the "
+            "run an encoder's file, as Encoder.from_torch makes it"
+        )
+    if exists(path):
+        raise InputError(f"{path} exists already: choose another file")
+    write_whole(path, write(controller))
+
+
+def described(controller: Controller) -> dict[str, Any]:
+    """What a file says of its policy: names, units and ranges, the rate, where it comes from."""
+    task, settings = controller.task, controller.settings
+    period = None if task.timestep is None else task.timestep * controller.action_repeat
+    return {
+        "task": task.name,
+        "observation": [
+            {"name": each.name, "unit": each.unit, "low": each.low, "high": each.high}
+            for each in task.features
+        ],
+        "action": {"low": to_plain(task.action_low), "high": to_plain(task.action_high)},
+        "control_period": task.timestep,  # seconds
+        "action_repeat": controller.action_repeat,
+        "rate": None if period is None else 1 / period,  # actions a second
+        "encoder": {"name": controller.encoder.name, "sha256": controller.encoder.fingerprint},
+        "learner": settings.learner,
+        "steps": settings.steps,
+        "seed": settings.seed,
+    }
+
+
+def _onnx(controller: Controller) -> bytes:
+    from jbrep.encoders.onnx import traced  # imports onnx
+
+    encoder, acting = controller.encoder, controller.acting
+    assert isinstance(encoder, Encoder)
+
+    def outputs(observation: Any) -> Iterator[tuple[str, Any]]:
+        yield "action", acting.actions(encoder.arrays.encode(observation))
+
+    model = traced("controller", controller.task.size, outputs, described(controller))
+    return bytes(model.SerializeToString(deterministic=True))
+
+
+def _torch(controller: Controller) -> bytes:
+    import io
+
+    import torch
+
+    encoder, acting = controller.encoder, controller.acting.in_torch()
+
+    class Policy(torch.nn.Module):
+        def forward(self, observation: torch.Tensor) -> torch.Tensor:
+            return acting.actions(encoder.encode(observation))
+
+    rows = torch.export.Dim("rows")
+    program = torch.export.export(
+        Policy(), (torch.zeros(2, controller.task.size),), dynamic_shapes=({0: rows},)
+    )
+    content = io.BytesIO()
+    metadata = {"jbrep": json.dumps(described(controller))}
+    torch.export.save(program, content, extra_files=metadata)
+    return content.getvalue()
+
+
+_FORMS: dict[str, Callable[[Controller], bytes]] = {"onnx": _onnx, "torch": _torch}

@@ -1,0 +1,102 @@
+"""Policies as files for a robot: they act as the runs that they were taken from."""
+
+import json
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from command import jbrep, mistake
+from test_controller import TASK, controller_of, difference_over_an_episode, randomised
+
+from jbrep.envs.description import describe
+from jbrep.errors import InputError
+from jbrep.rl import Run, train
+from jbrep.rl.export import described, export
+
+KINDS = [("sac", "symmetry"), ("ppo", "coordinates"), ("td3", "dae-8"), ("crossq", "full")]
+
+
+@pytest.mark.parametrize(("algorithm", "encoder"), KINDS)
+def test_an_exported_policy_acts_as_its_run(algorithm, encoder, tmp_path):
+    trained = randomised(algorithm, encoder)
+    controller = controller_of(trained)
+    export(controller, tmp_path / "it.onnx")
+    session = onnxruntime.InferenceSession(tmp_path / "it.onnx")
+    said = json.loads(session.get_modelmeta().custom_metadata_map["jbrep"])
+    assert said == json.loads(json.dumps(described(controller)))
+    chosen, step = None, 0
+
+    def act(observation):  # as a robot would
+        nonlocal chosen, step
+        if step % said["action_repeat"] == 0:
+            (chosen,) = session.run(["action"], {"observation": np.float32(observation)[None]})
+        step += 1
+        return chosen[0]
+
+    worst, spread = difference_over_an_episode(trained, act)
+    assert worst < 1e-6
+    assert spread > 1e-3
+
+
+def test_a_program_of_torch_needs_torch_alone(tmp_path):
+    controller = controller_of(randomised("ppo", "symmetry"))
+    export(controller, tmp_path / "it.pt2", "torch")
+    extra = {"jbrep": ""}
+    program = torch.export.load(tmp_path / "it.pt2", extra_files=extra).module()
+    rows = np.random.default_rng(0).normal(size=(5, TASK.size)).astype(np.float32)
+    np.testing.assert_allclose(program(torch.from_numpy(rows)), controller(rows), atol=1e-6)
+    assert json.loads(extra["jbrep"])["task"] == "move_to_pose"
+
+
+def test_what_a_file_says_of_its_policy():
+    said = described(controller_of(randomised("td3", "full")))
+    assert said["observation"][0] == {"name": "position_x", "unit": "m", "low": -2.0, "high": 2.0}
+    assert (said["action_repeat"], said["control_period"]) == (3, 0.01)
+    assert said["rate"] == pytest.approx(100 / 3)
+    assert said["action"] == {"low": [-1.0], "high": [1.0]}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    task = describe("Pendulum-v1", max_episode_steps=30)
+    quick = {"steps": 64, "evaluation_episodes": 1, "final_episodes": 1}
+    train(Run.of(task, "a2c", overrides={"normalize": True}, **quick), folder / "a")
+    done = jbrep("policy", "export", folder / "a", "--out", folder / "a.onnx")
+    assert "3 numbers of Pendulum-v1 to 1, 20 times a second" in done.output
+    return folder / "a"
+
+
+def test_the_returns_of_a_file_are_those_of_its_run(run):
+    model = run.with_suffix(".onnx")
+    done = jbrep("policy", "check", model, "--run", run, "--episodes", 3)
+    assert done.output.startswith(f"Pendulum-v1, {model}: -")
+    assert float(done.output.split()[-1]) < 1e-2
+    alone = jbrep(
+        "policy", "check", model, "--episodes", 1, "--episode-steps", 30, "--task", "Pendulum-v1"
+    )
+    assert alone.output.startswith(f"Pendulum-v1, {model}: -")
+
+
+def test_mistakes_are_a_line(run, tmp_path):
+    model, bad, other = run.with_suffix(".onnx"), tmp_path / "bad.onnx", tmp_path / "other.onnx"
+    exporting, checking = ("policy", "export", run, "--out"), ("policy", "check")
+    assert f"{model} exists already: choose another file" in mistake(*exporting, model)
+    said = mistake(*exporting, tmp_path / "x", "--format", "tflite")
+    assert "unknown format 'tflite': choose one of onnx, torch" in said
+    bad.write_bytes(b"no model")
+    assert "is no ONNX model that can be run: " in mistake(*checking, bad)
+    said = mistake(*checking, model, "--task", "face_direction")
+    assert "takes 3 numbers and gives 1, but face_direction observes 16" in said
+    changed = onnx.load(model)
+    del changed.metadata_props[:]
+    onnx.save(changed, other)
+    assert f"{other} isn't a policy that jbrep policy export wrote" in mistake(*checking, other)
+
+
+def test_an_encoder_that_is_code_cannot_be_exported(tmp_path):
+    trained = randomised("sac", lambda rows: rows[:, :2] * rows[:, 2:4])
+    with pytest.raises(InputError, match="the encoder function is code, which a model can't hold"):
+        export(controller_of(trained), tmp_path / "it.onnx")
