@@ -21,7 +21,7 @@ from jbrep.evaluate.table import SCALARS, Diagnosed, write_diagnostics
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.methods.registry import METHODS
 
-GROUPS = ("data", "encoder")
+GROUPS = ("data", "encoder", "policy")
 COMMANDS = sorted({*main.commands} - {*GROUPS}) + [
     f"{group} {name}" for group in GROUPS for name in sorted(main.commands[group].commands)
 ]
@@ -237,7 +237,7 @@ def test_help_says_which_kind_takes_which_setting_in_80_columns(monkeypatch):
         "--on VALUE What is encoded:",
     ):
         assert line in said
-    assert "[default: extrema]" in said
+    assert "[others: extrema; coordinates, symmetry: standard]" in said
 
 
 def test_a_data_set_from_collecting_to_exporting(tmp_path):

@@ -68,7 +68,7 @@ def evaluate(
     everything: bool,
     as_json: bool,
 ) -> None:
-    """Show which encoders serve a controller, and what each lacks.
+    """Show which encoders serve, and what each lacks.
 
     Judged on the held-out episodes: how well they predict the state and the reward, what they say
     of a good policy's value and action, linear and nonlinear probes, reconstruction, corruption,
