@@ -19,7 +19,8 @@ from jbrep.play.sources import find_player, find_policy
 from jbrep.rl import Run, train
 from jbrep.rl.agent import Evaluator
 from jbrep.rl.files import EPISODES, EVALUATIONS, POLICY, POLICY_ZIP, read_evaluations
-from jbrep.rl.policy import load_run, load_zip
+from jbrep.rl.from_zip import load_zip
+from jbrep.rl.policy import load_run
 from jbrep.rl.policy_file import read
 from jbrep.rl.presets import sb3_class
 
@@ -147,7 +148,7 @@ def test_whoever_plays_the_policy_holds_its_actions(run, tmp_path):
     for episode in np.split(Dataset(tmp_path / "data")["action"][:], 2):
         assert_held(episode)
     shutil.copy(run / POLICY_ZIP, tmp_path / "moved.zip")
-    moved = load_zip(tmp_path / "moved.zip", TASK, "sac", "full", trust=True)
+    moved = load_zip(tmp_path / "moved.zip", TASK, "sac", trust=True).trained
     assert moved.action_repeat == REPEAT
     agent = sb3_class("sac").load(run / POLICY_ZIP)
     assert agent.action_repeat == REPEAT

@@ -32,7 +32,8 @@ from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.checkpoint import History
 from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, POLICY, read_evaluations, read_run
-from jbrep.rl.policy import load_run, load_zip
+from jbrep.rl.from_zip import load_zip
+from jbrep.rl.policy import load_run
 from jbrep.rl.presets import PRESETS, get_preset, sb3_class
 from jbrep.rl.sb3 import restore, take
 from jbrep.rl.settings import COHORT, SB3
@@ -478,9 +479,9 @@ def test_a_zip_file_from_elsewhere_needs_trust(tmp_path):
     SAC("MlpPolicy", make_env(TASK, 1, 0, find("dae-8", TASK)), buffer_size=10).save(path)
     with pytest.raises(InputError, match="runs as code when it is read; add --trust"):
         load_zip(path, TASK, "sac", "dae-8", trust=False)
-    assert load_zip(path, TASK, "sac", "dae-8", trust=True).task == TASK
+    assert load_zip(path, TASK, "sac", "dae-8", trust=True).trained.task == TASK
     for algorithm, encoder in (("sac", "dae-4"), ("ppo", "dae-8"), ("fly", "dae-8")):
-        with pytest.raises(InputError, match=r"is no|unknown algorithm"):
+        with pytest.raises(InputError, match=r"is no|unknown algorithm|observes 8 numbers"):
             load_zip(path, TASK, algorithm, encoder, trust=True)
 
 

@@ -11,6 +11,7 @@ from jbrep.encoders import find
 from jbrep.envs import describe
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
+from jbrep.play.sources import find_player
 from jbrep.records import container
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
@@ -79,6 +80,20 @@ def test_every_algorithm_learns_on_any_task(algorithm, task, short_rollouts, tmp
         assert all(row.episode_return < 0 for row in read_evaluations(tmp_path))
     elif episodes:
         assert max(row["length"] for row in episodes) < HOPPER.max_episode_steps
+
+
+@pytest.mark.parametrize("algorithm", ["a2c", "ppo", "trpo", "sac"])
+def test_the_units_of_actions_do_not_matter(algorithm, short_rollouts, tmp_path):
+    """Pulses of 1,000 to 2,000 us would be clipped nearly always, were they not scaled."""
+    played = []
+    for name in (cart.ID, cart.SERVO):
+        run = Run.of(name, algorithm=algorithm, steps=160, evaluation_episodes=2)
+        assert train(run, tmp_path / str(len(played))).status == "finished"
+        rows = read_evaluations(tmp_path / str(len(played)))
+        played.append([row.episode_return for row in rows])
+    np.testing.assert_allclose(*played, rtol=0.01)
+    (rollout,) = find_player(str(tmp_path / "1")).play([0])
+    assert 1000 <= rollout.action.min() < rollout.action.max() <= 2000
 
 
 def test_evaluations_are_in_the_order_of_their_starts():

@@ -37,8 +37,9 @@ from jbrep.rl.files import (
     read_evaluations,
     read_run,
 )
+from jbrep.rl.from_zip import load_zip
 from jbrep.rl.job import Scalars
-from jbrep.rl.policy import load_run, load_untrained, load_zip
+from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.policy_file import read
 from jbrep.study.results import conclude
 
@@ -278,7 +279,7 @@ def test_a_file_from_elsewhere_must_be_a_regular_one(tmp_path):
         path.unlink()
     A2C("MlpPolicy", make_env(TASK, 1, 0, find("dae-8", TASK))).save(tmp_path / "real.zip")
     path.symlink_to(tmp_path / "real.zip")
-    assert load_zip(path, TASK, "a2c", "dae-8", trust=True).task == TASK
+    assert load_zip(path, TASK, "a2c", "dae-8", trust=True).trained.task == TASK
 
 
 def test_a_run_under_way_plays_its_checkpoint(under_way, trained):

@@ -22,9 +22,10 @@ from jbrep.report.tables import read_tables
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, statistics_of
 from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, RUN, read_evaluations, read_run
+from jbrep.rl.from_zip import load_zip
 from jbrep.rl.learner import Learner, preset_text, read_preset, usual_name
 from jbrep.rl.overrides import overridden, setting_names
-from jbrep.rl.policy import load_run, load_untrained, load_zip
+from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.presets import sb3_class
 from jbrep.rl.settings import CLASSES
 from jbrep.study.config import as_study, read_study
@@ -311,7 +312,7 @@ def test_normalisation_is_resumed_evaluated_and_read_back(run, tmp_path):
     told = [json.loads(line) for line in evaluated(run, tmp_path / "without")]
     assert told[0]["returns"] != told[1]["returns"]
     shutil.copy(run / POLICY_ZIP, tmp_path / "moved.zip")
-    moved = load_zip(tmp_path / "moved.zip", TASK, "sac", "full", trust=True)
+    moved = load_zip(tmp_path / "moved.zip", TASK, "sac", trust=True).trained
     observations = np.zeros((2, TASK.size))
     acts = [each.begin(TASK, [0, 1])(observations) for each in (moved, ours)]
     np.testing.assert_array_equal(*acts)

@@ -1,7 +1,7 @@
 """What policies do."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -35,6 +35,12 @@ _TASK = "face_direction"
 @task_options
 @click.option("--algorithm", default="sac", show_default=True, help="Of a zip file.")
 @click.option(
+    "--vecnormalize",
+    type=PATH,
+    metavar="FILE",
+    help="What VecNormalize.save wrote, if a zip file's agent was trained behind that.",
+)
+@click.option(
     "--encoder",
     help="What a zip file was trained on, or what a policy by name observes through: a file, the "
     "name of one that ships, or code, mymodule:MyEncoder; of a run that was made with code, that.",
@@ -45,6 +51,7 @@ def evaluate_policy(
     episodes: int,
     trust: bool,
     algorithm: str,
+    vecnormalize: Path | None,
     encoder: str | None,
     as_json: bool,
     **options: Any,
@@ -52,17 +59,20 @@ def evaluate_policy(
     """Show the returns of a policy.
 
     POLICY is a folder of jbrep rl, a zip file that stable-baselines3 wrote, or a policy by its
-    name, such as heuristic, or trained, which ships; a zip file and a name need a --task, which is
-    face_direction if not given. A run that is under way or was stopped plays its last checkpoint.
-    Of a folder only numbers are read. A zip file from elsewhere runs as code when it is opened, so
-    it needs --trust. A policy by name may act on what an encoder's latent is decoded to: the return
-    that it loses measures what the latent lacks.
+    name, such as heuristic, or trained, which ships; a name needs a --task, which is face_direction
+    if not given, and a zip file does unless jbrep wrote it. A run that is under way or was stopped
+    plays its last checkpoint. Of a folder only numbers are read. A zip file from elsewhere runs as
+    code when it is opened, so it needs --trust; its agent sees what the environment gives, unless
+    jbrep wrote it, or --encoder and --vecnormalize say what it was trained on. A policy by name may
+    act on what an encoder's latent is decoded to: the return that it loses measures what the latent
+    lacks.
     """
     from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import source_of
 
     import_code(encoder)
-    player = _find(policy, given_task(options), algorithm, encoder, trust)
+    zip_file = _Zip(algorithm, trust, vecnormalize)
+    player = _find(policy, given_task(options), encoder, zip_file)
     source = None if encoder is None else source_of(encoder, player.task)
     returns = player.returns(episodes)
     if as_json:
@@ -95,11 +105,27 @@ def _title(policy: str, player: "Player") -> str:
     return f"{player.task.name} on {player.representation}{step}"
 
 
-def _find(
-    policy: str, task: "Task | None", algorithm: str, encoder: str | None, trust: bool
-) -> "Player":
+class _Zip(NamedTuple):
+    """What is said of a zip file."""
+
+    algorithm: str
+    trust: bool
+    vecnormalize: Path | None
+
+    def player(self, path: Path, task: "Task | None", encoder: str | None) -> "Player":
+        """The policy in it; what it doesn't tell is noted."""
+        from jbrep.play.sources import as_player
+        from jbrep.rl.from_zip import load_zip  # imports torch
+
+        found = load_zip(path, task, self.algorithm, encoder, self.trust, self.vecnormalize)
+        if found.note:
+            say(f"note: {found.note}", err=True)
+        return as_player(str(path), found.trained, task)
+
+
+def _find(policy: str, task: "Task | None", encoder: str | None, zip_file: _Zip) -> "Player":
     """The policy of a run, by name, or in a zip file."""
-    from jbrep.encoders import FULL, find
+    from jbrep.encoders import find
     from jbrep.envs.description import describe
     from jbrep.play import sources
     from jbrep.records.storage import exists
@@ -107,6 +133,9 @@ def _find(
     path, folder = Path(policy), sources.run_folder(policy)
     if sources.is_by_name(policy):
         task = task or describe(_TASK)
+    is_zip = not (sources.is_by_name(policy) or sources.is_trained(policy) or path.is_dir())
+    if zip_file.vecnormalize and not is_zip:
+        raise InputError("--vecnormalize is for zip files: others have their own statistics")
     if sources.is_trained(policy) or (exists(path) and path.is_dir()):
         if encoder and not (folder and encoder == _code_of(folder)):
             raise InputError(
@@ -121,10 +150,7 @@ def _find(
             f"no policy at {policy}: a folder of jbrep rl is needed, a zip file of "
             f"stable-baselines3, or a name: {sources.policy_names()}"
         )
-    from jbrep.rl.policy import load_zip  # imports torch
-
-    task = task or describe(_TASK)
-    return sources.as_player(policy, load_zip(path, task, algorithm, encoder or FULL, trust))
+    return zip_file.player(path, task, encoder)
 
 
 def _code_of(folder: Path) -> str | None:

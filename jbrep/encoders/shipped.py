@@ -52,6 +52,15 @@ def unlearned(task: Task, name: str = FULL) -> Encoder:
     return _scaled(task, name, tried_coordinates(task, _UNLEARNED[name]))
 
 
+def unscaled(task: Task) -> Encoder:
+    """The encoder that leaves a task's observation as it is, in physical units."""
+    header = EncoderHeader(
+        kind=FULL, name="observation", environment=task, training={}, metrics={HELD_OUT_MSE: 0.0}
+    )
+    high = np.ones(task.size, np.float32)
+    return Encoder(header, Scaler(-high, high, None), (), ())
+
+
 def _scaled(task: Task, name: str, coordinates: Coordinates | None) -> Encoder:
     """The encoder that only scales, by usual ranges as far as they are known."""
     features = coordinates.features if coordinates else task.features

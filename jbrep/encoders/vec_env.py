@@ -19,17 +19,17 @@ Float32 = NDArray[np.float32]
 
 
 def agent_spaces(task: Task, encoder: BaseEncoder | None) -> tuple[spaces.Box, spaces.Box]:
-    """The spaces of what an agent observes and of its actions."""
+    """The spaces of what an agent observes and of its actions, which are scaled to [-1, 1]."""
     size = encoder.latent_size if encoder else task.size
-    low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
-    return spaces.Box(-np.inf, np.inf, (size,), np.float32), spaces.Box(low, high)
+    return spaces.Box(-np.inf, np.inf, (size,), np.float32), spaces.Box(-1, 1, (task.action_size,))
 
 
 class JitterbugVecEnv(VecEnv):
     """Many lanes of a task for stable-baselines3, stepped together where that is possible.
 
     Observations are float32, scaled by the task's usual ranges. With an encoder the agent sees
-    latents instead, terminal ones too; the encoder gets observations in physical units.
+    latents instead, terminal ones too; the encoder gets observations in physical units. Actions are
+    scaled to [-1, 1] from their bounds, whatever these are.
 
     The first episode of lane i has the seed `seed + i`, as in a Gymnasium environment; episode k
     from 1 on has a number below 2^31 drawn from (seed + i, k), so that each episode can be played
@@ -83,7 +83,6 @@ class JitterbugVecEnv(VecEnv):
         self._endless = Endless(task, num_envs, num_threads, action_repeat)
         self.lanes = self._endless.lanes
         observation_space, action_space = agent_spaces(task, self._encoder)
-        self._low, self._high = np.array(task.action_low), np.array(task.action_high)
         self._actions = np.zeros((num_envs, task.action_size))
         super().__init__(num_envs, observation_space, action_space)
         self.seed(seed)
@@ -96,13 +95,9 @@ class JitterbugVecEnv(VecEnv):
         return self._represent(observation)
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
-        """Keep the actions, (num_envs, k), for `step_wait`.
-
-        An algorithm that works on actions in [-1, 1] rounds when it scales them to their bounds,
-        and may leave these by a bit: they are clipped.
-        """
+        """Keep the actions, (num_envs, k), for `step_wait`; they are clipped to [-1, 1]."""
         checked = check_actions(actions, self.num_envs, self.task.action_size)
-        self._actions = np.minimum(np.maximum(checked, self._low), self._high)
+        self._actions = self.task.unscale_action(checked)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Hold the actions for a step of every lane; where an episode ends, start the next."""

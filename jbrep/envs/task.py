@@ -251,6 +251,16 @@ class Task(Record, frozen=True):
         centre, half_width = self._centre_and_half_width
         return scaled * half_width + centre
 
+    @cached_property
+    def _action_bounds(self) -> tuple[Array, Array]:
+        return np.array(self.action_low), np.array(self.action_high)
+
+    def unscale_action(self, scaled: NDArray[np.floating]) -> Array:
+        """Actions (..., k) from those that are scaled to [-1, 1]; whatever is beyond is clipped."""
+        low, high = self._action_bounds
+        action = np.minimum(np.maximum(scaled, -1), 1) * ((high - low) / 2) + (high + low) / 2
+        return np.minimum(np.maximum(action, low), high)  # where they round to beyond
+
     def split(self, observation: NDArray[_Float]) -> dict[str, NDArray[_Float]]:
         """Split flat observations (..., d) by group; the parts are views."""
         return {name: observation[..., place] for name, place in self.groups.items()}

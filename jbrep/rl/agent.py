@@ -9,6 +9,8 @@ from typing import Any, cast
 import gymnasium
 import numpy as np
 import torch
+from gymnasium import spaces
+from gymnasium.spaces.utils import flatdim
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -53,9 +55,9 @@ def make_env(
     return normalized(VecMonitor(lanes)) if normalize else VecMonitor(lanes)
 
 
-def one_line(error: Exception) -> str:
-    """An error's text for a message."""
-    return textwrap.shorten(str(error), 200)
+def one_line(told: object) -> str:
+    """The text of an error, or of what else is to be named, for a message."""
+    return textwrap.shorten(str(told), 200)
 
 
 class Spaces(gymnasium.Env[Any, Any]):
@@ -160,7 +162,8 @@ def unchecked_distributions() -> Iterator[None]:
 def deterministic(policy: BasePolicy, task: Task, see: See, batch_size: int | None = None) -> Actor:
     """The policy's most likely actions, within their bounds despite rounding.
 
-    They are not finite where its weights aren't.
+    They are not finite where its weights aren't. A policy whose own actions are in [-1, 1] has them
+    scaled to the task's bounds.
 
     Args:
         policy: which to play.
@@ -171,20 +174,39 @@ def deterministic(policy: BasePolicy, task: Task, see: See, batch_size: int | No
     """
     policy.set_training_mode(False)
     low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
+    is_scaled = is_action_scaled(policy.action_space)
 
     def act(observation: Array) -> NDArray[np.float32]:
         size = batch_size or len(observation)
         batches = torch.from_numpy(observation.astype(np.float32)).split(size)
         with single_torch_thread(), torch.no_grad(), unchecked_distributions():
             chosen = [
-                policy._predict(torch.as_tensor(see(each.numpy())), deterministic=True)
+                policy._predict(_as_observed(policy.observation_space, see(each.numpy())), True)
                 for each in batches
             ]
         actions = torch.cat(chosen).numpy()
-        scaled = policy.unscale_action(actions) if policy.squash_output else actions
-        return np.clip(scaled, low, high)
+        own = policy.unscale_action(actions) if policy.squash_output else actions
+        return np.clip(task.unscale_action(own).astype(np.float32) if is_scaled else own, low, high)
 
     return act
+
+
+def _as_observed(space: gymnasium.Space[Any], rows: NDArray[np.float32]) -> Any:
+    """Flat rows (n, d) in the form in which a policy takes the observations of its space."""
+    if isinstance(space, spaces.Dict):
+        ends = np.cumsum([flatdim(part) for part in space.spaces.values()])[:-1]
+        parts = zip(space.spaces.items(), np.split(rows, ends, 1), strict=True)
+        return {name: _as_observed(part, own) for (name, part), own in parts}
+    if isinstance(space, spaces.Discrete):
+        return torch.as_tensor(rows.argmax(1))
+    return torch.as_tensor(rows.reshape(len(rows), *(space.shape or ())))
+
+
+def is_action_scaled(space: gymnasium.Space[Any]) -> bool:
+    """Whether actions in a space are scaled to [-1, 1]."""
+    if not isinstance(space, spaces.Box):
+        return False
+    return bool((space.low == -1).all() and (space.high == 1).all())
 
 
 def seeing(encode: See, statistics: Statistics | None) -> See:

@@ -141,7 +141,7 @@ class CheckpointHeader(Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep checkpoint"
-    format_version = 2
+    format_version = 3
 
     settings: RunSettings
     versions: Mapping[Line, Line]

@@ -177,13 +177,30 @@ class PolicyHeader(Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep policy"
-    format_version = 3
+    format_version = 4
 
     settings: RunSettings
     encoder: dict[str, Any] | None
     run: Line
     step: Annotated[int, Meta(ge=0, le=MAX_STEPS)]
     finished: bool
+
+
+class ZipHeader(Document, frozen=True, kw_only=True):
+    """What policy.zip says beside what stable-baselines3 reads.
+
+    Attributes:
+        environment: of the run.
+        encoder: the fingerprint of that through which its agent observes.
+        representation: what tables call that.
+    """
+
+    format = "jbrep policy.zip"
+    format_version = 1
+
+    environment: Task
+    encoder: Sha256
+    representation: Name
 
 
 class Episode(NamedTuple):

@@ -195,7 +195,7 @@ class Job:
         write_rows(self.folder / EVALUATIONS, self.history.evaluations, Evaluation)
         if policy:
             write_whole(self.folder / POLICY, policy)
-            write_whole(self.folder / POLICY_ZIP, policy_zip(agent))
+            write_whole(self.folder / POLICY_ZIP, policy_zip(agent, self.settings))
         result = RunRecord(
             status=FAILED if failure else FINISHED,
             reason=f"{_one_line(failure)} after {steps:,} steps" if failure else None,

@@ -15,15 +15,25 @@ from jbrep.errors import DamageError
 CLIP = 10.0  # standard deviations
 _EPSILON = 1e-8  # added to the variance
 _PREFIX = "statistics."  # begins the names of the tensors
+_KEPT = ("mean", "variance", "count")  # in files: jbrep's own have one clip and epsilon
 
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """The running mean and variance of each of the numbers that an agent sees."""
+    """The running mean and variance of each of the numbers that an agent sees.
+
+    Attributes:
+        mean, variance: of each number.
+        count: of observations.
+        clip: the limit of what is normalised, in standard deviations; of all or of each number.
+        epsilon: added to the variance.
+    """
 
     mean: Array  # (size,)
     variance: Array  # (size,)
-    count: float  # of observations
+    count: float
+    clip: Array | float = CLIP
+    epsilon: float = _EPSILON
 
     @classmethod
     def untrained(cls, size: int) -> "Statistics":
@@ -65,7 +75,7 @@ class Statistics:
     @property
     def tensors(self) -> dict[str, NDArray[Any]]:
         """Themselves by names, for a file."""
-        return {_PREFIX + name: np.asarray(value) for name, value in vars(self).items()}
+        return {_PREFIX + name: np.asarray(getattr(self, name)) for name in _KEPT}
 
     @property
     def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -75,8 +85,8 @@ class Statistics:
 
     def __call__(self, seen: NDArray[np.float32]) -> NDArray[np.float32]:
         """What an agent sees, (n, size), normalised as in training."""
-        scaled = (seen - self.mean) / np.sqrt(self.variance + _EPSILON)
-        return np.clip(scaled, -CLIP, CLIP).astype(np.float32)
+        scaled = (seen - self.mean) / np.sqrt(self.variance + self.epsilon)
+        return np.clip(scaled, -self.clip, self.clip).astype(np.float32)
 
     def give(self, env: VecNormalize) -> None:
         """Let an environment continue from them."""

@@ -1,6 +1,5 @@
-"""Trained policies, read back from the folders of runs and from stable-baselines3's files."""
+"""Trained policies, read back from the folders of runs."""
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +7,9 @@ from jbrep.encoders import find, load
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.code import make
 from jbrep.encoders.encoder import as_file
-from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
 from jbrep.records.record import to_plain
-from jbrep.records.storage import exists, read_file
-from jbrep.rl.agent import Spaces, action_repeat, one_line
+from jbrep.records.storage import exists
 from jbrep.rl.checkpoint import PARAMETERS, read_checkpoint, without
 from jbrep.rl.files import (
     BEGINNING,
@@ -25,11 +22,8 @@ from jbrep.rl.files import (
     read_finished,
     read_run,
 )
-from jbrep.rl.normalization import Statistics
 from jbrep.rl.overrides import check_shape
-from jbrep.rl.policy_file import MAX_BYTES, Trained, acting, build, read
-from jbrep.rl.policy_zip import statistics_in
-from jbrep.rl.presets import sb3_class
+from jbrep.rl.policy_file import Trained, acting, build, read
 from jbrep.training.trainer import single_torch_thread
 
 
@@ -97,37 +91,6 @@ def run_settings(folder: Path) -> RunSettings:
     if exists(folder / RUN):
         return read_run(folder).settings
     return read_checkpoint(folder / CHECKPOINT)[1].settings
-
-
-def load_zip(path: Path, task: Task, algorithm: str, encoder: str, trust: bool) -> Trained:
-    """The policy of a stable-baselines3 zip file from elsewhere.
-
-    Args:
-        path: the file.
-        task: which the policy was trained on.
-        algorithm: a key of CLASSES.
-        encoder: what the policy was trained on: a file, or the name of one that ships.
-        trust: whether the file may run code; without it nothing is read.
-
-    Raises:
-        InputError: it isn't trusted, is no such file, or fits neither task nor encoder.
-    """
-    if not trust:
-        raise InputError(
-            f"{path} is not in a folder of jbrep rl: stable-baselines3 files hold pickled Python, "
-            "which runs as code when it is read; add --trust if you know who made it"
-        )
-    kind, seen = sb3_class(algorithm), find(encoder, task)
-    raw = read_file(path.resolve(), MAX_BYTES)
-    try:
-        agent = kind.load(io.BytesIO(raw), Spaces(task, seen), device="cpu")
-        tensors = statistics_in(raw)
-    except Exception as error:  # whatever its pickled parts do
-        reason = one_line(error)
-        raise InputError(f"{path} is no {algorithm} policy for {task.name}: {reason}") from None
-    statistics = Statistics.read(tensors, seen.latent_size, path) if tensors else None
-    repeat = action_repeat(agent)
-    return Trained(agent.policy, task, seen, statistics=statistics, action_repeat=repeat)
 
 
 def _untrained(folder: Path, settings: RunSettings, given: Any) -> Trained:

@@ -3,7 +3,8 @@
 import io
 import json
 import zipfile
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import safetensors.numpy
 import stable_baselines3
@@ -12,9 +13,12 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import data_to_json
 
+from jbrep.records.document import document_from, parse_json
 from jbrep.rl.agent import statistics_of
+from jbrep.rl.files import RunSettings, ZipHeader
 
 STATISTICS = "observation_statistics.safetensors"  # by which an agent normalises what it sees
+_HEADER = "jbrep.json"
 _OF_TRAINING = {
     "action_noise",  # which may be jbrep's own
     "replay_buffer_class",  # `load` finds the one for n_steps, and warns of one that is given
@@ -30,12 +34,19 @@ _OF_THIS_PROCESS = {  # wall times, and where the environment was: `load` starts
 }
 
 
-def policy_zip(agent: BaseAlgorithm) -> bytes:
+class Told(NamedTuple):
+    """What a zip file that jbrep wrote says beside what stable-baselines3 reads."""
+
+    header: ZipHeader
+    statistics: dict[str, NDArray[Any]]  # see `jbrep.rl.normalization.Statistics`; perhaps none
+
+
+def policy_zip(agent: BaseAlgorithm, settings: RunSettings) -> bytes:
     """A zip file that the algorithm's `load` takes, as its `save` writes it.
 
     Unlike there, members carry a fixed date, whatever the clock says, and nothing in them depends
-    on the process or the machine. Statistics by which the agent normalises what it sees are a
-    member that `load` leaves alone.
+    on the process or the machine. What the agent observes through, and statistics by which it
+    normalises that, are members that `load` leaves alone.
     """
     names, variables = agent._get_torch_save_params()
     left_out = {*agent._excluded_save_params(), *_OF_THIS_PROCESS, *_OF_TRAINING}
@@ -47,6 +58,7 @@ def policy_zip(agent: BaseAlgorithm) -> bytes:
         "pytorch_variables.pth": _to_bytes({name: getattr(agent, name) for name in variables}),
         **{f"{name}.pth": _to_bytes(state) for name, state in agent.get_parameters().items()},
         "_stable_baselines3_version": stable_baselines3.__version__,
+        _HEADER: _header(settings).text(),
         **({STATISTICS: safetensors.numpy.save(statistics.tensors)} if statistics else {}),
     }
     content = io.BytesIO()
@@ -56,15 +68,28 @@ def policy_zip(agent: BaseAlgorithm) -> bytes:
     return content.getvalue()
 
 
-def statistics_in(raw: bytes) -> dict[str, NDArray[Any]]:
-    """The statistics in a zip file's bytes; nothing if it has none.
+def told_by(raw: bytes, path: Path) -> Told | None:
+    """What a zip file's bytes say; None if jbrep didn't write them. The path is for messages.
 
     Raises:
         Exception: of many types, for a file that isn't one.
     """
     members = zipfile.ZipFile(io.BytesIO(raw))
-    found = STATISTICS in members.namelist()
-    return safetensors.numpy.load(members.read(STATISTICS)) if found else {}
+    names = members.namelist()
+    if _HEADER not in names:
+        return None
+    said = parse_json(members.read(_HEADER), path, ZipHeader.format)
+    has_statistics = STATISTICS in names
+    statistics = safetensors.numpy.load(members.read(STATISTICS)) if has_statistics else {}
+    return Told(document_from(said, path, ZipHeader), statistics)
+
+
+def _header(settings: RunSettings) -> ZipHeader:
+    return ZipHeader(
+        environment=settings.environment,
+        encoder=settings.encoder,
+        representation=settings.representation,
+    )
 
 
 def _to_json(data: dict[str, Any]) -> str:

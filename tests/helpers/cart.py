@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-ID = "Test/Cart-v0"
+ID, SERVO = "Test/Cart-v0", "Test/Servo-v0"
 LIMIT = 20
 _drift = itertools.count()
 
@@ -32,7 +32,7 @@ class Cart(gymnasium.Env):
         return self.state.astype(np.float32), {}
 
     def step(self, action):
-        assert self.action_space.contains(action), action
+        assert Cart.action_space.contains(action), action
         self.steps += 1
         if self.fails and self.steps == 7:
             raise RuntimeError("the motor\x1b[2J is broken" + "!" * 2000 + "\nand more")
@@ -41,4 +41,16 @@ class Cart(gymnasium.Env):
         return self.state.astype(np.float32), -abs(self.state[0]), terminated, False, {}
 
 
+class Servo(Cart):
+    """The cart, driven by pulse widths [us]."""
+
+    action_space = spaces.Box(1000, 2000, (2,), np.float32)
+
+    def step(self, action):
+        low, high = Cart.action_space.low, Cart.action_space.high
+        share = (action.astype(np.float64) - 1000) / 1000
+        return super().step((low + share * (high - low)).astype(np.float32).clip(low, high))
+
+
+gymnasium.register(SERVO, entry_point=Servo, max_episode_steps=LIMIT)
 gymnasium.register(ID, entry_point=Cart, max_episode_steps=LIMIT)

@@ -67,9 +67,10 @@ class Cohort:
         Raises:
             EnvironmentFailedError: an environment fails; `member_of` its lane says whose it is.
         """
-        scaled, space = self._choose_actions(), self._shared.action_space
-        action = self._shared.policy.unscale_action(scaled).clip(space.low, space.high)
-        moved = self._endless.step(action.reshape(-1, action.shape[2]).astype(float))
+        scaled = self._choose_actions()
+        action = self._shared.policy.unscale_action(scaled)
+        lanes = action.reshape(-1, action.shape[2]).astype(float)
+        moved = self._endless.step(self._endless.lanes.task.unscale_action(lanes))
         self.agent_step += self._lanes
         ended, terminated = self._by_member(moved.ended), self._by_member(moved.terminated)
         reward = self._by_member(moved.reward).astype(np.float32)

@@ -1,0 +1,173 @@
+"""stable-baselines3's zip files from elsewhere: each plays as it was trained to see and act."""
+
+import json
+import shutil
+
+import gymnasium
+import numpy as np
+import pytest
+from command import jbrep, mistake
+from gymnasium import spaces
+from stable_baselines3 import DDPG, PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from jbrep.encoders import save
+from jbrep.encoders.shipped import unscaled
+from jbrep.envs import describe
+from jbrep.rl import Run, train
+from jbrep.rl.files import EVALUATION_SEED, POLICY_ZIP, last_returns, read_evaluations
+
+LIMIT = 20
+PENDULUM = describe("Pendulum-v1", max_episode_steps=LIMIT)
+
+
+class Far(gymnasium.ObservationWrapper):
+    """Observations far from 0, in an array or in a dictionary with a side."""
+
+    def __init__(self, env, as_dict=False):
+        super().__init__(env)
+        self.as_dict = as_dict
+        self.observation_space = spaces.Box(-np.inf, np.inf, (3,))
+        if as_dict:
+            speed, angle = spaces.Box(-9e4, 9e4, (1,)), spaces.Box(-np.inf, np.inf, (2, 1))
+            parts = {"speed": speed, "angle": angle, "side": spaces.Discrete(2)}
+            self.observation_space = spaces.Dict(parts)
+
+    def observation(self, observation):
+        far = (observation * [100, 100, 1000] + [5000, -300, 0]).astype(np.float32)
+        if not self.as_dict:
+            return far
+        return {"speed": far[2:], "angle": far[:2, None], "side": int(observation[1] > 0)}
+
+
+class Driven(gymnasium.ActionWrapper):
+    """Torques given by numbers in another range."""
+
+    def __init__(self, env, low, high):
+        super().__init__(env)
+        self.action_space = spaces.Box(low, high, (1,))
+
+    def action(self, action):
+        low, high = self.action_space.low, self.action_space.high
+        return (action - low) / (high - low) * 4 - 2
+
+
+def make(as_dict=False):
+    pendulum = gymnasium.make("Pendulum-v1", max_episode_steps=LIMIT).unwrapped
+    return Driven(Far(pendulum, as_dict), 0, 10)
+
+
+gymnasium.register("Test/Far-v0", entry_point=make, max_episode_steps=LIMIT)
+gymnasium.register(
+    "Test/FarParts-v0", entry_point=make, max_episode_steps=LIMIT, kwargs={"as_dict": True}
+)
+
+
+def saved(path, task, kind=PPO, normalizes=True, **arguments):
+    """An agent that saw some steps of a task, its statistics beside it, and what it returns."""
+    policy = "MultiInputPolicy" if "Parts" in task else "MlpPolicy"
+    env = DummyVecEnv([lambda: gymnasium.make(task)])
+    if normalizes:
+        keys = ["speed", "angle"] if "Parts" in task else None
+        env = VecNormalize(env, clip_obs=1.5, norm_obs_keys=keys)
+    agent = kind(policy, env, seed=3, device="cpu", policy_kwargs={"net_arch": [16]}, **arguments)
+    if kind is PPO:
+        agent.policy.action_net.weight.data *= 300  # which begin near 0
+    env.seed(0), env.reset()
+    for number in range(40):
+        env.step(np.full((1, 1), np.sin(number)))
+    agent.save(path)
+    if normalizes:
+        env.save(path.with_name("vecnormalize.pkl"))
+    one, returns = gymnasium.make(task), []
+    for episode in range(3):
+        observation, _ = one.reset(seed=EVALUATION_SEED + episode)
+        total, ended = 0.0, False
+        while not ended:
+            seen = env.normalize_obs(observation) if normalizes else observation
+            action, _ = agent.predict(seen, deterministic=True)
+            observation, reward, terminated, truncated, _ = one.step(action)
+            total, ended = total + reward, terminated or truncated
+        returns.append(total)
+    return returns
+
+
+def played(path, task, *options, algorithm="ppo"):
+    told = jbrep(
+        *("evaluate-policy", path, "--trust", "--task", task, "--algorithm", algorithm),
+        *("--episodes", 3, "--json", *options),
+    )
+    assert told.exit_code == 0, told.output
+    return np.array(json.loads(told.stdout)["returns"]), told.stderr
+
+
+@pytest.mark.parametrize("task", ["Test/Far-v0", "Test/FarParts-v0"])
+def test_an_agent_sees_by_the_statistics_that_it_was_trained_with(task, tmp_path):
+    path, statistics = tmp_path / "agent.zip", tmp_path / "vecnormalize.pkl"
+    expected = saved(path, task, n_steps=8, batch_size=8)
+    returns, said = played(path, task, "--vecnormalize", statistics)
+    np.testing.assert_allclose(returns, expected, rtol=1e-4)
+    assert said == ""
+    returns, said = played(path, task)
+    assert not np.allclose(returns, expected, rtol=1e-2)
+    assert said.startswith(f"note: {path} doesn't say what its agent was trained to see")
+    assert f"--vecnormalize {statistics}" in said
+    assert said.count("\n") == 1
+
+
+def test_a_zip_file_has_its_own_spaces_and_sees_what_the_environment_gives(tmp_path):
+    path = tmp_path / "agent.zip"
+    expected = saved(path, "Test/Far-v0", DDPG, normalizes=False, buffer_size=50)
+    returns, said = played(path, "Test/Far-v0", algorithm="ddpg")
+    np.testing.assert_allclose(returns, expected, rtol=1e-4)
+    assert said.startswith("note: ")
+    scaled, _ = played(path, "Test/Far-v0", "--encoder", "full", algorithm="ddpg")
+    assert scaled.tolist() == returns.tolist()  # nothing is known by which to scale
+
+
+def test_what_jbrep_wrote_tells_what_it_sees_and_how_it_acts(tmp_path):
+    """Its observations are scaled, its actions scaled to [-1, 1] and held."""
+    run = Run.of(
+        PENDULUM,
+        algorithm="a2c",
+        overrides={"normalize": True, "action_repeat": 2, "net_arch": [8]},
+        steps=64,
+        evaluation_episodes=3,
+        final_episodes=3,
+    )
+    assert train(run, tmp_path / "run").status == "finished"
+    path = shutil.copy(tmp_path / "run" / POLICY_ZIP, tmp_path / "moved.zip")
+    returns, said = played(path, "Pendulum-v1", "--episode-steps", LIMIT, algorithm="a2c")
+    alone = jbrep("evaluate-policy", path, "--trust", "--algorithm", "a2c", "--episodes", 3)
+    assert "Pendulum-v1 on full: median return" in alone.stdout
+    np.testing.assert_allclose(returns, last_returns(read_evaluations(tmp_path / "run")), atol=1e-2)
+    assert said == ""
+    given = ("evaluate-policy", path, "--trust", "--task", "Pendulum-v1", "--algorithm", "a2c")
+    refused = mistake(*given, "--vecnormalize", tmp_path / "any.pkl")
+    assert "has the statistics that it needs: leave out --vecnormalize" in refused
+    save(unscaled(PENDULUM), tmp_path / "other.safetensors")
+    refused = mistake(*given, "--encoder", tmp_path / "other.safetensors")
+    assert "was trained on full, which isn't this observation: give that" in refused
+
+
+def test_what_does_not_fit_is_named_in_one_line(tmp_path):
+    path, statistics = tmp_path / "agent.zip", tmp_path / "vecnormalize.pkl"
+    saved(path, "Test/FarParts-v0", n_steps=8, batch_size=8)
+    given = ("evaluate-policy", path, "--algorithm", "ppo", "--trust", "--task")
+    assert "observes 5 numbers, where Test/Far-v0 has 3" in mistake(*given, "Test/Far-v0")
+    saved(path, "Test/Far-v0", n_steps=8, batch_size=8)
+    assert f"{statistics} isn't what VecNormalize.save wrote for this policy" in mistake(
+        *given, "Test/Far-v0", "--vecnormalize", __file__
+    ).replace(__file__, str(statistics))
+    saved(tmp_path / "parts.zip", "Test/FarParts-v0", n_steps=8, batch_size=8)
+    assert "its statistics are of other observations" in mistake(
+        *given, "Test/Far-v0", "--vecnormalize", statistics
+    )
+    untrusted = ("evaluate-policy", path, "--vecnormalize", statistics)
+    assert "add --trust if you know who made it" in mistake(*untrusted)
+    by_name = ("evaluate-policy", "uniform", "--vecnormalize", statistics)
+    assert "--vecnormalize is for zip files" in mistake(*by_name)
+    PPO("MlpPolicy", Driven(gymnasium.make("Pendulum-v1"), 1000, 2000), device="cpu").save(path)
+    assert "where Pendulum-v1 acts from -2 to 2: its bounds must be these, or -1 to 1" in (
+        mistake(*given, "Pendulum-v1")
+    )
