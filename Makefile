@@ -16,14 +16,14 @@ help: ## what there is to make
 
 setup: $(READY) ## a virtual environment with everything in it
 $(READY): $(READY_DEMO)
-	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[cluster,export,learn,render,suite,tune,view,wandb,dev]'
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[cluster,dm-control,export,learn,render,suite,tune,view,wandb,dev]'
 	@touch $@
 
 $(READY_DEMO): pyproject.toml constraints.txt
-	@case "$(VERSION)" in 3.11|3.12) ;; *) echo "jbrep needs Python 3.11 or 3.12, and $(PYTHON) is" \
+	@case "$(VERSION)" in 3.11|3.12) ;; *) echo "this needs Python 3.11 or 3.12, and $(PYTHON) is" \
 	  "'$(VERSION)' (dm-control's labmaze has no wheels for newer ones): make PYTHON=python3.12 ..."; exit 2;; esac
 	test -d $(VENV)/lib/python$(VERSION) || $(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[learn,view]'
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dm-control,learn,view]'
 	@touch $@
 
 demo: $(READY_DEMO) ## the whole job in minutes: collect, train and judge encoders, learn, report, record

@@ -14,6 +14,7 @@ from packaging.requirements import Requirement
 
 EXTRAS = {  # what each extra is for; the empty name stands for the core
     "": "the robot and its environments, collect, data",
+    "dm-control": "jbrep.jitterbug.load, which gives dm_control environments",
     "learn": "train-dae, train-encoder, evaluate, rl, study, report",
     "cluster": "collect and study --backend ray",
     "render": "render",

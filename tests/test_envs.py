@@ -275,3 +275,26 @@ def test_lanes_are_reset_by_hand_where_autoreset_is_off():
         observation, _, _, truncated, _ = many.step(action)
         np.testing.assert_array_equal(observation[1], single.step(action[1])[0])
         assert truncated.tolist() == [True, False, True]
+
+
+_WITHOUT = """
+import sys
+sys.modules["dm_control"] = None  # as if it weren't installed
+import gymnasium, jbrep
+from jbrep import jitterbug
+from jbrep.errors import InputError
+print(gymnasium.make("jbrep:Jitterbug/MoveToPose-v0").reset(seed=0)[0].shape)
+print(gymnasium.make_vec("Jitterbug/MoveToPose-v0", num_envs=3).reset(seed=0)[0].shape)
+try:
+    jitterbug.load("move_to_pose")
+except InputError as error:
+    print(error)
+"""
+
+
+def test_the_dm_control_domain_alone_needs_dm_control():
+    done = subprocess.run([sys.executable, "-c", _WITHOUT], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    one, many, said = done.stdout.splitlines()
+    assert (one, many) == ("(19,)", "(3, 19)")
+    assert said.startswith("a dm_control environment needs dm_control: pip install 'jbrep[dm-")

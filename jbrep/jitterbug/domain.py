@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jbrep.errors import InputError
 from jbrep.jitterbug import tasks
 from jbrep.jitterbug.bodies import read_xml
 from jbrep.jitterbug.tasks import Array, Readings
@@ -14,10 +15,16 @@ from jbrep.opengl import prepare_opengl
 
 prepare_opengl()  # dm_control chooses its platform, and opens EGL, when it is imported
 
-from dm_control import mujoco, suite  # noqa: E402
-from dm_control.rl import control  # noqa: E402
-from dm_control.suite import base  # noqa: E402
-from dm_control.utils import containers  # noqa: E402
+try:
+    from dm_control import mujoco, suite
+    from dm_control.rl import control
+    from dm_control.suite import base
+    from dm_control.utils import containers
+except ModuleNotFoundError as error:
+    raise InputError(
+        f"a dm_control environment needs {error.name}: pip install 'jbrep[dm-control]', with "
+        "Python 3.11 or 3.12; the Jitterbug's Gymnasium and vector environments don't need it"
+    ) from error
 
 DOMAIN = "jitterbug"
 SUITE = containers.TaggedTasks()
