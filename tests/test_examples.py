@@ -2,15 +2,27 @@
 
 import os
 import runpy
+import socket
+import struct
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command import in_this_process
 
+from jbrep.envs.description import describe
+from jbrep.play.sources import find_player
+from jbrep.rl.controller import load_policy
+from jbrep.rl.export import export
+from jbrep.rl.shipped import find
 from jbrep.study.runner import BACKENDS
 
 OWN = Path("examples/own/own.py").resolve()
+ROBOT = Path("examples/robot").resolve()
 
 
 @pytest.mark.usefixtures("one_figure")
@@ -30,3 +42,60 @@ def test_everything_that_one_can_bring(tmp_path, monkeypatch, capfd):
     for made in ("study/report.html", "mine.rrd", "pendulum-encoders/pca-2.safetensors"):
         assert (tmp_path / "out" / made).stat().st_size > 1000, made
     assert (tmp_path / "out/mixed-encoders/pca-2.safetensors").stat().st_size > 1000
+
+
+@pytest.fixture
+def on_robot(monkeypatch, tmp_path):
+    """The controller of a shipped policy, and a robot beside it."""
+    monkeypatch.syspath_prepend(ROBOT)
+    export(load_policy(find(describe("face_direction"))), tmp_path / "it.onnx")
+    controller, robot = import_module("controller"), import_module("robot")
+    with controller.listen(0) as link:
+        yield controller, robot, controller.Controller(str(tmp_path / "it.onnx")), link
+
+
+def served(controller, made, link, steps):
+    """Its answers in a thread; what it counted, once that is done."""
+    pool = ThreadPoolExecutor(1)
+    counted = pool.submit(controller.serve, made, link, steps)
+    pool.shutdown(wait=False)
+    return counted
+
+
+def test_a_robot_is_driven_as_its_run_would_drive_it(on_robot, capsys):
+    controller, robot, made, link = on_robot
+    counted = served(controller, made, link, 50)
+    port = link.getsockname()[1]
+    total = robot.play("face_direction", port, episode=0, steps=50, in_step=True)
+    task = describe("face_direction", max_episode_steps=50)
+    assert total == pytest.approx(find_player("trained", task).returns(1)[0], abs=1e-3)
+    counted.result(10)
+    assert f"return {total:.1f}, 0 actions late" in capsys.readouterr().out
+    assert len(made.seconds) == 50
+
+
+def test_a_robot_is_stopped_where_its_sensors_cannot_be_believed(on_robot):
+    controller, _, made, link = on_robot
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
+        robot.connect(link.getsockname())
+        robot.settimeout(10)
+        counted = served(controller, made, link, 8)
+        good = np.zeros(16, np.float32)
+        spoilt = [np.full(16, np.nan), np.full(16, 1e9), good[:3]]
+
+        def answer(step, sensors):
+            robot.send(struct.pack("<I", step) + np.asarray(sensors, np.float32).tobytes())
+            while True:
+                number, action = struct.unpack("<If", robot.recv(100))
+                if number == step or len(sensors) != 16:
+                    return action
+
+        assert answer(0, good) != 0
+        assert [answer(step, sensors) for step, sensors in enumerate(spoilt, 1)] == [0, 0, 0]
+        assert answer(4, good) != 0
+        time.sleep(0.1)  # more than three periods: the watchdog answers
+        robot.settimeout(0.0)
+        assert struct.unpack("<If", robot.recv(100)) == (4, 0)
+        robot.settimeout(10)
+        assert answer(7, good) != 0
+        assert counted.result(10) > 3
