@@ -31,9 +31,9 @@ class Acting(NamedTuple):
     Attributes:
         statistics: mean (l,) and standard deviation (l,) of what the network sees, if it is
             normalised by them.
-        network: layers to the actions before they are squashed or clipped.
-        low, high: bounds of the actions, (k,).
-        is_squashed: whether actions are squashed into their bounds; others are clipped.
+        network: layers to the actions before they are squashed or clipped to [-1, 1].
+        low, high: bounds of the actions, (k,), to which they are scaled then.
+        is_squashed: whether actions are squashed; others are clipped.
     """
 
     statistics: tuple[Any, Any] | None
@@ -61,10 +61,11 @@ class Acting(NamedTuple):
             seen = ((seen - mean) / deviation).clip(-CLIP, CLIP)
         chosen = run(self.network, seen)
         if self.is_squashed:
-            half = 0.5 * (self.high - self.low)
-            chosen = (activate("tanh", chosen) + 1) * half + self.low
-        library = library_of(chosen)
-        return library.minimum(library.maximum(chosen, self.low), self.high)
+            chosen = activate("tanh", chosen)
+        half, centre = 0.5 * (self.high - self.low), 0.5 * (self.high + self.low)
+        action = chosen.clip(-1, 1) * half + centre
+        library = library_of(action)
+        return library.minimum(library.maximum(action, self.low), self.high)  # despite rounding
 
 
 class Controller:
