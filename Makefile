@@ -52,6 +52,7 @@ check: $(READY) ## lint, types, import direction
 	$(BIN)/lint-imports
 
 bench: $(READY) ## speed as ratios in one run, and what the hand-written policies return
+	$(BIN)/python benchmarks/quick.py
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/dataset.py
 	$(BIN)/python benchmarks/encoders.py

@@ -304,3 +304,33 @@ def test_help_loads_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.endswith("[]\n")
+
+
+_MISTAKES = """
+import sys
+from jbrep.cli import main
+given = (
+    "rl --task face_direction --steps -5 --out x", "rl --task fly --out x",
+    "rl --task face_direction --algorithm fly --out x",
+    "rl --task face_direction --encoder fly --out x", "rl --task face_direction --seed -1 --out x",
+    "rl --task face_direction --preset fly --out x", "rl --task face_direction --set a --out x",
+    "rl --task face_direction --from nothing --out x",
+    "tune --task face_direction --steps 0 --out x",
+    "collect --task fly --steps 10 --out x", "collect --task face_direction --steps -5 --out x",
+    "evaluate --encoder dae-8 --data nothing", "evaluate-policy nothing", "inspect nothing",
+    "behaviour nothing --out x", "study nothing.toml", "report nothing", "encoder info nothing",
+)
+for words in given:
+    try:
+        main(words.split())
+    except SystemExit as ended:
+        assert ended.code == 2, words
+    assert "torch" not in sys.modules, words
+"""
+
+
+def test_mistakes_in_words_are_found_before_torch_is_imported(tmp_path):
+    command = [sys.executable, "-c", _MISTAKES]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("Error: ") == done.stderr.count("\n") == 18

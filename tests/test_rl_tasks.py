@@ -15,6 +15,7 @@ from jbrep.play.sources import find_player
 from jbrep.records import container
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
+from jbrep.rl.controller import load_policy
 from jbrep.rl.files import (
     CHECKPOINT,
     EPISODES,
@@ -94,6 +95,8 @@ def test_the_units_of_actions_do_not_matter(algorithm, short_rollouts, tmp_path)
     np.testing.assert_allclose(*played, rtol=0.01)
     (rollout,) = find_player(str(tmp_path / "1")).play([0])
     assert 1000 <= rollout.action.min() < rollout.action.max() <= 2000
+    exported = load_policy(tmp_path / "1")(rollout.observation[:-1])
+    np.testing.assert_allclose(exported, rollout.action, rtol=1e-5)
 
 
 def test_evaluations_are_in_the_order_of_their_starts():

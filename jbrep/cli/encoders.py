@@ -78,8 +78,13 @@ def evaluate(
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders import find
     from jbrep.encoders.code import import_code
-    from jbrep.encoders.shipped import source_of
-    from jbrep.evaluate.diagnosis import write
+    from jbrep.encoders.shipped import check_found, source_of
+
+    whole = Dataset(data)
+    for name in encoder:
+        import_code(name)
+        check_found(name, whole.task)
+    from jbrep.evaluate.diagnosis import write  # imports torch
     from jbrep.evaluate.evaluation import EVALUATION
     from jbrep.play.sources import find_good_policy
     from jbrep.records.storage import check_writable
@@ -87,9 +92,7 @@ def evaluate(
     from jbrep.report.figures import encoder_plots
     from jbrep.report.figures import write as write_plots
 
-    for name in encoder:
-        import_code(name)
-    scaled = ScaledDataset(Dataset(data))
+    scaled = ScaledDataset(whole)
     encoders = [find(name, scaled.task) for name in encoder]
     sources = [source_of(name, scaled.task) for name in encoder]
     labels = _labels([each.name for each in encoders], sources)

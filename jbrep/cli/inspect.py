@@ -63,10 +63,17 @@ def inspect(
     if view and serve:
         raise InputError("--view and --serve exclude each other: choose one")
     from jbrep.encoders.code import import_code
-    from jbrep.inspection import inspect as record
+    from jbrep.encoders.shipped import check_found
+    from jbrep.play.sources import check_source
 
-    import_code(encoder)
     task = given_task(options)
+    import_code(encoder)
+    if task and encoder is not None:
+        check_found(encoder, task)
+    if source and not Path(source).exists():
+        check_source(source)
+    from jbrep.inspection import inspect as record  # imports torch
+
     path = record(source, episode, task, encoder, traverse, out, data, say)
     say(f"{path}" if view or serve else f"{path}; open it with: rerun {path}")
     if view:

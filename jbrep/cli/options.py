@@ -8,7 +8,7 @@ from msgspec import NODEFAULT, inspect
 
 from jbrep.cli.base import COUNT, with_options
 from jbrep.records.keys import Key, keys_of
-from jbrep.records.record import Record
+from jbrep.records.record import Record, converted
 from jbrep.records.words import bare
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
@@ -53,7 +53,17 @@ def _option(key: Key) -> Callable[[_Command], _Command]:
         default=key.default if has_default else None,
         show_default=bool(key.default_shown and not default and key.default is not False),
         help=key.help + default,
+        callback=_check(key),
     )
+
+
+def _check(key: Key) -> Callable[[click.Context, click.Parameter, Any], Any]:
+    """Refuses what the record would refuse, before the command imports what it works with."""
+
+    def check(context: click.Context, option: click.Parameter, value: Any) -> Any:
+        return value if value is None else converted(value, key.annotation, key.name)
+
+    return check
 
 
 def _choices(node: inspect.Type) -> str | None:

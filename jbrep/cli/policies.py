@@ -214,9 +214,14 @@ def behaviour(
     import numpy as np
 
     from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
-    from jbrep.report.figures import behaviour_plots, write
+    from jbrep.play.sources import check_source
 
     yaw, task = np.deg2rad(target_yaw), given_task(options)
+    for policy in policies:
+        if not Path(policy).exists():
+            check_source(policy)
+    from jbrep.report.figures import behaviour_plots, write  # imports torch
+
     with stoppable("the same command starts again"):
         shared_task, behaviours = observe(policies, task, episodes, yaw)
     header = (

@@ -65,13 +65,16 @@ def render(
     from jbrep.opengl import find_opengl
 
     find_opengl()
+    from jbrep.play.sources import check_source, find_episode
+
+    task = given_task(options)
+    for source in sources:
+        check_source(source)
     from jbrep.play.film import Film, Pace, get_format
     from jbrep.play.pictures import Camera
-    from jbrep.play.sources import find_episode
 
     form = get_format(out)
     pace = Pace(form.fps if fps is None else fps, speed, seconds)
-    task = given_task(options)
     with stoppable("no video was written"), Camera(camera, *(size or form.size)) as seen_by:
         rollouts = [find_episode(source, episode, task) for source in sources]
         film = Film(rollouts, seen_by, pace)

@@ -23,7 +23,9 @@ from jbrep.cli.base import (
 )
 from jbrep.cli.environment import needed_task, parse_arguments, task_options
 from jbrep.cli.options import record_options
-from jbrep.rl.settings import CLASSES, TrainingSettings
+from jbrep.errors import choose
+from jbrep.records.record import converted
+from jbrep.rl.settings import CLASSES, Seed, TrainingSettings
 from jbrep.text import interval_of, rounded, sparkline
 
 if TYPE_CHECKING:
@@ -83,13 +85,26 @@ def given_run(options: dict[str, Any], **others: Any) -> "Run":
         InputError: --set isn't NAME=VALUE, or names a setting again; or as `Run.of`.
     """
     from jbrep.encoders.code import import_code
-    from jbrep.rl import Run
+    from jbrep.encoders.shipped import check_found
+    from jbrep.rl.files import read_finished
+    from jbrep.rl.presets import get_preset, usual_preset
 
+    algorithm = options["algorithm"]
+    choose(algorithm, CLASSES, "algorithm")
+    preset = options["preset"] or usual_preset(algorithm)
+    if not preset.endswith(".toml"):
+        get_preset(preset, algorithm)
+    converted(options["seed"], Seed, "seed")
     overrides = parse_arguments(options.pop("overrides"), "--set")
     if options.pop("normalize"):
         overrides["normalize"] = True
-    import_code(options["encoder"])
+    if begin_from := options.get("begin_from"):
+        read_finished(Path(begin_from))
     task = needed_task(options)
+    import_code(options["encoder"])
+    check_found(options["encoder"], task)
+    from jbrep.rl import Run  # imports torch, after all words are known to be right
+
     return Run.of(task, overrides=overrides, **options, **others)
 
 
@@ -124,6 +139,7 @@ def rl(context: click.Context, /, out: Path, project: str | None, **options: Any
     resumes from it, to the same result.
     """
     with stop_signals() as received:
+        run = given_run(options)
         from joblib import cpu_count
 
         from jbrep.encoders.shipped import source_of
@@ -132,7 +148,6 @@ def rl(context: click.Context, /, out: Path, project: str | None, **options: Any
         from jbrep.rl.job import Job, Session
         from jbrep.rl.trainers import train_jobs
 
-        run = given_run(options)
         job = Job(run, out, cpu_count())
         source = source_of(run.encoder, run.task)
         if not run.task.reproducible:
@@ -253,6 +268,8 @@ def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **option
     --trials may grow.
     """
     with stop_signals() as received:
+        steps, episodes = options["steps"], options["evaluation_episodes"]
+        run = given_run(options, evaluate_every=steps, final_episodes=episodes)
         from jbrep.rl import StoppedError
         from jbrep.rl.tune import BEST, Trial
         from jbrep.rl.tune import tune as search
@@ -261,8 +278,6 @@ def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **option
             score = "failed" if trial.value is None else rounded(trial.value)[0]
             click.echo(f"trial {trial.number + 1} of {trials}: {score}  {_shown(trial.overrides)}")
 
-        steps, episodes = options["steps"], options["evaluation_episodes"]
-        run = given_run(options, evaluate_every=steps, final_episodes=episodes)
         try:
             best = search(run, trials, seeds, out, show, stop=lambda: bool(received))
         except StoppedError as error:

@@ -66,7 +66,12 @@ def study(
     Data sets and encoders are made first. Stopped or killed, the same command resumes the study;
     runs that have ended are never run again.
     """
-    from jbrep.errors import choose
+    from jbrep.errors import InputError, choose
+    from jbrep.records.toml import read_toml
+
+    if not study.exists():
+        raise InputError(f"no study at {study}: it must be a TOML file")
+    read_toml(study)
     from jbrep.report.statistics import forecast_text
     from jbrep.study import Plan, read_study, register_study, run_study
     from jbrep.study.packing import forecast
@@ -124,6 +129,10 @@ def report(
     """
     import json
 
+    from jbrep.errors import InputError
+
+    if not folder.exists():
+        raise InputError(f"{folder} is not the folder of a study: there is no such folder")
     from jbrep.report.report import SUMMARY, write_report_of
     from jbrep.report.statistics import results_text
     from jbrep.report.tables import read_tables

@@ -97,6 +97,22 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
         return make(name, task)
     if _is_made(name, task):
         return unlearned(task, str(name))
+    encoder = load(_path(name, task))
+    encoder.check_task(task)
+    return encoder
+
+
+def check_found(name: str, task: Task) -> None:
+    """Make sure that there is an encoder of that name, without loading it.
+
+    Raises:
+        InputError: there is none.
+    """
+    if not is_code(name) and not _is_made(name, task):
+        _path(name, task)
+
+
+def _path(name: str | Path, task: Task) -> Path:
     path = _files(task).get(str(name)) or Path(name)
     if not exists(path):
         ships = ", ".join(names(task))
@@ -104,9 +120,7 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
             f"no encoder {str(name)!r}: give a file, or "
             + (f"one that ships for {task.name}: {ships}" if ships else FULL)
         )
-    encoder = load(path)
-    encoder.check_task(task)
-    return encoder
+    return path
 
 
 def find_alone(name: Any, task: Task | None) -> BaseEncoder:

@@ -13,7 +13,6 @@ from jbrep.dataset.manifest import MANIFEST
 from jbrep.encoders import FULL
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
-from jbrep.evaluate.control import GoodPolicy, PlayedEpisode
 from jbrep.play.jitterbug import jitterbug_task
 from jbrep.play.player import Player
 from jbrep.play.rollout import Rollout, replay
@@ -23,6 +22,7 @@ from jbrep.rl.files import POLICY, POLICY_ZIP, is_policy_file, is_run
 from jbrep.rl.shipped import SHIPPED
 
 if TYPE_CHECKING:
+    from jbrep.evaluate.control import GoodPolicy
     from jbrep.rl.policy_file import Trained
 
 _HEURISTIC = "heuristic"  # the Jitterbug's hand-written policy
@@ -112,6 +112,20 @@ def is_by_name(source: str) -> bool:
     return source == SHIPPED or source.partition(":")[0] in POLICIES
 
 
+def check_source(source: str) -> None:
+    """Make sure that a source is something to play or replay, without loading it.
+
+    Raises:
+        InputError: it is nothing of these.
+    """
+    if is_trained(source) or is_by_name(source) or exists(Path(source) / MANIFEST):
+        return
+    raise InputError(
+        f"{source} is no data set, no run with a policy or checkpoint, and no policy by name: "
+        f"those are {policy_names()}"
+    )
+
+
 def policy_names() -> str:
     """The names of policies, for messages."""
     return ", ".join((*POLICIES, SHIPPED))
@@ -143,11 +157,7 @@ def find_player(source: str, task: Task | None = None, encoder: Any = None) -> P
         return _trained(source, task, encoder)
     if exists(Path(source) / MANIFEST):
         raise InputError(f"{source} is a data set: give the folder of a run or a policy")
-    if not is_by_name(source):
-        raise InputError(
-            f"{source} is no data set, no run with a policy or checkpoint, and no policy by name: "
-            f"those are {policy_names()}"
-        )
+    check_source(source)
     return Player(source, _needed(task, source), parse_policy(source).begin)
 
 
@@ -157,7 +167,7 @@ def _needed(task: Task | None, policy: str) -> Task:
     return task
 
 
-def find_good_policy(source: str | None, task: Task) -> GoodPolicy | None:
+def find_good_policy(source: str | None, task: Task) -> "GoodPolicy | None":
     """A policy with the episodes that it plays: the first of those that runs are evaluated on.
 
     Args:
@@ -176,6 +186,8 @@ def find_good_policy(source: str | None, task: Task) -> GoodPolicy | None:
         raise InputError(
             f"policy {source} doesn't act on what it observes: give {_HEURISTIC} or a run's folder"
         )
+    from jbrep.evaluate.control import GoodPolicy, PlayedEpisode  # imports torch
+
     player = find_player(source, task)
 
     def act(observation: NDArray[Any]) -> NDArray[Any]:

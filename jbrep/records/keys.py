@@ -15,6 +15,7 @@ class Key(NamedTuple):
     name: str  # in files
     field: str  # in Python
     kind: inspect.Type
+    annotation: Any  # the same as Python has it
     default: Any  # NODEFAULT: it must be given
     help: str  # what it means
     default_in_words: str  # where the default stands for what other settings decide; often empty
@@ -39,7 +40,14 @@ def keys_of(kind: type[Record]) -> list[Key]:
     node = type_of(kind)
     assert isinstance(node, inspect.StructType)
     return [
-        Key(each.encode_name, each.name, each.type, default_of(field), *_words(each.type))
+        Key(
+            each.encode_name,
+            each.name,
+            each.type,
+            field.type,
+            default_of(field),
+            *_words(each.type),
+        )
         for each, field in zip(node.fields, msgspec.structs.fields(kind), strict=True)
     ]
 
