@@ -19,15 +19,16 @@ from jbrep.evaluate.table import DIAGNOSTICS, SCALARS, Diagnosed, write_diagnost
 from jbrep.play.sources import find_episode
 from jbrep.records.tables import write_csv, write_rows
 from jbrep.report import report, write_report
+from jbrep.report.answer import answer
 from jbrep.report.facts import full_scaling, reproduce, setting_table
 from jbrep.report.figures import study_plots, write
 from jbrep.report.markdown import escape, markdown
 from jbrep.report.page import page as page_of
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, STATISTICS, SUMMARY
 from jbrep.report.tables import read_tables
-from jbrep.report.words import answers, headline
+from jbrep.report.words import answers
 from jbrep.rl.files import ENCODER, Evaluation
-from jbrep.stats.claims import CLAIMS
+from jbrep.stats.claims import CLAIMS, FASTER
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD
@@ -162,7 +163,7 @@ def test_a_figure_can_be_enlarged(page):
 
 
 def test_tables_sort_by_number_and_by_name(page):
-    table = page.locator("#tables table").first
+    table = page.locator("#answer table").first
 
     def column(i):
         return table.locator(f"tbody tr td:nth-child({i})").all_inner_texts()
@@ -185,8 +186,8 @@ def test_text_stands_left_and_numbers_right(page):
         return [cell.evaluate("cell => getComputedStyle(cell).textAlign") for cell in cells]
 
     right = ["right"]
+    assert alignments("#answer .wide >> nth=0 >> table") == ["left", *3 * right, "left", *right]
     assert alignments("#tables .wide >> nth=0 >> table") == ["left"] + 8 * right
-    assert alignments("#tables .wide >> nth=3 >> table") == ["left"] + 3 * right
 
 
 def test_a_column_of_numbers_may_have_intervals_and_dashes():
@@ -194,24 +195,54 @@ def test_a_column_of_numbers_may_have_intervals_and_dashes():
     assert Table("", ("",) * 7, rows).numeric == [True] * 5 + [False] * 2
 
 
-def test_verdicts_come_as_a_matrix_whose_cells_open(page):
-    text = page.locator("#verdicts").inner_text()
-    assert "There are no verdicts: no cell was named primary before the runs." in text
+def test_the_answer_comes_first_and_nothing_is_judged_that_was_not_registered(page):
+    lead = page.locator("#answer .lead").all_inner_texts()
+    assert lead[0].startswith("face_direction, sac, final returns: full 798, pca-8 830, dae")
+    assert "; without looking standing still 260, random 110; hand-written 950. " in lead[0]
+    assert lead[0].endswith("Learned: full, pca-8; didn't: dae-8.")
+    assert (
+        lead[1]
+        == "With 4 runs of each and no claim registered, this is exploratory: no conclusion."
+    )
+    kinds = page.locator("#answer > *").evaluate_all("all => all.map(each => each.tagName)")
+    assert kinds == ["P", "P", "FIGURE", "H3", "DIV"]
+    assert page.locator("#beside h2").inner_text() == "Beside full"
+    assert "exploratory" not in page.locator("#beside").inner_text()
+    heads = page.locator("#beside th").all_inner_texts()
+    assert heads == [
+        *("representation", "of full's gain"),
+        *("spread of curves, times full's", "steps to half of full's gain"),
+    ]
+    assert re.search(r"\d (slower|faster) \[", page.locator("#beside").inner_text())
+
+
+def test_verdicts_come_as_a_matrix_whose_cells_open(browser, tmp_path):
+    """With the interval that decides; gains are counted as it was registered."""
+    (tmp_path / PAGE).write_text(page_of(read_tables(Path("results/confirm")), [], []))
+    page = browser.new_page(offline=True)
+    page.goto((tmp_path / PAGE).resolve().as_uri())
+    assert page.locator("h1").inner_text() == "The paper's claims on face_direction"
+    decided = page.locator("#answer .lead").last.inner_text()
+    assert decided.startswith("Decided: 'not worse' is contradicted for dae-12, undecided for forw")
+    assert decided.endswith("As it was registered, gains count over standing still.")
     matrix = page.locator(".matrix")
-    heads = matrix.locator("thead th").all_inner_texts()
-    assert heads == ["representation", *CLAIMS]
-    assert matrix.locator("tbody th").all_inner_texts() == ["dae-8", "pca-8"]
+    assert matrix.locator("thead th").all_inner_texts() == ["representation", *CLAIMS]
+    assert matrix.locator("tbody th").all_inner_texts() == ["dae-12", "forward-8", "slow-12"]
     first = matrix.locator("tbody tr").first.locator("details").first
-    assert first.locator(".pill").inner_text() == "exploratory"
+    assert first.locator(".pill").inner_text() == "contradicted"
+    assert re.search(r"\] at 98\.33 %, which lies below 0\.9$", first.inner_text())
     assert not first.locator("dl").is_visible()
     first.locator("summary").click()
     heads, texts = (first.locator(kind).all_inner_texts() for kind in ("dt", "dd"))
     rows = dict(zip(heads, texts, strict=True))
     assert rows["Claim"] == "Agents on less state lose at most 10 % of the gain"
+    assert rows["Gains are counted over"] == "what standing still returns, 180"
     assert rows["Boundary"] == "0.9"
-    assert rows["Runs"] == "4 of dae-8 and 4 of full"
-    assert rows["It holds"] == "for this encoder"
-    assert rows["Deviations"] == "not registered beforehand"
+    assert rows["Runs"] == "12 of dae-12 and 12 of full"
+    assert rows["It holds"] == "for these 4 encoders"
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert matrix.bounding_box()["width"] <= 362
+    page.close()
 
 
 def test_it_can_be_read_on_a_telephone(page):
@@ -222,7 +253,10 @@ def test_it_can_be_read_on_a_telephone(page):
         width = image.bounding_box()["width"]
         assert width >= image.evaluate("image => image.naturalWidth") - 1  # as on paper
         assert figure.evaluate("button => button.scrollWidth") >= width  # none is out of reach
-    assert page.locator(".matrix").bounding_box()["width"] <= 362
+    for each in page.locator(".wide, .zoom, nav, pre").all():  # what is cut says that it scrolls
+        is_cut = each.evaluate("each => each.scrollWidth > each.clientWidth + 1")
+        said = each.evaluate("each => getComputedStyle(each, '::before').content")
+        assert said == ('"scroll →"' if is_cut else "none")
 
 
 def test_it_prints(page):
@@ -245,7 +279,9 @@ def test_each_claim_has_its_verdicts_with_the_numbers_of_the_statistics(whole):
                 if each["representation"] == comparison["representation"]
             ]
             assert finding["verdict"] == verdict["verdict"]
-            value = number(verdict["estimate"][0], SIGNIFICANT)
+            is_time = verdict["claim"] == FASTER.name
+            value = number(verdict["estimate"][0], ",.0f" if is_time else SIGNIFICANT)
+            value = value.removeprefix("-") if is_time else value
             assert value in finding["sentence"]
             assert value in text
     assert summary["claims"]["not worse"]["counts"] == {"exploratory": 2}
@@ -256,14 +292,14 @@ def test_each_claim_has_its_verdicts_with_the_numbers_of_the_statistics(whole):
 def test_the_markdown_shows_verdicts_numbers_and_a_figure_that_is_there(whole):
     text = (whole / MARKDOWN).read_text()
     assert text.startswith("# a-study\n")
-    assert "**There are no verdicts: no cell was named primary before the runs.**" in text
+    order = ("**face_direction, sac, final returns: full", "**With 4 runs", "![", "| agents on |")
+    assert [text.index(each) for each in order] == sorted(text.index(each) for each in order)
     (figure,) = re.findall(r"!\[.*\]\((.*)\)", text)
     assert (whole / figure).exists()
-    assert "| full | 4 | 0 |" in text
+    assert "| full | 4 | - |" in text
     assert "> 1 run is counted as return 0" in text
-    matrix = "| representation | not worse | less variance | faster |"  # each estimate once
-    assert text.index(matrix) < text.index("**Agents on less state lose at most 10 % of the gain")
-    assert re.search(r"\n\| dae-8 \| -?[\d.]+ \[.* \|\n", text)
+    assert "| representation | of full's gain | spread" in text  # each estimate once
+    assert "exploratory" not in text.partition("of full's gain")[2]
     assert re.search(r"\n\| standing still \| .* \| 260 \[", text)
 
 
@@ -307,7 +343,7 @@ def test_markdown_keeps_its_tables_whatever_the_names(whole, tmp_path):
     assert text.startswith("# a\\|b\\*\n")
     assert "| mine | 4 | 1 |" in text
     lines = [line for line in text.splitlines() if line.startswith("|")]
-    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {5, 10}
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {5, 7}
     assert not re.search(r"(?<!\\)[<`]", text)
 
 
@@ -391,7 +427,19 @@ def test_where_nothing_was_compared_the_claims_say_so(whole):
     alone = replace(analysis, groups=(alone,))
     (first, *_) = answers(alone)
     assert first.headline.endswith("of the gain: no reduced state was compared")
-    assert headline(alone) == "No reduced state was compared with the full one."
+    told = answer(read_tables(whole)._replace(analysis=alone))
+    assert told[-1] == "No reduced state was compared with the full one."
+
+
+def test_where_the_baseline_did_not_learn_nothing_is_compared(whole, tmp_path):
+    copy_tables(whole, tmp_path / "idle")
+    path = tmp_path / "idle" / REFERENCE_RETURNS
+    path.write_text(re.sub(r"(random,\d+),.*", r"\1,900", path.read_text()))
+    told = markdown(read_tables(tmp_path / "idle"), [], [], "figure.png")
+    assert "Learned" not in told
+    assert "**Agents on full didn't learn: nothing can be compared with them.**" in told
+    assert "of full's gain" not in told
+    assert not re.search(r"slower|faster", told)
 
 
 @pytest.mark.usefixtures("one_figure")
@@ -407,7 +455,7 @@ def test_an_unfinished_study_says_what_is_missing(tmp_path):
     text = (plan.folder / PAGE).read_text()
     assert "This study is unfinished: 5 runs are missing" in text
     assert "700</td>" in text
-    assert "exploratory" in text  # of what two runs are there
+    assert "With 2 runs of each" in text
 
 
 def test_of_single_runs_it_shows_what_there_is(tmp_path):

@@ -394,7 +394,7 @@ def test_tables_have_a_line_for_each_label_comparison_and_verdict(analysis):
     first = next(line for line in lines if line[:1] == ["dae-8"])
     assert first[1:3] == ["6", "0"]
     assert first[-2:] == ["-", "(0/6)"]
-    assert "representation not worse less variance faster" in " ".join(text.split())
+    assert "representation of full's gain spread of curves" in " ".join(text.split())
 
 
 def test_tables_fit_a_terminal(analysis):

@@ -74,10 +74,7 @@ def test_a_studys_tables_are_those_of_its_runs(peace):
         assert mean == pytest.approx(np.mean(label["by_run"]["final_return"]))
     assert len(rows) == 2 * 2 * (1 + 10)
     assert {"not worse", "less variance", "faster"} < set(CLAIMS)
-    assert (
-        "| representation | not worse | less variance | faster |"
-        in (folder / "summary.md").read_text()
-    )
+    assert "| agents on | runs | final return | learned |" in (folder / "summary.md").read_text()
     made = folder / "encoders" / "face_direction" / "dae-4.safetensors"
     alone = peace[0] / "encoders" / "dae-4.safetensors"
     assert made.read_bytes() == alone.read_bytes()
@@ -92,14 +89,12 @@ def test_a_report_says_what_the_tables_say(peace):
     for verdict in comparison["verdicts"]:
         (found,) = summary["claims"][verdict["claim"]]["verdicts"]
         assert (found["representation"], found["verdict"]) == ("dae-4", verdict["verdict"])
-        assert verdict["claim"] in page
     for label in statistics["groups"][0]["labels"]:
         name = f"face_direction/a2c/{label['representation']}"
         assert summary["numbers"][name] == label["numbers"]
         assert name in page
     assert (summary["runs"], summary["missing"], summary["failed"]) == (4, [], [])
-    for made in ("report.html", "summary.md", "figures"):
-        assert str(folder / made) in said
+    assert f"{folder / 'report.html'} (summary.json, summary.md" in said
     drawn = {path.stem for path in (folder / "figures").iterdir()}
     for name in drawn:
         for suffix in ("pdf", "png", "csv"):

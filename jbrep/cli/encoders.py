@@ -113,7 +113,8 @@ def evaluate(
     click.echo("\n".join(notes))
     more = "" if everything else "; --all shows errors, probes and units"
     beside = f" and {len(pictures)} figures beside it" if pictures else ""
-    return say(f"\n{out / EVALUATION}{beside}{more}")
+    click.echo()
+    return say(f"{out / EVALUATION}{beside}{more}")
 
 
 def _notes(

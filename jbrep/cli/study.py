@@ -114,15 +114,17 @@ def study(
     "--across-trainers", is_flag=True, help="Compare runs of different trainers or precisions, too."
 )
 @click.option("--out", type=PATH, help="A folder for it.  [default: the study's own]")
+@click.option("--all", "everything", is_flag=True, help="Print every table; the page has them.")
 @as_json
 def report(
     folder: Path,
     evaluation: tuple[str, ...],
     across_trainers: bool,
     out: Path | None,
+    everything: bool,
     as_json: bool,
 ) -> None:
-    """Show what a study found, as a page, tables and figures.
+    """Say what a study found, and write it as a page, tables and figures.
 
     FOLDER holds a study, finished or not, or any runs. Where there are no runs, as in
     results/confirm, the report is made from the tables alone.
@@ -130,6 +132,7 @@ def report(
     import json
 
     from jbrep.errors import InputError
+    from jbrep.records.storage import check_writable
 
     if not folder.exists():
         raise InputError(f"{folder} is not the folder of a study: there is no such folder")
@@ -139,16 +142,20 @@ def report(
     from jbrep.study.results import conclude, has_runs
     from jbrep.study.tables import add_diagnostics
 
-    ran = has_runs(folder)
-    paths = conclude(folder) if ran else []
+    if out:
+        check_writable(out)
+    if has_runs(folder):
+        conclude(folder)
     lines = add_diagnostics(folder, evaluation)
     tables = read_tables(folder, across_trainers)
-    if ran and not as_json:
-        echo_text(results_text(tables, terminal_width()))
+    if not as_json:
+        echo_text(results_text(tables, terminal_width(), everything))
     for line in lines:
         say(line, err=True)
-    paths += write_report_of(tables, out or folder)
+    page, *others = write_report_of(tables, out or folder)
     if as_json:
-        echo_json(json.loads(((out or folder) / SUMMARY).read_bytes()))
-    else:
-        echo_paths(paths)
+        return echo_json(json.loads(((out or folder) / SUMMARY).read_bytes()))
+    beside = ", ".join(path.name for path in others)
+    more = "" if everything else "; --all prints every table"
+    click.echo()
+    return say(f"{page} ({beside} beside it){more}")

@@ -19,6 +19,7 @@ from jbrep.study.record import EACH_ITS_OWN, EncoderFacts, Label
 from jbrep.study.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, number, slug
 
+_FEW = 6  # representations that are named
 RUNNING = "running mean and variance"  # of what agents see, where they normalise it
 _NOT_SHOWN = ("task", "representation", "encoder", "encoder_code")  # among the settings
 _OPTIONS = ("task", "algorithm", "preset", *TrainingSettings.__struct_fields__)  # of jbrep rl
@@ -35,11 +36,18 @@ def outline(tables: Tables) -> str:
     failed = len(failed_runs(tables).rows)
     own = in_order((e.representation for e in settings if e.encoder == EACH_ITS_OWN), FULL)
     return (
-        f"{', '.join(algorithms)} on {', '.join(tasks)} with the representations "
-        f"{', '.join(representations)}: {len(runs) - failed} of {total} runs finished, {failed} "
-        f"failed; up to {max(run.steps for run in runs):,} steps each."
-        + (f" With {', '.join(own)}, {EACH_ITS_OWN}." if own else "")
+        f"{', '.join(algorithms)} on {', '.join(tasks)}, seeing {_some(representations)}: "
+        f"{len(runs) - failed} of {total} runs finished, {failed} failed; up to "
+        f"{max(run.steps for run in runs):,} steps each."
+        + (f" With {_some(own)}, {EACH_ITS_OWN}." if own else "")
     )
+
+
+def _some(names: Sequence[str]) -> str:
+    """Names, or how many there are."""
+    if len(names) <= _FEW:
+        return ", ".join(names)
+    return f"{len(names)} representations"
 
 
 def full_scaling(tables: Tables) -> str:
@@ -89,7 +97,7 @@ def notices(tables: Tables) -> list[str]:
     """What the report lacks."""
     lines = []
     if missing := list(tables.record.missing):
-        names = ", ".join(missing[:3]) + (" and others" if len(missing) > 3 else "")
+        names = missing[0] + (" and others" if len(missing) > 1 else "")
         lines.append(
             f"This study is unfinished: {_runs(missing)} missing ({names}). The same jbrep study "
             "command resumes it."

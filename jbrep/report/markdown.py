@@ -4,9 +4,11 @@ import re
 from collections.abc import Iterator, Sequence
 
 from jbrep.report import facts
-from jbrep.report.statistics import across_tasks, label_table, matrix
+from jbrep.report.answer import answer
+from jbrep.report.returns import returns_tables
+from jbrep.report.statistics import across_tasks, matrix
 from jbrep.report.tables import Tables
-from jbrep.report.words import Answer, headline, notes, reference_words
+from jbrep.report.words import Answer, notes, reference_words
 from jbrep.stats import Analysis
 from jbrep.stats.claims import EXPLORATORY
 from jbrep.text import Table
@@ -25,17 +27,15 @@ def markdown(
 def _parts(
     tables: Tables, answers: Sequence[Answer], predictions: Sequence[Table], picture: str
 ) -> Iterator[str]:
-    yield from (f"# {escape(tables.name)}", escape(facts.outline(tables)))
+    yield from (f"# {escape(tables.title)}", escape(facts.outline(tables)))
     yield from map(escape, filter(None, (facts.full_scaling(tables), facts.registered(tables))))
     for notice in facts.notices(tables):
         yield f"> {escape(notice)}"
-    yield f"**{escape(headline(tables.analysis))}**"
+    yield from (f"**{escape(each)}**" for each in answer(tables))
     if tables.analysis:
-        yield from _findings(tables.analysis, answers)
         yield f"![Returns over training]({picture})"
-        for group in tables.analysis.groups:
-            title = f"{group.name}, with 95 % intervals over runs"
-            yield _titled(label_table(group)._replace(title=title))
+        yield from map(_titled, returns_tables(tables.analysis))
+        yield from _findings(tables.analysis, answers)
         yield from map(_titled, across_tasks(tables.analysis))
     yield from map(_titled, predictions)
 
@@ -43,20 +43,21 @@ def _parts(
 def _findings(analysis: Analysis, answers: Sequence[Answer]) -> Iterator[str]:
     """Verdicts as tables, then in sentences."""
     for group in analysis.groups:
-        if group.comparisons:
+        if group.compares:
             title = f"{group.name}, compared with {analysis.baseline}"
             yield _titled(matrix(group, analysis.planned)._replace(title=title))
             yield escape(f"Gains are counted over {reference_words(group)}.")
+    if not any(group.is_judged for group in analysis.groups):
+        return
     yield from map(escape, notes(analysis.planned))
-    for answer in answers:
-        estimated = f"{answer.claim.name!r} is estimated by: {answer.claim.estimand}."
-        yield f"**{escape(answer.headline)}.** {escape(estimated)}"
-        judged = [each for each in answer.findings if each.verdict != EXPLORATORY]
-        if judged:
-            yield "\n".join(
-                f"- {escape(each.where)}: *{each.verdict}*. {escape(each.sentence)}"
-                for each in judged
-            )
+    for each in answers:
+        estimated = f"{each.claim.name!r} is estimated by: {each.claim.estimand}."
+        yield f"**{escape(each.headline)}.** {escape(estimated)}"
+        yield "\n".join(
+            f"- {escape(finding.where)}: *{finding.verdict}*. {escape(finding.sentence)}"
+            for finding in each.findings
+            if finding.verdict != EXPLORATORY
+        )
 
 
 def _titled(table: Table) -> str:

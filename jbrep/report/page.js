@@ -9,6 +9,13 @@ let before = "light";
 addEventListener("beforeprint", () => { before = root.dataset.theme; setTheme("light"); });
 addEventListener("afterprint", () => setTheme(before));
 
+const wide = document.querySelectorAll(".wide, .zoom, pre");
+const markCut = () => {
+  for (const each of wide) each.classList.toggle("cut", each.scrollWidth > each.clientWidth + 1);
+};
+addEventListener("load", markCut);
+addEventListener("resize", markCut);
+
 const amount = (row, column) => {
   const text = row.cells[column].textContent.trim();
   const number = parseFloat(text.replace(/[,<>\s]/g, ""));

@@ -6,6 +6,7 @@ from typing import NamedTuple
 from jbrep.encoders import FULL
 from jbrep.evaluate.evaluation import Evaluation, Lost
 from jbrep.evaluate.table import headline
+from jbrep.report.words import listed
 from jbrep.text import r2_text
 
 _MEASURES = {  # the first that the full observation tells anything of counts
@@ -49,12 +50,12 @@ def serving(evaluation: Evaluation) -> str:
     else:
         smallest = min(good, key=lambda label: evaluation.encoders[label].latent)
         answer = (
-            f"{_listed(good)} should serve a controller: each tells {told}. The smallest is "
+            f"{listed(good)} should serve a controller: each tells {told}. The smallest is "
             f"{smallest}."
         )
     lost = [label for label in good if lacking(evaluation)[label]]
     return (
-        f"{answer} But see what {_listed(lost)} {'lacks' if len(lost) == 1 else 'lack'}."
+        f"{answer} But see what {listed(lost)} {'lacks' if len(lost) == 1 else 'lack'}."
         if lost
         else answer
     )
@@ -67,10 +68,6 @@ def _told(measured: _Measured, r2: Collection[float]) -> str:
         f"{measured.what} over the next 10 steps with an R² of {numbers} (the full one: "
         f"{r2_text(measured.full)})"
     )
-
-
-def _listed(names: list[str]) -> str:
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def _measured(evaluation: Evaluation) -> _Measured | None:

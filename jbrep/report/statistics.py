@@ -6,6 +6,9 @@ from operator import attrgetter
 
 import numpy as np
 
+from jbrep.report import facts
+from jbrep.report.answer import answer
+from jbrep.report.returns import return_form, returns_tables, steps
 from jbrep.report.tables import Tables
 from jbrep.report.words import (
     EFFECTS,
@@ -17,13 +20,14 @@ from jbrep.report.words import (
     shown,
     shown_number,
     statements,
+    told,
 )
 from jbrep.rl.files import FAILED
 from jbrep.stats.aggregates import Aggregate
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.association import Association
 from jbrep.stats.comparison import Comparison
-from jbrep.stats.labels import REACHED, RepresentationResult
+from jbrep.stats.labels import RepresentationResult
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import SOLVED
 from jbrep.study.packing import Forecast
@@ -31,7 +35,6 @@ from jbrep.study.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, duration, rounded, table, wrapped
 
 _KEY, _NAME = "representation", attrgetter("representation")
-_MOST_DIGITS = 9  # after the point
 
 
 def statistics_text(analysis: Analysis, width: int | None = None) -> str:
@@ -40,10 +43,49 @@ def statistics_text(analysis: Analysis, width: int | None = None) -> str:
     return "\n\n".join(each.text(width) for each in (*tables, *across_tasks(analysis)))
 
 
-def results_text(tables: Tables, width: int | None = None) -> str:
-    """The statistics as tables of that width, or each run's last evaluation without any."""
-    told = statistics_text(tables.analysis, width) if tables.analysis else _last(tables, width)
-    return "\n".join((told, *(f"\nno statistics: {line}" for line in tables.left_out)))
+def results_text(tables: Tables, width: int | None = None, everything: bool = False) -> str:
+    """The answer with the returns that it rests on and what is decided; all tables if wanted.
+
+    Without statistics, each run's last evaluation.
+    """
+    parts = [wrapped(each, width) for each in (*facts.notices(tables), *answer(tables))]
+    if analysis := tables.analysis:
+        shown_first = [*returns_tables(analysis), *decided_tables(analysis)]
+        parts += [each.text(width) for each in shown_first]
+        if everything:
+            parts.append(statistics_text(analysis, width))
+    else:
+        parts.append(_last(tables, width))
+    return "\n\n".join(parts)
+
+
+def decided_tables(analysis: Analysis) -> list[Table]:
+    """What was tested: a table for each task and algorithm with primary cells."""
+    found = []
+    for group in analysis.groups:
+        decided = [
+            (comparison.representation, verdict)
+            for comparison in group.comparisons
+            for verdict in comparison.verdicts
+            if not math.isnan(verdict.level)
+        ]
+        rows = [
+            (
+                f"{name}: {verdict.claim}",
+                verdict.verdict,
+                f"{told(verdict.claim, verdict.interval)} at {100 * (1 - verdict.level):.3g} %",
+            )
+            for name, verdict in decided
+        ]
+        boundaries = ", ".join(
+            f"{claim} {boundary:g}"
+            for claim, boundary in {v.claim: v.boundary for _, v in decided}.items()
+        )
+        title = f"{group.name}, boundaries: {boundaries}"
+        header = ("registered claim", "verdict", "interval that decides")
+        if rows:
+            found.append(Table(title, header, rows))
+    return found
 
 
 def _last(tables: Tables, width: int | None) -> str:
@@ -65,9 +107,10 @@ def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[Table]:
         tables.append(_component_table(group))
     if any(comparison.is_open for comparison in group.comparisons):
         tables.append(_comparison_table(group, analysis.baseline))
-    if group.comparisons:
-        judged = any(comparison.is_judged for comparison in group.comparisons)
-        table = _verdict_table(group) if judged else _estimate_table(group, analysis.planned)
+    if group.compares:
+        table = (
+            _verdict_table(group) if group.is_judged else _estimate_table(group, analysis.planned)
+        )
         how = (*notes(analysis.planned), f"Gains are counted over {reference_words(group)}.")
         tables.append(table._replace(title=f"{table.title}. {' '.join(how)}"))
     return tables
@@ -81,7 +124,7 @@ def label_table(group: GroupAnalysis) -> Table:
     """
     runs = sum(len(label.seeds) for label in group.labels)
     cut = f"; the comparison {group.cut}" if group.cut else ""
-    form = _form(group)
+    form = return_form([group])
     columns: dict[str, Callable[[RepresentationResult], str]] = {
         _KEY: _NAME,
         "runs": lambda label: str(len(label.seeds)),
@@ -89,11 +132,11 @@ def label_table(group: GroupAnalysis) -> Table:
         "final return": _number("final_return_mean", form),
         "mean return": _number("mean_return_mean", form),
         "IQM of final": _number("final_return_iqm", form),
-        "steps to 50 %": lambda label: _steps(label, "steps_to_50_percent"),
-        "to 90 %": lambda label: _steps(label, "steps_to_90_percent"),
+        "steps to 50 %": lambda label: steps(label, "steps_to_50_percent"),
+        "to 90 %": lambda label: steps(label, "steps_to_90_percent"),
     }
     if not math.isnan(group.solved):
-        columns[f"to solved ({group.solved:,g})"] = lambda label: _steps(label, SOLVED)
+        columns[f"to solved ({group.solved:,g})"] = lambda label: steps(label, SOLVED)
     title = f"{group.name}: {runs} runs over {group.grid[-1]:,.0f} steps; 95 % intervals over runs"
     found = Table.of(f"{title}{cut}", group.labels, columns)
     references = [
@@ -110,20 +153,8 @@ def _number(
     return lambda each: shown(each.numbers[name], form)
 
 
-def _steps(label: RepresentationResult, name: str) -> str:
-    steps = shown_number(label.numbers[name].value, ",.0f")
-    reached, runs = label.numbers[REACHED[name]].value, len(label.seeds)
-    return steps if math.isnan(reached) else f"{steps} ({round(reached * runs)}/{runs})"
-
-
-def _form(group: GroupAnalysis, more: int = 0) -> str:
-    """A format for returns: three digits of the range of final returns, or more of them."""
-    width = group.profile_returns[-1] - group.profile_returns[0]
-    return f",.{np.clip(2 - math.floor(math.log10(width)), 0, _MOST_DIGITS) + more}f"
-
-
 def _spread_table(group: GroupAnalysis) -> Table:
-    form = _form(group, more=1)
+    form = return_form([group], more=1)
     return Table.of(
         "Spread of final returns over runs; CVaR is the mean of the worst quarter",
         group.labels,
@@ -154,7 +185,7 @@ def _component_table(group: GroupAnalysis) -> Table:
 
 def _comparison_table(group: GroupAnalysis, baseline: str) -> Table:
     """A row for each comparison with the baseline, but for those that wait for a look."""
-    form = _form(group)
+    form = return_form([group])
     return Table.of(
         f"Compared with {baseline}",
         [comparison for comparison in group.comparisons if comparison.is_open],
@@ -179,7 +210,10 @@ def _verdict_table(group: GroupAnalysis) -> Table:
             (
                 f"{comparison.representation}: {verdict.claim}",
                 verdict.verdict + (f" ({verdict.reason})" if verdict.reason else ""),
-                shown(verdict.estimate if math.isnan(verdict.level) else verdict.interval),
+                told(
+                    verdict.claim,
+                    verdict.estimate if math.isnan(verdict.level) else verdict.interval,
+                ),
                 shown_number(verdict.boundary),
                 probability(verdict.p),
                 probability(verdict.level),
@@ -194,13 +228,16 @@ def _verdict_table(group: GroupAnalysis) -> Table:
 def _estimate_table(group: GroupAnalysis, planned: Planned) -> Table:
     """A row for each comparison without verdicts: estimates, where claims share one only once."""
     claims = statements(planned)
-    estimands = [claim.estimand for claim in claims]
-    columns = [i for i, each in enumerate(estimands) if estimands.index(each) == i]
+    heads = [claim.head for claim in claims]
+    columns = [i for i, each in enumerate(heads) if heads.index(each) == i]
     return Table(
-        "What the claims are about",
-        (_KEY, *(claims[i].name for i in columns)),
+        group.name,
+        (_KEY, *(heads[i] for i in columns)),
         [
-            (comparison.representation, *(shown(comparison.verdicts[i].estimate) for i in columns))
+            (
+                comparison.representation,
+                *(told(claims[i].name, comparison.verdicts[i].estimate) for i in columns),
+            )
             for comparison in group.comparisons
         ],
     )
@@ -208,7 +245,7 @@ def _estimate_table(group: GroupAnalysis, planned: Planned) -> Table:
 
 def matrix(group: GroupAnalysis, planned: Planned) -> Table:
     """A row for each comparison, a column for each claim; of estimates where nothing is judged."""
-    if not any(comparison.is_judged for comparison in group.comparisons):
+    if not group.is_judged:
         return _estimate_table(group, planned)
     return Table(
         "Verdicts",

@@ -28,6 +28,11 @@ class Tables(NamedTuple):
     analysis: Analysis | None  # None where runs allow no statistics
     left_out: list[str]  # what there are no statistics of, and why
 
+    @property
+    def title(self) -> str:
+        """What the study's file calls it, or else the folder."""
+        return (self.record.study.title if self.record.study else "") or self.name
+
 
 def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
     """The tables in a folder, with statistics if they allow any.

@@ -10,11 +10,9 @@ from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.claims import (
     CLAIMS,
-    EXPLORATORY,
     FASTER,
     LESS_VARIANCE,
     NOT_WORSE,
-    NOT_YET,
     WITHIN_HALF,
     Verdict,
 )
@@ -33,6 +31,12 @@ EFFECTS = (  # of `jbrep.stats.power`
     "fail to learn, may stop a verdict."
 )
 _KEPT = "gain over {over}, as a share of that on the full state"
+_HEADS = {  # of columns
+    NOT_WORSE.name: "of full's gain",
+    LESS_VARIANCE.name: "spread of curves, times full's",
+    FASTER.name: "steps to half of full's gain",
+    WITHIN_HALF.name: "of full's gain",
+}
 _OVER = {"blind": "the best policy that doesn't look", "still": "standing still"}
 _CLAIMS = {  # as a sentence, with a place for the percentage that may be lost; what is estimated
     NOT_WORSE.name: ("Agents on less state lose at most {} of the gain", _KEPT),
@@ -42,7 +46,7 @@ _CLAIMS = {  # as a sentence, with a place for the percentage that may be lost; 
     ),
     FASTER.name: (
         "They learn faster",
-        "steps to half of the full agents' gain, beyond what these take",
+        "steps to half of the full agents' gain, beside what these take",
     ),
     WITHIN_HALF.name: ("They lose at most {} of it", _KEPT),
 }
@@ -57,6 +61,7 @@ class Statement(NamedTuple):
     """A claim in words."""
 
     name: str
+    head: str  # of a column of estimates
     statement: str  # as a sentence
     estimand: str  # what is estimated
     is_ratio: bool  # of which logarithms are drawn
@@ -93,7 +98,9 @@ def statements(planned: Planned) -> list[Statement]:
         percent = f"{100 * (1 - claim.boundary(planned.rules.margin)):.3g} %"
         sentence, estimand = _CLAIMS[name]
         estimated = estimand.format(over=over(planned.rules))
-        found.append(Statement(name, sentence.format(percent), estimated, claim.is_ratio))
+        found.append(
+            Statement(name, _HEADS[name], sentence.format(percent), estimated, claim.is_ratio)
+        )
     return found
 
 
@@ -114,27 +121,6 @@ def notes(planned: Planned) -> list[str]:
         "way.",
         f"Verdicts may come after {counts} runs of each arm{levels}; other cells are exploratory.",
     ]
-
-
-def headline(analysis: Analysis | None) -> str:
-    """What was found, in a sentence."""
-    if analysis is None:
-        return "There are no statistics yet, and so no verdicts."
-    found = [each.verdicts for group in analysis.groups for each in group.comparisons]
-    if not found:
-        return "No reduced state was compared with the full one."
-    judged = [verdicts for verdicts in found if verdicts[0].verdict != EXPLORATORY]
-    if not judged and not analysis.planned.rules.primary:
-        return "There are no verdicts: no cell was named primary before the runs."
-    if not judged:
-        return "There are no verdicts yet: no primary cell has two runs of each side."
-    decided = [verdicts for verdicts in judged if verdicts[0].verdict != NOT_YET]
-    if not decided:
-        return f"There are no verdicts yet: {judged[0][0].reason}."
-    cells = "the one cell" if len(judged) == 1 else f"the {len(judged)} cells"
-    columns = zip(analysis.planned.rules.claims, zip(*judged, strict=True), strict=True)
-    parts = [f"{claim!r} {_overall(_counts(each))}" for claim, each in columns]
-    return f"In {cells} judged: {'; '.join(parts)}."
 
 
 def _counts(verdicts: Sequence[Verdict]) -> Counter[str]:
@@ -172,22 +158,21 @@ def _answer(position: int, claim: Statement, analysis: Analysis) -> Answer:
 
 def _sentence(claim: Statement, verdict: Verdict, name: str, baseline: str) -> str:
     """The numbers behind a verdict; of an undecided one, why."""
-    parts = [f"{name} against {baseline}: {claim.estimand} {shown(verdict.estimate)}"]
-    if test := _tested(verdict):
-        parts.append(test)
+    estimate = tested(verdict) or told(claim.name, verdict.estimate)
+    parts = [f"{name} against {baseline}: {claim.estimand} {estimate}"]
     if verdict.reason:
         parts.append(verdict.reason)
     return f"{'; '.join(parts)}."
 
 
-def _tested(verdict: Verdict) -> str:
-    """Where the interval lies that decides; empty where nothing was tested."""
+def tested(verdict: Verdict) -> str:
+    """The estimate with the interval that decides, and where it lies; empty if none was tested."""
     _, low, high = verdict.interval
     if math.isnan(verdict.level) or math.isnan(low) or math.isnan(high):
         return ""
-    ends = f"[{shown_number(low)}, {shown_number(high)}]"
     level, boundary = f"{100 * (1 - verdict.level):.4g} %", shown_number(verdict.boundary)
-    return f"at {level}, {ends} {_place(verdict)} {boundary}"
+    interval = told(verdict.claim, verdict.interval)
+    return f"{interval} at {level}, which {_place(verdict)} {boundary}"
 
 
 def _place(verdict: Verdict) -> str:
@@ -197,9 +182,26 @@ def _place(verdict: Verdict) -> str:
 
 
 def remark(verdict: Verdict) -> str:
-    """The estimate, and why there is no verdict, for a narrow column."""
-    estimate = "" if math.isnan(verdict.estimate.value) else shown(verdict.estimate)
-    return "; ".join(filter(None, (estimate, verdict.reason)))
+    """The estimate with the interval that decides, or why there is no verdict."""
+    known = "" if math.isnan(verdict.estimate.value) else told(verdict.claim, verdict.estimate)
+    return "; ".join(filter(None, (tested(verdict) or known, verdict.reason)))
+
+
+def told(claim: str, estimate: Interval) -> str:
+    """The estimate of a claim, with its direction where a sign would have to be known."""
+    if claim != FASTER.name or math.isnan(estimate.value):
+        return shown(estimate)
+    value, *ends = (_later(steps) for steps in estimate)
+    return value if math.isnan(estimate.low) else f"{value} [{ends[0]}, {ends[1]}]"
+
+
+def _later(steps: float) -> str:
+    return f"{abs(steps):,.0f} {'slower' if steps > 0 else 'faster'}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in a sentence: a, b and c."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def details(
@@ -216,12 +218,12 @@ def details(
         ("Gains are counted over", reference_words(group)),
     ]
     if not math.isnan(verdict.estimate.value):
-        rows.append(("Estimate with 95 % interval", shown(verdict.estimate)))
+        rows.append(("Estimate with 95 % interval", told(verdict.claim, verdict.estimate)))
     rows.append(("Boundary", shown_number(verdict.boundary)))
     if not math.isnan(verdict.level):
-        tested = _tested(verdict) or "no interval"
+        test = tested(verdict) or "no interval"
         levels = f"p {probability(verdict.p)} at a level of {probability(verdict.level)}"
-        rows.append((f"Test at look {verdict.look}", f"{tested}; {levels}"))
+        rows.append((f"Test at look {verdict.look}", f"{test}; {levels}"))
     if verdict.reason:
         rows.append(("Why", verdict.reason))
     if verdict.claim in _BESIDE and comparison.is_open:

@@ -33,7 +33,7 @@ class GroupAnalysis:
     return_ceiling: float  # the largest possible one; NaN if unknown
     failure_return: float  # what a failed run counts as from the step of failure on
     reference: float  # the return that gains are counted over, as in `Scale`
-    blind: float  # the return that shows whether agents learned, as in `Scale`
+    blind: Interval  # the return that shows whether agents learned, as in `Scale`
     reference_policy: str | None  # the policy that returns it; None if no policy's return is known
     # mean returns of policies that don't learn, each with its 95 % interval over starts
     references: Mapping[str, Interval]
@@ -48,6 +48,16 @@ class GroupAnalysis:
     def solved(self) -> float:
         """The return from which on the task counts as solved; NaN if unknown."""
         return self.thresholds[SOLVED]
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether a comparison has verdicts."""
+        return any(comparison.is_judged for comparison in self.comparisons)
+
+    @property
+    def compares(self) -> bool:
+        """Whether something can be compared: the baseline learned, or what was found is decided."""
+        return self.is_judged or (bool(self.comparisons) and self.labels[0].learnt == YES)
 
     @property
     def name(self) -> str:
@@ -122,7 +132,7 @@ def _analyse_group(
     }
     means = {policy: float(each.value) for policy, each in played.items()}
     grid, cut, curves, finals = compared(group)
-    scale = scale_of(list(finals.values()), next(iter(curves.values())), grid, first, means)
+    scale = scale_of(list(finals.values()), next(iter(curves.values())), grid, first, played)
     baseline, *others = (
         describe(runs, curves[name], finals[name], scale, seed) for name, runs in group.items()
     )

@@ -87,10 +87,11 @@ def describe(
     )
 
 
-def _learnt(final: Array, blind: float, bounds: Bounds) -> str:
-    if surely_above(final, blind, bounds):
+def _learnt(final: Array, blind: Interval, bounds: Bounds) -> str:
+    """Whether final returns lie above a mean return beyond what is uncertain of either."""
+    if surely_above(final, blind.value, bounds) and not final.mean() <= blind.high:
         return YES
-    return UNCLEAR if final.mean() > blind else NO
+    return UNCLEAR if final.mean() > blind.value else NO
 
 
 def profile(final_return: Array, returns: Array, seed: int) -> Interval:

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jbrep.stats.bootstrap import Array
-from jbrep.stats.intervals import surely_above
+from jbrep.stats.bootstrap import Array, Interval
+from jbrep.stats.intervals import UNDEFINED, surely_above
 from jbrep.stats.runs import RunCurve
 
 SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the gain of the baseline's median run
@@ -22,7 +22,8 @@ class Scale(NamedTuple):
 
     grid: Array  # training steps at which runs are compared, (g,)
     reference: float  # the return that gains are counted over, as `reference_of` has it
-    blind: float  # the mean return of the best policy that doesn't look, else the reference
+    # the mean return of the best policy that doesn't look, with its interval, else the reference
+    blind: Interval
     # the return to reach for each of STEPS_TO, NaN where there is none
     thresholds: Mapping[str, float]
     # at which performance profiles are evaluated, (k,): round numbers that enclose all final
@@ -52,7 +53,7 @@ def scale_of(
     curves: Array,
     grid: Array,
     run: RunCurve,
-    policies: Mapping[str, float],
+    policies: Mapping[str, Interval],
 ) -> Scale:
     """The scale of a group of runs.
 
@@ -61,9 +62,10 @@ def scale_of(
         curves: of the baseline's runs on the grid (g,), (runs, g).
         grid: training steps.
         run: any of the group.
-        policies: mean returns of policies that don't learn.
+        policies: mean returns of policies that don't learn, with their intervals.
     """
-    reference, solved, best = reference_of(run, curves), run.solved, best_blind(policies)
+    reference, solved = reference_of(run, curves), run.solved
+    best = best_blind({name: float(each.value) for name, each in policies.items()})
     gained = surely_above(finals[0], reference, run.bounds)
     gain = float(np.median(finals[0])) - reference if gained else np.nan
     shares = [reference + share * gain for share in SHARES.values()]
@@ -71,7 +73,7 @@ def scale_of(
     return Scale(
         grid=grid,
         reference=reference,
-        blind=policies[best] if best else reference,
+        blind=policies[best] if best else UNDEFINED._replace(value=reference),
         thresholds=dict(zip(STEPS_TO, thresholds, strict=True)),
         profile_returns=_round_numbers(np.concatenate(finals), run.return_floor),
     )

@@ -48,7 +48,7 @@ def claim_plot(analysis: Analysis, looks: Looks) -> Plot:
 
 def _rows(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
     for group in analysis.groups:
-        for comparison in group.comparisons:
+        for comparison in group.comparisons if group.compares else ():
             for each in comparison.verdicts:
                 numbers = (*each.estimate, *each.interval[1:], each.boundary)
                 key = (group.task, group.algorithm, comparison.representation, each.claim)
@@ -57,7 +57,7 @@ def _rows(analysis: Analysis) -> Iterator[tuple[Any, ...]]:
 
 def _draw(analysis: Analysis, looks: Looks) -> Figure:
     """A row of panels for each group, a column for each estimand, to one scale each."""
-    groups = [group for group in analysis.groups if group.comparisons]
+    groups = [group for group in analysis.groups if group.compares]
     look, claims = looks(), statements(analysis.planned)
     columns = _columns(claims)
     most = max(len(group.comparisons) for group in groups)

@@ -34,6 +34,10 @@ Groups = Sequence[GroupAnalysis]
 Runs = dict[int, dict[int, float]]  # mean returns of a label, by seed and step
 Played = Mapping[str, Mapping[str, float]]  # mean returns by task and policy that learns nothing
 
+_POLICIES = (  # in captions
+    "policies that don't learn, on all starts of the last evaluation, of which those before it "
+    "have the first"
+)
 _MOST_ACROSS = 5  # panels of runs side by side
 _TITLE = 0.062  # width of a character in a panel's title [inches]
 _HANDLE, _CHARACTER, _LINE = 0.5, 0.05, 0.14  # of a legend: widths, height of a line [inches]
@@ -50,7 +54,7 @@ def curves(groups: Groups, played: Played, looks: Looks) -> Plot:
     extents = _extents(groups, played)
     caption = "Return of the deterministic policy over training: median and 10 to 90 % over n runs."
     if any(played.get(task) for task in extents):
-        caption += " Dashed: means of policies that don't learn, on the same starts."
+        caption += f" Dashed: {_POLICIES}."
     solved = {group.solved for group in groups if extents[group.task].contain(group.solved)}
     if solved:
         values = ", ".join(f"{value:,g}" for value in sorted(solved))
@@ -90,7 +94,7 @@ def every_run(returns: Sequence[Return], played: Played, looks: Looks) -> Plot:
         "every_run",
         "Every run",
         "Mean return of each evaluation, a line for each of n runs; thick: their median."
-        + (" Dashed: policies that don't learn, on the same starts." if played else ""),
+        + (f" Dashed: {_POLICIES}." if played else ""),
         ("task", "algorithm", "representation", "seed", "step", "mean_return"),
         [
             (*label, seed, step, cell(mean))

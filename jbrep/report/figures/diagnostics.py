@@ -27,10 +27,10 @@ def diagnostics(associations: Sequence[Association], looks: Looks) -> Plot:
     return Plot(
         "diagnostics",
         "Final return against diagnostics",
-        "Left: the rank correlation of each diagnostic of the codes with their final return, with "
-        "its 95 % bootstrap interval over codes, where there are at least five: 1 if the code with "
-        "the better value always has the higher return. Right: each code by the main diagnostics, "
-        "better ones to the right, with its mean final return.",
+        "Each code by the main diagnostics, better ones to the right, with its mean final return. "
+        "Where there are five codes or more, on the left: the rank correlation of each diagnostic "
+        "with the final return, with its 95 % bootstrap interval over codes: 1 if the better value "
+        "always goes with the higher return.",
         (
             *("task", "algorithm", "diagnostic", "representation", "value", "final_return"),
             *("rank_correlation", "low", "high", "codes"),
@@ -57,16 +57,22 @@ def _draw(associations: Sequence[Association], looks: Looks) -> Figure:
     rows = max(-(-len(_main(each)) // _ACROSS) for each in by_group.values())
     rows = max(rows, 2)  # room for the names of all diagnostics
     figure = Figure(figsize=(PAGE, 0.6 + _HEIGHT * rows * len(groups)))
-    grid = figure.add_gridspec(rows * len(groups), 1 + _ACROSS, width_ratios=(1.15, 1, 1, 1))
+    ranked = any(np.isfinite(each.correlation.value) for each in associations)
+    widths = (1.15, 1, 1, 1) if ranked else (1, 1, 1)
+    grid = figure.add_gridspec(rows * len(groups), len(widths), width_ratios=widths)
     look, panels = looks(), []
     for i, (name, group) in enumerate(groups.items()):
-        left = figure.add_subplot(grid[i * rows : (i + 1) * rows, 0])
-        _draw_correlations(left, by_group[name])
-        left.set_title(plain(f"{group.task},\n{group.algorithm}"))
+        told = plain(f"{group.task},\n{group.algorithm}")
+        if ranked:
+            left = figure.add_subplot(grid[i * rows : (i + 1) * rows, 0])
+            _draw_correlations(left, by_group[name])
+            left.set_title(told)
         for j, each in enumerate(_main(by_group[name])):
-            axes = figure.add_subplot(grid[i * rows + j // _ACROSS, 1 + j % _ACROSS])
+            place = i * rows + j // _ACROSS, j % _ACROSS + (len(widths) - _ACROSS)
+            axes = figure.add_subplot(grid[place])
             _draw_codes(axes, each, group, look)
-            axes.set_ylabel("" if j % _ACROSS else "final return")
+            what = "final return" if ranked else f"{told}\nfinal return"
+            axes.set_ylabel("" if j % _ACROSS else what)
             panels.append(axes)
     below(figure, panels)
     return figure

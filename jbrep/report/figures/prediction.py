@@ -1,6 +1,7 @@
 """How well codes predict what comes next, given the actions: by feature and by horizon."""
 
 from collections.abc import Iterator, Sequence
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ MOST = 40  # features in a picture, and names on an axis
 _HORIZON = 10  # steps that the heat map looks ahead, if the evaluation has them
 _SUMS = {"mean": "mean of features", "reward": "reward"}  # of a prediction, in words
 _COLUMNS = ("encoder", "steps", "target", "r2", "low", "high")
+_CHARACTER = 0.06  # of a title [inches]
 _LOWEST = -0.1  # R² on an axis
 
 
@@ -37,7 +39,8 @@ def heat_map(
     axes.set_yticks(range(len(rows)), [plain(name) for name in rows])
     axes.set_xticks(range(len(columns)), [plain(n) for n in columns], rotation=60, ha="right")
     bare(axes)
-    axes.set_title(plain(title))
+    lines = (fill(plain(line), int(width / _CHARACTER)) for line in title.splitlines())
+    figure.suptitle("\n".join(lines), x=0.01, ha="left", size=7.5)
     figure.colorbar(picture, label=label)
     return figure
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from jbrep.encoders import FULL
 from jbrep.report.figures.claims import claim_plot
-from jbrep.report.figures.curves import Played, across_tasks, curves, every_run
+from jbrep.report.figures.curves import across_tasks, curves, every_run
 from jbrep.report.figures.diagnostics import diagnostics
 from jbrep.report.figures.diagrams import diagrams
 from jbrep.report.figures.plot import Plot
@@ -15,9 +15,10 @@ from jbrep.report.figures.returns import final_return, learning_rate, profiles
 from jbrep.report.figures.style import styles
 from jbrep.stats import Analysis
 from jbrep.stats.association import Association
+from jbrep.stats.intervals import FEWEST_RUNS
 from jbrep.stats.runs import in_order
 from jbrep.study.record import Label
-from jbrep.study.tables import References, Return, by_run
+from jbrep.study.tables import References, Return
 
 
 def study_plots(
@@ -36,12 +37,14 @@ def study_plots(
         *(shared.settings.representation for shared in labels.values()),
     }
     looks = partial(styles, in_order(names, baseline), baseline if baseline in names else None)
-    plots, played = [], _on_the_same_starts(references, returns)
+    plots, played = [], {task: _means(each) for task, each in references.items()}
     if analysis:
         plots += [curves(groups, played, looks), final_return(groups, looks)]
-        if any(group.comparisons for group in groups):
+        if any(group.compares for group in groups):
             plots.append(claim_plot(analysis, looks))
-        plots += [learning_rate(groups, looks), profiles(analysis, looks)]
+        plots.append(learning_rate(groups, looks))
+        if any(len(label.seeds) >= FEWEST_RUNS for group in groups for label in group.labels):
+            plots.append(profiles(analysis, looks))
         if analysis.aggregates:
             plots.append(across_tasks(analysis, looks))
     if associations:
@@ -51,13 +54,6 @@ def study_plots(
     return [*plots, *diagrams(labels, looks)]
 
 
-def _on_the_same_starts(references: References, returns: Sequence[Return]) -> Played:
-    """Means of references in the episodes that curves are of; the last evaluation may have more."""
-    fewest: dict[str, int] = {}
-    for (label, _), by_step in by_run(returns).items():
-        task, count = label.rsplit("/", 2)[0], min(map(len, by_step.values()))
-        fewest[task] = min(fewest.get(task, count), count)
-    return {
-        task: {policy: float(np.mean(each[: fewest.get(task)])) for policy, each in played.items()}
-        for task, played in references.items()
-    }
+def _means(played: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """The mean returns of policies over all starts of the last evaluation, as tables have them."""
+    return {policy: float(np.mean(each)) for policy, each in played.items()}

@@ -1,0 +1,145 @@
+"""The answer of a study in a few sentences: what agents return, which learned, what is decided."""
+
+from collections.abc import Iterable, Sequence
+
+from jbrep.report.returns import by_task, named, shown_return
+from jbrep.report.tables import Tables
+from jbrep.report.words import listed
+from jbrep.stats.analysis import Analysis, GroupAnalysis
+from jbrep.stats.arms import FEWEST_UNITS
+from jbrep.stats.claims import CONTRADICTED, EXPLORATORY, NOT_YET, SUPPORTED, UNDECIDED, Verdict
+from jbrep.stats.labels import NO, UNCLEAR, YES, RepresentationResult
+from jbrep.stats.scale import LOOKING
+from jbrep.text import counted
+
+_MOST = 6  # agents of a task that are named
+_BEST = 3  # of more, those that end highest
+_ALIKE = {
+    YES: "All learned.",
+    UNCLEAR: "Whether any learned isn't clear.",
+    NO: "None learned.",
+}
+_ALONE = {
+    YES: "They learned.",
+    NO: "They didn't learn.",
+    UNCLEAR: "Whether they learned isn't clear.",
+}
+
+
+def answer(tables: Tables) -> list[str]:
+    """Final returns beside policies that don't learn, by task; then what follows from them."""
+    if tables.analysis is None:
+        return ["There is nothing to compare yet: no cell has two runs that have ended."]
+    tasks = by_task(tables.analysis)
+    return [*map(_returns, tasks), " ".join(_conclusion(tables.analysis))]
+
+
+def _returns(groups: Sequence[GroupAnalysis]) -> str:
+    """What agents on a task return at the end, beside policies that don't learn."""
+    group, agents = groups[0], named(groups)
+    where = group.task if len(groups) > 1 else group.name
+    told = f"{where}, final returns: {_listed_returns(agents, groups)}"
+    blind, written = (
+        [
+            f"{policy} {shown_return(mean.value, groups)}"
+            for policy, mean in group.references.items()
+            if (policy == LOOKING) is looks
+        ]
+        for looks in (False, True)
+    )
+    for policies, how in ((blind, "without looking "), (written, "")):
+        told += f"; {how}{', '.join(policies)}" if policies else ""
+    return f"{told}. {_learnt(agents)}"
+
+
+def _listed_returns(
+    agents: Sequence[tuple[str, RepresentationResult]], groups: Sequence[GroupAnalysis]
+) -> str:
+    """Each agent's name and mean final return; of many the first and the highest."""
+    values = [(name, float(label.numbers["final_return_mean"].value)) for name, label in agents]
+    first = [] if len(groups) > 1 else values[:1]
+    others = sorted(values[len(first) :], key=lambda each: -each[1])
+    shown = [*first, *(others if len(agents) <= _MOST else others[:_BEST])]
+    told = ", ".join(f"{name} {shown_return(value, groups)}" for name, value in shown)
+    if rest := [value for _, value in others[len(shown) - len(first) :]]:
+        high, low = (shown_return(each, groups) for each in (rest[0], rest[-1]))
+        told += f", {len(rest)} others {high} to {low}"
+    return told
+
+
+def _learnt(agents: Sequence[tuple[str, RepresentationResult]]) -> str:
+    """Which agents end above the best policy that doesn't look."""
+    names = {
+        state: [name for name, label in agents if label.learnt == state]
+        for state in (YES, UNCLEAR, NO)
+    }
+    for state, which in names.items():
+        if len(which) == len(agents):
+            return _ALIKE[state] if len(agents) > 1 else _ALONE[state]
+    told = (
+        f"{word}: {', '.join(which) if len(which) <= _MOST else f'{len(which)} of {len(agents)}'}"
+        for word, which in zip(("learned", "not clearly", "didn't"), names.values(), strict=True)
+        if which
+    )
+    text = "; ".join(told)
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def _conclusion(analysis: Analysis) -> Iterable[str]:
+    """What can be concluded of the comparisons with the baseline."""
+    compared = [group for group in analysis.groups if group.comparisons]
+    if not compared:
+        yield "No reduced state was compared with the full one."
+        return
+    silent = [group for group in compared if group.labels[0].learnt != YES]
+    if silent:
+        surely = "" if all(group.labels[0].learnt == NO for group in silent) else "clearly "
+        where = f" on {listed([group.name for group in silent])}" if len(compared) > 1 else ""
+        yield (
+            f"Agents on {analysis.baseline} didn't {surely}learn{where}: nothing can be compared "
+            f"{'there' if where else 'with them'}."
+        )
+    cells = [(group, each) for group in compared for each in group.comparisons]
+    judged = [(group, each) for group, each in cells if each.is_judged]
+    if judged:
+        several = len(compared) > 1
+        yield from _decided(
+            analysis.planned.rules.claims,
+            [
+                (f"{c.representation} ({g.name})" if several else c.representation, c.verdicts)
+                for g, c in judged
+            ],
+        )
+        if analysis.planned.rules.gains_over == "still":
+            yield "As it was registered, gains count over standing still."
+    elif len(silent) < len(compared):
+        fewest = min(len(label.seeds) for group in compared for label in group.labels)
+        none = ": no conclusion" if fewest < FEWEST_UNITS else ""
+        yield (
+            f"With {counted(fewest, 'run')} of each and no claim registered, this is "
+            f"exploratory{none}."
+        )
+
+
+def _decided(
+    claims: Sequence[str], cells: Sequence[tuple[str, Sequence[Verdict]]]
+) -> Iterable[str]:
+    """What is found of each claim that anything is decided of; then of all others."""
+    first = cells[0][1][0]
+    if all(verdict.verdict == NOT_YET for _, verdicts in cells for verdict in verdicts):
+        yield f"Nothing is decided yet: {first.reason}."
+        return
+    silent = []
+    for position, claim in enumerate(claims):
+        names = {
+            state: [name for name, verdicts in cells if verdicts[position].verdict == state]
+            for state in (SUPPORTED, CONTRADICTED, UNDECIDED, NOT_YET, EXPLORATORY)
+        }
+        if not names[SUPPORTED] + names[CONTRADICTED]:
+            silent.append(repr(claim))
+            continue
+        told = [f"{state} for {listed(which)}" for state, which in names.items() if which]
+        yield f"Decided: {claim!r} is {', '.join(told)}."
+    if silent:
+        verb = "is" if len(silent) == 1 else "are"
+        yield f"{listed(silent)} {verb} undecided{' everywhere' if len(cells) > 1 else ''}."

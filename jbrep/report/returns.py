@@ -1,0 +1,112 @@
+"""Final returns beside policies that don't learn: a table for each task."""
+
+import math
+import re
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from jbrep.report.words import over, shown, shown_number
+from jbrep.stats.analysis import Analysis, GroupAnalysis
+from jbrep.stats.labels import REACHED, RepresentationResult
+from jbrep.stats.scale import STILL, best_blind
+from jbrep.text import Table
+
+_MOST_DIGITS = 9  # after the point
+_NOTHING = re.compile(r"-( \(0/\d+\))?")  # cells that say nothing
+
+
+def by_task(analysis: Analysis) -> list[list[GroupAnalysis]]:
+    """Groups that are told together: of several algorithms on one representation, by task."""
+    if any(len(group.labels) > 1 for group in analysis.groups):
+        return [[group] for group in analysis.groups]
+    tasks: dict[str, list[GroupAnalysis]] = {}
+    for group in analysis.groups:
+        tasks.setdefault(group.task, []).append(group)
+    return [*tasks.values()]
+
+
+def named(groups: Sequence[GroupAnalysis]) -> list[tuple[str, RepresentationResult]]:
+    """The agents of groups that are told together, by what tells them apart."""
+    if len(groups) > 1:
+        return [(group.algorithm, group.labels[0]) for group in groups]
+    return [(label.representation, label) for label in groups[0].labels]
+
+
+def returns_tables(analysis: Analysis) -> list[Table]:
+    """A table for each task: final returns, which agents learned, and what they gain."""
+    return [_returns_table(groups, analysis) for groups in by_task(analysis)]
+
+
+def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis) -> Table:
+    """A row for each agent, then for each policy that doesn't learn; no column without content."""
+    first = groups[0]
+    kept = {
+        comparison.representation: comparison.verdicts[0].estimate
+        for comparison in first.comparisons
+        if comparison.is_open and first.compares
+    }
+    form, best = return_form(groups), best_blind({p: r.value for p, r in first.references.items()})
+    counted_over_still = first.reference_policy == STILL != best
+    columns: dict[str, Callable[[RepresentationResult], str]] = {
+        "runs": lambda label: str(len(label.seeds)),
+        "failed": lambda label: str(len(label.failed) or "-"),
+        "final return": lambda label: shown(label.numbers["final_return_mean"], form),
+        "learned": lambda label: label.learnt,
+        f"over {best}": lambda label: (
+            shown_number(float(label.numbers["final_return_mean"].value) - first.blind.value, form)
+            if counted_over_still
+            else "-"
+        ),
+        f"of {analysis.baseline}'s gain": lambda label: (
+            shown(kept[label.representation], ".2f") if label.representation in kept else "-"
+        ),
+    }
+    rows = [(name, *(cell(label) for cell in columns.values())) for name, label in named(groups)]
+    for policy, mean in first.references.items():
+        cells = dict.fromkeys(columns, "-") | {"final return": shown(mean, form)}
+        rows.append((policy, *cells.values()))
+    what = "algorithm" if len(groups) > 1 else "agents on"
+    title = first.task if len(groups) > 1 else first.name
+    several = any(len(label.seeds) > 3 for _, label in named(groups))
+    title += f", {max(group.grid[-1] for group in groups):,.0f} steps"
+    title += "; 95 % intervals over runs" if several else ""
+    found = _without_nothing(Table(title, (what, *columns), rows))
+    if f"of {analysis.baseline}'s gain" in found.header:
+        gained = f"gains are over {first.reference_policy or over(analysis.planned.rules)}"
+        if counted_over_still:
+            gained += ", as it was registered"
+        return found._replace(title=f"{found.title}; {gained}")
+    return found
+
+
+def _without_nothing(table: Table) -> Table:
+    """The table without columns in which no cell says anything."""
+    kept = [
+        i
+        for i in range(len(table.header))
+        if not all(_NOTHING.fullmatch(row[i]) for row in table.rows)
+    ]
+    return table._replace(
+        header=tuple(table.header[i] for i in kept),
+        rows=[tuple(row[i] for i in kept) for row in table.rows],
+    )
+
+
+def steps(label: RepresentationResult, name: str) -> str:
+    """The median step at which a return is reached, and how many runs reach it."""
+    median = shown_number(label.numbers[name].value, ",.0f")
+    reached, runs = label.numbers[REACHED[name]].value, len(label.seeds)
+    return median if math.isnan(reached) else f"{median} ({round(reached * runs)}/{runs})"
+
+
+def return_form(groups: Sequence[GroupAnalysis], more: int = 0) -> str:
+    """A format for returns: three digits of the range of final returns, or more of them."""
+    returns = [each for group in groups for each in group.profile_returns[[0, -1]]]
+    width = max(returns) - min(returns)
+    return f",.{np.clip(2 - math.floor(math.log10(width)), 0, _MOST_DIGITS) + more}f"
+
+
+def shown_return(value: float, groups: Sequence[GroupAnalysis]) -> str:
+    """A return as tables show it."""
+    return shown_number(float(value), return_form(groups))
