@@ -20,6 +20,7 @@ from jbrep.rl.files import (
     CHECKPOINT,
     EPISODES,
     EVALUATION_SEED,
+    EVALUATIONS,
     FAILED,
     POLICY,
     RUN,
@@ -208,3 +209,37 @@ def test_arguments_and_time_limit_are_settings_of_a_run(tmp_path):
     assert told.exit_code == 2
     assert "holds another run: " in told.output
     assert "max_episode_steps 40 (now: 50); choose another folder" in told.output
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "overrides"),
+    [
+        ("sac", {"learning_starts": 50}),
+        ("a2c", {"use_sde": True}),
+        ("tqc", {"learning_starts": 50, "use_sde": True}),
+    ],
+)
+def test_a_run_goes_on_as_one_that_had_more_steps_at_first(algorithm, overrides, tmp_path):
+    settings = {"algorithm": algorithm, "preset": "modern", "overrides": overrides}
+    settings |= {"evaluate_every": 80, "evaluation_episodes": 2, "final_episodes": 3}
+    shorter, longer = (Run.of(CART, steps=steps, **settings) for steps in (160, 320))
+    grown, whole = tmp_path / "grown", tmp_path / "whole"
+    train(shorter, grown, keeps=True)
+    train(shorter, tmp_path / "short")
+    assert (grown / EVALUATIONS).read_bytes() == (tmp_path / "short" / EVALUATIONS).read_bytes()
+    train(longer, grown)
+    train(longer, whole)
+    for name in (EPISODES, EVALUATIONS, POLICY, "policy.zip"):
+        assert (grown / name).read_bytes() == (whole / name).read_bytes(), name
+    with pytest.raises(InputError, match=r"can't go on: its checkpoint.safetensors is gone"):
+        train(Run.of(CART, steps=400, **settings), grown)
+    with pytest.raises(InputError, match=r"holds another run: steps 320 \(now: 160\)"):
+        train(shorter, grown)
+
+
+def test_a_run_on_a_schedule_does_not_go_on(tmp_path):
+    settings = {"algorithm": "a2c", "evaluation_episodes": 1}
+    settings |= {"overrides": {"learning_rate": "linear:1e-3"}}
+    train(Run.of(CART, steps=80, **settings), tmp_path, keeps=True)
+    with pytest.raises(InputError, match="its learning_rate fell to 0 in them, which a longer"):
+        train(Run.of(CART, steps=160, **settings), tmp_path)

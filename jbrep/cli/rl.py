@@ -136,7 +136,8 @@ def rl(context: click.Context, /, out: Path, project: str | None, **options: Any
 
     It sees the full observation, scaled, or an encoder's latent. A checkpoint is written every
     minute, and on Ctrl-C before the command ends (td3 takes seconds to get there). The same command
-    resumes from it, to the same result.
+    resumes from it, to the same result. The last one stays: with more --steps the same command goes
+    on from there, to the result that it would have had with as many from the start.
     """
     with stop_signals() as received:
         run = given_run(options)
@@ -155,7 +156,9 @@ def rl(context: click.Context, /, out: Path, project: str | None, **options: Any
         try:
             with closing(_Bar(run.steps, f"{run.learner.algorithm} on {source}")) as bar:
                 writers = _writers(project, job)
-                session = Session(bar.show, stop=lambda: bool(received), writers=writers)
+                session = Session(
+                    bar.show, stop=lambda: bool(received), writers=writers, keeps=True
+                )
                 ((_, result),) = train_jobs([job], session)
         except StoppedError as error:
             resumes = f"; {RESUMES}" if run.task.reproducible else ""

@@ -193,8 +193,10 @@ class CheckpointFile:
         if not exists(self.path):
             return None
         tensors, header = read_checkpoint(self.path)
-        versions = differences(header.versions, self._versions)
-        if others := header.settings.differing(self._settings) or versions:
+        versions, settings = differences(header.versions, self._versions), header.settings
+        if settings.begins(self._settings) and not settings.schedules:
+            settings = self._settings
+        if others := settings.differing(self._settings) or versions:
             raise InputError(
                 f"{self.path} belongs to another configuration: {others}; choose another folder, "
                 "or delete the file to start over"

@@ -16,7 +16,7 @@ from jbrep.records.document import Document, read_document
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
 from jbrep.records.tables import read_rows
-from jbrep.rl.presets import Hyperparameters
+from jbrep.rl.presets import LINEAR, Hyperparameters
 from jbrep.rl.settings import (
     CLASSES,
     MAX_EPISODES,
@@ -103,10 +103,23 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
         """The label with the seed: face_direction/sac-modern/dae-8/seed-0."""
         return f"{self.label}/seed-{self.seed}"
 
-    def is_evaluation_due(self, step: int) -> bool:
-        """Whether the policy is to be evaluated after so many steps, which aren't all."""
+    def is_evaluation_due(self, step: int, keeps: bool = False) -> bool:
+        """Whether the policy is to be evaluated after so many steps, which aren't all.
+
+        Where the run is kept, to go on later, they may be: the last evaluation comes after it.
+        """
         at_once = self.control_steps(self.hyperparameters.num_envs)
-        return step % self.evaluate_every < at_once and step < self.steps
+        return step % self.evaluate_every < at_once and (keeps or step < self.steps)
+
+    @property
+    def schedules(self) -> list[str]:
+        """The names of what changes from a run's first step to its last."""
+        chosen = self.hyperparameters.algorithm_kwargs.items()
+        return [name for name, value in chosen if str(value).startswith(LINEAR)]
+
+    def begins(self, longer: "RunSettings") -> bool:
+        """Whether a longer run does the same as far as this one goes."""
+        return self.steps < longer.steps and not self.replace(steps=longer.steps).differing(longer)
 
     @property
     def agent_steps(self) -> int:
@@ -121,10 +134,6 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
     def episode_steps(self) -> int:
         """That an agent takes in the longest episode."""
         return self.hyperparameters.agent_steps(self.environment.max_episode_steps)
-
-    def episodes_at(self, step: int) -> int:
-        """Of the evaluation after so many steps."""
-        return self.final_episodes if step >= self.steps else self.evaluation_episodes
 
     def differing(self, wanted: "RunSettings") -> str:
         """How they differ from those of the run at hand, for a message; empty if they don't."""

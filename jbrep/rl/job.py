@@ -62,12 +62,14 @@ class Session(NamedTuple):
         save_every: seconds between checkpoints, at least.
         stop: asked before each rollout; once it is true, checkpoints are written and training ends.
         writers: of stable-baselines3's logger, that get what TensorBoard gets.
+        keeps: whether a run that has ended keeps a checkpoint, from which it can go on.
     """
 
     watch: Callable[["Job", int, float | None], None] = lambda job, step, mean: None
     save_every: float = 60
     stop: Callable[[], bool] = lambda: False
     writers: Sequence[KVWriter] = ()
+    keeps: bool = False
 
 
 class Job:
@@ -88,7 +90,7 @@ class Job:
     def __init__(self, run: Run, folder: Path, threads: int = 1):
         self.run, self.folder, self.threads = run, folder, threads
         self.encoder = run.find_encoder()
-        self.settings = run.settings(self.encoder)
+        self.settings = self._going_on(run.settings(self.encoder))
         self.history = History()
 
     def anew(self) -> "Job":
@@ -110,9 +112,39 @@ class Job:
         if not exists(self.folder / RUN):
             return None
         result = read_run(self.folder)
+        if result.settings.begins(self.settings):
+            self._check_goes_on(result)
+            return None
         if others := result.settings.differing(self.settings):
             raise InputError(f"{self.folder} holds another run: {others}; choose another folder")
         return result
+
+    def _going_on(self, settings: RunSettings) -> RunSettings:
+        """Settings with evaluations as far apart as before, where a shorter run goes on."""
+        if self.run.evaluate_every or not exists(self.folder / RUN):
+            return settings
+        before = read_run(self.folder).settings
+        same = settings.replace(evaluate_every=before.evaluate_every)
+        return same if before.begins(same) else settings
+
+    def _check_goes_on(self, before: RunRecord) -> None:
+        """Make sure that a run with fewer steps can go on.
+
+        Raises:
+            InputError: it failed, its checkpoint is gone, or a setting follows a schedule.
+        """
+        what = f"the run of {before.settings.steps:,} steps in {self.folder} can't go on"
+        if before.status == FAILED:
+            raise InputError(f"{what}: it failed; choose another folder")
+        if schedules := before.settings.schedules:
+            raise InputError(
+                f"{what}: its {schedules[0]} fell to 0 in them, which a longer run's doesn't; "
+                "choose another folder"
+            )
+        if not exists(self.folder / CHECKPOINT):
+            raise InputError(
+                f"{what}: its {CHECKPOINT} is gone; choose another folder, perhaps with --from"
+            )
 
     def clear(self) -> None:
         """Remove what a run that has ended may have left, if it was killed at the very end.
@@ -161,14 +193,23 @@ class Job:
         threads = self.threads_for(episodes)
         return Evaluator(self.run.task, self.encoder, episodes, num_threads=threads)
 
-    def evaluate(self, agent: BaseAlgorithm) -> None:
-        """Play an agent's deterministic policy, as often as is due, and record and log the returns.
+    def evaluate_finally(self, agent: BaseAlgorithm) -> None:
+        """Evaluate a trained agent, in more episodes; see `evaluate`.
+
+        What was evaluated after the last step already, in case that the run goes on, makes room.
+        """
+        rows = self.history.evaluations
+        self.history.evaluations = [row for row in rows if row.step < self.settings.steps]
+        self.evaluate(agent, self.settings.final_episodes)
+
+    def evaluate(self, agent: BaseAlgorithm, episodes: int | None = None) -> None:
+        """Play an agent's deterministic policy, and record and log the returns.
 
         Raises:
             NonFiniteActionError, EnvironmentFailedError: as `Evaluator.returns`.
         """
         step, logger = self.step_of(agent), agent.logger
-        returns = self.evaluator.returns(agent, self.settings.episodes_at(step))
+        returns = self.evaluator.returns(agent, episodes)
         self.history.evaluated(step, returns)
         logger.record("evaluation/mean_return", self.history.mean)
         logger.dump(agent.num_timesteps)
@@ -188,6 +229,7 @@ class Job:
             The contents of run.json.
         """
         steps = self.step_of(agent)
+        (self.folder / RUN).unlink(missing_ok=True)  # of fewer steps, before its files change
         parts = agent.policy, self.run.task, self.encoder, self.settings
         trained = Trained(*parts, None, statistics_of(agent), action_repeat(agent))
         policy = b"" if failure else pack_whole(trained)
@@ -209,7 +251,6 @@ class Job:
             policy_sha256=hashlib.sha256(policy).hexdigest() if policy else None,
         )
         result.write(self.folder / RUN)  # last: the run has ended where it exists
-        (self.folder / CHECKPOINT).unlink(missing_ok=True)
         return result
 
 

@@ -130,14 +130,17 @@ class _Follower(BaseCallback):
             total, length = float(info["episode"]["r"]), info["control_steps"]
             row = Episode(step, lane, total, length, info.get("non_finite", False))
             self._job.history.episodes.append(row)
-        if self._job.settings.is_evaluation_due(step):
+        if self._job.settings.is_evaluation_due(step, self._session.keeps):
             self._job.evaluate(self.model)
         return True
 
     def _on_training_end(self) -> None:
         check_finite(self.model)
         self._tell()  # the last evaluation can take minutes
-        self._job.evaluate(self.model)
+        if self._session.keeps:
+            _draw_noise(self.model)
+            self._job.checkpoint.write(take(self.model))
+        self._job.evaluate_finally(self.model)
         self._tell()
 
     def _tell(self) -> None:
@@ -217,6 +220,13 @@ def _restore_draws(agent: BaseAlgorithm, tensors: Tensors) -> None:
     if noise := _state_dependent_noise(agent):
         for name in _EXPLORATION:
             setattr(noise, name, torch.from_numpy(tensors[name]))
+
+
+def _draw_noise(agent: BaseAlgorithm) -> None:
+    """Draw state-dependent noise, if there is any, as the next rollout would at its start."""
+    if _state_dependent_noise(agent):
+        policy: Any = acting(agent.policy)
+        policy.reset_noise(agent.n_envs)
 
 
 def _state_dependent_noise(agent: BaseAlgorithm) -> StateDependentNoiseDistribution | None:

@@ -9,7 +9,7 @@ from stable_baselines3.common.logger import KVWriter
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import make_folder
 from jbrep.rl.cohort.trainer import train_together
-from jbrep.rl.files import RunRecord
+from jbrep.rl.files import CHECKPOINT, FAILED, RunRecord
 from jbrep.rl.job import Ended, Job, Session, Watch
 from jbrep.rl.run import Run
 from jbrep.rl.sb3 import train_in_turn
@@ -26,6 +26,7 @@ def train(
     save_every: float = 60,
     stop: Callable[[], bool] = lambda: False,
     writers: Sequence[KVWriter] = (),
+    keeps: bool = False,
 ) -> RunRecord:
     """Train an agent and write its folder, unless the run has ended already.
 
@@ -38,6 +39,7 @@ def train(
         save_every: seconds between checkpoints.
         stop: asked before each rollout; once it is true, the run writes a checkpoint and stops.
         writers: of stable-baselines3's logger, that get what TensorBoard gets.
+        keeps: whether the checkpoint stays, from which the same run with more steps goes on.
 
     Returns:
         The contents of run.json.
@@ -46,7 +48,7 @@ def train(
         InputError: as `Run.settings`; or the folder holds another run, or is in use.
         StoppedError: `stop` was true.
     """
-    session = Session(lambda job, *told: watch(*told), save_every, stop, writers)
+    session = Session(lambda job, *told: watch(*told), save_every, stop, writers, keeps)
     ((_, record),) = train_jobs([Job(run, folder)], session)
     return record
 
@@ -70,4 +72,7 @@ def train_jobs(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
         yield from ((job, result) for job, result in results.items() if result)
         for trainer, train_own in _FUNCTIONS.items():
             own = [job for job in jobs if job.settings.trainer == trainer and not results[job]]
-            yield from train_own(own, session)
+            for job, record in train_own(own, session):
+                if not session.keeps or record.status == FAILED:
+                    (job.folder / CHECKPOINT).unlink(missing_ok=True)
+                yield job, record

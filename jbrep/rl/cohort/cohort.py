@@ -1,6 +1,6 @@
 """Runs of one task and algorithm that learn side by side, each as it would alone."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -185,10 +185,17 @@ class Cohort:
 
     def evaluate(self) -> None:
         """Let each member play its policy that hasn't failed."""
+        self._let_play(lambda member: member.job.evaluate)
+
+    def evaluate_finally(self) -> None:
+        """The same after training, in more episodes."""
+        self._let_play(lambda member: member.job.evaluate_finally)
+
+    def _let_play(self, evaluation: Callable[[Member], Callable[[Any], None]]) -> None:
         self.write_to_agents()
         for member in self.members:
             if not member.failure:
-                member.evaluate()
+                member.evaluate(evaluation(member))
 
     @property
     def failed(self) -> list[Member]:

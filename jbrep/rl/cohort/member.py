@@ -3,7 +3,7 @@
 import math
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -123,10 +123,10 @@ class Member:
         if not math.isfinite(weights):
             self.fail(WEIGHTS_NOT_FINITE)
 
-    def evaluate(self) -> None:
-        """Play its agent's policy, deterministically."""
+    def evaluate(self, evaluation: Callable[[Any], None]) -> None:
+        """Let an evaluation of its job's play its agent's policy."""
         try:
-            self.job.evaluate(self.agent)
+            evaluation(self.agent)
         except NonFiniteActionError:
             self.fail(ACTIONS_NOT_FINITE)
         except EnvironmentFailedError as error:

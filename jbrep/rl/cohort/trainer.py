@@ -73,11 +73,13 @@ def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
             _save(cohort, session)
             for _ in range(cohort.rollout):
                 cohort.act()
-                if first.settings.is_evaluation_due(cohort.step):
+                if first.settings.is_evaluation_due(cohort.step, session.keeps):
                     cohort.evaluate()
             cohort.learn()
         _tell(cohort, session)  # the last evaluation can take minutes
-        cohort.evaluate()
+        if session.keeps:
+            _write(cohort)
+        cohort.evaluate_finally()
         _tell(cohort, session)
         yield from map(_end, cohort.members)
     except EnvironmentFailedError as error:
@@ -100,11 +102,16 @@ def _save(cohort: Cohort, session: Session) -> None:
     stopping = session.stop()
     first = cohort.members[0].job.checkpoint
     if stopping or first.is_due(session.save_every, len(cohort.members)):
-        cohort.write_to_agents()
-        for member in cohort.members:
-            member.job.checkpoint.write(cohort.take(member))
+        _write(cohort)
     if stopping:
         raise StoppedError(cohort.step)
+
+
+def _write(cohort: Cohort) -> None:
+    cohort.write_to_agents()
+    for member in cohort.members:
+        if not member.failure:
+            member.job.checkpoint.write(cohort.take(member))
 
 
 def _end(member: Member) -> Ended:
