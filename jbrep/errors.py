@@ -13,6 +13,10 @@ class InputError(ValueError):
     """A user's mistake: one line with what was wrong, what was expected, and the choices."""
 
 
+class Notice(UserWarning):
+    """What a user should know though work goes on; the command line shows it as a line."""
+
+
 class DamageError(InputError):
     """A file is not what jbrep wrote; the message names it."""
 

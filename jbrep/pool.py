@@ -7,11 +7,14 @@ so that a new one watches its parent before the seconds that it takes to import 
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
+from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 ATTEMPTS = 5  # at a job whose worker is killed
@@ -22,6 +25,10 @@ _SINGLE_THREADED = dict.fromkeys(
 _stop = threading.Event()  # set in a worker that is asked to stop
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
+
+
+class WorkerError(RuntimeError):
+    """A job raised an error, whose traceback the worker has shown; its last line."""
 
 
 class Pool(Generic[_Job, _Result]):
@@ -79,17 +86,23 @@ class Pool(Generic[_Job, _Result]):
             worker.connection.send((self._function, arguments))
 
     def result(self) -> tuple[_Job, _Result | None]:
-        """Wait for a job to end: what it returned, or None if its worker died or was stopped."""
+        """Wait for a job to end: what it returned, or None if its worker died or was stopped.
+
+        Raises:
+            WorkerError: it raised an error.
+        """
         connection = wait(list(self._busy))[0]
         assert isinstance(connection, Connection)
         worker, job = self._busy.pop(connection)
         try:
-            result: _Result = connection.recv()
+            result: _Result | WorkerError = connection.recv()
         except (EOFError, OSError):
             connection.close()
             worker.process.join()
             return job, None
         self._idle.append(worker)
+        if isinstance(result, WorkerError):
+            raise result
         return job, result
 
 
@@ -100,8 +113,20 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        self.process.start()
+        with _without_script():
+            self.process.start()
         theirs.close()
+
+
+@contextmanager
+def _without_script() -> Iterator[None]:
+    """Keep a new process from running the script that this one runs: it may have no main guard."""
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
 
 
 def stop_requested() -> bool:
@@ -117,11 +142,29 @@ def _serve(connection: Connection) -> None:
     os.environ.update(_SINGLE_THREADED)
     with suppress(EOFError, OSError):
         while True:
-            function, arguments = connection.recv()
-            result = function(*arguments)
+            result = _result(connection)
             if stop_requested():
                 return
             connection.send(result)
+
+
+def _result(connection: Connection) -> Any:
+    """What the next job returns, or the error that it raises; a job may not even be readable."""
+    try:
+        function, arguments = connection.recv()
+    except (EOFError, OSError):  # the parent is gone
+        raise
+    except Exception as error:
+        return _told(error)
+    try:
+        return function(*arguments)
+    except Exception as error:
+        return _told(error)
+
+
+def _told(error: Exception) -> WorkerError:
+    traceback.print_exception(error)
+    return WorkerError(f"a worker failed: {type(error).__name__}: {error}")
 
 
 def _end_with_parent() -> None:

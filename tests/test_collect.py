@@ -22,7 +22,7 @@ from jbrep.collect.derive import derive
 from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
 from jbrep.dataset import DamageError, Dataset
-from jbrep.dataset.manifest import open_shard, read_manifest, write_manifest
+from jbrep.dataset.manifest import current_manifest, open_shard, read_manifest, write_manifest
 from jbrep.dataset.schema import episode_seed
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
@@ -222,8 +222,8 @@ write_again(Path({str(collected)!r}), Path({str(folder)!r}))
 """
     killed = subprocess.run([sys.executable, "-c", script], check=False)
     assert killed.returncode == -signal.SIGKILL
-    committed = len(read_manifest(folder).shards)
-    assert committed == (2 if stage == 11 else 1)
+    committed = len(current_manifest(folder).shards)
+    assert committed == (2 if stage > 6 else 1)  # from when the shard's file is there
     before = contents(folder)
     dataset = Dataset(folder)
     np.testing.assert_array_equal(

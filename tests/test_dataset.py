@@ -230,20 +230,21 @@ def test_a_reader_sees_the_committed_part_while_a_collector_writes(
 ):
     seen = []
 
-    def look(folder, content):
+    def look(content, path):
+        folder = path.parent
         shards = sorted(path.name for path in folder.glob("shard-*.h5"))
-        if shards:
+        if shards and path.name == manifest.MANIFEST:
             dataset = Dataset(folder)
             np.testing.assert_array_equal(
                 dataset["observation"][:], Dataset(collected)["observation"][: len(dataset)]
             )
             seen.append((len(shards), len(dataset), dataset.manifest.complete))
-        return write_manifest(folder, content)
+        return write(content, path)
 
-    write_manifest = manifest.write_manifest
-    monkeypatch.setattr(manifest, "write_manifest", look)
+    write = manifest.Manifest.write
+    monkeypatch.setattr(manifest.Manifest, "write", look)
     write_again(collected, tmp_path / "growing")
-    assert seen == [(k + 1, 1000 * k, False) for k in range(5)]
+    assert seen == [(k, 1000 * k, k == 5) for k in range(1, 6)]
 
 
 def test_shards_committed_while_it_opens_are_no_strangers(collected, tmp_path, monkeypatch):
@@ -256,12 +257,12 @@ def test_shards_committed_while_it_opens_are_no_strangers(collected, tmp_path, m
         write_shards(settings(), folder, stop)
 
     def read_late(folder):
-        found = read_manifest(folder)
+        found = current_manifest(folder)
         write_again(collected, folder)
         return found
 
-    read_manifest = manifest.read_manifest
-    monkeypatch.setattr(reader, "read_manifest", read_late)
+    current_manifest = manifest.current_manifest
+    monkeypatch.setattr(reader, "current_manifest", read_late)
     assert len(Dataset(folder)) == 0
     monkeypatch.undo()
     assert len(Dataset(folder)) == 5000

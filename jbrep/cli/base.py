@@ -6,6 +6,8 @@ import math
 import os
 import signal
 import sys
+import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import Any, NoReturn, TextIO, TypeVar
 
 import click
 
-from jbrep.errors import InputError
+from jbrep.errors import InputError, Notice
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -179,12 +181,46 @@ def stoppable(afterwards: str) -> Iterator[None]:
             raise
 
 
+@contextmanager
+def _notices() -> Iterator[None]:
+    """Show each notice as a line on standard error."""
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
+        if issubclass(category, Notice):
+            say(f"Note: {message}", err=True)
+        else:
+            usual(message, category, *where, **options)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", Notice)
+        warnings.showwarning = show
+        yield
+
+
+@contextmanager
+def _closing() -> Iterator[None]:
+    """Close every environment at the end, also where SIGTERM is the end: it may be a robot."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if is_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _leave)
+    try:
+        yield
+    finally:
+        if instances := sys.modules.get("jbrep.envs.instances"):  # only if there may be any
+            instances.close_all()
+
+
+def _leave(number: int, frame: FrameType | None) -> NoReturn:
+    raise SystemExit(128 + number)
+
+
 class Cli(click.Group):
     """A user's mistake is one line and exit code 2; anything else shows its traceback."""
 
     def main(self, *args: Any, **options: Any) -> Any:
-        """Run the command line."""
-        with lasting_output():
+        """Run the command line; close what it has opened."""
+        with lasting_output(), _notices(), _closing():
             return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> None:

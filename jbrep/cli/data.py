@@ -18,16 +18,18 @@ from jbrep.cli.base import (
     say,
     stoppable,
 )
-from jbrep.cli.environment import given_task, import_option, needed_task, task_options
+from jbrep.cli.environment import (
+    given_task,
+    import_option,
+    needed_task,
+    retries_option,
+    task_options,
+    threads_option,
+)
 from jbrep.cli.options import record_options
 from jbrep.dataset.settings import TRAINED, CollectSettings, parts_of
 from jbrep.text import counted, terminal_width
 
-_threads = click.option(
-    "--threads",
-    type=click.IntRange(1, 4096),
-    help="Threads of a batch, or processes; as many as cores by default.",
-)
 _lanes = click.option(
     "--lanes",
     type=click.IntRange(1, 100_000),
@@ -50,7 +52,8 @@ _data = click.argument("data", type=PATH)
     "weights, of which each episode has one: uniform:0.5+runs/a:0.5.",
 )
 @_lanes
-@_threads
+@threads_option
+@retries_option
 @click.option("--backend", default="local", show_default=True, help="local, or ray for a cluster.")
 @click.option("--out", required=True, type=PATH, help="A folder.")
 def collect(
@@ -61,6 +64,7 @@ def collect(
     shard_episodes: int | None,
     lanes: int,
     threads: int | None,
+    retries: int,
     backend: str,
     out: Path,
     **options: Any,
@@ -69,8 +73,9 @@ def collect(
 
     The same command resumes an unfinished data set and leaves a finished one as it is; with more
     --steps it extends it, to the data that one command with as many collects. The numbers of lanes
-    and threads and the backend don't change the data. The policy of a run is kept with the data as
-    it is at the start, also if the run goes on.
+    and threads and the backend don't change the data. A robot that exists once needs --threads 1.
+    Episodes that are finished are kept whatever happens. The policy of a run is kept with the data
+    as it is at the start, also if the run goes on.
     """
     from jbrep.collect import collect as run
     from jbrep.collect.collector import usual_shard_episodes
@@ -93,7 +98,7 @@ def collect(
     settings = settings.replace(shard_episodes=shard_episodes)
     _tell_kept(out, settings.policy)
     with stoppable(RESUMES):
-        _report(out, *run(settings, out, lanes, threads, backend, actor))
+        _report(out, *run(settings, out, lanes, threads, backend, actor, retries))
 
 
 def _tell_kept(out: Path, policy: Mapping[str, Any]) -> None:
@@ -107,10 +112,21 @@ def _tell_kept(out: Path, policy: Mapping[str, Any]) -> None:
 def _report(out: Path, manifest: Any, rows: int, seconds: float) -> None:
     """Print what the folder holds now, and how fast it was written."""
     _report_size(out, manifest)
+    _tell_missing(out)
     if rows:
         click.echo(f"{rows:,} rows in {seconds:,.0f} s, {rows / seconds:,.0f} a second")
     else:
         click.echo("it was complete already: nothing was done")
+
+
+def _tell_missing(out: Path) -> None:
+    """Say how many readings were missing."""
+    from jbrep.dataset import Dataset
+
+    dataset = Dataset(out)
+    if dataset.task.missing:
+        count = int(dataset.episodes["missing"].sum())
+        say(f"{count:,} missing readings ({dataset.task.missing})", err=True)
 
 
 def _report_size(out: Path, manifest: Any) -> None:
@@ -144,7 +160,7 @@ def info(data: Path, as_json: bool) -> None:
 @_data
 @click.option("--replay", default=0, help="Episodes to simulate again and compare bit for bit.")
 @import_option
-@_threads
+@threads_option
 @click.pass_context
 def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> None:
     """Check every hash, shape, number and range.
@@ -181,7 +197,7 @@ def _say_all(lines: Iterable[str]) -> bool:
 @_data
 @import_option
 @_lanes
-@_threads
+@threads_option
 def repair(data: Path, lanes: int, threads: int | None) -> None:
     """Restore damaged and missing files as they were."""
     from jbrep.collect.repair import repair as run
@@ -199,7 +215,7 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
 @_data
 @click.option("--task", required=True, help="The task to observe and reward.")
 @record_options(CollectSettings, "store_state")
-@_threads
+@threads_option
 @click.option("--out", required=True, type=PATH, help="A folder.")
 def derive(data: Path, task: str, store_state: bool, threads: int | None, out: Path) -> None:
     """Make another task's data set from the same motion.
@@ -248,15 +264,22 @@ def import_(source: str, out: Path, **options: Any) -> None:
     from jbrep.dataset.formats import open_source
     from jbrep.dataset.formats.writer import write
 
+    told = {name: options[name] for name in ("features", "missing")}
+    if options["task"] is None:  # they can be said of data alone
+        options |= dict.fromkeys(told)
     task = given_task(options)
     with stoppable("nothing was imported"):
         with _deferred_stop():
             opened = open_source(source)
-        manifest = write(opened, out, task)
+        manifest = write(opened, out, task, **({} if task else _given(told)))
     if not (task or opened.task):
         line = f"{manifest.task.name} is made from the data alone: {opened.why_no_task}"
         say(line, err=True)
     _report_size(out, manifest)
+
+
+def _given(options: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from jbrep.text import terminal_width
 if TYPE_CHECKING:
     from jbrep.envs.task import Task
 
-_ARGUMENTS = ("env", "episode_steps", "features")
+_ARGUMENTS = ("env", "episode_steps", "features", "missing")
 
 
 def _import(context: click.Context, option: click.Parameter, modules: tuple[str, ...]) -> None:
@@ -47,9 +47,28 @@ _argument_options = with_options(
     click.option(
         "--features",
         type=PATH,
-        help="A TOML file with names, units, ranges and kinds of the features.",
+        help="A TOML file with names, units, ranges, kinds and offsets of the features.",
+    ),
+    click.option(
+        "--missing",
+        metavar="[skip|hold:N]",
+        help="What becomes of readings that aren't finite: an episode ends before one, or the last "
+        "one is held for at most N steps; otherwise they are errors.",
     ),
     import_option,
+)
+threads_option = click.option(
+    "--threads",
+    type=click.IntRange(1, 4096),
+    help="Threads of a batch, or instances of other environments at once; as many as cores by "
+    "default. A robot that exists once needs 1.",
+)
+retries_option = click.option(
+    "--retries",
+    type=click.IntRange(0, 1_000_000),
+    default=0,
+    show_default=True,
+    help="How often in a row an environment that fails is made anew and tried again.",
 )
 task_options = with_options(  # from which `given_task` makes a task
     click.option(
@@ -67,13 +86,13 @@ def needed_task(options: dict[str, Any]) -> "Task":
         InputError: there is none; or as `jbrep.envs.describe`.
     """
     name = options.pop("task")
-    env, steps, features = (options.pop(option) for option in _ARGUMENTS)
+    env, steps, features, missing = (options.pop(option) for option in _ARGUMENTS)
     if name is None:
         raise InputError("give the --task: one of the Jitterbug's, or a Gymnasium id")
     from jbrep.envs.description import describe
     from jbrep.envs.names import name_given
 
-    return describe(name_given(name), parse_arguments(env), steps, features)
+    return describe(name_given(name), parse_arguments(env), steps, features, missing)
 
 
 def given_task(options: dict[str, Any]) -> "Task | None":

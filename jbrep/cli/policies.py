@@ -15,7 +15,7 @@ from jbrep.cli.base import (
     say,
     stoppable,
 )
-from jbrep.cli.environment import given_task, task_options
+from jbrep.cli.environment import given_task, retries_option, task_options, threads_option
 from jbrep.errors import InputError
 from jbrep.text import interval_of, percentiles, table, terminal_width
 
@@ -33,6 +33,8 @@ _TASK = "face_direction"
 )
 @click.option("--trust", is_flag=True, help="Read a zip file from elsewhere, which can run code.")
 @task_options
+@threads_option
+@retries_option
 @click.option("--algorithm", default="sac", show_default=True, help="Of a zip file.")
 @click.option(
     "--vecnormalize",
@@ -46,9 +48,14 @@ _TASK = "face_direction"
     "name of one that ships, or code, mymodule:MyEncoder; of a run that was made with code, that.",
 )
 @as_json
+@click.pass_context
 def evaluate_policy(
+    context: click.Context,
+    /,
     policy: str,
     episodes: int,
+    threads: int | None,
+    retries: int,
     trust: bool,
     algorithm: str,
     vecnormalize: Path | None,
@@ -74,7 +81,7 @@ def evaluate_policy(
     zip_file = _Zip(algorithm, trust, vecnormalize)
     player = _find(policy, given_task(options), encoder, zip_file)
     source = None if encoder is None else source_of(encoder, player.task)
-    returns = player.returns(episodes)
+    returns, failure = _returns(player, episodes, threads, retries)
     if as_json:
         echo_json(
             {
@@ -83,16 +90,40 @@ def evaluate_policy(
                 "representation": player.representation,
                 **({} if source is None else {"encoder": source}),
                 **({} if player.step is None else {"step": player.step}),
-                "episodes": episodes,
-                "returns": returns.tolist(),
+                "episodes": len(returns),
+                "returns": returns,
                 **percentiles(returns),
             }
         )
-        return
-    if source is not None:
-        say(f"encoder: {source}")
-    title = _title(policy, player)
-    say(f"{title}: median return {interval_of(returns)} (10-90 % of {episodes} episodes)")
+    else:
+        if source is not None:
+            say(f"encoder: {source}")
+        title = _title(policy, player)
+        say(f"{title}: median return {interval_of(returns)} (10-90 % of {len(returns)} episodes)")
+    if failure:
+        say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
+        context.exit(1)
+
+
+def _returns(
+    player: "Player", episodes: int, threads: int | None, retries: int
+) -> tuple[list[float], str]:
+    """The returns of the episodes that were finished, and why others weren't.
+
+    Raises:
+        EnvironmentFailedError: none was.
+    """
+    from jbrep.envs.lanes import EnvironmentFailedError
+
+    returns: list[float] = []
+    try:
+        for some in player.returns_in_turn(episodes, threads, retries):
+            returns += some.tolist()
+    except EnvironmentFailedError as error:
+        if not returns:
+            raise
+        return returns, str(error)
+    return returns, ""
 
 
 def _title(policy: str, player: "Player") -> str:

@@ -21,16 +21,17 @@ from jbrep.cli.base import (
     say,
     with_options,
 )
-from jbrep.cli.environment import needed_task, parse_arguments, task_options
+from jbrep.cli.environment import needed_task, parse_arguments, retries_option, task_options
 from jbrep.cli.options import record_options
 from jbrep.errors import choose
 from jbrep.records.record import converted
-from jbrep.rl.settings import CLASSES, Seed, TrainingSettings
+from jbrep.rl.settings import CLASSES, MODERN, Seed, TrainingSettings
 from jbrep.text import interval_of, rounded, sparkline
 
 if TYPE_CHECKING:
     from stable_baselines3.common.logger import KVWriter
 
+    from jbrep.envs.task import Task
     from jbrep.rl import Run
     from jbrep.rl.job import Job
 
@@ -74,11 +75,12 @@ learner_options = with_options(  # which `given_run` reads
 )
 
 
-def given_run(options: dict[str, Any], **others: Any) -> "Run":
+def given_run(options: dict[str, Any], threads: int | None = None, **others: Any) -> "Run":
     """The run that the options of a command say; code that they name is imported.
 
     Args:
         options: of `task_options`, `learner_options` and `record_options`.
+        threads: 1 is one lane of an environment that isn't a batch.
         others: fields of a run.
 
     Raises:
@@ -103,9 +105,21 @@ def given_run(options: dict[str, Any], **others: Any) -> "Run":
     task = needed_task(options)
     import_code(options["encoder"])
     check_found(options["encoder"], task)
+    if is_one := is_one_robot(task, threads):
+        options["preset"] = options["preset"] or MODERN
     from jbrep.rl import Run  # imports torch, after all words are known to be right
 
-    return Run.of(task, overrides=overrides, **options, **others)
+    run = Run.of(task, overrides=overrides, **options, **others)
+    if is_one and run.learner.hyperparameters.num_envs > 1:
+        return run.replace(learner=run.learner.overridden({"num_envs": 1}))
+    return run
+
+
+def is_one_robot(task: "Task", threads: int | None) -> bool:
+    """Whether a command is to have one instance of an environment."""
+    from jbrep.envs.make import is_batched
+
+    return threads == 1 and not is_batched(task)
 
 
 @click.command(
@@ -115,6 +129,14 @@ def given_run(options: dict[str, Any], **others: Any) -> "Run":
 @learner_options
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
 @record_options(TrainingSettings)
+@click.option(
+    "--threads",
+    type=click.IntRange(1, 4096),
+    help="Threads of a batch, as many as cores by default. 1 is one instance of another "
+    "environment, as of a robot that exists once: num_envs is 1, in the preset modern unless one "
+    "is named, and evaluations wait for the end of an episode.",
+)
+@retries_option
 @click.option(
     "--from",
     "begin_from",
@@ -131,7 +153,15 @@ def given_run(options: dict[str, Any], **others: Any) -> "Run":
 )
 @click.option("--out", required=True, type=PATH, help="A folder for this run.")
 @click.pass_context
-def rl(context: click.Context, /, out: Path, project: str | None, **options: Any) -> None:
+def rl(
+    context: click.Context,
+    /,
+    out: Path,
+    project: str | None,
+    threads: int | None,
+    retries: int,
+    **options: Any,
+) -> None:
     """Train and evaluate one agent.
 
     It sees the full observation, scaled, or an encoder's latent. A checkpoint is written every
@@ -140,7 +170,7 @@ def rl(context: click.Context, /, out: Path, project: str | None, **options: Any
     on from there, to the result that it would have had with as many from the start.
     """
     with stop_signals() as received:
-        run = given_run(options)
+        run = given_run(options, threads)
         from joblib import cpu_count
 
         from jbrep.encoders.shipped import source_of
@@ -149,7 +179,8 @@ def rl(context: click.Context, /, out: Path, project: str | None, **options: Any
         from jbrep.rl.job import Job, Session
         from jbrep.rl.trainers import train_jobs
 
-        job = Job(run, out, cpu_count())
+        is_one = is_one_robot(run.task, threads)
+        job = Job(run, out, threads or cpu_count(), retries, is_one)
         source = source_of(run.encoder, run.task)
         if not run.task.reproducible:
             click.echo(_NOT_REPRODUCIBLE.format(run.task.name), err=True)

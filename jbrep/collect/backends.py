@@ -1,15 +1,20 @@
 """Where shards are made: in this process, in others on this machine, or on a Ray cluster."""
 
 import os
+import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
 from typing import Any
 
-from jbrep.collect.shards import Missing, Produce, Simulator
+import gymnasium
+from gymnasium.envs.registration import EnvSpec
+
+from jbrep.collect.shards import Made, Missing, Produce, Simulator, all_of
 from jbrep.dataset.schema import Columns
+from jbrep.envs.instances import close_kept
 from jbrep.envs.make import is_batched
-from jbrep.envs.names import import_modules, imported_modules
+from jbrep.envs.names import find_spec, import_modules, imported_modules
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, first_line
 from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
@@ -18,9 +23,21 @@ from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
 def local(simulator: Simulator) -> Produce:
     """A batch's shards in turn on threads; other environments' side by side in processes."""
     workers = simulator.num_threads or os.cpu_count() or 1
-    if is_batched(simulator.settings.task) or workers == 1:
+    task = simulator.settings.task
+    if is_batched(task) or workers == 1 or not _can_be_sent(find_spec(task.id), simulator):
         return simulator.in_turn
     return _in_processes(replace(simulator, lanes=1, num_threads=1), workers)
+
+
+def _can_be_sent(*parts: Any) -> bool:
+    """Whether other processes can make what this one has, though they don't run its script.
+
+    They can't make classes of a script or notebook, which stand in `__main__`.
+    """
+    try:
+        return b"__main__" not in pickle.dumps(parts)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return False
 
 
 def _in_processes(simulator: Simulator, workers: int) -> Produce:
@@ -30,12 +47,15 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
         if not missing.wants(first + 1):  # one shard alone
             yield from simulator.in_turn(first, missing, tick)
             return
-        made: dict[int, Columns | str] = {}
+        made: dict[int, Made] = {}
         started, attempts = first, dict[int, int]()
-        with Pool[int, Columns | str](make_shard, workers, lambda: None) as pool:
+        known = imported_modules(), find_spec(simulator.settings.task.id)
+        close_kept()  # the workers have their own
+        with Pool[int, Made](make_shard, workers, lambda: None) as pool:
 
             def submit(shard: int) -> None:
-                pool.submit(shard, imported_modules(), simulator, shard, missing.rows)
+                begun = missing.begun(shard)
+                pool.submit(shard, known, simulator, shard, missing.rows, begun)
 
             for shard in count(first):
                 while shard not in made:
@@ -56,27 +76,30 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
                             "because memory ran out: try fewer --threads"
                         )
                     submit(number)
-                yield _columns(made.pop(shard))
+                yield from all_of(made.pop(shard))
 
     return produce
 
 
 def make_shard(
-    modules: tuple[str, ...], simulator: Simulator, shard: int, rows: int
-) -> Columns | str:
-    """A shard, in a process of its own; the message of an error that a user can mend."""
+    known: tuple[tuple[str, ...], EnvSpec], simulator: Simulator, shard: int, rows: int, begun: int
+) -> Made:
+    """What is missing of a shard, in a process of its own.
+
+    Args:
+        known: modules to import, and what the environment is, if none of them registers it.
+        simulator: makes it.
+        shard: its number.
+        rows: how many are enough.
+        begun: episodes of it that are there.
+    """
+    modules, spec = known
     try:
         import_modules(modules)
-        return simulator.shard(shard, _stop_on_request, rows)
+        gymnasium.registry.setdefault(spec.id, spec)
+        return simulator.made(shard, _stop_on_request, rows, begun)
     except InputError as error:
-        return str(error)
-
-
-def _columns(result: Columns | str) -> Columns:
-    """What `make_shard` returned; its error only once the shard is needed."""
-    if isinstance(result, str):
-        raise InputError(result)
-    return result
+        return Made(None, str(error))
 
 
 def _stop_on_request(steps: int) -> None:
@@ -96,14 +119,17 @@ def on_ray(simulator: Simulator) -> Produce:
 
         make = on_cluster(make_shard, simulator.num_threads)
         alone = replace(simulator, lanes=1, num_threads=1)
+        known = imported_modules(), find_spec(simulator.settings.task.id)
         started, made = first, dict[int, Any]()
         try:
             for shard in count(first):
                 ahead = shard + 2 * int(ray.cluster_resources().get("CPU", 1))
                 while started == shard or (started < ahead and missing.wants(started)):
-                    made[started] = make.remote(imported_modules(), alone, started, missing.rows)
+                    begun = missing.begun(started)
+                    what = known, alone, started, missing.rows, begun
+                    made[started] = make.remote(*what)
                     started += 1
-                yield _columns(ray.get(made.pop(shard)))
+                yield from all_of(ray.get(made.pop(shard)))
         except ray.exceptions.RayError as error:
             reason = first_line(error)
             raise InputError(f"the cluster could not make shard {shard}: {reason}") from error

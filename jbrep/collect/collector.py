@@ -1,7 +1,7 @@
 """The collector: a policy in many episodes, written to the shards of a data set."""
 
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -11,21 +11,25 @@ from numpy.typing import NDArray
 
 from jbrep.collect.backends import BACKENDS
 from jbrep.collect.policies import Policy, make_policy
+from jbrep.collect.replay import replay_problems
 from jbrep.collect.shards import LANES, SHARD_ROWS, Missing, Produce, Simulator
+from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import (
     MANIFEST,
     Manifest,
     check_files,
     commit,
+    current_manifest,
     hdf5_files,
     new_manifest,
     read_manifest,
     write_manifest,
 )
-from jbrep.dataset.schema import EPISODES, Columns, DataSettings
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined, some_episodes
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.make import is_batched
-from jbrep.errors import InputError, choose, differences
+from jbrep.envs.task import changed_parts
+from jbrep.errors import DamageError, InputError, choose, differences
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
 from jbrep.records.record import to_plain
@@ -34,6 +38,9 @@ from jbrep.records.storage import check_space, exists, make_folder, read_regular
 _MAX_SHARDS = 10_000
 _BATCH_ROWS = 100_000  # of a shard that a batch makes
 _PILOT = 10  # episodes
+_HOLD_SECONDS = 30.0  # that episodes of a shard that isn't full are held before they are written
+
+_LENGTH = EPISODES + "length"
 
 Array = NDArray[Any]
 
@@ -53,11 +60,13 @@ def collect(
     num_threads: int | None = None,
     backend: str = "local",
     policy: Policy | None = None,
+    retries: int = 0,
 ) -> Written:
     """Collect a data set, or what is missing of it.
 
     Neither lanes, threads nor backend change a byte, nor does it whether a data set is collected at
-    once or extended.
+    once or extended. Before one that is there is gone on with, an episode of it is played again: it
+    must be the same to the last bit, where the environment is reproducible.
 
     Args:
         settings: what to collect.
@@ -67,18 +76,39 @@ def collect(
             each core.
         backend: local, or ray for a cluster.
         policy: in place of the one that the settings name.
+        retries: how often in a row an episode in which the environment fails is played again.
 
     Raises:
         InputError: invalid settings, a data set of other settings or of more steps in the folder, a
-            shard that is missing or damaged, too little disk space, or an environment that fails.
+            shard that is missing or damaged, an environment that isn't what it was, too little disk
+            space, or an environment that fails; the episodes before that are kept.
     """
     policy = policy or make_policy(settings.policy)
     policy.begin(settings.task, [0])  # may refuse the task
     settings = settings.replace(policy=policy.settings())
     check_counts(lanes, num_threads)
-    simulator = Simulator(settings, policy, lanes, num_threads)
+    simulator = Simulator(settings, policy, lanes, num_threads, retries)
     produce = choose(backend, BACKENDS, "backend")(simulator)
-    return write_shards(settings, folder, produce, policy.files())
+
+    def check() -> None:
+        _check_environment(folder, num_threads)
+
+    return write_shards(settings, folder, produce, policy.files(), check)
+
+
+def _check_environment(folder: Path, num_threads: int | None) -> None:
+    """Play an episode of a data set again.
+
+    Raises:
+        InputError: it differs.
+    """
+    dataset = Dataset(folder)
+    if dataset.task.reproducible and any(replay_problems(dataset, 1, num_threads)):
+        raise InputError(
+            f"{folder} can't be gone on with: an episode of {dataset.task.name} played again is "
+            "another one now; has the environment changed, or is this another machine? Choose "
+            "another folder for other data"
+        )
 
 
 def write_shards(
@@ -86,6 +116,7 @@ def write_shards(
     folder: Path,
     produce: Produce,
     files: Mapping[str, bytes] = MappingProxyType({}),
+    check: Callable[[], None] = lambda: None,
 ) -> Written:
     """Commit the missing shards, until there are as many rows as the settings ask for.
 
@@ -95,6 +126,7 @@ def write_shards(
         produce: makes shards, one after the other; of the last, only the episodes that are needed
             are kept.
         files: that the data set needs besides, by name.
+        check: called before episodes are added to those that are there.
 
     Raises:
         InputError: as `collect` does.
@@ -105,6 +137,8 @@ def write_shards(
         there = _begin(settings, folder, files)
         manifest = there.extended(settings.steps)
         if not manifest.complete:
+            if there.shards:
+                check()
             with Progress(
                 total=settings.steps,
                 initial=manifest.rows,
@@ -121,53 +155,105 @@ def write_shards(
 def _fill(
     folder: Path, there: Manifest, manifest: Manifest, produce: Produce, progress: Any
 ) -> Manifest:
-    """Commit shards until the data set is complete.
+    """Commit episodes until the data set is complete: at the end of a shard, or after a while.
 
-    What is there counts until the first shard has been simulated, which may replace its last one.
+    Those that are finished are kept whatever ends this.
     """
-    missing = Missing(manifest)
-    shards = produce(len(manifest.shards), missing, progress.update)
+    writing = _Writing(folder, there, Missing(manifest))
+    pieces = produce(manifest.full_shards, writing.missing, progress.update)
     try:
-        for columns in shards:
-            if manifest.settings != there.settings:
-                write_manifest(folder, manifest)
-                there = manifest
-            manifest = commit(folder, manifest, _cut(columns, missing.rows))
-            missing.manifest = manifest
-            progress.update(manifest.rows - progress.n)
-            size = sum(entry.bytes for entry in manifest.shards)
-            progress.set_postfix_str(f"{size / 1e6:,.0f} MB on disk", refresh=False)
-            if manifest.complete:
+        for columns in pieces:
+            writing.add(columns)
+            if writing.is_due:
+                writing.commit(progress)
+            if writing.missing.rows <= 0:
                 break
-            if len(manifest.shards) == _MAX_SHARDS:
-                raise InputError(
-                    f"{folder} has {_MAX_SHARDS:,} shards, which is the limit: put more than "
-                    f"{manifest.settings.shard_episodes:,} episodes in a shard, in another folder"
-                )
+    except InputError as error:
+        if isinstance(error, DamageError) or not writing.commit(progress).episodes:
+            raise
+        raise InputError(f"{error}; {writing.kept}") from None
     finally:
-        if isinstance(shards, Generator):
-            shards.close()
-    return manifest
+        writing.commit(progress)
+        if isinstance(pieces, Generator):
+            pieces.close()
+    return writing.missing.manifest
 
 
-def _cut(columns: Columns, rows: int) -> Columns:
-    """The fewest whole episodes of a shard that have as many rows; all if there are fewer."""
-    ends = np.cumsum(columns[EPISODES + "length"])
-    episodes = int(np.searchsorted(ends, rows)) + 1
-    rows = int(ends[min(episodes, len(ends)) - 1])
-    return {
-        name: values[: episodes if name.startswith(EPISODES) else rows]
-        for name, values in columns.items()
-    }
+class _Writing:
+    """Episodes on their way into a data set.
+
+    Args:
+        folder: of the data set.
+        there: its manifest so far, which counts until there is more.
+        missing: of the manifest that is wanted.
+    """
+
+    def __init__(self, folder: Path, there: Manifest, missing: Missing):
+        self.missing = missing
+        self._folder, self._there = folder, there
+        self._held: list[Columns] = []
+        self._committed = time.monotonic()
+
+    def add(self, columns: Columns) -> None:
+        """Hold the episodes that aren't there and are needed.
+
+        Raises:
+            InputError: there are as many shards as there can be.
+        """
+        manifest = self.missing.manifest
+        first = manifest.episodes + sum(len(each[_LENGTH]) for each in self._held)
+        known = first - int(columns[EPISODES + "episode"][0])
+        ends = np.cumsum(columns[_LENGTH][known:])
+        needed = int(np.searchsorted(ends, self.missing.rows)) + 1
+        self._held.append(some_episodes(columns, known, known + needed))
+        self.missing.held += len(self._held[-1]["step"])
+        if first // manifest.settings.shard_episodes >= _MAX_SHARDS:
+            raise InputError(
+                f"{self._folder} has {_MAX_SHARDS:,} shards, which is the limit: put more than "
+                f"{manifest.settings.shard_episodes:,} episodes in a shard, in another folder"
+            )
+
+    @property
+    def is_due(self) -> bool:
+        """Whether what is held fills a shard, is all that is needed, or has been held for long."""
+        manifest = self.missing.manifest
+        episodes = manifest.episodes + sum(len(each[_LENGTH]) for each in self._held)
+        return (
+            episodes % manifest.settings.shard_episodes == 0
+            or self.missing.rows <= 0
+            or time.monotonic() - self._committed > _HOLD_SECONDS
+        )
+
+    def commit(self, progress: Any) -> Manifest:
+        """Write what is held; the manifest of what is there then."""
+        if self._held:
+            if self.missing.manifest.settings != self._there.settings:
+                write_manifest(self._folder, self.missing.manifest)
+            held, self._held = joined(self._held), []
+            self._there = self.missing.manifest = commit(self._folder, self.missing.manifest, held)
+            self.missing.held, self._committed = 0, time.monotonic()
+            progress.update(self._there.rows - progress.n)
+            size = sum(entry.bytes for entry in self._there.shards)
+            progress.set_postfix_str(f"{size / 1e6:,.0f} MB on disk", refresh=False)
+        return self._there
+
+    @property
+    def kept(self) -> str:
+        """What is there, for a message."""
+        manifest = self._there
+        plural = "s" if manifest.episodes > 1 else ""
+        return f"{manifest.episodes:,} episode{plural} of {manifest.rows:,} rows are kept"
 
 
 def _begin(settings: DataSettings, folder: Path, files: Mapping[str, bytes]) -> Manifest:
     """The manifest to go on from, new if there is none."""
     shards = hdf5_files(folder)
     if (folder / MANIFEST).exists() or shards:
-        manifest = read_manifest(folder)
+        manifest = current_manifest(folder)
         _check_same(manifest, new_manifest(settings), folder)
         check_files(folder, manifest, shards)
+        if manifest != read_manifest(folder):
+            write_manifest(folder, manifest)
         _keep(files, folder)
         check_space(folder, (settings.steps - manifest.settings.steps) * settings.row_bytes())
     else:
@@ -191,6 +277,11 @@ def _keep(files: Mapping[str, bytes], folder: Path) -> None:
 def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
     """Check that going on gives what an uninterrupted run gives."""
     steps, own = wanted.settings.steps, there.settings.steps
+    if changed := changed_parts(there.task, wanted.task):
+        raise InputError(
+            f"{folder} holds a data set of {there.task.name} as it was: {changed} changed since; "
+            "put that back, or choose another folder"
+        )
     differing = differences(_flat(there.settings), _flat(wanted.settings))
     if differing and _flat(there.settings) != {**_flat(wanted.settings), "steps": own}:
         raise InputError(

@@ -13,6 +13,7 @@ from jbrep.dataset.manifest import (
     MANIFEST,
     Entry,
     Manifest,
+    current_manifest,
     hdf5_files,
     open_shard,
     read_manifest,
@@ -23,6 +24,7 @@ from jbrep.dataset.manifest import (
 )
 from jbrep.dataset.shard import column_hashes
 from jbrep.envs.lanes import check_counts
+from jbrep.envs.origin import changes_of
 from jbrep.errors import DamageError, InputError
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
@@ -55,7 +57,7 @@ def repair(
     check_counts(lanes, num_threads)
     intact = _intact_manifest(folder)
     with exclusive(folder):
-        manifest = read_manifest(folder, intact)
+        manifest = current_manifest(folder) if intact == MANIFEST else read_manifest(folder, intact)
         for path in unlisted_files(manifest, hdf5_files(folder)):
             aside = _set_aside(path)
             yield f"{path} renamed to {aside.name}: it is not one of the data set's shards"
@@ -132,8 +134,11 @@ def _restore(
         simulator = Simulator(settings, make(settings.policy), lanes, num_threads)
         columns = simulator.shard(shard, progress.update, most_episodes=entry.episodes)
     if column_hashes(columns) != entry.sha256:
-        raise InputError(
-            f"{path} can't be restored here: it comes out differently; use the machine it was made "
-            f"on, and these versions: {dict(manifest.versions)}"
+        changed = changes_of(settings.task)
+        why = (
+            f"{changed} changed since; put that back"
+            if changed
+            else (f"use the machine it was made on, and these versions: {dict(manifest.versions)}")
         )
+        raise InputError(f"{path} can't be restored here: it comes out differently; {why}")
     return write_shard(folder, manifest, shard, columns)

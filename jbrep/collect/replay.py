@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from jbrep.dataset import Dataset, Episode
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.make import is_batched
+from jbrep.envs.origin import changes_of
 from jbrep.envs.recording import Read, Recording, Tick, open_loop, read_nothing, read_states, record
 from jbrep.errors import InputError
 from jbrep.progress import Progress
@@ -57,9 +58,14 @@ def replay_problems(
             for lane, episode in enumerate(some):
                 if not _is_equal(recording, lane, episode):
                     versions = dict(dataset.manifest.versions)
+                    changed = changes_of(dataset.task)
+                    why = (
+                        f"{changed} changed since"
+                        if changed
+                        else (f"another machine, or other versions than {versions}?")
+                    )
                     yield (
-                        f"{dataset.folder}: episode {episode.number} simulated again differs: "
-                        f"another machine, or other versions than {versions}?"
+                        f"{dataset.folder}: episode {episode.number} simulated again differs: {why}"
                     )
 
 
@@ -88,16 +94,14 @@ def simulate_again(
     dataset = episodes[0].dataset
     _check_collected(dataset)
     task = dataset.task
-    lanes = Lanes(task, len(episodes), num_threads)
-    lanes.reset(range(len(episodes)), [int(episode.record["seed"]) for episode in episodes])
     middle = (np.array(task.action_low) + np.array(task.action_high)) / 2
     actions = np.tile(middle, (max(map(len, episodes)), len(episodes), 1))
     for lane, episode in enumerate(episodes):
         actions[: len(episode), lane] = episode["action"]
     afterwards = repeat(np.tile(middle, (len(episodes), 1)))
-    recording = record(lanes, open_loop(chain(actions, afterwards)), tick, read)
-    lanes.close()
-    return recording
+    with Lanes(task, len(episodes), num_threads) as lanes:
+        lanes.reset(range(len(episodes)), [int(episode.record["seed"]) for episode in episodes])
+        return record(lanes, open_loop(chain(actions, afterwards)), tick, read)
 
 
 def _is_equal(recording: Recording, lane: int, episode: Episode) -> bool:

@@ -4,17 +4,18 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.collect.policies import Policy
 from jbrep.dataset.manifest import Manifest
-from jbrep.dataset.schema import EPISODES, Columns, DataSettings
-from jbrep.envs.lanes import Lanes
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined
+from jbrep.envs.lanes import EnvironmentFailedError, Lanes, Retries
 from jbrep.envs.make import is_batched
 from jbrep.envs.recording import Recording, Tick, read_nothing, read_states, record
+from jbrep.errors import InputError
 
 LANES = 100  # of a batch
 SHARD_ROWS = 20_000  # of a shard of the usual size, unless a batch makes it
@@ -24,27 +25,60 @@ Array = NDArray[Any]
 
 @dataclass
 class Missing:
-    """What the shards of a manifest lack."""
+    """What the shards of a manifest lack.
+
+    Attributes:
+        manifest: of what is committed.
+        held: rows that were made since.
+    """
 
     manifest: Manifest
+    held: int = 0
 
     @property
     def rows(self) -> int:
         """How many rows, at present."""
-        return self.manifest.settings.steps - self.manifest.rows
+        return self.manifest.settings.steps - self.manifest.rows - self.held
+
+    def begun(self, shard: int) -> int:
+        """How many episodes of a shard are committed."""
+        each = self.manifest.settings.shard_episodes
+        return min(max(self.manifest.episodes - shard * each, 0), each)
 
     def wants(self, shard: int) -> bool:
         """Whether a shard of that number is likely to be needed.
 
         Judging by the mean of the shards so far, or else by the usual size.
         """
-        settings, done = self.manifest.settings, len(self.manifest.shards)
+        settings, done = self.manifest.settings, self.manifest.full_shards
         longest = settings.shard_episodes * settings.task.max_episode_steps
-        mean = self.manifest.rows / done if done else min(longest, SHARD_ROWS)
+        rows = sum(entry.rows for entry in self.manifest.shards[:done])
+        mean = rows / done if done else min(longest, SHARD_ROWS)
         return (shard - done) * mean < self.rows
 
 
-Produce = Callable[[int, Missing, Tick], Iterator[Columns]]  # shards in order, from a number on
+# the columns of episodes in order, from the shard of a number on, some of one shard at a time;
+# episodes that are committed already may be left out
+Produce = Callable[[int, Missing, Tick], Iterator[Columns]]
+
+
+class Made(NamedTuple):
+    """What became of a shard."""
+
+    columns: Columns | None  # of its episodes before a failure; None if there are none
+    failure: str = ""
+
+
+def all_of(made: Made) -> Iterator[Columns]:
+    """What was made, and then the failure.
+
+    Raises:
+        InputError: there is one.
+    """
+    if made.columns is not None:
+        yield made.columns
+    if made.failure:
+        raise InputError(made.failure)
 
 
 @dataclass(frozen=True)
@@ -56,52 +90,72 @@ class Simulator:
         policy: of the settings.
         lanes: environments of a batch, stepped at once.
         num_threads: threads to step a batch on; None takes one for each core.
+        retries: how often an episode in which the environment fails is played again.
     """
 
     settings: DataSettings
     policy: Policy
     lanes: int = LANES
     num_threads: int | None = None
+    retries: int = 0
 
     def in_turn(self, first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
         """Make one shard after the other, each with all threads."""
         for number in count(first):
-            yield self.shard(number, tick, missing.rows)
+            episodes = self._episodes(number)[missing.begun(number) :]
+            yield from self._blocks(episodes, tick, lambda: missing.rows)
 
-    def shard(
-        self, number: int, tick: Tick, rows: float = math.inf, most_episodes: int | None = None
-    ) -> Columns:
+    def _episodes(self, shard: int) -> Array:
+        each = self.settings.shard_episodes
+        return np.arange(shard * each, (shard + 1) * each)
+
+    def made(self, number: int, tick: Tick, rows: int, begun: int = 0) -> Made:
+        """A shard that ends early once it has enough rows, without the episodes that are there."""
+        blocks: list[Columns] = []
+
+        def wanted() -> float:
+            return rows - sum(len(block["step"]) for block in blocks)
+
+        failure = ""
+        try:
+            for block in self._blocks(self._episodes(number)[begun:], tick, wanted):
+                blocks.append(block)
+        except InputError as error:
+            failure = str(error)
+        return Made(joined(blocks) if blocks else None, failure)
+
+    def shard(self, number: int, tick: Tick, most_episodes: int | None = None) -> Columns:
         """The columns of a shard.
-
-        It ends early once it has enough rows: what it has is the beginning of the whole shard.
 
         Args:
             number: of the shard.
             tick: called with the number of steps made.
-            rows: how many are enough.
             most_episodes: how many of its episodes to make; None makes all.
         """
-        each = self.settings.shard_episodes
-        episodes = np.arange(number * each, (number + 1) * each)[:most_episodes]
-        blocks = list(self._blocks(episodes, tick, rows))
-        return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+        episodes = self._episodes(number)[:most_episodes]
+        return joined(list(self._blocks(episodes, tick, lambda: math.inf)))
 
-    def _blocks(self, episodes: Array, tick: Tick, rows: float) -> Iterator[Columns]:
-        """The columns of the episodes, some at a time, one in each lane, until there are enough."""
-        task = self.settings.task
-        lanes: Lanes | None = None
+    def _blocks(
+        self, episodes: Array, tick: Tick, wanted: Callable[[], float]
+    ) -> Iterator[Columns]:
+        """The columns of the episodes, some at a time, one in each lane, while rows are wanted."""
+        longest, retries = self.settings.task.max_episode_steps, Retries(self.retries)
         # side by side, other environments would wait for the longest episode
-        size = self.lanes if is_batched(task) else 1
-        while len(episodes) and rows > 0:
-            needed = math.ceil(min(rows / task.max_episode_steps, len(episodes)))
-            block, episodes = np.split(episodes, [min(size, needed)])
-            if lanes is None or lanes.num_lanes != len(block):
-                lanes = Lanes(task, len(block), self.num_threads)
-            columns = self._simulate(block, lanes, tick)
-            rows -= len(columns["step"])
-            yield columns
-        if lanes is not None:
-            lanes.close()
+        most = self.lanes if is_batched(self.settings.task) else 1
+
+        def at_once() -> int:
+            return min(most, math.ceil(min(wanted() / longest, len(episodes))))
+
+        while (size := at_once()) > 0:
+            try:
+                with Lanes(self.settings.task, size, self.num_threads) as lanes:
+                    while at_once() == size:
+                        columns = self._simulate(episodes[:size], lanes, tick)
+                        retries.succeeded()
+                        episodes = episodes[size:]
+                        yield columns
+            except EnvironmentFailedError as error:
+                retries.failed(error)
 
     def _simulate(self, episodes: Array, lanes: Lanes, tick: Tick) -> Columns:
         """The columns of some episodes, one in each lane."""
@@ -127,6 +181,7 @@ class Simulator:
         once: dict[str, Array] = {
             **{"episode": episodes, "seed": seeds, "length": length},
             **{"terminated": recording.terminated, "truncated": recording.truncated},
+            "missing": recording.missing,
             **{f"initial_{name}": recording.start[name] for name in task.state},
             **{name: recording.start[name] for name in task.constants},
             **{f"final_{name}": values[length, lanes] for name, values in seen.items()},

@@ -3,12 +3,13 @@
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from msgspec import Meta
 
-from jbrep.dataset.schema import EPISODES, Columns, DataSettings
+from jbrep.dataset.schema import EPISODES, Columns, DataSettings, joined
 from jbrep.dataset.settings import Digest
 from jbrep.dataset.shard import (
     REPAIR,
@@ -100,21 +101,24 @@ class Manifest(Document, frozen=True, kw_only=True):
         return hashlib.sha256("".join(parts).encode()).hexdigest()
 
     def extended(self, steps: int) -> "Manifest":
-        """The manifest of more steps, before what it lacks is collected.
+        """The manifest of so many steps, before what it lacks is collected."""
+        return self.replace(settings=self.settings.replace(steps=steps))
 
-        If there aren't enough rows, a last shard that isn't full is left out: it has to be made
-        again, with more episodes.
-        """
-        longer = self.replace(settings=self.settings.replace(steps=steps))
-        full = self.episodes == len(self.shards) * self.settings.shard_episodes
-        return longer if longer.complete or full else longer.replace(shards=self.shards[:-1])
+    @property
+    def full_shards(self) -> int:
+        """Number of shards that no episode is added to."""
+        return self.episodes // self.settings.shard_episodes
 
     def is_next(self, other: "Manifest") -> bool:
         """Whether a collector writes the other manifest after this one."""
-        more = other.settings.steps > self.settings.steps
-        expected = self.extended(other.settings.steps) if more else self
-        begun = other.shards in (expected.shards, (*expected.shards, *other.shards[-1:]))
-        return begun and other == expected.replace(shards=other.shards)
+        more = max(self.settings.steps, other.settings.steps)
+        kept, added = self.shards[: self.full_shards], other.shards[self.full_shards :]
+        begun = other.shards == self.shards or (
+            other.shards[: self.full_shards] == kept
+            and len(added) == 1
+            and other.episodes > self.episodes
+        )
+        return begun and other == self.extended(more).replace(shards=other.shards)
 
     def attributes(self, shard: int, rows: int) -> dict[str, Any]:
         """The HDF5 attributes of a shard's file."""
@@ -182,6 +186,32 @@ def read_manifest(folder: Path, name: str = MANIFEST) -> Manifest:
         raise _explain_missing(path) from None
     except DamageError as error:
         raise DamageError(f"{error}; {REPAIR}") from None
+
+
+def current_manifest(folder: Path) -> Manifest:
+    """The manifest of what is in the folder, as `read_manifest` reads it.
+
+    It is the backup, if a collector was killed, or is at work, between the last shard and the
+    manifest that names it.
+    """
+    manifest = read_manifest(folder)
+    count = len(manifest.shards)
+    is_added = _size(folder, count) is not None
+    is_other = count > 0 and _size(folder, count - 1) not in (None, manifest.shards[-1].bytes)
+    if is_added or is_other:
+        with suppress(InputError):
+            backup = read_manifest(folder, BACKUP)
+            size = _size(folder, len(backup.shards) - 1)
+            if manifest.is_next(backup) and backup.shards and backup.shards[-1].bytes == size:
+                return backup
+    return manifest
+
+
+def _size(folder: Path, shard: int) -> int | None:
+    try:
+        return (folder / shard_name(shard)).lstat().st_size
+    except OSError:
+        return None
 
 
 def _manifest_from(raw: bytes, path: Path) -> Manifest:
@@ -300,15 +330,29 @@ def unlisted_files(manifest: Manifest, files: list[Path]) -> list[Path]:
 
 
 def commit(folder: Path, manifest: Manifest, columns: Columns) -> Manifest:
-    """Write the next shard, then the manifest that names it.
+    """Add episodes to the last shard, or begin another one if that is full.
+
+    At every moment the manifest or its backup names what is there, see `current_manifest`.
+
+    Args:
+        folder: of the data set.
+        manifest: of what is there.
+        columns: of the episodes, no more than the shard lacks.
+
+    Returns:
+        The manifest that names them, too.
 
     Raises:
-        InputError: it can't be written.
+        InputError: they can't be written.
     """
-    shard = len(manifest.shards)
-    entry = write_shard(folder, manifest, shard, columns)
-    manifest = manifest.replace(shards=(*manifest.shards, entry))
-    write_manifest(folder, manifest)
+    shard = manifest.full_shards
+    if shard < len(manifest.shards):
+        columns = joined([dict(open_shard(folder, manifest, shard)), columns])
+    entry, image = _entry_and_image(manifest, shard, columns)
+    manifest = manifest.replace(shards=(*manifest.shards[:shard], entry))
+    manifest.write(folder / BACKUP)
+    write_whole(folder / shard_name(shard), image)
+    manifest.write(folder / MANIFEST)
     return manifest
 
 
@@ -318,13 +362,20 @@ def write_shard(folder: Path, manifest: Manifest, shard: int, columns: Columns) 
     Raises:
         InputError: it can't be written.
     """
+    entry, image = _entry_and_image(manifest, shard, columns)
+    write_whole(folder / shard_name(shard), image)
+    return entry
+
+
+def _entry_and_image(manifest: Manifest, shard: int, columns: Columns) -> tuple[Entry, bytes]:
+    """What the manifest says of a shard, and the bytes of its file."""
     rows, episodes = len(columns["step"]), len(columns[EPISODES + "length"])
     hashes = column_hashes(columns)
     image = shard_image(columns, hashes, manifest.attributes(shard, rows))
-    write_whole(folder / shard_name(shard), image)
-    return Entry(
+    entry = Entry(
         bytes=len(image), rows=rows, episodes=episodes, xxh3=file_hash(image), sha256=hashes
     )
+    return entry, image
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:

@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.columns import Batches, Column
-from jbrep.dataset.manifest import check_files, hdf5_files, open_shard, read_manifest, shard_name
+from jbrep.dataset.manifest import (
+    check_files,
+    current_manifest,
+    hdf5_files,
+    open_shard,
+    shard_name,
+)
 from jbrep.dataset.scaling import EXTREMA, Scaler, fit_scaler
 from jbrep.dataset.schema import EPISODES, episode_bounds, episode_columns
 from jbrep.dataset.shard import FileState, Shard, file_state
@@ -84,7 +90,7 @@ class Dataset:
     def __init__(self, folder: str | Path):
         self.folder = Path(folder)
         files = hdf5_files(self.folder)
-        self.manifest = read_manifest(self.folder)
+        self.manifest = current_manifest(self.folder)
         check_files(self.folder, self.manifest, files)
         self.task = self.manifest.task
         self._checked: set[FileState] = set()

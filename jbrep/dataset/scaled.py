@@ -146,7 +146,8 @@ class ScaledDataset:
         """Actions of the rows, scaled to [-1, 1] by their bounds in that type, (n, k)."""
         bounds = self.task.action_low, self.task.action_high
         low, high = (np.asarray(bound, dtype) for bound in bounds)
-        return (self.dataset["action"][rows] - (high + low) / 2) / ((high - low) / 2)
+        half_width = np.where(high > low, (high - low) / 2, 1)  # 1 of what can't move
+        return (self.dataset["action"][rows] - (high + low) / 2) / half_width.astype(dtype)
 
     @cached_property
     def moments(self) -> Moments:

@@ -69,8 +69,11 @@ def _specs(task: Task, store_state: bool, weights: Sequence[float]) -> dict[str,
     }
     ends = {"final_observation": _spec("<f4", task.size)}  # after the last action
     policy = {"policy": _spec("<i4", follows=parts)}  # the number of the part of a mixture
+    missing = {"missing": _spec("<i4")}  # readings, see `Task.missing`
     for name in task.arrays:
-        if name in {**steps, **begins, **policy} or name.startswith(("initial_", "final_")):
+        if name in {**steps, **begins, **policy, **missing} or name.startswith(
+            ("initial_", "final_")
+        ):
             raise InputError(f"{task.name} has an array {name!r}: data sets have such a column")
     once = {
         **begins,
@@ -79,6 +82,7 @@ def _specs(task: Task, store_state: bool, weights: Sequence[float]) -> dict[str,
         **ends,
         **({f"final_{name}": spec for name, spec in moving.items()} if store_state else {}),
         **(policy if weights else {}),
+        **(missing if task.missing else {}),
     }
     by_step = steps | (moving if store_state else {})  # states with the observation
     return by_step | {EPISODES + name: spec for name, spec in once.items()}
@@ -156,6 +160,21 @@ def episode_columns(columns: Mapping[str, Any]) -> dict[str, Any]:
         for name, each in columns.items()
         if name.startswith(EPISODES)
     }
+
+
+def some_episodes(columns: Columns, first: int, stop: int) -> Columns:
+    """The columns of some of their episodes: from the first on, before the one to stop at."""
+    bounds = episode_bounds(columns[EPISODES + "length"][:stop])
+    rows = slice(int(bounds[min(first, len(bounds) - 1)]), int(bounds[-1]))
+    return {
+        name: values[first:stop] if name.startswith(EPISODES) else values[rows]
+        for name, values in columns.items()
+    }
+
+
+def joined(several: Sequence[Columns]) -> Columns:
+    """The columns of episodes, one after the other."""
+    return {name: np.concatenate([each[name] for each in several]) for name in several[0]}
 
 
 def episode_seed(task: Task, root: int, episode: int) -> int:

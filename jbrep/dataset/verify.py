@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from jbrep.dataset.manifest import (
     BACKUP,
     Manifest,
+    current_manifest,
     file_problems,
     hdf5_files,
     open_shard,
@@ -40,7 +41,7 @@ def find_problems(folder: Path) -> Iterator[str]:
     """
     files = hdf5_files(folder)
     try:
-        manifest = read_manifest(folder)
+        manifest = current_manifest(folder)
     except DamageError as damage:
         yield str(damage)
         return

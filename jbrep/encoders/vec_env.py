@@ -46,6 +46,8 @@ class JitterbugVecEnv(VecEnv):
         max_episode_steps: the time limit of a task given by its name [steps].
         action_repeat: control steps for which each action is held, fewer where an episode ends
             before; a step of the environment, whose reward is their sum.
+        retries: how often in a row an environment that fails is made anew; its episode ends
+            truncated, before the step that failed.
 
     Attributes:
         task: the task.
@@ -73,6 +75,7 @@ class JitterbugVecEnv(VecEnv):
         num_threads: int | None = None,
         max_episode_steps: int | None = None,
         action_repeat: int = 1,
+        retries: int = 0,
     ):
         if isinstance(task, str):
             task = describe(task, max_episode_steps=max_episode_steps)
@@ -80,7 +83,7 @@ class JitterbugVecEnv(VecEnv):
             raise InputError(f"{task.name} is described with its time limit: describe it anew")
         self.task = task
         self._encoder = None if encoder is None else as_encoder(encoder, task)
-        self._endless = Endless(task, num_envs, num_threads, action_repeat)
+        self._endless = Endless(task, num_envs, num_threads, action_repeat, retries)
         self.lanes = self._endless.lanes
         observation_space, action_space = agent_spaces(task, self._encoder)
         self._actions = np.zeros((num_envs, task.action_size))
@@ -93,6 +96,10 @@ class JitterbugVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         return self._represent(observation)
+
+    def restart(self) -> Float32:
+        """Start the episodes of now once more, as after others were played in their lanes."""
+        return self._represent(self._endless.restart())
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
         """Keep the actions, (num_envs, k), for `step_wait`; they are clipped to [-1, 1]."""

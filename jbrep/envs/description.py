@@ -2,21 +2,25 @@
 
 import json
 import math
+import warnings
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.spaces.utils import flatten, flatten_space
+from gymnasium.spaces.utils import flatten_space
 from msgspec.structs import asdict
 from numpy.typing import NDArray
 
-from jbrep.envs.make import creator, make_env
+from jbrep.envs import instances
+from jbrep.envs.make import aside, creator, flattener, number, reason
 from jbrep.envs.mujoco import with_kinds
 from jbrep.envs.names import find_spec
+from jbrep.envs.origin import absolute, code_of, files_of
+from jbrep.envs.precision import Signals, precision_problems
 from jbrep.envs.task import (
     NARROW_SEEDS,
     WIDE_SEEDS,
@@ -28,7 +32,7 @@ from jbrep.envs.task import (
     Task,
     Word,
 )
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import InputError, Notice
 from jbrep.records.record import Finite, Record, converted, from_plain
 from jbrep.records.toml import read_toml
 
@@ -41,6 +45,7 @@ def describe(
     arguments: Mapping[str, Any] | None = None,
     max_episode_steps: int | None = None,
     features: Path | None = None,
+    missing: str | None = None,
 ) -> Task:
     """Describe a task: its environment is made and played for some steps.
 
@@ -49,16 +54,30 @@ def describe(
 
     Args:
         name: one of the Jitterbug's tasks, or an id in Gymnasium's registry.
-        arguments: of the environment, plain JSON.
+        arguments: of the environment, plain JSON; files that they name become absolute paths.
         max_episode_steps: the time limit [steps]; the registered one if not given.
-        features: a TOML file with names, units, ranges and kinds, see docs/environments.md.
+        features: a TOML file with names, units, ranges, kinds and offsets, see
+            docs/environments.md.
+        missing: what becomes of readings that aren't finite, see `Task`; by default an error.
 
     Raises:
         InputError: an unknown task, an environment that can't be made, actions or observations
             of a kind that isn't possible, no time limit, or an unusable file of features.
     """
-    task = _describe(name, json.dumps(dict(arguments or {}), sort_keys=True), max_episode_steps)
-    return _with_features(task, features) if features else task
+    spec, given = find_spec(name), dict(arguments or {})
+    files = files_of({**spec.kwargs, **given})
+    key = (spec.entry_point, tuple(files.items()))
+    text = json.dumps(absolute(given), sort_keys=True)
+    task, signals = _describe(name, text, max_episode_steps, key)
+    written = files_of({**spec.kwargs, **given})  # by the environment itself, such as a log
+    kept = {file: digest for file, digest in files.items() if written.get(file) == digest}
+    task = task.replace(arguments=absolute(dict(task.arguments)))
+    if made_from := kept | code_of(spec):
+        task = task.replace(made_from=made_from)
+    task = with_features(task, features) if features else task
+    for problem in precision_problems(task, signals):
+        warnings.warn(problem, Notice, stacklevel=2)
+    return task.replace(missing=missing) if missing else task
 
 
 def as_task(given: Task | str) -> Task:
@@ -75,50 +94,76 @@ def as_task(given: Task | str) -> Task:
 
 
 @lru_cache(maxsize=64)
-def _describe(name: str, arguments: str, max_episode_steps: int | None) -> Task:
+def _describe(
+    name: str, arguments: str, max_episode_steps: int | None, key: tuple[Any, ...]
+) -> tuple[Task, Signals | None]:
+    """The task, and what its features went through where it was played.
+
+    Arguments are in JSON here, and the key is which environment has that name now.
+    """
     spec, given = find_spec(name), json.loads(arguments)
     if max_episode_steps is not None:
         converted(max_episode_steps, EpisodeSteps, "the number of steps in an episode")
     try:
-        if own := getattr(creator(spec), "describe", None):
-            described: Task = own({**spec.kwargs, **given}, max_episode_steps)
-            return described
-        return _probe(spec.id, given, max_episode_steps)
+        with aside():
+            if own := getattr(creator(spec), "describe", None):
+                described: Task = own({**spec.kwargs, **given}, max_episode_steps)
+                return described, None
+            return _probe(spec.id, given, max_episode_steps)
     except InputError:
         raise
     except Exception as error:  # whatever the environment raises
-        raise InputError(f"{spec.id} failed when it was tried: {kind_and_line(error)}") from error
+        raise InputError(f"{spec.id} failed when it was tried: {reason(error)}") from error
 
 
-def _probe(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None) -> Task:
-    env, fresh = (make_env(env_id, arguments, max_episode_steps) for _ in range(2))
+def _probe(
+    env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None
+) -> tuple[Task, Signals]:
+    env = instances.take(env_id, arguments, max_episode_steps)
     try:
-        action = _checked_action(env_id, env.action_space)
-        spec = env.spec or find_spec(env_id)
-        limit = max_episode_steps or spec.max_episode_steps or _find_limit(env, env_id)
-        plays = ((env, 1), (env, 0), (fresh, 0))
-        contents, terminated = zip(*(_play(each, seed) for each, seed in plays), strict=True)
-        timestep: Any = getattr(env.unwrapped, "dt", None)
-        return Task(
-            id=env_id,
-            name=env_id,
-            features=with_kinds(fresh, list(features_of(env_id, env.observation_space))),
-            action_low=tuple((-_below(-action.low)).tolist()),
-            action_high=tuple(_below(action.high).tolist()),
-            max_episode_steps=limit,
-            arguments=dict(arguments),
-            timestep=float(timestep) if _is_positive(timestep) else None,
-            solved_return=spec.reward_threshold,
-            terminates=True if any(terminated) else None,
-            reproducible=contents[1] == contents[2],
-            seed_bits=_seed_bits(env),
-        )
-    finally:
-        env.close()
-        fresh.close()
+        described = _described(env, env_id, arguments, max_episode_steps)
+    except BaseException:
+        instances.discard(env)
+        raise
+    instances.give_back(env)
+    return described
+
+
+def _described(
+    env: gymnasium.Env[Any, Any],
+    env_id: str,
+    arguments: Mapping[str, Any],
+    max_episode_steps: int | None,
+) -> tuple[Task, Signals]:
+    """What an instance shows; it is reproducible if a later episode equals its first one."""
+    action = _checked_action(env_id, env.action_space)
+    features = list(features_of(env_id, env.observation_space))
+    spec = find_spec(env_id)
+    episodes = [_play(env, seed) for seed in (0, 1, 0)]
+    limit = max_episode_steps or spec.max_episode_steps or _find_limit(env, env_id)
+    timestep: Any = getattr(env.unwrapped, "dt", None)
+    task = Task(
+        id=env_id,
+        name=env_id,
+        features=with_kinds(env, features),
+        action_low=tuple(_bounds(action)[0].tolist()),
+        action_high=tuple(_bounds(action)[1].tolist()),
+        max_episode_steps=limit,
+        arguments=dict(arguments),
+        timestep=float(timestep) if _is_positive(timestep) else None,
+        solved_return=spec.reward_threshold,
+        terminates=True if any(each.terminated for each in episodes) else None,
+        reproducible=episodes[0].content == episodes[2].content,
+        seed_bits=_seed_bits(env),
+    )
+    return task, Signals.of([each.observations for each in episodes])
 
 
 def _checked_action(env_id: str, space: spaces.Space[Any]) -> spaces.Box:
+    if type(space).__module__.startswith("gym."):
+        raise InputError(
+            f"{env_id} has spaces of old Gym, {space}: make them with gymnasium.spaces"
+        )
     if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
         raise InputError(
             f"{env_id} has actions in {space}: only continuous ones are possible, a Box of floats"
@@ -131,12 +176,19 @@ def _checked_action(env_id: str, space: spaces.Space[Any]) -> spaces.Box:
     return space
 
 
+def _bounds(space: spaces.Box) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Those that actions of 32 bits can keep, flat; equal ones, of what can't move, stay equal."""
+    low, high = np.ravel(space.low), np.ravel(space.high)
+    below = _below(high)
+    return np.where(low == high, below, -_below(-low)), below
+
+
 def _below(bound: NDArray[Any]) -> NDArray[np.float64]:
     """The largest numbers up to the bounds that 32 bits can hold, as actions have them, flat."""
-    single = np.ravel(bound).astype(np.float32)
-    return np.where(
-        single > np.ravel(bound), np.nextafter(single, np.float32(-np.inf)), single
-    ).astype(np.float64)
+    single = bound.astype(np.float32)
+    return np.where(single > bound, np.nextafter(single, np.float32(-np.inf)), single).astype(
+        np.float64
+    )
 
 
 def features_of(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
@@ -220,24 +272,36 @@ def _seed_bits(env: gymnasium.Env[Any, Any]) -> SeedBits:
     return WIDE_SEEDS
 
 
-def _play(env: gymnasium.Env[Any, Any], seed: int) -> tuple[list[bytes], bool]:
-    """An episode's first steps under random actions: what each gave; whether a state ended it."""
+class _Played(NamedTuple):
+    """The first steps of an episode under random actions."""
+
+    content: list[bytes]  # of each state, every bit
+    observations: NDArray[np.float64]  # (n, d)
+    terminated: bool  # by a state
+
+
+def _play(env: gymnasium.Env[Any, Any], seed: int) -> _Played:
     random = np.random.default_rng(seed)
     space: Any = env.action_space
-    observation, _ = env.reset(seed=seed)
-    content = [_bytes(env, observation)]
+    observation, info = env.reset(seed=seed)
+    if not isinstance(info, Mapping):
+        raise ValueError("too many values to unpack (expected 2")  # old Gym's
+    flat = [_flat(env, observation)]
+    content, ends = [flat[0].tobytes()], (False, False)
     for _ in range(_PROBE_STEPS):
         action = random.uniform(space.low, space.high).astype(space.dtype)
         observation, reward, terminated, truncated, _ = env.step(action)
-        content.append(_bytes(env, observation, reward, terminated, truncated))
-        if terminated or truncated:
-            return content, bool(terminated)
-    return content, False
+        ends = bool(number(terminated, "terminated")), bool(number(truncated, "truncated"))
+        flat.append(_flat(env, observation))
+        told = np.array([number(reward, "reward"), *ends])
+        content.append(flat[-1].tobytes() + told.tobytes())
+        if any(ends):
+            break
+    return _Played(content, np.array(flat, np.float64), ends[0])
 
 
-def _bytes(env: gymnasium.Env[Any, Any], observation: Any, *others: Any) -> bytes:
-    flat: NDArray[Any] = np.asarray(flatten(env.observation_space, observation))
-    return flat.tobytes() + np.array(others, dtype=np.float64).tobytes()
+def _flat(env: gymnasium.Env[Any, Any], observation: Any) -> NDArray[Any]:
+    return np.array(flattener(env.observation_space)(observation))
 
 
 class _FeatureChanges(Record, frozen=True):
@@ -251,6 +315,7 @@ class _FeatureChanges(Record, frozen=True):
     bounded: bool | None = None
     kind: Kind | None = None
     frame: Frame | None = None
+    offset: Finite | None = None
 
 
 class _TaskChanges(Record, frozen=True):
@@ -263,7 +328,7 @@ class _TaskChanges(Record, frozen=True):
     features: tuple[_FeatureChanges, ...] | None = None
 
 
-def _with_features(task: Task, path: Path) -> Task:
+def with_features(task: Task, path: Path) -> Task:
     """The task with what a TOML file says of its features and rewards.
 
     Raises:
@@ -275,10 +340,15 @@ def _with_features(task: Task, path: Path) -> Task:
         rows = changes.features
         if rows is not None and len(rows) != task.size:
             raise InputError(f"it must have a [[features]] for each of the {task.size} features")
-        features = [
-            old.replace(**_said(row)) for old, row in zip(task.features, rows or (), strict=False)
-        ]
-        return task.replace(**{**_said(changes), "features": features or task.features})
+        features, offsets = list(task.features), {}
+        for i, row in enumerate(rows or ()):
+            said = _said(row)
+            offset = said.pop("offset", 0.0)
+            features[i] = features[i].replace(**said)
+            if offset:
+                offsets[features[i].name] = offset
+        told = {**_said(changes), "features": features}
+        return task.replace(**told, **({"offsets": offsets} if offsets else {}))
     except InputError as error:
         raise InputError(f"{path} can't be used for {task.name}: {error}") from None
 

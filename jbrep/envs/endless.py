@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.envs.lanes import Flags, Lanes, State, Step
+from jbrep.envs.lanes import Flags, Lanes, Retries, State, Step
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 
@@ -47,15 +47,23 @@ class Endless:
         num_lanes: n.
         num_threads: as for `Lanes`.
         repeat: steps for which each action is held; fewer where an episode ends before.
+        retries: of failures, each of which ends an episode, truncated, before the step that failed.
 
     Attributes:
         lanes: the episodes under way.
     """
 
-    def __init__(self, task: Task, num_lanes: int, num_threads: int | None = None, repeat: int = 1):
+    def __init__(
+        self,
+        task: Task,
+        num_lanes: int,
+        num_threads: int | None = None,
+        repeat: int = 1,
+        retries: int = 0,
+    ):
         if repeat < 1:
             raise InputError(f"the action repeat is {repeat}: it must be at least 1")
-        self.lanes = Lanes(task, num_lanes, num_threads)
+        self.lanes = Lanes(task, num_lanes, num_threads, Retries(retries))
         self._repeat = repeat
         self._seeds = np.zeros(num_lanes, np.int64)
         self._episodes = np.zeros(num_lanes, np.int64)  # k of each lane's episode
@@ -66,6 +74,10 @@ class Endless:
         for lane, seed in enumerate(seeds):
             if seed is not None:
                 self._seeds[lane], self._episodes[lane] = seed, 0
+        return self._start(range(self.lanes.num_lanes))
+
+    def restart(self) -> Array:
+        """Start the episodes of now once more, as after others were played in their lanes."""
         return self._start(range(self.lanes.num_lanes))
 
     def step(self, actions: Array) -> Moved:

@@ -7,28 +7,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jbrep.envs.make import flattener, is_batched, make_batch, make_env
+from jbrep.envs.make import is_batched, make_batch
+from jbrep.envs.separate import EnvironmentFailedError as EnvironmentFailedError
+from jbrep.envs.separate import Flags as Flags
+from jbrep.envs.separate import Retries as Retries
+from jbrep.envs.separate import Separate, not_the_same
+from jbrep.envs.separate import State as State
 from jbrep.envs.task import Array, Task
-from jbrep.errors import InputError, kind_and_line
-
-Flags = NDArray[np.bool_]
-State = dict[str, NDArray[Any]]  # everything that decides how lanes continue; (n, ...) each
+from jbrep.errors import InputError
 
 
 class NonFiniteActionError(InputError):
     """An action is NaN or infinite."""
-
-
-class EnvironmentFailedError(InputError):
-    """An environment raised an error, or gave something else than its task's description says.
-
-    Attributes:
-        lane: in which it did.
-    """
-
-    def __init__(self, message: str, lane: int):
-        super().__init__(message)
-        self.lane = lane
 
 
 def check_counts(num_lanes: int, num_threads: int | None) -> None:
@@ -40,6 +30,27 @@ def check_counts(num_lanes: int, num_threads: int | None) -> None:
     for count, what in ((num_lanes, "lanes"), (num_threads, "threads")):
         if count is not None and count < 1:
             raise InputError(f"the number of {what} is {count}: it must be at least 1")
+
+
+def lanes_at_once(task: Task, most: int, threads: int | None, retries: int) -> "Lanes":
+    """As many lanes as there may be, or one, of a robot that exists once.
+
+    Args:
+        task: whose environment is made.
+        most: lanes.
+        threads: to step a batch on; 1 is one instance of other environments.
+        retries: as `Retries` takes them.
+
+    Raises:
+        InputError: not even one environment can be made.
+    """
+    if threads != 1 or is_batched(task):
+        try:
+            return Lanes(task, most, threads, Retries(retries))
+        except InputError:
+            if most == 1 or is_batched(task):
+                raise
+    return Lanes(task, 1, threads, Retries(retries))
 
 
 def check_actions(actions: ArrayLike, num_lanes: int, size: int) -> NDArray[np.float64]:
@@ -80,6 +91,8 @@ class Lanes:
         task: whose environment is made.
         num_lanes: n.
         num_threads: threads to step a batch on; None takes one for each core.
+        retries: of failures of separate environments, each of which ends an episode before the step
+            that failed; by default none.
 
     Attributes:
         task: the task.
@@ -89,6 +102,9 @@ class Lanes:
         info: all that a batch tells of its lanes, by name, (n, ...) each.
         terminated, truncated: how each lane's episode has ended, (n,).
         active: whether it goes on, (n,).
+        lost: whether the last step led to nothing that can be used, (n,): it doesn't count, and its
+            episode ended before it, truncated.
+        missing: readings that were missing in each lane's episode, (n,).
         num_active: in how many lanes it does.
         envs: the environments themselves: a batch, or one for each lane.
 
@@ -96,15 +112,25 @@ class Lanes:
         InputError: a number below 1, or the environment can't be made.
     """
 
-    def __init__(self, task: Task, num_lanes: int, num_threads: int | None = None):
+    def __init__(
+        self,
+        task: Task,
+        num_lanes: int,
+        num_threads: int | None = None,
+        retries: Retries | None = None,
+    ):
         check_counts(num_lanes, num_threads)
         self.task, self.num_lanes = task, num_lanes
         if is_batched(task):
             self._batch: Any = make_batch(task, num_lanes, num_threads)
             self.envs: Any = self._batch
         else:
-            self._batch = _Separate(task, num_lanes)
+            self._batch = Separate(task, num_lanes, retries or Retries())
             self.envs = self._batch.envs
+        self.lost = np.zeros(num_lanes, np.bool_)
+        self.missing: NDArray[np.int64] = getattr(
+            self._batch, "missing", np.zeros(num_lanes, np.int64)
+        )
         self.observation = np.zeros((num_lanes, task.size))
         self.arrays: Mapping[str, Array] = {}
         self.info: Mapping[str, Any] = {}
@@ -121,6 +147,11 @@ class Lanes:
     def ended(self) -> Flags:
         """Whether each lane's episode has ended, (n,)."""
         return ~self.active
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether an environment failed in an episode of now, which ended early thereby."""
+        return bool(np.any(getattr(self._batch, "failed", False)))
 
     @property
     def steps(self) -> NDArray[np.int64]:
@@ -170,6 +201,8 @@ class Lanes:
         self._check(observation, reward, "gave")
         self.observation, self.arrays, self.info = observation, arrays, info
         self.terminated, self.truncated = terminated, truncated
+        self.lost = getattr(self._batch, "lost", self.lost)
+        self._steps -= self.lost
         self._count()
         return Step(observation, reward, terminated, truncated, arrays)
 
@@ -199,15 +232,18 @@ class Lanes:
         observation, info = self._batch.restore(batch)
         observation = np.where(self.active[:, None], observation, expected)
         if observation.tobytes() != expected.astype(np.float64).tobytes():
-            raise InputError(
-                f"{self.task.name} is not reproducible here: the same seed and actions lead to "
-                "another state, so this can't continue where it stopped"
-            )
+            raise not_the_same(self.task)
         self._see(observation, info)
 
     def close(self) -> None:
-        """Free what the environments hold."""
+        """Free what the environments hold; a separate one is kept for the next who needs it."""
         self._batch.close()
+
+    def __enter__(self) -> "Lanes":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
     def _see(self, observation: Array, info: Mapping[str, Any]) -> None:
         self.observation, self.info = observation, info
@@ -230,105 +266,3 @@ class Lanes:
             f"{self._steps[lane]} of the episode with seed {self._seeds[lane]}",
             lane,
         )
-
-
-class _Separate:
-    """An environment for each lane, used like a batch without resets of its own.
-
-    A lane's state is its seed and the actions since.
-    """
-
-    def __init__(self, task: Task, num_lanes: int):
-        self._task = task
-        self.envs: Any = [
-            make_env(task.id, task.arguments, task.max_episode_steps) for _ in range(num_lanes)
-        ]
-        self._flat = flattener(self.envs[0].observation_space)
-        space: Any = self.envs[0].action_space
-        self._action_type, self._action_shape = space.dtype, space.shape
-        self._observation = np.zeros((num_lanes, task.size))
-        self._arrays = {name: np.zeros((num_lanes, w)) for name, w in task.arrays.items()}
-        self._seeds: list[int | None] = [0] * num_lanes
-        self._active = np.zeros(num_lanes, np.bool_)
-        self._actions: list[list[NDArray[np.float32]]] = [[] for _ in range(num_lanes)]
-
-    def reset(
-        self, seed: Sequence[int | None], options: Mapping[str, Flags]
-    ) -> tuple[Array, dict[str, Array]]:
-        self._make_new_arrays()
-        for lane in np.flatnonzero(options["reset_mask"]).tolist():
-            self._seeds[lane], self._actions[lane], self._active[lane] = seed[lane], [], True
-            try:
-                observation, info = self.envs[lane].reset(seed=seed[lane])
-                self._put(lane, observation, info)
-            except Exception as error:
-                raise self._failure(lane, error) from error
-        return self._observation, self._arrays
-
-    def step(self, actions: Array) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
-        return self._advance(actions, self._active)
-
-    def _advance(
-        self, actions: Array, chosen: Flags
-    ) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
-        """Step the lanes that are chosen."""
-        self._make_new_arrays()
-        single, reward = actions.astype(np.float32), np.zeros(len(chosen))
-        terminated, truncated = np.zeros((2, len(chosen)), np.bool_)
-        for lane in np.flatnonzero(chosen).tolist():
-            self._actions[lane].append(single[lane])
-            action = single[lane].astype(self._action_type, copy=False).reshape(self._action_shape)
-            try:
-                observation, *result, info = self.envs[lane].step(action)
-                self._put(lane, observation, info)
-                reward[lane], terminated[lane], truncated[lane] = result
-            except Exception as error:
-                raise self._failure(lane, error) from error
-            self._active[lane] = not (terminated[lane] or truncated[lane])
-        return self._observation, reward, terminated, truncated, self._arrays
-
-    def _make_new_arrays(self) -> None:
-        """So that those given before don't change."""
-        self._observation = self._observation.copy()
-        if self._arrays:
-            self._arrays = {name: values.copy() for name, values in self._arrays.items()}
-
-    def _put(self, lane: int, observation: Any, info: Mapping[str, Any]) -> None:
-        flat = self._flat(observation)
-        if flat.shape != (self._task.size,):
-            raise ValueError(
-                f"it gave an observation of {flat.size} numbers instead of {self._task.size}"
-            )
-        self._observation[lane] = flat
-        for name, values in self._arrays.items():
-            values[lane] = info[name]
-
-    def _failure(self, lane: int, error: Exception) -> EnvironmentFailedError:
-        return EnvironmentFailedError(
-            f"{self._task.name} failed at step {len(self._actions[lane])} of the episode with seed "
-            f"{self._seeds[lane]}: {kind_and_line(error)}",
-            lane,
-        )
-
-    @property
-    def state(self) -> State:
-        lengths = [len(actions) for actions in self._actions]
-        taken = np.zeros((len(self.envs), max(lengths), self._task.action_size), np.float32)
-        for lane, actions in enumerate(self._actions):
-            taken[lane, : len(actions)] = actions or 0
-        return {
-            "episode_seeds": np.array(self._seeds),
-            "lengths": np.array(lengths),
-            "actions": taken,
-        }
-
-    def restore(self, state: State) -> tuple[Array, dict[str, Array]]:
-        lengths, every_lane = state["lengths"], np.ones(len(self.envs), np.bool_)
-        self.reset(state["episode_seeds"].tolist(), {"reset_mask": every_lane})
-        for step in range(max(lengths.tolist())):
-            self._advance(state["actions"][:, step], step < lengths)
-        return self._observation, self._arrays
-
-    def close(self) -> None:
-        for env in self.envs:
-            env.close()

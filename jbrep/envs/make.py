@@ -1,9 +1,10 @@
 """Making a task's environment: one instance with a flat observation, or a batch of many."""
 
 import logging
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from typing import Any
 
 import gymnasium
@@ -39,13 +40,13 @@ def make_env(
     if max_episode_steps is not None:
         options["max_episode_steps"] = max_episode_steps  # None would lift the registered limit
     try:
-        with _quiet():
+        with _quiet(), aside():
             return gymnasium.make(spec, disable_env_checker=True, **{**arguments, **options})
     except InputError:
         raise
     except Exception as error:
         given = f" with {dict(arguments)}" if arguments else ""
-        raise InputError(f"can't make {env_id}{given}: {kind_and_line(error)}") from error
+        raise InputError(f"can't make {env_id}{given}: {reason(error)}") from error
 
 
 def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:
@@ -89,6 +90,44 @@ def flattener(space: spaces.Space[Any]) -> Flatten:
         each = [flattener(part) for part in space.spaces]
         return lambda given: np.concatenate([f(part) for f, part in zip(each, given, strict=True)])
     return lambda given: np.asarray(flatten(space, given))
+
+
+def aside() -> redirect_stdout[Any]:
+    """What an environment prints goes to standard error: the output is the command's own."""
+    return redirect_stdout(sys.stderr)
+
+
+_OF_OLD_GYM = {  # what Gymnasium's wrappers, or Python, say of environments of that kind
+    "not enough values to unpack (expected 5, got 4)": "its step gives four values: it must give "
+    "five: observation, reward, terminated, truncated and info",
+    "too many values to unpack (expected 2": "its reset gives an observation alone: it must give "
+    "observation and info",
+    "reset() got an unexpected keyword argument": "its reset takes no seed and options: it must be "
+    "reset(self, *, seed=None, options=None)",
+}
+
+
+def reason(error: Exception) -> str:
+    """What an error of an environment says, for a message; of an old Gym's, what is to be done."""
+    told = kind_and_line(error)
+    for sign, advice in _OF_OLD_GYM.items():
+        if sign in told:
+            return f"{advice}, as in Gymnasium; this is old Gym's"
+    return told
+
+
+def number(value: Any, what: str) -> float:
+    """One number that an environment gives, which may stand in an array by itself.
+
+    Raises:
+        ValueError: several numbers, or none.
+    """
+    if isinstance(value, float | int):
+        return float(value)
+    values = np.asarray(value)
+    if values.size != 1:
+        raise ValueError(f"it gave a {what} of shape {values.shape}: it must be one number")
+    return float(values.item())
 
 
 @contextmanager

@@ -80,6 +80,7 @@ class Recording:
         terminated: whether a state ended the episode, (n,).
         truncated: whether the time limit did, or physics that diverged, (n,).
         length: of each episode, (n,).
+        missing: readings in each episode in whose place is the one before, or at which it ended.
     """
 
     start: Mapping[str, Array]
@@ -90,6 +91,7 @@ class Recording:
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     length: NDArray[np.int32]
+    missing: NDArray[np.int64]
 
     def __repr__(self) -> str:
         steps, lanes = self.reward.shape
@@ -110,7 +112,7 @@ def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = read_nothing) -> R
     actives, actions, rewards = [], [], []
     for played in play(lanes, act):
         observations.append(played.step.observation)
-        actives.append(played.active)
+        actives.append(played.active & ~lanes.lost)
         actions.append(played.action)
         rewards.append(played.step.reward)
         reads.append(_copied(read(lanes)))
@@ -124,6 +126,7 @@ def record(lanes: Lanes, act: Actor, tick: Tick, read: Read = read_nothing) -> R
         terminated=lanes.terminated,
         truncated=lanes.truncated,
         length=np.stack(actives).sum(axis=0, dtype=np.int32),
+        missing=lanes.missing.copy(),
     )
 
 
@@ -144,3 +147,20 @@ def episode_returns(
         total += played.step.reward
         tick(int(played.active.sum()))
     return total
+
+
+def whole_returns(
+    lanes: Lanes, begin: Callable[[], Actor], first_seed: int, tick: Tick = lambda steps: None
+) -> Array:
+    """The same; episodes in which the environment failed are played again.
+
+    Args:
+        lanes: whose retries say how often.
+        begin: acts from the start of episodes on.
+        first_seed: of the first lane.
+        tick: called after each step.
+    """
+    while True:
+        returns = episode_returns(lanes, begin(), first_seed, tick)
+        if not lanes.has_failed:
+            return returns

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 from numpy.typing import NDArray
 
 from jbrep.errors import InputError
@@ -55,6 +55,14 @@ SPATIAL: Mapping[Kind, range] = {  # kinds of several features, a group of their
     "point": range(2, 4),
 }
 _Positive = Annotated[float, Meta(gt=0, le=1e12)]
+_Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", title="a SHA-256")]
+_Part = Annotated[str, Meta(pattern=r"\A[^\x00-\x1f\x7f-\x9f]{1,200}\Z", title="a name")]
+_Missing = Annotated[
+    str,
+    Meta(
+        pattern=r"\A(skip|hold:[1-9]\d{0,5})\Z", title="skip, or hold and a number of steps: hold:3"
+    ),
+]
 _Arrays = Mapping[Word, Annotated[int, Meta(ge=1, le=_MAX_FEATURES)]]
 _Bounds = Annotated[tuple[Finite, ...], Meta(min_length=1, max_length=_MAX_ACTIONS)]
 
@@ -145,6 +153,12 @@ class Task(Record, frozen=True):
             generator with the episode's seed; None if unknown.
         state: the arrays that `info` has of each state, by name, with their widths.
         constants: those that stay the same during an episode.
+        made_from: SHA-256 of the files that its arguments name and of the modules that define it,
+            by the names of arguments and modules; packages have versions instead.
+        offsets: of features by name, which are subtracted from what the environment gives, so that
+            32 bits hold it: everywhere a feature is what is left.
+        missing: what becomes of readings that aren't finite: skip ends an episode before one,
+            hold:3 has the last one instead, for at most 3 steps. Otherwise they are errors.
 
     Raises:
         InputError: a field that doesn't fit this description.
@@ -167,6 +181,9 @@ class Task(Record, frozen=True):
     draws: Annotated[int, Meta(ge=0, lt=1 << 32)] | None = None
     state: _Arrays = {}
     constants: _Arrays = {}
+    made_from: Mapping[_Part, _Sha256] | UnsetType = UNSET  # left out of files that have none
+    offsets: Mapping[Word, Finite] | UnsetType = UNSET
+    missing: _Missing | UnsetType = UNSET
 
     def check(self) -> None:
         """As for `Record`."""
@@ -185,8 +202,10 @@ class Task(Record, frozen=True):
         _check_range("a reward", self.reward_low, self.reward_high)
         if len(self.action_low) != len(self.action_high):
             raise InputError("its actions must have as many lower bounds as upper ones")
-        if not all(map(float.__lt__, self.action_low, self.action_high)):
-            raise InputError("each lower bound of its actions must be below the upper one")
+        if not all(map(float.__le__, self.action_low, self.action_high)):
+            raise InputError("each lower bound of its actions must be at most the upper one")
+        if unknown := set(self.offsets or ()) - set(self.feature_names):
+            raise InputError(f"offsets has {min(unknown)}, which is none of its features")
 
     @property
     def slug(self) -> str:
@@ -207,6 +226,17 @@ class Task(Record, frozen=True):
     def feature_names(self) -> tuple[str, ...]:
         """Names of all features, in order."""
         return tuple(feature.name for feature in self.features)
+
+    @cached_property
+    def offset(self) -> Array:
+        """What is subtracted from each number that the environment gives, (d,)."""
+        offsets = self.offsets or {}
+        return np.array([offsets.get(name, 0.0) for name in self.feature_names])
+
+    @property
+    def most_held(self) -> int | None:
+        """For how many steps the last reading stands for missing ones; None if it never does."""
+        return most_held(self.missing or "")
 
     @cached_property
     def groups(self) -> dict[str, slice]:
@@ -290,6 +320,12 @@ def _usual_range(feature: Feature) -> tuple[float, float]:
     return (low, high) if low is not None and high is not None and low < high else (-1.0, 1.0)
 
 
+def most_held(missing: str) -> int | None:
+    """For how many steps the last reading stands for missing ones, by `Task.missing`."""
+    kind, _, steps = missing.partition(":")
+    return int(steps) if kind == "hold" else None
+
+
 def check_same(expected: Task, actual: Task, what: str) -> None:
     """Make sure that two descriptions are of the same observations.
 
@@ -308,3 +344,17 @@ def check_same(expected: Task, actual: Task, what: str) -> None:
         )
     if actual.feature_names != expected.feature_names:
         raise InputError(f"{what} was made for other features of {actual.name}")
+    if (actual.offsets or {}) != (expected.offsets or {}):
+        raise InputError(
+            f"{what} was made for features of {actual.name} with other offsets: give those in "
+            "--features"
+        )
+
+
+def changed_parts(there: Task, now: Task) -> str:
+    """Of what is not what it was when an environment was described, for a message; or nothing."""
+    before, after = there.made_from or {}, now.made_from or {}
+    names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    return ", ".join(
+        f"{name} ({file})" if (file := now.arguments.get(name)) else name for name in names
+    )

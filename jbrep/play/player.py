@@ -1,16 +1,17 @@
 """Policies with their tasks, which play the episodes that every run is evaluated on."""
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from jbrep.encoders import FULL
 from jbrep.encoders.base import BaseEncoder
-from jbrep.envs.lanes import Lanes
+from jbrep.envs.lanes import Lanes, lanes_at_once
 from jbrep.envs.make import is_batched
 from jbrep.envs.physics import MotionReader
-from jbrep.envs.recording import Actor, Recording, episode_returns, record
+from jbrep.envs.recording import Actor, Recording, record, whole_returns
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 from jbrep.play.jitterbug import hold_diverged, turn_targets
@@ -53,14 +54,15 @@ class Player(NamedTuple):
                 f"steps at once: at most {_MAX_BYTES // self._episode_bytes:,} are possible"
             )
         seeds = [EVALUATION_SEED + episode for episode in episodes]
-        lanes, read = Lanes(self.task, len(seeds)), MotionReader()
-        lanes.reset(range(len(seeds)), seeds)
-        if target_yaw is not None:
-            turn_targets(lanes, target_yaw)
-        act = self.begin(self.task, seeds)
-        with _progress(len(seeds) * self.task.max_episode_steps) as bar:
+        act, read = self.begin(self.task, seeds), MotionReader()
+        with (
+            Lanes(self.task, len(seeds)) as lanes,
+            _progress(len(seeds) * self.task.max_episode_steps) as bar,
+        ):
+            lanes.reset(range(len(seeds)), seeds)
+            if target_yaw is not None:
+                turn_targets(lanes, target_yaw)
             recording = record(lanes, act, bar.update, read)
-        lanes.close()
         return [self._rollout(recording, lane, seed, read) for lane, seed in enumerate(seeds)]
 
     def _rollout(self, recording: Recording, lane: int, seed: int, read: MotionReader) -> Rollout:
@@ -91,21 +93,38 @@ class Player(NamedTuple):
         for some in _batches(count, max(1, _BATCH_BYTES // self._episode_bytes)):
             yield from self.play(some, target_yaw)
 
-    def returns(self, count: int) -> Array:
+    def returns(self, count: int, threads: int | None = None, retries: int = 0) -> Array:
         """Returns of the first `count` of these episodes, (count,).
+
+        Args:
+            count: of episodes.
+            threads: to step a batch on; 1 is one instance of other environments, which are also
+                played in one where no second can be made.
+            retries: how often in a row an episode in which the environment fails is played again.
 
         Raises:
             InputError: more episodes than an evaluation may have.
+            EnvironmentFailedError: the environment fails.
         """
+        return np.concatenate(list(self.returns_in_turn(count, threads, retries)))
+
+    def returns_in_turn(
+        self, count: int, threads: int | None = None, retries: int = 0
+    ) -> Iterator[Array]:
+        """The same, some at a time, as they are finished."""
         most = _BATCH_LANES if is_batched(self.task) else _SEPARATE_LANES
-        returns = []
+        check_episodes(count)
+        played = 0
         with _progress(count * self.task.max_episode_steps) as bar:
-            for some in _batches(count, most):
-                lanes, first = Lanes(self.task, len(some)), EVALUATION_SEED + some[0]
-                act = self.begin(self.task, range(first, first + len(some)))
-                returns.append(episode_returns(lanes, act, first, bar.update))
-                lanes.close()
-        return np.concatenate(returns)
+            while played < count:
+                most = min(most, count - played)
+                with lanes_at_once(self.task, most, threads, retries) as lanes:
+                    size, most = lanes.num_lanes, lanes.num_lanes
+                    while played + size <= count:
+                        first = EVALUATION_SEED + played
+                        begin = partial(self.begin, self.task, range(first, first + size))
+                        yield whole_returns(lanes, begin, first, bar.update)
+                        played += size
 
     @property
     def _episode_bytes(self) -> int:
@@ -137,9 +156,18 @@ def _progress(steps: int) -> Progress:
     return Progress(total=steps, unit="step", unit_scale=True, leave=False, delay=1)
 
 
-def _batches(count: int, most: int) -> Iterator[range]:
-    """The first episodes of evaluation, at most so many at a time."""
+def check_episodes(count: int) -> None:
+    """Make sure that an evaluation may have so many episodes.
+
+    Raises:
+        InputError: there are more.
+    """
     if count > MAX_EPISODES:
         raise InputError(f"{count:,} episodes are too many: at most {MAX_EPISODES:,} are played")
+
+
+def _batches(count: int, most: int) -> Iterator[range]:
+    """The first episodes of evaluation, at most so many at a time."""
+    check_episodes(count)
     for start in range(0, count, most):
         yield range(start, min(start + most, count))

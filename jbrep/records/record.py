@@ -43,8 +43,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def __post_init__(self) -> None:
         for field in msgspec.structs.fields(type(self)):
-            if field.type is not Any:
-                value = getattr(self, field.name)
+            value = getattr(self, field.name)
+            if field.type is not Any and value is not UNSET:
                 fitting = converted(_of_python(value), field.type, field.encode_name)
                 force_setattr(self, field.name, fitting)
         self.check()

@@ -21,7 +21,7 @@ from torch.distributions import Distribution
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.vec_env import JitterbugVecEnv, agent_spaces
 from jbrep.envs.lanes import Lanes
-from jbrep.envs.recording import Actor, episode_returns, held
+from jbrep.envs.recording import Actor, held, whole_returns
 from jbrep.envs.task import Array, Task
 from jbrep.records.container import Tensors
 from jbrep.records.record import to_plain
@@ -49,9 +49,11 @@ def make_env(
     normalize: bool = False,
     num_threads: int = 1,
     action_repeat: int = 1,
+    retries: int = 0,
 ) -> VecEnv:
     """Lanes of a task seen through an encoder, stepped on so many threads."""
-    lanes = JitterbugVecEnv(task, num_envs, seed, encoder, num_threads, None, action_repeat)
+    how = num_threads, None, action_repeat, retries
+    lanes = JitterbugVecEnv(task, num_envs, seed, encoder, *how)
     return normalized(VecMonitor(lanes)) if normalize else VecMonitor(lanes)
 
 
@@ -240,6 +242,7 @@ class Evaluator:
         episodes: how many are played at once.
         seed: of the first episode; the others take the numbers that follow.
         num_threads: as for `Lanes`.
+        lanes: to play in; new ones by default.
     """
 
     def __init__(
@@ -249,9 +252,14 @@ class Evaluator:
         episodes: int,
         seed: int = EVALUATION_SEED,
         num_threads: int | None = 1,
+        lanes: Lanes | None = None,
     ):
-        self._lanes = Lanes(task, episodes, num_threads)
-        self._encoder, self._seed = encoder, seed
+        self._lanes = lanes or Lanes(task, episodes, num_threads)
+        self._encoder, self._seed, self._episodes = encoder, seed, episodes
+
+    def close(self) -> None:
+        """Free what the environments hold."""
+        self._lanes.close()
 
     def returns(self, agent: BaseAlgorithm, episodes: int | None = None) -> Array:
         """The return of each episode, (episodes,): as many as are played at once, or as asked for.
@@ -264,8 +272,7 @@ class Evaluator:
         """
         see = seeing(self._encoder.encode, statistics_of(agent))
         act, repeat = deterministic(agent.policy, self._lanes.task, see), action_repeat(agent)
-        at_once = self._lanes.num_lanes
-        count = at_once if episodes is None else episodes
-        seeds = range(self._seed, self._seed + count, at_once)
-        returns = [episode_returns(self._lanes, held(act, repeat), seed) for seed in seeds]
+        count = self._episodes if episodes is None else episodes
+        seeds = range(self._seed, self._seed + count, self._lanes.num_lanes)
+        returns = [whole_returns(self._lanes, lambda: held(act, repeat), seed) for seed in seeds]
         return np.concatenate(returns)[:count]

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 import msgspec
 from msgspec import Meta
 
-from jbrep.envs.task import Id, Task
+from jbrep.envs.task import Id, Task, changed_parts
 from jbrep.errors import DamageError, InputError, differences
 from jbrep.records import container
 from jbrep.records.commit import Commits
@@ -137,6 +137,8 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
 
     def differing(self, wanted: "RunSettings") -> str:
         """How they differ from those of the run at hand, for a message; empty if they don't."""
+        if changed := changed_parts(self.environment, wanted.environment):
+            return f"{self.task} as it was before {changed} changed"
         return differences(_flat(self), _flat(wanted))
 
 

@@ -15,6 +15,7 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.encoders import Encoder, save
+from jbrep.envs.lanes import Lanes, lanes_at_once
 from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError
 from jbrep.records.commit import commits
@@ -79,6 +80,9 @@ class Job:
         run: what to train.
         folder: where; it need not exist yet.
         threads: that may step its robots; gradient steps take one.
+        retries: how often in a row an environment that fails is made anew.
+        is_one_robot: whether training and evaluations have the same instance of the environment;
+            evaluations then wait for the end of an episode of training.
         encoder: that the run sees its task through.
         settings: of the run, as run.json has them.
         history: what was recorded so far.
@@ -87,15 +91,23 @@ class Job:
         InputError: as `Run.settings`.
     """
 
-    def __init__(self, run: Run, folder: Path, threads: int = 1):
+    def __init__(
+        self,
+        run: Run,
+        folder: Path,
+        threads: int = 1,
+        retries: int = 0,
+        is_one_robot: bool = False,
+    ):
         self.run, self.folder, self.threads = run, folder, threads
+        self.retries, self.is_one_robot = retries, is_one_robot
         self.encoder = run.find_encoder()
         self.settings = self._going_on(run.settings(self.encoder))
         self.history = History()
 
     def anew(self) -> "Job":
         """The same with nothing recorded yet."""
-        return Job(self.run, self.folder, self.threads)
+        return Job(self.run, self.folder, self.threads, self.retries, self.is_one_robot)
 
     def threads_for(self, lanes: int) -> int:
         """How many threads step so many of its robots; no bit depends on it."""
@@ -189,9 +201,39 @@ class Job:
     @cached_property
     def evaluator(self) -> Evaluator:
         """What plays the run's evaluations."""
-        episodes = self.run.evaluation_episodes
+        return self._evaluator(None)
+
+    def share(self, lanes: Lanes) -> None:
+        """Evaluate in the lanes of training, if there is one robot."""
+        if self.is_one_robot:
+            self.evaluator = self._evaluator(lanes)
+
+    def _evaluator(self, lanes: Lanes | None) -> Evaluator:
+        task, episodes = self.run.task, self.run.evaluation_episodes
         threads = self.threads_for(episodes)
-        return Evaluator(self.run.task, self.encoder, episodes, num_threads=threads)
+        lanes = lanes or lanes_at_once(
+            task, episodes, None if threads == 1 else threads, self.retries
+        )
+        return Evaluator(task, self.encoder, episodes, lanes=lanes)
+
+    def is_evaluation_due(self, step: int, is_between: bool, keeps: bool) -> bool:
+        """Whether to evaluate after so many steps.
+
+        Args:
+            step: of training.
+            is_between: whether an episode of training has just ended.
+            keeps: as for `RunSettings.is_evaluation_due`.
+        """
+        every, last = self.settings.evaluate_every, self.history.evaluations[-1].step
+        if not self.is_one_robot:
+            return self.settings.is_evaluation_due(step, keeps)
+        return is_between and step < self.settings.steps and step // every > last // every
+
+    def close(self) -> None:
+        """Free what the evaluations hold."""
+        if "evaluator" in vars(self):
+            self.evaluator.close()
+            del self.evaluator
 
     def evaluate_finally(self, agent: BaseAlgorithm) -> None:
         """Evaluate a trained agent, in more episodes; see `evaluate`.

@@ -1,6 +1,7 @@
 """stable-baselines3 as the trainer of one run at a time, for all of its algorithms."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -62,12 +63,16 @@ def _train(job: Job, session: Session) -> RunRecord:
     seed = training_seed(run.seed)
     lanes = chosen.num_envs
     how = chosen.normalize, job.threads_for(lanes), chosen.action_repeat
-    env = make_env(run.task, lanes, seed, job.encoder, *how)
-    agent = make_agent(settings.algorithm, chosen, env, run.seed, settings.episode_steps)
-    env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
-    job.prepare(agent, session.writers)
-    failure = _learn(agent, settings.agent_steps, follower)
-    return job.end(agent, failure)
+    with (
+        closing(make_env(run.task, lanes, seed, job.encoder, *how, job.retries)) as env,
+        closing(job),
+    ):
+        agent = make_agent(settings.algorithm, chosen, env, run.seed, settings.episode_steps)
+        env.seed(seed)  # stable-baselines3 gave it the agent's, which lanes of other runs share
+        job.prepare(agent, session.writers)
+        job.share(_envs(agent)[1].lanes)
+        failure = _learn(agent, settings.agent_steps, follower)
+        return job.end(agent, failure)
 
 
 def _learn(agent: BaseAlgorithm, steps: int, callback: BaseCallback) -> str:
@@ -112,7 +117,7 @@ class _Follower(BaseCallback):
     def _on_rollout_start(self) -> None:
         check_finite(self.model)
         if not self._job.history.evaluations:
-            self._job.evaluate(self.model)
+            self._evaluate(self.model._last_obs)
         self._tell()
         if self._draws:  # state-dependent noise has just been drawn, for the second time
             _restore_draws(self.model, self._draws)
@@ -130,9 +135,26 @@ class _Follower(BaseCallback):
             total, length = float(info["episode"]["r"]), info["control_steps"]
             row = Episode(step, lane, total, length, info.get("non_finite", False))
             self._job.history.episodes.append(row)
-        if self._job.settings.is_evaluation_due(step, self._session.keeps):
-            self._job.evaluate(self.model)
+        is_between = bool(self.locals["dones"].any())
+        if self._job.is_evaluation_due(step, is_between, self._session.keeps):
+            self._evaluate(self.locals["new_obs"])
         return True
+
+    def _evaluate(self, observed: Any) -> None:
+        """Evaluate, with one robot between episodes: the next one begins once more.
+
+        Args:
+            observed: its first observation as the agent is to see it, (1, l).
+        """
+        self._job.evaluate(self.model)
+        if self._job.is_one_robot:
+            _, env = _envs(self.model)
+            first: Any = env.restart()
+            if normalizer := self.model.get_vec_normalize_env():
+                normalizer.old_obs = first
+                setattr(self.model, _UNSCALED, first.copy())
+                first = normalizer.normalize_obs(first)
+            observed[:] = first
 
     def _on_training_end(self) -> None:
         check_finite(self.model)

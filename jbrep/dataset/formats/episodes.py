@@ -33,14 +33,16 @@ _IMAGE_AXES = 3  # height, width, colour
 
 
 class Incoming(NamedTuple):
-    """An episode of n steps."""
+    """An episode of n steps; numbers may be missing."""
 
-    observation: NDArray[np.float32]  # (n, d), before each action
-    action: NDArray[np.float32]  # (n, k)
-    reward: NDArray[np.float32]  # (n,)
-    final: NDArray[np.float32]  # (d,), after the last action
+    where: str  # it is, for messages
+    observation: NDArray[np.float64]  # (n, d), before each action
+    action: NDArray[np.float64]  # (n, k)
+    reward: NDArray[np.float64]  # (n,)
+    final: NDArray[np.float64]  # (d,), after the last action
     terminated: bool
     seed: int
+    missing: int = 0  # numbers in whose place are others, or at which it was divided
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def whole_episode(where: str, given: Mapping[str, ArrayLike], **once: Any) -> It
 
 
 def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incoming]:
-    """An episode, its numbers checked; none if no step is left.
+    """An episode, its parts checked; none if no step is left.
 
     Without the observation after its last action, the last step is left out, so that the
     observation before that becomes the final one: nothing is made up. What ended the episode came
@@ -115,20 +117,20 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
         once: its final observation, whether it was terminated and its seed, where they are known.
 
     Raises:
-        InputError: gaps, or numbers that aren't finite or too large for 32 bits.
+        InputError: gaps.
     """
     if not len(rows["reward"]):
         return
     _check_steps(where, rows)
     following = _following(where, rows)
     final = once.get("final_observation", following)
-    observation = _single(where, "observation", rows["observation"])
+    observation = _flat(rows["observation"])
     by_row = bool(rows["terminated"][-1]) if "terminated" in rows else False
     terminated = bool(once.get("terminated", by_row))
     if final is None:
         observation, last, terminated = observation[:-1], observation[-1], False
     else:
-        last = _single(where, "final observation", np.asarray(final)[None])[0]
+        last = _flat(np.asarray(final)[None])[0]
     steps = len(observation)
     if not steps:
         return
@@ -140,9 +142,8 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
     seed = int(once.get("seed", UNKNOWN_SEED))
     if not UNKNOWN_SEED <= seed < 1 << 63:
         raise InputError(f"{where} has the seed {seed}: it must be from 0 to 2**63 - 1, or -1")
-    action = _single(where, "action", rows["action"][:steps])
-    reward = _single(where, "reward", rows["reward"][:steps])[:, 0]
-    yield Incoming(observation, action, reward, last, terminated, seed)
+    action, reward = _flat(rows["action"][:steps]), _flat(rows["reward"][:steps])[:, 0]
+    yield Incoming(where, observation, action, reward, last, terminated, seed)
 
 
 def _check_steps(where: str, rows: Rows) -> None:
@@ -166,8 +167,12 @@ def _following(where: str, rows: Rows) -> Array | None:
     """
     if "next_observation" not in rows:
         return None
-    after, before = rows["next_observation"][:-1], rows["observation"][1:]
-    apart = after.astype(np.float32) != before.astype(np.float32)
+    after, before = (
+        _flat(each) for each in (rows["next_observation"][:-1], rows["observation"][1:])
+    )
+    apart = (after.astype(np.float32) != before.astype(np.float32)) & ~(
+        np.isnan(after) & np.isnan(before)
+    )
     if apart.any():
         step = np.argwhere(apart)[0, 0]
         raise InputError(
@@ -178,17 +183,26 @@ def _following(where: str, rows: Rows) -> Array | None:
     return last
 
 
-def _single(where: str, what: str, values: Array) -> NDArray[np.float32]:
-    """Flat rows of single precision, (n, ...) to (n, m)."""
+def _flat(values: Array) -> NDArray[np.float64]:
+    """Flat rows, (n, ...) to (n, m)."""
+    return values.reshape(len(values), math.prod(values.shape[1:])).astype(np.float64)
+
+
+def single(where: str, what: str, values: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Numbers in single precision.
+
+    Raises:
+        InputError: one is beyond that.
+    """
     with np.errstate(over="ignore"):
-        single = values.reshape(len(values), math.prod(values.shape[1:])).astype(np.float32)
-    if not np.isfinite(single).all():
-        step = np.flatnonzero(~np.isfinite(single).all(axis=1))[0]
+        rounded = values.astype(np.float32)
+    if not np.isfinite(rounded).all():
+        step = np.argwhere(~np.isfinite(rounded))[0, 0]
         raise InputError(
             f"{where} has a number in its {what} that isn't finite, or beyond 32 bits, at step "
-            f"{step}: correct the data, or leave the episode out"
+            f"{step}: correct the data, leave the episode out, or give --missing"
         )
-    return single
+    return rounded
 
 
 def plain(name: str, what: str, values: ArrayLike) -> Array:

@@ -1,5 +1,7 @@
 """Writing a data set of episodes that were made elsewhere: one pass to see them, one to write."""
 
+import warnings
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,14 +10,16 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from jbrep.dataset.formats.episodes import Incoming, Source
+from jbrep.dataset.formats.episodes import Incoming, Source, single
+from jbrep.dataset.formats.missing import without_missing
 from jbrep.dataset.manifest import Manifest, commit, new_manifest, write_manifest
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.dataset.settings import IMPORTED, MAX_LETTERS
 from jbrep.dataset.verify import range_problems
-from jbrep.envs.description import features_of
+from jbrep.envs.description import features_of, with_features
+from jbrep.envs.precision import Signals, precision_problems
 from jbrep.envs.task import Task
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import InputError, Notice, kind_and_line
 from jbrep.progress import Progress
 from jbrep.records.storage import check_space, make_folder, publish_folder, unfinished
 
@@ -32,9 +36,16 @@ class _Survey(NamedTuple):
     size: int  # of an observation
     low: Array  # of the actions, (k,)
     high: Array
+    signals: Signals
 
 
-def write(source: Source, folder: Path, task: Task | None = None) -> Manifest:
+def write(
+    source: Source,
+    folder: Path,
+    task: Task | None = None,
+    features: Path | None = None,
+    missing: str = "",
+) -> Manifest:
     """Write a data set, whole or not at all.
 
     Args:
@@ -42,6 +53,9 @@ def write(source: Source, folder: Path, task: Task | None = None) -> Manifest:
         folder: new.
         task: that they are of; by default the one that the source names, or else one that is made
             from the data alone.
+        features: a TOML file of what else is known of the features, as `describe` takes it.
+        missing: what becomes of numbers that aren't finite, see `without_missing`; by default as
+            the task says.
 
     Raises:
         InputError: the folder exists already, there are no episodes, they don't fit the task, or
@@ -50,8 +64,14 @@ def write(source: Source, folder: Path, task: Task | None = None) -> Manifest:
     make_folder(folder.parent)
     try:
         with unfinished(folder) as partial:
-            survey = _survey(source)
-            settings = _settings(source, survey, _fitting(source, survey, task or source.task))
+            missing = missing or (task.missing if task else "") or ""
+            survey = _survey(source, missing)
+            fitting = _fitting(source, survey, task or source.task)
+            fitting = with_features(fitting, features) if features else fitting
+            for problem in precision_problems(fitting, survey.signals):
+                warnings.warn(problem, Notice, stacklevel=2)
+            fitting = fitting.replace(missing=missing) if missing else fitting
+            settings = _settings(source, survey, fitting)
             check_space(folder.parent, settings.steps * settings.row_bytes())
             partial.mkdir()
             manifest = _fill(source, settings, partial)
@@ -61,12 +81,20 @@ def write(source: Source, folder: Path, task: Task | None = None) -> Manifest:
     return manifest
 
 
-def _survey(source: Source) -> _Survey:
-    sizes, lengths = (0, 0), list[int]()
+def _episodes(source: Source, missing: str) -> Iterator[Incoming]:
+    """Those of a source without what is missing in them."""
+    for episode in source.episodes():
+        yield from without_missing(episode, missing)
+
+
+def _survey(source: Source, missing: str) -> _Survey:
+    sizes, lengths, count = (0, 0), list[int](), 0
+    signals: Signals | None = None
     low: Any = np.inf
     high: Any = -np.inf
     with Progress(total=source.rows, unit="step", unit_scale=True, desc="read") as progress:
-        for episode in source.episodes():
+        for episode in _episodes(source, missing):
+            count += episode.missing
             found = episode.observation.shape[1], episode.action.shape[1]
             sizes = sizes if lengths else found
             if found != sizes:
@@ -74,16 +102,21 @@ def _survey(source: Source) -> _Survey:
                     f"{source.name} has {found[0]} features and {found[1]} numbers in an action in "
                     f"an episode, but {sizes[0]} and {sizes[1]} before: all must be alike"
                 )
+            seen = Signals.of([episode.observation])
+            signals = signals.with_more(seen) if signals else seen
             low = np.minimum(low, episode.action.min(axis=0))
             high = np.maximum(high, episode.action.max(axis=0))
             lengths.append(len(episode.reward))
             progress.update(lengths[-1])
-    if not lengths:
+    if count:
+        warnings.warn(f"{source.name} had {count:,} missing readings ({missing})", Notice, 2)
+    if signals is None:
         raise InputError(
             f"{source.name} has no episode with a step, the last one's observation being the final "
             "one where no other is given"
         )
-    return _Survey(lengths, sizes[0], low, high)
+    low, high = low.astype(np.float32), high.astype(np.float32)
+    return _Survey(lengths, sizes[0], low, high, signals)
 
 
 def _fitting(source: Source, survey: _Survey, task: Task | None) -> Task:
@@ -155,7 +188,7 @@ def _settings(source: Source, survey: _Survey, task: Task) -> DataSettings:
 def _fill(source: Source, settings: DataSettings, folder: Path) -> Manifest:
     manifest = new_manifest(settings)
     write_manifest(folder, manifest)
-    episodes = source.episodes()
+    episodes = _episodes(source, settings.task.missing or "")
     with Progress(total=settings.steps, unit="step", unit_scale=True, desc="write") as progress:
         while some := list(islice(episodes, settings.shard_episodes)):
             columns = _columns(settings, some, manifest.episodes)
@@ -173,18 +206,26 @@ def _fill(source: Source, settings: DataSettings, folder: Path) -> Manifest:
 
 def _columns(settings: DataSettings, episodes: list[Incoming], first: int) -> Columns:
     """The columns of a shard."""
-    action = np.concatenate([episode.action for episode in episodes])
+
+    def rows(what: str, values: list[Array]) -> NDArray[np.float32]:
+        given = zip(episodes, values, strict=True)
+        return np.concatenate([single(episode.where, what, each) for episode, each in given])
+
+    offset = settings.task.offset
+    action = rows("action", [episode.action for episode in episodes])
+    finals = [episode.final[None] - offset for episode in episodes]
     terminated = np.array([episode.terminated for episode in episodes])
     known = {
         EPISODES + "episode": np.arange(first, first + len(episodes)),
         EPISODES + "seed": np.array([episode.seed for episode in episodes]),
         EPISODES + "length": np.array([len(episode.reward) for episode in episodes]),
-        "observation": np.concatenate([episode.observation for episode in episodes]),
+        EPISODES + "missing": np.array([episode.missing for episode in episodes]),
+        "observation": rows("observation", [episode.observation - offset for episode in episodes]),
         "action": _bounded(settings.task, action),
-        "reward": np.concatenate([episode.reward for episode in episodes]),
+        "reward": rows("reward", [episode.reward for episode in episodes]),
         EPISODES + "terminated": terminated,
         EPISODES + "truncated": ~terminated,
-        EPISODES + "final_observation": np.stack([episode.final for episode in episodes]),
+        EPISODES + "final_observation": rows("final observation", finals),
     }
     return settings.columns(known)
 

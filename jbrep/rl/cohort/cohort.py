@@ -41,14 +41,16 @@ class Cohort:
         capacity = capacity_of(job.run)
         self._replay = ReplayBuffer(len(members), self._lanes, capacity, *sizes, ahead)
         lanes, repeat = len(members) * self._lanes, settings.hyperparameters.action_repeat
-        self._endless = Endless(task, lanes, job.threads_for(lanes), repeat)
+        self._endless = Endless(task, lanes, job.threads_for(lanes), repeat, job.retries)
         self._device = torch.device(settings.device)
         agents = [member.agent for member in members]
         self._stack = Stack(agents, self._size, settings.precision, settings.device)
         self._algorithm = get_algorithm(settings.algorithm)(self._stack)
         self._stack.read_from_agents()
+        job.share(self._endless.lanes)
         seeds = [training_seed(m.job.run.seed) + i for m in members for i in range(self._lanes)]
         self._observation = self._encode(self._endless.reset(seeds))
+        self._is_between = False  # whether an episode has just ended
         self._update_statistics()
 
     @property
@@ -71,6 +73,7 @@ class Cohort:
         action = self._shared.policy.unscale_action(scaled)
         lanes = action.reshape(-1, action.shape[2]).astype(float)
         moved = self._endless.step(self._endless.lanes.task.unscale_action(lanes))
+        self._is_between = bool(moved.ended.any())
         self.agent_step += self._lanes
         ended, terminated = self._by_member(moved.ended), self._by_member(moved.terminated)
         reward = self._by_member(moved.reward).astype(np.float32)
@@ -196,6 +199,19 @@ class Cohort:
         for member in self.members:
             if not member.failure:
                 member.evaluate(evaluation(member))
+        if self.members[0].job.is_one_robot:
+            self._observation = self._encode(self._endless.restart())
+
+    def evaluate_if_due(self, keeps: bool) -> None:
+        """Evaluate, if it is time; see `RunSettings.is_evaluation_due`."""
+        if self.members[0].job.is_evaluation_due(self.step, self._is_between, keeps):
+            self.evaluate()
+
+    def close(self) -> None:
+        """Free what the environments hold."""
+        self._endless.lanes.close()
+        for member in self.members:
+            member.job.close()
 
     @property
     def failed(self) -> list[Member]:
@@ -219,6 +235,7 @@ class Cohort:
         self.write_to_agents()
         going = [member for member in self.members if not member.failure]
         snapshots = [self.take(member) for member in going]
+        self.close()
         others = Cohort(going)
         others.restore(snapshots)
         return others

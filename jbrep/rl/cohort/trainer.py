@@ -62,9 +62,9 @@ def _cohort(begun: Sequence[_Begun], session: Session) -> Cohort:
 
 
 def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
-    everyone, first = cohort.members, cohort.members[0].job
+    everyone = cohort.members
     try:
-        if not first.history.evaluations:
+        if not everyone[0].job.history.evaluations:
             cohort.evaluate()
         while cohort.goes_on:
             yield from map(_end, cohort.failed)
@@ -73,8 +73,7 @@ def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
             _save(cohort, session)
             for _ in range(cohort.rollout):
                 cohort.act()
-                if first.settings.is_evaluation_due(cohort.step, session.keeps):
-                    cohort.evaluate()
+                cohort.evaluate_if_due(session.keeps)
             cohort.learn()
         _tell(cohort, session)  # the last evaluation can take minutes
         if session.keeps:
@@ -83,11 +82,13 @@ def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
         _tell(cohort, session)
         yield from map(_end, cohort.members)
     except EnvironmentFailedError as error:
+        cohort.close()
         cohort.member_of(error.lane).fail(str(error))
         yield from map(_end, cohort.failed)
         others = [m.job.anew() for m in cohort.members if not m.failure]
         yield from train_together(others, session)  # from their checkpoints
     finally:
+        cohort.close()
         for member in everyone:
             member.agent.logger.close()
 

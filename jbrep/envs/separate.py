@@ -1,0 +1,307 @@
+"""An environment for each lane, used like a batch: simulations of any kind, and real robots."""
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.envs import instances
+from jbrep.envs.make import aside, flattener, number, reason
+from jbrep.envs.task import Array, Task
+from jbrep.errors import InputError, Notice
+
+Flags = NDArray[np.bool_]
+State = dict[str, NDArray[Any]]
+_Actions = list[NDArray[np.float32]]
+_NOW, _BEFORE = "", "before_"  # begin the names of what a state has of each lane's episodes
+
+
+class EnvironmentFailedError(InputError):
+    """An environment raised an error, or gave something else than its task's description says.
+
+    Attributes:
+        lane: in which it did.
+    """
+
+    def __init__(self, message: str, lane: int):
+        super().__init__(message)
+        self.lane = lane
+
+
+class Retries:
+    """How often what fails is tried again, in a row.
+
+    Args:
+        most: times.
+    """
+
+    def __init__(self, most: int = 0):
+        self._most = self._left = most
+
+    def failed(self, error: Exception) -> None:
+        """Tell of a failure.
+
+        Raises:
+            Exception: the error itself, if there were as many before.
+        """
+        if not self._left:
+            raise error
+        self._left -= 1
+        warnings.warn(f"{error}; it is tried again", Notice, stacklevel=2)
+
+    def succeeded(self) -> None:
+        """Forget the failures so far."""
+        self._left = self._most
+
+
+class _MissingError(Exception):
+    """A reading is missing, before which the episode is to end."""
+
+
+class _Episode:
+    """A lane's episode so far: it follows from the seed and the actions."""
+
+    def __init__(self, seed: int | None = 0):
+        self.seed, self.actions = seed, _Actions()
+
+
+class Separate:
+    """An environment for each lane.
+
+    Args:
+        task: whose environments are made.
+        num_lanes: how many.
+        retries: of failures, which end an episode before the step that failed.
+
+    Attributes:
+        envs: the environments; None where one failed, until the lane is reset.
+        lost: whether the last step of each lane led to nothing that can be used, (n,): the
+            observation is still the one before it, and the episode is truncated.
+        failed: whether the environment failed in each lane's episode, (n,).
+        missing: readings that were missing in each lane's episode, (n,).
+    """
+
+    def __init__(self, task: Task, num_lanes: int, retries: Retries):
+        self._task, self._retries = task, retries
+        self.envs: list[Any] = []
+        try:
+            for _ in range(num_lanes):
+                self.envs.append(self._take())
+        except BaseException:
+            self.close()
+            raise
+        self._flat = flattener(self.envs[0].observation_space)
+        space: Any = self.envs[0].action_space
+        self._action_type, self._action_shape = space.dtype, space.shape
+        self._offset = task.offset if task.offset.any() else None
+        self._observation = np.zeros((num_lanes, task.size))
+        self._reward = np.zeros(num_lanes)
+        self._arrays = {name: np.zeros((num_lanes, w)) for name, w in task.arrays.items()}
+        self._active = np.zeros(num_lanes, np.bool_)
+        self._episodes = [_Episode() for _ in range(num_lanes)]
+        self._before = [_Episode() for _ in range(num_lanes)]
+        self._last = np.zeros((num_lanes, task.size))  # observations of the episodes before
+        self._last_reward = np.zeros(num_lanes)  # of the episode under way
+        self._held = np.zeros(num_lanes, np.int64)  # steps in a row with missing readings
+        self.missing = np.zeros(num_lanes, np.int64)
+        self.lost, self.failed = np.zeros((2, num_lanes), np.bool_)
+
+    def _take(self) -> Any:
+        return instances.take(self._task.id, self._task.arguments, self._task.max_episode_steps)
+
+    def reset(
+        self, seed: Sequence[int | None], options: Mapping[str, Flags]
+    ) -> tuple[Array, dict[str, Array]]:
+        """As a vector environment with `reset_mask`."""
+        self._make_new_arrays()
+        for lane in np.flatnonzero(options["reset_mask"]).tolist():
+            if self._episodes[lane].actions:
+                self._before[lane] = self._episodes[lane]
+                self._last[lane] = self._observation[lane]
+            self._begin(lane, seed[lane])
+        return self._observation, self._arrays
+
+    def _begin(self, lane: int, seed: int | None) -> None:
+        """Begin an episode, if need be with another instance."""
+        self._episodes[lane], self._active[lane] = _Episode(seed), True
+        while True:
+            self._held[lane] = self.missing[lane] = self._last_reward[lane] = 0
+            self.failed[lane] = False
+            try:
+                self.envs[lane] = self.envs[lane] or self._take()
+                with aside():
+                    observation, info = self.envs[lane].reset(seed=seed)
+                if not isinstance(info, Mapping):
+                    raise ValueError("too many values to unpack (expected 2")  # old Gym's
+                return self._put(lane, observation, info)
+            except Exception as error:
+                self._bear(lane, error)
+
+    def step(self, actions: Array) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
+        """As a vector environment."""
+        return self._advance(actions, self._active)
+
+    def _advance(
+        self, actions: Array, chosen: Flags
+    ) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
+        """Step the lanes that are chosen."""
+        self._make_new_arrays()
+        self._reward, self.lost = np.zeros(len(chosen)), np.zeros(len(chosen), np.bool_)
+        single = actions.astype(np.float32)
+        terminated, truncated = np.zeros((2, len(chosen)), np.bool_)
+        with aside():
+            for lane in np.flatnonzero(chosen).tolist():
+                self._episodes[lane].actions.append(single[lane])
+                try:
+                    terminated[lane], truncated[lane] = self._step(lane, single[lane])
+                except _MissingError:
+                    self._lose(lane)
+                except Exception as error:
+                    self._bear(lane, error)
+                    self._lose(lane)
+                    self.failed[lane] = True
+                truncated[lane] |= self.lost[lane]
+                self._active[lane] = not (terminated[lane] or truncated[lane])
+                if not (self._active[lane] or self.lost[lane]):
+                    self._retries.succeeded()
+        return self._observation, self._reward, terminated, truncated, self._arrays
+
+    def _step(self, lane: int, action: NDArray[np.float32]) -> tuple[bool, bool]:
+        """Step a lane; whether its episode is terminated and truncated."""
+        own = action.astype(self._action_type).reshape(self._action_shape)  # it may change it
+        observation, reward, terminated, truncated, info = self.envs[lane].step(own)
+        ends = number(terminated, "terminated"), number(truncated, "truncated")
+        self._put(lane, observation, info, number(reward, "reward"), True)
+        return bool(ends[0]), bool(ends[1])
+
+    def _make_new_arrays(self) -> None:
+        """So that those given before don't change."""
+        self._observation = self._observation.copy()
+        if self._arrays:
+            self._arrays = {name: values.copy() for name, values in self._arrays.items()}
+
+    def _put(
+        self,
+        lane: int,
+        observation: Any,
+        info: Mapping[str, Any],
+        reward: float = 0.0,
+        after_step: bool = False,
+    ) -> None:
+        flat = self._flat(observation)
+        if flat.shape != (self._task.size,):
+            raise ValueError(
+                f"it gave an observation of {flat.size} numbers instead of {self._task.size}"
+            )
+        if self._offset is not None:
+            flat = flat - self._offset
+        if math.isfinite(flat.sum() + reward):
+            self._held[lane] = 0
+        else:
+            flat, reward = self._without_missing(lane, flat, reward, after_step)
+        self._observation[lane] = flat
+        self._reward[lane] = self._last_reward[lane] = reward
+        for name, values in self._arrays.items():
+            values[lane] = info[name]
+
+    def _without_missing(
+        self, lane: int, flat: Array, reward: float, after_step: bool
+    ) -> tuple[Array, float]:
+        """An observation and a reward in which the last ones stand for those that are missing."""
+        missing, is_missing = ~np.isfinite(flat), not math.isfinite(reward)
+        if not missing.any() and not is_missing:
+            return flat, reward  # their sum overflows
+        self.missing[lane] += missing.sum() + is_missing
+        self._held[lane] += 1
+        if self._task.missing == "skip" and len(self._episodes[lane].actions) > 1:
+            raise _MissingError
+        if not after_step or self._held[lane] > (self._task.most_held or 0):
+            raise EnvironmentFailedError(
+                f"{self._task.name} {'gave' if after_step else 'reset gave'} an observation or "
+                f"reward that is not finite, at step {len(self._episodes[lane].actions)} of the "
+                f"episode with seed {self._episodes[lane].seed}; --missing says what becomes of it",
+                lane,
+            )
+        filled = np.where(missing, self._observation[lane], flat)
+        return filled, self._last_reward[lane] if is_missing else reward
+
+    def _lose(self, lane: int) -> None:
+        """Let the episode of a lane end before the step that it just took."""
+        self.lost[lane], self._reward[lane] = True, 0.0
+        self._episodes[lane].actions.pop()
+
+    def _bear(self, lane: int, error: Exception) -> None:
+        """Go on after a failure, with a new instance at the next reset.
+
+        Raises:
+            EnvironmentFailedError: there were too many.
+        """
+        if self.envs[lane] is not None:
+            instances.discard(self.envs[lane])
+            self.envs[lane] = None
+        if not isinstance(error, EnvironmentFailedError):
+            error = EnvironmentFailedError(
+                f"{self._task.name} failed at step {len(self._episodes[lane].actions)} of the "
+                f"episode with seed {self._episodes[lane].seed}: {reason(error)}",
+                lane,
+            )
+        self._retries.failed(error)
+
+    @property
+    def state(self) -> State:
+        """What `restore` takes: the actions of each lane's episode, and of the one before."""
+        now, before = self._played(_NOW, self._episodes), self._played(_BEFORE, self._before)
+        return {**now, **before, f"{_BEFORE}observation": self._last.copy()}
+
+    def _played(self, prefix: str, episodes: Sequence[_Episode]) -> State:
+        lengths = [len(each.actions) for each in episodes]
+        taken = np.zeros((len(episodes), max(lengths), self._task.action_size), np.float32)
+        for lane, each in enumerate(episodes):
+            taken[lane, : len(each.actions)] = each.actions or 0
+        return {
+            f"{prefix}episode_seeds": np.array([each.seed for each in episodes]),
+            f"{prefix}lengths": np.array(lengths),
+            f"{prefix}actions": taken,
+        }
+
+    def restore(self, state: State) -> tuple[Array, dict[str, Array]]:
+        """Play the episodes again; the ones before tell whether these are still the same robots.
+
+        Raises:
+            InputError: they aren't.
+        """
+        played = state[f"{_BEFORE}lengths"] > 0
+        if played.any():
+            self._play(_BEFORE, state)
+            last = state[f"{_BEFORE}observation"]
+            if self._observation[played].tobytes() != last[played].tobytes():
+                raise not_the_same(self._task)
+        self._play(_NOW, state)
+        self._last = state[f"{_BEFORE}observation"].copy()
+        for lane in np.flatnonzero(~played).tolist():
+            self._before[lane] = _Episode()
+        return self._observation, self._arrays
+
+    def _play(self, prefix: str, state: State) -> None:
+        lengths, every_lane = state[f"{prefix}lengths"], np.ones(len(self.envs), np.bool_)
+        seeds = state[f"{prefix}episode_seeds"].tolist()
+        self.reset(seeds, {"reset_mask": every_lane})
+        for step in range(max(lengths.tolist())):
+            self._advance(state[f"{prefix}actions"][:, step], step < lengths)
+
+    def close(self) -> None:
+        """Give the environments back."""
+        for env in self.envs:
+            if env is not None:
+                instances.give_back(env)
+
+
+def not_the_same(task: Task) -> InputError:
+    """The error where the same seed and actions lead elsewhere."""
+    return InputError(
+        f"{task.name} is not reproducible here, or another than it was: the same seed and actions "
+        "lead to another state, so this can't continue where it stopped"
+    )

@@ -1,0 +1,436 @@
+"""Other people's robots: that exist once, fail, miss readings, change; what they are made from."""
+
+import json
+import subprocess
+import sys
+from importlib import import_module, reload
+from pathlib import Path
+
+import arms
+import gymnasium
+import numpy as np
+import pytest
+from arms import STEPS, Arm
+from command import jbrep, mistake, refused
+from small import contents
+
+from jbrep.collect import collect
+from jbrep.dataset import Dataset, DataSettings
+from jbrep.dataset.verify import find_problems
+from jbrep.envs import Lanes, describe, instances
+from jbrep.envs.names import import_modules
+from jbrep.errors import InputError
+from jbrep.pool import Pool, WorkerError
+from jbrep.rl.files import read_run
+
+import_modules(["arms", "environments"])
+HOPPER = Path(gymnasium.__file__).parent / "envs/mujoco/assets/hopper.xml"
+
+
+@pytest.fixture(autouse=True)
+def fresh():
+    """No port is open, and the steps of all are counted anew."""
+    instances.close_all()
+    Arm.steps_of_all = 0
+    yield
+    instances.close_all()
+    assert Arm.ports == 0
+
+
+def arm(tmp_path, *options, **arguments):
+    """The words of a command that say which arm it is."""
+    given = {"log": str(tmp_path / "log"), **arguments}
+    pairs = [f"{name}={json.dumps(value)}" for name, value in given.items()]
+    return ("--task", arms.ID, *(word for pair in pairs for word in ("--env", pair)), *options)
+
+
+def events(tmp_path):
+    return (tmp_path / "log").read_text()
+
+
+def closed(tmp_path):
+    """Whether all that was opened was closed, one after the other."""
+    left = events(tmp_path).replace("f", "")
+    return left == "oc" * (len(left) // 2)
+
+
+# what an environment is made from
+
+
+@pytest.fixture
+def hopper(tmp_path, monkeypatch):
+    """A hopper's own model, with its body in another file."""
+    monkeypatch.chdir(tmp_path)
+    text = HOPPER.read_text()
+    begin, end = text.index("<actuator>"), text.index("</actuator>") + len("</actuator>")
+    Path("parts.xml").write_text(f"<mujocoinclude>{text[begin:end]}</mujocoinclude>")
+    Path("mine.xml").write_text(text[:begin] + '<include file="parts.xml"/>' + text[end:])
+    return "--task", "Hopper-v5", "--env", "xml_file=./mine.xml", "--episode-steps", 20
+
+
+def halve(name, what='gear="200.0"', by='gear="100.0"'):
+    before = Path(name).read_text()
+    assert what in before
+    Path(name).write_text(before.replace(what, by))
+
+
+@pytest.mark.parametrize("shard_episodes", [3, 50])
+def test_another_robot_under_the_same_name_is_refused(
+    shard_episodes, hopper, tmp_path, monkeypatch
+):
+    command = ("collect", *hopper, "--shard-episodes", shard_episodes, "--threads", 1, "--out", "d")
+    assert jbrep(*command, "--steps", 70).exit_code == 0
+    before = contents(Path("d"))
+    halve("parts.xml")
+    told = mistake(*command, "--steps", 200)
+    assert f"as it was: xml_file ({tmp_path / 'mine.xml'}) changed since; put that back" in told
+    assert contents(Path("d")) == before
+    told = jbrep("data", "verify", "d", "--replay", 2)
+    assert told.exit_code == 1
+    assert f"differs: xml_file ({tmp_path / 'mine.xml'}) changed since" in told.output
+    halve("parts.xml", 'gear="100.0"', 'gear="200.0"')
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir("other")  # the path is absolute
+    assert "equal in every bit" in jbrep("data", "verify", "../d", "--replay", 2).output
+    monkeypatch.chdir("..")
+    assert jbrep(*command, "--steps", 200).exit_code == 0
+    assert jbrep(*command[:-1], "e", "--steps", 200).exit_code == 0
+    assert contents(Path("d")) == contents(Path("e"))
+
+
+def test_an_episode_is_played_again_before_a_data_set_grows(tmp_path, monkeypatch):
+    """What an environment reads beyond its arguments and modules shows in what it does."""
+    task = describe("Sledges/Sledge-v0")
+    settings = DataSettings(task=task, steps=60, shard_episodes=50)
+    collect(settings, tmp_path / "d", num_threads=1)
+    before = contents(tmp_path / "d")
+    monkeypatch.setattr("environments.Sledge.dt", 0.1)  # nothing that it does
+    collect(settings.replace(steps=80), tmp_path / "d", num_threads=1)
+    observe = import_module("environments").Sledge.observe
+    monkeypatch.setattr("environments.Sledge.observe", lambda self: observe(self) * 1.001)
+    told = refused(lambda: collect(settings.replace(steps=300), tmp_path / "d", num_threads=1))
+    assert "played again is another one now; has the environment changed" in told
+    monkeypatch.undo()
+    again = collect(settings.replace(steps=80), tmp_path / "e", num_threads=1)
+    assert again.manifest == Dataset(tmp_path / "d").manifest
+    assert len(contents(tmp_path / "d")) == len(before)
+
+
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
+    """A module with a robot, which takes a constant from another one."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "gears42.py").write_text("GEAR = 0.5\n")
+    (tmp_path / "robot42.py").write_text(
+        "import gymnasium\nfrom environments import Sledge\nfrom gears42 import GEAR\n\n\n"
+        "class Robot(Sledge):\n    def step(self, action):\n        return super().step("
+        "action * self.action_space.high.dtype.type(GEAR))\n\n\n"
+        "gymnasium.register('Own/Robot-v0', 'robot42:Robot', max_episode_steps=30)\n"
+    )
+    yield ("--task", "robot42:Own/Robot-v0")
+    for name in ("robot42", "gears42"):
+        sys.modules.pop(name, None)
+    gymnasium.registry.pop("Own/Robot-v0", None)
+
+
+def test_a_run_of_another_robot_is_not_resumed(own_module, tmp_path):
+    """Neither one that was stopped nor one that has ended, nor a data set extended."""
+    run = ("rl", *own_module, "--algorithm", "a2c", "--set", "num_envs=1", "--evaluation-episodes")
+    run = (*run, 1, "--final-episodes", 1, "--steps", 40, "--out", tmp_path / "run")
+    data = ("collect", *own_module, "--threads", 1, "--out", tmp_path / "d")
+    assert jbrep(*run).exit_code == 0
+    assert jbrep(*data, "--steps", 40).exit_code == 0
+    made_from = read_run(tmp_path / "run").settings.environment.made_from
+    assert [*made_from] == ["module environments", "module gears42", "module robot42"]
+    (tmp_path / "gears42.py").write_text("GEAR = 0.25\n")
+    reload(sys.modules["gears42"])
+    gymnasium.registry.pop("Own/Robot-v0")
+    reload(sys.modules["robot42"])
+    assert "Own/Robot-v0 as it was before module gears42 changed" in mistake(*run)
+    assert "as it was: module gears42 changed since" in mistake(*data, "--steps", 80)
+
+
+def test_lanes_play_the_episode_before_again_when_they_go_on(monkeypatch):
+    """One that has just begun would not show another gear."""
+    lanes = Lanes(describe("Sledges/Sledge-v0"), 1)
+    for seed in (1, 2):
+        lanes.reset([0], [seed])
+        for _ in range(3 * (seed == 1)):
+            lanes.step(np.full((1, 3), 0.2))
+    state = lanes.state
+    lanes.restore(state)
+    step = import_module("environments").Sledge.step
+    monkeypatch.setattr("environments.Sledge.step", lambda self, action: step(self, action / 2))
+    with pytest.raises(InputError, match="not reproducible here, or another than it was"):
+        lanes.restore(state)
+
+
+# what 32 bits hold
+
+
+def test_a_clock_that_32_bits_swallow_is_told_and_shifted(tmp_path):
+    robot = arm(tmp_path, clock=1764000000.25)
+    told = jbrep("collect", *robot, "--steps", 50, "--threads", 1, "--out", tmp_path / "d")
+    assert told.exit_code == 0
+    assert "clock is near 1764000000 and changes by about 0.02" in told.stderr
+    assert (
+        "are 128 apart there: give it an offset in --features, such as offset = 17640"
+        in told.stderr
+    )
+    assert np.ptp(Dataset(tmp_path / "d")["clock"][:]) == 0
+    features = tmp_path / "features.toml"
+    order = describe(arms.ID, {"log": str(tmp_path / "log")}).feature_names
+    rows = [f"offset = {1764000000 if name == 'clock' else 0}" for name in order]
+    features.write_text("".join(f"[[features]]\n{row}\n" for row in rows))
+    again = ("--features", features, "--threads", 1, "--out", tmp_path / "e")
+    told = jbrep("collect", *robot, "--steps", 50, *again)
+    assert (told.exit_code, "apart there" in told.output) == (0, False)
+    dataset = Dataset(tmp_path / "e")
+    clock = 0.25 + 0.02 * dataset["step"][:]
+    np.testing.assert_allclose(dataset["clock"][:], clock, atol=1e-6)
+    assert dataset.task.offsets == {"clock": 1764000000.0}
+    assert jbrep("data", "verify", tmp_path / "e", "--replay", 1).exit_code == 0
+
+
+# one robot, which fails
+
+
+def test_one_instance_describes_collects_and_evaluates(tmp_path):
+    robot = arm(tmp_path)
+    told = jbrep("env", *robot[1:], "--json")
+    assert json.loads(told.stdout)["id"] == arms.ID  # what the robot prints goes elsewhere
+    assert "torque off" in told.stderr
+    assert closed(tmp_path)
+    data, run = tmp_path / "d", tmp_path / "run"
+    assert jbrep("collect", *robot, "--steps", 60, "--threads", 1, "--out", data).exit_code == 0
+    told = jbrep("evaluate-policy", "uniform", *robot, "--episodes", 3, "--json")
+    assert len(json.loads(told.stdout)["returns"]) == 3
+    assert events(tmp_path) == "oc" * 3
+    told = jbrep("evaluate-policy", "uniform", *robot, "--episodes", 3, "--threads", 1)
+    assert told.exit_code == 0
+    assert events(tmp_path) == "oc" * 4
+    assert run.exists() is False
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "ppo"])
+@pytest.mark.parametrize("drifts", [False, True])
+def test_training_and_evaluation_share_the_one_robot(algorithm, drifts, tmp_path):
+    """Evaluations wait for the end of an episode; normalised observations are the new ones."""
+    run = ("rl", *arm(tmp_path, drifts=drifts), "--algorithm", algorithm, "--normalize")
+    small = "learning_starts=10" if algorithm == "sac" else "n_steps=32"
+    run = (*run, "--set", small, "--set", "batch_size=8", "--evaluate-every", 40)
+    run = (*run, "--evaluation-episodes", 2, "--final-episodes", 3, "--steps", 128, "--threads", 1)
+    told = jbrep(*run, "--out", tmp_path / "run")
+    assert told.exit_code == 0, told.output
+    assert events(tmp_path) == "oc"
+    settings = read_run(tmp_path / "run").settings
+    assert (settings.preset, settings.hyperparameters.num_envs) == ("modern", 1)
+    rows = (tmp_path / "run" / "evaluations.csv").read_text().splitlines()[1:]
+    steps = list(dict.fromkeys(int(row.split(",")[0]) for row in rows))
+    assert steps == [0, 50, 100, 125, 128]
+    assert len(rows) == 11
+
+
+def test_what_fails_is_closed_kept_and_tried_again(tmp_path):
+    """In the third episode that is collected."""
+    describe(arms.ID, {"log": str(tmp_path / "log")})
+    probe, Arm.steps_of_all = Arm.steps_of_all, 0
+    instances.close_all()
+    (tmp_path / "log").unlink()
+    robot = arm(tmp_path, fails=[probe + 2 * STEPS + 7])
+    command = ("collect", *robot, "--steps", 100, "--threads", 1, "--out", tmp_path / "d")
+    told = jbrep(*command, "--shard-episodes", 50)
+    assert told.exit_code == 2
+    assert "OSError: no answer; 2 episodes of 50 rows are kept" in told.output
+    assert events(tmp_path) == "ofc"
+    assert not list(find_problems(tmp_path / "d"))
+    assert len(Dataset(tmp_path / "d")) == 50
+    told = jbrep(*command, "--shard-episodes", 50)  # the port has no such step any more
+    assert told.exit_code == 0, told.output
+    Arm.steps_of_all = 0
+    peace = (*command[:-1], tmp_path / "e", "--shard-episodes", 50, "--retries", 1)
+    told = jbrep(*peace)
+    assert told.exit_code == 0, told.output
+    assert "no answer; it is tried again" in told.stderr
+    assert contents(tmp_path / "d") == contents(tmp_path / "e")
+    assert closed(tmp_path)
+
+
+def test_evaluations_and_training_go_on_after_failures(tmp_path):
+    robot = arm(tmp_path, fails=[500, 620])
+    policy = ("evaluate-policy", "uniform", *robot, "--episodes", 40, "--threads", 1, "--json")
+    told = jbrep(*policy)
+    assert told.exit_code == 1
+    kept = json.loads(told.stdout)["returns"]
+    assert f"{len(kept)} of 40 episodes were finished" in told.stderr
+    Arm.steps_of_all = 0
+    told = jbrep(*policy, "--retries", 1)
+    assert told.exit_code == 0, told.output
+    assert json.loads(told.stdout)["returns"][: len(kept)] == kept
+    Arm.steps_of_all = 0
+    run = ("rl", *robot, "--algorithm", "sac", "--evaluation-episodes", 2, "--final-episodes", 2)
+    run = (*run, "--steps", 600, "--threads", 1, "--set", "learning_starts=1000")
+    told = jbrep(*run, "--retries", 1, "--out", tmp_path / "run")
+    assert told.exit_code == 0, told.output
+    assert told.stderr.count("no answer; it is tried again") == 2
+    assert read_run(tmp_path / "run").status == "finished"
+    assert closed(tmp_path)
+    Arm.steps_of_all = 0
+    told = jbrep(*run, "--out", tmp_path / "failed")
+    assert (told.exit_code, "the run failed: Arms/Arm-v0 failed at step" in told.output) == (
+        1,
+        True,
+    )
+    assert closed(tmp_path)
+
+
+def test_an_action_that_a_robot_changes_is_recorded_as_it_was(tmp_path):
+    """A stopped run's lanes go on; the data has what was handed out."""
+    lanes = Lanes(describe(arms.ID, {"log": str(tmp_path / "log")}), 1)
+    lanes.reset([0], [3])
+    for drive in (0.5, -0.25, 1.0):
+        given = np.array([[drive]])
+        lanes.step(given)
+        assert given == drive
+    np.testing.assert_array_equal(lanes.state["actions"][0, :, 0], [0.5, -0.25, 1.0])
+    lanes.restore(lanes.state)
+    lanes.close()
+
+
+# readings that are missing
+
+
+def test_missing_readings_are_held_or_end_an_episode_and_counted(tmp_path):
+    robot = arm(tmp_path, gaps=[4, 5, 9])
+    command = ("collect", *robot, "--steps", 30, "--threads", 1, "--out", tmp_path / "d")
+    told = jbrep(*command)
+    assert told.exit_code == 2
+    assert "gave an observation or reward that is not finite, at step 4" in told.output
+    assert "--missing" in told.output
+    told = jbrep(*command[:-1], tmp_path / "held", "--missing", "hold:2")
+    assert told.exit_code == 0, told.output
+    assert "12 missing readings" in told.output  # an angle and a reward, three times, two episodes
+    held = Dataset(tmp_path / "held")
+    angle = held["angle"][:STEPS]
+    assert angle[3] == angle[4] == angle[5] != angle[6]
+    assert angle[8] == angle[9]
+    reward = held["reward"][:STEPS]  # of the state that an action led to
+    assert reward[2] == reward[3] == reward[4] != reward[5]
+    assert held.episodes["missing"].tolist() == [6, 6]
+    assert jbrep("data", "verify", tmp_path / "held", "--replay", 2).exit_code == 0
+    told = jbrep(*command[:-1], tmp_path / "x", "--missing", "hold:1")
+    assert (told.exit_code, "not finite, at step 5" in told.output) == (2, True)
+    told = jbrep(*command[:-1], tmp_path / "cut", "--missing", "skip")
+    assert told.exit_code == 0, told.output
+    cut = Dataset(tmp_path / "cut")
+    assert set(cut.episodes["length"].tolist()) == {3}
+    assert cut.episodes["truncated"].all()
+    np.testing.assert_array_equal(cut.episodes["final_observation"][0], held["observation"][3])
+    assert not list(find_problems(tmp_path / "cut"))
+    assert jbrep("data", "verify", tmp_path / "cut", "--replay", 2).exit_code == 0
+    told = jbrep("env", *robot[1:], "--missing", "drop")
+    assert (told.exit_code, "must be skip, or hold and a number" in told.output) == (2, True)
+
+
+def test_missing_readings_of_a_log(tmp_path):
+    """Held, or the episode is divided there; a clock is told of, and shifted."""
+    rows, log = 40, tmp_path / "log.npz"
+    angle = np.sin(np.arange(rows) / 5)
+    angle[[7, 30, 31]] = np.nan
+    ends = np.arange(rows) % 20 == 19
+    np.savez(
+        log,
+        observations=np.column_stack((1764000000 + 0.02 * np.arange(rows), angle)),
+        actions=np.ones((rows, 1)) * np.where(np.arange(rows) % 2, -1.0, 1.0)[:, None],
+        rewards=np.ones(rows),
+        terminations=ends,
+        truncations=np.zeros(rows, bool),
+    )
+    features = tmp_path / "features.toml"
+    features.write_text('[[features]]\nname = "clock"\noffset = 1764000000\n[[features]]\n')
+    command = ("data", "import", log, "--out", tmp_path / "data")
+    assert "isn't finite, or beyond 32 bits, at step 7" in mistake(*command)
+    assert "isn't finite, at step 11" in mistake(*command, "--missing", "hold:1")
+    told = jbrep(*command, "--missing", "hold:2")
+    assert "log.npz had 3 missing readings (hold:2)" in told.stderr
+    assert "obs_0 is near 1764000000 and changes by about 0.02" in told.stderr
+    held = Dataset(tmp_path / "data")
+    assert held.episodes["missing"].tolist() == [1, 2]
+    np.testing.assert_array_equal(held["obs_1"][6:8], np.float32(angle[[6, 6]]))
+    told = jbrep(*command[:-1], tmp_path / "cut", "--missing", "skip", "--features", features)
+    assert "3 missing readings (skip)" in told.stderr
+    assert "apart there" not in told.stderr
+    cut = Dataset(tmp_path / "cut")
+    assert cut.episodes["length"].tolist() == [6, 11, 9, 7]
+    assert cut.episodes["terminated"].tolist() == [0, 0, 0, 0]  # what follows an end isn't known
+    assert cut.episodes["missing"].tolist() == [1, 0, 2, 0]
+    np.testing.assert_allclose(cut["clock"][:3], [0, 0.02, 0.04], atol=1e-6)
+    assert not list(find_problems(tmp_path / "cut"))
+
+
+# what environments give
+
+
+def test_a_reward_in_an_array_and_a_joint_that_can_t_move(tmp_path):
+    log = str(tmp_path / "log")
+    task = describe(arms.ID, {"log": log, "reward": "array", "locked": True})
+    assert task.action_low[1] == task.action_high[1] == np.float32(0.3)
+    settings = DataSettings(task=task, steps=50)
+    collect(settings, tmp_path / "d", num_threads=1)
+    dataset = Dataset(tmp_path / "d")
+    assert (dataset["action"][:][:, 1] == np.float32(0.3)).all()
+    assert (dataset["reward"][:] < 0).all()
+    told = refused(describe, arms.ID, {"log": log, "reward": "pair"})
+    assert "gave a reward of shape (2,): it must be one number" in told
+
+
+def test_what_an_environment_of_old_gym_is_told():
+    class Old(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-1, 1, (2,))
+        action_space = gymnasium.spaces.Box(-1, 1)
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(2, np.float32), {}
+
+        def step(self, action):
+            return np.zeros(2, np.float32), 0.0, False, {}
+
+    class Alone(Old):
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(2, np.float32)
+
+    class Seedless(Old):
+        def reset(self):
+            return np.zeros(2, np.float32)
+
+    said = {Old: "its step gives four values", Alone: "its reset gives an observation alone"}
+    for kind in (Old, Alone, Seedless):
+        for limit in (None, 30):
+            name = f"Old/{kind.__name__}{limit}-v0"
+            gymnasium.register(name, entry_point=kind, max_episode_steps=limit)
+            told = refused(describe, name)
+            assert said.get(kind, "its reset takes no seed and options") in told
+            assert told.endswith("as in Gymnasium; this is old Gym's")
+
+
+def test_a_script_without_a_main_guard_collects_in_processes_if_they_can(tmp_path):
+    script = Path(__file__).parent / "helpers" / "unguarded.py"
+    told = subprocess.run(
+        [sys.executable, script, tmp_path], capture_output=True, text=True, check=False
+    )
+    assert (told.returncode, told.stderr.count("Traceback")) == (0, 0), told.stderr
+    assert len(told.stdout.split()) == 2
+    here, there = (Dataset(tmp_path / name) for name in ("Here", "There"))
+    np.testing.assert_array_equal(here["observation"][:], there["observation"][:])
+
+
+def fail(what):
+    raise KeyError(what)
+
+
+def test_the_error_of_a_worker_is_told(capfd):
+    with Pool(fail, 1, lambda: None) as pool:
+        pool.submit("job", "what it lacks")
+        with pytest.raises(WorkerError, match="a worker failed: KeyError: 'what it lacks'"):
+            pool.result()
+    assert "Traceback" in capfd.readouterr().err
