@@ -18,7 +18,7 @@ from jbrep.rl.agent import statistics_of
 from jbrep.rl.files import RunSettings, ZipHeader
 
 STATISTICS = "observation_statistics.safetensors"  # by which an agent normalises what it sees
-_HEADER = "jbrep.json"
+_HEADER = "trained_on.json"
 _OF_TRAINING = {
     "action_noise",  # which may be jbrep's own
     "replay_buffer_class",  # `load` finds the one for n_steps, and warns of one that is given
