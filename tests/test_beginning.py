@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command import jbrep
+from small import forge
 
 from jbrep.envs import describe
 from jbrep.errors import DamageError, InputError
@@ -138,6 +139,6 @@ def test_a_policy_without_what_training_needs_is_none_to_begin_with(source, tmp_
         train(run, tmp_path / "new")
     record = json.loads((folder / RUN).read_text())
     record["policy_sha256"] = hashlib.sha256((folder / POLICY).read_bytes()).hexdigest()
-    (folder / RUN).write_text(json.dumps(record))
+    forge(folder / RUN, record)
     with pytest.raises(InputError, match="doesn't fit the run's settings"):
         train(run, tmp_path / "new")

@@ -234,13 +234,14 @@ def test_a_manifest_that_means_harm(change, message, copied):
 def test_files_that_can_t_be_read_are_named(copied, monkeypatch):
     dataset = Dataset(copied)
 
-    def refuse(path, *arguments, **keywords):
-        raise PermissionError(13, "Permission denied")
+    def refuse(path, *arguments, opened=os.open, **keywords):
+        if str(path).startswith(str(copied)):
+            raise PermissionError(13, "Permission denied")
+        return opened(path, *arguments, **keywords)
 
-    monkeypatch.setattr(type(copied), "open", refuse)
+    monkeypatch.setattr("jbrep.records.storage.os.open", refuse)
     with pytest.raises(InputError, match=r"can't read .*shard-00000\.h5: Permission denied"):
         dataset["reward"][0]
-    monkeypatch.setattr(type(copied), "read_bytes", refuse)
     with pytest.raises(InputError, match=r"can't read .*manifest\.json: Permission denied"):
         Dataset(copied)
 

@@ -91,7 +91,7 @@ def test_minari_lists_it_opens_it_and_recovers_the_environment(dataset, tmp_path
 
 
 def test_parquet_files_come_together_or_not_at_all(dataset, tmp_path, monkeypatch):
-    def fail(*arguments):
+    def fail(*arguments, **keywords):
         raise OSError("the disk is gone")
 
     monkeypatch.setattr(pq, "write_table", fail)

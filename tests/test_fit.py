@@ -163,23 +163,25 @@ def test_a_stopped_training_resumes_to_the_same_file(whole, collected, tmp_path)
 
 
 def test_only_one_may_train_it(data, tmp_path):
+    """Nor make it without training."""
     fitter = Fitter(data, tmp_path)
-    work = tmp_path / "dae-4.training"
-    work.mkdir()
-    with exclusive(work), pytest.raises(InputError, match="is being written by process"):
-        fitter.fit("dae", **how())
-    assert fitter.fit("dae", **how()).is_new
+    for kind, given in (("dae", how()), ("pca", {"latent": 4})):
+        path = tmp_path / f"{kind}-4.safetensors"
+        alone = exclusive(path, beside=True)
+        with alone, pytest.raises(InputError, match="is being written by process"):
+            fitter.fit(kind, **given)
+        assert fitter.fit(kind, **given).is_new
 
 
 def test_what_another_process_finished_before_the_lock_is_left_as_it_is(
     data, tmp_path, monkeypatch
 ):
     @contextmanager
-    def after_another(work):
+    def after_another(path, beside):
         with monkeypatch.context() as patch:
             patch.setattr(fit, "exclusive", exclusive)
             Fitter(data, tmp_path).fit("dae", **how())
-        with exclusive(work):
+        with exclusive(path, beside=beside):
             yield
 
     monkeypatch.setattr(fit, "exclusive", after_another)

@@ -39,7 +39,7 @@ from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode
 from jbrep.records.tables import write_rows
 from jbrep.rl import Run
-from jbrep.rl.files import Evaluation, read_evaluations
+from jbrep.rl.files import EVALUATIONS, Evaluation, read_evaluations
 
 FACE, POSE = "data/sample/face_direction", "data/sample/move_to_pose"
 DAE = "jbrep/encoders/shipped/face_direction/dae-4.safetensors"
@@ -699,11 +699,11 @@ def write_study(folder):
                 task="face_direction", encoder=representation, steps=300, seed=seed, preset="paper"
             )
             end = {"steps": 150, "reason": "it failed"} if failed else {"steps": 300}
-            write_record(run, settings, **end)
             steps = (0, 100) if failed else (0, 100, 200, 300)
             starts = [(step, episode) for step in steps for episode in (0, 1)]
             rows = [Evaluation(*start, float(random.uniform(0, 1000))) for start in starts]
-            write_rows(run / "evaluations.csv", rows, Evaluation)
+            tables = {EVALUATIONS: write_rows(run / EVALUATIONS, rows, Evaluation)}
+            write_record(run, settings, **end, tables=tables)
     return folder
 
 

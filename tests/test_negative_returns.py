@@ -266,9 +266,10 @@ def folder(runs, returns, tmp_path_factory):
     """The tables of the study, and its report."""
     folder = tmp_path_factory.mktemp("report")
     header = ("task", "algorithm", "representation", "seed", "step", "episode", "return")
-    write_csv(folder / "returns.csv", header, returns)
+    sha256 = write_csv(folder / "returns.csv", header, returns)
     RunsRecord(
         **{"study": None, "registration": None, "missing": {}, "labels": LABELS},
+        tables={"returns.csv": sha256},
         **{"versions": [{"jbrep": "0.2.0"}], "processors": ["a processor"]},
         runs=[
             RunFacts(

@@ -13,7 +13,7 @@ import pytest
 from msgspec import Meta
 
 from jbrep.errors import DamageError, InputError
-from jbrep.records.document import Document, read_document
+from jbrep.records.document import Document, read_document, sealed
 from jbrep.records.keys import key_table
 from jbrep.records.record import Finite, Record, from_plain, from_text, to_plain
 from jbrep.records.toml import toml_text
@@ -130,7 +130,7 @@ def test_a_document_comes_back_equal_and_byte_for_byte(tmp_path):
     assert back == PLAN
     assert back.text() == (tmp_path / "plan.json").read_text() == PLAN.text()
     plain = json.loads(PLAN.text())
-    assert list(plain)[:3] == ["format", "format_version", "steps"]
+    assert list(plain)[:3] == ["format", "format_version", "sha256"]
     assert (plain["from"], plain["points"]) == ("b", [["a", 1.0]])
 
 
@@ -208,3 +208,18 @@ def test_the_table_of_keys_says_what_each_may_be():
         "| `plan.rate` | a number above 0 and at most 1 | 0.5 | Of learning. |",
         "| `plan.kind` | one of first, second | first | Which one. |",
     ]
+
+
+def test_a_document_that_was_changed_is_refused(tmp_path):
+    """Whichever digit it is, unless the checksum is worked out anew."""
+    path, text = tmp_path / "plan.json", PLAN.text()
+    for place, letter in enumerate(text):
+        if letter.isdecimal():
+            path.write_text(f"{text[:place]}{(int(letter) + 1) % 10}{text[place + 1 :]}")
+            with pytest.raises(InputError):
+                read_document(path, Plan)
+    path.write_text(text.replace('"b"', '"c"'))
+    with pytest.raises(DamageError, match="was changed after it was written, or is damaged"):
+        read_document(path, Plan)
+    path.write_text(json.dumps(sealed(json.loads(path.read_text()))))
+    assert read_document(path, Plan) != PLAN

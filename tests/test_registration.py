@@ -5,16 +5,16 @@ from pathlib import Path
 
 import pytest
 from command import in_this_process, jbrep
+from small import forge
 from test_study import TINY, written
 
 from jbrep.errors import InputError
 from jbrep.records.document import read_document
-from jbrep.records.record import to_plain
 from jbrep.rl.files import RUN, read_run, runs_below
 from jbrep.study.config import read_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.registration import REGISTRATION, _hash, read_registration
+from jbrep.study.registration import REGISTRATION, read_registration
 from jbrep.study.results import conclude
 from jbrep.study.runner import register_study, run_study
 
@@ -107,10 +107,7 @@ def test_a_registration_comes_first_and_stays_as_it_is(tmp_path):
 
 
 def test_a_registration_without_a_study_is_refused(registered, tmp_path):
-    facts = {**to_plain(registered.registration), "study": {}}
-    header = {"format": "jbrep registration", "format_version": 1}
-    text = json.dumps({**header, **facts, "sha256": _hash(facts)})
-    (tmp_path / REGISTRATION).write_text(text)
+    forge(tmp_path / REGISTRATION, {**registered.registration.as_json(), "study": {}})
     with pytest.raises(InputError, match=r"registration\.json is damaged .*study.tasks is missing"):
         read_registration(tmp_path)
 

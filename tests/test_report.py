@@ -5,12 +5,14 @@ import json
 import random
 import re
 import shutil
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from made_up import write_record
+from small import adopt, forge
 
 from jbrep.encoders import find, save
 from jbrep.envs import describe
@@ -27,7 +29,7 @@ from jbrep.report.page import page as page_of
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, STATISTICS, SUMMARY
 from jbrep.report.tables import read_tables
 from jbrep.report.words import answers
-from jbrep.rl.files import ENCODER, Evaluation
+from jbrep.rl.files import ENCODER, EVALUATIONS, Evaluation
 from jbrep.stats.claims import CLAIMS, FASTER
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan
@@ -66,8 +68,9 @@ def write_a_run(plan, cell, failed=False, reason=TRAP):
         for step, mean in ((0, 100), (1000, final / 2), (2000, final))
         for episode in range(2)
     ]
-    write_rows(folder / "evaluations.csv", rows[: 4 if failed else 6], Evaluation)
-    facts = {"versions": {"jbrep": "0.1.0", "torch": "2.13.0+cpu"}}
+    rows = rows[: 4 if failed else 6]
+    tables = {EVALUATIONS: write_rows(folder / EVALUATIONS, rows, Evaluation)}
+    facts = {"versions": {"jbrep": "0.1.0", "torch": "2.13.0+cpu"}, "tables": tables}
     write_record(folder, run, reason if failed else None, steps=1500 if failed else 2000, **facts)
 
 
@@ -333,7 +336,8 @@ def named_otherwise(folder, out, name):
         quoted = json.dumps(name)[1:-1] if each.endswith("json") else name
         (out / each).write_text(text.replace("dae-8", quoted))
     record = json.loads((out / RECORD).read_text())
-    (out / RECORD).write_text(json.dumps({**record, "study": None}))  # no study has any name
+    forge(out / RECORD, {**record, "study": None})  # no study has any name
+    adopt(out / RECORD, *TABLES[1:])
 
 
 def test_markdown_keeps_its_tables_whatever_the_names(whole, tmp_path):
@@ -354,6 +358,7 @@ def test_diagnostics_are_set_against_returns_where_they_are_known(whole, tmp_pat
         Diagnosed("face_direction", name, "0", {"forward": 0.1 * i}) for i, name in enumerate(FINAL)
     ]
     write_diagnostics(tmp_path / "study" / DIAGNOSTICS, rows)
+    adopt(tmp_path / "study" / RECORD, DIAGNOSTICS)
     plots = []
     monkeypatch.setattr(report, "study_plots", lambda *parts: plots.extend(study_plots(*parts)))
     monkeypatch.setattr(report, "page", lambda *parts: page_of(parts[0], [], *parts[2:]))
@@ -472,7 +477,9 @@ def test_of_single_runs_it_shows_what_there_is(tmp_path):
 
 def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkeypatch):
     tasks = [(describe("face_direction", max_episode_steps=50), 2)]
-    rows = list(csv.reader(write_references(tasks, tmp_path).read_text().splitlines()))
+    sha256 = write_references(tasks, tmp_path, {})
+    path = tmp_path / REFERENCE_RETURNS
+    rows = list(csv.reader(path.read_text().splitlines()))
     assert rows[0] == ["task", "policy", "episode", "return"]
     policies = {"standing still": "still", "random": "uniform", "hand-written": "heuristic"}
     assert [row[1] for row in rows[1:]] == [name for name in policies for _ in range(2)]
@@ -480,7 +487,10 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
         alone = find_episode(policies[name], int(episode), tasks[0][0]).reward.sum()
         assert float(played) == pytest.approx(alone, abs=1e-3)
     monkeypatch.setattr("jbrep.study.tables.find_player", None)
-    write_references(tasks, tmp_path)
+    assert write_references(tasks, tmp_path, {}) == sha256
+    monkeypatch.undo()
+    path.write_text(path.read_text().replace(",1,", ",1,1"))  # what is another is played again
+    assert write_references(tasks, tmp_path, {REFERENCE_RETURNS: sha256}) == sha256
 
 
 @pytest.mark.parametrize(
@@ -504,8 +514,8 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
         ),
         (
             "runs.json",
-            lambda text: text.replace('version": 2', 'version": 1'),
-            "this jbrep reads version 2 alone",
+            lambda text: text.replace('version": 3', 'version": 2'),
+            "this jbrep reads version 3 alone",
         ),
         ("returns.csv", lambda text: text.replace("full,3,1000", "full,3,0"), "differ in their ep"),
         ("returns.csv", lambda text: text.replace("full,3,", "full,9,"), "of evaluations is 0"),
@@ -528,6 +538,8 @@ def test_damaged_tables_are_refused(name, change, message, whole, tmp_path):
     else:
         changed = change(path.read_text())
         path.write_bytes(changed if isinstance(changed, bytes) else changed.encode())
+        with suppress(ValueError, TypeError):
+            adopt(tmp_path / "runs.json", *TABLES[1:])
     before = sorted(tmp_path.iterdir())
     with pytest.raises(InputError, match=message):
         write_report(tmp_path)
@@ -557,7 +569,9 @@ def test_changed_tables_are_refused_or_shown(whole, tmp_path, monkeypatch):
     record = json.loads((whole / "runs.json").read_text())
     choose, refused = random.Random(0), []
     for _ in range(150):
-        (tmp_path / "runs.json").write_text(json.dumps(change_one(record, choose)))
+        changed = change_one(record, choose)
+        with suppress(AttributeError):
+            forge(tmp_path / "runs.json", changed)
         try:
             write_report(tmp_path)
         except InputError as error:
@@ -569,7 +583,7 @@ def test_changed_tables_are_refused_or_shown(whole, tmp_path, monkeypatch):
 def test_a_run_of_a_newer_jbrep_is_named(tmp_path):
     plan = make_study(tmp_path / "new", left=11)
     path = plan.folder_of(plan.cells[0]) / "run.json"
-    path.write_text(path.read_text().replace('version": 4', 'version": 7'))
+    path.write_text(path.read_text().replace('version": 5', 'version": 7'))
     with pytest.raises(InputError, match=r"run\.json has version 7 of the jbrep run format"):
         conclude(plan.folder)
 

@@ -18,6 +18,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from small import forge
 from stable_baselines3 import SAC
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
@@ -452,7 +453,7 @@ def test_nothing_in_a_runs_folder_runs_as_code(short, tmp_path):
     (folder / POLICY).write_bytes(trap)
     record = json.loads((folder / "run.json").read_text())
     record["policy_sha256"] = hashlib.sha256(trap).hexdigest()
-    (folder / "run.json").write_text(json.dumps(record))
+    forge(folder / "run.json", record)
     with pytest.raises(InputError, match="is not a jbrep policy"):
         load_run(folder)
     assert not sprung.exists()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command import jbrep, mistake
+from small import forge
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -53,7 +54,7 @@ def edited(folder, to, **hyperparameters):
     for name, value in hyperparameters.items():
         part = run["settings"] if name in run["settings"] else run["settings"]["hyperparameters"]
         part[name] = value
-    (to / RUN).write_text(json.dumps(run))
+    forge(to / RUN, run)
     return to
 
 
@@ -406,7 +407,7 @@ def test_damaged_statistics_are_named(run, tmp_path):
         container.write(folder / POLICY, tensors, header)
         written = json.loads((folder / RUN).read_text())
         written["policy_sha256"] = hashlib.sha256((folder / POLICY).read_bytes()).hexdigest()
-        (folder / RUN).write_text(json.dumps(written))
+        forge(folder / RUN, written)
         with pytest.raises(DamageError, match=r"policy\S+ is damaged: the (mean|variance)"):
             load_run(folder)
 

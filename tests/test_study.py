@@ -1,6 +1,7 @@
 """Studies: their files, preparation, workers, kills, clusters and results."""
 
 import csv
+import hashlib
 import json
 import os
 import shutil
@@ -25,6 +26,7 @@ from command import (
     wait_for_the_end_of,
     workers_of,
 )
+from small import adopt, forge
 
 from jbrep.dataset import Dataset
 from jbrep.encoders import load
@@ -196,7 +198,7 @@ def test_a_study_is_read_without_its_environments(tmp_path, monkeypatch):
     """Their package may be gone by then."""
     monkeypatch.setattr("jbrep.study.plan.describe", None)
     settings = {**TINY.as_json(), "tasks": ["Robots/Gone-v0"], "environment": {"g": 1}}
-    (tmp_path / STUDY).write_text(json.dumps(settings))
+    forge(tmp_path / STUDY, settings)
     plan = read_plan(tmp_path)
     assert plan.study.environment == {"g": 1}
     names = [cell.name for cell in plan.unfinished]
@@ -354,7 +356,7 @@ def tables_with(plan, folder, runs, **settings):
     shutil.copytree(plan.folder / "runs", folder / "runs")
     for path in folder.rglob(f"{runs}/{RUN}"):
         run = json.loads(path.read_text())
-        path.write_text(json.dumps({**run, "settings": {**run["settings"], **settings}}))
+        forge(path, {**run, "settings": {**run["settings"], **settings}})
     conclude(folder)
     return read_tables(folder)
 
@@ -482,12 +484,26 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
 
 def test_no_references_no_table_and_damaged_ones_are_named(tmp_path):
     path, header = tmp_path / REFERENCE_RETURNS, "task,policy,episode,return\n"
-    path.write_text(header + "of other runs,random,0,1.0\n")
-    assert write_references([], tmp_path) is None
-    assert not path.exists()
+    assert write_references([], tmp_path, {}) is None
+    assert read_references(tmp_path, None) == {}
     path.write_text(header + "a,b,0,x\n")
     with pytest.raises(DamageError, match=r"references\.csv is damaged or cut short"):
-        read_references(tmp_path)
+        read_references(tmp_path, hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+def test_references_of_an_environment_that_is_not_here_stay(tmp_path):
+    """Even of fewer episodes than are wanted; they can't be made again where they are damaged."""
+    path, header = tmp_path / REFERENCE_RETURNS, "task,policy,episode,return\n"
+    away = describe("face_direction").replace(id="Away/Robot-v0", name="Away/Robot-v0")
+    path.write_text(header + "Away/Robot-v0,random,0,1.0\n")
+    before = path.read_bytes()
+    sha256 = write_references([(away, 2)], tmp_path, {})
+    assert path.read_bytes() == before
+    assert read_references(tmp_path, sha256) == {"Away/Robot-v0": {"random": [1.0]}}
+    path.write_text(header + "Away/Robot-v0,random,0,2.0\n")
+    with pytest.raises(DamageError, match=r"references\.csv was changed"):
+        write_references([(away, 2)], tmp_path, {REFERENCE_RETURNS: sha256})
+    assert path.exists()
 
 
 def test_one_study_at_a_time(done):
@@ -512,9 +528,11 @@ def test_a_damaged_run_is_named(name, content, message, done, tmp_path):
         (tmp_path / each).write_bytes((source / each).read_bytes())
     if content == "settings":
         record = json.loads((tmp_path / RUN).read_text())
-        (tmp_path / RUN).write_text(json.dumps({**record, "settings": {}}))
+        forge(tmp_path / RUN, {**record, "settings": {}})
     else:
         (tmp_path / name).write_text(content)
+    if name != RUN:
+        adopt(tmp_path / RUN, name)
     with pytest.raises(InputError, match=message):
         read_runs(tmp_path)
 

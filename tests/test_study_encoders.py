@@ -13,6 +13,7 @@ from command import in_this_process, jbrep
 from judged import diagnostics, evaluation, prediction
 from made_up import label_of
 from my_encoders import LATENT, SIZE, FirstFeatures, dense
+from small import forge
 from test_convert import model
 from test_study import TINY as TINY_STUDY
 from test_study import tables_with
@@ -230,7 +231,7 @@ def test_a_study_names_evaluations(done, tmp_path):
     assert read_plan(tmp_path / "study").study == study
     contents = json.loads((done.folder / RECORD).read_text())
     contents["study"]["evaluations"] = [str(tmp_path / "{task}"), "nowhere"]
-    (tmp_path / RECORD).write_text(json.dumps(contents))
+    forge(tmp_path / RECORD, contents)
     write_evaluation(tmp_path / TASK, {"full": (None, 0.75)})
     (line,) = add_diagnostics(tmp_path)
     assert " of dense, from-onnx, mine (2 of 2 encoders), net: " in line

@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 from command import jbrep
-from small import contents, settings
+from small import contents, forge, settings
 
 from jbrep.collect import collect
 from jbrep.collect.backends import make_shard
@@ -202,7 +202,7 @@ def test_what_can_t_be_collected_with_is_said_in_one_line(runs, data, tmp_path):
     record = json.loads((runs / "jb" / RUN).read_text())
     code = shutil.copytree(runs / "jb", tmp_path / "code")
     (code / "encoder.safetensors").unlink()
-    (code / RUN).write_text(json.dumps(record))
+    forge(code / RUN, record)
     with pytest.raises(InputError, match="its encoder is code, which can't be kept with the data"):
         gather(code, tmp_path / "other")
     assert not (tmp_path / "other").exists()

@@ -128,6 +128,7 @@ class _Count(click.ParamType[int]):
 
 
 COUNT, POSITIVE = _Count(), _Count(least=1)
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 RESUMES = "the same command resumes it"
 
@@ -229,6 +230,14 @@ class Cli(click.Group):
             super().invoke(ctx)
         except InputError as error:
             raise _Mistake(str(error)) from None
+        except OSError as error:  # of what writes files in its own way, as TensorBoard does
+            if error.errno not in _FULL:
+                raise
+            what = f" {error.filename}" if error.filename else ""
+            raise _Mistake(
+                f"can't write{what}: {os.strerror(error.errno)}; free some space, then run the "
+                "same command again"
+            ) from None
         except click.UsageError as error:
             command = error.ctx.command_path if error.ctx else "jbrep"
             message = error.format_message()

@@ -294,13 +294,13 @@ def import_model(
     with the usual activations and normalisations. Nothing in it is run.
     """
     from jbrep.encoders.card import card
-    from jbrep.encoders.file import SUFFIX, save
+    from jbrep.encoders.file import SUFFIX, save_new
     from jbrep.encoders.from_onnx import convert
-    from jbrep.records.storage import exists
+    from jbrep.records.storage import exists, taken
 
     task = needed_task(options)
     if exists(out):
-        raise InputError(f"{out} exists already: choose another file")
+        raise taken(out)
     made = convert(model, task, decoder, name or out.name.removesuffix(SUFFIX))
-    save(made, out)
+    save_new(made, out)
     echo_text(card(made, str(out), terminal_width()))

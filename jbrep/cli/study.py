@@ -136,25 +136,19 @@ def report(
 
     if not folder.exists():
         raise InputError(f"{folder} is not the folder of a study: there is no such folder")
-    from jbrep.report.report import SUMMARY, write_report_of
+    from jbrep.report.report import SUMMARY, make_report
     from jbrep.report.statistics import results_text
-    from jbrep.report.tables import read_tables
-    from jbrep.study.results import conclude, has_runs
-    from jbrep.study.tables import add_diagnostics
 
     if out:
         check_writable(out)
-    if has_runs(folder):
-        conclude(folder)
-    lines = add_diagnostics(folder, evaluation)
-    tables = read_tables(folder, across_trainers)
+    made = make_report(folder, out, evaluation, across_trainers)
     if not as_json:
-        echo_text(results_text(tables, terminal_width(), everything))
-    for line in lines:
+        echo_text(results_text(made.tables, terminal_width(), everything))
+    for line in made.lines:
         say(line, err=True)
-    page, *others = write_report_of(tables, out or folder)
     if as_json:
         return echo_json(json.loads(((out or folder) / SUMMARY).read_bytes()))
+    page, *others = made.paths
     beside = ", ".join(path.name for path in others)
     more = "" if everything else "; --all prints every table"
     click.echo()

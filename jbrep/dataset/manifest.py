@@ -25,7 +25,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError
 from jbrep.records.commit import Commits, commits
 from jbrep.records.document import Document, document_from, parse_json
-from jbrep.records.record import Record
+from jbrep.records.record import Record, Version
 from jbrep.records.storage import MissingFileError, exists, read_regular, write_whole
 
 MANIFEST = "manifest.json"
@@ -34,7 +34,6 @@ _PACKAGES = ("jbrep", "mujoco", "numpy", "h5py")
 _HASH = "sha256"  # of the rest of the manifest
 
 _Count = Annotated[int, Meta(ge=1, le=1 << 62)]
-_Version = Annotated[str, Meta(pattern=r"(?a)\A[\w.+!-]+\Z", title="a version, as of a package")]
 
 
 class Entry(Record, frozen=True, kw_only=True):
@@ -56,7 +55,7 @@ class Manifest(Document, frozen=True, kw_only=True):
     indent: ClassVar[int] = 1
 
     settings: DataSettings
-    versions: Mapping[_Version, _Version]  # of the packages that made it
+    versions: Mapping[Version, Version]  # of the packages that made it
     commits: Commits = {}
     shards: tuple[Entry, ...] = ()
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.schema import EPISODES, Columns, Spec
 from jbrep.errors import DamageError, InputError
-from jbrep.records.storage import regular_size
+from jbrep.records.storage import open_regular
 
 REPAIR = "run jbrep data repair to restore it"
 FileState = tuple[int, ...] | None  # see `file_state`
@@ -67,16 +67,16 @@ def map_file(path: Path) -> mmap.mmap:
         InputError: it can't be read.
     """
     try:
-        if not regular_size(path):
-            raise DamageError(
-                f"{path} is damaged: it must be a regular file, not empty and not a link"
-            )
-        with path.open("rb") as file:
-            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        if (file := open_regular(path)) is not None:
+            with file:
+                return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except FileNotFoundError:
         raise DamageError(f"{path} is missing: {REPAIR}") from None
+    except ValueError:  # it is empty
+        pass
     except OSError as error:
         raise InputError(f"can't read {path}: {error.strerror or error}") from error
+    raise DamageError(f"{path} is damaged: it must be a regular file, not empty and not a link")
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from jbrep.errors import InputError
 from jbrep.records import container
 from jbrep.records.container import Tensors
 from jbrep.records.document import document_from
-from jbrep.records.storage import write_whole
+from jbrep.records.storage import make_folder, write_new, write_whole
 
 SUFFIX = ".safetensors"
 
@@ -25,6 +25,21 @@ def save(encoder: Encoder, path: Path) -> None:
     Raises:
         InputError: it can't be written, or `load` would refuse it.
     """
+    write_whole(path, _packed(encoder, path))
+
+
+def save_new(encoder: Encoder, path: Path) -> None:
+    """The same of a file that doesn't exist yet.
+
+    Raises:
+        InputError: as `save`; or it exists, or another process is writing it.
+    """
+    make_folder(path.parent)
+    write_new(path, _packed(encoder, path))
+
+
+def _packed(encoder: Encoder, path: Path) -> bytes:
+    """The bytes of an encoder's file; the path is for messages."""
     try:
         _check_metrics(encoder.header)
         content = container.pack(encoder.tensors(), encoder.header.as_json())
@@ -32,7 +47,7 @@ def save(encoder: Encoder, path: Path) -> None:
             raise InputError(f"{len(content):,} bytes are more than {container.MAX_BYTES:,}")
     except InputError as error:
         raise InputError(f"can't save an encoder in {path}: {error}") from None
-    write_whole(path, content)
+    return content
 
 
 def load(path: Path) -> Encoder:

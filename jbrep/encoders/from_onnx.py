@@ -30,6 +30,7 @@ _Values = dict[str, Value | None]  # None of those from before the latent
 _MOST_LETTERS = 100  # of what a message says of a node
 _MAX_BYTES = 1 << 26  # of a model, and of the file of its numbers
 _MAX_NODES = 1000
+_MOST_KEPT = 1 << 26  # numbers of constants and unfinished layers, at a time
 _FLOATS = (TensorProto.FLOAT, TensorProto.DOUBLE)
 _TYPES = (*_FLOATS, TensorProto.INT32, TensorProto.INT64, TensorProto.BOOL)
 _UNREADABLE = (DecodeError, onnx.checker.ValidationError, ValueError, TypeError, RuntimeError)
@@ -190,6 +191,7 @@ def _fold(
         if node.domain not in ("", "ai.onnx"):
             raise InputError(refusal(f"{node.domain}.{said}", "it is no operation of ONNX itself"))
         try:
+            _check_size(values, constants)
             given = _Node(node, values, constants)
             if given.values:
                 action = given.action()
@@ -208,6 +210,19 @@ def _fold(
         if node.output[0] == end:
             break
     return fold.layers_to(values.get(end))
+
+
+def _check_size(values: _Values, constants: Constants) -> None:
+    """Refuse a model whose nodes make many large arrays of a few numbers.
+
+    Raises:
+        InputError: what is kept of the nodes so far takes too much memory.
+    """
+    chains = {chain for value in values.values() if value for chain in value.forms}
+    kept = sum(chain.last[0].size for chain in chains if chain.last)
+    kept += sum(each.size for each in constants.values())
+    if kept > _MOST_KEPT:
+        raise InputError(f"the nodes before it make more than {_MOST_KEPT:,} numbers")
 
 
 class _Node:

@@ -14,8 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.layers import AVG_L1_NORM, EPSILON, LAYER_NORM, LEAST_NORM
-from jbrep.errors import InputError
-from jbrep.records.storage import exists, write_whole
+from jbrep.records.storage import exists, make_folder, taken, write_new
 
 _OPSET, _IR_VERSION = 17, 8
 _LATER = 20, 9  # the same for models with GELU
@@ -135,8 +134,9 @@ def export(encoder: Encoder, path: Path) -> None:
         InputError: the file exists already, or can't be written.
     """
     if exists(path):
-        raise InputError(f"{path} exists already: choose another file")
-    write_whole(path, model(encoder).SerializeToString(deterministic=True))
+        raise taken(path)
+    make_folder(path.parent)
+    write_new(path, model(encoder).SerializeToString(deterministic=True))
 
 
 def model(encoder: Encoder) -> onnx.ModelProto:

@@ -22,6 +22,7 @@ from jbrep.envs.names import find_spec
 from jbrep.envs.origin import absolute, code_of, files_of
 from jbrep.envs.precision import Signals, precision_problems
 from jbrep.envs.task import (
+    MAX_FEATURES,
     NARROW_SEEDS,
     WIDE_SEEDS,
     EpisodeSteps,
@@ -197,6 +198,11 @@ def features_of(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
     Raises:
         InputError: images, or what doesn't make one flat array; the message has the id.
     """
+    if space.is_np_flattenable and (size := spaces.utils.flatdim(space)) > MAX_FEATURES:
+        raise InputError(
+            f"{env_id} has observations of {size:,} numbers, flat: at most {MAX_FEATURES:,} are "
+            "possible"
+        )
     flat = flatten_space(space) if space.is_np_flattenable else None
     if not isinstance(flat, spaces.Box):
         raise InputError(f"{env_id} has observations in {space}, which don't make one flat array")

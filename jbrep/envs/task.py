@@ -21,7 +21,7 @@ MAX_EPISODE_STEPS = 1_000_000
 SeedBits = Literal[63, 31]
 WIDE_SEEDS: SeedBits = 63  # bits of the seeds that most environments take
 NARROW_SEEDS: SeedBits = 31  # and of those of others
-_MAX_FEATURES = 4096
+MAX_FEATURES = 4096
 _MAX_ACTIONS = 1024
 EpisodeSteps = Annotated[int, Meta(ge=1, le=MAX_EPISODE_STEPS)]
 Word = Annotated[
@@ -63,7 +63,7 @@ _Missing = Annotated[
         pattern=r"\A(skip|hold:[1-9]\d{0,5})\Z", title="skip, or hold and a number of steps: hold:3"
     ),
 ]
-_Arrays = Mapping[Word, Annotated[int, Meta(ge=1, le=_MAX_FEATURES)]]
+_Arrays = Mapping[Word, Annotated[int, Meta(ge=1, le=MAX_FEATURES)]]
 _Bounds = Annotated[tuple[Finite, ...], Meta(min_length=1, max_length=_MAX_ACTIONS)]
 
 SHORT_NAMES: dict[str, str] = {}  # ids of tasks by other names; a robot that ships adds its own
@@ -166,7 +166,7 @@ class Task(Record, frozen=True):
 
     id: Id
     name: Id
-    features: Annotated[tuple[Feature, ...], Meta(min_length=1, max_length=_MAX_FEATURES)]
+    features: Annotated[tuple[Feature, ...], Meta(min_length=1, max_length=MAX_FEATURES)]
     action_low: _Bounds
     action_high: _Bounds
     max_episode_steps: EpisodeSteps

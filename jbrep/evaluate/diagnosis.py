@@ -25,6 +25,7 @@ from jbrep.evaluate.reconstruction import corruption, reconstruction
 from jbrep.evaluate.regression import Networks, beside, fit
 from jbrep.progress import Progress
 from jbrep.records.document import read_document
+from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, make_folder
 from jbrep.stats.bootstrap import RESAMPLES
 from jbrep.training.trainer import single_torch_thread
@@ -44,13 +45,14 @@ def write(
     """
     path = folder / EVALUATION
     judged = {label: find(each, data.task) for label, each in encoders.items()}
-    if exists(path) and not _is_same(path, data, hashes(judged), policy):
-        raise InputError(
-            f"{path} is not an evaluation of these encoders on this data: choose another --out"
-        )
     make_folder(folder)
-    evaluation = diagnose(judged, data, policy)
-    evaluation.write(path)
+    with exclusive(path, beside=True):
+        if exists(path) and not _is_same(path, data, hashes(judged), policy):
+            raise InputError(
+                f"{path} is not an evaluation of these encoders on this data: choose another --out"
+            )
+        evaluation = diagnose(judged, data, policy)
+        evaluation.write(path)
     return evaluation
 
 

@@ -4,7 +4,7 @@ import json
 import re
 from typing import Any, ClassVar, Literal, NamedTuple
 
-from jbrep.records.document import Document
+from jbrep.records.document import Document, sealed
 from jbrep.records.record import Record
 from jbrep.stats.bootstrap import Interval
 
@@ -175,7 +175,7 @@ class Evaluation(Document, frozen=True, kw_only=True):
     """Encoders side by side, the full observation first."""
 
     format: ClassVar[str] = "jbrep evaluation"
-    format_version: ClassVar[int] = 2
+    format_version: ClassVar[int] = 3
     max_bytes: ClassVar[int] = 1 << 28
     indent: ClassVar[int] = 1
 
@@ -193,7 +193,7 @@ class Evaluation(Document, frozen=True, kw_only=True):
 
     def text(self) -> str:
         """As JSON, with numbers of six digits and each list of numbers on one line."""
-        text = json.dumps(_rounded(self.as_json()), indent=self.indent, allow_nan=False)
+        text = json.dumps(sealed(_rounded(self.as_json())), indent=self.indent)
         one_line = re.compile(r"\[[-+.,\deEnul\s]*\]")
         return one_line.sub(lambda match: " ".join(match[0].split()), text) + "\n"
 

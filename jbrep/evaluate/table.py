@@ -88,24 +88,28 @@ class Diagnosed(NamedTuple):
     values: Values
 
 
-def write_diagnostics(path: Path, rows: Iterable[Diagnosed]) -> None:
-    """Write the table.
+def write_diagnostics(path: Path, rows: Iterable[Diagnosed]) -> str:
+    """Write the table; returns its SHA-256.
 
     Raises:
         InputError: it can't be written.
     """
     cells = ((*row[:3], *(_cell(row.values.get(name)) for name in SCALARS)) for row in rows)
-    write_csv(path, [*_COLUMNS], cells)
+    return write_csv(path, [*_COLUMNS], cells)
 
 
-def read_diagnostics(path: Path) -> list[Diagnosed]:
+def read_diagnostics(path: Path, sha256: str | None = None) -> list[Diagnosed]:
     """The rows of the table.
+
+    Args:
+        path: of its file.
+        sha256: of the file, if it is known.
 
     Raises:
         InputError: it can't be read.
-        DamageError: it is not such a table.
+        DamageError: it is not such a table, or has another SHA-256.
     """
-    rows = read_csv(path, _COLUMNS)
+    rows = read_csv(path, _COLUMNS, sha256)
     return [
         Diagnosed(task, name, sha256, dict(zip(SCALARS, values, strict=True)))
         for task, name, sha256, *values in rows

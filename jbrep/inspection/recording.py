@@ -10,6 +10,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from jbrep.errors import InputError
+from jbrep.records.lock import exclusive
 from jbrep.records.storage import exists, make_folder, write_whole
 
 PROVENANCE = "provenance"
@@ -115,10 +116,11 @@ class Recording:
         Raises:
             InputError: another kind of file exists there, or it can't be written.
         """
-        check_out(path)
         make_folder(path.parent)
         self._stream.send_blueprint(blueprint)
-        write_whole(path, self._memory.drain_as_bytes())
+        with exclusive(path, beside=True):
+            check_out(path)
+            write_whole(path, self._memory.drain_as_bytes())
 
 
 def check_out(path: Path) -> None:

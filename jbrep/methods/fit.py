@@ -23,7 +23,7 @@ from jbrep.methods.shape import complete
 from jbrep.progress import Progress
 from jbrep.records.commit import commits
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder
+from jbrep.records.storage import exists, inside, make_folder
 from jbrep.training import checkpoint
 from jbrep.training.method import USUAL, ClosedForm, Learned, Made, Method
 from jbrep.training.trainer import (
@@ -126,11 +126,10 @@ class Fitter:
         is_complete = plan.is_complete()
         if not is_complete:
             make_folder(self._folder)
-            match plan.method:
-                case ClosedForm() as method:
-                    self._save(plan, method.make(plan.data))
-                case Learned() as method:
-                    is_complete = self._train_alone(plan, method)
+            with exclusive(plan.path, beside=True):
+                is_complete = plan.is_complete()  # another process may have made it meanwhile
+                if not is_complete:
+                    self._make(plan)
         return Fitted(load(plan.path), plan.path, not is_complete)
 
     def plan(self, kind: str, *, name: str | None = None, **settings: Any) -> Plan:
@@ -174,15 +173,14 @@ class Fitter:
         coordinates = tried_coordinates(self._data.task, method.on, method.leave_out)
         return self._data.rescaled(method.scaling, coordinates, method.clip, method.keep)
 
-    def _train_alone(self, plan: Plan, method: Learned) -> bool:
-        """Train while no other process does, unless one has finished it; whether one has."""
-        work = plan.path.with_suffix(".training")
-        make_folder(work)
-        with exclusive(work):
-            is_complete = plan.is_complete()
-            if not is_complete:
+    def _make(self, plan: Plan) -> None:
+        match plan.method:
+            case ClosedForm() as method:
+                self._save(plan, method.make(plan.data))
+            case Learned() as method:
+                work = inside(self._folder, plan.path.with_suffix(".training").name)
+                make_folder(work)
                 self._train(plan, method, work)
-        return is_complete
 
     def _train(self, plan: Plan, method: Learned, work: Path) -> None:
         """Train from the checkpoint, if there is one, or from the start."""

@@ -17,7 +17,7 @@ from jbrep.errors import InputError
 from jbrep.play.pictures import Camera, add_caption, join
 from jbrep.play.rollout import Rollout
 from jbrep.progress import Progress
-from jbrep.records.storage import exists, make_folder, write_whole
+from jbrep.records.storage import exists, make_folder, taken, write_new
 
 _LONGEST = 3600  # [s]
 _SPEEDS = (0.01, 100)
@@ -160,7 +160,7 @@ class Film:
         ):
             encoded = Path(folder) / path.name
             form.encode(bar, encoded, self.pace.fps)
-            write_whole(path, encoded.read_bytes())
+            write_new(path, encoded.read_bytes())
 
 
 def _check_shown(rollout: Rollout) -> None:
@@ -244,5 +244,5 @@ def get_format(path: Path) -> Format:
             f"{path} isn't named as a video: the suffix must be {' or '.join(FORMATS)}"
         )
     if exists(path):
-        raise InputError(f"{path} exists already: choose another name")
+        raise taken(path)
     return FORMATS[path.suffix.lower()]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from jbrep.errors import DamageError, InputError
-from jbrep.records.storage import MissingFileError, read_regular, regular_size, write_whole
+from jbrep.records.storage import MissingFileError, open_regular, read_regular, write_whole
 
 Tensors = dict[str, NDArray[Any]]
 
@@ -95,9 +95,10 @@ def unpack(raw: bytes, path: Path, what: str) -> tuple[Tensors, dict[str, Any]]:
 def format_of(path: Path) -> str:
     """The format that the header of such a file names; empty for any other file."""
     try:
-        if not regular_size(path):
+        file = open_regular(path)
+        if file is None:
             return ""
-        with path.open("rb") as file:
+        with file:
             start = file.read(8)
             start += file.read(min(int.from_bytes(start, "little"), MAX_BYTES))
         return str(_header(start).get("format", ""))

@@ -1,7 +1,12 @@
-"""Documents: records in JSON files and headers, which say their format and its version first."""
+"""Documents: records in JSON files and headers, which say their format and its version first.
 
+A file also holds the SHA-256 of its fields, so that damage and changes by hand are noticed.
+"""
+
+import hashlib
 import json
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -12,6 +17,8 @@ from jbrep.records.record import Record, from_plain, to_plain
 from jbrep.records.storage import read_regular, write_whole
 
 MAX_BYTES = 1 << 24  # of a JSON file, unless its class says otherwise
+_FORMAT = ("format", "format_version")
+_HASH = "sha256"
 
 
 class Document(Record, frozen=True):
@@ -26,13 +33,22 @@ class Document(Record, frozen=True):
         """The document as plain JSON, with its format and version first."""
         return {"format": self.format, "format_version": self.format_version, **to_plain(self)}
 
-    def text(self) -> str:
-        """The text of its file.
+    @cached_property
+    def sha256(self) -> str:
+        """SHA-256 of its fields, as canonical JSON.
 
         Raises:
             ValueError: a number in it is not finite.
         """
-        return json.dumps(self.as_json(), indent=self.indent, allow_nan=False) + "\n"
+        return str(sealed(self.as_json())[_HASH])
+
+    def text(self) -> str:
+        """The text of its file.
+
+        Raises:
+            ValueError: as `sha256`.
+        """
+        return json.dumps(sealed(self.as_json()), indent=self.indent) + "\n"
 
     def write(self, path: Path) -> None:
         """Write its file, whole or not at all.
@@ -51,10 +67,38 @@ def read_document(path: Path, kind: type[_Document]) -> _Document:
 
     Raises:
         InputError: the file can't be read, or has another version of the format.
-        DamageError: it isn't such a document.
+        DamageError: it isn't such a document, or not as it was written.
     """
-    raw = read_regular(path, kind.max_bytes)
-    return document_from(parse_json(raw, path, kind.format), path, kind)
+    return document_in(read_regular(path, kind.max_bytes), path, kind)
+
+
+def document_in(raw: bytes, path: Path, kind: type[_Document]) -> _Document:
+    """The document of these bytes, such as those of a part of a file; the path is for messages.
+
+    Raises:
+        InputError, DamageError: as `read_document`.
+    """
+    given = parse_json(raw, path, kind.format)
+    stated = given.pop(_HASH, None)
+    document = document_from(given, path, kind)
+    if stated != sealed(given)[_HASH]:
+        raise DamageError(
+            f"{path} was changed after it was written, or is damaged: its checksum doesn't match"
+        )
+    return document
+
+
+def sealed(given: Mapping[str, Any]) -> dict[str, Any]:
+    """A document as plain JSON, with the SHA-256 of its fields after its format and version.
+
+    Raises:
+        ValueError: a number in it is not finite.
+    """
+    fields = {name: value for name, value in given.items() if name not in (*_FORMAT, _HASH)}
+    plain = json.loads(json.dumps(fields, allow_nan=False))  # whose keys are text alone
+    canonical = json.dumps(plain, sort_keys=True, separators=(",", ":"))
+    digest = hashlib.sha256(canonical.encode()).hexdigest()
+    return {**{name: given.get(name) for name in _FORMAT}, _HASH: digest, **fields}
 
 
 def document_from(given: Mapping[str, Any], path: Path, kind: type[_Document]) -> _Document:

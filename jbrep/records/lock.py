@@ -13,7 +13,7 @@ from jbrep.errors import InputError
 
 
 @contextmanager
-def exclusive(path: Path, *, beside: bool = False) -> Iterator[None]:
+def exclusive(path: Path, *, beside: bool = False, wait: float = 0) -> Iterator[None]:
     """Be the only writer in a folder, which has a file `.lock` for as long.
 
     The lock is released when its process ends, even where that was killed and left the file.
@@ -21,15 +21,18 @@ def exclusive(path: Path, *, beside: bool = False) -> Iterator[None]:
     Args:
         path: the folder; with `beside`, a file or folder that may not exist yet.
         beside: whether the lock stands beside the path instead.
+        wait: for another process, so many seconds at most.
 
     Raises:
-        InputError: another process is writing there; the message names it.
+        InputError: another process is writing there; the message names it. Or it has no name.
     """
+    if beside and not path.name:
+        raise InputError(f"{path} can't be a new file or folder: give it a name")
     note = path.with_name(f".{path.name}.lock") if beside else path / ".lock"
     lock = filelock.FileLock(note)
     now = datetime.now().astimezone().isoformat(" ", "seconds")
     try:
-        lock.acquire(blocking=False)
+        lock.acquire(timeout=wait)
         note.write_text(f"process {os.getpid()} on {socket.gethostname()} since {now}")
     except filelock.Timeout:
         raise InputError(

@@ -25,6 +25,11 @@ _Kind = TypeVar("_Kind")
 _LARGEST = sys.float_info.max
 Finite = Annotated[float, Meta(ge=-_LARGEST, le=_LARGEST, title="a finite number")]
 
+Version = Annotated[
+    str,
+    Meta(pattern=r"(?a)\A\w[\w.+!-]*\Z", title="a version, or the name of a package"),
+]
+
 _AT = re.compile(r"(?P<reason>.*?)(?: - at `\$(?P<path>.*)`)?", re.DOTALL)
 _MISSING = re.compile(r"Object missing required field `(.*)`")
 _UNKNOWN = re.compile(r"Object contains unknown field `(.*)`")

@@ -1,17 +1,20 @@
 """Reading and writing files safely: whole or not at all, regular, of bounded size."""
 
+import errno
 import os
 import shutil
 import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 from pathlib import Path
 
 from jbrep.errors import InputError
 from jbrep.records.lock import exclusive
 
 _PARTIAL = ".partial"
+_READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK  # neither a link nor a pipe that nobody fills
 
 
 class MissingFileError(InputError):
@@ -42,6 +45,57 @@ def write_whole(path: Path, content: bytes) -> None:
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def write_note(path: Path, text: str) -> None:
+    """Write a small file that may be lost: whole or not at all, never through a link, not synced.
+
+    It isn't written where that fails, as on a full disk.
+    """
+    partial = path.with_name(path.name + _PARTIAL)
+    with suppress(OSError):
+        partial.unlink(missing_ok=True)
+        with partial.open("x") as file:
+            file.write(text)
+        partial.replace(path)
+
+
+def write_new(path: Path, content: bytes) -> None:
+    """Write a file that doesn't exist yet, as `write_whole`.
+
+    Raises:
+        InputError: it exists, another process is writing it, or it can't be written.
+    """
+    with unfinished(path) as partial:
+        write_whole(partial, content)
+        try:
+            publish_file(partial, path)
+        except OSError as error:
+            raise InputError(f"can't write {path}: {error.strerror or error}") from error
+
+
+def inside(folder: Path, *parts: str) -> Path:
+    """The path of what is in a folder of jbrep's own, such as a study's.
+
+    The folder's path is its user's and may lead through links. What is in it may come from a
+    stranger, and links there could lead to any file of the user's.
+
+    Args:
+        folder: that is jbrep's own.
+        parts: names below it, or several at once, as in "runs/full".
+
+    Raises:
+        InputError: one of them is a link.
+    """
+    path = folder
+    for name in Path(*parts).parts:
+        path = path / name
+        if path.is_symlink():
+            raise InputError(
+                f"{path} is a link, which isn't followed inside a folder of jbrep's: put the "
+                "folder itself there"
+            )
+    return path
 
 
 def sync(path: Path) -> None:
@@ -97,10 +151,22 @@ def check_space(folder: Path, needed: int) -> None:
         )
 
 
-def regular_size(path: Path) -> int:
-    """The size of a regular file in bytes; 0 of a link, a pipe or anything else."""
-    status = path.lstat()
-    return status.st_size if stat.S_ISREG(status.st_mode) else 0
+def open_regular(path: Path) -> BufferedReader | None:
+    """Open a regular file; None of a link, a pipe or anything else.
+
+    Raises:
+        OSError: it can't be opened, or there is none.
+    """
+    try:
+        descriptor = os.open(path, _READ)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):  # a link, a socket
+            return None
+        raise
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    return None
 
 
 def read_regular(path: Path, most: int) -> bytes:
@@ -111,7 +177,11 @@ def read_regular(path: Path, most: int) -> bytes:
         InputError: it can't be read.
     """
     try:
-        return path.read_bytes() if 0 < regular_size(path) <= most else b""
+        file = open_regular(path)
+        if file is None:
+            return b""
+        with file:
+            return file.read() if os.fstat(file.fileno()).st_size <= most else b""
     except OSError as error:
         is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
         kind = MissingFileError if is_missing else InputError
@@ -141,7 +211,7 @@ def unfinished(path: Path) -> Iterator[Path]:
     """
     with exclusive(path, beside=True):
         if os.path.lexists(path):
-            raise _taken(path)
+            raise taken(path)
         partial = path.with_name(f".{path.name}.partial")
         _remove(partial)
         try:
@@ -160,11 +230,15 @@ def publish_file(partial: Path, path: Path) -> None:
     try:
         os.link(partial, path)  # unlike a rename, it never replaces a file
     except FileExistsError:
-        raise _taken(path) from None
+        raise taken(path) from None
     except OSError:  # no hard links on this file system
         path.touch(exist_ok=False)
         partial.replace(path)
-    sync(path.parent)
+    try:
+        sync(path.parent)
+    except BaseException:
+        path.unlink()
+        raise
 
 
 def publish_folder(partial: Path, path: Path) -> None:
@@ -178,10 +252,15 @@ def publish_folder(partial: Path, path: Path) -> None:
             sync(Path(folder, name))
         sync(Path(folder))
     partial.rename(path)  # it replaces an empty folder, and nothing else
-    sync(path.parent)
+    try:
+        sync(path.parent)
+    except BaseException:
+        path.rename(partial)
+        raise
 
 
-def _taken(path: Path) -> InputError:
+def taken(path: Path) -> InputError:
+    """The error for a new file or folder whose name is in use."""
     return InputError(f"{path} exists already: choose another name")
 
 

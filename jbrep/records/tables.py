@@ -1,6 +1,7 @@
 """Tables as CSV."""
 
 import csv
+import hashlib
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -25,27 +26,34 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return text.getvalue()
 
 
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a table, whole or not at all.
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Write a table, whole or not at all; returns its SHA-256.
 
     Raises:
         InputError: it can't be written.
     """
-    write_whole(path, csv_text(columns, rows).encode())
+    content = csv_text(columns, rows).encode()
+    write_whole(path, content)
+    return hashlib.sha256(content).hexdigest()
 
 
-def read_csv(path: Path, columns: Columns) -> list[tuple[Any, ...]]:
+def read_csv(path: Path, columns: Columns, sha256: str | None = None) -> list[tuple[Any, ...]]:
     """The rows below the header, each cell as its column has it.
 
     Args:
         path: of the file.
         columns: the header must have these.
+        sha256: of the file, if it is known.
 
     Raises:
         InputError: it can't be read.
-        DamageError: it isn't such a table.
+        DamageError: it isn't such a table, or has another SHA-256.
     """
     raw = read_regular(path, _MAX_BYTES)
+    if sha256 is not None and hashlib.sha256(raw).hexdigest() != sha256:
+        raise DamageError(
+            f"{path} was changed after it was written, or is damaged: its checksum doesn't match"
+        )
     try:
         header, *rows = csv.reader(io.StringIO(raw.decode(), newline=""), strict=True)
         if header != [*columns]:
@@ -58,25 +66,27 @@ def read_csv(path: Path, columns: Columns) -> list[tuple[Any, ...]]:
         raise DamageError(f"{path} is damaged or cut short") from None
 
 
-def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -> None:
+def write_rows(path: Path, rows: Iterable[NamedTuple], kind: type[NamedTuple]) -> str:
     """Write a table whose columns are the fields of its rows: text, counts and numbers.
+
+    Returns:
+        Its SHA-256.
 
     Raises:
         InputError: it can't be written.
     """
-    write_csv(path, [*map(_column, kind._fields)], ([*map(_cell, row)] for row in rows))
+    return write_csv(path, [*map(_column, kind._fields)], ([*map(_cell, row)] for row in rows))
 
 
-def read_rows(path: Path, kind: type[_Row]) -> list[_Row]:
+def read_rows(path: Path, kind: type[_Row], sha256: str | None = None) -> list[_Row]:
     """What `write_rows` wrote.
 
     Raises:
-        InputError: it can't be read.
-        DamageError: it isn't such a table.
+        InputError, DamageError: as `read_csv`.
     """
     cells: dict[type, Callable[[str], Any]] = {str: str, int: count, float: finite}
     columns = {_column(name): cells[of] for name, of in kind.__annotations__.items()}
-    return [kind._make(row) for row in read_csv(path, columns)]
+    return [kind._make(row) for row in read_csv(path, columns, sha256)]
 
 
 def _cell(value: str | float) -> str | int:

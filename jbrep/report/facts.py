@@ -230,7 +230,7 @@ def _shown(value: Any) -> str:
 def reproduce(tables: Tables) -> list[tuple[str, str]]:
     """Commands and files, each with a line on what it does."""
     record = tables.record
-    versions = " ".join(
+    versions = shlex.join(
         f"{package}=={number.partition('+')[0]}"
         for package, number in record.versions[0].items()
         if package != "jbrep"

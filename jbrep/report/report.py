@@ -2,25 +2,72 @@
 
 import json
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jbrep.evaluate.table import SCALARS
-from jbrep.records.storage import make_folder, write_whole
+from jbrep.records.lock import exclusive
+from jbrep.records.storage import inside, make_folder, write_whole
 from jbrep.report import facts
 from jbrep.report.figures import study_plots, write
 from jbrep.report.markdown import markdown
 from jbrep.report.page import page
 from jbrep.report.statistics import association_tables
-from jbrep.report.tables import Tables, read_tables
+from jbrep.report.tables import Tables, check_tables, read_tables
 from jbrep.report.words import Answer, answers, notes, statements
 from jbrep.stats import Analysis
 from jbrep.stats.analysis import to_plain
 from jbrep.stats.association import Association, Diagnostic, associations
+from jbrep.study.results import conclude, has_runs
+from jbrep.study.tables import add_diagnostics
 
 PAGE, SUMMARY, MARKDOWN, FIGURES = "report.html", "summary.json", "summary.md", "figures"
 STATISTICS = "statistics.json"
 _MAIN_FIGURE = "representations"
+_MOST_SECONDS = 600.0  # to wait for another process's report
+
+
+class Report(NamedTuple):
+    """What was reported."""
+
+    tables: Tables
+    lines: list[str]  # of encoders that no evaluation knows
+    paths: list[Path]  # of the page, the summaries and the folder of figures
+
+
+def make_report(
+    folder: Path,
+    out: Path | None = None,
+    evaluations: Sequence[str] = (),
+    across_trainers: bool = False,
+) -> Report:
+    """Write the tables of the runs below a folder, if there are any, and the report of the tables.
+
+    Another process that reports of the same folder is waited for.
+
+    Args:
+        folder: with runs, of a study or not, or with the tables of a study alone.
+        out: folder for the report; the same one if not given.
+        evaluations: as for `jbrep.study.tables.add_diagnostics`.
+        across_trainers: compare runs of different trainers, too.
+
+    Raises:
+        InputError: as `conclude`, `add_diagnostics` and `write_report`.
+    """
+    out, ran = out or folder, has_runs(folder)
+    if not ran:
+        check_tables(folder)
+    make_folder(out)
+    written = [folder, out] if ran or evaluations else [out]
+    with ExitStack() as stack:
+        for each in sorted({each.resolve() for each in written}):
+            stack.enter_context(exclusive(each / PAGE, beside=True, wait=_MOST_SECONDS))
+        if ran:
+            conclude(folder)
+        lines = add_diagnostics(folder, evaluations)
+        tables = read_tables(folder, across_trainers)
+        return Report(tables, ran, lines, [*paths, *write_report_of(tables, out)])
 
 
 def write_report(
@@ -61,7 +108,7 @@ def write_report_of(tables: Tables, out: Path) -> list[Path]:
         SUMMARY: _json(_summary(tables, verdicts), indent=1),
         MARKDOWN: markdown(tables, verdicts, predictions, f"{FIGURES}/{_MAIN_FIGURE}.png"),
     }
-    write(plots, out / FIGURES)
+    write(plots, inside(out, FIGURES))
     if tables.analysis:
         texts[STATISTICS] = _json(statistics(tables.analysis), indent=2)
     else:

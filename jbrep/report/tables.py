@@ -13,7 +13,7 @@ from jbrep.stats.rules import Planned
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.registration import REGISTRATION, read_registration
 from jbrep.study.results import found
-from jbrep.study.tables import RETURNS, References, Return, read_references
+from jbrep.study.tables import REFERENCE_RETURNS, RETURNS, References, Return, read_references
 
 
 class Tables(NamedTuple):
@@ -34,6 +34,18 @@ class Tables(NamedTuple):
         return (self.record.study.title if self.record.study else "") or self.name
 
 
+def check_tables(folder: Path) -> None:
+    """Make sure that a folder has the tables of a study.
+
+    Raises:
+        InputError: it has none.
+    """
+    if not exists(folder / RECORD):
+        raise InputError(
+            f"{folder} is not the folder of a study: it has neither runs nor a {RECORD}"
+        )
+
+
 def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
     """The tables in a folder, with statistics if they allow any.
 
@@ -44,18 +56,17 @@ def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
     Raises:
         InputError: there is no study in it, or a file is damaged, missing, or of another version.
     """
-    if not exists(folder / RECORD):
-        raise InputError(
-            f"{folder} is not the folder of a study: it has neither runs nor a {RECORD}"
-        )
+    check_tables(folder)
     record = read_document(folder / RECORD, RunsRecord)
     registration = read_registration(folder)
     registered = record.registration.sha256 if record.registration else None
     if registered != (registration.sha256 if registration else None):
         raise InputError(f"{folder}: {RECORD} is of another registration than {REGISTRATION}")
-    returns = read_rows(folder / RETURNS, Return)
-    rows = read_diagnostics(folder / DIAGNOSTICS) if exists(folder / DIAGNOSTICS) else []
-    references = read_references(folder)
+    sha256 = record.tables
+    returns = read_rows(folder / RETURNS, Return, sha256.get(RETURNS, ""))
+    references = read_references(folder, sha256.get(REFERENCE_RETURNS))
+    known = sha256.get(DIAGNOSTICS)
+    rows = read_diagnostics(folder / DIAGNOSTICS, known) if known else []
     planned = registration.registered.planned if registration else Planned()
     statistics = found(record, returns, references, planned, across_trainers)
     name = folder.resolve().name.encode(errors="replace").decode()

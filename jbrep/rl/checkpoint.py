@@ -19,10 +19,11 @@ from jbrep.errors import DamageError, InputError, differences
 from jbrep.records import container
 from jbrep.records.container import Tensors
 from jbrep.records.document import Document, document_from
+from jbrep.records.record import Version
 from jbrep.records.storage import exists
 from jbrep.rl.agent import parameters, restore_statistics, statistics_of
 from jbrep.rl.files import Episode, Evaluation, RunSettings
-from jbrep.rl.settings import MAX_STEPS, Line
+from jbrep.rl.settings import MAX_STEPS
 
 MAX_BYTES = 1 << 34
 PARAMETERS = "parameters."  # begins the names of what gradient steps change
@@ -144,7 +145,7 @@ class CheckpointHeader(Document, frozen=True, kw_only=True):
     format_version = 3
 
     settings: RunSettings
-    versions: Mapping[Line, Line]
+    versions: Mapping[Version, Version]
     step: Annotated[int, Meta(ge=0, le=MAX_STEPS)]
     episodes: list[Episode]
     evaluations: list[Evaluation]

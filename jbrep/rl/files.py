@@ -13,7 +13,7 @@ from jbrep.errors import DamageError, InputError, differences
 from jbrep.records import container
 from jbrep.records.commit import Commits
 from jbrep.records.document import Document, read_document
-from jbrep.records.record import to_plain
+from jbrep.records.record import Version, to_plain
 from jbrep.records.storage import exists
 from jbrep.records.tables import read_rows
 from jbrep.rl.presets import LINEAR, Hyperparameters
@@ -156,7 +156,7 @@ class RunRecord(Document, frozen=True, kw_only=True):
     """run.json: a run that has ended."""
 
     format = "jbrep run"
-    format_version = 4
+    format_version = 5
     max_bytes = 1 << 22
 
     status: Literal["finished", "failed"]
@@ -165,15 +165,18 @@ class RunRecord(Document, frozen=True, kw_only=True):
     latent_size: Annotated[int, Meta(ge=1, le=1 << 20)]
     steps: Annotated[int, Meta(ge=0, le=MAX_STEPS)]
     seconds: Annotated[float, Meta(ge=0, le=1e12)]
-    versions: Mapping[Line, Line]  # by package
+    versions: Mapping[Version, Version]  # by package
     commits: Commits
     cpu: Line
+    tables: Mapping[Name, Sha256]  # of the files of its episodes and evaluations
     policy_sha256: Sha256 | None  # of its policy's file; null if it failed
 
     def check(self) -> None:
         """As for `Record`."""
         if (self.status == FINISHED) != (self.policy_sha256 is not None):
             raise InputError(f"it has {self.status}, but policy_sha256 is {self.policy_sha256}")
+        if EVALUATIONS not in self.tables:
+            raise InputError(f"tables.{EVALUATIONS} is missing")
 
 
 class PolicyHeader(Document, frozen=True, kw_only=True):
@@ -253,11 +256,11 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     The last one may have more of them.
 
     Raises:
-        InputError: the file is missing.
-        DamageError: it is not such a table.
+        InputError: as `read_run`, or the table is missing.
+        DamageError: as `read_run`, or the table isn't what the run wrote.
     """
     path = folder / EVALUATIONS
-    evaluations = read_rows(path, Evaluation)
+    evaluations = read_rows(path, Evaluation, read_run(folder).tables[EVALUATIONS])
     by_step = [(step, [*of_step]) for step, of_step in groupby(evaluations, lambda row: row.step)]
     steps, counts = [step for step, _ in by_step], [len(of_step) for _, of_step in by_step]
     if (

@@ -19,7 +19,7 @@ from jbrep.envs.lanes import Lanes, lanes_at_once
 from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError
 from jbrep.records.commit import commits
-from jbrep.records.storage import exists, read_file, write_whole
+from jbrep.records.storage import exists, inside, read_file, write_whole
 from jbrep.records.tables import write_rows
 from jbrep.rl.agent import Evaluator, action_repeat, restore_statistics, statistics_of
 from jbrep.rl.checkpoint import CheckpointFile, History
@@ -195,7 +195,7 @@ class Job:
             policy.fill_whole(agent.policy)
             restore_statistics(agent, policy.tensors, policy.path)
             write_whole(self.folder / BEGINNING, read_file(policy.path, MAX_BYTES))
-        scalars = Scalars(self.folder / "tensorboard", self.history.first_step)
+        scalars = Scalars(inside(self.folder, "tensorboard"), self.history.first_step)
         agent.set_logger(_Logger(self.settings, [scalars, *writers]))
 
     @cached_property
@@ -275,8 +275,13 @@ class Job:
         parts = agent.policy, self.run.task, self.encoder, self.settings
         trained = Trained(*parts, None, statistics_of(agent), action_repeat(agent))
         policy = b"" if failure else pack_whole(trained)
-        write_rows(self.folder / EPISODES, self.history.episodes, Episode)
-        write_rows(self.folder / EVALUATIONS, self.history.evaluations, Evaluation)
+        tables = {
+            name: write_rows(self.folder / name, rows, kind)
+            for name, rows, kind in (
+                (EPISODES, self.history.episodes, Episode),
+                (EVALUATIONS, self.history.evaluations, Evaluation),
+            )
+        }
         if policy:
             write_whole(self.folder / POLICY, policy)
             write_whole(self.folder / POLICY_ZIP, policy_zip(agent, self.settings))
@@ -290,6 +295,7 @@ class Job:
             versions=self.versions,
             commits=commits(),
             cpu=_cpu(),
+            tables=tables,
             policy_sha256=hashlib.sha256(policy).hexdigest() if policy else None,
         )
         result.write(self.folder / RUN)  # last: the run has ended where it exists

@@ -12,6 +12,7 @@ from stable_baselines3.common.logger import KVWriter
 
 from jbrep.errors import first_line
 from jbrep.records.record import to_plain
+from jbrep.records.storage import inside
 from jbrep.rl.files import RunSettings
 
 TENSORBOARD = "tensorboard"  # what is kept from it is kept from here, too
@@ -62,6 +63,7 @@ class Tracker(KVWriter):
                 self._failed = True
 
     def _begin(self) -> Any:
+        inside(self._folder, "wandb")
         text = json.dumps([self._project, str(self._folder), self._settings], sort_keys=True)
         return wandb.init(
             project=self._project,

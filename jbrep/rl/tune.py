@@ -3,26 +3,27 @@
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import optuna
+from msgspec import Meta
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
-from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
-from jbrep.errors import DamageError, InputError, differences
+from jbrep.errors import InputError, differences
+from jbrep.records.document import Document, read_document
 from jbrep.records.lock import exclusive
-from jbrep.records.record import to_plain
-from jbrep.records.storage import make_folder, write_whole
-from jbrep.rl.files import FINISHED, last_returns, read_evaluations
+from jbrep.records.record import Version
+from jbrep.records.storage import exists, inside, make_folder, write_whole
+from jbrep.rl.files import FINISHED, RunSettings, last_returns, read_evaluations
 from jbrep.rl.job import Job, Session
 from jbrep.rl.learner import preset_text
 from jbrep.rl.overrides import setting_names
 from jbrep.rl.run import Run
 from jbrep.rl.trainers import train_jobs
 
-JOURNAL, BEST = "optuna.journal", "best.toml"
+SEARCH, BEST = "search.json", "best.toml"
 _CHOICES: dict[str, list[Any]] = {
     "batch_size": [64, 128, 256, 512],
     "gamma": [0.9, 0.95, 0.98, 0.99, 0.995, 0.999],
@@ -39,6 +40,17 @@ _SPACE: dict[str, BaseDistribution] = {
     "learning_rate": FloatDistribution(1e-5, 1e-2, log=True),
     **{n: CategoricalDistribution([*map(json.dumps, each)]) for n, each in _CHOICES.items()},
 }
+
+
+class Search(Document, frozen=True, kw_only=True):
+    """search.json: what is searched, by which all trials and their order are decided."""
+
+    format = "jbrep search"
+    format_version = 1
+
+    settings: RunSettings  # that all trials begin with
+    seeds: Annotated[int, Meta(ge=1)]  # runs of each trial
+    optuna: Version  # of the package
 
 
 class Trial(NamedTuple):
@@ -59,7 +71,8 @@ def tune(
 ) -> Trial:
     """Search for the settings with the largest return, and write them as a preset file, `BEST`.
 
-    The same search resumes where it was stopped, to the same trials.
+    What is tried next follows from the search and from what the trials before it came to, which
+    their runs' files say: the same search resumes where it was stopped, to the same trials.
 
     Args:
         run: what each trial trains, with other settings; those that it sets itself are kept. Its
@@ -77,10 +90,14 @@ def tune(
         InputError: as `train`; or the folder holds another search; or each trial failed.
         StoppedError: `stop` was true.
     """
-    search = to_plain(run.settings(run.find_encoder())) | {"seeds": seeds}
+    search = Search(
+        settings=run.settings(run.find_encoder()), seeds=seeds, optuna=optuna.__version__
+    )
     make_folder(folder)
     with exclusive(folder):
-        study = _open(search, folder)
+        _claim(folder / SEARCH, search)
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        study = optuna.create_study(direction="maximize")
         ended = []
         for number in range(trials):
             ended.append(_trial(study, number, run, seeds, folder, stop))
@@ -93,21 +110,15 @@ def tune(
     return best
 
 
-def _open(search: dict[str, Any], folder: Path) -> optuna.Study:
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    path = folder / JOURNAL
-    try:
-        storage = optuna.storages.JournalStorage(JournalFileBackend(str(path)))
-        study = optuna.create_study(
-            storage=storage, study_name="tune", direction="maximize", load_if_exists=True
-        )
-    except (ValueError, LookupError):
-        raise DamageError(f"{path} is damaged: delete it to start over") from None
-    before = study.user_attrs.get("search", search)
-    if differing := differences(before, search):
-        raise InputError(f"{folder} holds another search: {differing}; choose another folder")
-    study.set_user_attr("search", search)
-    return study
+def _claim(path: Path, search: Search) -> None:
+    """Write what is searched in a folder, which must be the same from then on."""
+    if not exists(path):
+        search.write(path)
+        return
+    there = read_document(path, Search)
+    before, now = ({"seeds": each.seeds, "optuna": each.optuna} for each in (there, search))
+    if differing := there.settings.differing(search.settings) or differences(before, now):
+        raise InputError(f"{path.parent} holds another search: {differing}; choose another folder")
 
 
 def _space(run: Run) -> dict[str, BaseDistribution]:
@@ -123,26 +134,23 @@ def _overrides(parameters: Mapping[str, Any]) -> dict[str, Any]:
 def _trial(
     study: optuna.Study, number: int, run: Run, seeds: int, folder: Path, stop: Callable[[], bool]
 ) -> Trial:
-    """A trial, trained unless it has ended."""
-    if number == len(study.get_trials(deepcopy=False)):
-        seed = int(np.random.SeedSequence([run.seed, number]).generate_state(1)[0])
-        study.sampler = optuna.samplers.TPESampler(seed=seed)  # whatever was drawn before
-        study.ask(_space(run))
-    there = study.get_trials(deepcopy=False)[number]
-    overrides = _overrides(there.params)
-    if there.state.is_finished():
-        return Trial(number, overrides, there.value)
+    """A trial, whose runs are trained unless they have ended."""
+    seed = int(np.random.SeedSequence([run.seed, number]).generate_state(1)[0])
+    study.sampler = optuna.samplers.TPESampler(seed=seed)  # whatever was drawn before
+    asked = study.ask(_space(run))
+    overrides = _overrides(asked.params)
     trained = run.replace(learner=run.learner.overridden(overrides))
-    jobs = [
-        Job(trained.replace(seed=seed), folder / f"trial-{number}" / f"seed-{seed}")
-        for seed in range(run.seed, run.seed + seeds)
-    ]
-    returns = []
-    for job, result in train_jobs(jobs, Session(stop=stop)):
-        if result.status != FINISHED:
-            study.tell(number, state=TrialState.FAIL)
-            return Trial(number, overrides, None)
-        returns += last_returns(read_evaluations(job.folder))
-    value = float(np.mean(returns))
-    study.tell(number, value)
+    own = inside(folder, f"trial-{number}")
+    value = _score(trained, range(run.seed, run.seed + seeds), own, stop)
+    study.tell(asked, value, TrialState.FAIL if value is None else TrialState.COMPLETE)
     return Trial(number, overrides, value)
+
+
+def _score(run: Run, seeds: range, folder: Path, stop: Callable[[], bool]) -> float | None:
+    """The mean return of the last evaluations of a trial's runs; None if one failed."""
+    jobs = [Job(run.replace(seed=seed), inside(folder, f"seed-{seed}")) for seed in seeds]
+    for _, result in train_jobs(jobs, Session(stop=stop)):
+        if result.status != FINISHED:
+            return None
+    last = [each for job in jobs for each in last_returns(read_evaluations(job.folder))]
+    return float(np.mean(last))

@@ -76,7 +76,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     """
 
     format = "jbrep study"
-    format_version = 1
+    format_version = 2
 
     tasks: Annotated[
         tuple[str, ...],

@@ -12,7 +12,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError, differences
 from jbrep.records.document import read_document
 from jbrep.records.record import to_plain
-from jbrep.records.storage import exists, make_folder
+from jbrep.records.storage import exists, inside, make_folder
 from jbrep.rl import Run
 from jbrep.rl.files import RUN
 from jbrep.rl.learner import Learner
@@ -92,7 +92,7 @@ class Plan:
 
     def folder_of(self, cell: Cell) -> Path:
         """A run's folder."""
-        return self.folder / "runs" / cell.name
+        return inside(self.folder, "runs", cell.name)
 
     def has_ended(self, cell: Cell) -> bool:
         """Whether a run has finished or failed."""
@@ -148,13 +148,12 @@ class Plan:
 
     def encoders(self, task: str) -> Path:
         """The folder of the encoders that the study trains for a task."""
-        return self.folder / "encoders" / slug(task)
+        return inside(self.folder, "encoders", slug(task))
 
     def data(self, task: str, number: int = 0) -> Path:
         """The folder of a data set that the study collects for a task, one of several or alone."""
-        folder = self.folder / "data" / slug(task)
         several = self.study.data is not None and self.study.data.sets > 1
-        return folder / f"set-{number}" if several else folder
+        return inside(self.folder, "data", slug(task), *([f"set-{number}"] if several else ()))
 
     def write(self) -> None:
         """Make the folder, and write what the study is.

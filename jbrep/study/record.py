@@ -14,7 +14,7 @@ from jbrep.encoders import FULL, load
 from jbrep.encoders.base import OWN
 from jbrep.errors import InputError
 from jbrep.records.document import Document
-from jbrep.records.record import Record, from_plain, to_plain
+from jbrep.records.record import Record, Version, from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, RunRecord, RunSettings, SharedSettings
 from jbrep.rl.settings import Sha256
@@ -113,14 +113,15 @@ class RunsRecord(Document, frozen=True, kw_only=True):
     """runs.json."""
 
     format = "jbrep runs"
-    format_version = 2
+    format_version = 3
     max_bytes = 1 << 28
     indent = 1
 
     study: Study | None  # None for runs without one
     registration: RegistrationFacts | None
     missing: dict[str, Count]  # unfinished runs: training steps done
-    versions: list[dict[str, str]]  # by package
+    tables: dict[str, Sha256]  # of the files beside it
+    versions: list[dict[Version, Version]]  # by package
     processors: list[str]
     labels: dict[str, Label]
     runs: list[RunFacts]
@@ -144,12 +145,15 @@ class RunsRecord(Document, frozen=True, kw_only=True):
         return from_plain({**to_plain(shared), **run.differs}, LabelSettings)
 
 
-def runs_record(folder: Path, ended: Mapping[Path, RunRecord]) -> RunsRecord:
+def runs_record(
+    folder: Path, ended: Mapping[Path, RunRecord], tables: Mapping[str, str]
+) -> RunsRecord:
     """What was run.
 
     Args:
         folder: of a study, or any folder with runs below it.
         ended: what run.json says of each run that has finished or failed, by folder.
+        tables: SHA-256 of the tables of these runs, by their files' names.
 
     Raises:
         InputError: a file is damaged.
@@ -166,6 +170,7 @@ def runs_record(folder: Path, ended: Mapping[Path, RunRecord]) -> RunsRecord:
         study=plan.study if plan else None,
         registration=_registration(plan, runs) if plan else None,
         missing={name: read_progress(each)[0] for name, each in unfinished.items()},
+        tables=dict(tables),
         versions=_distinct(dict(run.versions) for run in runs),
         processors=_distinct(run.cpu for run in runs),
         labels=labels,

@@ -1,17 +1,15 @@
 """A study's plan, written down before its first run: what a report holds its runs against."""
 
-import hashlib
-import json
 from collections.abc import Collection, Iterable, Mapping
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from jbrep.errors import InputError, differences
+from jbrep.errors import differences
 from jbrep.records.commit import commits
 from jbrep.records.document import Document, read_document
-from jbrep.records.record import from_plain, to_plain
+from jbrep.records.record import Version, from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.files import RunRecord
 from jbrep.rl.job import packages
@@ -26,19 +24,14 @@ class Registration(Document, frozen=True, kw_only=True):
     format = "jbrep registration"
     format_version = 1
 
-    sha256: str  # of all else
-    study: dict[str, Any]  # as it was written, which the hash is of
+    study: dict[str, Any]  # as it was written
     encoders: dict[str, str]  # of those that were there: SHA-256 by the name of the run
     date: str  # ISO 8601, in UTC
-    versions: dict[str, str]  # by package
+    versions: dict[Version, Version]  # by package
     commits: dict[str, str]
 
     def check(self) -> None:
-        """As for `Record`: check the hash, and that a study was registered."""
-        if _hash(to_plain(self)) != self.sha256:
-            raise InputError(
-                "it was changed after it was written: restore it, or choose another folder"
-            )
+        """As for `Record`: check that a study was registered."""
         _ = self.registered
 
     @cached_property
@@ -60,14 +53,13 @@ class Registration(Document, frozen=True, kw_only=True):
             study: its settings.
             encoders: the SHA-256 of those that are there, by the name of the run.
         """
-        facts: dict[str, Any] = {
-            "study": _explicit(study),
-            "encoders": dict(encoders),
-            "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            "versions": packages(),
-            "commits": dict(commits()),
-        }
-        return cls(sha256=_hash(facts), **facts)
+        return cls(
+            study=_explicit(study),
+            encoders=dict(encoders),
+            date=datetime.now(UTC).isoformat(timespec="seconds"),
+            versions=packages(),
+            commits=dict(commits()),
+        )
 
     def differences(self, study: Study) -> str:
         """How a study differs from the registered one, but for its title and added seeds."""
@@ -121,10 +113,3 @@ def _explicit(study: Study) -> dict[str, Any]:
 
 def _listed(values: Iterable[object]) -> str:
     return ", ".join(map(str, values))
-
-
-def _hash(facts: Mapping[str, Any]) -> str:
-    """SHA-256 of all but the hash itself, as canonical JSON."""
-    hashed = {name: value for name, value in facts.items() if name != "sha256"}
-    canonical = json.dumps(hashed, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(canonical.encode()).hexdigest()

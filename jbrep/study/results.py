@@ -12,6 +12,7 @@ import numpy as np
 from jbrep.encoders import FULL
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
+from jbrep.evaluate.table import DIAGNOSTICS
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
 from jbrep.records.tables import write_rows
@@ -21,11 +22,13 @@ from jbrep.stats.rules import Planned, Rules
 from jbrep.study.plan import STUDY
 from jbrep.study.record import RECORD, LabelSettings, RunFacts, RunsRecord, runs_record
 from jbrep.study.tables import (
+    REFERENCE_RETURNS,
     RETURNS,
     References,
     Return,
     by_run,
     read_references,
+    stated,
     write_references,
 )
 
@@ -44,13 +47,16 @@ def conclude(folder: Path) -> list[Path]:
     Raises:
         InputError: there is no such run, a file is damaged, or a table can't be written.
     """
-    ended = _ended(folder)
-    paths = [folder / RETURNS, folder / RECORD]
-    references = write_references(_tasks(ended.values()), folder)
-    record, rows = runs_record(folder, ended), list(_returns(ended))
-    write_rows(paths[0], rows, Return)
-    record.write(paths[1])
-    return [*paths, references] if references else paths
+    ended, before = _ended(folder), stated(folder)
+    references = write_references(_tasks(ended.values()), folder, before)
+    rows = list(_returns(ended))
+    tables = {name: before[name] for name in (DIAGNOSTICS,) if name in before}
+    tables[RETURNS] = write_rows(folder / RETURNS, rows, Return)
+    if references:
+        tables[REFERENCE_RETURNS] = references
+    runs_record(folder, ended, tables).write(folder / RECORD)  # last: it says what they are
+    names = RETURNS, RECORD, *([REFERENCE_RETURNS] if references else [])
+    return [folder / name for name in names]
 
 
 def found(
@@ -94,8 +100,8 @@ def read_runs(folder: Path) -> list[RunCurve]:
         InputError: there is none, or a file of one is damaged.
     """
     ended = _ended(folder)
-    record, references = runs_record(folder, ended), read_references(folder)
-    return _curves(record, _returns(ended), references, Rules())
+    references = read_references(folder, stated(folder).get(REFERENCE_RETURNS))
+    return _curves(runs_record(folder, ended, {}), _returns(ended), references, Rules())
 
 
 def has_runs(folder: Path) -> bool:

@@ -146,7 +146,9 @@ def register_study(plan: Plan) -> Registration:
         InputError: as `run_study`, or there are runs already.
     """
     check(plan)
-    return plan.register()
+    make_folder(plan.folder)
+    with exclusive(plan.folder):
+        return plan.register()
 
 
 class Progress:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from jbrep.encoders import FULL
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import DamageError, InputError
 from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.table import (
     DIAGNOSTICS,
@@ -66,62 +66,76 @@ def by_run(returns: Iterable[Return]) -> dict[tuple[str, int], dict[int, list[fl
     return found
 
 
-def write_references(tasks: Iterable[tuple[Task, int]], folder: Path) -> Path | None:
+def stated(folder: Path) -> Mapping[str, str]:
+    """The SHA-256 of each table that runs.json in a folder says; nothing where that is no use."""
+    try:
+        return read_document(folder / RECORD, RunsRecord).tables
+    except InputError:
+        return {}
+
+
+def write_references(
+    tasks: Iterable[tuple[Task, int]], folder: Path, before: Mapping[str, str]
+) -> str | None:
     """Play the reference policies of tasks: standing still, random, and hand-written if there is.
 
-    What the file has already isn't played again; nor is a task whose environment is missing.
+    What the file has already isn't played again; what can't be played here stays in it.
 
     Args:
         tasks: each with its number of episodes.
         folder: for the file.
+        before: what runs.json says of the tables. A file that is another is written anew.
 
     Returns:
-        The file; None if there is nothing to write.
+        The SHA-256 of the file; None if there is nothing to write.
 
     Raises:
-        DamageError: what is there isn't such a file.
+        DamageError: the file is another, and what was in it can't be played here.
     """
-    path = folder / REFERENCE_RETURNS
-    there = _there(path)
-    rows = [
-        row
-        for task, episodes in sorted(tasks, key=lambda each: each[0].name)
-        for policy in _POLICIES
-        if policy != LOOKING or task.name in HEURISTICS
-        for row in _kept(there, task, policy, episodes) or _played(task, policy, episodes)
-    ]
-    if not rows:
-        path.unlink(missing_ok=True)
-        return None
-    if rows != there:
-        write_csv(path, ("task", "policy", "episode", "return"), rows)
-    return path
+    path, damage = folder / REFERENCE_RETURNS, None
+    try:
+        there = _there(path, before)
+    except DamageError as error:
+        there, damage = [], error
+    rows = []
+    for task, episodes in sorted(tasks, key=lambda each: each[0].name):
+        for policy in _POLICIES:
+            if policy != LOOKING or task.name in HEURISTICS:
+                own = [row for row in there if (row.task, row.policy) == (task.name, policy)]
+                if [row.episode for row in own] != [*range(episodes)]:
+                    own = _played(task, policy, episodes) or own
+                if damage and not own:
+                    raise damage
+                rows += own
+    return write_csv(path, ("task", "policy", "episode", "return"), rows) if rows else None
 
 
-def read_references(folder: Path) -> References:
-    """What `write_references` wrote; nothing if there is no such file.
+def read_references(folder: Path, sha256: str | None) -> References:
+    """What `write_references` wrote.
+
+    Args:
+        folder: that the file is in.
+        sha256: of the file; None if there was nothing to write.
 
     Raises:
+        InputError: there is no such file.
         DamageError: it isn't what was written.
     """
     found: References = {}
-    for row in _there(folder / REFERENCE_RETURNS):
+    for row in read_rows(folder / REFERENCE_RETURNS, _Reference, sha256) if sha256 else []:
         found.setdefault(row.task, {}).setdefault(row.policy, []).append(row.episode_return)
     return found
 
 
-def _there(path: Path) -> list[_Reference]:
+def _there(path: Path, before: Mapping[str, str]) -> list[_Reference]:
     """What the file has; nothing if there is none."""
-    return read_rows(path, _Reference) if exists(path) else []
-
-
-def _kept(there: list[_Reference], task: Task, policy: str, episodes: int) -> list[_Reference]:
-    """The rows of a task and policy, if they are those wanted."""
-    own = [row for row in there if (row.task, row.policy) == (task.name, policy)]
-    return own if [row.episode for row in own] == [*range(episodes)] else []
+    if not exists(path):
+        return []
+    return read_rows(path, _Reference, before.get(REFERENCE_RETURNS, "") if before else None)
 
 
 def _played(task: Task, policy: str, episodes: int) -> list[_Reference]:
+    """The rows of a task and policy; none where its environment isn't here."""
     try:
         returns = find_player(_POLICIES[policy], task).returns(episodes)
     except (InputError, ModuleNotFoundError):  # reports don't need the environments
@@ -164,10 +178,28 @@ def add_diagnostics(folder: Path, given: Sequence[str] = ()) -> list[str]:
         for file in files:
             known = evaluated(file) | known
     if exists(path):
-        known = {_key(row): row.values for row in read_diagnostics(path)} | known
+        known = _there_too(path, record.tables.get(DIAGNOSTICS, ""), used, known) | known
     rows = [row._replace(values=known[_key(row)]) for row in used if _key(row) in known]
-    write_diagnostics(path, rows)
+    tables = {**record.tables, DIAGNOSTICS: write_diagnostics(path, rows)}
+    if tables != record.tables:
+        record.replace(tables=tables).write(runs)
     return list(_unknown(used, known))
+
+
+def _there_too(
+    path: Path, sha256: str, used: Iterable[Diagnosed], known: Mapping[_Key, Values]
+) -> dict[_Key, Values]:
+    """What the table says already; one that is another isn't needed where all is known.
+
+    Raises:
+        DamageError: the table is another, and some of the encoders are known from it alone.
+    """
+    try:
+        return {_key(row): row.values for row in read_diagnostics(path, sha256)}
+    except DamageError:
+        if all(_key(row) in known for row in used):
+            return {}
+        raise
 
 
 def _encoders(record: RunsRecord) -> list[Diagnosed]:

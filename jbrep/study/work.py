@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jbrep.envs.names import import_modules
-from jbrep.errors import first_line
-from jbrep.records.storage import make_folder
+from jbrep.errors import InputError, first_line
+from jbrep.records.storage import make_folder, read_regular, write_note
 from jbrep.rl import Run, StoppedError
 from jbrep.rl.files import RunRecord
 from jbrep.rl.job import Job, Session
@@ -20,6 +20,7 @@ PROGRESS = "progress"
 ERROR = "error.txt"  # the traceback of a run that crashed
 CRASHED = "crashed"
 _WRITE_EVERY = 1.0  # seconds
+_MOST_PROGRESS = 1000  # bytes
 
 
 class Outcome(NamedTuple):
@@ -79,15 +80,14 @@ def _ended(assigned: Assigned, result: RunRecord) -> Outcome:
 
 def _crashed(assigned: Assigned, error: Exception) -> Outcome:
     path = assigned.folder / ERROR
-    with suppress(OSError):
-        path.write_text("".join(traceback.format_exception(error)))
+    write_note(path, "".join(traceback.format_exception(error)))
     return Outcome(assigned.name, CRASHED, f"{first_line(error)}; see {path}")
 
 
 def read_progress(folder: Path) -> tuple[int, str]:
     """The steps that a run has done, and the mean return of its last evaluation as text."""
-    with suppress(OSError, ValueError):
-        step, mean = (folder / PROGRESS).read_text().split()
+    with suppress(InputError, ValueError):
+        step, mean = read_regular(folder / PROGRESS, _MOST_PROGRESS).decode().split()
         return int(step), mean
     return 0, "-"
 
@@ -102,5 +102,6 @@ class _ProgressFiles:
     def __call__(self, job: Job, step: int, mean: float | None) -> None:
         now, folder = time.monotonic(), job.folder
         if step >= self._steps or now - self._written.get(folder, 0.0) >= _WRITE_EVERY:
-            (folder / PROGRESS).write_text(f"{step} {'-' if mean is None else rounded(mean)[0]}")
+            shown = "-" if mean is None else rounded(mean)[0]
+            write_note(folder / PROGRESS, f"{step} {shown}")
             self._written[folder] = now

@@ -8,7 +8,16 @@ from jbrep.records.tables import write_rows
 from jbrep.report.figures.style import PAPER
 from jbrep.rl.agent import Spaces, make_agent, parameters
 from jbrep.rl.checkpoint import CheckpointFile, History, Snapshot
-from jbrep.rl.files import CHECKPOINT, ENCODER, FAILED, FINISHED, RUN, Evaluation, RunRecord
+from jbrep.rl.files import (
+    CHECKPOINT,
+    ENCODER,
+    EVALUATIONS,
+    FAILED,
+    FINISHED,
+    RUN,
+    Evaluation,
+    RunRecord,
+)
 from jbrep.rl.job import packages
 from jbrep.rl.learner import Learner
 from jbrep.rl.overrides import check_shape
@@ -92,8 +101,8 @@ def _make_run(plan, cell):
         episodes = settings.episodes_at(step)
         returns = level + random.normal(0, 0.5, episodes)
         rows += [Evaluation(step, i, float(each)) for i, each in enumerate(returns.clip(0, 1000))]
-    write_rows(folder / "evaluations.csv", rows, Evaluation)
-    write_record(folder, run)
+    tables = {EVALUATIONS: write_rows(folder / EVALUATIONS, rows, Evaluation)}
+    write_record(folder, run, tables=tables)
 
 
 def write_record(folder, run, reason=None, **changes):
@@ -101,6 +110,7 @@ def write_record(folder, run, reason=None, **changes):
     encoder = find(run.encoder, run.task)
     facts = {"latent_size": encoder.latent_size, "steps": run.steps, "seconds": 60.0}
     facts |= {"versions": packages(), "commits": {}, "cpu": "a processor"}
+    facts["tables"] = {EVALUATIONS: "0" * 64}
     RunRecord(
         status=FINISHED if reason is None else FAILED,
         reason=reason,

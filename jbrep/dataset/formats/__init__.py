@@ -10,6 +10,7 @@ from jbrep.dataset.reader import Dataset
 from jbrep.errors import InputError, choose
 from jbrep.records.storage import check_space, exists
 
+_FILE_BYTES = 1 << 16  # whatever is in it
 FORMATS = {name: f"{__name__}.{name}" for name in ("minari", "parquet", "npz")}  # modules
 
 
@@ -37,13 +38,15 @@ def export(dataset: Dataset, to: str, out: Path) -> str:
     Raises:
         InputError: an unknown format, no rows, something there already, or it can't be written.
     """
-    write = load_format(to).write
+    module = load_format(to)
     if not len(dataset):
         raise InputError(f"{dataset.folder} has no rows yet")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        check_space(out.parent, len(dataset) * dataset.manifest.settings.row_bytes())
-        how: str = write(dataset, out)
+        rows = len(dataset) * dataset.manifest.settings.row_bytes()
+        episodes = dataset.manifest.episodes * module.EPISODE_BYTES
+        check_space(out.parent, rows + episodes + _FILE_BYTES)
+        how: str = module.write(dataset, out)
     except (OSError, RuntimeError) as error:  # HDF5 raises the latter when the disk is full
         reason = getattr(error, "strerror", None) or error  # some have only a text
         raise InputError(f"can't write {out}: {reason}") from error
@@ -63,6 +66,8 @@ def open_source(given: str) -> Source:
     path, files = Path(given), ("npz", "parquet")
     suffix = path.suffix.removeprefix(".")
     is_file = exists(path) and not path.is_dir()
+    if is_file and not path.is_file():
+        raise InputError(f"{path} is a pipe or a device: it must be a regular file")
     if is_file and suffix not in files:
         raise InputError(f"unknown format '.{suffix}': choose one of {', '.join(files)}")
     if exists(path / MANIFEST):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jbrep.dataset.schema import UNKNOWN_SEED
-from jbrep.envs.task import Feature, Task
+from jbrep.envs.task import MAX_FEATURES, Feature, Task
 from jbrep.errors import InputError
 from jbrep.text import slug
 
@@ -295,6 +295,8 @@ def check_kind(name: str, what: str, dtype: np.dtype[Any], row: Sequence[int] = 
         raise InputError(f"{name} has {shape} in each row: it must be one number")
     if len(row) >= _IMAGE_AXES or (len(row) > 1 and dtype == np.uint8):
         raise InputError(f"{name} has images, {shape}: only features are possible")
+    if math.prod(row) > MAX_FEATURES:
+        raise InputError(f"{name} has {shape}: at most {MAX_FEATURES:,} numbers are possible")
     if math.prod(row) == 0:
         raise InputError(f"{name} has {shape}: there must be at least one number")
     if what in _WHOLE and dtype.kind not in "iu":

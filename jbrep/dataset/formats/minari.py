@@ -1,15 +1,22 @@
-"""Data sets in Minari's HDF5 storage, with the environment that it recovers."""
+"""Data sets in Minari's HDF5 storage, with the environment that it recovers.
+
+They may be strangers': nothing outside their folder is read, and no environment is made with
+arguments that may name files. What jbrep exports has the checksums of its files beside them.
+"""
 
 import copy
+import hashlib
 import json
 import os
 import re
+import stat
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import h5py
 import minari
 import minari.dataset.minari_storage as storages
 import numpy as np
@@ -24,18 +31,42 @@ import jbrep.jitterbug.simulation  # noqa: F401  Minari makes the environment: l
 from jbrep.dataset.formats.episodes import Incoming, Source, check_kind, label, whole_episode
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.schema import UNKNOWN_SEED, DataSettings
+from jbrep.dataset.settings import Digest
 from jbrep.envs.description import describe, features_of
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import Task
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import DamageError, InputError, kind_and_line
 from jbrep.progress import Progress
-from jbrep.records.storage import exists, publish_folder, read_regular, unfinished, write_whole
+from jbrep.records.document import Document, read_document
+from jbrep.records.storage import (
+    exists,
+    inside,
+    make_folder,
+    open_regular,
+    publish_folder,
+    read_regular,
+    unfinished,
+    write_whole,
+)
 
 Array = NDArray[Any]
 _ROOT = "MINARI_DATASETS_PATH"  # Minari takes the folder of its data sets from there only
-_METADATA = "metadata.json"
+_METADATA, _CHECKSUMS = "metadata.json", "jbrep.json"
 _MAX_BYTES = 1 << 24  # of the metadata
+_MOST_AT_ONCE = 1 << 30  # bytes of an array of an episode
+_SQUEEZED = 2000  # times that HDF5's filters may make an array smaller, at most
+_WORD = re.compile(r"[\w-]{1,40}")
+EPISODE_BYTES = 1 << 14  # that HDF5 takes for each episode besides its rows
 _MOST_SHOWN = 10  # ids of data sets
+
+
+class Checksums(Document, frozen=True, kw_only=True):
+    """jbrep.json: the SHA-256 of each file that was exported, by its name."""
+
+    format = "jbrep export"
+    format_version = 1
+
+    files: Mapping[str, Digest]
 
 
 def open_source(given: str) -> Source:
@@ -46,8 +77,10 @@ def open_source(given: str) -> Source:
 
     Raises:
         InputError: there is none, or it holds what can't be imported.
+        DamageError: it isn't what jbrep exported.
     """
     folder = _folder(given)
+    _check_files(given, folder)
     metadata = _metadata(folder)
     storage = _storage(given, folder)
     name = f"Minari {metadata.get('dataset_id', given)}"
@@ -90,6 +123,60 @@ def _folder(given: str) -> Path:
         f"{given} is no .npz or .parquet file, and no Minari data set: it must be a path, or an id "
         f"in {root} ({_ROOT}), where there {f'are {shown}' if names else 'is none'}"
     )
+
+
+def _check_files(given: str, folder: Path) -> None:
+    """Make sure that all files are plain ones inside the folder, and as jbrep exported them.
+
+    Raises:
+        InputError: one isn't, or leads out of the folder, or holds more than it has bytes for.
+        DamageError: one isn't what was exported.
+    """
+    for path in sorted(folder.rglob("*")):
+        kind = path.lstat().st_mode
+        if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+            raise InputError(f"{path} must be a plain file: no link, pipe or device is opened")
+    if exists(folder / _CHECKSUMS):
+        for name, sha256 in read_document(folder / _CHECKSUMS, Checksums).files.items():
+            if _sha256(inside(folder, name)) != sha256:
+                raise DamageError(
+                    f"{folder / name} is damaged: it isn't what was exported, by its checksum; "
+                    "export the data set again"
+                )
+    for path in sorted(folder.rglob("*.hdf5")):
+        try:
+            with h5py.File(path) as file:
+                file.visititems_links(lambda name, link: _check_link(path, file, name, link))  # noqa: B023
+        except InputError:
+            raise
+        except Exception as error:  # whatever HDF5 raises at damaged files
+            raise _unreadable(given, error) from None
+
+
+def _sha256(path: Path) -> str:
+    """Of a regular file; empty where there is none."""
+    file = open_regular(path) if exists(path) else None
+    if file is None:
+        return ""
+    with file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _check_link(path: Path, file: h5py.File, name: str, link: Any) -> None:
+    """Make sure that a name in an HDF5 file stands for what is in the file itself."""
+    if not isinstance(link, h5py.HardLink):
+        raise InputError(f"{path}: {name} is a link, which isn't followed")
+    found = file[name]
+    if not isinstance(found, h5py.Dataset):
+        return
+    if found.external or found.is_virtual:
+        raise InputError(f"{path}: {name} is in another file, which isn't opened")
+    stored = found.id.get_storage_size()
+    if found.nbytes > min(_MOST_AT_ONCE, _SQUEEZED * (stored + 1)):
+        raise InputError(
+            f"{path}: {name} would have {found.nbytes:,} bytes, of which {stored:,} are stored: "
+            f"at most {_MOST_AT_ONCE:,} are possible, and what is stored"
+        )
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
@@ -142,10 +229,21 @@ def _describe(env_id: str, arguments: dict[str, Any], limit: int | None) -> tupl
     """The task, if its environment can be made here, or why not."""
     if not env_id:
         return None, "it names no environment"
+    if not _is_harmless(arguments):
+        return None, f"the arguments of {env_id} may name files, so that it isn't made"
     try:
         return describe(env_id, arguments, limit), ""
     except (InputError, ModuleNotFoundError) as error:
         return None, kind_and_line(error)
+
+
+def _is_harmless(value: Any) -> bool:
+    """Whether an argument of a stranger's can't name a file: numbers and words."""
+    if isinstance(value, dict):
+        return all(map(_is_harmless, (*value, *value.values())))
+    if isinstance(value, list):
+        return all(map(_is_harmless, value))
+    return not isinstance(value, str) or bool(_WORD.fullmatch(value) and not exists(value))
 
 
 def _episodes(name: str, storage: storages.MinariStorage) -> Iterator[Incoming]:
@@ -163,8 +261,8 @@ def _episodes(name: str, storage: storages.MinariStorage) -> Iterator[Incoming]:
 
 def _read(name: str, storage: storages.MinariStorage) -> Iterator[tuple[dict[str, Any], int]]:
     """Each episode, and its seed."""
-    numbers = range(storage.total_episodes)
     try:
+        numbers = range(storage.total_episodes)
         pairs = zip(
             storage.get_episodes(numbers), storage.get_episode_metadata(numbers), strict=True
         )
@@ -197,19 +295,25 @@ def write(dataset: Dataset, out: Path) -> str:
     """Add a data set to a folder of Minari data sets; returns how to open it."""
     settings = dataset.manifest.settings
     name = f"{_namespace(settings.task)}/{settings.policy['kind']}-v0"
-    path = out / name
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = inside(out, name)
+    make_folder(path.parent)
     with unfinished(path) as root:  # Minari ignores hidden folders
         root.mkdir()
         with _datasets_in(root.resolve()), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on the missing author and address
             _create(dataset, name)
+        _write_checksums(root / name / "data")
         for namespace in Path(name).parents[:-1]:
             metadata = namespace / NAMESPACE_METADATA_FILENAME
             if not exists(out / metadata):
                 write_whole(out / metadata, (root / metadata).read_bytes())
         publish_folder(root / name, path)
     return f"{_ROOT}={out} and minari.load_dataset({name!r})"
+
+
+def _write_checksums(folder: Path) -> None:
+    files = {path.name: _sha256(path) for path in sorted(folder.iterdir())}
+    Checksums(files=files).write(folder / _CHECKSUMS)
 
 
 def _namespace(task: Task) -> str:

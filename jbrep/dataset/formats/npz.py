@@ -20,7 +20,10 @@ from jbrep.progress import Progress
 from jbrep.records.storage import publish_file, unfinished
 
 Array = NDArray[Any]
+EPISODE_BYTES = 0  # besides its rows
 _SUFFIX = ".npy"
+_MOST_AT_ONCE = 1 << 30  # bytes of an array, which zeros can be squeezed into a thousandth of
+_MOST_WORDS = 1 << 22  # likewise, of names
 _DAMAGE = (  # what zipfile and NumPy raise at damaged files, and encrypted ones
     *(ValueError, TypeError, KeyError, OSError, EOFError, RuntimeError),
     *(NotImplementedError, zipfile.BadZipFile, zlib.error),
@@ -125,6 +128,8 @@ def _chunks(path: Path, own: dict[str, str]) -> Iterator[Rows]:
 def _stream(archive: zipfile.ZipFile, name: str) -> Iterator[Array]:
     """An array's rows in chunks; read at once if it is stored by columns."""
     with _opened(archive, name) as stored:
+        if stored.order == "F":
+            _check_size(archive, name, stored, _MOST_AT_ONCE)
         count, *row = stored.shape
         most = CHUNK if stored.order == "C" else max(1, count)
         for start in range(0, count, most):
@@ -133,9 +138,20 @@ def _stream(archive: zipfile.ZipFile, name: str) -> Iterator[Array]:
                 yield values[first : first + CHUNK]
 
 
-def _whole(archive: zipfile.ZipFile, name: str) -> Array:
+def _whole(archive: zipfile.ZipFile, name: str, most: int = _MOST_AT_ONCE) -> Array:
     with _opened(archive, name) as stored:
+        _check_size(archive, name, stored, most)
         return stored.read(*stored.shape)
+
+
+def _check_size(archive: zipfile.ZipFile, name: str, stored: _Stored, most: int) -> None:
+    """Refuse an array that is read at once, but too large for that."""
+    size = math.prod(stored.shape) * stored.dtype.itemsize
+    if size > most:
+        raise InputError(
+            f"{archive.filename} has {size:,} bytes in {name}, which must be read at once: at most "
+            f"{most:,} can be; observations and the like are read in parts if stored by rows"
+        )
 
 
 def _once(archive: zipfile.ZipFile, names: Collection[str]) -> dict[str, Array]:
@@ -151,7 +167,7 @@ def _once(archive: zipfile.ZipFile, names: Collection[str]) -> dict[str, Array]:
 def _features(archive: zipfile.ZipFile, names: Collection[str]) -> tuple[Feature, ...]:
     """Names and units, if there are any."""
     given, units = (
-        [str(word) for word in _whole(archive, name).ravel()] if name in names else []
+        [str(word) for word in _whole(archive, name, _MOST_WORDS).ravel()] if name in names else []
         for name in ("feature_names", "feature_units")
     )
     if units and len(units) != len(given):

@@ -11,6 +11,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from jbrep.progress import Progress
+from jbrep.records.lock import exclusive
 from jbrep.records.storage import make_folder, write_whole
 from jbrep.records.tables import csv_text
 from jbrep.report.figures.style import PAPER
@@ -71,13 +72,14 @@ def write(plots: Iterable[Plot], folder: Path) -> list[Path]:
         The paths of the PNG files.
 
     Raises:
-        InputError: they can't be written.
+        InputError: they can't be written, or another process is writing there.
     """
     make_folder(folder)
     pictures = []
-    for plot in Progress(list(plots), unit="figure", delay=1, leave=False):
-        for kind in ("pdf", "png"):
-            write_whole(folder / f"{plot.name}.{kind}", plot.on_paper.picture(kind))
-        write_whole(folder / f"{plot.name}.csv", csv_text(plot.columns, plot.rows).encode())
-        pictures.append(folder / f"{plot.name}.png")
+    with exclusive(folder):
+        for plot in Progress(list(plots), unit="figure", delay=1, leave=False):
+            for kind in ("pdf", "png"):
+                write_whole(folder / f"{plot.name}.{kind}", plot.on_paper.picture(kind))
+            write_whole(folder / f"{plot.name}.csv", csv_text(plot.columns, plot.rows).encode())
+            pictures.append(folder / f"{plot.name}.png")
     return pictures
