@@ -1,0 +1,296 @@
+"""Kill commands, fill their disk, run them twice at once and damage what they read or left.
+
+Each must end whole, or refuse in a line, and come to the same when it is run again. Everything
+happens in forks of this process, which has imported what they need.
+"""
+
+import errno
+import hashlib
+import os
+import resource
+import signal
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from small import flip_bit
+
+from jbrep.cli import main
+from jbrep.errors import InputError
+
+SYNCS = ("fsync", "replace", "rename", "link")  # each is a point where a command can end
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What is attacked."""
+
+    name: str
+    act: Callable[[Path], Any]  # makes something in a folder
+    result: Callable[[Path], Any]  # what it made, which is the same each time
+    # damages: the files, what reads them, and what that gives
+    files: Callable[[Path], list[Path]] = lambda folder: []
+    read: Callable[[Path], Any] | None = None
+    prepare: Callable[[Path], Any] = lambda folder: None
+
+
+@dataclass
+class Tally:
+    """What came of attacks, and those that weren't met as they must be."""
+
+    counts: Counter = field(default_factory=Counter)
+    faults: list[str] = field(default_factory=list)
+
+    def note(self, attack, outcome, fault=""):
+        self.counts[f"{attack}: {outcome}"] += 1
+        if fault:
+            self.faults.append(f"{attack}: {fault}")
+
+
+def command(*arguments):
+    """Run a command as a stranger types it."""
+    main([*map(str, arguments)], prog_name="jbrep", standalone_mode=True)
+
+
+def forked(act, folder, *, before=lambda: None, seconds=None):
+    """Do something in a fork, to be killed after so many seconds; its exit code and its words."""
+    told = folder.with_suffix(".told")
+    child = os.fork()
+    if not child:
+        code = 1
+        with suppress(BaseException):
+            code = _in_child(act, folder, before, told)
+        os._exit(code)
+    if seconds is not None:
+        time.sleep(seconds)
+        with suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status), told.read_text(errors="replace")
+
+
+def _in_child(act, folder, before, told):
+    descriptor = os.open(told, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    for standard in (1, 2):
+        os.dup2(descriptor, standard)
+    os.environ["TQDM_DISABLE"] = "1"
+    try:
+        before()
+        act(folder)
+    except SystemExit as error:
+        return error.code or 0
+    except InputError as error:
+        os.write(2, f"Error: {error}\n".encode())
+        return 2
+    except BaseException as error:
+        if isinstance(error, OSError) and error.errno in _FULL:
+            return 2  # of a function in Python; commands put it into a line
+        os.write(2, traceback.format_exc().encode())
+        return 1
+    return 0
+
+
+def at_sync(number, do):
+    """Before that many points of synchronisation: do this."""
+    left = [number]
+
+    def before():
+        for name in SYNCS:
+            call = getattr(os, name)
+
+            def counted(*arguments, call=call, **keywords):
+                left[0] -= 1
+                if left[0] == 0:
+                    do()
+                return call(*arguments, **keywords)
+
+            setattr(os, name, counted)
+
+    return before
+
+
+def _die():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _disk_is_full():
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def limited(size):
+    """No file may have more bytes than this, whoever writes it."""
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+
+
+def in_one_line(told):
+    """Whether a refusal has its line, perhaps after notes and results."""
+    lines = told.splitlines()
+    return "Traceback" not in told and any(line.startswith("Error: ") for line in lines[-1:])
+
+
+class Attacker:
+    """Attacks a surface, in folders of its own."""
+
+    def __init__(self, surface: Surface, folder: Path, seed: int = 0):
+        self.surface, self.folder, self.tally = surface, folder / surface.name, Tally()
+        self.random = np.random.default_rng([seed, *surface.name.encode()])
+        self._number = 0
+        self.peace = self._new()
+        begun = time.monotonic()
+        code, told = forked(surface.act, self.peace)
+        assert code == 0, (surface.name, told)
+        self.seconds = time.monotonic() - begun
+        self.expected = surface.result(self.peace)
+
+    def _new(self):
+        folder = self.folder / f"{self._number:05d}"
+        self._number += 1
+        folder.mkdir(parents=True)
+        self.surface.prepare(folder)
+        return folder
+
+    def points(self):
+        """How often it comes to a point of synchronisation."""
+        folder, counted = self._new(), self.folder / "points"
+
+        def count():
+            counted.write_text("")
+            at_sync(-1, lambda: None)()
+            for name in SYNCS:
+                call = getattr(os, name)
+
+                def noted(*arguments, call=call, **keywords):
+                    with counted.open("a") as file:
+                        file.write(".")
+                    return call(*arguments, **keywords)
+
+                setattr(os, name, noted)
+
+        assert forked(self.surface.act, folder, before=count)[0] == 0
+        return len(counted.read_text())
+
+    def again(self, attack, folder, code):
+        """The same once more must come to what it comes to in peace."""
+        ended, told = forked(self.surface.act, folder)
+        if ended == 0 or (code == 0 and in_one_line(told) and "exists already" in told):
+            result = self.surface.result(folder)
+            self.tally.note(attack, code, "" if result == self.expected else "another result")
+        else:
+            finished = "exists already" in told and in_one_line(told)
+            same = False
+            if finished:
+                with suppress(Exception):
+                    same = self.surface.result(folder) == self.expected
+            self.tally.note(attack, code, "" if same else f"not to be done again: {told[-300:]}")
+
+    def kills(self, count):
+        """At points of synchronisation, every one where there are few, and at any time."""
+        total = self.points()
+        some = range(1, total + 1)
+        if total > count:
+            some = sorted(self.random.choice(total, count, replace=False) + 1)
+        for number in some:
+            folder = self._new()
+            code, _ = forked(self.surface.act, folder, before=at_sync(number, _die))
+            self.again("killed at a sync", folder, code)
+        for _ in range(count // 2):
+            folder = self._new()
+            wait = self.random.uniform(0, self.seconds)
+            code, _ = forked(self.surface.act, folder, seconds=wait)
+            self.again("killed at any time", folder, code)
+
+    def full_disks(self, count):
+        """An error at a point of synchronisation, and files that can't grow."""
+        total = self.points()
+        some = range(1, total + 1)
+        if total > count:
+            some = sorted(self.random.choice(total, count, replace=False) + 1)
+        ways = [("full at a sync", at_sync(number, _disk_is_full)) for number in some]
+        largest = max(path.stat().st_size for path in self.peace.rglob("*") if path.is_file())
+        sizes = np.exp(self.random.uniform(3, np.log(largest), count // 2))
+        ways += [("files can't grow", limited(int(size))) for size in sizes]
+        for attack, before in ways:
+            folder = self._new()
+            code, told = forked(self.surface.act, folder, before=before)
+            if code not in (0, 2) or (code == 2 and told and not in_one_line(told)):
+                self.tally.note(attack, code, f"exit code {code}: {told[-600:]}")
+            else:
+                self.again(attack, folder, code)
+
+    def together(self, count):
+        """Two at once: each does its work or says why not, and one result is there."""
+        for _ in range(count):
+            folder = self._new()
+            children = [self._start(folder, name) for name in ("a", "b")]
+            codes = []
+            for child, told in children:
+                code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+                words = told.read_text(errors="replace")
+                codes.append(code)
+                if code not in (0, 2) or (code == 2 and not in_one_line(words)):
+                    self.tally.note("two at once", code, f"exit code {code}: {words[-400:]}")
+            same = 0 in codes and self.surface.result(folder) == self.expected
+            self.tally.note("two at once", sorted(codes), "" if same else "another result, or none")
+
+    def _start(self, folder, name):
+        told = folder.with_suffix(f".{name}")
+        child = os.fork()
+        if not child:
+            code = 1
+            with suppress(BaseException):
+                code = _in_child(self.surface.act, folder, lambda: None, told)
+            os._exit(code)
+        return child, told
+
+    def damages(self, count):
+        """Flip a bit of a file that is read: it is refused in a line, or nothing changes."""
+        surface = self.surface
+        assert surface.read is not None
+        files = surface.files(self.peace)
+        sizes = np.array([path.stat().st_size for path in files], float)
+        expected = surface.read(self.peace)
+        for _ in range(count):
+            # small files count as much as large ones, half of the time
+            weights = sizes / sizes.sum() if self.random.random() < 0.5 else None
+            path = files[self.random.choice(len(files), p=weights)]
+            content = path.read_bytes()
+            bit = int(self.random.integers(8 * len(content)))
+            flip_bit(path, bit)
+            try:
+                outcome = "no harm" if surface.read(self.peace) == expected else "other data"
+            except (InputError, SystemExit) as error:
+                outcome = "refused" if "\n" not in str(error) else "refused in several lines"
+            except Exception as error:
+                outcome = f"failed: {type(error).__name__}: {error}"
+            finally:
+                path.write_bytes(content)
+            is_met = outcome in ("no harm", "refused")
+            fault = "" if is_met else f"bit {bit} of {path.name}: {outcome}"
+            self.tally.note("a bit flipped", outcome.partition(":")[0], fault)
+
+
+def attack(surface, folder, *, kills=0, full=0, twice=0, flips=0, seed=0):
+    """Attack in each way so many times; the tally."""
+    attacker = Attacker(surface, folder, seed)
+    for way, count in (
+        (attacker.kills, kills),
+        (attacker.full_disks, full),
+        (attacker.together, twice),
+    ):
+        if count:
+            way(count)
+    if flips and surface.read:
+        attacker.damages(flips)
+    return attacker.tally
+
+
+def digest(*paths):
+    """Of files, by their names."""
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}

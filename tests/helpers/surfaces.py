@@ -1,0 +1,263 @@
+"""What is attacked: every command that makes something, at toy size."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from attacks import Surface, command, digest
+from click.testing import CliRunner
+from command import in_this_process
+from small import brief
+
+from jbrep.cli import main
+from jbrep.collect import collect
+from jbrep.dataset import Dataset
+from jbrep.dataset.formats import export, open_source
+from jbrep.dataset.manifest import read_manifest
+from jbrep.encoders import load
+from jbrep.envs import describe
+from jbrep.records.document import read_document
+from jbrep.report import make_report
+from jbrep.report.report import STATISTICS, SUMMARY
+from jbrep.report.tables import read_tables
+from jbrep.rl import Run
+from jbrep.rl.files import CHECKPOINT, EVALUATIONS, POLICY, RUN
+from jbrep.rl.job import Job, Session
+from jbrep.rl.trainers import train_jobs
+from jbrep.rl.tune import BEST, SEARCH
+from jbrep.study.config import Study
+from jbrep.study.plan import STUDY, Plan
+from jbrep.study.record import RECORD
+from jbrep.study.registration import REGISTRATION, Registration
+from jbrep.study.runner import run_study
+from jbrep.study.tables import REFERENCE_RETURNS, RETURNS
+
+PENDULUM = describe("Pendulum-v1", max_episode_steps=20)
+SHORT = ("--task", "Pendulum-v1", "--episode-steps", 20, "--steps", 40, "--evaluation-episodes", 1)
+TINY = Study(
+    tasks=("face_direction",),
+    algorithms=("a2c",),
+    representations=("full",),
+    seeds=(0, 1),
+    steps=40,
+    evaluate_every=40,
+    evaluation_episodes=1,
+    final_episodes=1,
+    episode_steps=20,
+)
+
+
+def surfaces(shared):
+    """All of them; what they read is made once in a folder, before the first fork."""
+    data, model = shared / "data", shared / "model.onnx"
+    collect(brief(), data)
+    task = ("--task", "face_direction")
+    command_or_refusal("encoder", "export", "pca-4", *task, "--out", model)
+    exported = {to: shared / f"data.{to}" for to in ("npz", "parquet", "minari")}
+    for to, path in exported.items():
+        export(Dataset(data), to, path)
+    exported["minari"] = next(exported["minari"].rglob("main_data.hdf5")).parent
+    tables = shared / "study"
+    plan = Plan(TINY, tables)
+    run_study(plan, in_this_process, 1)
+    make_report(tables)
+    return [
+        _tune(),
+        _run("sac", overrides=CHEAP, trainer="cohort"),
+        _run("ppo", overrides={"net_arch": [4], "n_steps": 8, "batch_size": 8}),
+        *(_import(to, path) for to, path in exported.items()),
+        *(_export(to, Dataset(data)) for to in exported),
+        _encoder_import(model, task),
+        _encoder_export(task),
+        _registration(),
+        _report(tables),
+    ]
+
+
+CHEAP = {"net_arch": [8], "learning_starts": 8, "batch_size": 8, "buffer_size": 100}
+
+
+def _tune():
+    given = ("--algorithm", "a2c", "--trials", 3, "--set", "net_arch=[4]")
+
+    def act(folder):
+        command("tune", *SHORT, *given, "--out", folder / "it")
+
+    def result(folder):
+        runs = sorted(folder.rglob(EVALUATIONS))
+        return digest(folder / "it" / BEST), [digest(path) for path in runs]
+
+    def read(folder):
+        command_or_refusal("tune", *SHORT, *given, "--out", folder / "it")
+        return result(folder)
+
+    def files(folder):
+        return [folder / "it" / SEARCH, *folder.rglob(RUN), *folder.rglob(EVALUATIONS)]
+
+    return Surface("tune", act, result, files, read)
+
+
+def command_or_refusal(*arguments):
+    """A command in this process, quietly; SystemExit with its line if it refuses."""
+    told = CliRunner().invoke(main, [*map(str, arguments)], prog_name="jbrep")
+    if told.exception and not isinstance(told.exception, SystemExit):
+        raise told.exception
+    if told.exit_code:
+        raise SystemExit(told.output.rstrip("\n").rpartition("\n")[2])
+
+
+def _run(algorithm, **settings):
+    """Two runs that write a checkpoint at every step; in a cohort, together."""
+    runs = [
+        Run.of(task=PENDULUM, algorithm=algorithm, steps=32, seed=seed, **LAST, **settings)
+        for seed in (0, 1)
+    ]
+
+    def jobs(folder):
+        return [Job(run, folder / f"seed-{run.seed}") for run in runs]
+
+    def act(folder):
+        list(train_jobs(jobs(folder), Session(save_every=0)))
+
+    def result(folder):
+        return [digest(job.folder / POLICY, job.folder / EVALUATIONS) for job in jobs(folder)]
+
+    def files(folder):
+        """Checkpoints, of runs that are stopped on the way."""
+        half = folder / "half"
+        if not half.exists():
+            asked = iter(range(100))
+            try:
+                list(train_jobs(jobs(half), Session(save_every=0, stop=lambda: next(asked) > 1)))
+            except Exception as error:
+                assert type(error).__name__ == "StoppedError"  # noqa: PT017
+        return sorted(half.rglob(CHECKPOINT))
+
+    def read(folder):
+        """What a checkpoint says; it is read whole before training goes on."""
+        files(folder)
+        found = [job.checkpoint.read() for job in jobs(folder / "half")]
+        return [
+            ({name: each.tobytes() for name, each in one.tensors.items()}, one.counters)
+            for one in found
+            if one
+        ]
+
+    return Surface(f"checkpoints of {algorithm}", act, result, files, read)
+
+
+LAST = {"evaluation_episodes": 1, "final_episodes": 1, "evaluate_every": 32}
+
+
+def _import(to, path):
+    def act(folder):
+        command("data", "import", path, "--out", folder / "it")
+
+    def result(folder):
+        return read_manifest(folder / "it").fingerprint
+
+    def copied(folder):
+        """What is damaged is a copy."""
+        there = folder / path.name
+        if not there.exists():
+            (shutil.copytree if path.is_dir() else shutil.copy)(path, there)
+            if to == "parquet":
+                shutil.copy(path.with_stem(f"{path.stem}-episodes"), folder)
+        return there
+
+    def files(folder):
+        there = copied(folder)
+        if to == "parquet":
+            return [there, there.with_stem(f"{there.stem}-episodes")]
+        return sorted(there.iterdir()) if there.is_dir() else [there]
+
+    def read(folder):
+        source = open_source(str(copied(folder)))
+        episodes = [[np.asarray(each).tolist() for each in e] for e in source.episodes()]
+        return episodes, source.features or source.task
+
+    return Surface(f"import of {to}", act, result, files, read)
+
+
+def _export(to, dataset):
+    def act(folder):
+        command("data", "export", dataset.folder, "--to", to, "--out", folder / f"it.{to}")
+
+    def result(folder):
+        given = folder / f"it.{to}"
+        given = next(given.rglob("main_data.hdf5")).parent if to == "minari" else given
+        known = [e.observation.tobytes() for e in open_source(str(given)).episodes()]
+        left = [path.name for path in folder.rglob(".*")]
+        return known, left
+
+    return Surface(f"export to {to}", act, result)
+
+
+def _encoder_import(model, task):
+    def act(folder):
+        command("encoder", "import", model, *task, "--out", folder / "it.safetensors")
+
+    def result(folder):
+        return load(folder / "it.safetensors").fingerprint
+
+    def files(folder):
+        return [folder / "it.safetensors"]
+
+    return Surface("encoder import", act, result, files, result)
+
+
+def _encoder_export(task):
+    def act(folder):
+        command("encoder", "export", "dae-4", *task, "--out", folder / "it.onnx")
+
+    return Surface("encoder export", act, lambda folder: digest(folder / "it.onnx"))
+
+
+def _registration():
+    def act(folder):
+        (folder / "it.toml").write_text(TINY.toml())
+        command("study", folder / "it.toml", "--register", "--out", folder / "it")
+
+    def result(folder):
+        registered = read_document(folder / "it" / REGISTRATION, Registration)
+        return digest(folder / "it" / STUDY), registered.study, registered.encoders
+
+    def files(folder):
+        return [folder / "it" / REGISTRATION, folder / "it" / STUDY]
+
+    def read(folder):
+        plan = Plan(TINY, folder / "it")
+        plan.write()
+        return plan.registration
+
+    return Surface("registration", act, result, files, read)
+
+
+def _report(study: Path):
+    """Of runs; what is damaged are tables alone, as results are passed on."""
+
+    def prepare(folder):
+        shutil.copytree(study, folder / "it", ignore=shutil.ignore_patterns("report.html"))
+
+    def act(folder):
+        command("report", folder / "it", "--json")
+
+    def result(folder):
+        it = folder / "it"
+        names = (RETURNS, REFERENCE_RETURNS, RECORD, SUMMARY, STATISTICS)
+        return digest(*(it / name for name in names))
+
+    def files(folder):
+        alone = folder / "alone"
+        if not alone.exists():
+            alone.mkdir()
+            for name in (RETURNS, REFERENCE_RETURNS, RECORD):
+                shutil.copy(folder / "it" / name, alone)
+        return [alone / name for name in (RETURNS, REFERENCE_RETURNS, RECORD)]
+
+    def read(folder):
+        files(folder)
+        tables = read_tables(folder / "alone")
+        return tables.returns, tables.references, tables.record.text()
+
+    return Surface("report", act, result, files, read, prepare)

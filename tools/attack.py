@@ -1,0 +1,42 @@
+"""Kill commands, fill their disk, run two at once and flip bits: python tools/attack.py 100.
+
+Each surface is attacked so many times in each way, and flipped ten times as many bits. It prints
+what came of it, and ends with code 1 where something false came of an attack.
+"""
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+HELPERS = Path(__file__).resolve().parent.parent / "tests" / "helpers"
+
+
+def main() -> None:
+    sys.path.insert(0, str(HELPERS))
+    from attacks import attack
+    from surfaces import surfaces
+
+    times = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+    only = sys.argv[2] if len(sys.argv) > 2 else ""
+    faults = 0
+    with tempfile.TemporaryDirectory() as temporary:
+        for surface in surfaces(Path(temporary) / "shared"):
+            if only not in surface.name:
+                continue
+            begun = time.monotonic()
+            counts = {"kills": times, "full": times, "twice": times // 4, "flips": 10 * times}
+            tally = attack(surface, Path(temporary), **counts, seed=1)
+            seconds = time.monotonic() - begun
+            print(f"{surface.name}: {seconds:.0f} s", flush=True)
+            for what, count in sorted(tally.counts.items()):
+                print(f"  {count:6} {what}")
+            for fault in tally.faults:
+                print(f"  FAULT {fault}", flush=True)
+            faults += len(tally.faults)
+    print(f"{faults} faults")
+    sys.exit(bool(faults))
+
+
+if __name__ == "__main__":
+    main()
