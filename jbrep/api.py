@@ -24,18 +24,17 @@ from jbrep.evaluate.diagnosis import diagnose, write
 from jbrep.evaluate.evaluation import Evaluation
 from jbrep.methods.fit import Fitter
 from jbrep.play.sources import find_good_policy, find_policy
-from jbrep.report.report import PAGE, write_report_of
+from jbrep.report.report import PAGE, make_report
 from jbrep.report.statistics import results_text
-from jbrep.report.tables import Tables, read_tables
+from jbrep.report.tables import Tables
 from jbrep.rl import Run
 from jbrep.rl.controller import Controller, load_policy
 from jbrep.rl.files import FINISHED, RunRecord, last_returns, read_evaluations
 from jbrep.rl.trainers import train as train_run
-from jbrep.study import Plan, Study, conclude, read_study, run_study
+from jbrep.study import Plan, Study, read_study, run_study
 from jbrep.study.config import as_study
-from jbrep.study.results import has_runs
 from jbrep.study.runner import BACKENDS
-from jbrep.study.tables import Return, add_diagnostics
+from jbrep.study.tables import Return
 from jbrep.text import interval_of, terminal_width
 
 __all__ = [
@@ -283,13 +282,9 @@ def report(
     Raises:
         InputError: there is nothing of a study, or a file is damaged.
     """
-    source = Path(folder)
-    if has_runs(source):
-        conclude(source)
-    notes = add_diagnostics(source, evaluation)
-    tables, target = read_tables(source, across_trainers), Path(out or source)
-    write_report_of(tables, target)
-    return Report(target, tables, tuple(notes))
+    target = Path(out or folder)
+    made = make_report(Path(folder), target, evaluation, across_trainers)
+    return Report(target, made.tables, tuple(made.lines))
 
 
 def _study(given: Study | Mapping[str, Any] | str | Path) -> Study:

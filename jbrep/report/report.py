@@ -28,7 +28,7 @@ _MAIN_FIGURE = "representations"
 _MOST_SECONDS = 600.0  # to wait for another process's report
 
 
-class Report(NamedTuple):
+class Made(NamedTuple):
     """What was reported."""
 
     tables: Tables
@@ -41,7 +41,7 @@ def make_report(
     out: Path | None = None,
     evaluations: Sequence[str] = (),
     across_trainers: bool = False,
-) -> Report:
+) -> Made:
     """Write the tables of the runs below a folder, if there are any, and the report of the tables.
 
     Another process that reports of the same folder is waited for.
@@ -67,7 +67,7 @@ def make_report(
             conclude(folder)
         lines = add_diagnostics(folder, evaluations)
         tables = read_tables(folder, across_trainers)
-        return Report(tables, ran, lines, [*paths, *write_report_of(tables, out)])
+        return Made(tables, ran, lines, [*paths, *write_report_of(tables, out)])
 
 
 def write_report(
