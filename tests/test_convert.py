@@ -403,6 +403,18 @@ def test_a_model_that_is_no_chain_is_refused_by_name(given, message, tmp_path):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("operator", ["Mul", "MatMul", "Transpose"])
+def test_a_model_whose_nodes_make_many_numbers_of_few_is_refused(operator, tmp_path, monkeypatch):
+    monkeypatch.setattr("jbrep.encoders.from_onnx._MOST_KEPT", 100_000)
+    weights = {"W": f32(16, 100), "V": f32(100, 100), "s": np.float32(2)}
+    of = {"Mul": "h s", "MatMul": "h V", "Transpose": "V"}[operator]
+    nodes = ["h = MatMul x W", *(f"y{i} = {operator} {of}" for i in range(30))]
+    path = tmp_path / "it.onnx"
+    path.write_bytes(model("; ".join(nodes), weights).SerializeToString())
+    with pytest.raises(InputError, match="the nodes before it make more than 100,000 numbers"):
+        convert(path, TASK, None, "mine")
+
+
 @pytest.mark.parametrize("kind", ["none", "text", "folder", "pipe", "link", "huge"])
 def test_what_is_no_model_is_refused(kind, tmp_path):
     path = tmp_path / "it.onnx"

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import warnings
 import zipfile
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
@@ -19,6 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from command import jbrep
+from gymnasium import spaces
 from small import flip_bit, settings
 
 from jbrep.collect import collect
@@ -32,6 +34,7 @@ from jbrep.dataset.manifest import shard_name
 from jbrep.dataset.verify import find_problems
 from jbrep.encoders import find
 from jbrep.envs import describe
+from jbrep.envs.description import features_of
 from jbrep.envs.names import import_modules
 from jbrep.envs.task import check_same
 from jbrep.errors import InputError
@@ -361,6 +364,7 @@ BAD_ARRAYS = {
         "final_observations": np.zeros((3, 4)),
     },
     "action 0 ranges from -1.* to 2.5, beyond [-2, 2]": spoiled("actions", 2, 2.5),
+    "observations of shape (5000,): at most 4,096": {"observations": np.zeros((20, 5000))},
     "images, observations of shape (64, 64, 3)": {"observations": np.zeros((20, 64, 64, 3))},
     "observations of type object": {"observations": [{"a": 1}] * 20},
     "observations of different sizes": {"observations": [[1, 2, 3]] * 19 + [[1, 2]]},
@@ -402,6 +406,79 @@ def test_bad_tables_are_refused(problem, tmp_path):
     with pytest.raises(InputError, match=re.escape(problem)):
         import_data(str(path), tmp_path / "data")
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_two_columns_of_one_name_are_refused(tmp_path):
+    plain_table(tmp_path / "a.parquet")
+    given = pq.read_table(tmp_path / "a.parquet")
+    pq.write_table(given.append_column("reward", given["reward"]), tmp_path / "a.parquet")
+    with pytest.raises(InputError, match=r"two columns 'reward': rename one"):
+        import_data(str(tmp_path / "a.parquet"), tmp_path / "data")
+
+
+def test_what_would_take_far_more_memory_than_its_file_is_refused(tmp_path, monkeypatch):
+    d4rl(tmp_path / "a.npz", feature_names=np.zeros(2_000_000, "<U1"))
+    with pytest.raises(InputError, match=r"8,000,000 bytes in feature_names"):
+        import_data(str(tmp_path / "a.npz"), tmp_path / "data")
+    monkeypatch.setattr("jbrep.dataset.formats.npz._MOST_AT_ONCE", 100)
+    d4rl(tmp_path / "a.npz")  # stored by columns
+    with pytest.raises(InputError, match=r"480 bytes in observations, which must be read at once"):
+        import_data(str(tmp_path / "a.npz"), tmp_path / "data")
+
+    for space in (spaces.Discrete(10**6), spaces.MultiBinary(10**8)):
+        with pytest.raises(InputError, match="at most 4,096 are possible"):
+            list(features_of("it", space))
+
+
+def of_other_files(file, elsewhere):
+    """What an HDF5 file may have of other files, and what isn't there at all."""
+    episode = file["episode_0"]
+    yield "a link", lambda: episode.__setitem__("rewards", h5py.ExternalLink(elsewhere, "x"))
+    yield "a link", lambda: episode.__setitem__("rewards", h5py.SoftLink("/episode_0/actions"))
+    yield (
+        "in another file",
+        lambda: episode.create_dataset("rewards", (12,), "<f8", external=[(elsewhere, 0, 96)]),
+    )
+    layout = h5py.VirtualLayout((12,), "<f8")
+    layout[:] = h5py.VirtualSource(elsewhere, "x", (12,))
+    yield "in another file", lambda: episode.create_virtual_dataset("rewards", layout)
+    yield "would have", lambda: episode.create_dataset("rewards", (1 << 40,), "<f8", chunks=(9,))
+
+
+@pytest.mark.parametrize("harm", range(5))
+def test_a_minari_data_set_reads_nothing_outside_itself(harm, minari_folder, tmp_path):
+    """A pipe that nobody fills would hang."""
+    folder = Path(minari_copy(minari_folder, tmp_path))
+    os.mkfifo(tmp_path / "pipe")
+    (path,) = folder.rglob("*.hdf5")
+    with h5py.File(path, "r+") as file:
+        message, do = list(of_other_files(file, str(tmp_path / "pipe")))[harm]
+        del file["episode_0"]["rewards"]
+        do()
+    with pytest.raises(InputError, match=message):
+        import_data(str(folder), tmp_path / "data")
+
+
+def test_a_minari_data_set_has_plain_files_and_harmless_arguments(minari_folder, tmp_path):
+    folder = Path(minari_copy(minari_folder, tmp_path))
+    (path,) = folder.rglob("*.hdf5")
+    path.rename(tmp_path / "elsewhere")
+    path.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="must be a plain file"):
+        import_data(str(folder), tmp_path / "data")
+    path.unlink()
+    (tmp_path / "elsewhere").rename(path)
+    metadata = next(folder.rglob("metadata.json"))
+    known = json.loads(metadata.read_text())
+    for text in ("/etc/passwd", "pipe.xml", "../up"):
+        spec = {"id": "Pendulum-v1", "kwargs": {"g": [{"a": text}]}, "max_episode_steps": 200}
+        metadata.write_text(json.dumps({**known, "env_spec": json.dumps(spec)}))
+        source = open_source(str(folder))
+        assert source.task is None
+        assert "may name files" in source.why_no_task
+    metadata.write_text(json.dumps({**known, "total_episodes": "many"}))
+    with pytest.raises(InputError, match="can't be read as a Minari data set"):
+        import_data(str(folder), tmp_path / "data")
 
 
 class Evil:

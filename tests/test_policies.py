@@ -110,7 +110,11 @@ def test_policies_as_people_write_them(text, policy):
         ("ornstein-uhlenbeck:sigma=1e15", "it must be a number from 0 to 1,000,000"),
         ("uniform+heuristic", "unknown policy 'uniform\\+heuristic': choose one of uniform"),
         ("uniform:0.5+heuristic", "weight 'heuristic' must be a positive number"),
-        ("uniform:0+heuristic:1", "weight '0' must be a positive number: each part of a mixture"),
+        ("uniform:1e308+uniform:1e308", "weight '1e308' must be a positive number below 1e12"),
+        (
+            "uniform:0+heuristic:1",
+            "weight '0' must be a positive number below 1e12: each part of a mixture",
+        ),
         ("uniform:0.5+heuristic:nan", "weight 'nan' must be a positive number"),
         ("uniform:0.5+sprint:0.5", "unknown policy 'sprint'"),
     ],

@@ -20,6 +20,7 @@ from jbrep.jitterbug.heuristics import HEURISTICS
 from jbrep.records.record import Record, from_plain, to_plain
 
 _Drive = Annotated[float, Meta(ge=-1, le=1)]  # from the lower bound to the upper
+_MAX_WEIGHT = 1e12
 _BLOCK = 1000  # steps that actions are drawn for at a time
 
 
@@ -255,10 +256,10 @@ def _weight(text: str) -> float:
         weight = float(text)
     except ValueError:
         weight = math.nan
-    if not 0 < weight < math.inf:
+    if not 0 < weight < _MAX_WEIGHT:
         raise InputError(
-            f"the weight {text!r} must be a positive number: each part of a mixture has one, as in "
-            "uniform:0.8+heuristic:0.2"
+            f"the weight {text!r} must be a positive number below 1e12: each part of a mixture "
+            "has one, as in uniform:0.8+heuristic:0.2"
         )
     return weight
 
