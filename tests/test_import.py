@@ -422,7 +422,7 @@ def test_what_would_take_far_more_memory_than_its_file_is_refused(tmp_path, monk
         import_data(str(tmp_path / "a.npz"), tmp_path / "data")
     monkeypatch.setattr("jbrep.dataset.formats.npz._MOST_AT_ONCE", 100)
     d4rl(tmp_path / "a.npz")  # stored by columns
-    with pytest.raises(InputError, match=r"480 bytes in observations, which must be read at once"):
+    with pytest.raises(InputError, match=r"240 bytes in observations, which must be read at once"):
         import_data(str(tmp_path / "a.npz"), tmp_path / "data")
 
     for space in (spaces.Discrete(10**6), spaces.MultiBinary(10**8)):

@@ -113,7 +113,7 @@ def test_policies_as_people_write_them(text, policy):
         ("uniform:1e308+uniform:1e308", "weight '1e308' must be a positive number below 1e12"),
         (
             "uniform:0+heuristic:1",
-            "weight '0' must be a positive number below 1e12: each part of a mixture",
+            "weight '0' must be a positive number below 1e12: each",
         ),
         ("uniform:0.5+heuristic:nan", "weight 'nan' must be a positive number"),
         ("uniform:0.5+sprint:0.5", "unknown policy 'sprint'"),

@@ -146,7 +146,8 @@ def model(encoder: Encoder) -> onnx.ModelProto:
         latent = encoder.arrays.encode(observation)
         yield "latent", latent
         if encoder.can_decode:
-            yield "reconstruction", encoder.arrays.decode(latent)
+            coded = _Rows(latent.graph, "latent", latent.width)  # so that a decoder begins there
+            yield "reconstruction", encoder.arrays.decode(coded)
 
     return traced(encoder.name, encoder.size, outputs, encoder.header.as_json())
 

@@ -13,6 +13,7 @@ import stat
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -146,11 +147,11 @@ def _check_files(given: str, folder: Path) -> None:
     for path in sorted(folder.rglob("*.hdf5")):
         try:
             with h5py.File(path) as file:
-                file.visititems_links(lambda name, link: _check_link(path, file, name, link))  # noqa: B023
-        except InputError:
-            raise
+                problem = file.visititems_links(partial(_link_problem, file))
         except Exception as error:  # whatever HDF5 raises at damaged files
             raise _unreadable(given, error) from None
+        if problem:
+            raise InputError(f"{path}: {problem}")
 
 
 def _sha256(path: Path) -> str:
@@ -162,21 +163,22 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _check_link(path: Path, file: h5py.File, name: str, link: Any) -> None:
-    """Make sure that a name in an HDF5 file stands for what is in the file itself."""
+def _link_problem(file: h5py.File, name: str, link: Any) -> str | None:
+    """Why a name in an HDF5 file stands for something else than what is in the file itself."""
     if not isinstance(link, h5py.HardLink):
-        raise InputError(f"{path}: {name} is a link, which isn't followed")
+        return f"{name} is a link, which isn't followed"
     found = file[name]
     if not isinstance(found, h5py.Dataset):
-        return
+        return None
     if found.external or found.is_virtual:
-        raise InputError(f"{path}: {name} is in another file, which isn't opened")
+        return f"{name} is in another file, which isn't opened"
     stored = found.id.get_storage_size()
-    if found.nbytes > min(_MOST_AT_ONCE, _SQUEEZED * (stored + 1)):
-        raise InputError(
-            f"{path}: {name} would have {found.nbytes:,} bytes, of which {stored:,} are stored: "
-            f"at most {_MOST_AT_ONCE:,} are possible, and what is stored"
-        )
+    if found.nbytes <= min(_MOST_AT_ONCE, _SQUEEZED * (stored + 1)):
+        return None
+    return (
+        f"{name} would have {found.nbytes:,} bytes, of which {stored:,} are stored: at most "
+        f"{_MOST_AT_ONCE:,} are possible, and what is stored"
+    )
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
