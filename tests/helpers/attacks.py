@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -156,13 +157,13 @@ class Attacker:
         self.surface.prepare(folder)
         return folder
 
+    @cached_property
     def points(self):
         """How often it comes to a point of synchronisation."""
         folder, counted = self._new(), self.folder / "points"
 
         def count():
             counted.write_text("")
-            at_sync(-1, lambda: None)()
             for name in SYNCS:
                 call = getattr(os, name)
 
@@ -179,20 +180,16 @@ class Attacker:
     def again(self, attack, folder, code):
         """The same once more must come to what it comes to in peace."""
         ended, told = forked(self.surface.act, folder)
-        if ended == 0 or (code == 0 and in_one_line(told) and "exists already" in told):
-            result = self.surface.result(folder)
-            self.tally.note(attack, code, "" if result == self.expected else "another result")
-        else:
-            finished = "exists already" in told and in_one_line(told)
-            same = False
-            if finished:
-                with suppress(Exception):
-                    same = self.surface.result(folder) == self.expected
-            self.tally.note(attack, code, "" if same else f"not to be done again: {told[-300:]}")
+        is_done = ended == 0 or ("exists already" in told and in_one_line(told))
+        if not is_done:
+            self.tally.note(attack, code, f"not to be done again: {told[-300:]}")
+            return
+        result = self.surface.result(folder)
+        self.tally.note(attack, code, "" if result == self.expected else "another result")
 
     def kills(self, count):
         """At points of synchronisation, every one where there are few, and at any time."""
-        total = self.points()
+        total = self.points
         some = range(1, total + 1)
         if total > count:
             some = sorted(self.random.choice(total, count, replace=False) + 1)
@@ -208,7 +205,7 @@ class Attacker:
 
     def full_disks(self, count):
         """An error at a point of synchronisation, and files that can't grow."""
-        total = self.points()
+        total = self.points
         some = range(1, total + 1)
         if total > count:
             some = sorted(self.random.choice(total, count, replace=False) + 1)
