@@ -250,9 +250,9 @@ class Attacker:
         """Flip a bit of a file that is read: it is refused in a line, or nothing changes."""
         surface = self.surface
         assert surface.read is not None
+        expected = surface.read(self.peace)
         files = surface.files(self.peace)
         sizes = np.array([path.stat().st_size for path in files], float)
-        expected = surface.read(self.peace)
         for _ in range(count):
             # small files count as much as large ones, half of the time
             weights = sizes / sizes.sum() if self.random.random() < 0.5 else None

@@ -146,7 +146,7 @@ def _run(algorithm, **settings):
     return Surface(f"checkpoints of {algorithm}", act, result, files, read)
 
 
-LAST = {"evaluation_episodes": 1, "final_episodes": 1, "evaluate_every": 32}
+LAST = {"preset": "modern", "evaluation_episodes": 1, "final_episodes": 1, "evaluate_every": 32}
 
 
 def _import(to, path):
