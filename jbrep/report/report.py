@@ -67,7 +67,7 @@ def make_report(
             conclude(folder)
         lines = add_diagnostics(folder, evaluations)
         tables = read_tables(folder, across_trainers)
-        return Made(tables, ran, lines, [*paths, *write_report_of(tables, out)])
+        return Made(tables, lines, write_report_of(tables, out))
 
 
 def write_report(
