@@ -23,8 +23,9 @@ from jbrep.play.jitterbug import read, reward_terms
 from jbrep.play.player import Player
 from jbrep.play.rollout import replay
 from jbrep.play.sources import find_episode, find_player
+from jbrep.report.tables import read_tables
 from jbrep.rl import Run, train
-from jbrep.rl.files import EVALUATION_SEED, read_evaluations
+from jbrep.rl.files import ENCODER, EVALUATION_SEED, read_evaluations
 from jbrep.rl.policy import load_untrained
 
 SHORT = {
@@ -217,6 +218,14 @@ def test_arrays_of_the_wrong_shape_are_named_with_both_shapes():
 def test_mistakes(source, episode, task, message):
     with pytest.raises(InputError, match=message):
         find_episode(source, episode, task and describe(task))
+
+
+def test_a_run_in_its_first_minute_is_told_from_what_is_none(tmp_path):
+    (tmp_path / ENCODER).touch()
+    with pytest.raises(InputError, match=r"has no checkpoint\.safetensors yet, which a run writes"):
+        find_player(str(tmp_path))
+    with pytest.raises(InputError, match="has ended yet: report them then"):
+        read_tables(tmp_path)
 
 
 def test_a_data_set_has_its_own_time_limit():

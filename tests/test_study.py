@@ -185,8 +185,11 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
     assert TINY.comparisons == 1
     assert TINY.notices == [
         "This study is exploratory: its report will give no verdicts, as its file names no cell in "
-        "verdicts.primary."
+        "verdicts.primary.",
+        "Encoders that ship with jbrep: pca-8. Your own are tables with a file: {name = ..., "
+        "file = ...}.",
     ]
+    assert TINY.replace(data=Data(steps=1000)).notices == TINY.notices[:1]
     path = written(tmp_path, f"representations = {json.dumps(representations)}")
     monkeypatch.setattr("jbrep.study.packing.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
@@ -436,7 +439,7 @@ def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     path = written(tmp_path)
     out = shutil.copytree(done.folder, tmp_path / "out")
     monkeypatch.setattr("jbrep.study.run_study", lambda *given: 2)
-    monkeypatch.setattr("jbrep.report.report.write_report_of", lambda tables, out: [])
+    monkeypatch.setattr("jbrep.report.report.write_report_of", lambda tables, out: [out])
     told = jbrep("study", path, "--out", out)
     assert told.exit_code == 1
     assert told.stderr.endswith("2 runs crashed: the same command tries them again\n")

@@ -47,7 +47,6 @@ def report(page: Path, out: Path) -> None:
         browser = started.chromium.launch(executable_path=path, args=["--no-sandbox"])
         opened = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
         opened.goto(page.resolve().as_uri())
-        opened.locator(".matrix summary").first.click()
         save(Image.open(io.BytesIO(opened.screenshot())), out)
         browser.close()
 

@@ -133,12 +133,11 @@ def report(
 
     from jbrep.errors import InputError
     from jbrep.records.storage import check_writable
-
-    if not folder.exists():
-        raise InputError(f"{folder} is not the folder of a study: there is no such folder")
     from jbrep.report.report import SUMMARY, make_report
     from jbrep.report.statistics import results_text
 
+    if not folder.exists():
+        raise InputError(f"{folder} is not the folder of a study: there is no such folder")
     if out:
         check_writable(out)
     made = make_report(folder, out, evaluation, across_trainers)

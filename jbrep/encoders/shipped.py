@@ -20,7 +20,7 @@ from jbrep.errors import InputError
 from jbrep.records.storage import exists
 
 _FOLDER = Path(__file__).parent / "shipped"
-_UNLEARNED: dict[str, System] = {  # encoders that are made of any task, and what they are on
+UNLEARNED: dict[str, System] = {  # encoders that are made of any task, and what they are on
     FULL: OBSERVATION,
     "coordinates": "coordinates",
     "symmetry": "symmetry",
@@ -49,7 +49,7 @@ def unlearned(task: Task, name: str = FULL) -> Encoder:
     Raises:
         InputError: the task has no such coordinates, or no such symmetry.
     """
-    return _scaled(task, name, tried_coordinates(task, _UNLEARNED[name]))
+    return _scaled(task, name, tried_coordinates(task, UNLEARNED[name]))
 
 
 def unscaled(task: Task) -> Encoder:
@@ -151,7 +151,7 @@ def source_of(name: str | Path, task: Task | None) -> str:
     if is_code(name):
         return f"{name}, code"
     if task and _is_made(name, task):
-        made = _scaled(task, str(name), make_coordinates(task, _UNLEARNED[str(name)]))
+        made = _scaled(task, str(name), make_coordinates(task, UNLEARNED[str(name)]))
         return f"{name}, {_SCALINGS[made.header.training['scaling']]}"
     return f"{name}, shipped" if task and str(name) in _files(task) else str(name)
 
@@ -173,7 +173,7 @@ def shipped_folder(task: Task) -> Path:
 
 def _is_made(name: str | Path, task: Task) -> bool:
     """Whether the name is of an encoder that needs no data and doesn't ship for a task."""
-    return str(name) in _UNLEARNED and str(name) not in _files(task)
+    return str(name) in UNLEARNED and str(name) not in _files(task)
 
 
 def _files(task: Task) -> dict[str, Path]:

@@ -27,7 +27,7 @@ from jbrep.inspection.traversal import record_traversal
 from jbrep.play.rollout import Rollout
 from jbrep.play.sources import find_episode, is_trained, run_folder
 from jbrep.records.storage import exists
-from jbrep.rl.files import ENCODER, is_run
+from jbrep.rl.files import ENCODER, check_begun, is_run
 from jbrep.stats import RunCurve
 from jbrep.stats.bootstrap import Array
 from jbrep.stats.runs import in_order, with_failure_returns
@@ -178,6 +178,7 @@ def _find(
         shown.check_task(task or shown.task)
         return find_episode(_POLICY, episode, task or shown.task), shown
     if _is_other_folder(Path(source)):
+        check_begun(Path(source))
         raise InputError(
             f"{source} is no data set, no run with a policy or checkpoint, and holds no finished "
             "run: jbrep collect makes a data set, jbrep rl a run"

@@ -18,7 +18,7 @@ from jbrep.play.player import Player
 from jbrep.play.rollout import Rollout, replay
 from jbrep.records.storage import exists
 from jbrep.rl import shipped
-from jbrep.rl.files import POLICY, POLICY_ZIP, is_policy_file, is_run
+from jbrep.rl.files import POLICY, POLICY_ZIP, check_begun, is_policy_file, is_run
 from jbrep.rl.shipped import SHIPPED
 
 if TYPE_CHECKING:
@@ -120,6 +120,7 @@ def check_source(source: str) -> None:
     """
     if is_trained(source) or is_by_name(source) or exists(Path(source) / MANIFEST):
         return
+    check_begun(Path(source))
     raise InputError(
         f"{source} is no data set, no run with a policy or checkpoint, and no policy by name: "
         f"those are {policy_names()}"

@@ -8,6 +8,7 @@ from jbrep.evaluate.table import DIAGNOSTICS, by_label, read_diagnostics
 from jbrep.records.document import read_document
 from jbrep.records.storage import exists
 from jbrep.records.tables import read_rows
+from jbrep.rl.files import ENCODER
 from jbrep.stats import Analysis
 from jbrep.stats.rules import Planned
 from jbrep.study.record import RECORD, RunsRecord
@@ -41,6 +42,8 @@ def check_tables(folder: Path) -> None:
         InputError: it has none.
     """
     if not exists(folder / RECORD):
+        if any(folder.rglob(ENCODER)):
+            raise InputError(f"no run in {folder} has ended yet: report them then")
         raise InputError(
             f"{folder} is not the folder of a study: it has neither runs nor a {RECORD}"
         )

@@ -36,6 +36,7 @@ RUN = "run.json"  # written last: its presence means that the run has ended
 POLICY = "policy.safetensors"
 POLICY_ZIP = "policy.zip"  # the same for stable-baselines3; jbrep doesn't read it
 CHECKPOINT = "checkpoint.safetensors"  # until the run ends
+SOON = "which a run writes about a minute after its start"  # of either, for messages
 BEGINNING = "beginning.safetensors"  # the policy that it begins with, if that is another run's
 ENCODER = "encoder.safetensors"
 EPISODES = "episodes.csv"
@@ -238,6 +239,16 @@ class Evaluation(NamedTuple):
 def is_run(folder: Path) -> bool:
     """Whether a folder is of a run that has ended or has written a checkpoint."""
     return exists(folder / RUN) or exists(folder / CHECKPOINT)
+
+
+def check_begun(folder: Path) -> None:
+    """Make sure that a folder isn't of a run that has only just begun.
+
+    Raises:
+        InputError: it is.
+    """
+    if exists(folder / ENCODER) and not is_run(folder):
+        raise InputError(f"the run in {folder} has no {CHECKPOINT} yet, {SOON}")
 
 
 def runs_below(folder: Path) -> list[Path]:

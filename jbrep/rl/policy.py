@@ -17,6 +17,7 @@ from jbrep.rl.files import (
     ENCODER,
     POLICY,
     RUN,
+    SOON,
     RunSettings,
     is_run,
     read_finished,
@@ -45,10 +46,7 @@ def load_run(folder: Path, encoder: Any = None) -> Trained:
         DamageError: a file isn't what was written.
     """
     if not is_run(folder):
-        raise InputError(
-            f"no run in {folder}: {RUN} or {CHECKPOINT} is expected, which a run writes about a "
-            "minute after its start"
-        )
+        raise InputError(f"no run in {folder}: {RUN} or {CHECKPOINT} is expected, {SOON}")
     if exists(folder / RUN):
         run, sha256 = read_finished(folder)
         policy = read(folder / POLICY, sha256)

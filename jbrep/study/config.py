@@ -11,6 +11,7 @@ from msgspec import Meta
 
 from jbrep.dataset.settings import MAX_ROOT_SEED
 from jbrep.encoders import FULL
+from jbrep.encoders.shipped import UNLEARNED
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES
 from jbrep.errors import InputError
@@ -288,6 +289,16 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             lines.append(
                 "This study is exploratory: its report will give no verdicts, as its file names no "
                 "cell in verdicts.primary."
+            )
+        shipped = [
+            each.name
+            for each in self.observed
+            if isinstance(each, ByName) and not self.data and each.name not in UNLEARNED
+        ]
+        if shipped:
+            lines.append(
+                f"Encoders that ship with jbrep: {', '.join(shipped)}. Your own are tables with a "
+                "file: {name = ..., file = ...}."
             )
         return lines
 
