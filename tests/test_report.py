@@ -440,6 +440,7 @@ def test_where_the_baseline_did_not_learn_nothing_is_compared(whole, tmp_path):
     copy_tables(whole, tmp_path / "idle")
     path = tmp_path / "idle" / REFERENCE_RETURNS
     path.write_text(re.sub(r"(random,\d+),.*", r"\1,900", path.read_text()))
+    adopt(tmp_path / "idle" / RECORD, REFERENCE_RETURNS)
     told = markdown(read_tables(tmp_path / "idle"), [], [], "figure.png")
     assert "Learned" not in told
     assert "**Agents on full didn't learn: nothing can be compared with them.**" in told
