@@ -19,6 +19,7 @@ from jbrep.cli.base import (
     STOP_SIGNALS,
     on_stop,
     say,
+    stoppable,
     with_options,
 )
 from jbrep.cli.environment import needed_task, parse_arguments, retries_option, task_options
@@ -178,6 +179,7 @@ def rl(
         from jbrep.rl.files import EVALUATIONS, RUN, last_returns, read_evaluations
         from jbrep.rl.job import Job, Session
         from jbrep.rl.trainers import train_jobs
+        from jbrep.study.single import beside
 
         is_one = is_one_robot(run.task, threads)
         job = Job(run, out, threads or cpu_count(), retries, is_one)
@@ -198,13 +200,16 @@ def rl(
     if result.reason is not None:
         click.echo(f"the run failed: {result.reason}; see {out / RUN}", err=True)
         context.exit(1)
-    say(f"encoder: {source}")
     last = last_returns(read_evaluations(out))
     name = result.settings.representation
     click.echo(
         f"returns on {name} at the end: {interval_of(last)}, median [10 %, 90 %] of {len(last)} "
-        f"episodes; all evaluations: {out / EVALUATIONS}"
+        "episodes"
     )
+    with stoppable("the run itself is finished"):
+        if compared := beside(run.task, last, min(len(last), run.evaluation_episodes)):
+            say(str(compared))
+    say(f"encoder: {source}; all evaluations: {out / EVALUATIONS}")
 
 
 def _writers(project: str | None, job: "Job") -> "list[KVWriter]":

@@ -79,7 +79,7 @@ def describe(
         seeds=tuple(int(run.seed) for run in runs),
         failed=tuple(int(run.seed) for run in runs if run.failed_at is not None),
         encoders=len({run.encoder_seed for run in runs}),
-        learnt=_learnt(final, scale.blind, runs[0].bounds),
+        learnt=learnt(final, scale.blind, runs[0].bounds),
         curve=bands(curves, seed),
         by_run=by_run,
         numbers={**_numbers(by_run, runs[0].bounds, seed), **_components(runs, final)},
@@ -87,7 +87,7 @@ def describe(
     )
 
 
-def _learnt(final: Array, blind: Interval, bounds: Bounds) -> str:
+def learnt(final: Array, blind: Interval, bounds: Bounds) -> str:
     """Whether final returns lie above a mean return beyond what is uncertain of either."""
     if surely_above(final, blind.value, bounds) and not final.mean() <= blind.high:
         return YES

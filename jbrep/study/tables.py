@@ -5,8 +5,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from jbrep.encoders import FULL
-from jbrep.envs.task import Task
+from jbrep.envs.task import Array, Task
 from jbrep.errors import DamageError, InputError
 from jbrep.evaluate.evaluation import EVALUATION, Evaluation
 from jbrep.evaluate.table import (
@@ -108,6 +110,19 @@ def write_references(
                     raise damage
                 rows += own
     return write_csv(path, ("task", "policy", "episode", "return"), rows) if rows else None
+
+
+def references_of(task: Task, episodes: int) -> dict[str, Array]:
+    """Returns of the reference policies of a task in its first episodes, by policy.
+
+    There is none of an environment that isn't installed.
+    """
+    return {
+        policy: np.array([row.episode_return for row in rows])
+        for policy in _POLICIES
+        if policy != LOOKING or task.name in HEURISTICS
+        if (rows := _played(task, policy, episodes))
+    }
 
 
 def read_references(folder: Path, sha256: str | None) -> References:

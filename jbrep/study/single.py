@@ -1,0 +1,59 @@
+"""A single run beside policies that don't learn."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jbrep.envs.task import Array, Task
+from jbrep.stats.intervals import LEVEL, Bounds, mean_within
+from jbrep.stats.labels import NO, UNCLEAR, YES, learnt
+from jbrep.stats.scale import LOOKING, best_blind
+from jbrep.study.tables import references_of
+from jbrep.text import counted, rounded
+
+_WORDS = {YES: "learned", UNCLEAR: "not clearly learned", NO: "not learned"}
+
+
+class Beside(NamedTuple):
+    """What a run's agent returns, beside policies that don't learn.
+
+    Attributes:
+        learnt: yes, no or unclear: whether it ends above the best policy that doesn't look.
+        references: mean returns by policy.
+        episodes: of each policy.
+    """
+
+    learnt: str
+    references: dict[str, float]
+    episodes: int
+
+    def __str__(self) -> str:
+        shown = dict(zip(self.references, rounded(*self.references.values()), strict=True))
+        written = shown.pop(LOOKING, None)
+        told = f"without looking {', '.join(f'{name} {value}' for name, value in shown.items())}"
+        told += f"; {LOOKING} {written}" if written else ""
+        played = counted(self.episodes, "episode")
+        return f"{_WORDS[self.learnt]}: {told} (in {played})"
+
+
+def beside(task: Task, returns: Sequence[float] | Array, episodes: int) -> Beside | None:
+    """Compare the returns of a run's final evaluation with those of policies that don't learn.
+
+    Args:
+        task: of the run.
+        returns: of the final evaluation's episodes.
+        episodes: how many the other policies play, from the same starts as the first of these.
+
+    Returns:
+        None where the other policies can't be played.
+    """
+    played = references_of(task, episodes)
+    means = {policy: float(each.mean()) for policy, each in played.items()}
+    best = best_blind(means)
+    if best is None:
+        return None
+    low, high = task.return_floor, task.return_ceiling
+    bounds = Bounds(-np.inf if low is None else low, np.inf if high is None else high)
+    blind = mean_within(played[best], bounds, LEVEL)
+    return Beside(learnt(np.asarray(returns), blind, bounds), means, episodes)
