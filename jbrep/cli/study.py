@@ -124,7 +124,7 @@ def report(
     everything: bool,
     as_json: bool,
 ) -> None:
-    """Say what a study found, and write it as a page, tables and figures.
+    """Say what a study found, and write a page of it.
 
     FOLDER holds a study, finished or not, or any runs. Where there are no runs, as in
     results/confirm, the report is made from the tables alone.

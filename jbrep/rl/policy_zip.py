@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import data_to_json
 
-from jbrep.records.document import document_from, parse_json
+from jbrep.records.document import document_in
 from jbrep.rl.agent import statistics_of
 from jbrep.rl.files import RunSettings, ZipHeader
 
@@ -78,10 +78,10 @@ def told_by(raw: bytes, path: Path) -> Told | None:
     names = members.namelist()
     if _HEADER not in names:
         return None
-    said = parse_json(members.read(_HEADER), path, ZipHeader.format)
+    header = document_in(members.read(_HEADER), path, ZipHeader)
     has_statistics = STATISTICS in names
     statistics = safetensors.numpy.load(members.read(STATISTICS)) if has_statistics else {}
-    return Told(document_from(said, path, ZipHeader), statistics)
+    return Told(header, statistics)
 
 
 def _header(settings: RunSettings) -> ZipHeader:
