@@ -43,7 +43,8 @@ STEPS = 100  # of an episode: little depends on its length
 TASK = describe("face_direction", max_episode_steps=STEPS)
 QUICK = {"task": TASK, "evaluation_episodes": 1}
 # to evaluate the text of a run
-IMPORTS = "from jbrep.envs import Feature, Task; from jbrep.rl.learner import Learner"
+IMPORTS = "from msgspec import UNSET; from jbrep.envs import Feature, Task; "
+IMPORTS += "from jbrep.rl.learner import Learner"
 SHORT = Run.of(algorithm="a2c", encoder="dae-8", steps=80, **QUICK, preset="paper")
 
 

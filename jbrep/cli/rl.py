@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 _LINE = "{desc}: {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"  # on a terminal
+_BESIDE = 10  # episodes of policies that don't learn
 _NAME, _CURVE = 16, 10  # letters and blocks in it, at most
 _NOT_REPRODUCIBLE = (
     "{} is not reproducible: the same seed gives other numbers the next time, and a run that is "
@@ -207,7 +208,7 @@ def rl(
         "episodes"
     )
     with stoppable("the run itself is finished"):
-        if compared := beside(run.task, last, min(len(last), run.evaluation_episodes)):
+        if compared := beside(run.task, last, min(len(last), _BESIDE)):
             say(str(compared))
     say(f"encoder: {source}; all evaluations: {out / EVALUATIONS}")
 

@@ -132,7 +132,7 @@ def write_shards(
         InputError: as `collect` does.
     """
     began = time.monotonic()
-    make_folder(folder)
+    make_folder(folder, (MANIFEST, "shard-*", "policy-*"))
     with exclusive(folder):
         there = _begin(settings, folder, files)
         manifest = there.extended(settings.steps)

@@ -5,8 +5,9 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
+from fnmatch import fnmatchcase
 from io import BufferedReader
 from pathlib import Path
 
@@ -112,16 +113,26 @@ def exists(path: str | Path) -> bool:
     return os.path.exists(path)  # noqa: PTH110, Path.exists raises there
 
 
-def make_folder(folder: Path) -> None:
+def make_folder(folder: Path, own: Collection[str] = ()) -> None:
     """Make a folder and its parents unless they exist.
 
+    Args:
+        folder: to make.
+        own: names of what marks a folder as one of those that are to be written, with * for any
+            letters; none if it may hold anything.
+
     Raises:
-        InputError: it can't be made.
+        InputError: it can't be made, or is there with other things alone.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        names = sorted(e.name for e in folder.iterdir() if not e.name.startswith("."))
     except OSError as error:
         raise InputError(f"can't make the folder {folder}: {error.strerror or error}") from None
+    if own and names and not any(fnmatchcase(name, each) for name in names for each in own):
+        raise InputError(
+            f"{folder} holds other things, such as {names[0]}: choose a folder that is new or empty"
+        )
 
 
 def check_writable(folder: Path) -> None:

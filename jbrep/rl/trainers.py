@@ -9,7 +9,7 @@ from stable_baselines3.common.logger import KVWriter
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import make_folder
 from jbrep.rl.cohort.trainer import train_together
-from jbrep.rl.files import CHECKPOINT, FAILED, RunRecord
+from jbrep.rl.files import CHECKPOINT, FAILED, OWN, RunRecord
 from jbrep.rl.job import Ended, Job, Session, Watch
 from jbrep.rl.run import Run
 from jbrep.rl.sb3 import train_in_turn
@@ -65,7 +65,7 @@ def train_jobs(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
     with ExitStack() as stack:
         for job in jobs:
             if not job.result:
-                make_folder(job.folder)
+                make_folder(job.folder, OWN)
                 stack.enter_context(exclusive(job.folder))
         stack.enter_context(single_torch_thread())
         results = {job: job.result for job in jobs}
