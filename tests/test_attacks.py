@@ -1,24 +1,18 @@
-"""Killed, without space, at once with another or damaged: whole, or refused in a line.
+"""Killed, without space or damaged: whole, or refused in a line. At small size."""
 
-At small size; tools/attack.py does the same at full size.
-"""
+import subprocess
+import sys
 
-import pytest
-from attacks import attack
-from surfaces import surfaces
-
-NAMES = (
-    *("tune", "checkpoints of sac", "import of parquet", "import of minari"),
-    *("encoder import", "registration", "report"),
+NAMES = (  # the quick ones; tools/attack.py without names attacks all
+    *("checkpoints of sac", "import of parquet", "import of minari"),
+    *("encoder import", "registration"),
 )
 
 
-@pytest.fixture(scope="module")
-def attacked(tmp_path_factory):
-    return {each.name: each for each in surfaces(tmp_path_factory.mktemp("attacked"))}
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_whatever_happens_to_a_command_nothing_false_comes_of_it(name, attacked, tmp_path):
-    tally = attack(attacked[name], tmp_path, kills=1, full=1, flips=6)
-    assert not tally.faults
+def test_whatever_happens_to_a_command_nothing_false_comes_of_it():
+    """In a process of its own, as it forks."""
+    command = [sys.executable, "-W", "ignore", "tools/attack.py", "1", *NAMES]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.endswith("\n0 faults\n")
+    assert all(f"{name}: " in done.stdout for name in NAMES)

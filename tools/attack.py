@@ -1,7 +1,8 @@
 """Kill commands, fill their disk, run two at once and flip bits: python tools/attack.py 100.
 
-Each surface is attacked so many times in each way, and flipped ten times as many bits. It prints
-what came of it, and ends with code 1 where something false came of an attack.
+Each surface is attacked so many times in each way, and flipped ten times as many bits; or those
+alone that are named after the number. It prints what came of it, and ends with code 1 where
+something false came of an attack.
 """
 
 import sys
@@ -18,11 +19,11 @@ def main() -> None:
     from surfaces import surfaces
 
     times = int(sys.argv[1]) if len(sys.argv) > 1 else 20
-    only = sys.argv[2] if len(sys.argv) > 2 else ""
+    names = sys.argv[2:]
     faults = 0
     with tempfile.TemporaryDirectory() as temporary:
         for surface in surfaces(Path(temporary) / "shared"):
-            if only not in surface.name:
+            if names and surface.name not in names:
                 continue
             begun = time.monotonic()
             counts = {"kills": times, "full": times, "twice": times // 4, "flips": 10 * times}

@@ -1,11 +1,13 @@
 """Kill commands, fill their disk, run them twice at once and damage what they read or left.
 
 Each must end whole, or refuse in a line, and come to the same when it is run again. Everything
-happens in forks of this process, which has imported what they need.
+happens in forks of this process, which has imported what they need, and itself trains nothing: a
+fork of a process in which torch has threads may wait for them for ever.
 """
 
 import errno
 import hashlib
+import json
 import os
 import resource
 import signal
@@ -284,8 +286,19 @@ def attack(surface, folder, *, kills=0, full=0, twice=0, flips=0, seed=0):
         if count:
             way(count)
     if flips and surface.read:
-        attacker.damages(flips)
+        told = attacker.folder / "damages"
+        code, words = forked(lambda _: _note_damages(attacker, flips, told), attacker.peace)
+        assert code == 0, words
+        damages = json.loads(told.read_text())
+        attacker.tally.counts.update(damages["counts"])
+        attacker.tally.faults += damages["faults"]
     return attacker.tally
+
+
+def _note_damages(attacker, flips, path):
+    attacker.tally = Tally()
+    attacker.damages(flips)
+    path.write_text(json.dumps(vars(attacker.tally)))
 
 
 def digest(*paths):

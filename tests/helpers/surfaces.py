@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from attacks import Surface, command, digest
+from attacks import Surface, command, digest, forked
 from click.testing import CliRunner
 from command import in_this_process
 from small import brief
@@ -58,9 +58,8 @@ def surfaces(shared):
         export(Dataset(data), to, path)
     exported["minari"] = next(exported["minari"].rglob("main_data.hdf5")).parent
     tables = shared / "study"
-    plan = Plan(TINY, tables)
-    run_study(plan, in_this_process, 1)
-    make_report(tables)
+    code, told = forked(_study, tables)
+    assert code == 0, told
     return [
         _tune(),
         _run("sac", overrides=CHEAP, trainer="cohort"),
@@ -75,6 +74,11 @@ def surfaces(shared):
 
 
 CHEAP = {"net_arch": [8], "learning_starts": 8, "batch_size": 8, "buffer_size": 100}
+
+
+def _study(folder):
+    run_study(Plan(TINY, folder), in_this_process, 1)
+    make_report(folder)
 
 
 def _tune():
