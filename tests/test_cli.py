@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command import jbrep, mistake
+from command import jbrep
 from stable_baselines3 import A2C
 from test_study import TOML
 
@@ -112,8 +112,12 @@ def test_folders_of_other_things_are_left_alone(tmp_path):
         ("rl", *short, "--steps", 10),
         ("study", demo, "--register"),
     ):
-        said = mistake(*command, "--out", tmp_path)
-        assert f"{tmp_path} holds other things, such as notes.txt: choose a folder that is" in said
+        told = jbrep(*command, "--out", tmp_path)
+        last = told.output.splitlines()[-1]
+        assert (told.exit_code, "holds other things, such as notes.txt: choose" in last) == (
+            2,
+            True,
+        )
         assert [each.name for each in tmp_path.iterdir()] == ["notes.txt"]
 
 
