@@ -194,6 +194,7 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
     monkeypatch.setattr("jbrep.study.packing.estimate", lambda run: 60)
     told = jbrep("study", path, "--out", tmp_path / "out", "--dry-run")
     assert "This study compares nothing: representations must have full" in told.stderr
+    assert max(map(len, told.stderr.splitlines())) <= 80
     assert "1.0 h" not in told.stdout
 
 

@@ -38,7 +38,7 @@ def test_states_become_encoders_and_diagnostics(peace):
     told = jbrep("encoder", "export", paths[0], "--out", folder / "it.onnx").output
     assert f"onnxruntime.InferenceSession('{folder / 'it.onnx'}')" in told
     told = jbrep("evaluate", "--encoder", *paths, "--data", data, "--out", folder / "judged")
-    for label in ("full", "dae-4", "pca-4", "judged/evaluation.json and ", " figures beside"):
+    for label in ("full", "dae-4", "pca-4", "judged/evaluation.json", "figures. --all shows"):
         assert label in told.output
     assert (folder / "judged" / "error_by_latent.png").exists()
     judged = json.loads((folder / "judged" / "evaluation.json").read_text())
@@ -94,12 +94,12 @@ def test_a_report_says_what_the_tables_say(peace):
         assert summary["numbers"][name] == label["numbers"]
         assert name in page
     assert (summary["runs"], summary["missing"], summary["failed"]) == (4, [], [])
-    assert f"{folder / 'report.html'} (summary.json, summary.md" in said
+    assert f"{folder / 'report.html'}\nBeside it: summary.json, summary.md" in said
     drawn = {path.stem for path in (folder / "figures").iterdir()}
     for name in drawn:
         for suffix in ("pdf", "png", "csv"):
             assert (folder / "figures" / f"{name}.{suffix}").stat().st_size > 0
-    assert {"representations", "claims", "every_run", "autoencoders"} <= drawn
+    assert {"representations", "final_return", "every_run", "autoencoders"} <= drawn
 
 
 def test_a_recording_shows_the_agent_that_was_evaluated(peace, tmp_path):

@@ -111,10 +111,10 @@ def evaluate(
         return echo_json(evaluation.as_json())
     click.echo(evaluation_text(evaluation, width, everything) + "\n")
     click.echo("\n".join(notes))
-    more = "" if everything else "; --all shows errors, probes and units"
-    beside = f" and {len(pictures)} figures beside it" if pictures else ""
+    more = "" if everything else " --all shows errors, probes and units."
     click.echo()
-    return say(f"{out / EVALUATION}{beside}{more}")
+    say(str(out / EVALUATION))
+    return click.echo(f"Beside it: {len(pictures)} figures.{more}")
 
 
 def _notes(

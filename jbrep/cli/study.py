@@ -16,7 +16,7 @@ from jbrep.cli.base import (
     stoppable,
 )
 from jbrep.cli.environment import import_option
-from jbrep.text import terminal_width
+from jbrep.text import terminal_width, wrapped
 
 _COUNT = click.IntRange(1, 1024)
 
@@ -82,7 +82,7 @@ def study(
     run = choose(backend, BACKENDS, "backend")
     expected = forecast(plan, workers, width) if dry_run else None
     for notice in plan.study.notices:
-        click.echo(notice, err=True)
+        click.echo(wrapped(notice, terminal_width()), err=True)
     if expected:
         click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
         return
@@ -133,7 +133,7 @@ def report(
 
     from jbrep.errors import InputError
     from jbrep.records.storage import check_writable
-    from jbrep.report.report import SUMMARY, make_report
+    from jbrep.report.report import PAGE, SUMMARY, make_report
     from jbrep.report.statistics import results_text
 
     if not folder.exists():
@@ -147,8 +147,8 @@ def report(
         say(line, err=True)
     if as_json:
         return echo_json(json.loads(((out or folder) / SUMMARY).read_bytes()))
-    page, *others = made.paths
-    beside = ", ".join(path.name for path in others)
-    more = "" if everything else "; --all prints every table"
+    beside = ", ".join(path.name for path in made.paths if path.name != PAGE)
+    more = "" if everything else " --all prints every table."
     click.echo()
-    return say(f"{page} ({beside} beside it){more}")
+    say(str((out or folder) / PAGE))
+    return click.echo(wrapped(f"Beside it: {beside}.{more}", terminal_width()))
