@@ -20,6 +20,7 @@ from jbrep.errors import InputError
 from jbrep.text import interval_of, percentiles, table, terminal_width
 
 if TYPE_CHECKING:
+    from jbrep.envs.infos import Numbers
     from jbrep.envs.task import Task
     from jbrep.play.player import Player
 
@@ -76,12 +77,14 @@ def evaluate_policy(
     """
     from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import source_of
+    from jbrep.envs.infos import by_name, shares_text
 
     import_code(encoder)
     zip_file = _Zip(algorithm, trust, vecnormalize)
     player = _find(policy, given_task(options), encoder, zip_file)
     source = None if encoder is None else source_of(encoder, player.task)
-    returns, failure = _returns(player, episodes, threads, retries)
+    returns, numbers, failure = _outcome(player, episodes, threads, retries)
+    values = by_name(numbers)
     if as_json:
         echo_json(
             {
@@ -93,6 +96,7 @@ def evaluate_policy(
                 "episodes": len(returns),
                 "returns": returns,
                 **percentiles(returns),
+                **({"infos": numbers} if values else {}),
             }
         )
     else:
@@ -100,15 +104,17 @@ def evaluate_policy(
             say(f"encoder: {source}")
         title = _title(policy, player)
         say(f"{title}: median return {interval_of(returns)} (10-90 % of {len(returns)} episodes)")
+        if told := shares_text(values):
+            say(told)
     if failure:
         say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
         context.exit(1)
 
 
-def _returns(
+def _outcome(
     player: "Player", episodes: int, threads: int | None, retries: int
-) -> tuple[list[float], str]:
-    """The returns of the episodes that were finished, and why others weren't.
+) -> tuple[list[float], "list[Numbers]", str]:
+    """The returns and infos of the episodes that were finished, and why others weren't.
 
     Raises:
         EnvironmentFailedError: none was.
@@ -116,14 +122,16 @@ def _returns(
     from jbrep.envs.lanes import EnvironmentFailedError
 
     returns: list[float] = []
+    numbers: list[Numbers] = []
     try:
-        for some in player.returns_in_turn(episodes, threads, retries):
-            returns += some.tolist()
+        for some in player.outcomes_in_turn(episodes, threads, retries):
+            returns += some.returns.tolist()
+            numbers += some.numbers
     except EnvironmentFailedError as error:
         if not returns:
             raise
-        return returns, str(error)
-    return returns, ""
+        return returns, numbers, str(error)
+    return returns, numbers, ""
 
 
 def _title(policy: str, player: "Player") -> str:

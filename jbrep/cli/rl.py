@@ -176,8 +176,16 @@ def rl(
         from joblib import cpu_count
 
         from jbrep.encoders.shipped import source_of
+        from jbrep.envs.infos import shares_text
         from jbrep.rl import StoppedError
-        from jbrep.rl.files import EVALUATIONS, RUN, last_returns, read_evaluations
+        from jbrep.rl.files import (
+            EVALUATIONS,
+            RUN,
+            last_infos,
+            last_returns,
+            read_evaluations,
+            read_infos,
+        )
         from jbrep.rl.job import Job, Session
         from jbrep.rl.trainers import train_jobs
         from jbrep.study.single import beside
@@ -201,12 +209,15 @@ def rl(
     if result.reason is not None:
         click.echo(f"the run failed: {result.reason}; see {out / RUN}", err=True)
         context.exit(1)
-    last = last_returns(read_evaluations(out))
+    evaluations = read_evaluations(out)
+    last = last_returns(evaluations)
     name = result.settings.representation
     click.echo(
         f"returns on {name} at the end: {interval_of(last)}, median [10 %, 90 %] of {len(last)} "
         "episodes"
     )
+    if told := shares_text(last_infos(read_infos(out), evaluations)):
+        say(told)
     with stoppable("the run itself is finished"):
         if compared := beside(run.task, last, min(len(last), _BESIDE)):
             say(str(compared))

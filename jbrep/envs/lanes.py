@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jbrep.envs.infos import Numbers
 from jbrep.envs.make import is_batched, make_batch
 from jbrep.envs.separate import EnvironmentFailedError as EnvironmentFailedError
 from jbrep.envs.separate import Flags as Flags
@@ -152,6 +153,11 @@ class Lanes:
     def has_failed(self) -> bool:
         """Whether an environment failed in an episode of now, which ended early thereby."""
         return bool(np.any(getattr(self._batch, "failed", False)))
+
+    @property
+    def numbers(self) -> list[Numbers]:
+        """What each lane's last step told in `info`, see `Separate`; batches tell nothing."""
+        return getattr(self._batch, "numbers", None) or [{} for _ in range(self.num_lanes)]
 
     @property
     def steps(self) -> NDArray[np.int64]:

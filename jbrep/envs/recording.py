@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import count
+from itertools import chain, count
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jbrep.envs.infos import Numbers
 from jbrep.envs.lanes import Lanes, Step
 from jbrep.envs.task import Array
 
@@ -134,10 +135,23 @@ def _copied(arrays: Mapping[str, Array]) -> dict[str, Array]:
     return {name: values.copy() for name, values in arrays.items()}
 
 
-def episode_returns(
+class Outcome(NamedTuple):
+    """What came of n whole episodes."""
+
+    returns: Array  # (n,)
+    numbers: list[Numbers]  # that each episode's `info` told at its end
+
+
+def joined(outcomes: Iterable[Outcome], count: int | None = None) -> Outcome:
+    """The first `count` episodes of several outcomes; None is all."""
+    returns, numbers = zip(*outcomes, strict=True)
+    return Outcome(np.concatenate(returns)[:count], [*chain(*numbers)][:count])
+
+
+def outcome(
     lanes: Lanes, act: Actor, first_seed: int = 0, tick: Tick = lambda steps: None
-) -> Array:
-    """Returns of one whole episode in each lane under a policy, (n,).
+) -> Outcome:
+    """What comes of one whole episode in each lane under a policy.
 
     Lane i starts like a Gymnasium environment reset with `first_seed` + i.
     """
@@ -146,13 +160,18 @@ def episode_returns(
     for played in play(lanes, act):
         total += played.step.reward
         tick(int(played.active.sum()))
-    return total
+    return Outcome(total, lanes.numbers)
 
 
-def whole_returns(
+def episode_returns(lanes: Lanes, act: Actor, first_seed: int = 0) -> Array:
+    """The returns of `outcome`, (n,)."""
+    return outcome(lanes, act, first_seed).returns
+
+
+def whole_outcome(
     lanes: Lanes, begin: Callable[[], Actor], first_seed: int, tick: Tick = lambda steps: None
-) -> Array:
-    """The same; episodes in which the environment failed are played again.
+) -> Outcome:
+    """As `outcome`; episodes in which the environment failed are played again.
 
     Args:
         lanes: whose retries say how often.
@@ -161,6 +180,6 @@ def whole_returns(
         tick: called after each step.
     """
     while True:
-        returns = episode_returns(lanes, begin(), first_seed, tick)
+        found = outcome(lanes, begin(), first_seed, tick)
         if not lanes.has_failed:
-            return returns
+            return found

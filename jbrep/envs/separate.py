@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.envs import instances
+from jbrep.envs.infos import SUCCESS, Numbers, number_of, numbers_in
 from jbrep.envs.make import aside, flattener, number, reason
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError, Notice
@@ -100,6 +101,8 @@ class Separate:
         self._observation = np.zeros((num_lanes, task.size))
         self._reward = np.zeros(num_lanes)
         self._arrays = {name: np.zeros((num_lanes, w)) for name, w in task.arrays.items()}
+        self._infos: list[Mapping[str, Any]] = [{} for _ in range(num_lanes)]
+        self._succeeded = np.zeros(num_lanes, np.bool_)  # at any step of the episode so far
         self._active = np.zeros(num_lanes, np.bool_)
         self._episodes = [_Episode() for _ in range(num_lanes)]
         self._before = [_Episode() for _ in range(num_lanes)]
@@ -206,6 +209,10 @@ class Separate:
         self._reward[lane] = self._last_reward[lane] = reward
         for name, values in self._arrays.items():
             values[lane] = info[name]
+        info = info or {}
+        self._infos[lane] = info
+        self._succeeded[lane] &= after_step
+        self._succeeded[lane] |= after_step and bool(number_of(info.get(SUCCESS)))
 
     def _without_missing(
         self, lane: int, flat: Array, reward: float, after_step: bool
@@ -249,6 +256,15 @@ class Separate:
                 lane,
             )
         self._retries.failed(error)
+
+    @property
+    def numbers(self) -> list[Numbers]:
+        """What each lane's last step told in `info`; `is_success` if any step of its episode did.
+
+        An environment may go on after a success, so its last step alone would miss some.
+        """
+        told = zip(self._infos, self._succeeded.tolist(), strict=True)
+        return [numbers_in(info) | ({SUCCESS: 1.0} if won else {}) for info, won in told]
 
     @property
     def state(self) -> State:

@@ -11,7 +11,7 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.lanes import Lanes, lanes_at_once
 from jbrep.envs.make import is_batched
 from jbrep.envs.physics import MotionReader
-from jbrep.envs.recording import Actor, Recording, record, whole_returns
+from jbrep.envs.recording import Actor, Outcome, Recording, joined, record, whole_outcome
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 from jbrep.play.jitterbug import hold_diverged, turn_targets
@@ -106,12 +106,12 @@ class Player(NamedTuple):
             InputError: more episodes than an evaluation may have.
             EnvironmentFailedError: the environment fails.
         """
-        return np.concatenate(list(self.returns_in_turn(count, threads, retries)))
+        return joined(self.outcomes_in_turn(count, threads, retries)).returns
 
-    def returns_in_turn(
+    def outcomes_in_turn(
         self, count: int, threads: int | None = None, retries: int = 0
-    ) -> Iterator[Array]:
-        """The same, some at a time, as they are finished."""
+    ) -> Iterator[Outcome]:
+        """The same with what `info` tells, some episodes at a time, as they are finished."""
         most = _BATCH_LANES if is_batched(self.task) else _SEPARATE_LANES
         check_episodes(count)
         played = 0
@@ -123,7 +123,7 @@ class Player(NamedTuple):
                     while played + size <= count:
                         first = EVALUATION_SEED + played
                         begin = partial(self.begin, self.task, range(first, first + size))
-                        yield whole_returns(lanes, begin, first, bar.update)
+                        yield whole_outcome(lanes, begin, first, bar.update)
                         played += size
 
     @property

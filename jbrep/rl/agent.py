@@ -21,7 +21,7 @@ from torch.distributions import Distribution
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.vec_env import JitterbugVecEnv, agent_spaces
 from jbrep.envs.lanes import Lanes
-from jbrep.envs.recording import Actor, held, whole_returns
+from jbrep.envs.recording import Actor, Outcome, held, joined, whole_outcome
 from jbrep.envs.task import Array, Task
 from jbrep.records.container import Tensors
 from jbrep.records.record import to_plain
@@ -262,7 +262,11 @@ class Evaluator:
         self._lanes.close()
 
     def returns(self, agent: BaseAlgorithm, episodes: int | None = None) -> Array:
-        """The return of each episode, (episodes,): as many as are played at once, or as asked for.
+        """The return of each episode, (episodes,), see `outcome`."""
+        return self.outcome(agent, episodes).returns
+
+    def outcome(self, agent: BaseAlgorithm, episodes: int | None = None) -> Outcome:
+        """What comes of each episode: as many as are played at once, or as asked for.
 
         What an agent normalises, it normalises by its statistics so far, which stay as they are.
 
@@ -274,5 +278,5 @@ class Evaluator:
         act, repeat = deterministic(agent.policy, self._lanes.task, see), action_repeat(agent)
         count = self._episodes if episodes is None else episodes
         seeds = range(self._seed, self._seed + count, self._lanes.num_lanes)
-        returns = [whole_returns(self._lanes, lambda: held(act, repeat), seed) for seed in seeds]
-        return np.concatenate(returns)[:count]
+        played = (whole_outcome(self._lanes, lambda: held(act, repeat), seed) for seed in seeds)
+        return joined(played, count)

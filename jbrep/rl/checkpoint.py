@@ -11,10 +11,10 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import torch
 from msgspec import Meta
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.envs.recording import Outcome
 from jbrep.errors import DamageError, InputError, differences
 from jbrep.records import container
 from jbrep.records.container import Tensors
@@ -22,7 +22,7 @@ from jbrep.records.document import Document, document_from
 from jbrep.records.record import Version
 from jbrep.records.storage import exists
 from jbrep.rl.agent import parameters, restore_statistics, statistics_of
-from jbrep.rl.files import Episode, Evaluation, RunSettings
+from jbrep.rl.files import Episode, Evaluation, Info, RunSettings
 from jbrep.rl.settings import MAX_STEPS
 
 MAX_BYTES = 1 << 34
@@ -46,6 +46,7 @@ class History:
     Attributes:
         episodes: of training.
         evaluations: of the deterministic policy.
+        infos: what the environment told at the ends of their episodes.
         first_step: the training step from which this process continues.
         earlier_seconds: the wall time that earlier processes took.
         means: returns of the evaluations.
@@ -53,6 +54,7 @@ class History:
 
     episodes: list[Episode] = field(default_factory=list)
     evaluations: list[Evaluation] = field(default_factory=list)
+    infos: list[Info] = field(default_factory=list)
     first_step: int = 0
     earlier_seconds: float = 0.0
     means: list[float] = field(default_factory=list)
@@ -68,15 +70,23 @@ class History:
         """The mean return of the last evaluation, once there was one."""
         return self.means[-1] if self.means else None
 
-    def evaluated(self, step: int, returns: NDArray[np.float64]) -> None:
-        """Record an evaluation's returns (e,) after so many steps."""
-        rounded = returns.round(3).tolist()
+    def evaluated(self, step: int, outcome: Outcome) -> None:
+        """Record an evaluation after so many steps."""
+        rounded = outcome.returns.round(3).tolist()
         self.evaluations += [Evaluation(step, i, each) for i, each in enumerate(rounded)]
+        told = enumerate(outcome.numbers)
+        self.infos += [Info(step, i, *each) for i, numbers in told for each in numbers.items()]
         self.means.append(float(np.mean(rounded)))
+
+    def forget_from(self, step: int) -> None:
+        """Forget the evaluations after so many steps, or more."""
+        self.evaluations = [row for row in self.evaluations if row.step < step]
+        self.infos = [row for row in self.infos if row.step < step]
 
     def resume(self, header: "CheckpointHeader") -> None:
         """Continue from an earlier process's record."""
         self.episodes, self.evaluations = header.episodes, header.evaluations
+        self.infos = header.infos
         self.earlier_seconds, self.first_step = header.seconds, header.step
         by_step = groupby(self.evaluations, lambda each: each.step)
         self.means = [float(np.mean([e.episode_return for e in own])) for _, own in by_step]
@@ -137,18 +147,19 @@ class CheckpointHeader(Document, frozen=True, kw_only=True):
         settings: of the run.
         versions: by package; these and the settings must be equal for the run to resume.
         step: of training.
-        episodes, evaluations, seconds: of the history so far.
+        episodes, evaluations, infos, seconds: of the history so far.
         counters: of the snapshot.
     """
 
     format = "jbrep checkpoint"
-    format_version = 3
+    format_version = 4
 
     settings: RunSettings
     versions: Mapping[Version, Version]
     step: Annotated[int, Meta(ge=0, le=MAX_STEPS)]
     episodes: list[Episode]
     evaluations: list[Evaluation]
+    infos: list[Info]
     seconds: float
     counters: Mapping[str, Any]
 
@@ -213,6 +224,7 @@ class CheckpointFile:
             step=self._settings.control_steps(snapshot.counters["num_timesteps"]),
             episodes=self._history.episodes,
             evaluations=self._history.evaluations,
+            infos=self._history.infos,
             seconds=self._history.seconds,
             counters=snapshot.counters,
         )

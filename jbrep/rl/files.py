@@ -8,6 +8,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 import msgspec
 from msgspec import Meta
 
+from jbrep.envs.infos import by_name
 from jbrep.envs.task import Id, Task, changed_parts
 from jbrep.errors import DamageError, InputError, differences
 from jbrep.records import container
@@ -15,7 +16,7 @@ from jbrep.records.commit import Commits
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Version, to_plain
 from jbrep.records.storage import exists
-from jbrep.records.tables import read_rows
+from jbrep.records.tables import read_rows, write_csv
 from jbrep.rl.presets import LINEAR, Hyperparameters
 from jbrep.rl.settings import (
     CLASSES,
@@ -41,8 +42,18 @@ BEGINNING = "beginning.safetensors"  # the policy that it begins with, if that i
 ENCODER = "encoder.safetensors"
 EPISODES = "episodes.csv"
 EVALUATIONS = "evaluations.csv"
+INFOS = "infos.csv"  # where the environment tells numbers
 _BEFORE = "progress", "error.txt", "tensorboard", "wandb"  # of a run that has just begun
-OWN = RUN, CHECKPOINT, BEGINNING, ENCODER, EPISODES, EVALUATIONS, *_BEFORE  # see `make_folder`
+OWN = (
+    RUN,
+    CHECKPOINT,
+    BEGINNING,
+    ENCODER,
+    EPISODES,
+    EVALUATIONS,
+    INFOS,
+    *_BEFORE,
+)  # see `make_folder`
 EVALUATION_SEED = 1 << 31  # of an evaluation's first episode; seeds in training are smaller
 FINISHED: Final = "finished"
 FAILED: Final = "failed"
@@ -171,7 +182,7 @@ class RunRecord(Document, frozen=True, kw_only=True):
     versions: Mapping[Version, Version]  # by package
     commits: Commits
     cpu: Line
-    tables: Mapping[Name, Sha256]  # of the files of its episodes and evaluations
+    tables: Mapping[Name, Sha256]  # of the files of its episodes, evaluations and infos
     policy_sha256: Sha256 | None  # of its policy's file; null if it failed
 
     def check(self) -> None:
@@ -238,6 +249,15 @@ class Evaluation(NamedTuple):
     episode_return: float
 
 
+class Info(NamedTuple):
+    """A number in `info` at the end of an episode of the deterministic policy."""
+
+    step: int  # of training before it
+    episode: int  # of the evaluation
+    name: str
+    value: float  # 1 or 0 of a truth; of is_success 1 if it was true at any step
+
+
 def is_run(folder: Path) -> bool:
     """Whether a folder is of a run that has ended or has written a checkpoint."""
     return exists(folder / RUN) or exists(folder / CHECKPOINT)
@@ -289,6 +309,32 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
             "every step, or more at the last"
         )
     return evaluations
+
+
+def write_infos(folder: Path, rows: Sequence[Info]) -> str:
+    """Write the numbers of a run's evaluations, to the last bit; returns the file's SHA-256.
+
+    Raises:
+        InputError: it can't be written.
+    """
+    return write_csv(folder / INFOS, Info._fields, rows)
+
+
+def read_infos(folder: Path) -> list[Info]:
+    """What `write_infos` wrote; nothing where the environment tells no numbers.
+
+    Raises:
+        InputError: as `read_run`, or the table is missing.
+        DamageError: as `read_run`, or the table isn't what the run wrote.
+    """
+    sha256 = read_run(folder).tables.get(INFOS)
+    return read_rows(folder / INFOS, Info, sha256) if sha256 else []
+
+
+def last_infos(infos: Sequence[Info], evaluations: Sequence[Evaluation]) -> dict[str, list[float]]:
+    """The numbers of the last evaluation's episodes, by name."""
+    own = [{row.name: row.value} for row in infos if row.step == evaluations[-1].step]
+    return by_name(own)
 
 
 def last_returns(evaluations: Sequence[Evaluation]) -> list[float]:

@@ -7,6 +7,7 @@ from contextlib import suppress
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
+from statistics import fmean
 from typing import NamedTuple
 
 from joblib import cpu_count
@@ -15,6 +16,7 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.encoders import Encoder, save
+from jbrep.envs.infos import by_name
 from jbrep.envs.lanes import Lanes, lanes_at_once
 from jbrep.envs.names import environment_versions
 from jbrep.errors import InputError
@@ -31,6 +33,7 @@ from jbrep.rl.files import (
     EVALUATIONS,
     FAILED,
     FINISHED,
+    INFOS,
     POLICY,
     POLICY_ZIP,
     RUN,
@@ -39,6 +42,7 @@ from jbrep.rl.files import (
     RunRecord,
     RunSettings,
     read_run,
+    write_infos,
 )
 from jbrep.rl.policy_file import MAX_BYTES, Trained, pack_whole, read
 from jbrep.rl.policy_zip import policy_zip
@@ -240,20 +244,21 @@ class Job:
 
         What was evaluated after the last step already, in case that the run goes on, makes room.
         """
-        rows = self.history.evaluations
-        self.history.evaluations = [row for row in rows if row.step < self.settings.steps]
+        self.history.forget_from(self.settings.steps)
         self.evaluate(agent, self.settings.final_episodes)
 
     def evaluate(self, agent: BaseAlgorithm, episodes: int | None = None) -> None:
-        """Play an agent's deterministic policy, and record and log the returns.
+        """Play an agent's deterministic policy, and record and log the returns and infos.
 
         Raises:
-            NonFiniteActionError, EnvironmentFailedError: as `Evaluator.returns`.
+            NonFiniteActionError, EnvironmentFailedError: as `Evaluator.outcome`.
         """
         step, logger = self.step_of(agent), agent.logger
-        returns = self.evaluator.returns(agent, episodes)
-        self.history.evaluated(step, returns)
+        outcome = self.evaluator.outcome(agent, episodes)
+        self.history.evaluated(step, outcome)
         logger.record("evaluation/mean_return", self.history.mean)
+        for name, values in by_name(outcome.numbers).items():
+            logger.record(f"evaluation/{name}", fmean(values))
         logger.dump(agent.num_timesteps)
 
     def step_of(self, agent: BaseAlgorithm) -> int:
@@ -282,6 +287,8 @@ class Job:
                 (EVALUATIONS, self.history.evaluations, Evaluation),
             )
         }
+        if self.history.infos:
+            tables[INFOS] = write_infos(self.folder, self.history.infos)
         if policy:
             write_whole(self.folder / POLICY, policy)
             write_whole(self.folder / POLICY_ZIP, policy_zip(agent, self.settings))

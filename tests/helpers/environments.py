@@ -180,6 +180,25 @@ class Told(Sledge):
         )
 
 
+class Scored(Sledge):
+    """A sledge that tells numbers, as its seed says; it is at its goal at step 3 alone."""
+
+    def step(self, action):
+        observation, _, fallen, _, _ = super().step(action)
+        odd = self.seed % 2
+        info = {
+            "is_success": np.bool_(odd and self.steps == 3),
+            "slid": self.seed % 3 == 0,
+            "steps": self.steps,
+            "heat": np.float64(self.seed % 5) / 7,
+            "broken": np.float32(np.nan),
+            "place": observation,
+            "mode": "free",
+            "bad\nname": 1.0,
+        }
+        return observation, 1.0, fallen, self.steps == 6, info
+
+
 class Free(Sledge):
     """A sledge with thrusters without bounds."""
 
@@ -207,6 +226,7 @@ for _name, _made, _limit in (
     ("Nested", Nested, LIMIT),
     ("Exact", Exact, LIMIT),
     ("Told", Told, LIMIT),
+    ("Scored", Scored, LIMIT),
     ("Free", Free, LIMIT),
     ("Filmed", Filmed, LIMIT),
     ("Endless", Sledge, None),

@@ -1,0 +1,115 @@
+"""Numbers that an environment tells in `info`: in evaluations, tables and reports."""
+
+import json
+
+import numpy as np
+import pytest
+from command import jbrep, refused
+from small import flip_bit
+
+from jbrep.envs import describe
+from jbrep.envs.infos import by_name, number_of, numbers_in, shares, shares_text
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.names import import_modules
+from jbrep.rl import Run, train
+from jbrep.rl.files import EVALUATION_SEED, INFOS, Info, read_infos, read_run
+
+import_modules(["environments"])
+SCORED = "Sledges/Scored-v0"
+EPISODES = 6
+NAMES = ("is_success", "slid", "steps", "heat")
+
+
+def told(episode):
+    """What the environment tells of an episode of evaluation."""
+    seed = EVALUATION_SEED + episode
+    return (float(seed % 2), float(seed % 3 == 0), 6.0, seed % 5 / 7)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of a short run, which went on after its first half, and what the command said."""
+    folder = tmp_path_factory.mktemp("infos") / "run"
+    command = ("rl", "--task", SCORED, "--algorithm", "a2c", "--set", "n_steps=8")
+    command += ("--evaluate-every", 32, "--evaluation-episodes", 2)
+    command += ("--final-episodes", EPISODES, "--out", folder, "--steps")
+    for steps in (32, 64):
+        done = jbrep(*command, steps)
+        assert done.exit_code == 0, done.output
+    return folder, done.stdout
+
+
+def test_what_counts_as_a_number():
+    assert [number_of(each) for each in (True, np.bool_(0), 3, np.int8(-3), np.float32(0.5))] == [
+        *(1.0, 0.0, 3.0, -3.0, 0.5)
+    ]
+    others = (None, "1", np.zeros(1), np.zeros(()), np.nan, -np.inf, 1 << 60, 1j, np.str_("1"))
+    assert [number_of(each) for each in others] == [None] * len(others)
+    assert numbers_in({"a": 1, 2: 3, "b\n": 1, "": 1, "c" * 65: 1, "d": {"e": 1}}) == {"a": 1.0}
+
+
+def test_shares_are_numbers_that_are_0_or_1():
+    values = by_name([{"a": 1.0, "b": 0.5}, {"a": 0.0, "c": 1.0}, {"a": 0.0}])
+    assert values == {"a": [1.0, 0.0, 0.0], "b": [0.5], "c": [1.0]}
+    assert [*shares(values)] == ["a", "c"]
+    assert shares_text(values) == "a 0.33 in 3 episodes; c 1.00 in 1 episode"
+
+
+def test_an_episode_succeeds_if_any_of_its_steps_does():
+    """Each lane's numbers are its own last step's, and a success is forgotten at the next reset."""
+    lanes = Lanes(describe(SCORED), 2)
+    lanes.reset([0, 1], [1, 2])
+    assert lanes.numbers == [{}, {}]
+    for step in range(1, 7):
+        lanes.step(np.zeros((2, 3)))
+        assert [each["is_success"] for each in lanes.numbers] == [step >= 3, 0.0]
+        assert [each["steps"] for each in lanes.numbers] == [step, step]
+    lanes.reset([0], [2])
+    assert [*map(dict.keys, lanes.numbers)] == [{}.keys(), dict.fromkeys(NAMES).keys()]
+    lanes.step(np.zeros((2, 3)))
+    assert [each["is_success"] for each in lanes.numbers] == [0.0, 0.0]
+    assert [each["steps"] for each in lanes.numbers] == [1.0, 6.0]
+    assert Lanes(describe("face_direction"), 2).numbers == [{}, {}]
+
+
+def test_a_run_keeps_them_and_says_the_shares(run):
+    folder, said = run
+    rows = [
+        Info(step, episode, *each)
+        for step, episodes in ((0, 2), (32, 2), (64, EPISODES))
+        for episode in range(episodes)
+        for each in zip(NAMES, told(episode), strict=True)
+    ]
+    assert read_infos(folder) == rows  # to the last bit
+    assert "is_success 0.50 in 6 episodes; slid 0.33 in 6 episodes\n" in said
+    assert (folder / INFOS).read_text().startswith("step,episode,name,value\n0,0,is_success,0.0\n")
+    assert INFOS in read_run(folder).tables
+
+
+def test_evaluate_policy_says_them(run):
+    folder, _ = run
+    command = ("evaluate-policy", folder, "--episodes", 5)
+    assert jbrep(*command).stdout.endswith(
+        "\nis_success 0.40 in 5 episodes; slid 0.40 in 5 episodes\n"
+    )
+    expected = [dict(zip(NAMES, told(episode), strict=True)) for episode in range(5)]
+    assert json.loads(jbrep(*command, "--json").stdout)["infos"] == expected
+
+
+def test_a_changed_table_is_refused(run, tmp_path):
+    folder, _ = run
+    for each in folder.iterdir():
+        if each.is_file():
+            (tmp_path / each.name).write_bytes(each.read_bytes())
+    flip_bit(tmp_path / INFOS, 300)
+    assert f"{INFOS} was changed after it was written" in refused(read_infos, tmp_path)
+    (tmp_path / INFOS).unlink()
+    assert "can't read" in refused(read_infos, tmp_path)
+
+
+def test_others_have_no_such_table(tmp_path):
+    sledge = Run.of("Sledges/Sledge-v0", "a2c", steps=40, evaluation_episodes=1, final_episodes=1)
+    result = train(sledge, tmp_path)
+    assert read_infos(tmp_path) == []
+    assert not (tmp_path / INFOS).exists()
+    assert INFOS not in result.tables
