@@ -81,7 +81,7 @@ def panels(figure):
 
 def test_a_study_has_every_figure(plots):
     assert list(plots) == [
-        *("representations", "final_return", "claims", "learning_rate", "profiles"),
+        *("final_return", "representations", "claims", "learning_rate", "profiles"),
         *("across_tasks", "every_run", "system", "autoencoders"),
     ]
 
@@ -115,6 +115,16 @@ def test_curves_are_the_medians_of_the_statistics(plots, analysis):
     assert any(set(line.get_ydata()) == {900} for line in axes.lines)
     bands = [path.get_paths()[0].get_extents() for path in axes.collections]
     assert bands[0].y1 == pytest.approx(max(group.labels[0].curve.p90))
+
+
+def test_policies_stand_beside_curves_of_the_same_starts_alone(plots, analysis, returns):
+    """Of more starts than the curves have, they would be other numbers."""
+    assert "Dashed: policies that don't learn" in plots["representations"].caption
+    played = {"face_direction": {"hand-written": [910, 950, 990, 1000]}}
+    _, curves, *_ = study_plots(analysis, returns, played, {})
+    assert "Dashed" not in curves.caption
+    lines = (line for axes in drawn(curves).axes for line in axes.lines)
+    assert not any(line.get_label() == "hand-written" for line in lines)
 
 
 def test_the_grid_has_tasks_by_algorithms(plots):
@@ -238,14 +248,14 @@ def cut_marks(axes, markers):
 
 def test_no_interval_stretches_an_axis_and_cuts_are_marked(analysis):
     wide = with_interval(analysis, "final_return_sd", (40, 2, 5000))
-    left, right = drawn(study_plots(wide, [], {}, {})[1]).axes
+    left, right = drawn(study_plots(wide, [], {}, {})[0]).axes
     _, high = right.get_ylim()
     low, top = left.get_ylim()
     assert high == pytest.approx(1.04 * (top - low) / 1.08 / 2)  # the SD of two far apart
     assert (0, high, "^") in cut_marks(right, "^v")
     largest = max(max(label.by_run["final_return"]) for label in wide.groups[0].labels)
     wide = with_interval(analysis, "final_return_mean", (500, -900, 1900))
-    left, _ = drawn(study_plots(wide, [], {}, {})[1]).axes
+    left, _ = drawn(study_plots(wide, [], {}, {})[0]).axes
     low, high = left.get_ylim()
     assert (low, high) == pytest.approx((-0.05 * largest, 1.3 * largest))  # not below the floor
     assert cut_marks(left, "^v") == [(0.16, low, "v"), (0.16, high, "^")]

@@ -34,10 +34,7 @@ Groups = Sequence[GroupAnalysis]
 Runs = dict[int, dict[int, float]]  # mean returns of a label, by seed and step
 Played = Mapping[str, Mapping[str, float]]  # mean returns by task and policy that learns nothing
 
-_POLICIES = (  # in captions
-    "policies that don't learn, on all starts of the last evaluation, of which those before it "
-    "have the first"
-)
+_POLICIES = "policies that don't learn, on the same starts"  # in captions
 _MOST_ACROSS = 5  # panels of runs side by side
 _TITLE = 0.062  # width of a character in a panel's title [inches]
 _HANDLE, _CHARACTER, _LINE = 0.5, 0.05, 0.14  # of a legend: widths, height of a line [inches]

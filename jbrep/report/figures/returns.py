@@ -25,6 +25,7 @@ from jbrep.report.figures.style import (
 )
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.bootstrap import Interval
+from jbrep.stats.intervals import FEWEST_RUNS
 
 _LABEL = ("task", "algorithm", "representation")
 _JITTER = 0.16  # between the outermost runs and the middle of their representation
@@ -41,8 +42,11 @@ def final_return(groups: Groups, looks: Looks) -> Plot:
     return Plot(
         "final_return",
         "Final return and its spread",
-        "Left: mean return at the end of training, a point for each of n runs, and their mean. "
-        "Right: the standard deviation over runs." + _INTERVALS + _dashed(groups) + _CUT,
+        "Mean return at the end of training, a point for each of n runs, and their mean; from four "
+        "runs on, beside it, the standard deviation over runs."
+        + _INTERVALS
+        + _dashed(groups)
+        + _CUT,
         (
             *(*_LABEL, "seed", "final_return", "mean", "mean_low", "mean_high"),
             *("sd", "sd_low", "sd_high"),
@@ -121,10 +125,14 @@ def _panels(groups: Groups, columns: int, height: float) -> tuple[Figure, Any]:
 
 
 def _draw_final(groups: Groups, looks: Looks) -> Figure:
-    figure, panels = _panels(groups, 2, _height(groups))
+    scatter = any(len(label.seeds) >= FEWEST_RUNS for group in groups for label in group.labels)
+    figure, panels = _panels(groups, 2 if scatter else 1, _height(groups))
     look = looks()
-    for (left, right), group in zip(panels, groups, strict=True):
+    for (left, *others), group in zip(panels, groups, strict=True):
         extent = _draw_runs(left, group, look, "final_return", group.solved)
+        if not others:
+            continue
+        (right,) = others
         deviations = [label.numbers["final_return_sd"] for label in group.labels]
         _from_zero(right, deviations, extent.width / 2)  # more than of any such returns
         right.set_ylabel("SD over runs")

@@ -7,7 +7,7 @@ import numpy as np
 
 from jbrep.encoders import FULL
 from jbrep.report.figures.claims import claim_plot
-from jbrep.report.figures.curves import across_tasks, curves, every_run
+from jbrep.report.figures.curves import Played, across_tasks, curves, every_run
 from jbrep.report.figures.diagnostics import diagnostics
 from jbrep.report.figures.diagrams import diagrams
 from jbrep.report.figures.plot import Plot
@@ -18,7 +18,7 @@ from jbrep.stats.association import Association
 from jbrep.stats.intervals import FEWEST_RUNS
 from jbrep.stats.runs import in_order
 from jbrep.study.record import Label
-from jbrep.study.tables import References, Return
+from jbrep.study.tables import References, Return, by_run
 
 
 def study_plots(
@@ -37,9 +37,9 @@ def study_plots(
         *(shared.settings.representation for shared in labels.values()),
     }
     looks = partial(styles, in_order(names, baseline), baseline if baseline in names else None)
-    plots, played = [], {task: _means(each) for task, each in references.items()}
+    plots, played = [], _on_all_starts(references, returns)
     if analysis:
-        plots += [curves(groups, played, looks), final_return(groups, looks)]
+        plots += [final_return(groups, looks), curves(groups, played, looks)]
         if any(group.compares for group in groups):
             plots.append(claim_plot(analysis, looks))
         plots.append(learning_rate(groups, looks))
@@ -54,6 +54,17 @@ def study_plots(
     return [*plots, *diagrams(labels, looks)]
 
 
-def _means(played: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    """The mean returns of policies over all starts of the last evaluation, as tables have them."""
-    return {policy: float(np.mean(each)) for policy, each in played.items()}
+def _on_all_starts(references: References, returns: Sequence[Return]) -> Played:
+    """Means of policies that don't learn, for tasks whose curves are of the same starts.
+
+    Where only the last evaluation has all starts, curves of the others can't stand beside them.
+    """
+    fewest: dict[str, int] = {}
+    for (label, _), by_step in by_run(returns).items():
+        task, count = label.rsplit("/", 2)[0], min(map(len, by_step.values()))
+        fewest[task] = min(fewest.get(task, count), count)
+    return {
+        task: {policy: float(np.mean(each)) for policy, each in played.items()}
+        for task, played in references.items()
+        if all(len(each) == fewest.get(task) for each in played.values())
+    }
