@@ -221,10 +221,10 @@ def unfinished(path: Path) -> Iterator[Path]:
         InputError: the path exists already, or another process is writing it.
     """
     with exclusive(path, beside=True):
-        if os.path.lexists(path):
-            raise taken(path)
         partial = path.with_name(f".{path.name}.partial")
         _remove(partial)
+        if os.path.lexists(path):
+            raise taken(path)
         try:
             yield partial
         finally:

@@ -65,6 +65,7 @@ def command(*arguments):
 def forked(act, folder, *, before=lambda: None, seconds=None):
     """Do something in a fork, to be killed after so many seconds; its exit code and its words."""
     told = folder.with_suffix(".told")
+    told.touch()
     child = os.fork()
     if not child:
         code = 1
