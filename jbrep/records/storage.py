@@ -126,9 +126,11 @@ def make_folder(folder: Path, own: Collection[str] = ()) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        names = sorted(e.name for e in folder.iterdir() if not e.name.startswith("."))
+        there = sorted(each.name for each in folder.iterdir())
     except OSError as error:
         raise InputError(f"can't make the folder {folder}: {error.strerror or error}") from None
+    # what a killed writer left is nothing yet
+    names = [each for each in there if not each.startswith(".") and not each.endswith(_PARTIAL)]
     if own and names and not any(fnmatchcase(name, each) for name in names for each in own):
         raise InputError(
             f"{folder} holds other things, such as {names[0]}: choose a folder that is new or empty"
