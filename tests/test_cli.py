@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from click.shell_completion import ShellComplete
 from command import jbrep
 from stable_baselines3 import A2C
 from test_study import TOML
@@ -355,3 +356,18 @@ def test_mistakes_in_words_are_found_before_torch_is_imported(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("Error: ") == done.stderr.count("\n") == 18
+
+
+@pytest.mark.parametrize(
+    ("typed", "begun", "expected"),
+    [
+        ("collect --task", "move_to", ["move_to_position", "move_to_pose"]),
+        ("train-encoder --kind", "linear", ["linear-forward"]),
+        ("rl --task move_to_pose --encoder", "sy", ["symmetry"]),
+        ("encoder info", "pca-1", ["pca-12"]),
+    ],
+)
+def test_a_shell_completes_tasks_kinds_and_encoders(typed, begun, expected):
+    completing = ShellComplete(main, {}, "jbrep", "_JBREP_COMPLETE")
+    found = completing.get_completions(typed.split(), begun)
+    assert [item.value for item in found] == expected

@@ -142,6 +142,10 @@ def test_a_run_of_another_robot_is_not_resumed(own_module, tmp_path):
     assert jbrep(*data, "--steps", 40).exit_code == 0
     made_from = read_run(tmp_path / "run").settings.environment.made_from
     assert [*made_from] == ["module environments", "module gears42", "module robot42"]
+    with pytest.MonkeyPatch.context() as elsewhere:
+        elsewhere.delitem(gymnasium.registry, "Own/Robot-v0")
+        said = mistake("evaluate-policy", tmp_path / "run")
+        assert "it was made by environments, gears42, robot42; add the one that registers" in said
     (tmp_path / "gears42.py").write_text("GEAR = 0.25\n")
     reload(sys.modules["gears42"])
     gymnasium.registry.pop("Own/Robot-v0")

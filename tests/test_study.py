@@ -460,7 +460,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     """Its workers import the package; its report is made where that is missing."""
     path, out = written(tmp_path, *MIXED), tmp_path / "mixed"
     with monkeypatch.context() as once:
-        once.setattr("jbrep.report.report.write_report_of", lambda tables, out: [])
+        once.setattr("jbrep.report.report.write_report_of", lambda tables, out: [out])
         told = jbrep("study", path, "--out", out, "--workers", 1, "--import", "robots")
     assert told.exit_code == 0, told.output
     monkeypatch.delitem(gymnasium.registry, robots.ID)
@@ -483,7 +483,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     }
     refused = jbrep("study", path, "--out", out)
     assert "unknown task 'Robots/Pendulum-v1'" in refused.stderr
-    assert "--import PACKAGE" in refused.stderr
+    assert "--import PACKAGE" in refused.stderr  # its file names no module
 
 
 def test_no_references_no_table_and_damaged_ones_are_named(tmp_path):

@@ -18,6 +18,7 @@ from jbrep.cli.base import (
     say,
     stoppable,
 )
+from jbrep.cli.completion import complete_task
 from jbrep.cli.environment import (
     given_task,
     import_option,
@@ -213,7 +214,12 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
     epilog="Example: jbrep data derive data/face --task move_in_direction --out data/move"
 )
 @_data
-@click.option("--task", required=True, help="The task to observe and reward.")
+@click.option(
+    "--task",
+    required=True,
+    shell_complete=complete_task,
+    help="The task to observe and reward.",
+)
 @record_options(CollectSettings, "store_state")
 @threads_option
 @click.option("--out", required=True, type=PATH, help="A folder.")

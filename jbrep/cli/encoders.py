@@ -17,6 +17,7 @@ from jbrep.cli.base import (
     say,
     stoppable,
 )
+from jbrep.cli.completion import complete_encoder, complete_task
 from jbrep.cli.environment import given_task, needed_task, task_options
 from jbrep.errors import InputError
 from jbrep.text import facts, r2_text, table, terminal_width, wrapped
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--encoder",
+    shell_complete=complete_encoder,
     required=True,
     multiple=True,
     help="Files, names that ship, or code, mymodule:MyEncoder; one or several.",
@@ -159,7 +161,11 @@ _COLUMNS["times_pca"] = "error"
 
 
 @encoder.command("list", epilog="Example: jbrep encoder list --task face_direction")
-@click.option("--task", help="One of the Jitterbug's; all of them by default.")
+@click.option(
+    "--task",
+    shell_complete=complete_task,
+    help="One of the Jitterbug's; all of them by default.",
+)
 @as_json
 def list_shipped(task: str | None, as_json: bool) -> None:
     """Show which encoders ship, and how they were judged.
@@ -215,7 +221,7 @@ def _with_diagnostics(task: "Task") -> "list[tuple[str, Encoder, Values]]":
     return [(name, each, known.get(each.fingerprint, {})) for name, each in shipped(task).items()]
 
 
-_which = click.argument("encoder")
+_which = click.argument("encoder", shell_complete=complete_encoder)
 
 
 @encoder.command(epilog="Example: jbrep encoder info dae-8 --task face_direction")

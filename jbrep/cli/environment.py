@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from jbrep.cli.base import PATH, POSITIVE, as_json, echo_json, echo_text, with_options
+from jbrep.cli.completion import complete_task
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.text import terminal_width
@@ -73,6 +74,7 @@ retries_option = click.option(
 task_options = with_options(  # from which `given_task` makes a task
     click.option(
         "--task",
+        shell_complete=complete_task,
         help="One of the Jitterbug's, such as face_direction, or a Gymnasium id: Hopper-v5.",
     ),
     _argument_options,
@@ -120,7 +122,7 @@ def parse_arguments(given: tuple[str, ...], option: str = "--env") -> dict[str, 
 
 
 @click.command(epilog="Example: jbrep env Hopper-v5")
-@click.argument("task")
+@click.argument("task", shell_complete=complete_task)
 @_argument_options
 @as_json
 def env(as_json: bool, **options: Any) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from jbrep.cli.base import COUNT, PATH, say, stoppable
+from jbrep.cli.completion import complete_encoder
 from jbrep.cli.environment import given_task, task_options
 from jbrep.errors import InputError
 
@@ -24,6 +25,7 @@ _KEEPER = ("sh", "-c", "read -r _; kill 0")
 @task_options
 @click.option(
     "--encoder",
+    shell_complete=complete_encoder,
     help="A file, a name that ships, or code, mymodule:MyEncoder; a run's own if not given.",
 )
 @click.option("--traverse", is_flag=True, help="Show what each unit of the latent moves.")

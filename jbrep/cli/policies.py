@@ -15,6 +15,7 @@ from jbrep.cli.base import (
     say,
     stoppable,
 )
+from jbrep.cli.completion import complete_encoder
 from jbrep.cli.environment import given_task, retries_option, task_options, threads_option
 from jbrep.errors import InputError
 from jbrep.text import interval_of, percentiles, table, terminal_width
@@ -45,6 +46,7 @@ _TASK = "face_direction"
 )
 @click.option(
     "--encoder",
+    shell_complete=complete_encoder,
     help="What a zip file was trained on, or what a policy by name observes through: a file, the "
     "name of one that ships, or code, mymodule:MyEncoder; of a run that was made with code, that.",
 )

@@ -22,6 +22,7 @@ from jbrep.cli.base import (
     stoppable,
     with_options,
 )
+from jbrep.cli.completion import complete_encoder
 from jbrep.cli.environment import needed_task, parse_arguments, retries_option, task_options
 from jbrep.cli.options import record_options
 from jbrep.errors import choose
@@ -69,6 +70,7 @@ learner_options = with_options(  # which `given_run` reads
     ),
     click.option(
         "--encoder",
+        shell_complete=complete_encoder,
         default="full",
         show_default=True,
         help="A file, a shipped encoder's name, or code as module:Class, which is run; full is "

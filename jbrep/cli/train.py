@@ -9,6 +9,7 @@ import click
 from msgspec import inspect
 
 from jbrep.cli.base import POSITIVE, RESUMES, Variadic, data_option, printable, stoppable
+from jbrep.cli.completion import complete_kind
 from jbrep.errors import InputError, choose
 from jbrep.records.keys import Key, keys_of
 from jbrep.records.words import bare
@@ -180,7 +181,7 @@ def train_dae(**options: Any) -> None:
     epilog="Example: jbrep train-encoder --kind slow --data data/face --latent 8 "
     "--out encoders/face",
 )
-@click.option("--kind", required=True, help="One of those below.")
+@click.option("--kind", required=True, shell_complete=complete_kind, help="One of those below.")
 @_making
 def train_encoder(kind: str, **options: Any) -> None:
     """Make encoders of any kind.

@@ -14,7 +14,7 @@ from jbrep.collect.shards import Made, Missing, Produce, Simulator, all_of
 from jbrep.dataset.schema import Columns
 from jbrep.envs.instances import close_kept
 from jbrep.envs.make import is_batched
-from jbrep.envs.names import find_spec, import_modules, imported_modules
+from jbrep.envs.names import import_modules, imported_modules, spec_of
 from jbrep.envs.recording import Tick
 from jbrep.errors import InputError, first_line
 from jbrep.pool import ATTEMPTS, Pool, on_cluster, stop_requested
@@ -24,7 +24,7 @@ def local(simulator: Simulator) -> Produce:
     """A batch's shards in turn on threads; other environments' side by side in processes."""
     workers = simulator.num_threads or os.cpu_count() or 1
     task = simulator.settings.task
-    if is_batched(task) or workers == 1 or not _can_be_sent(find_spec(task.id), simulator):
+    if is_batched(task) or workers == 1 or not _can_be_sent(spec_of(task), simulator):
         return simulator.in_turn
     return _in_processes(replace(simulator, lanes=1, num_threads=1), workers)
 
@@ -49,7 +49,7 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
             return
         made: dict[int, Made] = {}
         started, attempts = first, dict[int, int]()
-        known = imported_modules(), find_spec(simulator.settings.task.id)
+        known = imported_modules(), spec_of(simulator.settings.task)
         close_kept()  # the workers have their own
         with Pool[int, Made](make_shard, workers, lambda: None) as pool:
 
@@ -119,7 +119,7 @@ def on_ray(simulator: Simulator) -> Produce:
 
         make = on_cluster(make_shard, simulator.num_threads)
         alone = replace(simulator, lanes=1, num_threads=1)
-        known = imported_modules(), find_spec(simulator.settings.task.id)
+        known = imported_modules(), spec_of(simulator.settings.task)
         started, made = first, dict[int, Any]()
         try:
             for shard in count(first):

@@ -15,7 +15,7 @@ from gymnasium.spaces.utils import flatten
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from jbrep.envs.names import find_spec
+from jbrep.envs.names import find_spec, spec_of
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, kind_and_line
 
@@ -52,7 +52,7 @@ def make_env(
 def make_batch(task: Task, num_lanes: int, num_threads: int | None) -> VectorEnv[Any, Any, Any]:
     """All lanes as one environment that steps them together, see `is_batched`."""
     return gymnasium.make_vec(
-        find_spec(task.id),
+        spec_of(task),
         num_envs=num_lanes,
         vectorization_mode="vector_entry_point",
         autoreset_mode=AutoresetMode.DISABLED,
@@ -70,7 +70,7 @@ def is_batched(task: Task) -> bool:
     one with the attributes `state` and `restore`, and with the arguments num_threads, dtype and
     autoreset_mode.
     """
-    return hasattr(creator(find_spec(task.id), vector=True), "restore")
+    return hasattr(creator(spec_of(task), vector=True), "restore")
 
 
 def creator(spec: EnvSpec, vector: bool = False) -> Any:

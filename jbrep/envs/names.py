@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from jbrep.envs.task import SHORT_NAMES
+from jbrep.envs.task import SHORT_NAMES, Task
 from jbrep.errors import InputError, kind_and_line
 
 _imported: list[str] = []
@@ -38,6 +38,27 @@ def find_spec(name: str) -> EnvSpec:
         raise InputError(
             f"unknown task {name!r}: {hint}choose one of {', '.join(SHORT_NAMES)}, or an id that "
             "Gymnasium knows; for one of another package add --import PACKAGE"
+        ) from None
+
+
+def spec_of(task: Task) -> EnvSpec:
+    """What is registered under a task's id.
+
+    Raises:
+        InputError, ModuleNotFoundError: as `find_spec`; the message names the module that the task
+            was defined in.
+    """
+    try:
+        return find_spec(task.id)
+    except InputError:
+        parts = [part.partition(" ") for part in task.made_from or ()]
+        modules = dict.fromkeys(name.split(".")[0] for kind, _, name in parts if kind == "module")
+        if not modules:
+            raise
+        which = f"--import {min(modules)}" if len(modules) == 1 else "the one that registers it"
+        raise InputError(
+            f"unknown task {task.id!r}: it was made by {', '.join(modules)}; add {which}"
+            f"{'' if len(modules) == 1 else ', as --import MODULE'}: this runs its code"
         ) from None
 
 

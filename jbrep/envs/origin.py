@@ -17,7 +17,7 @@ from typing import Any
 from gymnasium.envs.registration import EnvSpec
 
 from jbrep.envs.make import creator
-from jbrep.envs.names import find_spec
+from jbrep.envs.names import spec_of
 from jbrep.envs.task import Task, changed_parts
 
 _MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")  # of files that name others
@@ -88,7 +88,7 @@ def changes_of(task: Task) -> str:
     """What is not what it was when a task was described, for a message; empty if all is."""
     if not task.made_from:
         return ""
-    spec = find_spec(task.id)
+    spec = spec_of(task)
     files = files_of({**spec.kwargs, **task.arguments})
     now = {**files, **code_of(spec)}
     known = {name: now.get(name, "0" * 64) for name in task.made_from}
