@@ -4,15 +4,23 @@ import json
 
 import numpy as np
 import pytest
-from command import jbrep, refused
+from command import in_this_process, jbrep, refused
 from small import flip_bit
 
 from jbrep.envs import describe
 from jbrep.envs.infos import by_name, number_of, numbers_in, shares, shares_text
 from jbrep.envs.lanes import Lanes
 from jbrep.envs.names import import_modules
+from jbrep.report import report
+from jbrep.report.returns import returns_tables
+from jbrep.report.shares import share_cells, shares_of_runs
+from jbrep.report.tables import read_tables
 from jbrep.rl import Run, train
 from jbrep.rl.files import EVALUATION_SEED, INFOS, Info, read_infos, read_run
+from jbrep.study.config import Study
+from jbrep.study.plan import Plan
+from jbrep.study.runner import run_study
+from jbrep.study.tables import RUN_INFOS, Return, RunInfo
 
 import_modules(["environments"])
 SCORED = "Sledges/Scored-v0"
@@ -113,3 +121,80 @@ def test_others_have_no_such_table(tmp_path):
     assert read_infos(tmp_path) == []
     assert not (tmp_path / INFOS).exists()
     assert INFOS not in result.tables
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """The folder of a tiny study, finished, and what its report says."""
+    folder = tmp_path_factory.mktemp("infos") / "study"
+    tiny = {"algorithms": ("a2c",), "representations": ("full",), "seeds": (0, 1), "steps": 40}
+    tiny |= {"evaluate_every": 40, "evaluation_episodes": 1, "final_episodes": EPISODES}
+    plan = Plan(Study(tasks=(SCORED, "Sledges/Sledge-v0"), **tiny), folder)
+    assert run_study(plan, in_this_process, 1) == 0
+    draw = report.study_plots
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "study_plots", lambda *tables: draw(*tables)[:1])
+        done = jbrep("report", folder)
+    assert done.exit_code == 0, done.output
+    return folder, done.stdout
+
+
+def test_a_study_has_them_in_a_table_of_its_own(study, tmp_path):
+    folder, _ = study
+    tables = read_tables(folder)
+    assert tables.infos == [
+        RunInfo(SCORED, "a2c", "full", seed, step, episode, *each)
+        for seed in (0, 1)
+        for step, episodes in ((0, 1), (40, EPISODES))
+        for episode in range(episodes)
+        for each in zip(NAMES, told(episode), strict=True)
+    ]
+    for name in ("runs.json", "returns.csv", "references.csv", RUN_INFOS):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    flip_bit(tmp_path / RUN_INFOS, 300)
+    assert f"{RUN_INFOS} was changed after it was written" in refused(read_tables, tmp_path)
+
+
+def test_reports_have_a_column_for_each_share(study):
+    folder, said = study
+    scored, sledge = returns_tables(read_tables(folder))
+    heads = ("share of is_success", "share of slid")
+    assert scored.header[-2:] == heads
+    assert [row[-2:] for row in scored.rows] == [("0.50", "0.33"), *[("-", "-")] * 2]
+    assert not {*heads} & {*sledge.header}
+    assert f"  {heads[0]}  {heads[1]}\n" in said
+    for name in ("report.html", "summary.md"):
+        assert heads[0] in (folder / name).read_text()
+
+
+def test_shares_are_of_last_evaluations_and_have_intervals(study):
+    """A run that failed has none; four or more runs have an interval."""
+    tables = read_tables(study[0])
+    first, *_ = tables.record.runs
+    made = [first.replace(seed=seed) for seed in range(5)]
+    made[4] = first.replace(seed=4, status="failed", reason="of heat")
+    key = (SCORED, "a2c", "full")
+    returns = [Return(*key, seed, step, 0, 1.0) for seed in range(5) for step in (0, 40)]
+    infos = [
+        RunInfo(*key, seed, step, episode, "won", float(step == 40 and episode <= seed))
+        for seed in range(5)
+        for step in (0, 40)
+        for episode in range(5)
+    ]
+    infos.append(RunInfo(*key, 3, 40, 0, "heat", 0.5))
+    tables = tables._replace(record=tables.record.replace(runs=made), returns=returns, infos=infos)
+    label = first.label
+    assert shares_of_runs(tables) == {(label, seed): {"won": (seed + 1) / 5} for seed in range(4)}
+    assert share_cells(tables) == {"share of won": {label: "0.50 [0.16, 0.84]"}}
+
+
+def test_a_run_is_reported_in_its_own_folder(run):
+    """Its own table stays what it was."""
+    folder, _ = run
+    before = (folder / INFOS).read_bytes()
+    done = jbrep("report", folder)
+    assert done.exit_code == 0, done.output
+    assert (folder / INFOS).read_bytes() == before
+    words = done.stdout.split()
+    assert "share of slid" in " ".join(words)
+    assert (words.count("0.50"), words.count("0.33")) == (1, 1)

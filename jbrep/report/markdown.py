@@ -34,7 +34,7 @@ def _parts(
     yield from (f"**{escape(each)}**" for each in answer(tables))
     if tables.analysis:
         yield f"![Returns over training]({picture})"
-        yield from map(_titled, returns_tables(tables.analysis))
+        yield from map(_titled, returns_tables(tables))
         yield from _findings(tables.analysis, answers)
         yield from map(_titled, across_tasks(tables.analysis))
     yield from map(_titled, predictions)

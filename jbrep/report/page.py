@@ -34,7 +34,7 @@ def page(tables: Tables, plots: Sequence[Plot], predictions: Sequence[Table]) ->
         facts=facts,
         words=words,
         answer=answer(tables),
-        returns=returns_tables(analysis) if analysis else [],
+        returns=returns_tables(tables),
         beside=_beside(analysis),
         estimates=matrix,
         how=_how(analysis) if analysis else "",

@@ -2,10 +2,12 @@
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from jbrep.report.shares import Cells, share_cells
+from jbrep.report.tables import Tables
 from jbrep.report.words import over, shown, shown_number
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.labels import REACHED, RepresentationResult
@@ -33,12 +35,18 @@ def named(groups: Sequence[GroupAnalysis]) -> list[tuple[str, RepresentationResu
     return [(label.representation, label) for label in groups[0].labels]
 
 
-def returns_tables(analysis: Analysis) -> list[Table]:
-    """A table for each task: final returns, which agents learned, and what they gain."""
-    return [_returns_table(groups, analysis) for groups in by_task(analysis)]
+def returns_tables(tables: Tables) -> list[Table]:
+    """A table for each task: final returns, which agents learned, what they gain, shares.
+
+    There is none without statistics.
+    """
+    if (analysis := tables.analysis) is None:
+        return []
+    shares = share_cells(tables)
+    return [_returns_table(groups, analysis, shares) for groups in by_task(analysis)]
 
 
-def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis) -> Table:
+def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: Cells) -> Table:
     """A row for each agent, then for each policy that doesn't learn; no column without content."""
     first = groups[0]
     kept = {
@@ -61,6 +69,7 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis) -> Table
         f"of {analysis.baseline}'s gain": lambda label: (
             shown(kept[label.representation], ".2f") if label.representation in kept else "-"
         ),
+        **_share_columns(groups, shares),
     }
     rows = [(name, *(cell(label) for cell in columns.values())) for name, label in named(groups)]
     for policy, mean in first.references.items():
@@ -78,6 +87,22 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis) -> Table
             gained += ", as it was registered"
         return found._replace(title=f"{found.title}; {gained}")
     return found
+
+
+def _share_columns(
+    groups: Sequence[GroupAnalysis], shares: Cells
+) -> dict[str, Callable[[RepresentationResult], str]]:
+    """A column for each share that is known of these agents."""
+    labels = {
+        label: f"{group.task}/{group.algorithm}/{label.representation}"
+        for group in groups
+        for label in group.labels
+    }
+
+    def column(cells: Mapping[str, str]) -> Callable[[RepresentationResult], str]:
+        return lambda label: cells.get(labels[label], "-")
+
+    return {head: column(cells) for head, cells in shares.items()}
 
 
 def _without_nothing(table: Table) -> Table:

@@ -9,6 +9,7 @@ import numpy as np
 from jbrep.report import facts
 from jbrep.report.answer import answer
 from jbrep.report.returns import return_form, returns_tables, steps
+from jbrep.report.shares import share_of, shares_of_runs
 from jbrep.report.tables import Tables
 from jbrep.report.words import (
     EFFECTS,
@@ -32,7 +33,7 @@ from jbrep.stats.rules import Planned
 from jbrep.stats.scale import SOLVED
 from jbrep.study.packing import Forecast
 from jbrep.study.tables import by_run
-from jbrep.text import SIGNIFICANT, Table, duration, rounded, table, wrapped
+from jbrep.text import SIGNIFICANT, Table, duration, number, rounded, table, wrapped
 
 _KEY, _NAME = "representation", attrgetter("representation")
 
@@ -50,7 +51,7 @@ def results_text(tables: Tables, width: int | None = None, everything: bool = Fa
     """
     parts = [wrapped(each, width) for each in (*facts.notices(tables), *answer(tables))]
     if analysis := tables.analysis:
-        shown_first = [*returns_tables(analysis), *decided_tables(analysis)]
+        shown_first = [*returns_tables(tables), *decided_tables(analysis)]
         parts += [each.text(width) for each in shown_first]
         if everything:
             parts.append(statistics_text(analysis, width))
@@ -90,14 +91,19 @@ def decided_tables(analysis: Analysis) -> list[Table]:
 
 def _last(tables: Tables, width: int | None) -> str:
     returns, rows = by_run(tables.returns), []
+    shares = shares_of_runs(tables)
+    names = list(dict.fromkeys(name for of_run in shares.values() for name in of_run))
     for run in tables.record.runs:
         if run.status == FAILED:
-            rows.append((run.label, str(run.seed), f"{run.steps:,}", "failed", "-"))
+            cells = [str(run.seed), f"{run.steps:,}", "failed", *["-"] * (1 + len(names))]
+            rows.append((run.label, *cells))
             continue
         step, final = max(returns[run.label, run.seed].items())
         low, median, high = rounded(*np.percentile(final, (10, 50, 90)))
-        rows.append((run.label, str(run.seed), f"{step:,}", median, f"[{low}, {high}]"))
-    return table(("run", "seed", "steps", "median return", "10-90 %"), rows, width)
+        own = [number(shares[run.label, run.seed].get(name), ".2f") for name in names]
+        rows.append((run.label, str(run.seed), f"{step:,}", median, f"[{low}, {high}]", *own))
+    header = ("run", "seed", "steps", "median return", "10-90 %", *map(share_of, names))
+    return table(header, rows, width)
 
 
 def group_tables(group: GroupAnalysis, analysis: Analysis) -> list[Table]:

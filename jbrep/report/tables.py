@@ -14,7 +14,15 @@ from jbrep.stats.rules import Planned
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.registration import REGISTRATION, read_registration
 from jbrep.study.results import found
-from jbrep.study.tables import REFERENCE_RETURNS, RETURNS, References, Return, read_references
+from jbrep.study.tables import (
+    REFERENCE_RETURNS,
+    RETURNS,
+    RUN_INFOS,
+    References,
+    Return,
+    RunInfo,
+    read_references,
+)
 
 
 class Tables(NamedTuple):
@@ -23,6 +31,7 @@ class Tables(NamedTuple):
     name: str
     record: RunsRecord  # runs.json
     returns: list[Return]  # returns.csv
+    infos: list[RunInfo]  # run-infos.csv
     references: References  # references.csv: returns by task and policy
     # diagnostics.csv: values by task and representation, then by name
     diagnostics: dict[tuple[str, str], dict[str, float | None]]
@@ -68,9 +77,10 @@ def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
     sha256 = record.tables
     returns = read_rows(folder / RETURNS, Return, sha256.get(RETURNS, ""))
     references = read_references(folder, sha256.get(REFERENCE_RETURNS))
-    known = sha256.get(DIAGNOSTICS)
+    told, known = sha256.get(RUN_INFOS), sha256.get(DIAGNOSTICS)
+    infos = read_rows(folder / RUN_INFOS, RunInfo, told) if told else []
     rows = read_diagnostics(folder / DIAGNOSTICS, known) if known else []
     planned = registration.registered.planned if registration else Planned()
     statistics = found(record, returns, references, planned, across_trainers)
     name = folder.resolve().name.encode(errors="replace").decode()
-    return Tables(name, record, returns, references, by_label(rows), *statistics)
+    return Tables(name, record, returns, infos, references, by_label(rows), *statistics)

@@ -3,9 +3,10 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,8 +16,16 @@ from jbrep.errors import InputError
 from jbrep.evaluate.table import DIAGNOSTICS
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
-from jbrep.records.tables import write_rows
-from jbrep.rl.files import FAILED, RUN, RunRecord, read_evaluations, read_run, runs_below
+from jbrep.records.tables import write_csv, write_rows
+from jbrep.rl.files import (
+    FAILED,
+    RUN,
+    RunRecord,
+    read_evaluations,
+    read_infos,
+    read_run,
+    runs_below,
+)
 from jbrep.stats import Analysis, RunCurve, analyse
 from jbrep.stats.rules import Planned, Rules
 from jbrep.study.plan import STUDY
@@ -24,8 +33,10 @@ from jbrep.study.record import RECORD, LabelSettings, RunFacts, RunsRecord, runs
 from jbrep.study.tables import (
     REFERENCE_RETURNS,
     RETURNS,
+    RUN_INFOS,
     References,
     Return,
+    RunInfo,
     by_run,
     read_references,
     stated,
@@ -42,21 +53,23 @@ def conclude(folder: Path) -> list[Path]:
         folder: with the runs.
 
     Returns:
-        The files: every return, what was run, and the returns of reference policies.
+        The files: every return, what was run, what `info` told, the returns of reference policies.
 
     Raises:
         InputError: there is no such run, a file is damaged, or a table can't be written.
     """
     ended, before = _ended(folder), stated(folder)
     references = write_references(_tasks(ended.values()), folder, before)
-    rows = list(_returns(ended))
+    rows, infos = list(_returns(ended)), list(_of_runs(ended, read_infos))
     tables = {name: before[name] for name in (DIAGNOSTICS,) if name in before}
     tables[RETURNS] = write_rows(folder / RETURNS, rows, Return)
+    if infos:
+        tables[RUN_INFOS] = write_csv(folder / RUN_INFOS, RunInfo._fields, infos)
     if references:
         tables[REFERENCE_RETURNS] = references
     runs_record(folder, ended, tables).write(folder / RECORD)  # last: it says what they are
-    names = RETURNS, RECORD, *([REFERENCE_RETURNS] if references else [])
-    return [folder / name for name in names]
+    names = dict.fromkeys((RETURNS, RECORD, *tables))
+    return [folder / name for name in names if name != DIAGNOSTICS]
 
 
 def found(
@@ -149,11 +162,16 @@ def _tasks(runs: Iterable[RunRecord]) -> Iterable[tuple[Task, int]]:
 
 def _returns(ended: Ended) -> Iterator[Return]:
     """A row for each episode of each evaluation, by label, seed and step."""
+    return (Return(*row) for row in _of_runs(ended, read_evaluations))
+
+
+def _of_runs(ended: Ended, read: Callable[[Path], Iterable[NamedTuple]]) -> Iterator[list[Any]]:
+    """The rows of a table that runs have, each after what tells its run, by label and seed."""
     runs = ((run.settings, folder) for folder, run in ended.items())
     for settings, folder in sorted(runs, key=lambda run: (run[0].label, run[0].seed)):
         key = settings.task, settings.learner, settings.representation, settings.seed
-        for row in read_evaluations(folder):
-            yield Return(*key, *row)
+        for row in read(folder):
+            yield [*key, *row]
 
 
 def _curves(

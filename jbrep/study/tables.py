@@ -30,6 +30,7 @@ from jbrep.text import slug
 
 RETURNS = "returns.csv"
 REFERENCE_RETURNS = "references.csv"
+RUN_INFOS = "run-infos.csv"  # a run may be in the same folder: its own table is infos.csv
 _POLICIES = {STILL: "still", "random": "uniform", LOOKING: "heuristic"}
 References = dict[str, dict[str, list[float]]]  # returns by task and policy
 
@@ -47,6 +48,24 @@ class Return(NamedTuple):
     step: int
     episode: int
     episode_return: float
+
+
+class RunInfo(NamedTuple):
+    """A row of run-infos.csv: a number that the environment told of such an episode."""
+
+    task: str
+    algorithm: str
+    representation: str
+    seed: int
+    step: int
+    episode: int
+    name: str
+    value: float
+
+    @property
+    def run(self) -> tuple[str, int]:
+        """The run's label and seed."""
+        return f"{self.task}/{self.algorithm}/{self.representation}", self.seed
 
 
 class _Reference(NamedTuple):
