@@ -20,7 +20,7 @@ from jbrep.cli.base import (
 from jbrep.cli.completion import complete_encoder, complete_task
 from jbrep.cli.environment import given_task, needed_task, task_options
 from jbrep.errors import InputError
-from jbrep.text import facts, r2_text, table, terminal_width, wrapped
+from jbrep.text import facts, r2_text, slug, table, terminal_width, wrapped
 
 if TYPE_CHECKING:
     from jbrep.encoders import Encoder
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from jbrep.envs.task import Task
     from jbrep.evaluate.evaluation import Evaluation
     from jbrep.evaluate.table import Values
+
+
+_LETTERS = 100  # of the name of a folder
 
 
 @click.command(
@@ -45,10 +48,8 @@ if TYPE_CHECKING:
 @data_option
 @click.option(
     "--out",
-    default="evaluation",
-    show_default=True,
     type=PATH,
-    help="A folder for evaluation.json and figures.",
+    help="A folder for evaluation.json and figures.  [default: evaluation/DATA/ENCODERS]",
 )
 @click.option(
     "--policy",
@@ -65,7 +66,7 @@ if TYPE_CHECKING:
 def evaluate(
     encoder: tuple[str, ...],
     data: Path,
-    out: Path,
+    out: Path | None,
     policy: str | None,
     everything: bool,
     as_json: bool,
@@ -100,6 +101,7 @@ def evaluate(
     labels = _labels([each.name for each in encoders], sources)
     if twice := {label for label in labels if labels.count(label) > 1}:
         raise InputError(f"{min(twice)} is given twice: leave one out")
+    out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(labels))[:_LETTERS])
     check_writable(out)
     labelled = dict(zip(labels, encoders, strict=True))
     with stoppable("the same command starts over"):
