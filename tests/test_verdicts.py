@@ -63,7 +63,7 @@ def test_before_a_look_there_are_curves_and_counts_alone(looks):
     analysis, page, text = looks[1][5]
     assert words(cell(analysis, "face_direction", "dae-8")) == ["not yet"] * 4
     assert "Nothing is decided yet: the first look is at 8 runs of each arm." in page
-    assert "Returns over training" in text
+    assert "![Final returns]" in text
     assert [each.representation for each in analysis.open_aggregates] == ["full"]
     assert words(cell(analysis, "move_in_direction", "dae-8")) == ["exploratory"] * 4
     tables = [group_tables(group, analysis) for group in analysis.groups]

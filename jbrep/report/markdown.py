@@ -33,7 +33,7 @@ def _parts(
         yield f"> {escape(notice)}"
     yield from (f"**{escape(each)}**" for each in answer(tables))
     if tables.analysis:
-        yield f"![Returns over training]({picture})"
+        yield f"![Final returns]({picture})"
         yield from map(_titled, returns_tables(tables))
         yield from _findings(tables.analysis, answers)
         yield from map(_titled, across_tasks(tables.analysis))

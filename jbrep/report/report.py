@@ -24,7 +24,7 @@ from jbrep.study.tables import add_diagnostics
 
 PAGE, SUMMARY, MARKDOWN, FIGURES = "report.html", "summary.json", "summary.md", "figures"
 STATISTICS = "statistics.json"
-_MAIN_FIGURE = "representations"
+_MAIN_FIGURE = "final_return"
 _MOST_SECONDS = 600.0  # to wait for another process's report
 
 
