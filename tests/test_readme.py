@@ -1,0 +1,83 @@
+"""README's commands, one after the other in one empty folder, each with less work to do."""
+
+import os
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import gymnasium
+import pytest
+from command import in_this_process, jbrep
+
+from jbrep.study.runner import BACKENDS
+
+ROOT = Path(__file__).parent.parent
+LESS = {  # by command: numbers in place of README's, or beside them
+    "collect": {"--steps": "1k", "--episode-steps": "100"},
+    "train-dae": {"--epochs": "2"},
+    "train-encoder": {},
+    "rl": {"--steps": "200", "--evaluation-episodes": "1", "--episode-steps": "100"},
+    "tune": {"--steps": "100", "--trials": "1", "--evaluation-episodes": "1"},
+    "behaviour": {"--episodes": "2"},
+    "render": {"--seconds": "0.5", "--size": "64x64"},
+    "evaluate-policy": {"--episodes": "2"},
+}
+STUDY = {
+    "seeds": "1",
+    "steps": "100",
+    "evaluate_every": "50",
+    "evaluation_episodes": "1",
+    "final_episodes": "2",
+}
+MY_ROBOT = """
+import gymnasium
+
+if "MyRobot-v0" not in gymnasium.registry:
+    hopper = "gymnasium.envs.mujoco.hopper_v5:HopperEnv"
+    gymnasium.register("MyRobot-v0", hopper, max_episode_steps=100)
+"""
+
+
+def commands():
+    """README's, in order."""
+    text = (ROOT / "README.md").read_text()
+    return [
+        shlex.split(line, comments=True) for line in re.findall(r"^ {4}jbrep (.*)$", text, re.M)
+    ]
+
+
+def lessened(words):
+    """The same command with less to do, and nothing to show on a screen."""
+    words = [word for word in words if word != "--view"]
+    for option, value in LESS.get(words[0], {}).items():
+        if option in words:
+            words[words.index(option) + 1] = value
+        else:
+            words += [option, value]
+    return words
+
+
+@pytest.mark.usefixtures("one_figure")
+@pytest.mark.filterwarnings("ignore")  # of encoders with two epochs, of very short runs
+def test_the_commands_of_the_readme_follow_one_another(tmp_path, monkeypatch):
+    monkeypatch.setitem(BACKENDS, "local", in_this_process)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.environ.get("PYTHONPATH", ""))
+    (tmp_path / "my_package.py").write_text(MY_ROBOT)
+    (tmp_path / "studies").mkdir()
+    demo = re.sub(r"^evaluations = .*\n", "", (ROOT / "studies/demo.toml").read_text(), flags=re.M)
+    for key, value in STUDY.items():
+        demo = re.sub(rf"^{key} = .*$", f"{key} = {value}", demo, flags=re.M)
+    (tmp_path / "studies/demo.toml").write_text(f"episode_steps = 100\n{demo}")
+    try:
+        for words in commands():
+            told = jbrep(*lessened(words))
+            assert told.exit_code == 0, (words, told.output)
+    finally:
+        sys.modules.pop("my_package", None)
+        gymnasium.registry.pop("MyRobot-v0", None)
+    for made in ("ddpg.onnx", "walk.mp4", "runs/demo/report.html", "runs/tune/best.toml"):
+        assert (tmp_path / made).stat().st_size, made
