@@ -31,9 +31,7 @@ _COLUMNS = {  # of the headline
     "action": "the action",
 }
 _OF_POLICY = ("value", "action")
-_LACKING = (
-    "What each lacks of what a controller needs (R² of reading it below .5), the most needed first"
-)
+_LACKING = "What each lacks of what a controller needs (R² of reading it below .5)"
 _NOISE = 0.1  # the level of corruption that is shown
 _MANY = 8  # quantities from which probes are summed up
 
@@ -50,7 +48,7 @@ def evaluation_text(
     if everything:
         encoders = evaluation.encoders
         tables = _errors(evaluation), _readings(encoders), _units(encoders)
-        parts += [each.text(width) for each in tables]
+        parts += [_columns(evaluation, width), *(each.text(width) for each in tables)]
     return "\n\n".join(parts)
 
 
@@ -59,13 +57,9 @@ def _headline(evaluation: Evaluation) -> Table:
     data = evaluation.data
     numbers = {label: headline(known) for label, known in evaluation.encoders.items()}
     shown = [c for c in _COLUMNS if any(each[c] is not None for each in numbers.values())]
-    explained = "; ".join(
-        f"{name}: {_COLUMNS[name]}" + (f" of {evaluation.policy}" if name in _OF_POLICY else "")
-        for name in shown
-    )
     return Table(
         f"R² on {counted(data.test_episodes, 'held-out episode')} ({data.test_rows:,} steps), "
-        f"nonlinear (1: all, 0: nothing). {explained}",
+        "nonlinear (1: all, 0: nothing)",
         ("encoder", "size", *shown),
         [
             (
@@ -76,6 +70,16 @@ def _headline(evaluation: Evaluation) -> Table:
             for label, each in numbers.items()
         ],
     )
+
+
+def _columns(evaluation: Evaluation, width: int | None) -> str:
+    """What the columns of the headline are."""
+    named = {
+        name: words + (f" of {evaluation.policy}" if name in _OF_POLICY else "")
+        for name, words in _COLUMNS.items()
+        if evaluation.policy or name not in _OF_POLICY
+    }
+    return facts(named, width or sys.maxsize, indent=0)
 
 
 def _lacking(evaluation: Evaluation, width: int | None) -> str:
@@ -91,10 +95,10 @@ def _lacking(evaluation: Evaluation, width: int | None) -> str:
         more = len(said) - _MANY
         some = [f"{words} ({r2_text(kept)})" for words, kept in list(said.items())[:_MANY]]
         lines[label] = ", ".join(some) + (f" and {more} more" if more > 0 else "") or "nothing"
-    told = f"{wrapped(_LACKING, width)}\n\n{facts(lines, width or sys.maxsize, indent=0)}"
+    told = f"{wrapped(_LACKING, width)}\n{facts(lines, width or sys.maxsize, indent=0)}"
     if unread := dict.fromkeys(in_words(task, each.name) for each in unreadable(evaluation)):
         nor = f"Not even from the full observation can be read here: {', '.join(unread)}."
-        told += f"\n\n{wrapped(nor, width)}"
+        told += f"\n{wrapped(nor, width)}"
     return told
 
 
