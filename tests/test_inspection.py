@@ -81,6 +81,17 @@ def poses(entity):
     return values(entity, "Transform3D:translation")[:, 0], turned[:, [3, 0, 1, 2]]
 
 
+def placed(found, root, path):
+    """The poses of a body that another carries, in the world: its own is in the other's frame."""
+    (place, turned), (own, attitude) = poses(found[root]), poses(found[f"{root}/{path}"])
+    products = [np.zeros(4) for _ in turned]
+    for product, carrier, each in zip(
+        products, turned, np.broadcast_to(attitude, turned.shape), strict=True
+    ):
+        mujoco.mju_mulQuat(product, carrier.astype(float), each.astype(float))
+    return place + rotate(turned, np.broadcast_to(own, place.shape)), np.array(products)
+
+
 @pytest.fixture(scope="module")
 def robot(rollout):
     return Robot(rollout.motion.model)
@@ -120,7 +131,7 @@ def traversed(folder):
 def test_every_body_and_geom_of_the_model_is_there(entities, robot):
     assert len(robot.bodies) == 10
     for body in robot.bodies:
-        entity = entities[f"/world/robot/{robot.names[body]}"]
+        entity = entities[f"/world/robot/{robot.paths[body]}"]
         for part in (*poses(entity), entity["step"], entity["time"]):
             assert len(part) == ROWS
         drawn = [name for name in entity if name.endswith(":colors")]
@@ -131,12 +142,12 @@ def test_every_body_and_geom_of_the_model_is_there(entities, robot):
 
 
 def test_shapes_are_the_models(entities, robot):
-    weight = entities["/world/robot/weight"]
+    weight = entities["/world/robot/jitterbug/weight"]
     geom = robot.model.geom("weight")
     np.testing.assert_allclose(values(weight, "Ellipsoids3D:half_sizes")[0, 0], geom.size)
     np.testing.assert_allclose(values(weight, "Ellipsoids3D:centers")[0, 0], geom.pos, rtol=1e-6)
     assert values(weight, "Ellipsoids3D:colors")[0, 0] == 0xD93326FF  # .85 .2 .15
-    leg = entities["/world/robot/leg1_lower"]
+    leg = entities["/world/robot/jitterbug/leg1_lower"]
     assert values(leg, "Cylinders3D:lengths").item() == pytest.approx(0.065)
     np.testing.assert_allclose(values(leg, "Ellipsoids3D:half_sizes")[0, 0], [0.003] * 3)
 
@@ -154,9 +165,9 @@ def test_poses_are_the_episodes(entities, rollout):
         motion.put(data, row)
         mujoco.mj_kinematics(model, data)
         for name in ("leg3_lower", "weight"):
-            there, attitude = poses(entities[f"/world/robot/{name}"])
+            there, attitude = placed(entities, "/world/robot/jitterbug", name)
             np.testing.assert_allclose(there[row], data.body(name).xpos, atol=1e-7)
-            np.testing.assert_allclose(attitude[row], data.body(name).xquat, atol=1e-7)
+            np.testing.assert_allclose(attitude[row], data.body(name).xquat, atol=3e-7)
 
 
 def test_the_timelines(entities):
@@ -210,7 +221,7 @@ def test_what_is_decoded(entities, rollout):
     np.testing.assert_array_equal(position, decoded[:, :3].astype(np.float32))
     length = np.linalg.norm(decoded[:, 3:7], axis=1, keepdims=True)
     np.testing.assert_allclose(quaternion, decoded[:, 3:7] / length, atol=1e-6)
-    _, weight = poses(entities["/world/ghost/weight"])
+    _, weight = placed(entities, "/world/ghost/jitterbug", "weight")
     half = (decoded[:, 13] - np.pi / 2) / 2
     turned = np.stack((np.cos(half), 0 * half, 0 * half, np.sin(half)), axis=1)
     x, y, z = (rotate(turned, np.tile(axis, (ROWS, 1))) for axis in np.eye(3))
@@ -227,6 +238,19 @@ def test_what_is_decoded(entities, rollout):
     aligned, attitude = poses(entities["/world/aligned/jitterbug"])
     np.testing.assert_array_equal(aligned, qpos[:, :3].astype(np.float32))
     np.testing.assert_array_equal(attitude, quaternion)
+
+
+def test_what_is_rigid_is_sent_once(entities, robot):
+    """The decoded robots' legs are at rest: their poses are those of the model's."""
+    data = mujoco.MjData(robot.model)
+    mujoco.mj_kinematics(robot.model, data)
+    for body in robot.bodies[1:]:
+        name, moves = robot.names[body], robot.names[body] == "weight"
+        for root in ("ghost", "aligned"):
+            own, _ = poses(entities[f"/world/{root}/jitterbug/{name}"])
+            assert len(own) == (ROWS if moves else 1)
+            away = data.xpos[body] - data.xpos[robot.root]
+            np.testing.assert_allclose(own[0], away, atol=1e-7)
 
 
 def test_an_encoder_that_keeps_all_gives_the_robot_back(unchanged):
@@ -528,7 +552,10 @@ def test_any_robot_of_mujoco_is_recorded(name, short):
     rollout.motion.put(data, rows - 1)
     mujoco.mj_kinematics(robot.model, data)
     for body in robot.bodies:
-        position, quaternion = poses(found[f"/world/robot/{robot.names[body]}"])
+        root = f"/world/robot/{robot.names[robot.root]}"
+        is_root = body == robot.root
+        name = robot.names[body]
+        position, quaternion = poses(found[root]) if is_root else placed(found, root, name)
         assert len(position) == rows
         np.testing.assert_allclose(position[-1], data.xpos[body], atol=1e-6)
         np.testing.assert_allclose(quaternion[-1], data.xquat[body], atol=1e-6)
@@ -668,10 +695,11 @@ def test_bodies_that_stand_still_have_one_pose_and_bare_ones_no_shape(folder):
     robot.draw(recording, "robot", times, robot.poses(motion), [1, 2, 3])
     recording.write(folder / "shapes.rrd", curves_layout(["robot"], 2))
     found = read(folder / "shapes.rrd")
-    moving = {name: len(poses(found[f"/robot/{name}"])[0]) for name in ("a_b", "bare", "body_3")}
-    assert moving == {"a_b": 3, "bare": 3, "body_3": 1}
+    paths = ("a_b", "a_b/bare", "body_3")
+    moving = {path: len(poses(found[f"/robot/{path}"])[0]) for path in paths}
+    assert moving == {"a_b": 3, "a_b/bare": 1, "body_3": 1}
     assert "Mesh3D:vertex_positions" in found["/robot/a_b"]
-    assert not any(":colors" in name for name in found["/robot/bare"])
+    assert not any(":colors" in name for name in found["/robot/a_b/bare"])
 
 
 def test_the_force_of_a_contact_is_the_one_on_the_robot():

@@ -14,6 +14,7 @@ from jbrep.envs.physics import Motion, root_of
 from jbrep.envs.task import Array
 from jbrep.inspection.recording import Recording
 
+_ROUNDING = 1e-9  # [m], and of a quaternion
 _DEFAULT_SIZE = 1.0  # [m] of a model without geoms
 XYZW = [1, 2, 3, 0]  # Rerun's order of a quaternion's components, from MuJoCo's
 _SHOWN_GROUPS = 3  # of geoms: MuJoCo's viewers hide those from here on, used for collisions
@@ -37,10 +38,28 @@ def rotate(quaternion: Array, vector: Array) -> Array:
 
 
 class Poses(NamedTuple):
-    """Where the bodies of a model are in n states, in the world."""
+    """Where the bodies of a model are in n states, in the world; of one body, without that axis."""
 
     position: Array  # (n, bodies, 3) [m]
     quaternion: Array  # (n, bodies, 4)
+
+    def of(self, body: int) -> "Poses":
+        """Those of one body."""
+        return Poses(self.position[:, body], self.quaternion[:, body])
+
+    def seen_from(self, other: "Poses") -> "Poses":
+        """Those of one body in the frame of another."""
+        back, turned = other.quaternion * (1, -1, -1, -1), self.quaternion
+        scalar = (other.quaternion * turned).sum(axis=1, keepdims=True)
+        axis = back[:, :1] * turned[:, 1:] + turned[:, :1] * back[:, 1:]
+        axis += np.cross(back[:, 1:], turned[:, 1:])
+        place = rotate(back, self.position - other.position)
+        return Poses(place, np.concatenate((scalar, axis), axis=1))
+
+    @property
+    def is_still(self) -> bool:
+        """Whether they are the same in all states, but for rounding."""
+        return all(np.ptp(values, axis=0).max() < _ROUNDING for values in self)
 
 
 class Robot:
@@ -52,6 +71,7 @@ class Robot:
         model: the MuJoCo model.
         colours: of all geoms, (geoms, 4).
         names: of all bodies as parts of paths, each a different one.
+        paths: of all bodies; the robot's others are below its root, and move with it.
         root: number of the body that carries the robot's others.
         bodies: numbers of the robot's bodies, the root first.
         others: numbers of all other bodies, such as the world and a target.
@@ -69,6 +89,11 @@ class Robot:
         roots = model.body_rootid if self.root else np.zeros(model.nbody, int)
         self.bodies = np.flatnonzero(roots == self.root).tolist()
         self.others = np.flatnonzero(roots != self.root).tolist()
+        carrier = self.names[self.root]
+        self.paths = [
+            f"{carrier}/{name}" if body in self.bodies and body != self.root else name
+            for body, name in enumerate(self.names)
+        ]
         self.place, self.size = self._reach()
 
     @property
@@ -110,7 +135,7 @@ class Robot:
         bodies: Iterable[int],
         colours: NDArray[np.uint8] | None = None,
     ) -> None:
-        """Draw bodies as entities below another.
+        """Draw bodies as entities below another; what doesn't move in its frame is sent once.
 
         Args:
             recording: to draw in.
@@ -130,13 +155,15 @@ class Robot:
             else:
                 static = shapes(self.model, geoms, None)
                 columns = [type(shape).columns(colors=colours[:, i]) for shape in static]
-            place, turned = poses.position[:, body], poses.quaternion[:, body][:, XYZW]
-            if (place == place[0]).all() and (turned == turned[0]).all():
+            path, there = f"{root}/{self.paths[body]}", poses.of(body)
+            if self.paths[body] != self.names[body]:
+                there = there.seen_from(poses.of(self.root))
+            place, turned = there.position, there.quaternion[:, XYZW]
+            if there.is_still:
                 still = rr.Quaternion(xyzw=turned[0])
                 static.append(rr.Transform3D(translation=place[0], quaternion=still))
             else:
                 columns.append(rr.Transform3D.columns(translation=place, quaternion=turned))
-            path = f"{root}/{self.names[body]}"
             if static:
                 recording.send(path, *static)
             if columns:
