@@ -360,7 +360,7 @@ def test_a_damaged_checkpoint_is_named(under_way):
 def test_a_run_without_a_checkpoint_so_far(under_way):
     (under_way / CHECKPOINT).unlink()
     assert f"{RUN} or {CHECKPOINT} is expected" in refused(load_run, under_way)
-    assert "no run with a policy or checkpoint" in mistake("evaluate-policy", under_way)
+    assert "has no checkpoint.safetensors yet" in mistake("evaluate-policy", under_way)
 
 
 def test_evaluating_a_run(run):
