@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from jbrep.cli.rl import _Bar
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
-from jbrep.envs.recording import episode_returns
+from jbrep.envs.recording import Outcome, episode_returns
 from jbrep.errors import InputError
 from jbrep.records import container
 from jbrep.rl import Run, StoppedError, train
@@ -338,7 +338,7 @@ def made_up_job(*means):
     """A run whose evaluations had these mean returns."""
     history = History()
     for number, mean in enumerate(means):
-        history.evaluated(1000 * number, np.array([mean - 1, mean + 1]))
+        history.evaluated(1000 * number, Outcome(np.array([mean - 1, mean + 1]), [{}, {}]))
     return SimpleNamespace(history=history)
 
 
@@ -387,7 +387,7 @@ def test_the_rate_after_resuming_counts_the_steps_since():
         assert (bar._progress.n, bar._progress.initial) == (600, 500)
         bar.show(job, 1000, 1.0)
         assert bar._progress.postfix == "returns=final ones under way"
-        job.history.evaluated(1000, np.array([1.5, 2.5]))
+        job.history.evaluated(1000, Outcome(np.array([1.5, 2.5]), [{}, {}]))
         bar.show(job, 1000, 2.0)
         assert bar._progress.postfix == "returns=2.00"
     trained, resumed = agent_of("a2c").learn(80), agent_of("a2c").learn(40)

@@ -24,7 +24,6 @@ from jbrep.text import slug
 from jbrep.training.trainer import get_device
 
 STUDY = "study.json"
-OWN = STUDY, REGISTRATION, "data", "encoders", "runs"  # see `make_folder`
 _GRID = (  # may change
     "tasks",
     "algorithms",

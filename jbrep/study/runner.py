@@ -19,11 +19,14 @@ from jbrep.rl.files import FAILED, FINISHED, read_run
 from jbrep.rl.job import Job
 from jbrep.rl.settings import CUDA
 from jbrep.study.packing import Pack, packed, usual_workers
-from jbrep.study.plan import OWN, Cell, Plan
+from jbrep.study.plan import STUDY, Cell, Plan
 from jbrep.study.prepare import check, prepare
-from jbrep.study.registration import Registration
+from jbrep.study.registration import REGISTRATION, Registration
+from jbrep.study.tables import REFERENCE_RETURNS
 from jbrep.study.work import CRASHED, Outcome, read_progress, work
 from jbrep.text import duration
+
+_OWN = STUDY, REGISTRATION, REFERENCE_RETURNS, "data", "encoders", "runs"  # see `make_folder`
 
 Backend = Callable[[Plan, Iterable[Pack], int], Generator[Outcome]]
 
@@ -122,7 +125,7 @@ def run_study(
     check(plan)
     workers, unfinished = workers or usual_workers(plan), plan.unfinished
     packs = packed(plan, workers, width)
-    make_folder(plan.folder, OWN)
+    make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
         plan.write()
         if plan.study.verdicts.primary and not plan.has_begun:
@@ -146,7 +149,7 @@ def register_study(plan: Plan) -> Registration:
         InputError: as `run_study`, or there are runs already.
     """
     check(plan)
-    make_folder(plan.folder, OWN)
+    make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
         return plan.register()
 
