@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from jbrep.opengl import prepare_opengl
+from jbrep.records.commit import commits
 
+commits()  # of the repository, before any test works in another folder
 torch.set_num_threads(1)  # the workers share the cores
 HEADLESS = find_library("EGL") is not None
 if not HEADLESS:

@@ -133,13 +133,14 @@ def report(
 
     from jbrep.errors import InputError
     from jbrep.records.storage import check_writable
-    from jbrep.report.report import PAGE, SUMMARY, make_report
-    from jbrep.report.statistics import results_text
 
     if not folder.exists():
         raise InputError(f"{folder} is not the folder of a study: there is no such folder")
     if out:
         check_writable(out)
+    from jbrep.report.report import PAGE, SUMMARY, make_report  # imports torch
+    from jbrep.report.statistics import results_text
+
     made = make_report(folder, out, evaluation, across_trainers)
     if not as_json:
         echo_text(results_text(made.tables, terminal_width(), everything))
