@@ -330,4 +330,4 @@ def test_a_data_set_whose_package_isn_t_imported(sledges, tmp_path, monkeypatch)
     for command in (("verify", sledges, "--replay", 1), ("export", sledges, "--to", "minari")):
         told = jbrep("data", *command, *(("--out", tmp_path / "x") if "--to" in command else ()))
         assert (told.exit_code, told.output.count("\n")) == (2, 1)
-        assert "for one of another package add --import PACKAGE" in told.output
+        assert "it was made by environments; add --import environments" in told.output
