@@ -47,7 +47,9 @@ class Table(NamedTuple):
 
 def wrapped(text: str, width: int | None) -> str:
     """Text in lines of at most that width; None leaves it on one line."""
-    return text if width is None else textwrap.fill(text, width, break_on_hyphens=False)
+    if width is None:
+        return text
+    return textwrap.fill(text, width, break_on_hyphens=False, break_long_words=False)
 
 
 def terminal_width() -> int:

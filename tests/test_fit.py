@@ -158,7 +158,7 @@ def test_a_stopped_training_resumes_to_the_same_file(whole, collected, tmp_path)
     assert f"the same command resumes it; the best so far is in {out}" in told
     kept = load(path).header.metrics
     assert 1 <= kept["best_epoch"] <= kept["epochs"] < 30
-    assert "dae-4: held-out mean squared error" in jbrep(*command).output
+    assert "dae-4: reconstructs held-out states" in jbrep(*command).output
     assert path.read_bytes() == whole.read_bytes()
 
 

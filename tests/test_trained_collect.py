@@ -4,6 +4,7 @@ import json
 import pickle
 import shutil
 
+import gymnasium
 import numpy as np
 import pytest
 from command import jbrep
@@ -101,8 +102,9 @@ def test_a_worker_makes_the_same_shard(runs, tmp_path):
     """Of a network that gives actions in [-1, 1] for what has been normalised before."""
     chosen, actor = some(runs / "sledge", tmp_path, task=SLEDGE, store_state=False, steps=80)
     gather(runs / "sledge", tmp_path / "data", {"num_threads": 1}, task=SLEDGE, store_state=False)
-    sent = pickle.loads(pickle.dumps((("environments",), Simulator(chosen, actor, 1, 1), 1, 80)))
-    made, dataset = make_shard(*sent), Dataset(tmp_path / "data")
+    known = ("environments",), gymnasium.spec(SLEDGE.id)
+    sent = pickle.loads(pickle.dumps((known, Simulator(chosen, actor, 1, 1), 1, 80, 0)))
+    made, dataset = make_shard(*sent).columns, Dataset(tmp_path / "data")
     start = dataset.manifest.shards[0].rows
     rows = slice(start, start + len(made["action"]))
     np.testing.assert_array_equal(made["action"], dataset["action"][rows])

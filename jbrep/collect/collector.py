@@ -132,7 +132,7 @@ def write_shards(
         InputError: as `collect` does.
     """
     began = time.monotonic()
-    make_folder(folder, (MANIFEST, "shard-*", "policy-*"))
+    make_folder(folder, ("manifest*", "shard-*", "policy-*"))
     with exclusive(folder):
         there = _begin(settings, folder, files)
         manifest = there.extended(settings.steps)
@@ -277,7 +277,8 @@ def _keep(files: Mapping[str, bytes], folder: Path) -> None:
 def _check_same(there: Manifest, wanted: Manifest, folder: Path) -> None:
     """Check that going on gives what an uninterrupted run gives."""
     steps, own = wanted.settings.steps, there.settings.steps
-    if changed := changed_parts(there.task, wanted.task):
+    is_same = there.task.id == wanted.task.id
+    if is_same and (changed := changed_parts(there.task, wanted.task)):
         raise InputError(
             f"{folder} holds a data set of {there.task.name} as it was: {changed} changed since; "
             "put that back, or choose another folder"

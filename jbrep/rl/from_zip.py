@@ -30,7 +30,6 @@ _PARTS = (spaces.Box, spaces.Discrete, spaces.MultiBinary)  # which `determinist
 _UNUSED: dict[str, Any] = {  # what only training needs: memory, or an environment to be made with
     "buffer_size": 1,
     "replay_buffer_class": None,
-    "replay_buffer_kwargs": {},
 }
 
 
@@ -135,7 +134,8 @@ def _loaded(raw: bytes, path: Path, algorithm: str) -> tuple[BaseAlgorithm, Told
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of schedules that another Python pickled
-            agent = kind.load(io.BytesIO(raw), device="cpu", custom_objects=_UNUSED)
+            unused = _UNUSED | {"replay_buffer_kwargs": {}}  # to which loading may add
+            agent = kind.load(io.BytesIO(raw), device="cpu", custom_objects=unused)
         return agent, told_by(raw, path)
     except InputError:
         raise

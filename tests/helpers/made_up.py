@@ -98,7 +98,8 @@ def _make_run(plan, cell):
     rows = []
     for step in range(0, plan.study.steps + 1, plan.study.evaluate_every):
         level = STILL + (end - STILL) / (1 + np.exp((middle - step) / 700))
-        episodes = settings.episodes_at(step)
+        is_last = step == plan.study.steps
+        episodes = settings.final_episodes if is_last else settings.evaluation_episodes
         returns = level + random.normal(0, 0.5, episodes)
         rows += [Evaluation(step, i, float(each)) for i, each in enumerate(returns.clip(0, 1000))]
     tables = {EVALUATIONS: write_rows(folder / EVALUATIONS, rows, Evaluation)}

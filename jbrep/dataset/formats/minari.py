@@ -34,7 +34,7 @@ from jbrep.dataset.reader import Dataset
 from jbrep.dataset.schema import UNKNOWN_SEED, DataSettings
 from jbrep.dataset.settings import Digest
 from jbrep.envs.description import describe, features_of
-from jbrep.envs.names import find_spec
+from jbrep.envs.names import spec_of
 from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, kind_and_line
 from jbrep.progress import Progress
@@ -350,7 +350,7 @@ def _env_spec(settings: DataSettings) -> EnvSpec | None:
     """
     task = settings.task
     try:
-        spec = copy.deepcopy(find_spec(task.id))
+        spec = copy.deepcopy(spec_of(task))
     except (InputError, ModuleNotFoundError):
         if settings.is_imported:
             return None
