@@ -85,6 +85,45 @@ def drawn(agent, seed, draws):
     return Batch(wide[0], rows.actions, wide[1], rows.rewards, rows.dones, discounts), normals
 
 
+@pytest.mark.parametrize("algorithm", ["sac", "td3"])
+@pytest.mark.parametrize("layers", [[4], [5, 7], [20, 13]])
+def test_every_bit_is_that_of_a_network_alone(algorithm, layers):
+    """Whatever the sizes: those that fill no vector of the processor, and no line of its cache."""
+    used = overridden(algorithm, "modern", {"net_arch": layers, "buffer_size": 10})
+    random, count, rows = torch.Generator().manual_seed(0), 17, 7
+
+    def draw(*shape):
+        return torch.randn(10, count, rows, *shape, generator=random)
+
+    values, actions = [draw(16), draw(16), draw(1)], [draw(1).tanh(), draw(1), draw(1)]
+
+    def learned(members):
+        agents = [
+            make_agent(algorithm, used, make_env(TASK, 1, 0, find("full", TASK)), seed)
+            for seed in members
+        ]
+        for agent in agents:
+            for _, part in trained_parts(agent):
+                if isinstance(part, torch.optim.Optimizer):
+                    allocate_adam_state(part)
+        stack = Stack(agents, 16)
+        learner = get_algorithm(algorithm)(stack)
+        stack.read_from_agents()
+        for step in range(10):
+            seen, following, reward = (each[step, members] for each in values)
+            action, *normals = (each[step, members] for each in actions)
+            rest = torch.zeros_like(reward), torch.full_like(reward, 0.99)
+            batch = Batch(seen, action, following, reward, *rest)
+            learner.update(batch, normals[: learner.normals_to_learn], step + 1, 0)
+        stack.write_to_agents()
+        return [dict(parameters(agent)) for agent in agents]
+
+    together = learned([*range(count)])
+    for member in (0, 9, count - 1):
+        (alone,) = learned([member])
+        assert all(torch.equal(each, together[member][name]) for name, each in alone.items())
+
+
 VARIANTS = [
     *((algorithm, preset, {}) for preset in PRESETS for algorithm in ALGORITHMS),
     ("sac", "modern", {"ent_coef": 0.1}),

@@ -5,6 +5,7 @@ and Adam leaves it at zero.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import torch
@@ -12,12 +13,14 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn import Linear, Module, functional
 from torch.optim import Adam
+from torch.optim.adam import adam
 from torch.utils._pytree import tree_leaves
 
 from jbrep.rl.settings import CPU, FLOAT32
 from jbrep.training.trainer import allocate_adam_state
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam
+_ALIGNED = 64  # [bytes]; where torch puts what it makes
 
 
 class Layer(NamedTuple):
@@ -87,6 +90,7 @@ class _Compute(Function):
         parts = 1 if mlp.together else len(inputs)
         every = (each.chunk(parts) for each in (inputs, *weights))
         for values, *own in zip(*every, strict=True):
+            values = _aligned(values)
             done, last = list[_Done](), len(own) - 2
             for i in range(0, len(own), 2):
                 factors = mlp.cast(values), mlp.cast(own[i])
@@ -102,7 +106,7 @@ class _Compute(Function):
         mlp, (of_inputs, _, of_weights, *_) = ctx.mlp, ctx.needs_input_grad
         every = []
         for own, done in zip(gradient.chunk(len(ctx.parts)), ctx.parts, strict=True):
-            gradients = list[Tensor]()
+            own, gradients = _aligned(own), list[Tensor]()
             for i, layer in reversed([*enumerate(done)]):
                 if layer is not done[-1]:
                     own = mlp.activation.gradient(own, layer.before, layer.after)
@@ -116,6 +120,11 @@ class _Compute(Function):
         of_input, *of_each = map(torch.cat, zip(*every, strict=True))
         nothing = [None] * (len(ctx.needs_input_grad) - 2)
         return of_input if of_inputs else None, None, *(of_each or nothing)
+
+
+def _aligned(values: Tensor) -> Tensor:
+    """Values where a product sums them as if they were alone: elsewhere it may in another order."""
+    return values if values.data_ptr() % _ALIGNED == 0 else values.clone()
 
 
 def make_mlp(activation: Module, precision: str, device: torch.device) -> MLP:
@@ -136,6 +145,44 @@ def make_mlp(activation: Module, precision: str, device: torch.device) -> MLP:
 def _rounded(values: Tensor) -> Tensor:
     """To bfloat16, kept as they were: products of such factors are exact in float32."""
     return values.bfloat16().to(values.dtype)
+
+
+class StackedAdam(Adam):
+    """Adam of stacked weights that takes each network's by themselves.
+
+    Its fused kernel rounds the last numbers of a tensor, which don't fill a vector of the
+    processor, otherwise than those before: which these are may not depend on how many networks
+    there are. The state has a step for each.
+    """
+
+    def __init__(self, weights: Sequence[Tensor], **settings: Any):
+        super().__init__(weights, **settings)
+        allocate_adam_state(self)
+        for weight, state in self.state.items():
+            state["step"] = state["step"].repeat(len(weight))
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> None:  # type: ignore[override]  # no closures
+        """Take a step of the weights that have gradients."""
+        (group,) = self.param_groups
+        weights = [weight for weight in group["params"] if weight.grad is not None]
+        states = [self.state[weight] for weight in weights]
+        stacked = (
+            weights,
+            [weight.grad for weight in weights],
+            *([state[name] for state in states] for name in _MOMENTS),
+            [],
+            [state["step"] for state in states],
+        )
+        beta1, beta2 = group["betas"]
+        names = "amsgrad", "lr", "weight_decay", "eps", "maximize", "fused"
+        settings = {name: group[name] for name in names}
+        adam(*map(_unbound, stacked), beta1=beta1, beta2=beta2, **settings)
+
+
+def _unbound(stacked: Iterable[Tensor]) -> list[Tensor]:
+    """Each network's part of each tensor."""
+    return list(chain.from_iterable(each.unbind() for each in stacked))
 
 
 Modules = Iterable[Module | list[Linear]]  # of an agent's network; several can be one layer
@@ -186,8 +233,7 @@ class Stack:
     def adam(self, weights: Any, find: Callable[[Any], Adam]) -> Adam:
         """Adam of stacked weights."""
         own = [find(agent) for agent in self.agents]
-        optimizer = Adam(tree_leaves(weights), **own[0].defaults)
-        allocate_adam_state(optimizer)
+        optimizer = StackedAdam(tree_leaves(weights), **own[0].defaults)
         state = {weight: moments for each in own for weight, moments in each.state.items()}
         self._optimizers.append((optimizer, state))
         return optimizer
@@ -216,7 +262,7 @@ class Stack:
             for weight, moments in optimizer.state.items():
                 for parameter, place in self._parts[weight]:
                     own = state[parameter]
-                    yield moments["step"], (), own["step"]
+                    yield moments["step"], place[0], own["step"]
                     for name in _MOMENTS:
                         yield moments[name], place, _matrix(own[name])
 
