@@ -1,6 +1,7 @@
 """Recordings hold what they were made from, as Rerun's own reader finds it."""
 
 import json
+import os
 import re
 import signal
 import sys
@@ -798,7 +799,7 @@ def test_an_encoder_alone_is_shown_on_random_drives(tmp_path):
         ({"source": "none.safetensors"}, "no encoder at none.safetensors"),
         ({"source": POSE, "encoder": DAE}, "dae-4 was made for face_direction"),
         ({"source": FACE, "out": Path("README.md")}, "README.md exists and is not a Rerun record"),
-        ({"source": FACE, "out": Path("docs")}, "can't write docs: Is a directory"),
+        ({"source": FACE, "out": Path("docs")}, "docs exists and is not a Rerun recording"),
     ],
 )
 def test_mistakes(given, message):
@@ -820,6 +821,9 @@ def test_an_earlier_recording_is_overwritten_and_nothing_else(tmp_path):
         inspect(FACE, out=out)
     assert out.read_text() == "mine"
     assert list(tmp_path.iterdir()) == [out]
+    os.mkfifo(tmp_path / "pipe.rrd")  # that nobody fills: it isn't waited for
+    with pytest.raises(InputError, match="is not a Rerun recording: choose another --out"):
+        inspect(FACE, out=tmp_path / "pipe.rrd")
     out.write_bytes(b"RRF2 an earlier one")
     inspect(FACE, out=out)
     assert "/world/robot/jitterbug" in read(out)

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from jbrep.errors import InputError
 from jbrep.records.lock import exclusive
-from jbrep.records.storage import exists, make_folder, write_whole
+from jbrep.records.storage import exists, make_folder, open_regular, write_whole
 
 PROVENANCE = "provenance"
 SUFFIX = ".rrd"
@@ -132,9 +133,10 @@ def check_out(path: Path) -> None:
     if not exists(path):
         return
     try:
-        with path.open("rb") as file:
-            earlier = file.read(len(_MAGIC)) == _MAGIC
+        file = open_regular(path)
     except OSError as error:
         raise InputError(f"can't write {path}: {error.strerror or error}") from None
+    with file or BytesIO() as content:
+        earlier = content.read(len(_MAGIC)) == _MAGIC
     if not earlier:
         raise InputError(f"{path} exists and is not a Rerun recording: choose another --out")
