@@ -167,17 +167,15 @@ class StackedAdam(Adam):
         (group,) = self.param_groups
         weights = [weight for weight in group["params"] if weight.grad is not None]
         states = [self.state[weight] for weight in weights]
-        stacked = (
-            weights,
-            [weight.grad for weight in weights],
-            *([state[name] for state in states] for name in _MOMENTS),
-            [],
-            [state["step"] for state in states],
+        mean, square, step = (
+            _unbound(state[name] for state in states) for name in (*_MOMENTS, "step")
         )
+        gradients = _unbound(weight.grad for weight in weights if weight.grad is not None)
         beta1, beta2 = group["betas"]
         names = "amsgrad", "lr", "weight_decay", "eps", "maximize", "fused"
         settings = {name: group[name] for name in names}
-        adam(*map(_unbound, stacked), beta1=beta1, beta2=beta2, **settings)
+        parts = _unbound(weights), gradients, mean, square
+        adam(*parts, [], step, beta1=beta1, beta2=beta2, **settings)
 
 
 def _unbound(stacked: Iterable[Tensor]) -> list[Tensor]:
