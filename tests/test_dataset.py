@@ -2,7 +2,9 @@
 
 import json
 import pickle
+import resource
 from itertools import accumulate
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -386,3 +388,11 @@ def test_the_constants_of_a_policy_are_numbers_and_text_in_lists_and_tables():
 def test_the_samples_are_verified(task):
     told = jbrep("data", "verify", f"data/sample/{task}", "--replay", 1)
     assert (told.exit_code, "no problems in 4,000 rows, 1 shard" in told.output) == (0, True)
+
+
+def test_shards_take_half_of_the_files_that_a_process_may_open(brief, monkeypatch):
+    monkeypatch.setattr(resource, "getrlimit", lambda what: (4, 4))
+    before, dataset = len([*Path("/dev/fd").iterdir()]), Dataset(brief)
+    assert len([*brief.glob("shard-*.h5")]) > 2
+    assert len(dataset["observation"][:]) == dataset.episodes["length"].sum()
+    assert len([*Path("/dev/fd").iterdir()]) == before + 2

@@ -1,5 +1,6 @@
 """Reading a data set."""
 
+import resource
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -24,7 +25,7 @@ from jbrep.dataset.shard import FileState, Shard, file_state
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 
-_OPEN_SHARDS = 256  # memory-mapped at a time: each takes a file descriptor
+_OPEN_SHARDS = 256  # memory-mapped at a time, at most: each takes a file descriptor
 _MEMORY = 4 << 30  # [bytes]
 
 
@@ -94,7 +95,7 @@ class Dataset:
         check_files(self.folder, self.manifest, files)
         self.task = self.manifest.task
         self._checked: set[FileState] = set()
-        self._opened = lru_cache(_OPEN_SHARDS)(self._open)
+        self._opened = lru_cache(_open_at_once())(self._open)
         self._ends = list(accumulate(entry.rows for entry in self.manifest.shards))
         self._specs = self.manifest.settings.step_specs()
 
@@ -194,16 +195,13 @@ class Dataset:
     @cached_property
     def episodes(self) -> dict[str, NDArray[Any]]:
         """Columns with a row for each episode: seed, length, return, terminated and more."""
-        shards = [self._shard(k) for k in range(len(self.manifest.shards))]
-        return {
-            name: np.concatenate(
-                [
-                    np.empty((0, *spec.row), spec.dtype),
-                    *(shard[EPISODES + name] for shard in shards),
-                ]
-            )
-            for name, spec in episode_columns(self.manifest.settings.specs()).items()
-        }
+        specs = episode_columns(self.manifest.settings.specs())
+        parts = {name: [np.empty((0, *spec.row), spec.dtype)] for name, spec in specs.items()}
+        for number in range(len(self.manifest.shards)):
+            shard = self._shard(number)
+            for name, each in parts.items():
+                each.append(shard[EPISODES + name].copy())  # a view would keep the file open
+        return {name: np.concatenate(each) for name, each in parts.items()}
 
     @cached_property
     def _bounds(self) -> NDArray[np.int64]:
@@ -267,3 +265,9 @@ class Dataset:
         """
         rows = np.arange(len(self)) if rows is None else rows
         return Batches({name: self[name] for name in columns}, rows, size, seed, memory)
+
+
+def _open_at_once() -> int:
+    """How many shards to have open: they take half of the files that the process may, at most."""
+    most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return _OPEN_SHARDS if most == resource.RLIM_INFINITY else min(_OPEN_SHARDS, most // 2)

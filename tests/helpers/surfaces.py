@@ -63,7 +63,7 @@ def surfaces(shared):
     return [
         _tune(),
         _run("sac", overrides=CHEAP, trainer="cohort"),
-        _run("ppo", overrides={"net_arch": [4], "n_steps": 8, "batch_size": 8}),
+        _run("ppo", overrides={**SMALL, "n_steps": 8, "batch_size": 8}),
         *(_import(to, path) for to, path in exported.items()),
         *(_export(to, Dataset(data)) for to in exported),
         _encoder_import(model, task),
@@ -73,6 +73,7 @@ def surfaces(shared):
     ]
 
 
+SMALL = {"net_arch": [4], "num_envs": 1}
 CHEAP = {"net_arch": [8], "learning_starts": 8, "batch_size": 8, "buffer_size": 100}
 
 
