@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from jbrep.api import (
         collect,
         evaluate,
-        load_policy,
         report,
         study,
         train,
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from jbrep.envs.description import describe
     from jbrep.envs.lanes import Lanes
     from jbrep.envs.task import Feature, Task
+    from jbrep.rl.controller import load_policy
     from jbrep.study.config import Study
 
 __all__ = [
@@ -61,7 +61,7 @@ _MODULES = "collect", "evaluate", "report", "study"  # that are functions, too
 _load = exports(
     __name__,
     {
-        **dict.fromkeys(("load_policy", "train", "train_encoder"), "api"),
+        **dict.fromkeys(("train", "train_encoder"), "api"),
         "Dataset": "dataset.reader",
         "Encoded": "encoders.wrapper",
         "Encoder": "encoders.encoder",
@@ -71,6 +71,7 @@ _load = exports(
         "Study": "study.config",
         "Task": "envs.task",
         "describe": "envs.description",
+        "load_policy": "rl.controller",
     },
 )
 

@@ -42,7 +42,6 @@ __all__ = [
     "Report",
     "collect",
     "evaluate",
-    "load_policy",
     "report",
     "study",
     "train",

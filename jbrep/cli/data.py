@@ -133,8 +133,8 @@ def _tell_missing(out: Path) -> None:
 def _report_size(out: Path, manifest: Any) -> None:
     """Print what the folder holds."""
     size = sum(entry.bytes for entry in manifest.shards) / 1e6
-    plural = "s" if manifest.episodes > 1 else ""
-    what = f"{manifest.episodes:,} episode{plural} of {manifest.task.name}, {manifest.rows:,} rows"
+    episodes = counted(manifest.episodes, "episode")
+    what = f"{episodes} of {manifest.task.name}, {manifest.rows:,} rows"
     say(f"{what}, {size:,.1f} MB in {out}")
 
 

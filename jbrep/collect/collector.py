@@ -34,6 +34,7 @@ from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
 from jbrep.records.record import to_plain
 from jbrep.records.storage import check_space, exists, make_folder, read_regular, write_whole
+from jbrep.text import counted
 
 _MAX_SHARDS = 10_000
 _BATCH_ROWS = 100_000  # of a shard that a batch makes
@@ -241,8 +242,7 @@ class _Writing:
     def kept(self) -> str:
         """What is there, for a message."""
         manifest = self._there
-        plural = "s" if manifest.episodes > 1 else ""
-        return f"{manifest.episodes:,} episode{plural} of {manifest.rows:,} rows are kept"
+        return f"{counted(manifest.episodes, 'episode')} of {manifest.rows:,} rows are kept"
 
 
 def _begin(settings: DataSettings, folder: Path, files: Mapping[str, bytes]) -> Manifest:

@@ -162,6 +162,11 @@ class Bounds(NamedTuple):
     low: float = -np.inf
     high: float = np.inf
 
+    @classmethod
+    def of(cls, low: float | None, high: float | None) -> "Bounds":
+        """Bounds of which either may be unknown."""
+        return cls(-np.inf if low is None else low, np.inf if high is None else high)
+
 
 def mean_within(values: Array, bounds: Bounds, level: float) -> Interval:
     """The mean of (..., n) with its interval, (...); NaN where nothing varies."""

@@ -136,8 +136,7 @@ class RunCurve:
     @property
     def bounds(self) -> Bounds:
         """Of the returns of the task."""
-        low, high = self.return_floor, self.return_ceiling
-        return Bounds(-np.inf if low is None else low, np.inf if high is None else high)
+        return Bounds.of(self.return_floor, self.return_ceiling)
 
     @property
     def evaluations(self) -> list[Array]:

@@ -53,7 +53,6 @@ def beside(task: Task, returns: Sequence[float] | Array, episodes: int) -> Besid
     best = best_blind(means)
     if best is None:
         return None
-    low, high = task.return_floor, task.return_ceiling
-    bounds = Bounds(-np.inf if low is None else low, np.inf if high is None else high)
+    bounds = Bounds.of(task.return_floor, task.return_ceiling)
     blind = mean_within(played[best], bounds, LEVEL)
     return Beside(learnt(np.asarray(returns), blind, bounds), means, episodes)
