@@ -1,5 +1,6 @@
 """What the commands share: how mistakes are shown, Ctrl-C, numbers as people write them."""
 
+import _thread
 import errno
 import json
 import math
@@ -174,12 +175,22 @@ def stoppable(afterwards: str) -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         raise SystemExit(128 + number)
 
+    def repeat(dropped: "sys.UnraisableHookArgs") -> None:
+        """Send the signal again: Python drops what is raised while an object is destroyed."""
+        if isinstance(stopped := dropped.exc_value, SystemExit) and isinstance(stopped.code, int):
+            threading.Timer(0.1, _thread.interrupt_main, [stopped.code - 128]).start()
+        else:
+            usual(dropped)
+
+    usual, sys.unraisablehook = sys.unraisablehook, repeat
     with on_stop(stop):
         try:
             yield
         except SystemExit:
             click.echo(f"stopped; {afterwards}", err=True)
             raise
+        finally:
+            sys.unraisablehook = usual
 
 
 @contextmanager
