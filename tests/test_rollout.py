@@ -90,6 +90,17 @@ def test_a_run_plays_the_episodes_that_it_was_evaluated_on(run):
     np.testing.assert_allclose(played, last, atol=2e-3)
 
 
+def test_an_episode_of_a_run_is_played_without_the_others_to_the_same_bits(run, monkeypatch):
+    player = find_player(str(run))._replace(evaluation_batch=5)
+    together = player.play(range(5))
+    monkeypatch.setattr("jbrep.play.player._MAX_BYTES", player._episode_bytes)
+    monkeypatch.setattr("jbrep.play.sources.find_player", lambda *_: player)
+    for episode, expected in enumerate(together):
+        alone = find_episode(str(run), episode)
+        np.testing.assert_array_equal(alone.observation, expected.observation)
+        np.testing.assert_array_equal(alone.action, expected.action)
+
+
 def test_a_policy_before_training_is_the_one_that_was_evaluated_first(run):
     first = [e.episode_return for e in read_evaluations(run) if e.step == 0]
     before = load_untrained(run)

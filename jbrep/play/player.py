@@ -65,6 +65,21 @@ class Player(NamedTuple):
             recording = record(lanes, act, bar.update, read)
         return [self._rollout(recording, lane, seed, read) for lane, seed in enumerate(seeds)]
 
+    def play_one(self, episode: int) -> Rollout:
+        """Play one of these episodes as its evaluation does, without the others.
+
+        What is observed goes through the network at its place in a batch of that size: elsewhere it
+        rounds differently.
+        """
+        size = self.evaluation_batch
+        place = episode % size
+
+        def begin(task: Task, seeds: Sequence[int]) -> Actor:
+            act = self.begin(task, seeds)
+            return lambda seen: act(seen.repeat(size, axis=0))[[place]]
+
+        return self._replace(begin=begin).play([episode])[0]
+
     def _rollout(self, recording: Recording, lane: int, seed: int, read: MotionReader) -> Rollout:
         steps = int(recording.length[lane])
         truncated = bool(recording.truncated[lane])

@@ -35,8 +35,7 @@ def find_episode(
     """An episode of a data set by its number, or one under a policy that `find_player` knows.
 
     Those under a policy are the episodes of evaluation. A run's come out as they did when it was
-    evaluated, for which all of them are played at once: with another batch size its network rounds
-    differently.
+    evaluated.
 
     Raises:
         InputError: as `find_player`, or there is no such episode, or the data set is of another
@@ -53,9 +52,7 @@ def find_episode(
     player = find_player(source, task, encoder)
     if episode < 0:
         raise InputError(f"there is no episode {episode}: they count from 0")
-    if episode < player.evaluation_batch:
-        return player.play(range(player.evaluation_batch))[episode]
-    return player.play([episode])[0]
+    return player.play_one(episode)
 
 
 def find_policy(text: str, folder: Path, task: Task) -> Policy:
