@@ -10,11 +10,14 @@ import tempfile
 import time
 from pathlib import Path
 
+from jbrep.opengl import prepare_opengl
+
 HELPERS = Path(__file__).resolve().parent.parent / "tests" / "helpers"
 
 
 def main() -> None:
     sys.path.insert(0, str(HELPERS))
+    prepare_opengl()  # before MuJoCo is imported
     from attacks import attack
     from surfaces import surfaces
 

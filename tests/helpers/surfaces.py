@@ -1,12 +1,15 @@
 """What is attacked: every command that makes something, at toy size."""
 
+import os
 import shutil
 from pathlib import Path
 
 import numpy as np
+import torch._dynamo  # noqa: F401  or every fork imports it, in seconds
 from attacks import Surface, command, digest, forked
 from click.testing import CliRunner
 from command import in_this_process
+from rerun.chunk import RrdReader
 from small import brief
 
 from jbrep.cli import main
@@ -16,13 +19,15 @@ from jbrep.dataset.formats import export, open_source
 from jbrep.dataset.manifest import read_manifest
 from jbrep.encoders import load
 from jbrep.envs import describe
+from jbrep.inspection import inspect  # noqa: F401  the same
 from jbrep.records.document import read_document
 from jbrep.report import make_report
 from jbrep.report.report import STATISTICS, SUMMARY
 from jbrep.report.tables import read_tables
 from jbrep.rl import Run
-from jbrep.rl.files import CHECKPOINT, EVALUATIONS, POLICY, RUN
+from jbrep.rl.files import CHECKPOINT, ENCODER, EVALUATIONS, POLICY, RUN
 from jbrep.rl.job import Job, Session
+from jbrep.rl.policy import load_run
 from jbrep.rl.trainers import train_jobs
 from jbrep.rl.tune import BEST, SEARCH
 from jbrep.study.config import Study
@@ -60,6 +65,7 @@ def surfaces(shared):
     tables = shared / "study"
     code, told = forked(_study, tables)
     assert code == 0, told
+    run = next(tables.rglob(POLICY)).parent
     return [
         _tune(),
         _run("sac", overrides=CHEAP, trainer="cohort"),
@@ -70,11 +76,22 @@ def surfaces(shared):
         _encoder_export(task),
         _registration(),
         _report(tables),
+        *(_of_a_run(name, run, *each) for name, each in OF_A_RUN.items()),
     ]
 
 
 SMALL = {"net_arch": [4], "num_envs": 1}
 CHEAP = {"net_arch": [8], "learning_starts": 8, "batch_size": 8, "buffer_size": 100}
+OF_A_RUN = {  # in the folder that it stands in, and what that makes
+    "rl --from": (
+        "rl --task face_direction --algorithm a2c --preset paper --episode-steps 20 --steps 40 "
+        "--evaluation-episodes 1 --from run --out it",
+        "it/*.csv",
+    ),
+    "inspect": ("inspect run --out it.rrd", "it.rrd"),
+    "render": ("render run --size 64x64 --out it.gif", "it.gif"),
+    "behaviour": ("behaviour run --episodes 1 --out it", "it/*"),
+}
 
 
 def _study(folder):
@@ -266,3 +283,29 @@ def _report(study: Path):
         return tables.returns, tables.references, tables.record.text()
 
     return Surface("report", act, result, files, read, prepare)
+
+
+def _of_a_run(name, run: Path, line, made):
+    """A command that begins with a run, which is damaged."""
+
+    def act(folder):
+        os.chdir(folder)  # as what is made tells the paths that it was made from
+        command(*line.split())
+
+    def result(folder):
+        paths = sorted(folder.glob(made))
+        if name != "inspect":
+            return digest(*paths)
+        chunks = RrdReader(*paths).stream()  # rows have the time at which they were sent
+        return sorted((each.entity_path, each.num_rows) for each in chunks)
+
+    def files(folder):
+        return [folder / "run" / name for name in (RUN, POLICY, ENCODER)]
+
+    def read(folder):
+        trained = load_run(folder / "run")
+        return trained.settings, [each.tolist() for each in trained.policy.parameters()]
+
+    return Surface(
+        name, act, result, files, read, lambda folder: shutil.copytree(run, folder / "run")
+    )
