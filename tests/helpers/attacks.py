@@ -214,7 +214,8 @@ class Attacker:
             some = sorted(self.random.choice(total, count, replace=False) + 1)
         ways = [("full at a sync", at_sync(number, _disk_is_full)) for number in some]
         largest = max(path.stat().st_size for path in self.peace.rglob("*") if path.is_file())
-        sizes = np.exp(self.random.uniform(3, np.log(largest), count // 2))
+        # from some 1,000 bytes on: what the command says is in a file, too
+        sizes = np.exp(self.random.uniform(7, np.log(largest), count // 2))
         ways += [("files can't grow", limited(int(size))) for size in sizes]
         for attack, before in ways:
             folder = self._new()
