@@ -227,6 +227,40 @@ def test_a_killed_export_leaves_nothing_under_the_final_name(to, dataset, tmp_pa
     assert not list(tmp_path.rglob(".*"))
 
 
+KILLED_BETWEEN = """
+import os, sys
+from pathlib import Path
+from jbrep.dataset import Dataset
+from jbrep.dataset.formats import export
+source, out, beside = map(Path, sys.argv[1:])
+def fsync(descriptor, call=os.fsync):
+    if beside.exists():
+        os.kill(os.getpid(), 9)
+    call(descriptor)
+os.fsync = fsync
+export(Dataset(source), "parquet", out)
+"""
+
+
+def test_an_export_killed_between_its_two_files_is_made_whole(dataset, tmp_path):
+    out, beside = tmp_path / "it.parquet", tmp_path / "it-episodes.parquet"
+    command = [sys.executable, "-W", "ignore", "-c", KILLED_BETWEEN, dataset.folder, out, beside]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    assert not out.exists()
+    export(dataset, "parquet", out)
+    left = {path.name for path in tmp_path.iterdir() if not path.name.endswith(".lock")}
+    assert left == {out.name, beside.name}
+
+
+def test_hdf5_isnt_begun_where_a_file_cant_grow(dataset, tmp_path):
+    """It would crash, after many lines."""
+    limit = f"ulimit -f 200; {sys.executable} -W ignore -m jbrep data export"
+    command = f"{limit} {dataset.folder} --to minari --out {tmp_path / 'it'}"
+    told = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
+    assert (told.returncode, told.stderr.count("\n")) == (2, 1)
+    assert "not enough space in" in told.stderr
+
+
 @pytest.mark.parametrize("to", FORMATS)
 def test_an_export_is_on_the_disk_and_has_one_writer(to, dataset, tmp_path, monkeypatch):
     path, synced, sync = exported(to, tmp_path), set(), os.fsync

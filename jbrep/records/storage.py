@@ -159,9 +159,24 @@ def check_space(folder: Path, needed: int) -> None:
     """
     free = shutil.disk_usage(folder).free
     if needed > free:
-        raise InputError(
-            f"not enough space in {folder}: about {needed:,} bytes are needed, {free:,} are free"
-        )
+        raise _no_space(folder, needed, f"{free:,} are free")
+
+
+def check_allocation(folder: Path, needed: int) -> None:
+    """The same by a file of that size, as a quota or a limit of files would stop it, too.
+
+    Raises:
+        InputError: there can't be one.
+    """
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            os.posix_fallocate(file.fileno(), 0, needed)
+    except OSError as error:
+        raise _no_space(folder, needed, (error.strerror or str(error)).lower()) from None
+
+
+def _no_space(folder: Path, needed: int, why: str) -> InputError:
+    return InputError(f"not enough space in {folder}: about {needed:,} bytes are needed, {why}")
 
 
 def open_regular(path: Path) -> BufferedReader | None:

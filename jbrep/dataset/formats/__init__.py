@@ -8,7 +8,7 @@ from jbrep.dataset.formats.episodes import Source
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.dataset.reader import Dataset
 from jbrep.errors import InputError, choose
-from jbrep.records.storage import check_space, exists
+from jbrep.records.storage import check_allocation, check_space, exists
 
 _FILE_BYTES = 1 << 16  # whatever is in it
 FORMATS = {name: f"{__name__}.{name}" for name in ("minari", "parquet", "npz")}  # modules
@@ -45,7 +45,9 @@ def export(dataset: Dataset, to: str, out: Path) -> str:
         out.parent.mkdir(parents=True, exist_ok=True)
         rows = len(dataset) * dataset.manifest.settings.row_bytes()
         episodes = dataset.manifest.episodes * module.EPISODE_BYTES
-        check_space(out.parent, rows + episodes + _FILE_BYTES)
+        # HDF5 crashes where a file can't grow, perhaps after the last word of Python
+        check = check_allocation if to == "minari" else check_space
+        check(out.parent, rows + episodes + _FILE_BYTES)
         how: str = module.write(dataset, out)
     except (OSError, RuntimeError) as error:  # HDF5 raises the latter when the disk is full
         reason = getattr(error, "strerror", None) or error  # some have only a text

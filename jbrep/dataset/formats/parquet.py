@@ -34,7 +34,7 @@ from jbrep.records.storage import (
     read_regular,
     taken,
     unfinished,
-    write_new,
+    write_whole,
 )
 
 EPISODE_BYTES = 0  # besides its rows
@@ -230,8 +230,7 @@ def write(dataset: Dataset, out: Path) -> str:
         if is_there and read_regular(beside, _MAX_BYTES) != episodes:
             raise taken(beside)
         _write_steps(dataset, partial, out.name, hashlib.sha256(episodes).hexdigest())
-        if not is_there:
-            write_new(beside, episodes)
+        write_whole(beside, episodes)
         try:
             publish_file(partial, out)
         except BaseException:
