@@ -52,6 +52,7 @@ def test_an_episode_s_seed_starts_it_in_the_environments_too(collected):
             np.testing.assert_array_equal(observation, dataset["observation"][first + step])
             observation, reward, *_ = environment.step(dataset["action"][first + step])
             assert np.float32(reward) == dataset["reward"][first + step]
+        pytest.importorskip("dm_control")
         physics = jitterbug.load("face_direction", seed=seed)
         physics.reset()
         qpos = dataset.episodes["initial_qpos"][episode]

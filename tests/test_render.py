@@ -135,6 +135,7 @@ def test_any_robot_of_mujoco_is_filmed(task):
 
 def test_a_camera_that_follows_the_robot():
     """The model's own one, or else from aside: Reacher's model has none."""
+    pytest.importorskip("shimmy")
     for name, kind in (("Hopper-v5", 0), ("dm_control/cheetah-run-v0", 0), ("face_direction", 1)):
         assert find_camera(physics_of(make_env(name, {})).model, None) == kind
     model = physics_of(make_env("Reacher-v5", {})).model
