@@ -5,6 +5,9 @@ import json
 import random
 import re
 import shutil
+import subprocess
+import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +23,7 @@ from jbrep.errors import InputError
 from jbrep.evaluate.table import DIAGNOSTICS, SCALARS, Diagnosed, write_diagnostics
 from jbrep.play.sources import find_episode
 from jbrep.records.tables import write_csv, write_rows
-from jbrep.report import report, write_report
+from jbrep.report import make_report, report, write_report
 from jbrep.report.answer import answer
 from jbrep.report.facts import full_scaling, reproduce, setting_table
 from jbrep.report.figures import study_plots, write
@@ -425,6 +428,23 @@ def test_runs_without_a_study_are_made_again_each_in_a_folder_of_its_own(whole):
     )
 
 
+def test_no_line_to_copy_runs_what_a_stranger_wrote(whole, tmp_path):
+    tables, trap = read_tables(whole), "$(touch trap); touch trap #"
+    label, shared = next(iter(tables.record.labels.items()))
+    settings = shared.settings.replace(
+        environment=shared.settings.environment.replace(arguments={"file": trap}),
+        overrides={"net_arch": trap},
+    )
+    labels = {**tables.record.labels, label: shared.replace(settings=settings)}
+    for study in (None, STUDY):
+        record = tables.record.replace(labels=labels, study=study)
+        for _, code in reproduce(tables._replace(name=trap, record=record)):
+            if code.startswith(("jbrep ", "pip ")):
+                script = f"jbrep() {{ :; }}; pip() {{ :; }}; {code}"
+                subprocess.run(["sh", "-c", script], cwd=tmp_path, check=True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_where_nothing_was_compared_the_claims_say_so(whole):
     analysis = read_tables(whole).analysis
     (group,) = analysis.groups
@@ -476,6 +496,22 @@ def test_of_single_runs_it_shows_what_there_is(tmp_path):
     assert (plan.folder / FIGURES / "every_run.png").exists()
 
 
+def test_two_reports_of_a_folder_take_turns(whole, tmp_path, monkeypatch):
+    copy_tables(whole, tmp_path)
+    events = []
+
+    def write(tables, out):
+        events.append("begun")
+        time.sleep(0.3)  # in which the other would begin
+        events.append("ended")
+        return []
+
+    monkeypatch.setattr(report, "write_report_of", write)
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(make_report, [tmp_path] * 2))
+    assert events == ["begun", "ended"] * 2
+
+
 def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkeypatch):
     tasks = [(describe("face_direction", max_episode_steps=50), 2)]
     sha256 = write_references(tasks, tmp_path, {})
@@ -502,6 +538,7 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
         ("runs.json", lambda text: text.replace("60.0", "NaN"), "runs.json is damaged"),
         ("runs.json", lambda text: text.replace("60.0", "1e999"), "runs.json is damaged"),
         ("runs.json", lambda text: text.replace('"seed"', '"sead"'), "unknown runs.0..sead"),
+        ("runs.json", lambda text: text.replace('"2.13.0', '"2; touch P #'), "must be a version"),
         ("runs.json", lambda text: text.replace('"failed"', '"lost"'), "is .lost.: it must"),
         (
             "runs.json",

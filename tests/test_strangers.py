@@ -4,6 +4,8 @@ import pytest
 from command import in_this_process, refused
 from test_study import TINY
 
+from jbrep.envs import describe
+from jbrep.envs.names import spec_of
 from jbrep.errors import InputError
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import inside, read_regular, write_new, write_note, write_whole
@@ -48,6 +50,12 @@ def test_no_file_is_written_or_read_through_a_link(precious, tmp_path):
     (tmp_path / ".lock").symlink_to(precious / "file")
     with pytest.raises(InputError, match="can't write in"), exclusive(tmp_path):
         pass
+
+
+def test_the_module_to_import_for_a_strangers_task_is_one_word():
+    trap = {"module x; touch trap #": "0" * 64}
+    task = describe("face_direction").replace(id="Away/Robot-v0", made_from=trap)
+    assert "; add --import 'x; touch trap #': " in refused(spec_of, task)
 
 
 def test_what_is_inside_a_folder_is_reached_without_links(tmp_path):

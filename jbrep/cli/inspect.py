@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import click
@@ -77,7 +78,7 @@ def inspect(
     from jbrep.inspection import inspect as record  # imports torch
 
     path = record(source, episode, task, encoder, traverse, out, data, say)
-    say(f"{path}" if view or serve else f"{path}; open it with: rerun {path}")
+    say(f"{path}" if view or serve else f"{path}; open it with: rerun {quote(str(path))}")
     if view:
         _run_viewer(path)
     if serve:

@@ -1,5 +1,6 @@
 """Taking a policy out, for a robot, and checking what was taken out."""
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,8 @@ def export(run: Path, form: str, out: Path) -> None:
     rate = "" if said["rate"] is None else f", {said['rate']:g} times a second"
     say(f"{out}: {task.size} numbers of {task.name} to {task.action_size}{rate}")
     if form == "onnx":
-        click.echo(f"check it with jbrep policy check {out} --run {run}")
+        check = ("jbrep", "policy", "check", str(out), "--run", str(run))
+        click.echo(f"check it with {shlex.join(check)}")
     else:
         click.echo(f"open it with torch.export.load({str(out)!r}).module()")
 

@@ -1,6 +1,7 @@
 """Names of tasks: every id in Gymnasium's registry, and short names for some of them."""
 
 import difflib
+import shlex
 import sys
 from collections.abc import Iterable
 from importlib import import_module, metadata
@@ -55,7 +56,11 @@ def spec_of(task: Task) -> EnvSpec:
         modules = dict.fromkeys(name.split(".")[0] for kind, _, name in parts if kind == "module")
         if not modules:
             raise
-        which = f"--import {min(modules)}" if len(modules) == 1 else "the one that registers it"
+        which = (
+            f"--import {shlex.quote(min(modules))}"
+            if len(modules) == 1
+            else "the one that registers it"
+        )
         raise InputError(
             f"unknown task {task.id!r}: it was made by {', '.join(modules)}; add {which}"
             f"{'' if len(modules) == 1 else ', as --import MODULE'}: this runs its code"
