@@ -14,6 +14,7 @@ import json
 import socket
 import struct
 import time
+from collections import deque
 
 import numpy as np
 import onnxruntime
@@ -39,6 +40,8 @@ class Controller:
         room = FAR * (high - low)
         self._low, self._high = low - room, high + room  # NaN where no range is known
         self.size, self.repeat = len(low), said["action_repeat"]
+        self._states: deque[np.ndarray] = deque(maxlen=said["history"])  # the newest first
+        self._actions: deque[np.ndarray] = deque(maxlen=said["history"] - 1)
         self.period = said["control_period"] or 0.01
         bounds = np.array([said["action"]["low"], said["action"]["high"]], np.float32)
         self.safe = np.clip(np.zeros_like(bounds[0]), *bounds)  # no torque
@@ -49,11 +52,17 @@ class Controller:
         """The action at a control step; None for sensors that can't be believed."""
         if not np.isfinite(sensors).all() or ((sensors < self._low) | (sensors > self._high)).any():
             return None
+        if step == 0:  # before the start it stood still
+            self._states.extend([sensors] * (self._states.maxlen or 1))
+            self._actions.extend([self.safe] * (self._actions.maxlen or 0))
+        self._states.appendleft(sensors)
         if step % self.repeat == 0:
             began = time.perf_counter()
-            (actions,) = self._session.run(["action"], {"observation": sensors[None]})
+            seen = np.concatenate([*self._states, *self._actions])[None]
+            (actions,) = self._session.run(["action"], {"observation": seen})
             self.seconds.append(time.perf_counter() - began)
             self._action = actions[0]
+        self._actions.appendleft(self._action)
         return self._action
 
 

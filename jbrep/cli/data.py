@@ -26,9 +26,11 @@ from jbrep.cli.environment import (
     retries_option,
     task_options,
     threads_option,
+    view_options,
 )
 from jbrep.cli.options import record_options
 from jbrep.dataset.settings import TRAINED, CollectSettings, parts_of
+from jbrep.errors import InputError
 from jbrep.text import counted, terminal_width
 
 _lanes = click.option(
@@ -216,24 +218,40 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
 @_data
 @click.option(
     "--task",
-    required=True,
     shell_complete=complete_task,
-    help="The task to observe and reward.",
+    help="Another of the Jitterbug's tasks to observe and reward.",
 )
 @record_options(CollectSettings, "store_state")
+@view_options
 @threads_option
 @click.option("--out", required=True, type=PATH, help="A folder.")
-def derive(data: Path, task: str, store_state: bool, threads: int | None, out: Path) -> None:
-    """Make another task's data set from the same motion.
+def derive(
+    data: Path,
+    task: str | None,
+    store_state: bool,
+    hide: tuple[str, ...],
+    history: int,
+    threads: int | None,
+    out: Path,
+) -> None:
+    """Make a data set of the same motion: of another task, or with less or more to see.
 
-    It equals collecting that task with the same settings, bit for bit, without simulating again.
-    The source needs its states (collect --store-state) and a policy that doesn't depend on
-    observations.
+    Another task's equals collecting that task with the same settings, bit for bit, without
+    simulating again; the source needs its states (collect --store-state) and a policy that doesn't
+    depend on observations. What is seen can be changed in any data set: --hide leaves features out,
+    --history adds those of the steps before, and the actions since. Such an encoder estimates what
+    can't be measured.
     """
     from jbrep.collect.derive import derive as run
+    from jbrep.collect.derive import derive_view
 
+    if bool(task) == (bool(hide) or history > 1):
+        raise InputError("give a --task, or else --hide or --history")
     with stoppable(RESUMES):
-        _report(out, *run(data, task, out, store_state, threads))
+        if task:
+            _report(out, *run(data, task, out, store_state, threads))
+        else:
+            _report(out, *derive_view(data, out, hide, history))
 
 
 @data.command(epilog="Example: jbrep data export data/face --to parquet --out face.parquet")

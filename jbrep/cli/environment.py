@@ -14,7 +14,7 @@ from jbrep.text import terminal_width
 if TYPE_CHECKING:
     from jbrep.envs.task import Task
 
-_ARGUMENTS = ("env", "episode_steps", "features", "missing")
+_ARGUMENTS = ("env", "episode_steps", "features", "missing", "hide", "history")
 
 
 def _import(context: click.Context, option: click.Parameter, modules: tuple[str, ...]) -> None:
@@ -32,6 +32,21 @@ import_option = click.option(
     is_eager=True,  # it takes effect before the command begins
     callback=_import,
     help="Import a module that registers environments; this runs its code.",
+)
+view_options = with_options(
+    click.option(
+        "--hide",
+        multiple=True,
+        metavar="NAME",
+        help="A feature or group that isn't seen, or a pattern: 'velocity_*'; may be repeated.",
+    ),
+    click.option(
+        "--history",
+        type=click.IntRange(1, 1000),
+        default=1,
+        help="States that are seen at once, the current one and those before, with the actions "
+        "between.",
+    ),
 )
 _argument_options = with_options(
     click.option(
@@ -56,6 +71,7 @@ _argument_options = with_options(
         help="What becomes of readings that aren't finite: an episode ends before one, or the last "
         "one is held for at most N steps; otherwise they are errors.",
     ),
+    view_options,
     import_option,
 )
 threads_option = click.option(
@@ -88,18 +104,18 @@ def needed_task(options: dict[str, Any]) -> "Task":
         InputError: there is none; or as `jbrep.envs.describe`.
     """
     name = options.pop("task")
-    env, steps, features, missing = (options.pop(option) for option in _ARGUMENTS)
+    env, *others = (options.pop(option) for option in _ARGUMENTS)
     if name is None:
         raise InputError("give the --task: one of the Jitterbug's, or a Gymnasium id")
     from jbrep.envs.description import describe
     from jbrep.envs.names import name_given
 
-    return describe(name_given(name), parse_arguments(env), steps, features, missing)
+    return describe(name_given(name), parse_arguments(env), *others)
 
 
 def given_task(options: dict[str, Any]) -> "Task | None":
     """The same where a task may be left out, with all that would be said of it."""
-    said = any(options[option] for option in ("task", *_ARGUMENTS))
+    said = any(options[option] for option in ("task", *_ARGUMENTS[:-1])) or options["history"] > 1
     return needed_task(options) if said else None
 
 

@@ -1,6 +1,6 @@
-"""Deriving another task's data set: the same motion, with its observations and rewards."""
+"""Deriving data sets from the same motion: another task's, or with less or more to see."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from jbrep.dataset.manifest import new_manifest, open_shard
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.recording import Tick
+from jbrep.envs.view import seen_in_episodes, with_view
 from jbrep.errors import InputError, differences
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import TASKS, JitterbugTask, get_task
@@ -63,6 +64,8 @@ def derive(
             f"{source} was collected by a {settings.policy['kind']} policy, which acts on "
             f"observations: run jbrep collect --task {task_name} instead"
         )
+    if dataset.task.view:
+        raise InputError(f"{source} shows a part of its states: derive the task from the whole")
     check_counts(1, num_threads)
     task, before = get_task(task_name), dataset.task
     described = task.describe(before.arguments, before.max_episode_steps)
@@ -75,6 +78,42 @@ def derive(
             f"--task {task_name} instead"
         )
     return write_shards(settings, folder, _Deriver(dataset, task, settings, num_threads))
+
+
+def derive_view(
+    source: Path, folder: Path, hidden: Sequence[str] = (), history: int = 1
+) -> Written:
+    """Write the data set with less to see: without some features, or with those of some last steps.
+
+    Args:
+        source: a finished data set, of any robot.
+        folder: where to write; an unfinished derivation is resumed.
+        hidden: as `with_view` takes it.
+        history: likewise.
+
+    Raises:
+        InputError: the source is unfinished or was made with other versions; or as `with_view` or
+            `collect`.
+    """
+    dataset = Dataset(source)
+    manifest = dataset.manifest
+    if not manifest.complete:
+        raise InputError(f"{source} is unfinished: resume it with the same jbrep collect")
+    task = with_view(dataset.task, hidden, history)
+    settings = manifest.settings.replace(task=task)
+    versions = new_manifest(settings).versions
+    if differing := differences({**manifest.versions, "jbrep": versions["jbrep"]}, versions):
+        raise InputError(f"{source} was made with other versions: {differing}")
+
+    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
+        for shard in range(first, len(manifest.shards)):
+            columns = open_shard(dataset.folder, manifest, shard)
+            final = EPISODES + "final_observation"
+            given = "observation", "action", final, EPISODES + "length"
+            before, last = seen_in_episodes(task, *(columns[name][:] for name in given))
+            yield settings.columns({**columns, "observation": before, final: last})
+
+    return write_shards(settings, folder, produce)
 
 
 def _check_versions(dataset: Dataset, versions: Mapping[str, str], num_threads: int | None) -> None:

@@ -3,7 +3,7 @@
 import json
 import math
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +33,7 @@ from jbrep.envs.task import (
     Task,
     Word,
 )
+from jbrep.envs.view import with_view
 from jbrep.errors import InputError, Notice
 from jbrep.records.record import Finite, Record, converted, from_plain
 from jbrep.records.toml import read_toml
@@ -47,6 +48,8 @@ def describe(
     max_episode_steps: int | None = None,
     features: Path | None = None,
     missing: str | None = None,
+    hidden: Iterable[str] = (),
+    history: int = 1,
 ) -> Task:
     """Describe a task: its environment is made and played for some steps.
 
@@ -60,6 +63,8 @@ def describe(
         features: a TOML file with names, units, ranges, kinds and offsets, see
             docs/environments.md.
         missing: what becomes of readings that aren't finite, see `Task`; by default an error.
+        hidden: what isn't seen of it, see `jbrep.envs.view.with_view`.
+        history: states that are seen at once, see there.
 
     Raises:
         InputError: an unknown task, an environment that can't be made, actions or observations
@@ -78,7 +83,8 @@ def describe(
     task = with_features(task, features) if features else task
     for problem in precision_problems(task, signals):
         warnings.warn(problem, Notice, stacklevel=2)
-    return task.replace(missing=missing) if missing else task
+    task = task.replace(missing=missing) if missing else task
+    return with_view(task, hidden, history)
 
 
 def as_task(given: Task | str) -> Task:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -120,6 +120,12 @@ class Feature(Record, frozen=True, array_like=True):
     def __str__(self) -> str:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
+    def in_the_past(self, steps: int) -> "Feature":
+        """What it was so many steps before, which is a number of its own, or an angle."""
+        turned = {} if self.is_angle else {"kind": "scalar", "frame": ""}
+        group = self.group and f"{self.group}.{steps}"
+        return self.replace(name=f"{self.name}.{steps}", group=group, **turned)
+
     @property
     def is_angle(self) -> bool:
         """Whether it is an angle."""
@@ -131,6 +137,44 @@ class Feature(Record, frozen=True, array_like=True):
         if not self.is_angle or not self.bounded or self.low is None or self.high is None:
             return False
         return math.isclose(self.high - self.low, 2 * math.pi, rel_tol=0.01)
+
+
+class View(Record, frozen=True):
+    """What is seen of an environment's observation, see `jbrep.envs.view`.
+
+    Args:
+        features: that the environment gives, all of them.
+        hidden: names of those that aren't seen.
+        history: states that are seen, the current one among them.
+    """
+
+    features: Annotated[tuple[Feature, ...], Meta(min_length=1, max_length=MAX_FEATURES)]
+    hidden: Annotated[tuple[Word, ...], Meta(max_length=MAX_FEATURES)] = ()
+    history: Annotated[int, Meta(ge=1, le=MAX_FEATURES)] = 1
+
+    def check(self) -> None:
+        """As for `Record`."""
+        if unknown := set(self.hidden) - {each.name for each in self.features}:
+            raise InputError(f"{min(unknown)} is hidden, which is none of its features")
+        if not self.places:
+            raise InputError("all features are hidden: leave some to see")
+
+    @property
+    def places(self) -> list[int]:
+        """Where the features that are seen stand among all."""
+        return [i for i, each in enumerate(self.features) if each.name not in self.hidden]
+
+    def seen(self, low: Sequence[float], high: Sequence[float]) -> tuple[Feature, ...]:
+        """Features of the observation, given the bounds of actions, (k,) each."""
+        now = [self.features[i] for i in self.places]
+        action = "action" if len(low) == 1 else "action_{}"
+        taken = [
+            Feature(name=action.format(i), low=a, high=b, bounded=True, group="action")
+            for i, (a, b) in enumerate(zip(low, high, strict=True))
+        ]
+        lags = range(1, self.history)
+        past = [each.in_the_past(lag) for part in (now, taken) for lag in lags for each in part]
+        return (*now, *past)
 
 
 class Task(Record, frozen=True):
@@ -159,6 +203,7 @@ class Task(Record, frozen=True):
             32 bits hold it: everywhere a feature is what is left.
         missing: what becomes of readings that aren't finite: skip ends an episode before one,
             hold:3 has the last one instead, for at most 3 steps. Otherwise they are errors.
+        view: what of the environment's observation is seen, if it isn't the current one, whole.
 
     Raises:
         InputError: a field that doesn't fit this description.
@@ -184,9 +229,12 @@ class Task(Record, frozen=True):
     made_from: Mapping[_Part, _Sha256] | UnsetType = UNSET  # left out of files that have none
     offsets: Mapping[Word, Finite] | UnsetType = UNSET
     missing: _Missing | UnsetType = UNSET
+    view: View | UnsetType = UNSET
 
     def check(self) -> None:
         """As for `Record`."""
+        if self.view and self.features != self.view.seen(self.action_low, self.action_high):
+            raise InputError("its features must be those that its view shows")
         try:
             json.dumps(self.arguments, allow_nan=False)
         except (TypeError, ValueError, RecursionError):
@@ -204,8 +252,13 @@ class Task(Record, frozen=True):
             raise InputError("its actions must have as many lower bounds as upper ones")
         if not all(map(float.__le__, self.action_low, self.action_high)):
             raise InputError("each lower bound of its actions must be at most the upper one")
-        if unknown := set(self.offsets or ()) - set(self.feature_names):
+        if unknown := set(self.offsets or ()) - set(self.whole.feature_names):
             raise InputError(f"offsets has {min(unknown)}, which is none of its features")
+
+    @property
+    def whole(self) -> "Task":
+        """The task with all that its environment gives, now."""
+        return self.replace(features=self.view.features, view=UNSET) if self.view else self
 
     @property
     def slug(self) -> str:

@@ -18,7 +18,9 @@ from jbrep.jitterbug.tasks import (
 
 
 def jitterbug_task(task: Task) -> JitterbugTask | None:
-    """The task as the Jitterbug's own; None for another robot's."""
+    """The task as the Jitterbug's own; None for another robot's, or if not all of it is seen."""
+    if task.view:
+        return None
     return next((own for own in TASKS.values() if environment_id(own.name) == task.id), None)
 
 

@@ -12,6 +12,7 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.fold import Chain
 from jbrep.encoders.layers import Layer, activate, run
+from jbrep.envs.view import Window
 from jbrep.errors import InputError
 from jbrep.records.container import Tensors
 from jbrep.rl.files import RunSettings
@@ -120,20 +121,37 @@ class Controller:
     def reset(self) -> None:
         """Begin another episode: the next call chooses an action."""
         self._calls, self._held = 0, np.empty(0, np.float32)
+        self._window: Window | None = None
 
     def __call__(self, observation: ArrayLike) -> NDArray[np.float32]:
         """The action (k,) at an observation (d,) in the units of the task's features.
 
-        Several robots may be given at once, (n, d), for (n, k).
+        Several robots may be given at once, (n, d), for (n, k). A policy that was trained with a
+        history keeps it: give what the robot shows now.
 
         Raises:
             InputError: observations of another size; or the action isn't finite, as where an
                 observation isn't.
         """
+        seen = self._seen(np.asarray(observation, np.float32))
         if self._calls % self.action_repeat == 0:
-            self._held = self._chosen(np.asarray(observation, np.float32))
+            self._held = self._chosen(seen)
         self._calls += 1
         return self._held.copy()
+
+    def _seen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The observation with its history, if the policy was trained with one."""
+        if not self.task.view:
+            return observation
+        rows = np.atleast_2d(observation)
+        every = range(len(rows))
+        if self._window is None:
+            self._window = Window(self.task, len(rows), range(len(self.task.view.places)))
+            seen = self._window.begin(every, rows)
+        else:
+            taken = np.atleast_2d(self._held)
+            seen = self._window.step(np.ones(len(rows), np.bool_), taken, rows)
+        return seen.reshape(*observation.shape[:-1], -1).astype(np.float32)
 
     def _chosen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         if observation.ndim == 1 and not self._one_row:

@@ -17,7 +17,8 @@ def export(controller: Controller, path: Path, form: str = "onnx") -> None:
 
     Its input is `observation`, (rows, d) float32 in the units of the task's features; its output is
     `action`, (rows, k) in those of the actuators. `described` is in its metadata, as `jbrep`. Each
-    action is to be held for `action_repeat` control steps, which is for the caller to do.
+    action is to be held for `action_repeat` control steps, which is for the caller to do, as is
+    keeping the states and actions of the steps before for a policy that was trained with a history.
 
     Args:
         controller: of the policy.
@@ -41,14 +42,17 @@ def export(controller: Controller, path: Path, form: str = "onnx") -> None:
 def described(controller: Controller) -> dict[str, Any]:
     """What a file says of its policy: names, units and ranges, the rate, where it comes from."""
     task, settings = controller.task, controller.settings
+    now = task.features[: len(task.view.places)] if task.view else task.features
     period = None if task.timestep is None else task.timestep * controller.action_repeat
     return {
         "task": task.name,
         "observation": [
             {"name": each.name, "unit": each.unit, "low": each.low, "high": each.high}
-            for each in task.features
+            for each in now
         ],
         "action": {"low": to_plain(task.action_low), "high": to_plain(task.action_high)},
+        # of so many states, the newest first, then of the actions between, the input consists
+        "history": task.view.history if task.view else 1,
         "control_period": task.timestep,  # seconds
         "action_repeat": controller.action_repeat,
         "rate": None if period is None else 1 / period,  # actions a second

@@ -1,0 +1,147 @@
+"""What is seen of an environment that gives more: some of its features, and their history."""
+
+from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.envs.task import Array, Task, View
+from jbrep.errors import InputError
+
+
+def with_view(task: Task, hidden: Iterable[str] = (), history: int = 1) -> Task:
+    """The task seen without some features, or with those of its last steps, or both.
+
+    The observation is what isn't hidden of the current state, then of the state before, and so on,
+    then the last action, the one before, and so on: `speed`, `speed.1`, `action.1`. Before an
+    episode's start, it stood still: its first state, and actions of 0 or the nearest to it.
+
+    Args:
+        task: without a view.
+        hidden: names or patterns, as in `velocity_*`, of features or groups to leave out.
+        history: states that are seen, the current one among them.
+
+    Raises:
+        InputError: a pattern that fits nothing, nothing left, too many features, or the task has a
+            view already.
+    """
+    if task.view:
+        raise InputError(f"some of {task.name} is hidden, or seen with its past, already")
+    names = [name for pattern in hidden for name in _matching(pattern, task)]
+    view = View(features=task.features, hidden=tuple(dict.fromkeys(names)), history=history)
+    if not view.hidden and history == 1:
+        return task
+    without = f".without-{len(view.hidden)}" if view.hidden else ""
+    past = f".history-{history}" if history > 1 else ""
+    seen = view.seen(task.action_low, task.action_high)
+    return task.replace(name=f"{task.name}{without}{past}", features=seen, view=view)
+
+
+def _matching(pattern: str, task: Task) -> list[str]:
+    """The names of the features that a pattern fits, or the name of their group."""
+    found = [
+        each.name
+        for each in task.features
+        if fnmatchcase(each.name, pattern) or fnmatchcase(each.group, pattern)
+    ]
+    if not found:
+        names = ", ".join(task.feature_names)
+        raise InputError(f"no feature of {task.name} is called {pattern}: it has {names}")
+    return found
+
+
+class Window:
+    """What n robots have shown of late, from which observations with a history are made.
+
+    Args:
+        task: with a view.
+        num_lanes: n.
+        places: where the features that are seen stand in what is given, of D numbers.
+    """
+
+    def __init__(self, task: Task, num_lanes: int, places: Sequence[int]):
+        view = task.view
+        assert view
+        self._places = np.array(places)
+        self._states = np.zeros((num_lanes, view.history, len(self._places)))
+        self._rest = np.clip(0.0, task.action_low, task.action_high)
+        self._actions = np.zeros((num_lanes, view.history - 1, task.action_size))
+
+    def begin(self, lanes: Sequence[int] | NDArray[np.int64], given: NDArray[Any]) -> Array:
+        """What is seen in all lanes, (n, d), after an episode began in some.
+
+        Args:
+            lanes: their numbers.
+            given: by the environment, (n, D).
+        """
+        self._states[lanes] = given[lanes][:, None, self._places]
+        self._actions[lanes] = self._rest
+        return self._seen()
+
+    def step(self, moved: NDArray[np.bool_], actions: NDArray[Any], given: NDArray[Any]) -> Array:
+        """What is seen in all lanes, (n, d), after a step.
+
+        Args:
+            moved: the lanes that took it, (n,).
+            actions: that were taken, (n, k).
+            given: by the environment, (n, D).
+        """
+        for past, now in ((self._states, given[:, self._places]), (self._actions, actions)):
+            if past.shape[1]:
+                past[moved, 1:] = past[moved, :-1]
+                past[moved, 0] = now[moved]
+        return self._seen()
+
+    def _seen(self) -> Array:
+        n = len(self._states)
+        return np.hstack((self._states.reshape(n, -1), self._actions.reshape(n, -1)))
+
+    @property
+    def state(self) -> dict[str, Array]:
+        """A copy of what `restore` takes."""
+        return {"window_states": self._states.copy(), "window_actions": self._actions.copy()}
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Go on from where the state was taken; what is taken from it, is removed."""
+        self._states[:] = state.pop("window_states")
+        self._actions[:] = state.pop("window_actions")
+
+    def now(self, given: NDArray[Any]) -> Array:
+        """What is seen, (n, d), when the last that was given is given once more, (n, D)."""
+        self._states[:, 0] = given[:, self._places]
+        return self._seen()
+
+
+def seen_in_episodes(
+    task: Task,
+    observation: NDArray[np.float32],
+    action: NDArray[np.float32],
+    final: NDArray[np.float32],
+    length: NDArray[np.int32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What is seen in recorded episodes, before each step (N, d) and at the end of each (n, d).
+
+    Args:
+        task: with a view.
+        observation: that the environment gave before each step, (N, D).
+        action: of each step, (N, k).
+        final: the last observation of each episode, (n, D).
+        length: steps of each episode, (n,), N in all.
+    """
+    view = task.view
+    assert view
+    ends = np.cumsum(length)
+    states = np.insert(observation, ends, final, axis=0)[:, view.places]
+    rest = np.clip(0.0, task.action_low, task.action_high)
+    actions = np.insert(action, ends, rest, axis=0)
+    last = ends + np.arange(len(length))  # rows of the final states
+    first = np.repeat(last - length, length + 1)
+    row = np.arange(len(states))
+    past = [actions[row - lag] for lag in range(1, view.history)]
+    for lag, taken in enumerate(past, 1):
+        taken[row - lag < first] = rest
+    parts = [states[np.maximum(row - lag, first)] for lag in range(view.history)] + past
+    seen = np.hstack(parts).astype(np.float32)
+    return np.delete(seen, last, axis=0), seen[last]

@@ -1,0 +1,166 @@
+"""What is seen of a robot: some of its features, and those of the steps before."""
+
+from importlib import import_module
+
+import numpy as np
+import pytest
+from command import jbrep, mistake
+from test_controller import controller_of, difference_over_an_episode, randomised
+
+from jbrep.collect import collect
+from jbrep.collect.derive import derive_view
+from jbrep.collect.policies import Heuristic
+from jbrep.dataset import Dataset, DataSettings
+from jbrep.envs import Lanes, describe
+from jbrep.envs.names import import_modules
+from jbrep.envs.view import with_view
+from jbrep.errors import InputError
+from jbrep.rl.export import export
+
+import_modules(["environments"])
+TASK = "move_in_direction"
+
+
+@pytest.fixture(scope="module")
+def task():
+    return describe(TASK, {}, 20)
+
+
+@pytest.fixture(scope="module")
+def seen(task):
+    return with_view(task, ["*velocity*"], history=3)
+
+
+def test_features_have_names_in_the_past(task, seen):
+    now = [name for name in task.feature_names if "velocity" not in name]
+    assert seen.feature_names[: len(now)] == tuple(now)
+    assert seen.feature_names[len(now)] == "position_x.1"
+    assert seen.feature_names[-2:] == ("action.1", "action.2")
+    assert seen.size == 3 * len(now) + 2
+    assert seen.whole == task.replace(name=seen.name)
+
+
+def stacked(lanes, act):
+    """What would be seen of the whole observations, stacked by hand, and the rewards."""
+    names = [i for i, name in enumerate(lanes.task.feature_names) if "velocity" not in name]
+    states = [lanes.observation[:, names]] * 3
+    actions = [np.zeros((lanes.num_lanes, 1))] * 2
+    yield np.hstack([*states, *actions])
+    while lanes.num_active:
+        action = act()
+        states = [lanes.step(action).observation[:, names], *states[:2]]
+        actions = [action, actions[0]]
+        yield np.hstack([*states, *actions])
+
+
+def test_lanes_show_the_steps_before(task, seen):
+    random = np.random.default_rng(0)
+    drives = random.uniform(-1, 1, (20, 4, 1))
+    whole, lanes = Lanes(task, 4), Lanes(seen, 4)
+    for each in (whole, lanes):
+        each.reset(range(4), [3, 4, 5, 6])
+    expected = stacked(whole, iter(drives).__next__)
+    np.testing.assert_array_equal(lanes.observation, next(expected))
+    for step, (drive, wanted) in enumerate(zip(drives, expected, strict=True)):
+        if step == 7:
+            state = lanes.state
+            lanes = Lanes(seen, 4)
+            lanes.restore(state)
+        np.testing.assert_array_equal(lanes.step(drive).observation, wanted)
+    assert not lanes.num_active
+
+
+def test_a_lane_that_begins_anew_forgets():
+    lanes = Lanes(with_view(describe("Sledges/Sledge-v0"), history=2), 2)
+    first = lanes.reset([0, 1], [1, 2])
+    lanes.step(np.full((2, 3), 0.5))
+    again = lanes.reset([1], [2])
+    np.testing.assert_array_equal(again[1], first[1])
+    assert again[0, -1] == np.float32(0.5)
+
+
+@pytest.mark.parametrize("name", [TASK, "Sledges/Sledge-v0"])
+def test_a_derived_data_set_is_as_if_it_were_collected(name, tmp_path):
+    task = describe(name, {}, 20 if name == TASK else None)
+    hidden = task.feature_names[1:2]
+    settings = DataSettings(task=task, steps=300, shard_episodes=4)
+    collect(settings, tmp_path / "whole", num_threads=1)
+    derive_view(tmp_path / "whole", tmp_path / "derived", hidden, 3)
+    collect(
+        settings.replace(task=with_view(task, hidden, 3)), tmp_path / "collected", num_threads=1
+    )
+    derived, collected = Dataset(tmp_path / "derived"), Dataset(tmp_path / "collected")
+    assert len(derived.episodes["length"]) > 4
+    assert derived.task.size == 3 * (task.size - 1) + 2 * task.action_size
+    for column in collected.columns:
+        assert derived[column][:].tobytes() == collected[column][:].tobytes(), column
+    for column, values in collected.episodes.items():
+        assert derived.episodes[column].tobytes() == values.tobytes(), column
+
+
+def test_a_controller_keeps_the_history_itself(seen):
+    trained = randomised("td3", "full", seen)
+    now = len(seen.view.places)
+    controller = controller_of(trained)
+    worst, spread = difference_over_an_episode(
+        trained, lambda observation: controller(observation[:now]), steps=20
+    )
+    assert worst < 1e-6 < 1e-3 < spread
+    controller.reset()
+    several = np.random.default_rng(0).normal(size=(4, now))
+    alone = controller_of(trained)
+    np.testing.assert_allclose(controller(several)[0], alone(several[0]), atol=1e-6)
+
+
+def test_a_robot_keeps_the_history_of_an_exported_policy(seen, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend("examples/robot")
+    controller = controller_of(randomised("td3", "full", seen))
+    export(controller, tmp_path / "it.onnx")
+    robot = import_module("controller").Controller(str(tmp_path / "it.onnx"))
+    low, high = np.array([(each.low, each.high) for each in seen.features[: robot.size]]).T
+    shown = np.random.default_rng(0).uniform(low, high, (8, robot.size)).astype(np.float32)
+    for step, sensors in enumerate(shown):
+        np.testing.assert_allclose(robot.act(step, sensors), controller(sensors), atol=1e-6)
+
+
+def test_what_a_view_refuses(task, seen):
+    for hidden, history, said in (
+        (["speed"], 1, "no feature of move_in_direction is called speed: it has position_x, "),
+        (["*"], 1, "all features are hidden: leave some to see"),
+        (["orientation_w"], 1, "orientation is a quaternion of 3 numbers: it must have 4"),
+        ((), 5000, "history"),
+    ):
+        with pytest.raises(InputError, match=said):
+            with_view(task, hidden, history)
+    with pytest.raises(InputError, match="already"):
+        with_view(seen, history=2)
+    with pytest.raises(InputError, match="its features must be those that its view shows"):
+        seen.replace(features=seen.features[1:])
+    with pytest.raises(InputError, match="has no hand-written policy"):
+        Heuristic().begin(seen, [0])
+
+
+def test_commands_take_what_is_seen(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run(command):
+        told = jbrep(*command.split())
+        assert told.exit_code == 0, told.output
+        return told.output
+
+    hide = "--hide *velocity* --history 2"
+    task = f"--task {TASK} --episode-steps 20"
+    short = "--steps 200 --evaluate-every 100 --evaluation-episodes 1 --final-episodes 1"
+    assert "move_in_direction.without-10.history-2" in run(f"env {TASK} {hide}")
+    run(f"collect {task} --steps 200 --out whole")
+    assert "--hide or --history" in mistake(*["data", "derive", "whole", "--out", "seen"])
+    run(f"data derive whole {hide} --out seen")
+    run("data verify seen --replay 2")
+    run("train-encoder --kind pca --latent 4 --data seen --out codes --name code")
+    run("evaluate --encoder codes/code.safetensors --data seen --out evaluation")
+    given = f"--encoder codes/code.safetensors {short}"
+    assert "made for other features" in mistake(*f"rl {task} {given} --out other".split())
+    run(f"rl {task} {hide} {given} --out run")
+    run("policy export run --out it.onnx")
+    told = run("policy check it.onnx --run run --episodes 2")
+    assert float(told.rpartition("differs by more than ")[2]) < 1e-5
