@@ -7,6 +7,7 @@ so that a new one watches its parent before the seconds that it takes to import 
 import multiprocessing
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -18,6 +19,7 @@ from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 ATTEMPTS = 5  # at a job whose worker is killed
+_ANSWERS_WITHIN = 10.0  # seconds, a cluster
 _STOPPING_SECONDS = 60.0  # that jobs under way have to stop before they are killed
 _SINGLE_THREADED = dict.fromkeys(
     ("MKL_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
@@ -182,11 +184,29 @@ def on_cluster(function: Callable[..., Any], cpus: int | None, gpus: int = 0) ->
         function: to run.
         cpus: of the local cluster that is started where RAY_ADDRESS names none; None takes all.
         gpus: that it needs.
+
+    Raises:
+        InputError: no cluster can be reached or started.
     """
     import ray
 
     if not ray.is_initialized():
-        cores = None if "RAY_ADDRESS" in os.environ else cpus
-        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-        ray.init(num_cpus=cores, include_dashboard=False, **quiet)
+        _connect(os.environ.get("RAY_ADDRESS"), cpus)
     return ray.remote(num_cpus=1, num_gpus=gpus, max_retries=ATTEMPTS - 1)(function)
+
+
+def _connect(address: str | None, cpus: int | None) -> None:
+    """Join the cluster at an address, or start one where none is given."""
+    import ray
+
+    from jbrep.errors import InputError, first_line
+
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    try:
+        host, _, port = (address or "").removeprefix("ray://").rpartition(":")
+        if host and port.isdecimal():  # Ray itself tries for minutes, and tells each time
+            socket.create_connection((host, int(port)), _ANSWERS_WITHIN).close()
+        ray.init(num_cpus=None if address else cpus, include_dashboard=False, **quiet)
+    except Exception as error:  # of its many kinds Ray's plainest, too
+        where = f"at RAY_ADDRESS={address}" if address else "on this machine"
+        raise InputError(f"no Ray cluster {where}: {first_line(error)}") from error

@@ -11,7 +11,8 @@ from types import SimpleNamespace
 import pytest
 from command import wait_for, wait_for_the_end_of, workers_of
 
-from jbrep.pool import Pool, stop_requested
+from jbrep.errors import InputError
+from jbrep.pool import Pool, on_cluster, stop_requested
 
 PARENT = """
 import sys
@@ -135,3 +136,11 @@ def test_a_run_that_kills_its_workers_crashes_alone(monkeypatch):
     assert sorted(others) == ["outcome of fourth", "outcome of second", "outcome of third"]
     assert (crashed.name, crashed.status) == ("first", "crashed")
     assert crashed.message.startswith("its worker was killed 5 times, perhaps because memory ran")
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:9", "ray://127.0.0.1:9", "no such; thing"])
+def test_a_cluster_that_is_not_there_is_told_at_once(address, monkeypatch):
+    pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(InputError, match=f"^no Ray cluster at RAY_ADDRESS={address}: "):
+        on_cluster(print, 1)
