@@ -19,6 +19,7 @@ EXTRAS = {  # what each extra is for; the empty name stands for the core
     "cluster": "collect and study --backend ray",
     "render": "render",
     "export": "data import and export, encoder import and export",
+    "logs": "data import of robots' logs: CSV, ROS bags, LeRobot data sets",
     "suite": "--task dm_control/...",
     "tune": "tune",
     "view": "inspect",

@@ -186,7 +186,7 @@ def any_data(request, collected, tmp_path_factory):
     return Dataset(folder)
 
 
-@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("to", [to for to in FORMATS if to != "lerobot"])
 def test_what_is_exported_comes_back(to, any_data, tmp_path):
     dataset, out = any_data, tmp_path / (f"data.{to}" if to != "minari" else "minari")
     export(dataset, to, out)
@@ -392,8 +392,8 @@ BAD_TABLES = {
         "episode": np.where(np.arange(20) > 14, 4, EPISODE)
     },
     "has string in the column 'joint 0'": {"joint 0": ["a"] * 20},
-    "empty cells in the column 'step'": {"step": [None, *range(19)]},
-    "has no rewards": {"reward": None},
+    "a.parquet, row 0: 'step' has an empty cell": {"step": [None, *range(19)]},
+    "has no actions": {"action_0": None},
 }
 
 

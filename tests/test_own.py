@@ -24,8 +24,8 @@ from jbrep import Encoded, JitterbugVecEnv
 from jbrep.encoders import Encoder, find
 from jbrep.encoders.base import as_encoder
 from jbrep.encoders.card import card as describe_encoder
-from jbrep.encoders.code import import_code
 from jbrep.envs import describe
+from jbrep.envs.names import import_code
 from jbrep.errors import InputError
 from jbrep.evaluate import diagnose
 from jbrep.inspection import inspect

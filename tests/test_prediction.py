@@ -53,7 +53,7 @@ class Cart:
         task = make_task(features, "Cart-v0")
         self.task = task.replace(action_low=(-1.0,), action_high=(1.0,))
         self.episodes = {"length": np.full(EPISODES, STEPS), "seed": np.arange(EPISODES)}
-        policy = SimpleNamespace(policy={"kind": "uniform"}, seed=0)
+        policy = SimpleNamespace(policy={"kind": "uniform"}, seed=0, unrewarded=False)
         self.manifest = SimpleNamespace(fingerprint="cart", settings=policy)
         random = np.random.default_rng(0)
         actions = random.uniform(-1, 1, (EPISODES, STEPS, 1)).astype(np.float32)
@@ -193,7 +193,7 @@ def test_nothing_is_said_where_it_cannot_be(evaluation):
         encoders=codes | {"full": full.replace(prediction=still)},
     )
     told = evaluation_text(constant)
-    assert "can't be said: the reward is the same in all held-out steps" in told
+    assert "can't be said: no reward is known that varies over the held-out steps" in told
     assert not re.search(r"noise +nothing", told)
     blind = {k: a.replace(rewarded=unknown, reward=unknown, mean=unknown) for k, a in still.items()}
     nothing = evaluation.replace(encoders=codes | {"full": full.replace(prediction=blind)})

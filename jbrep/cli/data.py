@@ -29,6 +29,7 @@ from jbrep.cli.environment import (
     view_options,
 )
 from jbrep.cli.options import record_options
+from jbrep.dataset.layout import Layout
 from jbrep.dataset.settings import TRAINED, CollectSettings, parts_of
 from jbrep.errors import InputError
 from jbrep.text import counted, terminal_width
@@ -257,7 +258,7 @@ def derive(
 @data.command(epilog="Example: jbrep data export data/face --to parquet --out face.parquet")
 @_data
 @import_option
-@click.option("--to", required=True, help="minari, parquet or npz.")
+@click.option("--to", required=True, help="minari, parquet, npz or lerobot.")
 @click.option("--out", required=True, type=PATH, help="A new file or folder.")
 def export(data: Path, to: str, out: Path) -> None:
     """Write a data set in another tool's format.
@@ -275,31 +276,62 @@ def export(data: Path, to: str, out: Path) -> None:
 
 
 @data.command("import", epilog="Example: jbrep data import D4RL/hopper/expert-v0 --out data/hopper")
-@click.argument("source")
+@click.argument("source", nargs=-1, required=True)
 @task_options
+@record_options(Layout)
+@click.option(
+    "--layout", type=PATH, help="A TOML file with the options from --observations to --fill."
+)
 @click.option("--out", required=True, type=PATH, help="A new folder.")
-def import_(source: str, out: Path, **options: Any) -> None:
-    """Make a data set of one that was made elsewhere.
+def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
+    """Make a data set of one that was made elsewhere, or of a robot's logs.
 
-    SOURCE is an .npz or .parquet file, the folder of a Minari data set, or its id in
-    MINARI_DATASETS_PATH. Without --task, the task is the one that the source names, or is made from
-    the data alone. See docs/data-format.md for the columns that a file must have.
+    SOURCE is a file (.csv, .tsv, .txt, .parquet, .npz), the folder of a Minari data set, or its id
+    in MINARI_DATASETS_PATH; of several, an episode ends with each. Without --task, the task is the
+    one that the source names, or is made from the data alone. See docs/logs.md, and
+    docs/data-format.md for what is known by its name.
     """
-    from jbrep.dataset.formats import open_source
+    from jbrep.dataset.formats import open_source, together
     from jbrep.dataset.formats.writer import write
+    from jbrep.envs.names import import_code, is_code
 
+    import_code(options["reward"])
+    layout = _layout(options)
+    reward = layout.reward if is_code(layout.reward) else ""
     told = {name: options[name] for name in ("features", "missing")}
     if options["task"] is None:  # they can be said of data alone
         options |= dict.fromkeys(told)
     task = given_task(options)
     with stoppable("nothing was imported"):
         with _deferred_stop():
-            opened = open_source(source)
-        manifest = write(opened, out, task, **({} if task else _given(told)))
+            missing = told["missing"] or (task.missing if task else "") or ""
+            opened = together([open_source(each, layout, missing) for each in source])
+        said = {} if task else _given(told)
+        manifest = write(opened, out, task, **said, reward=reward)
+    for note in opened.notes:
+        say(note)
+    for (noun, what), count in opened.changes().items():
+        say(f"{counted(count, noun)} {what}")
+    if manifest.settings.unrewarded:
+        say("no rewards: what needs some will say so; --reward can make them", err=True)
     if not (task or opened.task):
         line = f"{manifest.task.name} is made from the data alone: {opened.why_no_task}"
         say(line, err=True)
     _report_size(out, manifest)
+
+
+def _layout(options: dict[str, Any]) -> Layout:
+    """What the columns are by a file, and by options before it; they are taken out."""
+    from jbrep.records.record import from_plain
+    from jbrep.records.toml import read_toml
+
+    given = {name: options.pop(name) for name in Layout.__struct_fields__}
+    usual, path = Layout(), options.pop("layout")
+    said = {n: value for n, value in given.items() if value not in (None, getattr(usual, n))}
+    try:
+        return from_plain({**(read_toml(path) if path else {}), **said}, Layout)
+    except InputError as error:
+        raise InputError(f"{path}: {error}" if path else f"{error}") from None
 
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -80,8 +80,8 @@ def evaluate(
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders import find
-    from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import check_found, source_of
+    from jbrep.envs.names import import_code
 
     whole = Dataset(data)
     for name in encoder:
@@ -237,8 +237,8 @@ def info(encoder: str, as_json: bool, **options: Any) -> None:
     mymodule:MyEncoder, whose module is imported: this runs it.
     """
     from jbrep.encoders.card import card, describe
-    from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import find_alone, source_of
+    from jbrep.envs.names import import_code
 
     import_code(encoder)
     task = given_task(options)
@@ -262,9 +262,9 @@ def export(encoder: str, out: Path, **options: Any) -> None:
     decoder, `reconstruction`. ENCODER is as for `info`.
     """
     from jbrep.encoders import Encoder
-    from jbrep.encoders.code import import_code
     from jbrep.encoders.onnx import export as run
     from jbrep.encoders.shipped import find_alone, source_of
+    from jbrep.envs.names import import_code
 
     import_code(encoder)
     task = given_task(options)

@@ -65,8 +65,8 @@ def inspect(
     """
     if view and serve:
         raise InputError("--view and --serve exclude each other: choose one")
-    from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import check_found
+    from jbrep.envs.names import import_code
     from jbrep.play.sources import check_source
 
     task = given_task(options)

@@ -8,7 +8,7 @@ from msgspec import NODEFAULT, inspect
 
 from jbrep.cli.base import COUNT, with_options
 from jbrep.records.keys import Key, keys_of
-from jbrep.records.record import Record, converted
+from jbrep.records.record import Record, converted, from_text
 from jbrep.records.words import bare
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
@@ -50,7 +50,7 @@ def _option(key: Key) -> Callable[[_Command], _Command]:
         is_flag=isinstance(node, inspect.BoolType),
         metavar=_choices(node),
         required=not has_default,
-        default=key.default if has_default else None,
+        default=key.default if has_default and key.default not in ((), {}) else None,
         show_default=bool(key.default_shown and not default and key.default is not False),
         help=key.help + default,
         callback=_check(key),
@@ -61,6 +61,8 @@ def _check(key: Key) -> Callable[[click.Context, click.Parameter, Any], Any]:
     """Refuses what the record would refuse, before the command imports what it works with."""
 
     def check(context: click.Context, option: click.Parameter, value: Any) -> Any:
+        if isinstance(value, str):
+            return from_text(value, key.annotation, key.name)
         return value if value is None else converted(value, key.annotation, key.name)
 
     return check

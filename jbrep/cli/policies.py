@@ -77,9 +77,9 @@ def evaluate_policy(
     act on what an encoder's latent is decoded to: the return that it loses measures what the latent
     lacks.
     """
-    from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import source_of
     from jbrep.envs.infos import by_name, shares_text
+    from jbrep.envs.names import import_code
 
     import_code(encoder)
     zip_file = _Zip(algorithm, trust, vecnormalize)

@@ -90,8 +90,8 @@ def given_run(options: dict[str, Any], threads: int | None = None, **others: Any
     Raises:
         InputError: --set isn't NAME=VALUE, or names a setting again; or as `Run.of`.
     """
-    from jbrep.encoders.code import import_code
     from jbrep.encoders.shipped import check_found
+    from jbrep.envs.names import import_code
     from jbrep.rl.files import read_finished
     from jbrep.rl.presets import get_preset, usual_preset
 

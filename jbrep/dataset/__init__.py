@@ -7,6 +7,7 @@ from jbrep.lazy import exports
 
 if TYPE_CHECKING:
     from jbrep.dataset.columns import Batches, Column
+    from jbrep.dataset.layout import Layout
     from jbrep.dataset.reader import Dataset, Episode, Split
     from jbrep.dataset.scaled import ScaledDataset
     from jbrep.dataset.scaling import Scaler
@@ -19,6 +20,7 @@ __all__ = [
     "DataSettings",
     "Dataset",
     "Episode",
+    "Layout",
     "ScaledDataset",
     "Scaler",
     "Split",
@@ -28,7 +30,7 @@ __getattr__ = exports(
     __name__,
     {
         **{"Batches": "columns", "Column": "columns", "DataSettings": "schema"},
-        **{"Dataset": "reader", "Episode": "reader", "Split": "reader"},
+        **{"Layout": "layout", "Dataset": "reader", "Episode": "reader", "Split": "reader"},
         **{"ScaledDataset": "scaled", "Scaler": "scaling"},
     },
 )

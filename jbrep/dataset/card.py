@@ -28,7 +28,7 @@ def describe(dataset: Dataset) -> dict[str, Any]:
         "episodes": len(episodes["length"]),
         "terminated": int(episodes["terminated"].sum()),
         "steps_per_episode": _spread(episodes["length"]),
-        "return": _spread(episodes["return"]),
+        "return": _spread(episodes.get("return", ())),
         "columns": list(dataset.columns),
         "shards": len(manifest.shards),
         "complete": manifest.complete,
@@ -61,6 +61,8 @@ def card(dataset: Dataset, width: int = 80) -> str:
             f"median {of['median']} [10 % {of['p10']}, 90 % {of['p90']}], mean {of['mean']}, "
             f"from {of['min']} to {of['max']}"
         )
+    if dataset.manifest.settings.unrewarded:
+        named["return"] = "not known: the data have no rewards"
     if dataset.manifest.settings.is_imported:
         named["note"] = "the data were imported: no episode can be simulated again"
     elif not dataset.task.reproducible:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.dataset.columns import Batches, Column
+from jbrep.dataset.layout import Layout
 from jbrep.dataset.manifest import (
     check_files,
     current_manifest,
@@ -123,7 +124,7 @@ class Dataset:
             observations: before each action, (N, d). In a list, the observations of an episode may
                 have one row more than the rest: the final one.
             actions: (N, k).
-            rewards: (N,).
+            rewards: (N,); None where none are known.
             terminations: whether a state ended the episode at that step, (N,).
             truncations: whether anything else did, such as a time limit, (N,).
             final_observations: after the last action of each episode, (n, d). Where they aren't
@@ -148,6 +149,44 @@ class Dataset:
         once = {"final_observation": final_observations, "seed": seeds}
         opened = source_of(columns, once, source)
         write(opened, Path(folder), None if task is None else as_task(task))
+        return Dataset(folder)
+
+    @staticmethod
+    def from_table(
+        folder: str | Path,
+        table: Any,
+        layout: Layout | None = None,
+        *,
+        missing: str = "",
+        task: Task | str | None = None,
+        source: str = "table",
+    ) -> "Dataset":
+        """Write a data set of a table's rows, such as a robot's log, whole or not at all.
+
+        Args:
+            folder: new.
+            table: a frame of pandas or polars, a table of pyarrow's, or a dict of columns.
+            layout: what its columns are, and what becomes of its rows.
+            missing: what becomes of numbers that are missing: skip, or hold:3 and the like.
+            task: that the rows are of, or its name; made from the data alone if not given.
+            source: where they come from, a few words; also the id of a task made from the data.
+
+        Returns:
+            The data set.
+
+        Raises:
+            InputError: the folder exists already, or the table can't be used.
+        """
+        from jbrep.dataset.formats import source_from
+        from jbrep.dataset.formats.arrow import table_of
+        from jbrep.dataset.formats.writer import write
+        from jbrep.envs.description import as_task
+        from jbrep.envs.names import is_code
+
+        opened = source_from(table_of(table, source), layout, missing)
+        reward = layout.reward if layout and is_code(layout.reward) else ""
+        known = None if task is None else as_task(task)
+        write(opened, Path(folder), known, missing=missing, reward=reward)
         return Dataset(folder)
 
     def _shard(self, shard: int) -> Shard:

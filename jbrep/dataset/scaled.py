@@ -111,10 +111,16 @@ class ScaledDataset:
 
     @cached_property
     def reward_varies(self) -> bool:
-        """Whether not all training rows have the same reward."""
-        parts = self.dataset["reward"].parts(self.train)
-        first = self.dataset["reward"][self.train[0]]
-        return any((part != first).any() for part in parts)
+        """Whether there are rewards, and not all training rows have the same."""
+        rewards = self.rewards(self.train)
+        return bool((rewards != rewards[:1]).any())
+
+    def rewards(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Rewards of the rows, of the same shape; all 0 where the data have none."""
+        if self.dataset.manifest.settings.unrewarded:
+            return np.zeros(rows.shape, np.float32)
+        rewards: NDArray[np.float32] = self.dataset["reward"][rows]
+        return rewards
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
         names = [feature.name for feature in self.scaler.features(self.task)]

@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from jbrep.dataset.settings import IMPORTED, MIXTURE, CollectSettings, PolicySettings, check_policy
@@ -33,7 +34,9 @@ def _spec(dtype: str, *row: int, follows: Callable[[Columns], NDArray[Any]] | No
     return Spec(np.dtype(dtype), row, follows)
 
 
-def _specs(task: Task, store_state: bool, weights: Sequence[float]) -> dict[str, Spec]:
+def _specs(
+    task: Task, store_state: bool, weights: Sequence[float], unrewarded: bool
+) -> dict[str, Spec]:
     """The columns of each shard, by their paths in the file.
 
     Raises:
@@ -41,7 +44,7 @@ def _specs(task: Task, store_state: bool, weights: Sequence[float]) -> dict[str,
     """
 
     def steps_of(known: Columns) -> NDArray[Any]:
-        rows, firsts = len(known["reward"]), episode_bounds(known[length])[:-1]
+        rows, firsts = len(known["action"]), episode_bounds(known[length])[:-1]
         return np.arange(rows) - np.repeat(firsts, known[length])
 
     def parts(known: Columns) -> NDArray[Any]:
@@ -85,7 +88,9 @@ def _specs(task: Task, store_state: bool, weights: Sequence[float]) -> dict[str,
         **(missing if task.missing else {}),
     }
     by_step = steps | (moving if store_state else {})  # states with the observation
-    return by_step | {EPISODES + name: spec for name, spec in once.items()}
+    specs = by_step | {EPISODES + name: spec for name, spec in once.items()}
+    without = {"reward", EPISODES + "return"} if unrewarded else set()
+    return {name: spec for name, spec in specs.items() if name not in without}
 
 
 class DataSettings(CollectSettings, frozen=True, kw_only=True):
@@ -98,6 +103,7 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
 
     task: Task = msgspec.field(name="environment")
     policy: PolicySettings = msgspec.field(default_factory=lambda: {"kind": "uniform"})
+    unrewarded: Literal[True] | UnsetType = UNSET  # imported data that have no rewards
 
     def check(self) -> None:
         """As for `Record`."""
@@ -126,7 +132,7 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
 
     def specs(self) -> dict[str, Spec]:
         """The columns of each shard, by their paths in the file."""
-        return _specs(self.task, self.store_state, self.weights)
+        return _specs(self.task, self.store_state, self.weights, bool(self.unrewarded))
 
     def step_specs(self) -> dict[str, Spec]:
         """Those with a row for each step."""

@@ -105,7 +105,8 @@ def range_problems(task: Task, columns: Columns) -> Iterator[str]:
     ranges: list[tuple[str, NDArray[Any], float, float]] = list(bounds)
     reward_low = -np.inf if task.reward_low is None else min(task.reward_low, 0)
     reward_high = np.inf if task.reward_high is None else max(task.reward_high, 0)
-    ranges.append(("reward", columns["reward"], reward_low, reward_high))
+    if "reward" in columns:
+        ranges.append(("reward", columns["reward"], reward_low, reward_high))
     for values in (columns["observation"], columns[EPISODES + "final_observation"]):
         ranges += [
             (feature.name, values[:, i], feature.low, feature.high)

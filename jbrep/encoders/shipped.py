@@ -10,11 +10,12 @@ from jbrep.coordinates.invariance import tried_coordinates
 from jbrep.dataset import Scaler
 from jbrep.dataset.scaling import usual_range
 from jbrep.encoders.base import BaseEncoder, as_encoder
-from jbrep.encoders.code import is_code, make
+from jbrep.encoders.code import make
 from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.file import SUFFIX, load
 from jbrep.encoders.header import FULL, HELD_OUT_MSE, EncoderHeader
 from jbrep.encoders.names import EncoderName
+from jbrep.envs.names import is_code
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.storage import exists

@@ -1,10 +1,12 @@
 """Names of tasks: every id in Gymnasium's registry, and short names for some of them."""
 
 import difflib
+import re
 import shlex
 import sys
 from collections.abc import Iterable
 from importlib import import_module, metadata
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -14,6 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 from jbrep.envs.task import SHORT_NAMES, Task
 from jbrep.errors import InputError, kind_and_line
 
+_CODE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", re.ASCII)
 _imported: list[str] = []
 
 
@@ -92,6 +95,46 @@ def imported_modules() -> tuple[str, ...]:
 def imported(module: str) -> ModuleType | None:
     """A module, if `import_modules` was asked for it."""
     return sys.modules[module] if module in _imported else None
+
+
+def is_code(name: object) -> bool:
+    """Whether a text names code, as in mymodule:MyEncoder, rather than a file."""
+    return isinstance(name, (str, Path)) and _CODE.fullmatch(str(name)) is not None
+
+
+def import_code(name: object) -> None:
+    """Import the module of code that a command line names; nothing for another text.
+
+    Raises:
+        InputError: as `import_modules`.
+    """
+    if is_code(name):
+        import_modules([str(name).partition(":")[0]])
+
+
+def code_named(name: str, what: str) -> Any:
+    """What code names, as in mymodule:MyEncoder.
+
+    Args:
+        name: of it.
+        what: it is, for messages.
+
+    Raises:
+        InputError: its module wasn't imported on request, or has no such name.
+    """
+    module, _, path = name.partition(":")
+    thing: Any = imported(module)
+    if thing is None:
+        raise InputError(
+            f"the {what} {name} is code: importing {module} runs it; if you trust it, add "
+            f"--import {module}"
+        )
+    try:
+        for part in path.split("."):
+            thing = getattr(thing, part)
+    except AttributeError as error:
+        raise InputError(f"can't make the {what} {name}: {kind_and_line(error)}") from None
+    return thing
 
 
 def name_given(text: str) -> str:

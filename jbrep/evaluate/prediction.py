@@ -117,7 +117,7 @@ def following(held_out: HeldOut, part: str, ahead: int) -> Steps:
     chosen = sample_rows(rows[first_rows(data, rows, ahead)], _ROWS[part], width)
     observation = dataset["observation"]
     steps = chosen[:, None] + np.arange(ahead)
-    reward = dataset["reward"][steps].mean(axis=1, dtype=np.float64)
+    reward = data.rewards(steps).mean(axis=1, dtype=np.float64)
     changed = changes(task, observation, chosen, ahead)
     wanted = np.hstack((changed, reward[:, None])).astype(np.float32)
     action = dataset["action"][steps].reshape(len(chosen), -1)

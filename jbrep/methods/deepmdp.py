@@ -49,8 +49,8 @@ class DeepMDP(Network, Learned, frozen=True, kw_only=True):
             )
         if not data.reward_varies:
             raise InputError(
-                f"the reward is constant in {data.dataset.folder}, with which deepmdp makes a "
-                "constant code: use data in which it varies"
+                f"deepmdp needs a reward that varies, and there is none in {data.dataset.folder}: "
+                "the code would be constant"
             )
 
     @classmethod

@@ -69,7 +69,8 @@ class Forward(Network, Learned, frozen=True, kw_only=True):
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
         """As for `Method`."""
         steps, lost = max(metrics["loss_by_horizon"].items(), key=lambda each: int(each[0]))
-        told = " and ".join(f"{1 - lost[part]:.2f} of the {part}" for part in ("changes", "reward"))
+        parts = [part for part in ("changes", "reward") if part in lost]
+        told = " and ".join(f"{1 - lost[part]:.2f} of the {part}" for part in parts) or "nothing"
         return f"predicts {told} over {steps} held-out steps (R²)"
 
     def objective(self, data: ScaledDataset) -> Objective:
@@ -213,13 +214,18 @@ class ForwardObjective(Objective):
         return loss
 
     def report(self, windows: Windows) -> dict[str, Any]:
-        """The loss by horizon: of changes, values and reward, unweighted; 1 for no prediction."""
+        """The loss by horizon: of changes, values and reward, unweighted; 1 for no prediction.
+
+        Of those that vary: there may be no reward.
+        """
         batch = self.batch(windows, windows.numbers)
         errors = self._errors(batch, self.encoder(batch.now.T))
-        by_part = [part.mean(1).tolist() for part in errors.split(self._sizes, 1)]
+        varies = self._deviation.squeeze(2).isfinite()
+        each = zip(PARTS, *(of.split(self._sizes, 1) for of in (errors, varies)), strict=True)
+        by_part = {part: lost.mean(1).tolist() for part, lost, some in each if some.any()}
         return {
             "loss_by_horizon": {
-                str(k): dict(zip(PARTS, losses, strict=True))
-                for k, losses in zip(self._horizons, zip(*by_part, strict=True), strict=True)
+                str(k): {part: losses[i] for part, losses in by_part.items()}
+                for i, k in enumerate(self._horizons)
             }
         }

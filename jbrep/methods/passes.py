@@ -47,7 +47,7 @@ class Block:
     @cached_property
     def _earned(self) -> Array:
         """Sums of the rewards before each row, (n + 1,)."""
-        rewards = self._data.dataset["reward"][self._places]
+        rewards = self._data.rewards(self._places)
         return np.concatenate(([0], np.cumsum(rewards, dtype=float)))
 
     def later(self, ahead: int) -> Array:

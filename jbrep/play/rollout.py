@@ -100,13 +100,14 @@ def replay(dataset: Dataset, episode: int) -> Rollout:
 
 def _as_stored(episode: Episode) -> Rollout:
     ends = episode.record
+    unknown = np.full(len(episode), np.nan, np.float32)
     return Rollout(
         task=episode.dataset.task,
         name=f"{episode.dataset.folder}, episode {episode.number}",
         seed=int(ends["seed"]),
         observation=np.concatenate((episode["observation"], ends["final_observation"][None])),
         action=episode["action"],
-        reward=episode["reward"],
+        reward=episode["reward"] if "reward" in episode.dataset.columns else unknown,
         terminated=bool(ends["terminated"]),
         truncated=bool(ends["truncated"]),
     )

@@ -90,7 +90,7 @@ def untold(evaluation: Evaluation) -> str:
     if not full:
         return "episodes are too short to look ahead"
     if all(ahead.reward.value is None for ahead in full.values()):
-        return "the reward is the same in all held-out steps, and no --policy says what it looks at"
+        return "no reward is known that varies over the held-out steps, and no --policy is given"
     return "the reward of these steps can't be predicted, and no --policy says what it looks at"
 
 

@@ -6,9 +6,9 @@ from typing import Any
 
 from jbrep.encoders import FULL, Encoder, find
 from jbrep.encoders.base import BaseEncoder
-from jbrep.encoders.code import is_code
 from jbrep.encoders.encoder import as_file
 from jbrep.envs.description import as_task
+from jbrep.envs.names import is_code
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain

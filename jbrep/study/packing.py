@@ -11,7 +11,7 @@ import numpy as np
 from joblib import cpu_count
 
 from jbrep.encoders import FULL
-from jbrep.encoders.code import is_code
+from jbrep.envs.names import is_code
 from jbrep.errors import InputError
 from jbrep.progress import Progress
 from jbrep.rl import Run

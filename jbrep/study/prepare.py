@@ -10,8 +10,8 @@ from jbrep.collect.derive import derive
 from jbrep.dataset import Dataset, DataSettings, ScaledDataset
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.encoders import FULL
-from jbrep.encoders.code import is_code
 from jbrep.encoders.shipped import names
+from jbrep.envs.names import is_code
 from jbrep.envs.task import Task, check_same
 from jbrep.errors import InputError
 from jbrep.jitterbug.tasks import TASKS

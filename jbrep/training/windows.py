@@ -100,9 +100,8 @@ class Windows:
     @cached_property
     def _earned(self) -> Tensor:
         """Sums of the rewards before each row, (rows + 1,)."""
-        column = self._data.dataset["reward"]
         earned = np.zeros(len(self._rows) + 1)
-        np.cumsum(np.concatenate(list(column.parts(self._rows)), dtype=np.float64), out=earned[1:])
+        np.cumsum(self._data.rewards(self._rows), dtype=np.float64, out=earned[1:])
         return torch.from_numpy(earned).to(self.device)
 
 

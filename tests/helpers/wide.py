@@ -43,7 +43,7 @@ class WideDataset:
         self.task = make_task([make_feature(f"obs_{i}") for i in range(features)])
         self.episodes = {"length": np.array(lengths), "seed": np.arange(len(lengths))}
         self.folder = folder
-        settings = SimpleNamespace(policy={"kind": "uniform"}, seed=0)
+        settings = SimpleNamespace(policy={"kind": "uniform"}, seed=0, unrewarded=False)
         self.manifest = SimpleNamespace(fingerprint="wide", settings=settings)
         random = np.random.default_rng(0)
         self.arrays = {

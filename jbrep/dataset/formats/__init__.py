@@ -1,17 +1,31 @@
-"""Data sets in other tools' formats: exported to them, and imported from them or from arrays."""
+"""Data sets in other tools' formats: exported to them, and imported from them or from logs."""
 
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from jbrep.dataset.formats.episodes import Source
+from jbrep.dataset.layout import Layout
 from jbrep.dataset.manifest import MANIFEST
 from jbrep.dataset.reader import Dataset
 from jbrep.errors import InputError, choose
 from jbrep.records.storage import check_allocation, check_space, exists
+from jbrep.text import counted
 
 _FILE_BYTES = 1 << 16  # whatever is in it
-FORMATS = {name: f"{__name__}.{name}" for name in ("minari", "parquet", "npz")}  # modules
+FORMATS = {
+    name: f"{__name__}.{name}" for name in ("minari", "parquet", "npz", "lerobot")
+}  # modules
+_FILES = {  # which module reads files that end so
+    **{"npz": "npz", "parquet": "parquet"},
+    **dict.fromkeys(("csv", "tsv", "txt"), "delimited"),
+}
+_FOLDERS = {"meta/info.json": "lerobot"}  # and folders that hold such a file
 
 
 def load_format(name: str) -> ModuleType:
@@ -55,26 +69,67 @@ def export(dataset: Dataset, to: str, out: Path) -> str:
     return how
 
 
-def open_source(given: str) -> Source:
+def open_source(given: str, layout: Layout | None = None, missing: str = "") -> Source:
     """Open what is to be imported.
 
     Args:
-        given: an .npz or .parquet file, the folder of a Minari data set, or its id.
+        given: a file of a kind in `_FILES`, the folder of a LeRobot or Minari data set, or the id
+            of the latter.
+        layout: what the columns of a table are.
+        missing: what becomes of numbers that are missing in a table, see `without_missing`.
 
     Raises:
         InputError: there is nothing of the kind, or it can't be read.
         ModuleNotFoundError: its format needs a package that isn't installed.
     """
-    path, files = Path(given), ("npz", "parquet")
-    suffix = path.suffix.removeprefix(".")
+    path = Path(given)
+    suffix = path.suffix.removeprefix(".").lower()
     is_file = exists(path) and not path.is_dir()
     if is_file and not path.is_file():
         raise InputError(f"{path} is a pipe or a device: it must be a regular file")
-    if is_file and suffix not in files:
-        raise InputError(f"unknown format '.{suffix}': choose one of {', '.join(files)}")
+    if is_file and suffix not in _FILES:
+        raise InputError(f"unknown format '.{suffix}': choose one of {', '.join(_FILES)}")
     if exists(path / MANIFEST):
         raise InputError(f"{path} is a data set of jbrep's already: there is nothing to import")
-    if not is_file and suffix in files:
+    if not is_file and suffix in _FILES:
         raise InputError(f"there is no file {path}")
-    opened: Source = load_format(suffix if is_file else "minari").open_source(given)
+    folders = (name for mark, name in _FOLDERS.items() if exists(path / mark))
+    name = _FILES[suffix] if is_file else next(folders, "minari")
+    module = import_module(f"{__name__}.{name}")
+    if hasattr(module, "open_table"):
+        return source_from(module.open_table(given), layout, missing)
+    if layout not in (None, Layout()):
+        raise InputError(f"{given} names its arrays itself: only a table's columns can be named")
+    opened: Source = module.open_source(given)
     return opened
+
+
+def source_from(table: Any, layout: Layout | None = None, missing: str = "") -> Source:
+    """A table as a source of episodes, see `jbrep.dataset.formats.logs.source_of_table`."""
+    from jbrep.dataset.formats.logs import source_of_table  # imports pyarrow
+
+    return source_of_table(table, layout, missing)
+
+
+def together(sources: Sequence[Source]) -> Source:
+    """Several sources as one: the episodes of each in turn.
+
+    Raises:
+        InputError: they differ in features, or some only have rewards.
+    """
+    first, *others = sources
+    for other in others:
+        for what in ("features", "has_rewards", "action_bounds"):
+            if getattr(other, what) != getattr(first, what):
+                raise InputError(
+                    f"{other.name} has other {what} than {first.name}: import it alone"
+                )
+    rows = [source.rows or 0 for source in sources]
+    return replace(
+        first,
+        name=f"{first.name} and {counted(len(others), 'more')}" if others else first.name,
+        episodes=lambda: chain.from_iterable(source.episodes() for source in sources),
+        rows=sum(rows) if all(rows) else None,
+        notes=tuple(dict.fromkeys(note for source in sources for note in source.notes)),
+        changes=lambda: sum((Counter(source.changes()) for source in sources), Counter()),
+    )

@@ -16,19 +16,19 @@ from jbrep.text import slug
 Array = NDArray[Any]
 Rows = Mapping[str, Array]  # arrays with a row for each step, by the names of ALIASES
 
-ALIASES = {  # what others call the columns
-    "observation": ("observation", "observations"),
+ALIASES = {  # what others call the columns; the dotted and the last ones are LeRobot's
+    "observation": ("observation", "observations", "observation.state"),
     "action": ("action", "actions"),
-    "reward": ("reward", "rewards"),
+    "reward": ("reward", "rewards", "next.reward"),
     "terminated": ("terminated", "terminations", "terminals"),
     "truncated": ("truncated", "truncations", "timeouts"),
     "next_observation": ("next_observation", "next_observations"),
-    "episode": ("episode",),
-    "step": ("step",),
+    "episode": ("episode", "episode_index"),
+    "step": ("step", "frame_index"),
 }
 ENDS = ("terminated", "truncated")
 WIDE = ("observation", "action", "next_observation", "final_observation")  # with many numbers a row
-_WHOLE = ("episode", "step", "seed")
+WHOLE = ("episode", "step", "seed")
 _IMAGE_AXES = 3  # height, width, colour
 
 
@@ -38,7 +38,7 @@ class Incoming(NamedTuple):
     where: str  # it is, for messages
     observation: NDArray[np.float64]  # (n, d), before each action
     action: NDArray[np.float64]  # (n, k)
-    reward: NDArray[np.float64]  # (n,)
+    reward: NDArray[np.float64]  # (n,), 0 where none is known
     final: NDArray[np.float64]  # (d,), after the last action
     terminated: bool
     seed: int
@@ -59,6 +59,11 @@ class Source:
         max_episode_steps: for a task made from the data alone; the longest episode if None.
         why_no_task: for the user.
         rows: how many there are, if that is known.
+        has_rewards: whether they are known.
+        timestep: for a task made from the data alone [s].
+        notes: what is done to its columns, for the user.
+        changes: what was done to the rows that were read last, how often: what it is, and what
+            became of it.
     """
 
     name: str
@@ -70,6 +75,10 @@ class Source:
     max_episode_steps: int | None = None
     why_no_task: str = "it names no environment"
     rows: int | None = None
+    has_rewards: bool = True
+    timestep: float | None = None
+    notes: tuple[str, ...] = ()
+    changes: Callable[[], Mapping[tuple[str, str], int]] = dict
 
 
 def label(name: str) -> str:
@@ -91,7 +100,7 @@ def whole_episode(where: str, given: Mapping[str, ArrayLike], **once: Any) -> It
     """
     arrays = {name: plain(where, name, values) for name, values in given.items()}
     observation = arrays["observation"]
-    if len(observation) == len(arrays["reward"]) + 1 and "final_observation" not in once:
+    if len(observation) == len(arrays["action"]) + 1 and "final_observation" not in once:
         arrays["observation"], once["final_observation"] = observation[:-1], observation[-1]
     check_arrays(where, arrays)
     if "final_observation" in once:
@@ -119,7 +128,7 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
     Raises:
         InputError: gaps.
     """
-    if not len(rows["reward"]):
+    if not len(rows["action"]):
         return
     _check_steps(where, rows)
     following = _following(where, rows)
@@ -142,7 +151,8 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
     seed = int(once.get("seed", UNKNOWN_SEED))
     if not UNKNOWN_SEED <= seed < 1 << 63:
         raise InputError(f"{where} has the seed {seed}: it must be from 0 to 2**63 - 1, or -1")
-    action, reward = _flat(rows["action"][:steps]), _flat(rows["reward"][:steps])[:, 0]
+    action = _flat(rows["action"][:steps])
+    reward = _flat(rows["reward"][:steps])[:, 0] if "reward" in rows else np.zeros(steps)
     yield Incoming(where, observation, action, reward, last, terminated, seed)
 
 
@@ -240,11 +250,9 @@ def check_names(name: str, columns: Iterable[str]) -> None:
         InputError: a column is missing, or nothing tells where an episode ends.
     """
     columns = set(columns)
-    for needed in ("observation", "action", "reward"):
+    for needed in ("observation", "action"):
         if needed not in columns:
-            raise InputError(
-                f"{name} has no {needed}s: it must have observations, actions and rewards"
-            )
+            raise InputError(f"{name} has no {needed}s: it must have observations and actions")
     if not columns & {*ENDS, "episode", "step"}:
         raise InputError(
             f"{name} doesn't tell where an episode ends: give it terminations and truncations, or "
@@ -299,7 +307,7 @@ def check_kind(name: str, what: str, dtype: np.dtype[Any], row: Sequence[int] = 
         raise InputError(f"{name} has {shape}: at most {MAX_FEATURES:,} numbers are possible")
     if math.prod(row) == 0:
         raise InputError(f"{name} has {shape}: there must be at least one number")
-    if what in _WHOLE and dtype.kind not in "iu":
+    if what in WHOLE and dtype.kind not in "iu":
         raise InputError(f"{name} has {what}s of type {dtype}: they must be whole numbers")
     if what == "action" and dtype.kind != "f":
         raise InputError(

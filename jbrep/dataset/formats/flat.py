@@ -1,6 +1,6 @@
 """Rows of many episodes, one after the other, divided into episodes; and arrays in Python."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -66,7 +66,13 @@ def own_names(name: str, names: Collection[str]) -> dict[str, str]:
     return own
 
 
-def split(name: str, chunks: Iterable[Rows], known: Mapping[str, Array]) -> Iterator[Incoming]:
+def split(
+    name: str,
+    chunks: Iterable[Rows],
+    known: Mapping[str, Array],
+    most: int = MAX_EPISODE_STEPS,
+    parts: Callable[[Rows], Iterable[Rows]] = lambda rows: (rows,),
+) -> Iterator[Incoming]:
     """Divide rows into episodes, in bounded memory.
 
     An episode ends where it is terminated or truncated, before another episode's number or a
@@ -76,13 +82,15 @@ def split(name: str, chunks: Iterable[Rows], known: Mapping[str, Array]) -> Iter
         name: of the source.
         chunks: of rows, in order.
         known: once for each episode, as of `per_episode`.
+        most: rows of an episode.
+        parts: makes episodes of the rows of one.
 
     Raises:
         InputError: gaps in an episode, one that is too long or in two parts, as many episodes as
             `known` doesn't have, or as `checked`.
     """
     count, numbers = 0, set[int]()
-    for rows in _divided(name, chunks):
+    for rows in _divided(name, chunks, most):
         number = int(rows["episode"][0]) if "episode" in rows else count
         if number in numbers:
             raise InputError(
@@ -95,7 +103,8 @@ def split(name: str, chunks: Iterable[Rows], known: Mapping[str, Array]) -> Iter
                 f"{name} has a {few[0]} for {len(known[few[0]]):,} episodes, and more episodes"
             )
         of_episode = {what: values[count] for what, values in known.items()}
-        yield from checked(f"{name}: episode {number}", rows, of_episode)
+        for part in parts(rows):
+            yield from checked(f"{name}: episode {number}", part, of_episode)
         count += 1
     for what, values in known.items():
         if len(values) != count:
@@ -105,24 +114,31 @@ def split(name: str, chunks: Iterable[Rows], known: Mapping[str, Array]) -> Iter
             )
 
 
-def _divided(name: str, chunks: Iterable[Rows]) -> Iterator[Rows]:
+def _divided(name: str, chunks: Iterable[Rows], most: int) -> Iterator[Rows]:
     """The rows of each episode."""
-    rest: Rows = {}
+    begun: list[Rows] = []
     for given in chunks:
-        chunk = {n: narrow(n, values) for n, values in given.items()}
-        rest = {n: np.concatenate((rest[n], chunk[n])) for n in rest} if rest else chunk
-        begin = 0
-        for end in _ends(name, rest):
-            yield {n: values[begin:end] for n, values in rest.items()}
-            begin = end
-        rest = {n: values[begin:] for n, values in rest.items()}
-        if len(rest["reward"]) > MAX_EPISODE_STEPS:
+        chunk, begin = {n: narrow(n, values) for n, values in given.items()}, 0
+        for end in _ends(name, begun[-1:], chunk):
+            yield _joined([*begun, _some(chunk, begin, end)])
+            begun, begin = [], end
+        if begin < len(chunk["action"]):
+            begun.append(_some(chunk, begin, None))
+        if sum(len(rows["action"]) for rows in begun) > most:
             raise InputError(
-                f"{name} has an episode of more than {MAX_EPISODE_STEPS:,} steps: does something "
-                "tell where it ends?"
+                f"{name} has an episode of more than {most:,} steps: does something tell where it "
+                "ends?"
             )
-    if rest and len(rest["reward"]):
-        yield rest
+    if begun:
+        yield _joined(begun)
+
+
+def _some(rows: Rows, begin: int, end: int | None) -> Rows:
+    return {n: values[begin:end] for n, values in rows.items()}
+
+
+def _joined(several: list[Rows]) -> Rows:
+    return {n: np.concatenate([rows[n] for rows in several]) for n in several[0]}
 
 
 def narrow(name: str, values: Array) -> Array:
@@ -130,17 +146,19 @@ def narrow(name: str, values: Array) -> Array:
     return values if name in WIDE else values.reshape(len(values))
 
 
-def _ends(name: str, rows: Rows) -> list[int]:
-    """Where episodes end: after which rows, but the last one unless it says so itself."""
-    is_end = np.zeros(len(rows["reward"]), dtype=bool)
+def _ends(name: str, before: list[Rows], rows: Rows) -> list[int]:
+    """Before which of the rows an episode ends; maybe before the first, after those before."""
+    is_end = np.zeros(len(rows["action"]) + 1, dtype=bool)
     for flag in ENDS:
         if flag in rows:
-            is_end |= flags(name, flag, rows[flag])
-    if "episode" in rows:
-        is_end[:-1] |= rows["episode"][1:] != rows["episode"][:-1]
-    elif "step" in rows:
-        is_end[:-1] |= rows["step"][1:] == 0
-    return [int(row) + 1 for row in np.flatnonzero(is_end)]
+            is_end[1:] |= flags(name, flag, rows[flag])
+    number = "episode" if "episode" in rows else "step"
+    if number in rows:
+        last = [each[number][-1:] for each in before]
+        numbers = np.concatenate([*last, rows[number]])
+        begins = numbers[1:] != numbers[:-1] if number == "episode" else numbers[1:] == 0
+        is_end[len(is_end) - 1 - len(begins) : -1] |= begins
+    return [int(row) for row in np.flatnonzero(is_end)]
 
 
 def source_of(columns: Mapping[str, Any], once: Mapping[str, Any], name: str) -> Source:
@@ -158,11 +176,11 @@ def source_of(columns: Mapping[str, Any], once: Mapping[str, Any], name: str) ->
     given = {what: values for what, values in columns.items() if values is not None}
     known = {what: values for what, values in once.items() if values is not None}
     check_names(name, given)
-    reward = given["reward"]
-    if isinstance(reward, list | tuple) and len(reward) and np.ndim(reward[0]) == 1:
+    single = next(given[what] for what in ("reward", *ENDS) if what in given)
+    if isinstance(single, list | tuple) and len(single) and np.ndim(single[0]) == 1:
         return _listed(name, given, known)
     arrays = {what: plain(name, what, values) for what, values in given.items()}
-    rows = len(arrays["reward"])
+    rows = len(arrays["action"])
     check_arrays(name, arrays)
     checked_once = per_episode(name, known)
 
@@ -171,8 +189,10 @@ def source_of(columns: Mapping[str, Any], once: Mapping[str, Any], name: str) ->
         chunks = ({n: v[start : start + CHUNK] for n, v in arrays.items()} for start in starts)
         return split(name, chunks, checked_once)
 
-    features = _named(columns["observation"])
-    return Source(name, label(name), episodes, features=features, rows=rows)
+    features, has_rewards = _named(columns["observation"]), "reward" in given
+    return Source(
+        name, label(name), episodes, features=features, rows=rows, has_rewards=has_rewards
+    )
 
 
 def _named(observations: Any) -> tuple[Feature, ...]:
@@ -190,12 +210,14 @@ def _listed(name: str, columns: Mapping[str, Any], once: dict[str, Any]) -> Sour
         once |= per_episode(name, {"seed": once["seed"]})
 
     def episodes() -> Iterator[Incoming]:
-        for number in range(len(columns["reward"])):
+        for number in range(len(columns["action"])):
             own, ends = (
                 {what: values[number] for what, values in each.items()} for each in (columns, once)
             )
             yield from whole_episode(f"{name}: episode {number}", own, **ends)
 
-    features = _named(next(iter(columns["observation"]), None))
-    rows = sum(map(len, columns["reward"]))
-    return Source(name, label(name), episodes, features=features, rows=rows)
+    features, has_rewards = _named(next(iter(columns["observation"]), None)), "reward" in columns
+    rows = sum(map(len, columns["action"]))
+    return Source(
+        name, label(name), episodes, features=features, rows=rows, has_rewards=has_rewards
+    )

@@ -6,8 +6,6 @@ What jbrep exports says the checksums of its columns, and of the file of its epi
 import hashlib
 import io
 import json
-import re
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,11 +17,12 @@ import pyarrow.parquet as pq
 import xxhash
 from numpy.typing import NDArray
 
-from jbrep.dataset.formats.episodes import Rows, Source, check_kind, check_names, label
-from jbrep.dataset.formats.flat import CHUNK, own_names, per_episode, split
+from jbrep.dataset.formats.episodes import label
+from jbrep.dataset.formats.flat import CHUNK, per_episode
+from jbrep.dataset.formats.tables import Table, with_widths
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.settings import Digest
-from jbrep.envs.task import Feature, Task
+from jbrep.envs.task import Task
 from jbrep.errors import DamageError, InputError, first_line
 from jbrep.progress import Progress
 from jbrep.records.document import Document, document_in
@@ -42,8 +41,6 @@ _SETTINGS, _CHECKSUMS = b"jbrep", b"jbrep checksums"  # in a file's metadata
 _MAX_COLUMNS = 1 << 14
 _MAX_BYTES = 1 << 31  # of the file of episodes
 _ROW_BYTES = 64  # of a number in a column, before compression, at most
-_ACTION = re.compile(r"actions?(_\d+)?")
-_NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former
 
 
 class Checksums(Document, frozen=True, kw_only=True):
@@ -57,45 +54,32 @@ class Checksums(Document, frozen=True, kw_only=True):
     episodes: Digest  # of the file of episodes
 
 
-def open_source(given: str) -> Source:
+def open_table(given: str) -> Table:
     """Open a Parquet file, and the one of its episodes if jbrep exported it.
 
     Raises:
-        InputError: it can't be read, or has no columns that can be used.
+        InputError: it can't be read.
         DamageError: it isn't what was exported.
     """
-    name, path = given, Path(given)
-    with _reading(path), pq.ParquetFile(path) as file:
+    path = Path(given)
+    with reading(path), pq.ParquetFile(path) as file:
         metadata, schema = file.metadata, file.schema_arrow
-        _check_sizes(name, metadata, schema)
-    rows, known = metadata.num_rows, _checksums(path, metadata.metadata or {})
-    task = _own_task(schema, metadata.metadata) if known else None
-    own = own_names(name, schema.names)
-    actions = [column for column in schema.names if _ACTION.fullmatch(column)]
-    if task:
-        features = list(task.feature_names)
-    else:
-        others = {*own.values(), *actions}
-        features = [n for n in schema.names if n not in others and not _NOT_FEATURES.fullmatch(n)]
-    check_kind(name, "observation", np.dtype(np.float64), (len(features),))
-    columns = {column: [given] for column, given in own.items()}
-    columns |= {"observation": features, "action": actions}
-    check_names(name, [column for column, given in columns.items() if given])
-    _check_types(name, schema, columns)
-    once = _once(path, known) if known else {}
-    named = () if task else tuple(Feature(_word(column)) for column in features)
-    return Source(
-        name,
+        check_sizes(given, metadata, schema)
+        schema = with_widths(schema, next(file.iter_batches(1), None))
+    known = _checksums(path, metadata.metadata or {})
+    return Table(
+        given,
         label(path.stem),
-        lambda: split(name, _chunks(path, columns, known), once),
-        task=task,
-        features=named,
-        rows=rows,
+        schema,
+        lambda columns: _batches(path, columns, known),
+        rows=metadata.num_rows,
+        task=_own_task(schema, metadata.metadata) if known else None,
+        once=_once(path, known) if known else {},
     )
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def reading(path: Path) -> Iterator[None]:
     """Say of a file that it can't be read."""
     try:
         yield
@@ -106,13 +90,11 @@ def _reading(path: Path) -> Iterator[None]:
         raise InputError(f"{path} can't be read as a Parquet file: {reason}") from None
 
 
-def _check_sizes(name: str, metadata: pq.FileMetaData, schema: pa.Schema) -> None:
+def check_sizes(name: str, metadata: pq.FileMetaData, schema: pa.Schema) -> None:
     """Refuse what would take much more memory than its numbers."""
     names = schema.names
     if len(names) > _MAX_COLUMNS:
         raise InputError(f"{name} has {len(names):,} columns: the limit is {_MAX_COLUMNS:,}")
-    if twice := [each for each, count in Counter(names).items() if count > 1]:
-        raise InputError(f"{name} has two columns {twice[0]!r}: rename one")
     for group in map(metadata.row_group, range(metadata.num_row_groups)):
         for column in map(group.column, range(group.num_columns)):
             if column.total_uncompressed_size > _ROW_BYTES * (column.num_values + CHUNK):
@@ -145,50 +127,24 @@ def _own_task(schema: pa.Schema, metadata: Mapping[bytes, bytes]) -> Task | None
     return task if set(task.feature_names) <= set(schema.names) else None
 
 
-def _check_types(name: str, schema: pa.Schema, columns: dict[str, list[str]]) -> None:
-    for what, given in columns.items():
-        for column in given:
-            try:
-                dtype = np.dtype(schema.field(column).type.to_pandas_dtype())
-            except NotImplementedError:
-                dtype = np.dtype(object)
-            if dtype.kind not in "fiub":
-                raise InputError(
-                    f"{name} has {schema.field(column).type} in the column {column!r}: it must be "
-                    "plain numbers"
-                )
-            check_kind(name, what, dtype)
+def batches_of(path: Path, columns: list[str]) -> Iterator[pa.RecordBatch]:
+    """The rows of some columns, some at a time; the checksums of pages are compared."""
+    with reading(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
+        yield from file.iter_batches(CHUNK, columns=columns)
 
 
-def _chunks(path: Path, columns: dict[str, list[str]], known: Checksums | None) -> Iterator[Rows]:
-    """The rows, some at a time; the columns' checksums are compared at the end."""
-    wanted = [given for group in columns.values() for given in group]
-    hashes = {name: xxhash.xxh3_128() for name in wanted}
-    with _reading(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
-        for batch in file.iter_batches(CHUNK, columns=wanted):
-            _check_full(path, batch)
-            arrays = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in wanted}
-            for name, values in arrays.items():
-                hashes[name].update(np.ascontiguousarray(values).data)
-            yield {name: _array(name, arrays, given) for name, given in columns.items()}
+def _batches(path: Path, columns: list[str], known: Checksums | None) -> Iterator[pa.RecordBatch]:
+    """The same; the columns' checksums are compared at the end, if jbrep exported them."""
     expected = known.columns if known else {}
-    for name in expected and wanted:
-        if hashes[name].hexdigest() != expected.get(name):
+    hashes = {name: xxhash.xxh3_128() for name in columns if expected}
+    for batch in batches_of(path, columns):
+        for name, digest in hashes.items():
+            values = batch.column(name).to_numpy(zero_copy_only=False)
+            digest.update(np.ascontiguousarray(values).data)
+        yield batch
+    for name, digest in hashes.items():
+        if digest.hexdigest() != expected.get(name):
             raise _damaged(path, f"the numbers in the column {name!r}")
-
-
-def _check_full(path: Path, batch: pa.RecordBatch) -> None:
-    for column, values in zip(batch.schema.names, batch.columns, strict=True):
-        if values.null_count:
-            raise InputError(
-                f"{path} has empty cells in the column {column!r}: fill them, or leave the "
-                "episode out"
-            )
-
-
-def _array(name: str, arrays: Mapping[str, NDArray[Any]], columns: list[str]) -> NDArray[Any]:
-    given = [arrays[column] for column in columns]
-    return np.stack(given, axis=1) if name in ("observation", "action") else given[0]
 
 
 def _beside(path: Path) -> Path:
@@ -206,17 +162,11 @@ def _once(path: Path, known: Checksums) -> dict[str, NDArray[Any]]:
         raise DamageError(
             f"{beside} is damaged, or of another data set than {path}: export the data set again"
         )
-    with _reading(beside):
+    with reading(beside):
         table = pq.read_table(io.BytesIO(content))
         final = np.stack(table["final_observation"].to_numpy())
         once = {name: table[name].to_numpy() for name in ("terminated", "seed")}
         return per_episode(str(beside), {"final_observation": final, **once})
-
-
-def _word(column: str) -> str:
-    """The name of a column as a feature's."""
-    word = re.sub(r"[^A-Za-z0-9_.-]", "_", column)
-    return word if word[:1].isalpha() else f"obs_{word}"
 
 
 def write(dataset: Dataset, out: Path) -> str:

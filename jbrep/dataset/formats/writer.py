@@ -2,12 +2,14 @@
 
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from jbrep.dataset.formats.episodes import Incoming, Source, single
@@ -17,6 +19,7 @@ from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.dataset.settings import IMPORTED, MAX_LETTERS
 from jbrep.dataset.verify import range_problems
 from jbrep.envs.description import features_of, with_features
+from jbrep.envs.names import code_named
 from jbrep.envs.precision import Signals, precision_problems
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, Notice, kind_and_line
@@ -45,6 +48,7 @@ def write(
     task: Task | None = None,
     features: Path | None = None,
     missing: str = "",
+    reward: str = "",
 ) -> Manifest:
     """Write a data set, whole or not at all.
 
@@ -56,6 +60,8 @@ def write(
         features: a TOML file of what else is known of the features, as `describe` takes it.
         missing: what becomes of numbers that aren't finite, see `without_missing`; by default as
             the task says.
+        reward: code, as module:function, that gives rewards in place of the source's, (n,), of the
+            observations (n, d) and actions (n, k) of an episode.
 
     Raises:
         InputError: the folder exists already, there are no episodes, they don't fit the task, or
@@ -65,13 +71,14 @@ def write(
     try:
         with unfinished(folder) as partial:
             missing = missing or (task.missing if task else "") or ""
+            source = _rewarded(source, reward, missing) if reward else source
             survey = _survey(source, missing)
             fitting = _fitting(source, survey, task or source.task)
             fitting = with_features(fitting, features) if features else fitting
             for problem in precision_problems(fitting, survey.signals):
                 warnings.warn(problem, Notice, stacklevel=2)
             fitting = fitting.replace(missing=missing) if missing else fitting
-            settings = _settings(source, survey, fitting)
+            settings = _settings(source, survey, fitting, reward)
             check_space(folder.parent, settings.steps * settings.row_bytes())
             partial.mkdir()
             manifest = _fill(source, settings, partial)
@@ -79,6 +86,27 @@ def write(
     except OSError as error:
         raise InputError(f"can't write {folder}: {error.strerror or error}") from error
     return manifest
+
+
+def _rewarded(source: Source, reward: str, missing: str) -> Source:
+    """A source with rewards of its user's."""
+    function = code_named(reward, "reward")
+
+    def episodes() -> Iterator[Incoming]:
+        for episode in _episodes(source, missing):
+            try:
+                given = function(episode.observation.copy(), episode.action.copy())
+                values = np.asarray(given, float)
+            except Exception as error:
+                raise InputError(f"the reward {reward} fails: {kind_and_line(error)}") from error
+            if values.shape != episode.reward.shape:
+                raise InputError(
+                    f"the reward {reward} gives an array of shape {values.shape} for "
+                    f"{len(episode.action)} steps: it must be {episode.reward.shape}"
+                )
+            yield episode._replace(reward=values)
+
+    return replace(source, episodes=episodes, has_rewards=True)
 
 
 def _episodes(source: Source, missing: str) -> Iterator[Incoming]:
@@ -153,6 +181,7 @@ def _from_data(source: Source, survey: _Survey) -> Task:
             action_low=tuple(low.tolist()),
             action_high=tuple(high.tolist()),
             max_episode_steps=max(max(survey.lengths), source.max_episode_steps or 0),
+            timestep=source.timestep,
             reproducible=False,
         )
     except ValueError as error:
@@ -173,13 +202,18 @@ def _action_bounds(source: Source, survey: _Survey) -> tuple[Array, Array]:
     return below, above
 
 
-def _settings(source: Source, survey: _Survey, task: Task) -> DataSettings:
+def _settings(source: Source, survey: _Survey, task: Task, reward: str) -> DataSettings:
     steps = sum(survey.lengths)
     rows = max(_SHARD_ROWS, steps // _MOST_SHARDS)
     name = "".join(c if c.isprintable() else "?" for c in source.name)
     return DataSettings(
         task=task,
-        policy={"kind": IMPORTED, "source": name[-MAX_LETTERS:]},
+        policy={
+            "kind": IMPORTED,
+            "source": name[-MAX_LETTERS:],
+            **({"reward": reward} if reward else {}),
+        },
+        unrewarded=UNSET if source.has_rewards else True,
         steps=steps,
         shard_episodes=max(1, rows * len(survey.lengths) // steps),
     )

@@ -1,0 +1,30 @@
+"""Frames in Python, as tables."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pyarrow as pa
+
+from jbrep.dataset.formats.episodes import label
+from jbrep.dataset.formats.flat import CHUNK
+from jbrep.dataset.formats.tables import Table, with_widths
+from jbrep.errors import InputError, kind_and_line
+
+
+def table_of(frame: Any, name: str) -> Table:
+    """A frame of pandas or polars, or whatever else Arrow takes.
+
+    Raises:
+        InputError: it is something else.
+    """
+    try:
+        columns = dict(frame) if isinstance(frame, Mapping) else frame
+        table = pa.table(columns).combine_chunks()
+    except (TypeError, ValueError, pa.ArrowException) as error:
+        raise InputError(f"{name} is no table: {kind_and_line(error)}") from None
+
+    def batches(names: list[str]) -> Iterator[pa.RecordBatch]:
+        yield from table.select(names).to_batches(CHUNK)
+
+    schema = with_widths(table.schema, next(iter(table.to_batches(1)), None))
+    return Table(name, label(name), schema, batches, rows=table.num_rows)

@@ -1,0 +1,144 @@
+"""Rows with times: where episodes end, and rows on an even clock."""
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.coordinates import wrapped
+from jbrep.dataset.formats.episodes import ENDS, Rows, flags
+from jbrep.dataset.layout import Layout
+from jbrep.errors import InputError
+
+Array = NDArray[Any]
+
+MOST_RAW = 20_000_000  # rows of what is cut, or brought to another clock
+_SLACK = 1e-6  # of a step, by which rounding may shift a reading
+_EVEN = 0.1  # by which most steps of an even clock may differ from the median
+_SIGNALS = ("observation", "action", "reward")
+
+
+class Clock:
+    """Divides rows with times, and brings them to an even clock.
+
+    Args:
+        layout: which says how.
+        angles: which numbers of an observation jump by a full turn, (d,).
+        counts: of what was done, for the report.
+    """
+
+    def __init__(self, layout: Layout, angles: NDArray[np.bool_], counts: Counter[str]):
+        self._layout, self._angles, self._counts = layout, angles, counts
+
+    def cut(self, name: str, chunks: Iterator[Rows]) -> Iterator[Rows]:
+        """Number the episodes: a new one where time goes back or is silent for too long.
+
+        And where the table says so itself.
+
+        Raises:
+            InputError: an episode comes in two parts.
+        """
+        number, before, known = 0, dict[str, Array](), set[int]()
+        for rows in chunks:
+            if not len(rows["time"]):
+                continue
+            last = before or {key: values[:1] for key, values in rows.items()}
+            begins = np.zeros(len(rows["time"]), bool)
+            if "episode" in rows:
+                begins |= np.diff(rows["episode"], prepend=last["episode"]) != 0
+                labels = [*([] if before else rows["episode"][:1]), *rows["episode"][begins]]
+                if known & {*labels} or len({*labels}) < len(labels):
+                    raise InputError(
+                        f"{name}: an episode comes in two parts: its rows must stand together"
+                    )
+                known |= {*labels}
+            for flag in (flag for flag in ENDS if flag in rows):
+                ended = np.concatenate((before[flag] if before else [False], rows[flag][:-1]))
+                begins |= flags(name, flag, ended)
+            step = np.diff(rows["time"], prepend=last["time"])
+            back, silent = step < 0, step > (self._layout.gap or np.inf)
+            self._counts["back"] += int((back & ~begins).sum())
+            self._counts["gaps"] += int((silent & ~begins).sum())
+            numbers = number + np.cumsum(begins | back | silent)
+            yield {**rows, "episode": numbers}
+            number, before = int(numbers[-1]), {key: v[-1:] for key, v in rows.items()}
+
+    def parts(self, rows: Rows) -> Iterator[Rows]:
+        """The rows of an episode, each at its time, in parts that are whole and not too long."""
+        parts = self._resampled(rows) if self._layout.rate else iter([self._once_each(rows)])
+        for part in parts:
+            steps = len(part["action"])
+            length = self._layout.length or steps
+            self._counts["cuts"] += max(0, steps - 1) // max(length, 1)
+            for begin in range(0, steps, length or 1):
+                self._counts["last"] += min(length, steps - begin)
+                yield {name: values[begin : begin + length] for name, values in part.items()}
+
+    def _once_each(self, rows: Rows) -> Rows:
+        """The rows without those that have the time of the one before."""
+        if "time" not in rows:
+            return rows
+        again = np.diff(rows["time"], prepend=-np.inf) == 0
+        self._counts["repeated"] += int(again.sum())
+        return {name: values[~again] for name, values in rows.items()}
+
+    def _resampled(self, rows: Rows) -> Iterator[Rows]:
+        """The rows on an even clock, from where each column has had a reading."""
+        time, rate = rows["time"], self._layout.rate or 1.0
+        values = np.column_stack([rows[name] for name in _SIGNALS if name in rows])
+        known = np.isfinite(values)
+        begin = max(time[some.argmax()] if some.any() else np.inf for some in known.T)
+        if not np.isfinite(begin):
+            self._counts["never"] += len(time)
+            return
+        count = int((time[-1] - begin) * rate + _SLACK) + 1
+        if count > MOST_RAW:
+            raise InputError(f"an episode has {count:,} steps at {rate:g} Hz: give a lower --rate")
+        grid = begin + np.arange(count) / rate
+        size, linear = rows["observation"].shape[1], self._layout.fill == "linear"
+        turning = np.zeros(values.shape[1], bool)
+        turning[:size] = self._angles
+        columns = [
+            self._signal(grid, time[some], column[some], linear and i < size, bool(turning[i]))
+            for i, (some, column) in enumerate(zip(known.T, values.T, strict=True))
+        ]
+        even = np.stack(columns, axis=1)
+        whole = np.isfinite(even).all(axis=1)
+        self._counts["resampled"] += count
+        self._counts["stale"] += int((~whole).sum())
+        edges = np.flatnonzero(np.diff(np.concatenate(([False], whole, [False]))))
+        for first, end in edges.reshape(-1, 2).tolist():
+            some = even[first:end]
+            part = {"observation": some[:, :size], "action": some[:, size:]}
+            if "reward" in rows:
+                part |= {"action": some[:, size:-1], "reward": some[:, -1]}
+            yield part
+
+    def _signal(
+        self, grid: Array, time: Array, values: Array, linear: bool, turning: bool
+    ) -> Array:
+        """A column on the clock; NaN where its readings are too far away."""
+        slack = _SLACK / (self._layout.rate or 1.0)
+        last = np.searchsorted(time, grid + slack, side="right") - 1
+        age = grid - time[last]
+        if linear:
+            age = np.maximum(age, time[np.minimum(last + 1, len(time) - 1)] - time[last])
+            even = np.interp(grid, time, np.unwrap(values) if turning else values)
+            even = wrapped(even) if turning else even
+        else:
+            even = values[last].astype(float)
+        even[age > (self._layout.gap or np.inf) + slack] = np.nan
+        return even
+
+
+def timestep_of(time: Array) -> float | None:
+    """From row to row [s], if the clock is even."""
+    steps = np.diff(time)
+    steps = steps[steps > 0]
+    if not len(steps):
+        return None
+    low, median, high = np.percentile(steps, (5, 50, 95))
+    even = (1 - _EVEN) * median <= low and high <= (1 + _EVEN) * median
+    return float(f"{median:.4g}") if even else None

@@ -1,0 +1,167 @@
+"""Text with a row in each line, as loggers write it: CSV, with other separators, too."""
+
+import csv
+import re
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+
+from jbrep.dataset.formats.episodes import label
+from jbrep.dataset.formats.tables import UNIT, Table
+from jbrep.errors import InputError, first_line
+
+_SEPARATORS = ",;\t|"
+_COMMENTS = ("#", "%")
+_EMPTY = [*pa_csv.ConvertOptions().null_values, "-", "--", "None", "NAN", "Nan"]
+_UNIT = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\])]*)[\])]")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d\S*")
+_ZONE = re.compile(r"(Z|[+-]\d\d:?\d\d)$")
+_PROBLEM = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?: (.*)")
+_SHORT = re.compile(r"CSV parse error: (?:Row #(\d+): )?(Expected .* got \d+)")
+_PEEKED = 200  # lines by which columns get their types
+_BLOCK = 1 << 20  # bytes read at a time
+
+
+class _Form(NamedTuple):
+    """How a file is written."""
+
+    names: list[str]
+    units: list[str]
+    types: list[pa.DataType]
+    separator: str
+    decimal: str
+    begin: int  # lines before the first row
+
+
+def open_table(given: str) -> Table:
+    """Open a text file whose first line, but for comments, names the columns.
+
+    Raises:
+        InputError: it can't be read, or names no columns.
+    """
+    path = Path(given)
+    form = _form(path)
+    schema = pa.schema(
+        pa.field(name, kind, metadata={UNIT: unit.encode()} if unit else None)
+        for name, kind, unit in zip(form.names, form.types, form.units, strict=True)
+    )
+    return Table(
+        given,
+        label(path.stem),
+        schema,
+        lambda columns: _batches(path, form, schema, columns),
+        first=("line", form.begin + 1),
+    )
+
+
+def _form(path: Path) -> _Form:
+    try:
+        with path.open(encoding="utf-8-sig", newline=None) as file:
+            lines = [line.rstrip("\n") for line in islice(file, _PEEKED)]
+    except UnicodeDecodeError:
+        raise InputError(f"{path} can't be read as text: it must be in UTF-8") from None
+    except OSError as error:
+        raise InputError(f"{path} can't be read: {error.strerror}") from None
+    begin = next((i for i, s in enumerate(lines) if s.strip() and s[0] not in _COMMENTS), None)
+    if begin is None:
+        raise InputError(f"{path} is empty: its first line must name the columns")
+    separator = max(_SEPARATORS, key=lines[begin].count)
+    header, *rows = (
+        [cell.strip() for cell in cells] for cells in csv.reader(lines[begin:], delimiter=separator)
+    )
+    if any(map(_is_number, header)):
+        raise InputError(f"{path}, line {begin + 1}: a number where the columns must be named")
+    names, units = _names(header)
+    begin += 1
+    if rows and any(rows[0]) and not any(map(_is_value, rows[0])) and len(rows) > 1:
+        below = rows.pop(0)
+        if len(below) == len(names) and any(map(_is_value, rows[0])):  # a line of units
+            units, begin = [a or b for a, b in zip(units, below, strict=True)], begin + 1
+    is_comma = separator == ";" and any(_DECIMAL_COMMA.fullmatch(c) for row in rows for c in row)
+    decimal = "," if is_comma else "."
+    columns = [[row[i] for row in rows if i < len(row)] for i in range(len(names))]
+    types = [_type(cells, decimal) for cells in columns]
+    return _Form(names, units, types, separator, decimal, begin)
+
+
+def _names(header: list[str]) -> tuple[list[str], list[str]]:
+    """Names and units of a header's cells, such as 'speed [m/s]'."""
+    found = [_UNIT.fullmatch(cell) for cell in header]
+    names = [f["name"] if f else cell for f, cell in zip(found, header, strict=True)]
+    units = [f["unit"].strip() if f else "" for f in found]
+    if len(set(names)) < len(names):
+        names = header
+    return [name or f"column_{i}" for i, name in enumerate(names)], units
+
+
+def _type(cells: list[str], decimal: str) -> pa.DataType:
+    """The type of a column by its first cells that aren't empty."""
+    some = [cell for cell in cells if cell not in _EMPTY]
+    if all(cell.lower() in ("true", "false") for cell in some) and some:
+        return pa.bool_()
+    if all(_DATE.fullmatch(cell) for cell in some) and some:
+        return pa.timestamp("ns", tz="UTC" if _ZONE.search(some[0]) else None)
+    if not some or _is_number(some[0].replace(decimal, ".")):
+        return pa.float64()
+    return pa.string()
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_value(cell: str) -> bool:
+    """Whether it may be a row's: a number, a date or a flag."""
+    return bool(
+        _is_number(cell.replace(",", "."))
+        or _DATE.fullmatch(cell)
+        or cell.lower() in ("true", "false")
+    )
+
+
+def _batches(
+    path: Path, form: _Form, schema: pa.Schema, columns: list[str]
+) -> Iterator[pa.RecordBatch]:
+    """The rows of some columns, some at a time."""
+    try:
+        with pa_csv.open_csv(
+            path,
+            pa_csv.ReadOptions(
+                use_threads=False,  # which lose count of the lines
+                block_size=_BLOCK,
+                skip_rows=form.begin,
+                column_names=form.names,
+            ),
+            pa_csv.ParseOptions(delimiter=form.separator),
+            pa_csv.ConvertOptions(
+                column_types=schema,
+                include_columns=columns,
+                null_values=_EMPTY,
+                strings_can_be_null=True,
+                decimal_point=form.decimal,
+            ),
+        ) as reader:
+            yield from reader
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(_line(path, form, error)) from None
+
+
+def _line(path: Path, form: _Form, error: BaseException) -> str:
+    """An error of Arrow's, with row and column."""
+    text = first_line(error)
+    if found := _PROBLEM.fullmatch(text):
+        place = f", line {found[2]}" if found[2] else ""
+        return f"{path}{place}, column {form.names[int(found[1])]!r}: {found[3]}"
+    if found := _SHORT.match(text):
+        place = f", line {found[1]}" if found[1] else ""
+        return f"{path}{place}: {found[2].lower()}"
+    return f"{path} can't be read as rows of text: {text}"

@@ -1,0 +1,231 @@
+"""LeRobot data sets, version 3 of their layout: https://github.com/huggingface/lerobot.
+
+A folder of Parquet files with a row for each step, and meta/info.json, which says what is in them.
+Images and videos are left out. Version 2.1 has the same columns, a file for each episode.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from jbrep.dataset.formats.episodes import label
+from jbrep.dataset.formats.parquet import batches_of, check_sizes, reading
+from jbrep.dataset.formats.tables import NAMES, Table, width, with_widths
+from jbrep.dataset.layout import Layout
+from jbrep.dataset.reader import Dataset
+from jbrep.dataset.scaling import extrema, mean_and_std
+from jbrep.errors import InputError
+from jbrep.progress import Progress
+from jbrep.records.storage import publish_folder, read_regular, unfinished, write_whole
+
+EPISODE_BYTES = 1 << 10  # in the table of episodes
+INFO = "meta/info.json"
+_MAX_BYTES = 1 << 24  # of it
+_VERSIONS = ("v3", "v2")
+_FILE_ROWS = 1 << 20  # of what is written
+_CHUNK_FILES = 1000
+_IMAGES = ("image", "video")
+_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_NUMBERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+
+
+def open_table(given: str) -> Table:
+    """Open a data set by its folder.
+
+    Raises:
+        InputError: it can't be read, or has another layout; or a link in place of a file.
+    """
+    folder = Path(given)
+    info = _info(folder / INFO)
+    paths = sorted(folder.glob("data/*/*.parquet"))
+    if not paths:
+        raise InputError(f"{given} has no data/chunk-*/*.parquet: download it whole")
+    for path in paths:
+        if path.is_symlink() or not path.is_file():
+            raise InputError(f"{path} must be a plain file: no link, pipe or device is opened")
+    rows, schema = 0, None
+    for path in paths:
+        with reading(path), pq.ParquetFile(path) as file:
+            check_sizes(str(path), file.metadata, file.schema_arrow)
+            schema = schema or with_widths(file.schema_arrow, next(file.iter_batches(1), None))
+            rows += file.metadata.num_rows
+    assert schema is not None
+    known = info["features"]
+    images = [name for name, each in known.items() if each["dtype"] in _IMAGES]
+    seen = [n for n in known if n.startswith("observation.") and n not in images]
+    return Table(
+        given,
+        label(folder.resolve().name),
+        _named(schema, known),
+        lambda columns: _batches(paths, columns),
+        rows=rows,
+        layout=Layout(observations=tuple(seen), actions=("action",)),
+        timestep=1 / info["fps"],
+        notes=(f"images are left out: {', '.join(images)}",) if images else (),
+    )
+
+
+def _info(path: Path) -> dict[str, Any]:
+    """What the data set says of itself, as far as it is used."""
+    try:
+        info = json.loads(read_regular(path, _MAX_BYTES))
+        version, fps = str(info["codebase_version"]), float(info["fps"])
+        known = {str(name): dict(each) for name, each in info["features"].items()}
+        known = {name: each | {"dtype": str(each["dtype"])} for name, each in known.items()}
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(f"{path} isn't as LeRobot writes it: {error!r}") from None
+    if not version.startswith(_VERSIONS):
+        raise InputError(f"{path} is of LeRobot's layout {version}: it must be v3.0 or v2.1")
+    if not 0 < fps < np.inf:
+        raise InputError(f"{path} has {fps} frames a second")
+    return {"fps": fps, "features": known}
+
+
+def _named(schema: pa.Schema, known: Mapping[str, Any]) -> pa.Schema:
+    """The schema with the names of the numbers in lists."""
+    for i, each in enumerate(schema):
+        names = known.get(each.name, {}).get("names")
+        if isinstance(names, dict):  # as in {"motors": [...]}
+            names = next(iter(names.values()), None)
+        fits = isinstance(names, list) and len(names) == width(each.type)
+        if fits and all(isinstance(name, str) for name in names):
+            schema = schema.set(i, each.with_metadata({NAMES: "\n".join(names).encode()}))
+    return schema
+
+
+def _batches(paths: list[Path], columns: list[str]) -> Iterator[pa.RecordBatch]:
+    for path in paths:
+        yield from batches_of(path, columns)
+
+
+def write(dataset: Dataset, out: Path) -> str:
+    """Write a folder; returns how to open it.
+
+    LeRobot has no place for the observation after the last action, and none for the two ways in
+    which an episode ends: what is exported lacks them.
+
+    Raises:
+        InputError: it isn't known how long a step lasts.
+    """
+    if dataset.task.timestep is None:
+        raise InputError(
+            f"{dataset.task.name} doesn't say how long a step lasts, which LeRobot needs to know: "
+            "give a timestep in --features when the data are made"
+        )
+    with unfinished(out) as partial:
+        fps = 1 / dataset.task.timestep
+        fps = round(fps) if abs(fps - round(fps)) < 1e-6 * fps else fps
+        (partial / "meta").mkdir(parents=True)
+        files = _write_steps(dataset, partial, fps)
+        _write_meta(dataset, partial, files, fps)
+        publish_folder(partial, out)
+    return f"LeRobotDataset({out.name!r}, root={str(out)!r})"
+
+
+def _features(dataset: Dataset) -> dict[str, Any]:
+    task = dataset.task
+    actions = [f"action_{i}" for i in range(task.action_size)]
+    wide = {"observation.state": list(task.feature_names), "action": actions}
+    features = {n: {"dtype": "float32", "shape": [len(v)], "names": v} for n, v in wide.items()}
+    single = {"next.reward": "float32"} if "reward" in dataset.columns else {}
+    single |= {name: "float32" if name == "timestamp" else "int64" for name in _NUMBERS}
+    return features | {n: {"dtype": t, "shape": [1], "names": None} for n, t in single.items()}
+
+
+def _write_steps(dataset: Dataset, folder: Path, fps: float) -> list[int]:
+    """The rows, in files of whole episodes; returns the number of the file of each episode."""
+    lengths, files, rows = dataset.episodes["length"].tolist(), list[int](), 0
+    for length in lengths:
+        rows += length
+        files.append(files[-1] if files else 0)
+        if rows > _FILE_ROWS and rows > length:
+            files[-1], rows = files[-1] + 1, length
+    schema = pa.schema(
+        pa.field(name, pa.list_(kind, each["shape"][0]) if each["names"] else kind)
+        for name, each in _features(dataset).items()
+        for kind in [pa.float32() if each["dtype"] == "float32" else pa.int64()]
+    )
+    writer, begin = None, 0
+    for number, length in enumerate(Progress(lengths, unit="episode", desc=folder.name)):
+        if number == 0 or files[number] != files[number - 1]:
+            if writer:
+                writer.close()
+            chunk, file = divmod(files[number], _CHUNK_FILES)
+            path = folder / _DATA.format(chunk_index=chunk, file_index=file)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            writer = pq.ParquetWriter(path, schema)
+        episode, steps = dataset.episode(number), np.arange(length)
+        columns = {"timestamp": steps / fps, "frame_index": steps, "index": begin + steps}
+        columns |= {"episode_index": np.full(length, number), "task_index": np.zeros(length)}
+        columns |= {"next.reward": episode["reward"]} if "next.reward" in schema.names else {}
+        wide = {"observation.state": episode["observation"], "action": episode["action"]}
+        arrays = [
+            pa.FixedSizeListArray.from_arrays(wide[each.name].ravel(), each.type.list_size)
+            if each.name in wide
+            else pa.array(columns[each.name].astype(each.type.to_pandas_dtype()))
+            for each in schema
+        ]
+        assert writer is not None
+        writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+        begin += length
+    if writer:
+        writer.close()
+    return files
+
+
+def _write_meta(dataset: Dataset, folder: Path, files: list[int], fps: float) -> None:
+    lengths, name = dataset.episodes["length"], dataset.task.name
+    ends, count = np.cumsum(lengths), len(lengths)
+    chunks, numbers = np.divmod(files, _CHUNK_FILES)
+    episodes = {
+        "episode_index": np.arange(count),
+        "tasks": [[name]] * count,
+        "length": lengths.astype(np.int64),
+        "data/chunk_index": chunks,
+        "data/file_index": numbers,
+        "dataset_from_index": ends - lengths,
+        "dataset_to_index": ends,
+        "meta/episodes/chunk_index": np.zeros(count, np.int64),
+        "meta/episodes/file_index": np.zeros(count, np.int64),
+    }
+    path = folder / "meta/episodes/chunk-000/file-000.parquet"
+    path.parent.mkdir(parents=True)
+    pq.write_table(pa.table(episodes), path)
+    index = "__index_level_0__"  # pandas reads the tasks by their names
+    kinds = {"task_index": ("task_index", "int64", "int64"), index: (None, "unicode", "object")}
+    keys = ("name", "pandas_type", "numpy_type")
+    columns = [
+        {"field_name": n, "metadata": None, **dict(zip(keys, k, strict=True))}
+        for n, k in kinds.items()
+    ]
+    pandas = {"index_columns": [index], "column_indexes": [], "columns": columns}
+    tasks = pa.table({"task_index": [0], index: [name]})
+    tasks = tasks.replace_schema_metadata({"pandas": json.dumps({**pandas, "pandas_version": "2"})})
+    pq.write_table(tasks, folder / "meta/tasks.parquet")
+    stats = {}
+    for column, of in (("observation.state", "observation"), ("action", "action")):
+        (low, high), (mean, std) = extrema(dataset[of].chunks()), mean_and_std(dataset[of].chunks())
+        told = {"min": low, "max": high, "mean": mean, "std": std, "count": [len(dataset)]}
+        stats[column] = {what: np.asarray(each).tolist() for what, each in told.items()}
+    write_whole(folder / "meta/stats.json", json.dumps(stats, indent=4).encode())
+    info = {
+        "codebase_version": "v3.0",
+        "robot_type": None,
+        "total_episodes": count,
+        "total_frames": len(dataset),
+        "total_tasks": 1,
+        "chunks_size": _CHUNK_FILES,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": fps,
+        "splits": {"train": f"0:{count}"},
+        "data_path": _DATA,
+        "video_path": None,
+        "features": _features(dataset),
+    }
+    write_whole(folder / INFO, json.dumps(info, indent=4).encode())

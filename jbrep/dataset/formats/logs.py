@@ -1,0 +1,224 @@
+"""Tables as sources of episodes: rows read by their layout, cut, and brought to a clock."""
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from jbrep.coordinates import wrapped
+from jbrep.dataset.formats.clock import MOST_RAW, Clock, timestep_of
+from jbrep.dataset.formats.episodes import WIDE, Incoming, Rows, Source
+from jbrep.dataset.formats.flat import split
+from jbrep.dataset.formats.missing import without_missing
+from jbrep.dataset.formats.tables import (
+    DEGREES,
+    MOST_SHOWN,
+    Leaf,
+    Roles,
+    Table,
+    features_of_table,
+    roles_of,
+    width,
+)
+from jbrep.dataset.layout import Layout
+from jbrep.envs.task import MAX_EPISODE_STEPS
+from jbrep.errors import InputError
+from jbrep.text import counted
+
+Array = NDArray[Any]
+
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+_SAID = {  # of what is counted: what it is, and what became of it
+    "rows": ("row", "read"),
+    "repeated": ("row", "at the time of the row before: left out"),
+    "back": ("step", "back in time: an episode ends there"),
+    "gaps": ("gap", "of more than {gap} s: an episode ends there"),
+    "never": ("row", "of episodes in which a column has no reading: left out"),
+    "resampled": ("row", "at {rate:g} Hz, by the {fill} readings"),
+    "stale": ("row", "of these without a reading of each column within {gap} s: left out"),
+    "cuts": ("cut", "after {length} rows"),
+    "last": ("row", "after the last action of an episode, or alone: no step begins there"),
+    "missing": ("step", "without all readings: left out"),
+}
+
+
+def source_of_table(table: Table, given: Layout | None = None, missing: str = "") -> Source:
+    """A table as a source of episodes.
+
+    Args:
+        table: to read.
+        given: what the user says of its columns, before what its format says.
+        missing: what becomes of numbers that are missing, see `without_missing`.
+
+    Raises:
+        InputError: columns that are missing or of other types. Reading raises it with row and
+            column.
+    """
+    layout = _both(table, given or Layout())
+    roles = roles_of(table, layout)
+    features = tuple(features_of_table(table, roles["observation"]))
+    reader = _Reader(table, layout, roles, missing)
+    return Source(
+        table.name,
+        table.label,
+        reader.episodes,
+        task=table.task,
+        features=() if table.task else features,
+        rows=None if layout.rate else table.rows,
+        has_rewards="reward" in roles,
+        timestep=1 / layout.rate if layout.rate else table.timestep or reader.timestep,
+        notes=reader.notes(),
+        changes=reader.changes,
+    )
+
+
+def _both(table: Table, given: Layout) -> Layout:
+    """What the user says, and what the format says where the user says nothing."""
+    usual = Layout()
+    said = {name: getattr(given, name) for name in Layout.__struct_fields__}
+    layout = table.layout.replace(**{n: v for n, v in said.items() if v != getattr(usual, n)})
+    for name in ("gap", "rate"):
+        if getattr(layout, name) and not layout.time:
+            raise InputError(f"--{name} needs --time, the column of times")
+    return layout
+
+
+class _Reader:
+    """Reads a table's rows as episodes, and counts what it does to them."""
+
+    def __init__(self, table: Table, layout: Layout, roles: Roles, missing: str):
+        self._table, self._layout, self._roles = table, layout, roles
+        self._missing, self._counts = missing, Counter[str]()
+        self._may_miss = bool(missing or layout.rate)
+        seen = roles["observation"]
+        self._angles = np.array([each.is_angle for each in seen])
+        turned = self._angles & np.array([each.unit in DEGREES for each in seen])
+        self._factors = np.where(turned, math.pi / 180, 1)
+        self._columns = list(dict.fromkeys(e.column for some in roles.values() for e in some))
+        self.timestep = self._timestep() if "time" in roles else None
+
+    def _timestep(self) -> float | None:
+        """What an even clock has from row to row [s], by the first rows."""
+        first = next(self._rows(), None)
+        return None if first is None else timestep_of(first["time"])
+
+    def episodes(self) -> Iterator[Incoming]:
+        """The episodes, from the first on."""
+        self._counts.clear()
+        name, layout, chunks = self._table.name, self._layout, self._rows()
+        clock = Clock(layout, self._angles, self._counts)
+        if layout.time:
+            chunks = clock.cut(name, chunks)
+        most = MOST_RAW if layout.rate or layout.length else MAX_EPISODE_STEPS
+        for episode in split(name, chunks, self._table.once, most, clock.parts):
+            self._counts["last"] -= len(episode.action)
+            self._counts["missing"] += len(episode.action)
+            for part in without_missing(episode, self._missing):
+                self._counts["missing"] -= len(part.action)
+                yield part
+
+    def _rows(self) -> Iterator[Rows]:
+        """The rows by role, some at a time."""
+        first, origin, labels = 0, None, dict[Any, int]()
+        for batch in self._table.batches(self._columns):
+            arrays = {name: self._numbers(batch, name, first) for name in self._columns}
+            rows = dict[str, Array]()
+            for role, leaves in self._roles.items():
+                each = [arrays[leaf.column] for leaf in leaves]
+                each = [
+                    values if leaf.place is None else values[:, leaf.place]
+                    for leaf, values in zip(leaves, each, strict=True)
+                ]
+                for leaf, values in zip(leaves, each, strict=True):
+                    self._check(leaf, role, values, first)
+                rows[role] = np.stack(each, axis=1) if role in WIDE else each[0]
+            if "time" in rows:
+                origin = rows["time"][:1] if origin is None or not len(origin) else origin
+                passed = (rows["time"] - origin).astype(float)
+                rows["time"] = passed * self._seconds(self._roles["time"][0])
+            if "episode" in rows and rows["episode"].dtype.kind not in "iu":
+                numbers = [labels.setdefault(e, len(labels)) for e in rows["episode"].tolist()]
+                rows["episode"] = np.array(numbers, int)
+            if self._angles.any():
+                turned = rows["observation"] * self._factors
+                rows["observation"] = np.where(self._angles, wrapped(turned), turned)
+            first += batch.num_rows
+            self._counts["rows"] += batch.num_rows
+            yield rows
+
+    def _check(self, leaf: Leaf, role: str, values: Array, first: int) -> None:
+        """Refuse a number that is missing where none may be."""
+        if values.dtype.kind != "f" or (self._may_miss and role in (*WIDE, "reward")):
+            return
+        if len(wrong := np.flatnonzero(~np.isfinite(values))):
+            raise InputError(
+                f"{self._at(first + int(wrong[0]))}: {leaf.name!r} is empty, or no finite number: "
+                "correct it, leave the row out, or give --missing"
+            )
+
+    def _seconds(self, leaf: Leaf) -> float:
+        """What brings the times to seconds."""
+        kind = self._table.schema.field(leaf.column).type
+        unit = "ns" if pa.types.is_temporal(kind) else leaf.unit or "s"
+        if unit not in _SECONDS:
+            raise InputError(
+                f"{self._table.name}: the times {leaf.name!r} are in {unit!r}: choose one of "
+                f"{', '.join(_SECONDS)}"
+            )
+        return _SECONDS[unit]
+
+    def _at(self, row: int) -> str:
+        word, begin = self._table.first
+        return f"{self._table.name}, {word} {begin + row}"
+
+    def _numbers(self, batch: pa.RecordBatch, name: str, first: int) -> Array:
+        """A column as an array: numbers, of which empty ones are NaN; or words."""
+        column = batch.column(name)
+        kind, empty = column.type, column.null_count
+        size = width(self._table.schema.field(name).type)
+        if empty and (size or not (pa.types.is_floating(kind) or self._may_miss)):
+            row = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
+            raise InputError(f"{self._at(first + row)}: {name!r} has an empty cell: fill it")
+        if size is not None:
+            lengths = column.value_lengths().to_numpy(zero_copy_only=False)
+            if len(wrong := np.flatnonzero(lengths != size)):
+                row = int(wrong[0])
+                raise InputError(
+                    f"{self._at(first + row)}: {name!r} has {lengths[row]} numbers, not {size} as "
+                    "before"
+                )
+            flat = column.flatten().to_numpy(zero_copy_only=False)
+            return flat.astype(float).reshape(len(column), size)
+        if pa.types.is_temporal(kind):
+            wide = pa.timestamp("ns") if pa.types.is_timestamp(kind) else pa.duration("ns")
+            column = column.cast(wide).cast(pa.int64())
+        elif pa.types.is_dictionary(kind):
+            column = column.dictionary_decode()
+        elif pa.types.is_decimal(kind) or (empty and pa.types.is_boolean(kind)):
+            column = column.cast(pa.float64())
+        return np.asarray(column.to_numpy(zero_copy_only=False))
+
+    def changes(self) -> dict[tuple[str, str], int]:
+        """What was done to the rows that were read last, how often."""
+        layout, counts = self._layout, self._counts
+        how = {name: getattr(layout, name) for name in ("gap", "rate", "fill", "length")}
+        told = [(*words, counts[what]) for what, words in _SAID.items() if counts[what]]
+        return {(noun, said.format(**how)): count for noun, said, count in told}
+
+    def notes(self) -> tuple[str, ...]:
+        """What is done to the columns."""
+        notes = list(self._table.notes)
+        if unused := [name for name in self._table.schema.names if name not in self._columns]:
+            more = ", ..." if unused[MOST_SHOWN:] else ""
+            notes.append(f"not used: {', '.join(unused[:MOST_SHOWN])}{more}")
+        if self._layout.time and not self._layout.rate and self.timestep is None:
+            notes.append("the clock is uneven: --rate brings the rows to an even one")
+        if self._angles.any():
+            degrees = int((self._factors != 1).sum())
+            angles = counted(int(self._angles.sum()), "angle")
+            notes.append(f"{angles} brought to [-pi, pi) rad, {degrees} of them from degrees")
+        return tuple(notes)

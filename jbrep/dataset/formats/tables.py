@@ -1,0 +1,225 @@
+"""Tables: rows with named columns, of which a layout says what they are to a data set."""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from jbrep.dataset.formats.episodes import WHOLE, WIDE, check_kind, check_names
+from jbrep.dataset.formats.flat import own_names
+from jbrep.dataset.layout import Layout
+from jbrep.envs.names import is_code
+from jbrep.envs.task import Feature, Task
+from jbrep.errors import InputError
+
+Array = NDArray[Any]
+
+UNIT, NAMES = b"unit", b"names"  # in a field's metadata: its unit, and those of a list's numbers
+_ACTION = re.compile(r"actions?(_\d+)?")
+_NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former
+DEGREES = ("deg", "°", "degrees", "degree")
+_WORDS = pa.types.is_string, pa.types.is_large_string, pa.types.is_dictionary
+MOST_SHOWN = 12  # names of columns in a message
+_ONCE = ("reward", "time", "episode", "terminated")  # of a layout: one column each
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows with named columns, in Arrow's types.
+
+    Attributes:
+        name: for messages and provenance.
+        label: for a task made from the data alone.
+        schema: of all columns; a field's metadata may say its unit, and a list's names.
+        batches: of some columns by name, from the first row on at each call.
+        rows: how many there are, if that is known.
+        layout: what its format says of its columns.
+        task, once: what it knows besides, see `Source` and `per_episode`.
+        first: the number of the first row in messages, and what rows are called there.
+        timestep: of its clock, if its format says it [s].
+        notes: on what its format leaves out.
+    """
+
+    name: str
+    label: str
+    schema: pa.Schema
+    batches: Callable[[list[str]], Iterator[pa.RecordBatch]]
+    rows: int | None = None
+    layout: Layout = field(default_factory=Layout)
+    task: Task | None = None
+    once: Mapping[str, Array] = field(default_factory=dict)
+    first: tuple[str, int] = ("row", 0)
+    timestep: float | None = None
+    notes: tuple[str, ...] = ()
+
+
+class Leaf(NamedTuple):
+    """A number of each row: a column, or a part of a column of lists."""
+
+    name: str
+    short: str  # the name for a feature, unless two are the same
+    column: str
+    place: int | None = None  # in a list
+    unit: str = ""
+    is_angle: bool = False
+
+
+Roles = Mapping[str, list[Leaf]]  # by the names of ALIASES, and time
+
+
+def _leaves(schema: pa.Schema, layout: Layout) -> Iterator[Leaf]:
+    """All that could be used of a table."""
+    for each in schema:
+        said = each.metadata or {}
+        unit = layout.units.get(each.name, said.get(UNIT, b"").decode())
+        names = said.get(NAMES, b"").decode().split("\n") if NAMES in said else []
+        size = width(each.type)
+        for i in range(1 if size is None else size):
+            name, short, place = each.name, each.name, None
+            if size is not None:
+                place, short = i, names[i] if names else f"{each.name}_{i}"
+                name = f"{each.name}.{names[i] if names else i}"
+            is_angle = any(_means(wanted, name, each.name) for wanted in layout.angles)
+            yield Leaf(name, short, each.name, place, unit, is_angle)
+
+
+def _means(wanted: str, name: str, column: str) -> bool:
+    """Whether a name or pattern stands for a part of a column."""
+    return wanted in (name, column) or fnmatchcase(name, wanted)
+
+
+def with_widths(schema: pa.Schema, first: pa.RecordBatch | None) -> pa.Schema:
+    """The schema with lists as long as they are in the first row."""
+    for i, each in enumerate(schema):
+        if pa.types.is_list(each.type) or pa.types.is_large_list(each.type):
+            told = first.column(each.name)[:1].to_pylist() if first else []
+            size = len(told[0]) if told and told[0] is not None else 0
+            schema = schema.set(i, each.with_type(pa.list_(each.type.value_type, size)))
+    return schema
+
+
+def width(kind: pa.DataType) -> int | None:
+    """Numbers of a list in each row; None of what is no list."""
+    return kind.list_size if pa.types.is_fixed_size_list(kind) else None
+
+
+def roles_of(table: Table, layout: Layout) -> Roles:
+    """Which columns are what, by the layout, or else by their names.
+
+    Raises:
+        InputError: columns that are missing or of other types, or two of one name.
+    """
+    name, names = table.name, table.schema.names
+    if twice := [each for each, n in Counter(names).items() if n > 1]:
+        raise InputError(f"{name} has two columns {twice[0]!r}: rename one")
+    leaves = list(_leaves(table.schema, layout))
+    roles = {role: _matching(table, leaves, said) for role, said in _said(table, layout).items()}
+    roles.setdefault("action", [each for each in leaves if _ACTION.fullmatch(each.column)])
+    roles.setdefault("observation", list(_others(table, leaves, roles)))
+    _matching(table, roles["observation"], layout.angles)
+    roles = {role: some for role, some in roles.items() if some}
+    check_names(name, [*roles, *(["step"] if layout.time or layout.length else [])])
+    for role, some in roles.items():
+        _check_types(table, role, some, named=bool(layout.actions))
+    return roles
+
+
+def _said(table: Table, layout: Layout) -> dict[str, tuple[str, ...]]:
+    """The names of columns by what they are."""
+    names = table.schema.names
+    said = {role: (own,) for role, own in own_names(table.name, names).items()}
+    once = {role: getattr(layout, role) for role in ("time", "episode", "terminated")}
+    once["reward"] = layout.reward if not is_code(layout.reward) else ""
+    if layout.time:  # which tells more than the numbers of steps
+        said.pop("step", None)
+    said |= {role: (given,) for role, given in once.items() if given}
+    wide = {"action": layout.actions, "observation": layout.observations}
+    return said | {role: given for role, given in wide.items() if given}
+
+
+def _others(table: Table, leaves: list[Leaf], roles: Roles) -> Iterator[Leaf]:
+    """The columns that are nothing else."""
+    if table.task:
+        yield from _matching(table, leaves, table.task.feature_names)
+        return
+    taken = {each.name for some in roles.values() for each in some}
+    for each in leaves:
+        if each.name not in taken and not _NOT_FEATURES.fullmatch(each.column):
+            yield each
+
+
+def _matching(table: Table, leaves: list[Leaf], names: tuple[str, ...]) -> list[Leaf]:
+    """Those of such names, in the order of the names and each once.
+
+    Raises:
+        InputError: none has one of the names.
+    """
+    found: dict[str, Leaf] = {}
+    for wanted in names:
+        some = [each for each in leaves if _means(wanted, each.name, each.column)]
+        if not some:
+            there = [each.name for each in leaves]
+            shown = ", ".join(there[:MOST_SHOWN]) + (", ..." if there[MOST_SHOWN:] else "")
+            raise InputError(f"{table.name} has no column {wanted!r}: it has {shown}")
+        found |= {each.name: each for each in some}
+    return list(found.values())
+
+
+def _check_types(table: Table, role: str, leaves: list[Leaf], named: bool) -> None:
+    """Make sure that columns can be what they are said to be."""
+    if role not in WIDE and len(leaves) > 1:
+        raise InputError(f"{table.name} has {len(leaves)} columns of the {role}: it must be one")
+    check_kind(table.name, role, np.dtype(int if role in WHOLE else float), (len(leaves),))
+    for each in leaves:
+        kind = table.schema.field(each.column).type
+        kind = kind if each.place is None else kind.value_type
+        is_number = pa.types.is_integer(kind) or pa.types.is_floating(kind)
+        is_number |= pa.types.is_boolean(kind) or pa.types.is_decimal(kind)
+        if (role == "time" and pa.types.is_temporal(kind)) or (
+            role == "episode" and any(each(kind) for each in _WORDS)
+        ):
+            continue
+        if not is_number:
+            raise InputError(
+                f"{table.name} has {kind} in the column {each.column!r}: it must be plain numbers; "
+                "or name the observations and actions without it"
+            )
+        if role == "action" and not named and not pa.types.is_floating(kind):
+            raise InputError(
+                f"{table.name} has {kind} in the column {each.column!r}: only continuous actions "
+                "are possible; if these are, name the actions"
+            )
+
+
+def features_of_table(table: Table, leaves: list[Leaf]) -> Iterator[Feature]:
+    """The features by the names and units of their columns.
+
+    Raises:
+        InputError: an angle in another unit.
+    """
+    shorts = Counter(_word(each.short) for each in leaves)
+    for each in leaves:
+        name = _word(each.short if shorts[_word(each.short)] == 1 else each.name)
+        if not each.is_angle:
+            yield Feature(name=name, unit=each.unit[:40])
+        elif each.unit in ("", "rad", *DEGREES):
+            pi = math.pi
+            yield Feature(name=name, unit="rad", low=-pi, high=pi, bounded=True, kind="angle")
+        else:
+            raise InputError(
+                f"{table.name} has the angle {each.name!r} in {each.unit!r}: it must be in rad or "
+                "deg"
+            )
+
+
+def _word(column: str) -> str:
+    """The name of a column as a feature's."""
+    word = re.sub(r"[^A-Za-z0-9_.-]", "_", column.strip("/"))[:90]
+    return word if word[:1].isalpha() else f"obs_{word}"

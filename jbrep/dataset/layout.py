@@ -1,0 +1,76 @@
+"""What the columns of a table are to a data set, and what becomes of its rows."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from jbrep.records.record import Record
+
+_Name = Annotated[str, Meta(min_length=1, max_length=1000)]
+_Names = tuple[_Name, ...]
+_Seconds = Annotated[float, Meta(gt=0, le=1e9)]
+
+
+class Layout(Record, frozen=True, kw_only=True):
+    """What the columns of a table are, by their names, and what becomes of its rows.
+
+    Observations and actions may be patterns, such as `imu.*`, and columns of lists.
+    """
+
+    observations: Annotated[
+        _Names,
+        Meta(
+            description="Columns that make the observation: names or patterns, as in 'hip,imu.*'.",
+            extra={"default": "all others"},
+        ),
+    ] = ()
+    actions: Annotated[
+        _Names,
+        Meta(
+            description="Those of the action, likewise.",
+            extra={"default": "action, or action_0, action_1 and so on"},
+        ),
+    ] = ()
+    reward: Annotated[
+        str,
+        Meta(
+            description="The reward's column; or module:function, which is run, for rewards (n,) "
+            "of observations (n, d) and actions (n, k).",
+            extra={"default": "reward, if there is one"},
+        ),
+    ] = ""
+    time: Annotated[
+        str, Meta(description="The column of times: dates, or s, or as its unit or --units says.")
+    ] = ""
+    episode: Annotated[
+        str, Meta(description="A column that changes where an episode ends: numbers or words.")
+    ] = ""
+    terminated: Annotated[
+        str, Meta(description="A column that is true where a state ended the episode.")
+    ] = ""
+    units: Annotated[
+        Mapping[_Name, str],
+        Meta(description="Of columns: pitch=deg,t=ms.", extra={"default": "as in 'pitch [deg]'"}),
+    ] = {}
+    angles: Annotated[
+        _Names, Meta(description="Observations that are angles, in rad or deg, which may wrap.")
+    ] = ()
+    gap: Annotated[
+        _Seconds | None, Meta(description="An episode ends where nothing comes for so long [s].")
+    ] = None
+    length: Annotated[
+        Annotated[int, Meta(ge=2, le=1_000_000)] | None,
+        Meta(description="An episode is cut after so many rows."),
+    ] = None
+    rate: Annotated[
+        Annotated[float, Meta(gt=0, le=1e6)] | None,
+        Meta(description="Bring the rows to an even clock of so many a second [Hz]."),
+    ] = None
+    fill: Annotated[
+        Literal["latest", "linear"],
+        Meta(
+            description="What stands between readings then: the latest, or for observations what "
+            "lies between two."
+        ),
+    ] = "latest"

@@ -1,0 +1,375 @@
+"""Logs of real robots: layouts as loggers write them, incomplete as they are."""
+
+import json
+import math
+import shutil
+import sys
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pandas
+import polars
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from command import jbrep
+
+from jbrep.dataset import Dataset, Layout, ScaledDataset
+from jbrep.dataset.verify import find_problems
+from jbrep.errors import InputError
+from jbrep.evaluate.diagnosis import diagnose
+from jbrep.methods.fit import Fitter
+from jbrep.report.serving import untold
+
+RATE = 100
+TIMES = np.concatenate((np.arange(60), 500 + np.arange(60))) / RATE
+TICKS = 420_000_000 + np.arange(120)
+GYRO = 8 + np.arange(120) / 100
+PITCH = (800 * TIMES + 180) % 360 - 180
+VOLTS = np.sin(np.arange(120))
+
+
+def csv_rows(**changes):
+    """A log's cells; some of a column may be replaced."""
+    columns = {
+        "time [s]": [f"{t:.5f}" for t in TIMES],
+        "pitch [deg]": [f"{v:.4f}" for v in PITCH],
+        "gyro (rad/s)": [f"{v:.3f}" for v in GYRO],
+        "ticks": [str(v) for v in TICKS],
+        "u [V]": [f"{v:.4f}" for v in VOLTS],
+        "status": ["OK"] * 120,
+    }
+    for name, cells in changes.items():
+        for row, cell in cells.items():
+            columns[next(n for n in columns if n.startswith(name))][row] = cell
+    return columns
+
+
+def write_csv(path, rows, separator=",", before=(), decimal="."):
+    lines = [separator.join(rows), *map(separator.join, zip(*rows.values(), strict=True))]
+    lines[1:] = [line.replace(".", decimal) for line in lines[1:]]
+    path.write_text("\n".join([*before, *lines]) + "\n", encoding="utf-8-sig")
+    return path
+
+
+NAMED = ("--observations", "pitch,gyro,ticks", "--actions", "u", "--time", "time")
+
+
+def imported(path, *options, out="data"):
+    """What the command says, and the data set."""
+    folder = path.parent / out
+    done = jbrep("data", "import", path, *options, "--out", folder)
+    assert done.exit_code == 0, done.output
+    assert not list(find_problems(folder))
+    return done.output, Dataset(folder)
+
+
+def test_a_csv_as_loggers_write_it(tmp_path):
+    """Comments, units in the header, decimal commas, words, angles in degrees, a pause."""
+    path = write_csv(tmp_path / "a.csv", csv_rows(), ";", ["# logger 2.1", ""], ",")
+    told, data = imported(path, *NAMED, "--gap", "0.5", "--angles", "pitch")
+    assert data.episodes["length"].tolist() == [59, 59]
+    named = [(f.name, f.unit, f.kind) for f in data.task.features]
+    assert named == [
+        ("pitch", "rad", "angle"),
+        ("gyro", "rad/s", "scalar"),
+        ("ticks", "", "scalar"),
+    ]
+    kept = np.delete(np.arange(120), [59, 119])
+    turned = np.asarray(data["pitch"]) - np.radians(PITCH[kept])
+    assert np.abs(np.angle(np.exp(1j * turned))).max() < 1e-5
+    np.testing.assert_allclose(data["gyro"], GYRO[kept], rtol=1e-6)
+    assert data.task.timestep == 1 / RATE
+    assert data.columns == ("observation", "action", "episode", "step")
+    for line in (
+        "120 rows read",
+        "1 gap of more than 0.5 s: an episode ends there",
+        "2 rows after the last action of an episode, or alone",
+        "not used: status",
+        "1 angle brought to [-pi, pi) rad, 1 of them from degrees",
+        "no rewards: what needs some will say so",
+        "ticks is near 420000000 and changes by about 1",
+        "2 episodes of a, 118 rows",
+    ):
+        assert line in told
+
+
+def test_a_line_of_units_tabs_and_dates(tmp_path):
+    rows = csv_rows()
+    begin = datetime(2024, 3, 1, 12, tzinfo=UTC)
+    dates = [(begin + timedelta(seconds=t)).strftime("%Y-%m-%d %H:%M:%S.%fZ") for t in TIMES]
+    rows = {"stamp": ["UTC", *dates], "gyro": ["rad/s", *rows["gyro (rad/s)"]]}
+    rows |= {"u": ["V", *map(str, VOLTS)], "trial": ["-", *["a"] * 50, *["b"] * 70]}
+    path = write_csv(tmp_path / "a.tsv", rows, "\t")
+    names = ("--observations", "gyro", "--actions", "u", "--time", "stamp", "--episode", "trial")
+    told, data = imported(path, *names, "--gap", "1")
+    assert data.episodes["length"].tolist() == [49, 9, 59]
+    assert data.task.features[0].unit == "rad/s"
+    assert "1 gap of more than 1.0 s" in told
+
+
+def test_missing_cells_are_cut_or_held_and_counted(tmp_path):
+    path = write_csv(tmp_path / "a.csv", csv_rows(gyro=dict.fromkeys((30, 31), "")))
+    done = jbrep("data", "import", path, *NAMED, "--gap", "1", "--out", tmp_path / "no")
+    assert (done.exit_code, done.output.count("\n")) == (2, 1)
+    assert "a.csv, line 32: 'gyro' is empty" in done.output
+    told, data = imported(path, *NAMED, "--gap", "1", "--missing", "skip")
+    assert data.episodes["length"].tolist() == [29, 27, 59]
+    assert "2 missing readings (skip)" in told
+    assert "3 steps without all readings: left out" in told
+    told, data = imported(path, *NAMED, "--gap", "1", "--missing", "hold:2", out="held")
+    np.testing.assert_allclose(data["gyro"][29:33], [8.29, 8.29, 8.29, 8.32], rtol=1e-6)
+    assert data.episodes["missing"].tolist() == [2, 0]
+
+
+def test_uneven_clocks_are_brought_to_an_even_one(tmp_path):
+    """By the latest value, or linearly, the shorter way round for an angle."""
+    time = np.sort(np.random.default_rng(0).uniform(0, 2, 400))
+    time[200:] += 3
+    frame = pandas.DataFrame({"t": time * 1000, "angle": np.angle(np.exp(8j * time)), "u": time})
+    frame["flag"] = frame.index % 2
+    layout = Layout(
+        observations=("angle",), actions=("u",), time="t", units={"t": "ms"}, gap=1, rate=50
+    )
+    data = Dataset.from_table(tmp_path / "latest", frame, layout)
+    assert len(data.episodes["length"]) == 2
+    grid = time[0] + np.arange(data.episodes["length"][0]) / 50
+    latest = time[np.searchsorted(time, grid + 1e-9, side="right") - 1]
+    np.testing.assert_allclose(data.episode(0)["action"][:, 0], latest, rtol=1e-6)
+    layout = layout.replace(angles=("angle",), fill="linear")
+    data = Dataset.from_table(tmp_path / "linear", polars.DataFrame(frame), layout)
+    apart = data.episode(0)["observation"][:, 0] - 8 * grid
+    assert np.abs(np.angle(np.exp(1j * apart))).max() < 0.01
+    assert data.task.timestep == 1 / 50
+
+
+def test_columns_that_come_at_their_own_rates_meet_on_one_clock(tmp_path):
+    """Rows with a cell each, as loggers of several devices write; one is silent for a while."""
+    slow = ["" if i % 10 else f"{i}" for i in range(120)]
+    rows = {"t": [f"{i / 100}" for i in range(120)], "slow": slow}
+    rows["u"] = ["" if 40 < i < 80 else f"{i}" for i in range(120)]
+    path = write_csv(tmp_path / "a.csv", rows)
+    names = ("--observations", "slow", "--actions", "u", "--time", "t", "--rate", "100")
+    told, data = imported(path, *names, "--gap", "0.2")
+    assert data.episodes["length"].tolist() == [60, 39]
+    np.testing.assert_array_equal(data.episode(0)["observation"][:, 0], np.arange(60) // 10 * 10)
+    assert data.episode(0)["action"][-1] == 40
+    assert "19 rows of these without a reading of each column within 0.2 s: left out" in told
+
+
+def test_time_that_stands_or_goes_back(tmp_path):
+    time = [*range(10), 9, *range(20)]
+    rows = {"t": map(str, time), "x": map(str, range(31)), "u": ["0.5"] * 31}
+    path = write_csv(tmp_path / "a.csv", rows)
+    names = ("--observations", "x", "--actions", "u", "--time", "t", "--units", "t=ms")
+    told, data = imported(path, *names, "--length", "8")
+    assert data.episodes["length"].tolist() == [7, 1, 7, 7, 3]
+    assert data.task.timestep == 1e-3
+    for line in ("1 row at the time of", "1 step back in time", "3 cuts after 8 rows"):
+        assert line in told
+
+
+REWARD = """
+import numpy as np
+def upright(observations, actions):
+    observations *= 1  # what it is given is its own
+    return np.cos(observations[:, 0]) - 0.01 * (actions**2).sum(axis=1)
+def scalar(observations, actions):
+    return 1.0
+"""
+
+
+@pytest.fixture
+def rewards(tmp_path, monkeypatch):
+    (tmp_path / "my_rewards.py").write_text(REWARD)
+    monkeypatch.chdir(tmp_path)
+    yield
+    sys.modules.pop("my_rewards", None)
+
+
+def test_an_own_reward_after_the_fact(tmp_path, rewards):
+    path = write_csv(tmp_path / "a.csv", csv_rows())
+    options = (*NAMED, "--gap", "1", "--angles", "pitch")
+    (tmp_path / "layout.toml").write_text('reward = "my_rewards:upright"\n')
+    done = jbrep("data", "import", path, *options, "--layout", "layout.toml", "--out", "no")
+    assert "the reward my_rewards:upright is code: importing my_rewards runs it" in done.output
+    _, data = imported(path, *options, "--reward", "my_rewards:upright")
+    expected = np.cos(data["pitch"]) - 0.01 * np.asarray(data["action"])[:, 0] ** 2
+    np.testing.assert_allclose(data["reward"], expected, rtol=1e-5)
+    assert data.manifest.settings.policy["reward"] == "my_rewards:upright"
+    done = jbrep("data", "import", path, *options, "--reward", "my_rewards:scalar", "--out", "no")
+    assert "gives an array of shape () for 59 steps: it must be (59,)" in done.output
+    assert not (tmp_path / "no").exists()
+
+
+def test_data_without_rewards_go_through_what_needs_none(tmp_path):
+    random = np.random.default_rng(0)
+    position = np.cumsum(random.normal(size=(300, 2)), axis=0)
+    action = random.uniform(-1, 1, (300, 1))
+    ends = np.arange(300) % 30 == 29
+    data = Dataset.write(tmp_path / "data", position, action, None, ends, source="walks")
+    assert "not known: the data have no rewards" in jbrep("data", "info", data.folder).output
+    scaled = ScaledDataset(data)
+    fitter = Fitter(scaled, tmp_path / "encoders")
+    encoder = fitter.fit("linear-forward", latent=1).encoder
+    evaluation = diagnose({"code": encoder}, scaled)
+    assert "no reward is known" in untold(evaluation)
+    assert evaluation.encoders["code"].prediction["5"].mean.value is not None
+    with pytest.raises(InputError, match="deepmdp needs a reward that varies"):
+        fitter.plan("deepmdp", latent=2)
+    with pytest.raises(InputError, match="no column, group or feature 'reward'"):
+        data["reward"]
+
+
+BAD = {
+    "line 6, column 'gyro': invalid value '1,5.2'": ({"gyro": {4: '"1,5.2"'}}, NAMED),
+    "line 9: expected 6 columns, got 7": ({"status": {7: "a,b"}}, NAMED),
+    "line 4: 'time' is empty": ({"time": {2: ""}}, (*NAMED, "--missing", "skip")),
+    "line 7: 'u' is empty, or no finite number": ({"u": {5: "inf"}}, NAMED),
+    "has no column 'speed': it has time, pitch, gyro": ({}, (*NAMED[:1], "speed", *NAMED[2:])),
+    "has string in the column 'status'": ({}, ("--actions", "u", "--time", "time")),
+    "doesn't tell where an episode ends": ({}, NAMED[:4]),
+    "--gap needs --time": ({}, (*NAMED[:4], "--gap", "1")),
+    "the times 'time' are in 'days'": ({}, (*NAMED, "--units", "time=days")),
+    "the angle 'gyro' in 'rad/s'": ({}, (*NAMED, "--angles", "gyro")),
+    "has no column 'u': it has pitch, gyro, ticks": ({}, (*NAMED, "--angles", "u")),
+    "an episode comes in two parts": ({"status": {9: "b"}}, (*NAMED, "--episode", "status")),
+    "fill is 'cubic': it must be": ({}, (*NAMED, "--fill", "cubic")),
+}
+
+
+@pytest.mark.parametrize("problem", BAD)
+def test_what_is_wrong_is_told_in_a_line_with_its_place(problem, tmp_path):
+    changes, options = BAD[problem]
+    path = write_csv(tmp_path / "a.csv", csv_rows(**changes))
+    done = jbrep("data", "import", path, *options, "--out", tmp_path / "out")
+    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+    assert problem in done.stderr
+    assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
+
+
+def test_text_that_is_no_table(tmp_path):
+    for content, problem in {
+        b"": "is empty: its first line must name the columns",
+        b"1,2\n3,4\n": "line 1: a number where the columns must be named",
+        b"a,b\n\xff\xfe,3\n": "it must be in UTF-8",
+    }.items():
+        (tmp_path / "a.csv").write_bytes(content)
+        done = jbrep("data", "import", tmp_path / "a.csv", "--out", tmp_path / "out")
+        assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+        assert problem in done.stderr
+
+
+def test_lists_in_a_table_and_integers_as_actions(tmp_path):
+    frame = polars.DataFrame(
+        {
+            "observation": [[i / 1, i / 2] for i in range(40)],
+            "pulse": [1000 + 10 * i for i in range(40)],
+            "trial": ["a"] * 20 + ["b"] * 20,
+        }
+    )
+    frame.write_parquet(tmp_path / "a.parquet")
+    assert "list" in str(pq.read_schema(tmp_path / "a.parquet").field("observation").type)
+    done = jbrep("data", "import", tmp_path / "a.parquet", "--out", tmp_path / "out")
+    assert "has no actions" in done.output
+    _, data = imported(tmp_path / "a.parquet", "--actions", "pulse", "--episode", "trial")
+    assert data.task.feature_names == ("observation_0", "observation_1")
+    assert (data.task.action_low, data.task.action_high) == ((1000,), (1380,))
+    ragged = frame.with_columns(observation=polars.lit([1.0])).with_row_index("i")
+    frame = polars.concat([frame.with_row_index("i"), ragged], how="vertical_relaxed")
+    frame.write_parquet(tmp_path / "b.parquet")
+    names = ("--observations", "observation", "--actions", "pulse", "--episode", "trial")
+    done = jbrep("data", "import", tmp_path / "b.parquet", *names, "--out", tmp_path / "out")
+    assert "b.parquet, row 40: 'observation' has 1 numbers, not 2 as before" in done.output
+
+
+def test_several_logs_are_an_episode_each(tmp_path):
+    first = write_csv(tmp_path / "a.csv", csv_rows())
+    second = write_csv(tmp_path / "b.csv", csv_rows())
+    told, data = imported(first, second, *NAMED, "--length", "100")
+    assert data.episodes["length"].tolist() == [99, 19, 99, 19]
+    assert "240 rows read" in told
+    assert math.isclose(data.task.action_high[0], VOLTS.max(), rel_tol=1e-4)
+
+
+def lerobot_folder(folder, version="v3.0", **features):
+    """A data set as LeRobot's documentation lays it out: three episodes, a camera."""
+    lengths = (10, 11, 12)
+    step = np.concatenate([np.arange(n) for n in lengths])
+    state = np.stack([np.repeat(range(3), lengths), step], axis=1).astype(np.float32)
+    names = {"motors": ["shoulder.pos", "elbow.pos"]}
+    known = {
+        "observation.state": {"dtype": "float32", "shape": [2], "names": names},
+        "action": {"dtype": "float32", "shape": [2], "names": names},
+        "observation.images.top": {"dtype": "video", "shape": [3, 48, 64], "names": None},
+        "next.reward": {"dtype": "float32", "shape": [1], "names": None},
+        **features,
+    }
+    columns = {
+        "observation.state": pa.array(state.tolist(), pa.list_(pa.float32(), 2)),
+        "action": pa.array((state / 12).tolist(), pa.list_(pa.float32())),
+        "next.reward": pa.array(step.astype(np.float32)),
+        "timestamp": pa.array((step / 30).astype(np.float32)),
+        "frame_index": pa.array(step),
+        "episode_index": pa.array(np.repeat(range(3), lengths)),
+        "index": pa.array(np.arange(33)),
+        "task_index": pa.array(np.zeros(33, int)),
+    }
+    table = pa.table(columns)
+    (folder / "data/chunk-000").mkdir(parents=True)
+    (folder / "meta").mkdir()
+    for file, (begin, end) in enumerate([(0, 21), (21, 33)]):
+        path = folder / f"data/chunk-000/file-{file:03d}.parquet"
+        pq.write_table(table.slice(begin, end - begin), path)
+    info = {"codebase_version": version, "fps": 30, "features": known}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    return folder
+
+
+def test_a_lerobot_data_set(tmp_path):
+    told, data = imported(lerobot_folder(tmp_path / "arm"))
+    assert data.episodes["length"].tolist() == [9, 10, 11]
+    assert data.task.feature_names == ("shoulder.pos", "elbow.pos")
+    np.testing.assert_array_equal(data["reward"][:9], np.arange(9))
+    assert data.task.timestep == 1 / 30
+    assert "images are left out: observation.images.top" in told
+    assert "not used: timestamp, index, task_index" in told
+    told, few = imported(tmp_path / "arm", "--observations", "observation.state.elbow*", out="few")
+    assert few.task.feature_names == ("elbow.pos",)
+
+
+def test_what_is_exported_to_lerobot_has_its_layout_and_comes_back(tmp_path):
+    _, data = imported(lerobot_folder(tmp_path / "arm"))
+    out = tmp_path / "again"
+    done = jbrep("data", "export", data.folder, "--to", "lerobot", "--out", out)
+    assert done.output == f"open it with LeRobotDataset('again', root='{out}')\n"
+    info = json.loads((out / "meta/info.json").read_text())
+    assert (info["fps"], info["total_episodes"], info["total_frames"]) == (30, 3, 30)
+    assert pandas.read_parquet(out / "meta/tasks.parquet").loc[data.task.name].task_index == 0
+    episodes = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [each["dataset_to_index"] for each in episodes] == [9, 19, 30]
+    _, back = imported(out, out="back")  # without the last steps, whose next states have no place
+    assert back.episodes["length"].tolist() == [8, 9, 10]
+    np.testing.assert_array_equal(back["action"][:8], data["action"][:8])
+    assert back.task.features == data.task.features
+    unknown = Dataset.from_table(
+        tmp_path / "unknown", {"x": [0.0, 1, 2], "action": [0.5] * 3}, Layout(length=9)
+    )
+    done = jbrep("data", "export", unknown.folder, "--to", "lerobot", "--out", tmp_path / "no")
+    assert "doesn't say how long a step lasts" in done.output
+
+
+def test_damaged_lerobot_data_sets_are_refused(tmp_path):
+    folder = lerobot_folder(tmp_path / "new", "v4.0")
+    done = jbrep("data", "import", folder, "--out", tmp_path / "out")
+    assert "layout v4.0: it must be v3.0 or v2.1" in done.output
+    (folder / "meta/info.json").write_text("{}")
+    done = jbrep("data", "import", folder, "--out", tmp_path / "out")
+    assert "isn't as LeRobot writes it: KeyError('codebase_version')" in done.output
+    shutil.rmtree(folder / "data")
+    (folder / "meta/info.json").write_text(
+        json.dumps({"codebase_version": "v3.0", "fps": 30, "features": {}})
+    )
+    done = jbrep("data", "import", folder, "--out", tmp_path / "out")
+    assert "has no data/chunk-*/*.parquet" in done.output
+    assert not (tmp_path / "out").exists()
