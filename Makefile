@@ -10,7 +10,7 @@ TASKS := move_from_origin face_direction move_in_direction move_to_position move
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures figures samples data encoders decoded $(STUDIES) trainers policies behaviour clean
+.PHONY: help setup demo test coverage check bench pictures docs figures samples data encoders decoded $(STUDIES) trainers policies behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -45,7 +45,7 @@ test: $(READY) ## the test suite
 coverage: $(READY) ## the test suite, with the lines of jbrep/ that no test runs
 	$(BIN)/python -m pytest --cov
 
-check: $(READY) ## lint, types, import direction
+check: docs ## lint, types, import direction, links of the documentation
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -70,6 +70,9 @@ pictures: $(READY) ## the pictures in docs/, drawn anew
 	$(BIN)/jbrep inspect data/sample/face_direction --episode 1 --encoder dae-8 --out inspect/shown.rrd
 	$(BIN)/jbrep report results/confirm-move
 	MUJOCO_GL=egl $(BIN)/python tools/pictures.py results/confirm-move/report.html inspect/shown.rrd docs
+
+docs: $(READY) ## the documentation as a site, in site/
+	$(BIN)/python tools/site.py site
 
 figures: $(READY) ## figures and reports in results/ anew, from the tables there
 	$(BIN)/python tools/figures.py
