@@ -257,6 +257,9 @@ def test_what_fails_is_closed_kept_and_tried_again(tmp_path):
     assert told.exit_code == 0, told.output
     assert "no answer; it is tried again" in told.stderr
     assert contents(tmp_path / "d") == contents(tmp_path / "e")
+    Arm.steps_of_all = 0  # in the episodes that a shard's size is judged by
+    told = jbrep(*command[:-1], tmp_path / "f", "--retries", 1)
+    assert (told.exit_code, told.stderr.count("it is tried again")) == (0, 1), told.output
     assert closed(tmp_path)
 
 

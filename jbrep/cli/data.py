@@ -98,7 +98,7 @@ def collect(
         task=task, policy=actor.settings(), steps=steps, seed=seed, store_state=store_state
     )
     if shard_episodes is None:
-        shard_episodes = usual_shard_episodes(settings, out, actor)
+        shard_episodes = usual_shard_episodes(settings, out, actor, retries)
     settings = settings.replace(shard_episodes=shard_episodes)
     _tell_kept(out, settings.policy)
     with stoppable(RESUMES):

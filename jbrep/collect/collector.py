@@ -312,14 +312,17 @@ def _flat(settings: DataSettings) -> dict[str, Any]:
     return {n: v for n, v in settings.as_json().items() if n != "environment"} | task
 
 
-def usual_shard_episodes(settings: DataSettings, folder: Path, policy: Policy | None = None) -> int:
+def usual_shard_episodes(
+    settings: DataSettings, folder: Path, policy: Policy | None = None, retries: int = 0
+) -> int:
     """Episodes in a shard of the usual size, judging by the data set's first few.
 
     A batch's shards have 100,000 steps, each with all threads; other environments' 20,000, since
     they are made side by side. A data set that is there already keeps its own number.
 
     Raises:
-        InputError: the manifest in the folder can't be read.
+        InputError: the manifest in the folder can't be read, or the environment fails more than
+            `retries` times in a row.
     """
     if exists(folder / MANIFEST):
         return read_manifest(folder).settings.shard_episodes
@@ -328,6 +331,6 @@ def usual_shard_episodes(settings: DataSettings, folder: Path, policy: Policy | 
     if task.terminates is not False:
         policy = policy or make_policy(settings.policy)
         pilot = settings.replace(shard_episodes=_PILOT)
-        columns = Simulator(pilot, policy).shard(0, lambda steps: None)
+        columns = Simulator(pilot, policy, retries=retries).shard(0, lambda steps: None)
         length = columns[EPISODES + "length"].mean()
     return max(1, round((_BATCH_ROWS if is_batched(task) else SHARD_ROWS) / length))
