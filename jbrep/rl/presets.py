@@ -166,11 +166,11 @@ _MANY_ROBOTS = {  # few gradient steps: one for 16 steps of a robot
     "buffer_size": 1_000_000,
     "learning_starts": 12_800,
     "train_freq": 1,
-    "gradient_steps": 4,
+    "gradient_steps": 8,
     "batch_size": 512,
 }
 _WIDE = {
-    name: Hyperparameters((128, 128), _MANY_ROBOTS, num_envs=64, noise=noise)
+    name: Hyperparameters((128, 128), _MANY_ROBOTS, num_envs=64, noise=noise, action_repeat=2)
     for name, noise in {
         "ddpg": NormalNoise(sigma=0.2),
         "td3": NormalNoise(sigma=0.2),
