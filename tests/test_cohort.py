@@ -217,7 +217,7 @@ FOLLOWED = [
 def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, tmp_path):
     """The same bits until the first gradient step; ten steps later, the same weights nearly."""
     settings = {"learning_starts": 100, **overrides}
-    steps = 110 * overrides.get("action_repeat", 1)
+    steps = 110 * overridden(algorithm, preset, settings).action_repeat
     made = runs(steps, preset, algorithm=algorithm, overrides=settings)
     members = [Member(Job(run, tmp_path / str(run.seed)), []) for run in made]
     cohort = Cohort(members)
