@@ -19,65 +19,44 @@ import wrapt
 from jbrep.lazy import exports
 
 if TYPE_CHECKING:
-    from jbrep.api import (
-        collect,
-        evaluate,
-        report,
-        study,
-        train,
-        train_encoder,
-    )
-    from jbrep.dataset.reader import Dataset
-    from jbrep.encoders.encoder import Encoder
-    from jbrep.encoders.vec_env import JitterbugVecEnv
-    from jbrep.encoders.wrapper import Encoded
-    from jbrep.envs.description import describe
-    from jbrep.envs.lanes import Lanes
-    from jbrep.envs.task import Feature, Task
-    from jbrep.rl.controller import load_policy
-    from jbrep.study.config import Study
+    from jbrep.api import collect as collect
+    from jbrep.api import evaluate as evaluate
+    from jbrep.api import report as report
+    from jbrep.api import study as study
+    from jbrep.api import train as train
+    from jbrep.api import train_encoder as train_encoder
+    from jbrep.dataset.reader import Dataset as Dataset
+    from jbrep.encoders.encoder import Encoder as Encoder
+    from jbrep.encoders.vec_env import JitterbugVecEnv as JitterbugVecEnv
+    from jbrep.encoders.wrapper import Encoded as Encoded
+    from jbrep.envs.description import describe as describe
+    from jbrep.envs.lanes import Lanes as Lanes
+    from jbrep.envs.task import Feature as Feature
+    from jbrep.envs.task import Task as Task
+    from jbrep.rl.controller import load_policy as load_policy
+    from jbrep.study.config import Study as Study
 
-__all__ = [
-    "Dataset",
-    "Encoded",
-    "Encoder",
-    "Feature",
-    "JitterbugVecEnv",
-    "Lanes",
-    "Study",
-    "Task",
-    "collect",
-    "describe",
-    "evaluate",
-    "load_policy",
-    "report",
-    "study",
-    "train",
-    "train_encoder",
-]
+_CALLABLE = "collect", "evaluate", "report", "study"  # modules that are functions, too
+_PLACES = {
+    **dict.fromkeys(("train", "train_encoder"), "api"),
+    "Dataset": "dataset.reader",
+    "Encoded": "encoders.wrapper",
+    "Encoder": "encoders.encoder",
+    "Feature": "envs.task",
+    "JitterbugVecEnv": "encoders.vec_env",
+    "Lanes": "envs.lanes",
+    "Study": "study.config",
+    "Task": "envs.task",
+    "describe": "envs.description",
+    "load_policy": "rl.controller",
+}
+__all__ = [*_CALLABLE, *_PLACES]
 
-_MODULES = "collect", "evaluate", "report", "study"  # that are functions, too
-
-_load = exports(
-    __name__,
-    {
-        **dict.fromkeys(("train", "train_encoder"), "api"),
-        "Dataset": "dataset.reader",
-        "Encoded": "encoders.wrapper",
-        "Encoder": "encoders.encoder",
-        "Feature": "envs.task",
-        "JitterbugVecEnv": "encoders.vec_env",
-        "Lanes": "envs.lanes",
-        "Study": "study.config",
-        "Task": "envs.task",
-        "describe": "envs.description",
-        "load_policy": "rl.controller",
-    },
-)
+_load = exports(__name__, _PLACES)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
+    if name in _CALLABLE:
         return import_module(f"{__name__}.{name}")
     return version(__name__) if name == "__version__" else _load(name)
 
@@ -99,7 +78,7 @@ class _Package(ModuleType):
     """This package, in which some modules can be called as soon as they are imported."""
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in _MODULES and isinstance(value, ModuleType):
+        if name in _CALLABLE and isinstance(value, ModuleType):
             value.__class__ = _Callable
         super().__setattr__(name, value)
 

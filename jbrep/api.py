@@ -1,52 +1,30 @@
 """jbrep from Python: what the commands do, as functions with the same words and defaults.
 
-Each is there as `jbrep.NAME`. A task is the name of one, such as face_direction or Hopper-v5, or
-what `jbrep.describe` returns; data are a `Dataset` or the folder of one.
+Each is there as `jbrep.NAME`; the commands call them. A task is the name of one, such as
+face_direction or Hopper-v5, or what `jbrep.describe` returns; data are a `Dataset` or the folder of
+one. What a function works with is imported when it is called.
 """
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
+from jbrep.errors import InputError, Notice
 
-from jbrep.collect.collector import collect as write_data
-from jbrep.collect.collector import usual_shard_episodes
-from jbrep.collect.shards import LANES
-from jbrep.dataset import Dataset, DataSettings, ScaledDataset
-from jbrep.encoders import Encoder
-from jbrep.encoders.file import SUFFIX
-from jbrep.envs.description import as_task
-from jbrep.envs.task import Task
-from jbrep.errors import InputError, choose
-from jbrep.evaluate.diagnosis import diagnose, write
-from jbrep.evaluate.evaluation import Evaluation
-from jbrep.methods.fit import Fitter
-from jbrep.play.sources import find_good_policy, find_policy
-from jbrep.report.report import PAGE, make_report
-from jbrep.report.statistics import results_text
-from jbrep.report.tables import Tables
-from jbrep.rl import Run
-from jbrep.rl.controller import Controller, load_policy
-from jbrep.rl.files import FINISHED, RunRecord, last_returns, read_evaluations
-from jbrep.rl.trainers import train as train_run
-from jbrep.study import Plan, Study, read_study, run_study
-from jbrep.study.config import as_study
-from jbrep.study.runner import BACKENDS
-from jbrep.study.tables import Return
-from jbrep.text import interval_of, terminal_width
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-__all__ = [
-    "Agent",
-    "Report",
-    "collect",
-    "evaluate",
-    "report",
-    "study",
-    "train",
-    "train_encoder",
-]
+    from jbrep.dataset import Dataset, ScaledDataset
+    from jbrep.encoders import Encoder
+    from jbrep.envs.task import Task
+    from jbrep.evaluate.evaluation import Evaluation
+    from jbrep.report.report import Report
+    from jbrep.rl.controller import Controller
+    from jbrep.rl.files import RunRecord
+    from jbrep.study import Study
 
 
 class Agent(NamedTuple):
@@ -58,19 +36,28 @@ class Agent(NamedTuple):
     """
 
     folder: Path
-    record: RunRecord
+    record: "RunRecord"
 
     @property
-    def returns(self) -> NDArray[np.float64]:
+    def returns(self) -> "NDArray[np.float64]":
         """Returns of the final evaluation, one of each episode."""
+        import numpy as np
+
+        from jbrep.rl.files import last_returns, read_evaluations
+
         return np.array(last_returns(read_evaluations(self.folder)))
 
     @property
-    def policy(self) -> Controller:
+    def policy(self) -> "Controller":
         """What it has learned, as a function of observations."""
+        from jbrep.rl.controller import load_policy
+
         return load_policy(self.folder)
 
     def __repr__(self) -> str:
+        from jbrep.rl.files import FINISHED
+        from jbrep.text import interval_of
+
         settings = self.record.settings
         what = f"{settings.learner} on {settings.representation}, {settings.task}"
         if self.record.status != FINISHED:
@@ -82,35 +69,8 @@ class Agent(NamedTuple):
         )
 
 
-class Report(NamedTuple):
-    """What a study found.
-
-    Attributes:
-        folder: that has the page, the tables and the figures.
-        tables: what these say.
-        notes: what the diagnostics that were given are missing.
-    """
-
-    folder: Path
-    tables: Tables
-    notes: tuple[str, ...] = ()
-
-    @property
-    def page(self) -> Path:
-        """For a browser."""
-        return self.folder / PAGE
-
-    @property
-    def returns(self) -> list[Return]:
-        """The return of every episode of every evaluation: rows for a data frame."""
-        return self.tables.returns
-
-    def __repr__(self) -> str:
-        return f"{results_text(self.tables, terminal_width())}\n\n{self.page}"
-
-
 def collect(
-    task: Task | str,
+    task: "Task | str",
     out: str | Path,
     steps: int,
     *,
@@ -118,14 +78,15 @@ def collect(
     seed: int = 0,
     store_state: bool = False,
     shard_episodes: int | None = None,
-    lanes: int = LANES,
+    lanes: int = 100,
     threads: int | None = None,
+    retries: int = 0,
     backend: str = "local",
-) -> Dataset:
+) -> "Dataset":
     """Collect the states that a policy visits, as `jbrep collect` does.
 
     Args:
-        task: whose environment is played.
+        task: whose environment is played; how readings that are missing are treated belongs to it.
         out: a folder: new, or with an unfinished or smaller data set of the same settings.
         steps: how many; the last episode is completed.
         policy: uniform, heuristic, the folder of a run, or another that the command takes.
@@ -133,13 +94,26 @@ def collect(
         store_state: store the Jitterbug's qpos and qvel, too.
         shard_episodes: episodes in a shard; None for shards of a usual size.
         lanes: environments that are stepped at once.
-        threads: of a batch, or processes; None for as many as cores.
+        threads: of a batch, or processes; None for as many as cores, 1 for a robot that exists
+            once.
+        retries: how often in a row an environment that fails is made anew and tried again.
         backend: local, or ray for a cluster.
 
     Raises:
         InputError: as `jbrep.collect.collector.collect`.
     """
+    from jbrep.collect.collector import collect as run
+    from jbrep.collect.collector import usual_shard_episodes
+    from jbrep.dataset import Dataset, DataSettings
+    from jbrep.envs.description import as_task
+    from jbrep.play.sources import find_policy
+
     folder, known = Path(out), as_task(task)
+    if not known.reproducible:
+        _note(
+            f"{known.name} is not reproducible: no episode can be simulated again, to verify or to "
+            "repair the data set"
+        )
     actor = find_policy(policy, folder, known)
     settings = DataSettings(
         task=known, policy=actor.settings(), steps=steps, seed=seed, store_state=store_state
@@ -147,19 +121,20 @@ def collect(
     settings = settings.replace(
         shard_episodes=shard_episodes or usual_shard_episodes(settings, folder, actor)
     )
-    write_data(settings, folder, lanes, threads, backend, actor)
+    _tell_kept(folder, settings.policy)
+    run(settings, folder, lanes, threads, backend, actor, retries)
     return Dataset(folder)
 
 
 def train_encoder(
-    data: Dataset | str | Path,
+    data: "Dataset | str | Path",
     out: str | Path,
     kind: str = "dae",
     *,
     name: str | None = None,
     device: str = "auto",
     **settings: Any,
-) -> Encoder:
+) -> "Encoder":
     """Make an encoder from a data set, as `jbrep train-encoder` does.
 
     Args:
@@ -174,17 +149,19 @@ def train_encoder(
         InputError: a setting that the kind doesn't take, or one that is missing; or the file
             that it would have is another encoder's.
     """
+    from jbrep.methods.fit import Fitter
+
     fitter = Fitter(_scaled(data), Path(out), device)
     return fitter.fit(kind, name=name, **settings).encoder
 
 
 def evaluate(
     encoders: Mapping[str, Any] | Sequence[Any] | Any,
-    data: Dataset | str | Path,
+    data: "Dataset | str | Path",
     out: str | Path | None = None,
     *,
     policy: str | None = None,
-) -> Evaluation:
+) -> "Evaluation":
     """Judge encoders on the held-out part of a data set, as `jbrep evaluate` does.
 
     Args:
@@ -197,17 +174,20 @@ def evaluate(
     Raises:
         InputError: an encoder that isn't one of this task's, or two of one name.
     """
+    from jbrep.encoders.shipped import find_all
+    from jbrep.evaluate.diagnosis import diagnose, write
+    from jbrep.play.sources import find_good_policy
+    from jbrep.records.storage import check_writable
+
+    if out is not None:
+        check_writable(Path(out))
     scaled = _scaled(data)
-    labelled, good = _labelled(encoders), find_good_policy(policy, scaled.task)
-    return (
-        diagnose(labelled, scaled, good)
-        if out is None
-        else write(labelled, scaled, Path(out), good)
-    )
+    found, good = find_all(encoders, scaled.task), find_good_policy(policy, scaled.task)
+    return diagnose(found, scaled, good) if out is None else write(found, scaled, Path(out), good)
 
 
 def train(
-    task: Task | str,
+    task: "Task | str",
     out: str | Path,
     *,
     algorithm: str = "sac",
@@ -215,6 +195,10 @@ def train(
     encoder: Any = "full",
     seed: int = 0,
     overrides: Mapping[str, Any] = {},
+    threads: int | None = None,
+    retries: int = 0,
+    wandb: str | None = None,
+    stop: Callable[[], bool] = lambda: False,
     **settings: Any,
 ) -> Agent:
     """Train and evaluate one agent, as `jbrep rl` does.
@@ -228,24 +212,57 @@ def train(
         encoder: what it observes: full, a shipped encoder's name, a file, or an encoder of yours.
         seed: of agent and episodes.
         overrides: settings other than the preset's, such as {"learning_rate": 3e-4}.
+        threads: of a batch; None for as many as cores, 1 for a robot that exists once.
+        retries: how often in a row an environment that fails is made anew and tried again.
+        wandb: a project of Weights & Biases to log to, too.
+        stop: asked before each rollout; once it is true, the run writes a checkpoint and stops.
         settings: of the training: steps, evaluate_every, evaluation_episodes, ...
 
     Raises:
         InputError: an unknown name, or a value that can't be used; or another run is in the folder.
+        StoppedError: `stop` was true.
     """
-    run = Run.of(task, algorithm, preset, overrides, encoder=encoder, seed=seed, **settings)
-    folder = Path(out)
-    return Agent(folder, train_run(run, folder))
+    from joblib import cpu_count
+
+    from jbrep.envs.description import as_task
+    from jbrep.envs.make import is_batched
+    from jbrep.rl.bar import Bar
+    from jbrep.rl.job import Job, Session
+    from jbrep.rl.run import Run
+    from jbrep.rl.settings import MODERN
+    from jbrep.rl.trainers import train_jobs
+
+    known = as_task(task)
+    is_one = threads == 1 and not is_batched(known)
+    preset = preset or (MODERN if is_one else "")
+    run = Run.of(known, algorithm, preset, overrides, encoder=encoder, seed=seed, **settings)
+    if is_one and run.learner.hyperparameters.num_envs > 1:
+        run = run.replace(learner=run.learner.overridden({"num_envs": 1}))
+    job = Job(run, Path(out), threads or cpu_count(), retries, is_one)
+    if not known.reproducible:
+        _note(
+            f"{known.name} is not reproducible: the same seed gives other numbers the next time, "
+            "and a run that is stopped can't be resumed"
+        )
+    writers = []
+    if wandb:
+        from jbrep.rl.tracker import Tracker
+
+        writers.append(Tracker(wandb, job.folder, job.settings))
+    with closing(Bar(run.steps, f"{algorithm} on {job.encoder.name}")) as bar:
+        session = Session(bar.show, stop=stop, writers=writers, keeps=True)
+        ((_, record),) = train_jobs([job], session)
+    return Agent(job.folder, record)
 
 
 def study(
-    study: Study | Mapping[str, Any] | str | Path,
+    study: "Study | Mapping[str, Any] | str | Path",
     out: str | Path,
     *,
     workers: int | None = None,
     width: int | None = None,
     backend: str = "local",
-) -> Report:
+) -> "Report":
     """Train a grid of agents, and report what became of them, as `jbrep study` does.
 
     Args:
@@ -258,8 +275,13 @@ def study(
     Raises:
         InputError: a study that can't be run, or the folder holds another.
     """
+    from jbrep.errors import choose
+    from jbrep.study import Plan, run_study
+    from jbrep.study.runner import BACKENDS
+
     plan = Plan(_study(study), Path(out))
-    run_study(plan, choose(backend, BACKENDS, "backend"), workers, width)
+    if crashed := run_study(plan, choose(backend, BACKENDS, "backend"), workers, width):
+        _note(f"{crashed} runs crashed: the same call tries them again")
     return report(plan.folder)
 
 
@@ -269,7 +291,7 @@ def report(
     evaluation: Sequence[str] = (),
     across_trainers: bool = False,
     out: str | Path | None = None,
-) -> Report:
+) -> "Report":
     """Show what a study found, as `jbrep report` does.
 
     Args:
@@ -281,33 +303,41 @@ def report(
     Raises:
         InputError: there is nothing of a study, or a file is damaged.
     """
-    target = Path(out or folder)
-    made = make_report(Path(folder), target, evaluation, across_trainers)
-    return Report(target, made.tables, tuple(made.lines))
+    from jbrep.records.storage import check_writable
+
+    if not Path(folder).exists():
+        raise InputError(f"{folder} is not the folder of a study: there is no such folder")
+    if out:
+        check_writable(Path(out))
+    from jbrep.report.report import make_report  # imports torch
+
+    return make_report(Path(folder), Path(out) if out else None, evaluation, across_trainers)
 
 
-def _study(given: Study | Mapping[str, Any] | str | Path) -> Study:
+def _study(given: "Study | Mapping[str, Any] | str | Path") -> "Study":
+    from jbrep.study import Study, read_study
+    from jbrep.study.config import as_study
+
     if isinstance(given, Study):
         return given
     return as_study(given) if isinstance(given, Mapping) else read_study(Path(given))
 
 
-def _scaled(data: Dataset | str | Path) -> ScaledDataset:
+def _scaled(data: "Dataset | str | Path") -> "ScaledDataset":
+    from jbrep.dataset import Dataset, ScaledDataset
+
     return ScaledDataset(data if isinstance(data, Dataset) else Dataset(data))
 
 
-def _labelled(encoders: Any) -> dict[str, Any]:
-    """Encoders by the names that tables call them."""
-    if isinstance(encoders, Mapping):
-        return dict(encoders)
-    several = encoders if isinstance(encoders, (list, tuple)) else [encoders]
-    labels = [_label(each) for each in several]
-    if twice := {label for label in labels if labels.count(label) > 1}:
-        raise InputError(f"{min(twice)} is given twice: give encoders as a dictionary, by names")
-    return dict(zip(labels, several, strict=True))
+def _tell_kept(folder: Path, policy: Mapping[str, Any]) -> None:
+    """Say which policies of runs the data set has already, as they were then."""
+    from jbrep.dataset.settings import TRAINED, parts_of
+
+    for part in parts_of(policy):
+        if part["kind"] == TRAINED and (folder / part["file"]).exists():
+            known = f"{part['run']} acts as it did at step {part['step']:,}"
+            _note(f"{known}, which {folder / part['file']} keeps")
 
 
-def _label(encoder: Any) -> str:
-    if isinstance(encoder, (str, Path)):
-        return Path(encoder).name.removesuffix(SUFFIX)
-    return str(getattr(encoder, "name", type(encoder).__name__))
+def _note(line: str) -> None:
+    warnings.warn(line, Notice, stacklevel=3)

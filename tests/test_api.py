@@ -47,7 +47,7 @@ def test_encoders_are_judged_by_names_and_as_a_dictionary(home):
     named = jbrep.evaluate({"mine": path}, jbrep.Dataset(home / "data"), home / "evaluation")
     assert (home / "evaluation/evaluation.json").exists()
     assert named.encoders["mine"].reconstruction == by_name.encoders["pca-4"].reconstruction
-    with pytest.raises(InputError, match="pca-4 is given twice: give encoders as a dictionary"):
+    with pytest.raises(InputError, match="pca-4 is given twice: leave one out, or, in Python"):
         jbrep.evaluate([path, path], home / "data")
 
 

@@ -41,9 +41,9 @@ def long(tmp_path_factory):
 
 def test_an_extended_data_set_is_the_one_collected_at_once(short, long, tmp_path):
     folder = shutil.copytree(short, tmp_path / "data")
-    assert collect(two_by_two(350), folder).rows == 100  # the last shard becomes a full one
-    assert collect(two_by_two(400), folder).rows == 0
-    assert collect(two_by_two(500), folder, lanes=1, num_threads=1).rows == 100
+    assert collect(two_by_two(350), folder).rows == 400  # the last shard becomes a full one
+    assert collect(two_by_two(400), folder).rows == 400
+    assert collect(two_by_two(500), folder, lanes=1, num_threads=1).rows == 500
     found = subprocess.run(
         ["diff", "-r", folder, long], capture_output=True, text=True, check=False
     )

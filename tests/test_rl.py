@@ -23,7 +23,6 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import VecMonitor
 
-from jbrep.cli.rl import _Bar
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
 from jbrep.envs.recording import Outcome, episode_returns
@@ -31,6 +30,7 @@ from jbrep.errors import InputError
 from jbrep.records import container
 from jbrep.rl import Run, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
+from jbrep.rl.bar import Bar
 from jbrep.rl.checkpoint import History
 from jbrep.rl.files import EVALUATION_SEED, FAILED, FINISHED, POLICY, read_evaluations, read_run
 from jbrep.rl.from_zip import load_zip
@@ -368,7 +368,7 @@ class Terminal(io.StringIO):
 def test_a_terminal_shows_the_course_of_the_return(encoding, means, course, monkeypatch):
     terminal = Terminal(encoding)
     monkeypatch.setattr(sys, "stderr", terminal)
-    with closing(_Bar(5_000_000, "sac on a-long-name-of-an-encoder")) as bar:
+    with closing(Bar(5_000_000, "sac on a-long-name-of-an-encoder")) as bar:
         bar.show(made_up_job(), 1000, None)
         bar._progress.start_t -= 36_000  # seconds
         bar.show(made_up_job(*means), 100_000, None)
@@ -381,7 +381,7 @@ def test_a_terminal_shows_the_course_of_the_return(encoding, means, course, monk
 
 def test_the_rate_after_resuming_counts_the_steps_since():
     job = made_up_job()
-    with closing(_Bar(1000, "sac")) as bar:
+    with closing(Bar(1000, "sac")) as bar:
         bar.show(job, 500, None)
         bar.show(job, 600, 1.0)
         assert (bar._progress.n, bar._progress.initial) == (600, 500)

@@ -183,7 +183,7 @@ def test_an_environment_that_is_not_reproducible(tmp_path):
     rl = ("rl", "--task", cart.ID, "--env", "drifts=true", "--algorithm", "a2c", "--steps", 80)
     told = jbrep(*rl, "--evaluation-episodes", 1, "--out", tmp_path / "run")
     assert told.exit_code == 0, told.output
-    assert told.stderr.startswith("Test/Cart-v0 is not reproducible: ")
+    assert told.stderr.startswith("Note: Test/Cart-v0 is not reproducible: ")
     assert told.stderr.count("\n") == 1
     drifting = describe(cart.ID, {"drifts": True})
     run = Run.of(task=drifting, algorithm="a2c", steps=80, evaluation_episodes=1, preset="paper")

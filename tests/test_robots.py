@@ -112,7 +112,7 @@ def test_an_episode_is_played_again_before_a_data_set_grows(tmp_path, monkeypatc
     assert "played again is another one now; has the environment changed" in told
     monkeypatch.undo()
     again = collect(settings.replace(steps=80), tmp_path / "e", num_threads=1)
-    assert again.manifest == Dataset(tmp_path / "d").manifest
+    assert again == Dataset(tmp_path / "d").manifest
     assert len(contents(tmp_path / "d")) == len(before)
 
 

@@ -1,10 +1,11 @@
 """Collecting data sets, and working with them."""
 
 import signal
-from collections.abc import Iterable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -30,9 +31,12 @@ from jbrep.cli.environment import (
 )
 from jbrep.cli.options import record_options
 from jbrep.dataset.layout import Layout
-from jbrep.dataset.settings import TRAINED, CollectSettings, parts_of
+from jbrep.dataset.settings import CollectSettings
 from jbrep.errors import InputError
 from jbrep.text import counted, terminal_width
+
+if TYPE_CHECKING:
+    from jbrep.dataset import Dataset
 
 _lanes = click.option(
     "--lanes",
@@ -60,19 +64,7 @@ _data = click.argument("data", type=PATH)
 @retries_option
 @click.option("--backend", default="local", show_default=True, help="local, or ray for a cluster.")
 @click.option("--out", required=True, type=PATH, help="A folder.")
-def collect(
-    steps: int,
-    seed: int,
-    policy: str,
-    store_state: bool,
-    shard_episodes: int | None,
-    lanes: int,
-    threads: int | None,
-    retries: int,
-    backend: str,
-    out: Path,
-    **options: Any,
-) -> None:
+def collect(out: Path, **options: Any) -> None:
     """Collect the states that a policy visits.
 
     The same command resumes an unfinished data set and leaves a finished one as it is; with more
@@ -81,11 +73,9 @@ def collect(
     Episodes that are finished are kept whatever happens. The policy of a run is kept with the data
     as it is at the start, also if the run goes on.
     """
-    from jbrep.collect import collect as run
-    from jbrep.collect.collector import usual_shard_episodes
-    from jbrep.dataset import DataSettings
-    from jbrep.play.sources import find_policy
+    from jbrep import api
 
+<<<<<<< HEAD
     task = needed_task(options)
     if not task.reproducible:
         click.echo(
@@ -101,33 +91,31 @@ def collect(
         shard_episodes = usual_shard_episodes(settings, out, actor, retries)
     settings = settings.replace(shard_episodes=shard_episodes)
     _tell_kept(out, settings.policy)
+=======
+    _report(out, lambda: api.collect(needed_task(options), out, **options))
+
+
+def _report(out: Path, write: Callable[[], object]) -> None:
+    """Let a data set be written; print what the folder holds then, and how fast it was written."""
+    from jbrep.dataset import Dataset
+    from jbrep.dataset.manifest import MANIFEST, current_manifest
+
+    before = current_manifest(out).rows if (out / MANIFEST).exists() else 0
+    began = time.monotonic()
+>>>>>>> 6e0821d (The commands call jbrep.api: settings are built, encoders named and runs trained in one place)
     with stoppable(RESUMES):
-        _report(out, *run(settings, out, lanes, threads, backend, actor, retries))
-
-
-def _tell_kept(out: Path, policy: Mapping[str, Any]) -> None:
-    """Say which policies of runs the data set has already, as they were then."""
-    for part in parts_of(policy):
-        if part["kind"] == TRAINED and (out / part["file"]).exists():
-            known = f"{part['run']} acts as it did at step {part['step']:,}"
-            say(f"{known}, which {out / part['file']} keeps", err=True)
-
-
-def _report(out: Path, manifest: Any, rows: int, seconds: float) -> None:
-    """Print what the folder holds now, and how fast it was written."""
-    _report_size(out, manifest)
-    _tell_missing(out)
-    if rows:
+        write()
+    seconds, dataset = time.monotonic() - began, Dataset(out)
+    _report_size(out, dataset.manifest)
+    _tell_missing(dataset)
+    if rows := len(dataset) - before:
         click.echo(f"{rows:,} rows in {seconds:,.0f} s, {rows / seconds:,.0f} a second")
     else:
         click.echo("it was complete already: nothing was done")
 
 
-def _tell_missing(out: Path) -> None:
+def _tell_missing(dataset: "Dataset") -> None:
     """Say how many readings were missing."""
-    from jbrep.dataset import Dataset
-
-    dataset = Dataset(out)
     if dataset.task.missing:
         count = int(dataset.episodes["missing"].sum())
         say(f"{count:,} missing readings ({dataset.task.missing})", err=True)
@@ -248,11 +236,10 @@ def derive(
 
     if bool(task) == (bool(hide) or history > 1):
         raise InputError("give a --task, or else --hide or --history")
-    with stoppable(RESUMES):
-        if task:
-            _report(out, *run(data, task, out, store_state, threads))
-        else:
-            _report(out, *derive_view(data, out, hide, history))
+    if task:
+        _report(out, lambda: run(data, task, out, store_state, threads))
+    else:
+        _report(out, lambda: derive_view(data, out, hide, history))
 
 
 @data.command(epilog="Example: jbrep data export data/face --to parquet --out face.parquet")
@@ -284,7 +271,7 @@ def export(data: Path, to: str, out: Path) -> None:
 )
 @click.option("--out", required=True, type=PATH, help="A new folder.")
 def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
-    """Make a data set of one that was made elsewhere, or of a robot's logs.
+    """Make a data set of other tools' data, or of logs.
 
     SOURCE is a file (.csv, .tsv, .txt, .parquet, .npz), the folder of a Minari data set, or its id
     in MINARI_DATASETS_PATH; of several, an episode ends with each. Without --task, the task is the

@@ -78,38 +78,30 @@ def evaluate(
     the latent's units and dimensions, nearest neighbours, and the prediction of the next latent. An
     encoder of your own is code such as mymodule:MyEncoder; its module is imported, which runs it.
     """
-    from jbrep.dataset import Dataset, ScaledDataset
-    from jbrep.encoders import find
-    from jbrep.encoders.shipped import check_found, source_of
+    from jbrep import api
+    from jbrep.dataset import Dataset
+    from jbrep.encoders.shipped import check_found, find_all, source_of
     from jbrep.envs.names import import_code
 
     whole = Dataset(data)
     for name in encoder:
         import_code(name)
         check_found(name, whole.task)
-    from jbrep.evaluate.diagnosis import write  # imports torch
-    from jbrep.evaluate.evaluation import EVALUATION
-    from jbrep.play.sources import find_good_policy
-    from jbrep.records.storage import check_writable
+    from jbrep.evaluate.evaluation import EVALUATION  # imports torch
     from jbrep.report.evaluation import evaluation_text
     from jbrep.report.figures import encoder_plots
     from jbrep.report.figures import write as write_plots
 
-    scaled = ScaledDataset(whole)
-    encoders = [find(name, scaled.task) for name in encoder]
-    sources = [source_of(name, scaled.task) for name in encoder]
-    labels = _labels([each.name for each in encoders], sources)
-    if twice := {label for label in labels if labels.count(label) > 1}:
-        raise InputError(f"{min(twice)} is given twice: leave one out")
-    out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(labels))[:_LETTERS])
-    check_writable(out)
-    labelled = dict(zip(labels, encoders, strict=True))
+    encoders = find_all(encoder, whole.task)
+    sources = {
+        label: source_of(name, whole.task) for label, name in zip(encoders, encoder, strict=True)
+    }
+    out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(encoders))[:_LETTERS])
     with stoppable("the same command starts over"):
-        evaluation = write(labelled, scaled, out, find_good_policy(policy, scaled.task))
+        evaluation = api.evaluate(encoders, whole, out, policy=policy)
         pictures = write_plots(encoder_plots(evaluation), out)
     width = terminal_width()
-    told = _notes(labelled, dict(zip(labels, sources, strict=True)), evaluation)
-    notes = [wrapped(printable(note), width) for note in told]
+    notes = [wrapped(printable(note), width) for note in _notes(encoders, sources, evaluation)]
     if as_json:
         click.echo("\n".join(notes), err=True)
         return echo_json(evaluation.as_json())
@@ -139,18 +131,6 @@ def _notes(
             "same seed or isn't known."
         )
     return notes
-
-
-def _labels(names: list[str], sources: list[str]) -> list[str]:
-    """What tables call encoders: their names, or their sources where a name is taken."""
-    from jbrep.encoders import FULL
-    from jbrep.encoders.file import SUFFIX
-
-    taken = [FULL, *names]
-    return [
-        name if taken.count(name) == 1 else source.removesuffix(SUFFIX).removesuffix(", code")
-        for name, source in zip(names, sources, strict=True)
-    ]
 
 
 @click.group()

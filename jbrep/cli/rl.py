@@ -3,8 +3,8 @@
 import os
 import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -27,25 +27,15 @@ from jbrep.cli.environment import needed_task, parse_arguments, retries_option, 
 from jbrep.cli.options import record_options
 from jbrep.errors import choose
 from jbrep.records.record import converted
-from jbrep.rl.settings import CLASSES, MODERN, Seed, TrainingSettings
-from jbrep.text import interval_of, rounded, sparkline
+from jbrep.rl.settings import CLASSES, Seed, TrainingSettings
+from jbrep.text import interval_of, rounded
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.logger import KVWriter
-
-    from jbrep.envs.task import Task
-    from jbrep.rl import Run
-    from jbrep.rl.job import Job
+    pass
 
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
-_LINE = "{desc}: {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"  # on a terminal
 _BESIDE = 10  # episodes of policies that don't learn
-_NAME, _CURVE = 16, 10  # letters and blocks in it, at most
-_NOT_REPRODUCIBLE = (
-    "{} is not reproducible: the same seed gives other numbers the next time, and a run that is "
-    "stopped can't be resumed"
-)
-learner_options = with_options(  # which `given_run` reads
+learner_options = with_options(  # which `checked` reads
     click.option(
         "--algorithm", default="sac", show_default=True, help=f"One of {', '.join(CLASSES)}."
     ),
@@ -79,16 +69,14 @@ learner_options = with_options(  # which `given_run` reads
 )
 
 
-def given_run(options: dict[str, Any], threads: int | None = None, **others: Any) -> "Run":
-    """The run that the options of a command say; code that they name is imported.
+def checked(options: dict[str, Any]) -> dict[str, Any]:
+    """The options of a command as `jbrep.train` takes them; code that they name is imported.
 
     Args:
         options: of `task_options`, `learner_options` and `record_options`.
-        threads: 1 is one lane of an environment that isn't a batch.
-        others: fields of a run.
 
     Raises:
-        InputError: --set isn't NAME=VALUE, or names a setting again; or as `Run.of`.
+        InputError: a word is wrong, before anything heavy is imported.
     """
     from jbrep.encoders.shipped import check_found
     from jbrep.envs.names import import_code
@@ -101,7 +89,7 @@ def given_run(options: dict[str, Any], threads: int | None = None, **others: Any
     if not preset.endswith(".toml"):
         get_preset(preset, algorithm)
     converted(options["seed"], Seed, "seed")
-    overrides = parse_arguments(options.pop("overrides"), "--set")
+    overrides = parse_arguments(options["overrides"], "--set")
     if options.pop("normalize"):
         overrides["normalize"] = True
     if begin_from := options.get("begin_from"):
@@ -109,21 +97,7 @@ def given_run(options: dict[str, Any], threads: int | None = None, **others: Any
     task = needed_task(options)
     import_code(options["encoder"])
     check_found(options["encoder"], task)
-    if is_one := is_one_robot(task, threads):
-        options["preset"] = options["preset"] or MODERN
-    from jbrep.rl import Run  # imports torch, after all words are known to be right
-
-    run = Run.of(task, overrides=overrides, **options, **others)
-    if is_one and run.learner.hyperparameters.num_envs > 1:
-        return run.replace(learner=run.learner.overridden({"num_envs": 1}))
-    return run
-
-
-def is_one_robot(task: "Task", threads: int | None) -> bool:
-    """Whether a command is to have one instance of an environment."""
-    from jbrep.envs.make import is_batched
-
-    return threads == 1 and not is_batched(task)
+    return {**options, "task": task, "overrides": overrides}
 
 
 @click.command(
@@ -151,21 +125,12 @@ def is_one_robot(task: "Task", threads: int | None) -> bool:
 )
 @click.option(
     "--wandb",
-    "project",
     metavar="PROJECT",
     help="Log to Weights & Biases, too; WANDB_MODE=offline keeps it in the folder.",
 )
 @click.option("--out", required=True, type=PATH, help="A folder for this run.")
 @click.pass_context
-def rl(
-    context: click.Context,
-    /,
-    out: Path,
-    project: str | None,
-    threads: int | None,
-    retries: int,
-    **options: Any,
-) -> None:
+def rl(context: click.Context, /, out: Path, **options: Any) -> None:
     """Train and evaluate one agent.
 
     It sees the full observation, scaled, or an encoder's latent. A checkpoint is written every
@@ -174,111 +139,37 @@ def rl(
     on from there, to the result that it would have had with as many from the start.
     """
     with stop_signals() as received:
-        run = given_run(options, threads)
-        from joblib import cpu_count
-
+        options = checked(options)
+        from jbrep import api
         from jbrep.encoders.shipped import source_of
         from jbrep.envs.infos import shares_text
-        from jbrep.rl import StoppedError
-        from jbrep.rl.files import (
-            EVALUATIONS,
-            RUN,
-            last_infos,
-            last_returns,
-            read_evaluations,
-            read_infos,
-        )
-        from jbrep.rl.job import Job, Session
-        from jbrep.rl.trainers import train_jobs
+        from jbrep.rl.checkpoint import StoppedError  # imports torch
+        from jbrep.rl.files import EVALUATIONS, RUN, last_infos, read_evaluations, read_infos
         from jbrep.study.single import beside
 
-        is_one = is_one_robot(run.task, threads)
-        job = Job(run, out, threads or cpu_count(), retries, is_one)
-        source = source_of(run.encoder, run.task)
-        if not run.task.reproducible:
-            click.echo(_NOT_REPRODUCIBLE.format(run.task.name), err=True)
+        task = options["task"]
         try:
-            with closing(_Bar(run.steps, f"{run.learner.algorithm} on {source}")) as bar:
-                writers = _writers(project, job)
-                session = Session(
-                    bar.show, stop=lambda: bool(received), writers=writers, keeps=True
-                )
-                ((_, result),) = train_jobs([job], session)
+            agent = api.train(out=out, stop=lambda: bool(received), **options)
         except StoppedError as error:
-            resumes = f"; {RESUMES}" if run.task.reproducible else ""
+            resumes = f"; {RESUMES}" if task.reproducible else ""
             click.echo(f"{error}{resumes}", err=True)
             context.exit(128 + received[0])  # as a shell reports a command that a signal ended
-    if result.reason is not None:
-        click.echo(f"the run failed: {result.reason}; see {out / RUN}", err=True)
+    if agent.record.reason is not None:
+        click.echo(f"the run failed: {agent.record.reason}; see {out / RUN}", err=True)
         context.exit(1)
-    evaluations = read_evaluations(out)
-    last = last_returns(evaluations)
-    name = result.settings.representation
+    returns = agent.returns
+    name = agent.record.settings.representation
     click.echo(
-        f"returns on {name} at the end: {interval_of(last)}, median [10 %, 90 %] of {len(last)} "
-        "episodes"
+        f"returns on {name} at the end: {interval_of(returns)}, median [10 %, 90 %] of "
+        f"{len(returns)} episodes"
     )
-    if told := shares_text(last_infos(read_infos(out), evaluations)):
+    if told := shares_text(last_infos(read_infos(out), read_evaluations(out))):
         say(told)
     with stoppable("the run itself is finished"):
-        if compared := beside(run.task, last, min(len(last), _BESIDE)):
+        if compared := beside(task, returns, min(len(returns), _BESIDE)):
             say(str(compared))
+    source = source_of(options["encoder"], task)
     say(f"encoder: {source}; all evaluations: {out / EVALUATIONS}")
-
-
-def _writers(project: str | None, job: "Job") -> "list[KVWriter]":
-    """What logs to a project of Weights & Biases, if there is one."""
-    if project is None:
-        return []
-    from jbrep.rl.tracker import Tracker
-
-    return [Tracker(project, job.folder, job.settings)]
-
-
-class _Bar:
-    """A line of progress, from the step on at which the run starts or resumes.
-
-    On a terminal it has a curve of the evaluations' mean returns, and fits 80 columns.
-    """
-
-    def __init__(self, steps: int, name: str):
-        self._steps = steps
-        self._name = name if len(name) <= _NAME else f"{name[: _NAME - 3]}..."
-        self._progress: Any = None
-
-    def show(self, job: "Job", step: int, mean: float | None) -> None:
-        """Show the steps so far and the mean returns of the evaluations.
-
-        The final evaluation can take minutes: all steps are told before it, and after it again.
-        """
-        from jbrep.progress import Progress
-
-        if self._progress is None:
-            self._progress = Progress(
-                total=self._steps,
-                initial=step,
-                desc=self._name,
-                unit="",
-                unit_scale=True,
-                delay=0.5,
-                bar_format=_LINE,
-            )
-        is_final = self._progress.n < self._steps <= step
-        self._progress.update(step - self._progress.n)
-        shown = "final ones under way" if is_final else self._course(job.history.means)
-        self._progress.set_postfix(returns=shown, refresh=is_final)
-
-    def _course(self, means: Sequence[float]) -> str:
-        """The last mean return, after a curve of all where there are Unicode's blocks."""
-        if not means:
-            return "-"
-        curve = "" if self._progress.ascii else sparkline(means, _CURVE)
-        return f"{curve} {rounded(means[-1])[0]}".strip()
-
-    def close(self) -> None:
-        """End the line."""
-        if self._progress is not None:
-            self._progress.close()
 
 
 @contextmanager
@@ -322,8 +213,8 @@ def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **option
     """
     with stop_signals() as received:
         steps, episodes = options["steps"], options["evaluation_episodes"]
-        run = given_run(options, evaluate_every=steps, final_episodes=episodes)
-        from jbrep.rl import StoppedError
+        options = checked(options)
+        from jbrep.rl import Run, StoppedError  # imports torch, after all words are known
         from jbrep.rl.tune import BEST, Trial
         from jbrep.rl.tune import tune as search
 
@@ -331,6 +222,7 @@ def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **option
             score = "failed" if trial.value is None else rounded(trial.value)[0]
             click.echo(f"trial {trial.number + 1} of {trials}: {score}  {_shown(trial.overrides)}")
 
+        run = Run.of(**options, evaluate_every=steps, final_episodes=episodes)
         try:
             best = search(run, trials, seeds, out, show, stop=lambda: bool(received))
         except StoppedError as error:

@@ -131,25 +131,20 @@ def report(
     """
     import json
 
-    from jbrep.errors import InputError
-    from jbrep.records.storage import check_writable
+    from jbrep import api
 
-    if not folder.exists():
-        raise InputError(f"{folder} is not the folder of a study: there is no such folder")
-    if out:
-        check_writable(out)
-    from jbrep.report.report import PAGE, SUMMARY, make_report  # imports torch
+    made = api.report(folder, evaluation=evaluation, across_trainers=across_trainers, out=out)
+    from jbrep.report.report import SUMMARY
     from jbrep.report.statistics import results_text
 
-    made = make_report(folder, out, evaluation, across_trainers)
     if not as_json:
         echo_text(results_text(made.tables, terminal_width(), everything))
-    for line in made.lines:
+    for line in made.notes:
         say(line, err=True)
     if as_json:
-        return echo_json(json.loads(((out or folder) / SUMMARY).read_bytes()))
-    beside = ", ".join(path.name for path in made.paths if path.name != PAGE)
+        return echo_json(json.loads((made.folder / SUMMARY).read_bytes()))
+    beside = ", ".join(path.name for path in made.paths if path != made.page)
     more = "" if everything else " --all prints every table."
     click.echo()
-    say(str((out or folder) / PAGE))
+    say(str(made.page))
     return click.echo(wrapped(f"Beside it: {beside}.{more}", terminal_width()))

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,14 +46,6 @@ _LENGTH = EPISODES + "length"
 Array = NDArray[Any]
 
 
-class Written(NamedTuple):
-    """What a call has done."""
-
-    manifest: Manifest
-    rows: int  # written by this call
-    seconds: float
-
-
 def collect(
     settings: DataSettings,
     folder: Path,
@@ -62,7 +54,7 @@ def collect(
     backend: str = "local",
     policy: Policy | None = None,
     retries: int = 0,
-) -> Written:
+) -> Manifest:
     """Collect a data set, or what is missing of it.
 
     Neither lanes, threads nor backend change a byte, nor does it whether a data set is collected at
@@ -118,7 +110,7 @@ def write_shards(
     produce: Produce,
     files: Mapping[str, bytes] = MappingProxyType({}),
     check: Callable[[], None] = lambda: None,
-) -> Written:
+) -> Manifest:
     """Commit the missing shards, until there are as many rows as the settings ask for.
 
     Args:
@@ -132,7 +124,6 @@ def write_shards(
     Raises:
         InputError: as `collect` does.
     """
-    began = time.monotonic()
     make_folder(folder, ("manifest*", "shard-*", "policy-*"))
     with exclusive(folder):
         there = _begin(settings, folder, files)
@@ -150,7 +141,7 @@ def write_shards(
                 manifest = _fill(folder, there, manifest, produce, progress)
         elif manifest != there:
             write_manifest(folder, manifest)
-    return Written(manifest, manifest.rows - there.rows, time.monotonic() - began)
+    return manifest
 
 
 def _fill(

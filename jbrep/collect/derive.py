@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.collect.collector import Written, write_shards
+from jbrep.collect.collector import write_shards
 from jbrep.collect.policies import acts_on_observations
 from jbrep.collect.replay import replay_problems
 from jbrep.collect.shards import Missing
 from jbrep.dataset import Dataset, DataSettings
-from jbrep.dataset.manifest import new_manifest, open_shard
+from jbrep.dataset.manifest import Manifest, new_manifest, open_shard
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.recording import Tick
@@ -33,7 +33,7 @@ def derive(
     folder: Path,
     store_state: bool = False,
     num_threads: int | None = None,
-) -> Written:
+) -> Manifest:
     """Write the data set that collecting another task with the same settings gives, bit for bit.
 
     Actions that don't depend on observations lead to the same states in every task.

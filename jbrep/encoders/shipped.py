@@ -1,5 +1,7 @@
 """Encoders by name: those that ship with the package, and those that need no data."""
 
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +103,35 @@ def find(name: Any, task: Task | str) -> BaseEncoder:
     encoder = load(_path(name, task))
     encoder.check_task(task)
     return encoder
+
+
+def find_all(given: Any, task: Task) -> dict[str, BaseEncoder]:
+    """Encoders by what tables call them.
+
+    Args:
+        given: one, several, or several by names of the user's, each as `find` takes it. Otherwise
+            they have their own names, or where they are from, if a name is taken.
+        task: whose observations they read.
+
+    Raises:
+        InputError: two have one name; or as `find`.
+    """
+    if isinstance(given, Mapping):
+        return {label: find(each, task) for label, each in given.items()}
+    several = given if isinstance(given, (list, tuple)) else [given]
+    found = [find(each, task) for each in several]
+    taken = Counter((FULL, *(each.name for each in found)))
+    labels = [
+        source_of(name, task).removesuffix(SUFFIX).removesuffix(", code")
+        if taken[each.name] > 1 and isinstance(name, (str, Path))
+        else each.name
+        for name, each in zip(several, found, strict=True)
+    ]
+    if twice := [label for label, count in Counter(labels).items() if count > 1]:
+        raise InputError(
+            f"{twice[0]} is given twice: leave one out, or, in Python, give a dictionary by names"
+        )
+    return dict(zip(labels, found, strict=True))
 
 
 def check_found(name: str, task: Task) -> None:

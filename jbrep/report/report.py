@@ -13,14 +13,15 @@ from jbrep.report import facts
 from jbrep.report.figures import study_plots, write
 from jbrep.report.markdown import markdown
 from jbrep.report.page import page
-from jbrep.report.statistics import association_tables
+from jbrep.report.statistics import association_tables, results_text
 from jbrep.report.tables import Tables, check_tables, read_tables
 from jbrep.report.words import Answer, answers, notes, statements
 from jbrep.stats import Analysis
 from jbrep.stats.analysis import to_plain
 from jbrep.stats.association import Association, Diagnostic, associations
 from jbrep.study.results import conclude, has_runs
-from jbrep.study.tables import add_diagnostics
+from jbrep.study.tables import Return, add_diagnostics
+from jbrep.text import terminal_width
 
 PAGE, SUMMARY, MARKDOWN, FIGURES = "report.html", "summary.json", "summary.md", "figures"
 STATISTICS = "statistics.json"
@@ -28,12 +29,33 @@ _MAIN_FIGURE = "final_return"
 _MOST_SECONDS = 600.0  # to wait for another process's report
 
 
-class Made(NamedTuple):
-    """What was reported."""
+class Report(NamedTuple):
+    """What a study found.
 
+    Attributes:
+        folder: that has the page, the tables and the figures.
+        tables: what these say.
+        notes: what the diagnostics that were given are missing.
+        paths: of the page, the summaries and the folder of the figures.
+    """
+
+    folder: Path
     tables: Tables
-    lines: list[str]  # of encoders that no evaluation knows
-    paths: list[Path]  # of the page, the summaries and the folder of figures
+    notes: list[str]
+    paths: list[Path]
+
+    @property
+    def page(self) -> Path:
+        """For a browser."""
+        return self.folder / PAGE
+
+    @property
+    def returns(self) -> list[Return]:
+        """The return of every episode of every evaluation: rows for a data frame."""
+        return self.tables.returns
+
+    def __repr__(self) -> str:
+        return f"{results_text(self.tables, terminal_width())}\n\n{self.page}"
 
 
 def make_report(
@@ -41,7 +63,7 @@ def make_report(
     out: Path | None = None,
     evaluations: Sequence[str] = (),
     across_trainers: bool = False,
-) -> Made:
+) -> Report:
     """Write the tables of the runs below a folder, if there are any, and the report of the tables.
 
     Another process that reports of the same folder is waited for.
@@ -65,9 +87,9 @@ def make_report(
             stack.enter_context(exclusive(each / PAGE, beside=True, wait=_MOST_SECONDS))
         if ran:
             conclude(folder)
-        lines = add_diagnostics(folder, evaluations)
+        notes = add_diagnostics(folder, evaluations)
         tables = read_tables(folder, across_trainers)
-        return Made(tables, lines, write_report_of(tables, out))
+        return Report(out, tables, notes, write_report_of(tables, out))
 
 
 def write_report(

@@ -35,7 +35,7 @@ def write_again(source, folder):
         for shard in range(first, len(manifest.shards)):
             yield open_shard(source, manifest, shard)
 
-    return write_shards(manifest.settings, folder, produce).manifest
+    return write_shards(manifest.settings, folder, produce)
 
 
 def flip_bit(path, bit):

@@ -7,15 +7,17 @@ from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jbrep.dataset.formats.episodes import Source
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.manifest import MANIFEST
-from jbrep.dataset.reader import Dataset
 from jbrep.errors import InputError, choose
 from jbrep.records.storage import check_allocation, check_space, exists
 from jbrep.text import counted
+
+if TYPE_CHECKING:
+    from jbrep.dataset.reader import Dataset
 
 _FILE_BYTES = 1 << 16  # whatever is in it
 FORMATS = {
@@ -38,7 +40,7 @@ def load_format(name: str) -> ModuleType:
     return import_module(choose(name, FORMATS, "format"))
 
 
-def export(dataset: Dataset, to: str, out: Path) -> str:
+def export(dataset: "Dataset", to: str, out: Path) -> str:
     """Write a data set in another format.
 
     Args:
