@@ -119,7 +119,7 @@ def collect(
         task=known, policy=actor.settings(), steps=steps, seed=seed, store_state=store_state
     )
     settings = settings.replace(
-        shard_episodes=shard_episodes or usual_shard_episodes(settings, folder, actor)
+        shard_episodes=shard_episodes or usual_shard_episodes(settings, folder, actor, retries)
     )
     _tell_kept(folder, settings.policy)
     run(settings, folder, lanes, threads, backend, actor, retries)

@@ -75,23 +75,6 @@ def collect(out: Path, **options: Any) -> None:
     """
     from jbrep import api
 
-<<<<<<< HEAD
-    task = needed_task(options)
-    if not task.reproducible:
-        click.echo(
-            f"{task.name} is not reproducible: no episode can be simulated again, to verify or to "
-            "repair the data set",
-            err=True,
-        )
-    actor = find_policy(policy, out, task)
-    settings = DataSettings(
-        task=task, policy=actor.settings(), steps=steps, seed=seed, store_state=store_state
-    )
-    if shard_episodes is None:
-        shard_episodes = usual_shard_episodes(settings, out, actor, retries)
-    settings = settings.replace(shard_episodes=shard_episodes)
-    _tell_kept(out, settings.policy)
-=======
     _report(out, lambda: api.collect(needed_task(options), out, **options))
 
 
@@ -102,7 +85,6 @@ def _report(out: Path, write: Callable[[], object]) -> None:
 
     before = current_manifest(out).rows if (out / MANIFEST).exists() else 0
     began = time.monotonic()
->>>>>>> 6e0821d (The commands call jbrep.api: settings are built, encoders named and runs trained in one place)
     with stoppable(RESUMES):
         write()
     seconds, dataset = time.monotonic() - began, Dataset(out)
@@ -271,7 +253,7 @@ def export(data: Path, to: str, out: Path) -> None:
 )
 @click.option("--out", required=True, type=PATH, help="A new folder.")
 def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
-    """Make a data set of other tools' data, or of logs.
+    """Make a data set of one that was made elsewhere, or of a robot's logs.
 
     SOURCE is a file (.csv, .tsv, .txt, .parquet, .npz), the folder of a Minari data set, or its id
     in MINARI_DATASETS_PATH; of several, an episode ends with each. Without --task, the task is the
