@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders import Encoder
     from jbrep.envs.task import Task
-    from jbrep.evaluate.evaluation import Evaluation
+    from jbrep.evaluate.evaluation import Diagnostics, Evaluation
     from jbrep.report.report import Report
     from jbrep.rl.controller import Controller
     from jbrep.rl.files import RunRecord
@@ -67,6 +67,43 @@ class Agent(NamedTuple):
             f"Agent({what}: {interval_of(self.returns)}, median [10 %, 90 %] of {count} episodes; "
             f"{str(self.folder)!r})"
         )
+
+    def _repr_html_(self) -> str:
+        from jbrep.rl.files import read_evaluations
+        from jbrep.text import Table, html, interval_of
+
+        returns: dict[int, list[float]] = {}
+        for each in read_evaluations(self.folder):
+            returns.setdefault(each.step, []).append(each.episode_return)
+        rows = [(f"{step:,}", interval_of(own), str(len(own))) for step, own in returns.items()]
+        header = ("steps", "return: median [10 %, 90 %]", "episodes")
+        return html(repr(self), Table("", header, rows))
+
+
+class Judged(NamedTuple):
+    """What is known of encoders.
+
+    Attributes:
+        evaluation: all of it, as evaluation.json has it.
+    """
+
+    evaluation: "Evaluation"
+
+    @property
+    def encoders(self) -> "dict[str, Diagnostics]":
+        """What is known of each, by what tables call it."""
+        return self.evaluation.encoders
+
+    def __repr__(self) -> str:
+        from jbrep.report.evaluation import evaluation_text
+        from jbrep.text import terminal_width
+
+        return evaluation_text(self.evaluation, terminal_width())
+
+    def _repr_html_(self) -> str:
+        from jbrep.report.evaluation import evaluation_html
+
+        return evaluation_html(self.evaluation)
 
 
 def collect(
@@ -161,7 +198,7 @@ def evaluate(
     out: str | Path | None = None,
     *,
     policy: str | None = None,
-) -> "Evaluation":
+) -> Judged:
     """Judge encoders on the held-out part of a data set, as `jbrep evaluate` does.
 
     Args:
@@ -183,7 +220,9 @@ def evaluate(
         check_writable(Path(out))
     scaled = _scaled(data)
     found, good = find_all(encoders, scaled.task), find_good_policy(policy, scaled.task)
-    return diagnose(found, scaled, good) if out is None else write(found, scaled, Path(out), good)
+    return Judged(
+        diagnose(found, scaled, good) if out is None else write(found, scaled, Path(out), good)
+    )
 
 
 def train(

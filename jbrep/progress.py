@@ -6,11 +6,18 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 _LOG_EVERY = 30.0  # seconds between two lines where there is no terminal
+_NOTEBOOK = "ipykernel.iostream"  # the module of what is standard error there
 _LOG_LINE = "{desc}: {n_fmt} of {total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 
 
+def is_live() -> bool:
+    """Whether a line on standard error can be written over: on a terminal, or in a notebook."""
+    stream = sys.stderr
+    return stream is not None and (stream.isatty() or type(stream).__module__ == _NOTEBOOK)
+
+
 class Progress(tqdm):
-    """tqdm on standard error: a bar on a terminal, lines elsewhere, nothing where it is closed.
+    """tqdm on standard error: a bar where it is live, lines elsewhere, nothing where it is closed.
 
     It takes tqdm's arguments. What `initial` counts was done before, so the rate and the time left
     come from the rest.
@@ -19,7 +26,7 @@ class Progress(tqdm):
     def __init__(self, *args: Any, **options: Any):
         if sys.stderr is None:
             options |= {"disable": True}
-        elif not sys.stderr.isatty():
+        elif not is_live():
             options |= {"file": _Log(sys.stderr), "bar_format": _LOG_LINE, "leave": False}
             options |= {"mininterval": _LOG_EVERY, "delay": _LOG_EVERY, "miniters": 1}
         super().__init__(*args, **options)
@@ -29,8 +36,7 @@ class Progress(tqdm):
 
         With refresh that is at once, if it is a bar.
         """
-        is_bar = sys.stderr is not None and sys.stderr.isatty()
-        super().set_postfix(*args, refresh=refresh and is_bar, **values)
+        super().set_postfix(*args, refresh=refresh and is_live(), **values)
 
 
 class _Log:

@@ -385,10 +385,10 @@ def test_the_rate_after_resuming_counts_the_steps_since():
         bar.show(job, 500, None)
         bar.show(job, 600, 1.0)
         assert (bar._progress.n, bar._progress.initial) == (600, 500)
-        bar.show(job, 1000, 1.0)
-        assert bar._progress.postfix == "returns=final ones under way"
+        bar.show(job, 1008, 1.0)
+        assert (bar._progress.n, bar._progress.postfix) == (1000, "returns=final ones under way")
         job.history.evaluated(1000, Outcome(np.array([1.5, 2.5]), [{}, {}]))
-        bar.show(job, 1000, 2.0)
+        bar.show(job, 1008, 2.0)
         assert bar._progress.postfix == "returns=2.00"
     trained, resumed = agent_of("a2c").learn(80), agent_of("a2c").learn(40)
     restore(resumed, take(trained))

@@ -1,8 +1,10 @@
 """Tables and facts that fit a terminal; progress on a terminal and in a log."""
 
+import io
 import subprocess
 import sys
 
+from jbrep.progress import Progress
 from jbrep.text import duration, facts, slug, sparkline, table
 
 HEADER = ("encoder", "error", "ratio", "worst feature")
@@ -50,6 +52,16 @@ def test_facts_are_wrapped_below_themselves():
     assert shown[0] == "  task face_direction"
     assert all(len(line) <= 40 for line in shown)
     assert all(line.startswith(" " * 7) for line in shown[2:])
+
+
+def test_in_a_notebook_progress_is_a_bar(monkeypatch):
+    class Cell(io.StringIO):
+        __module__ = "ipykernel.iostream"
+
+    monkeypatch.setattr(sys, "stderr", Cell())
+    with Progress(total=3) as bar:
+        bar.update(3)
+    assert "\r100%|" in sys.stderr.getvalue()
 
 
 def test_in_a_log_progress_is_a_line_now_and_then():

@@ -98,7 +98,7 @@ def evaluate(
     }
     out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(encoders))[:_LETTERS])
     with stoppable("the same command starts over"):
-        evaluation = api.evaluate(encoders, whole, out, policy=policy)
+        evaluation = api.evaluate(encoders, whole, out, policy=policy).evaluation
         pictures = write_plots(encoder_plots(evaluation), out)
     width = terminal_width()
     notes = [wrapped(printable(note), width) for note in _notes(encoders, sources, evaluation)]

@@ -1,20 +1,22 @@
 """A data set on one screen, or as JSON."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import extrema, mean_and_std
 from jbrep.dataset.settings import policy_text
 from jbrep.envs.task import Task
-from jbrep.text import counted, facts, number, table
+from jbrep.text import Table, counted, facts, html, number
+
+if TYPE_CHECKING:
+    from jbrep.dataset.reader import Dataset
 
 _HEADER = ("feature", "unit", "min", "mean", "max", "std", "nominal")
 
 
-def describe(dataset: Dataset) -> dict[str, Any]:
+def describe(dataset: "Dataset") -> dict[str, Any]:
     """What a data set holds, how it was made, its returns and the ranges of its features.
 
     Returns:
@@ -39,9 +41,29 @@ def describe(dataset: Dataset) -> dict[str, Any]:
     }
 
 
-def card(dataset: Dataset, width: int = 80) -> str:
+def card(dataset: "Dataset", width: int = 80) -> str:
     """`describe` as text of at most `width` columns."""
     about = describe(dataset)
+    parts = [f"{dataset.folder}\n{facts(_facts(dataset, about), width)}"]
+    if about["features"]:
+        parts.append(_table(about).text(width))
+    return "\n\n".join(parts)
+
+
+def card_html(dataset: "Dataset") -> str:
+    """`describe` for a notebook."""
+    about = describe(dataset)
+    told = Table(str(dataset.folder), ("", ""), [*_facts(dataset, about).items()])
+    return html(told, *([_table(about)] if about["features"] else ()))
+
+
+def _table(about: Mapping[str, Any]) -> Table:
+    """The features and their ranges."""
+    return Table("", _HEADER, [_cells(each) for each in about["features"]])
+
+
+def _facts(dataset: "Dataset", about: Mapping[str, Any]) -> dict[str, str]:
+    """What is known of the whole."""
     policy, returns = about["policy"], about["return"]
     named = {
         "task": _task_line(dataset.task),
@@ -67,10 +89,7 @@ def card(dataset: Dataset, width: int = 80) -> str:
         named["note"] = "the data were imported: no episode can be simulated again"
     elif not dataset.task.reproducible:
         named["note"] = "the environment is not reproducible: no episode can be simulated again"
-    parts = [f"{dataset.folder}\n{facts(named, width)}"]
-    if about["features"]:
-        parts.append(table(_HEADER, map(_cells, about["features"]), width))
-    return "\n\n".join(parts)
+    return named
 
 
 def _task_line(task: Task) -> str:
@@ -89,11 +108,11 @@ def _episodes_line(about: Mapping[str, Any]) -> str:
     return f"{line}, {ended:,} terminated by a state" if ended else line
 
 
-def _cells(feature: Mapping[str, Any]) -> list[str]:
+def _cells(feature: Mapping[str, Any]) -> tuple[str, ...]:
     values = [number(feature[name], ".4g") for name in _HEADER[2:6]]
     low, high = feature["nominal"]
     usual = "-" if low is None else f"[{number(low, '.4g')}, {number(high, '.4g')}]"
-    return [feature["feature"], feature["unit"], *values, usual]
+    return (feature["feature"], feature["unit"], *values, usual)
 
 
 def _spread(values: Any) -> dict[str, float | None]:
@@ -106,7 +125,7 @@ def _spread(values: Any) -> dict[str, float | None]:
     return {name: _finite(value) for name, value in named.items()}
 
 
-def _features(dataset: Dataset) -> list[dict[str, Any]]:
+def _features(dataset: "Dataset") -> list[dict[str, Any]]:
     """Unit, extrema, mean and standard deviation of each feature, and its nominal range."""
     column = dataset["observation"]
     (low, high), (mean, std) = extrema(column.chunks()), mean_and_std(column.chunks())

@@ -205,6 +205,11 @@ class Dataset:
     def __repr__(self) -> str:
         return f"Dataset({str(self.folder)!r}: {self.task.name}, {len(self):,} rows)"
 
+    def _repr_html_(self) -> str:
+        from jbrep.dataset.card import card_html
+
+        return card_html(self)
+
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns with a row for each step."""

@@ -8,7 +8,7 @@ from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Scores
 from jbrep.evaluate.table import headline
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.report.serving import lacking, serving, unreadable, untold
-from jbrep.text import Table, counted, facts, interval, number, r2_text, wrapped
+from jbrep.text import Table, counted, facts, html, interval, number, r2_text, wrapped
 
 _Encoders = Mapping[str, Diagnostics]  # by label
 
@@ -50,6 +50,11 @@ def evaluation_text(
         tables = _errors(evaluation), _readings(encoders), _units(encoders)
         parts += [_columns(evaluation, width), *(each.text(width) for each in tables)]
     return "\n\n".join(parts)
+
+
+def evaluation_html(evaluation: Evaluation) -> str:
+    """Which codes serve and what each lacks, for a notebook."""
+    return html(serving(evaluation), _headline(evaluation), _lacking(evaluation, None))
 
 
 def _headline(evaluation: Evaluation) -> Table:

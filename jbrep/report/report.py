@@ -1,5 +1,6 @@
 """A study's report: a page, figures, and summaries for READMEs and for programs."""
 
+import base64
 import json
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -10,9 +11,11 @@ from jbrep.evaluate.table import SCALARS
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import inside, make_folder, write_whole
 from jbrep.report import facts
+from jbrep.report.answer import answer
 from jbrep.report.figures import study_plots, write
 from jbrep.report.markdown import markdown
 from jbrep.report.page import page
+from jbrep.report.returns import returns_tables
 from jbrep.report.statistics import association_tables, results_text
 from jbrep.report.tables import Tables, check_tables, read_tables
 from jbrep.report.words import Answer, answers, notes, statements
@@ -21,7 +24,7 @@ from jbrep.stats.analysis import to_plain
 from jbrep.stats.association import Association, Diagnostic, associations
 from jbrep.study.results import conclude, has_runs
 from jbrep.study.tables import Return, add_diagnostics
-from jbrep.text import terminal_width
+from jbrep.text import html, terminal_width
 
 PAGE, SUMMARY, MARKDOWN, FIGURES = "report.html", "summary.json", "summary.md", "figures"
 STATISTICS = "statistics.json"
@@ -56,6 +59,15 @@ class Report(NamedTuple):
 
     def __repr__(self) -> str:
         return f"{results_text(self.tables, terminal_width())}\n\n{self.page}"
+
+    def _repr_html_(self) -> str:
+        picture = self.folder / FIGURES / f"{_MAIN_FIGURE}.png"
+        if not picture.exists():
+            return html(repr(self))
+        content = base64.b64encode(picture.read_bytes()).decode()
+        shown = f'<img width="700" src="data:image/png;base64,{content}">'
+        told = html(*answer(self.tables))
+        return told + shown + html(*returns_tables(self.tables), str(self.page))
 
 
 def make_report(

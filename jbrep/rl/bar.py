@@ -38,7 +38,7 @@ class Bar:
                 bar_format=_LINE,
             )
         is_final = self._progress.n < self._steps <= step
-        self._progress.update(step - self._progress.n)
+        self._progress.update(min(step, self._steps) - self._progress.n)
         shown = "final ones under way" if is_final else self._course(job.history.means)
         self._progress.set_postfix(returns=shown, refresh=is_final)
 
