@@ -52,7 +52,7 @@ _PLACES = {
 }
 __all__ = [*_CALLABLE, *_PLACES]
 
-_load = exports(__name__, _PLACES)
+_load, _ = exports(__name__, _PLACES)
 
 
 def __getattr__(name: str) -> Any:
@@ -62,7 +62,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted((*globals(), *__all__, "__version__"))
+    return sorted((*__all__, "__version__"))
 
 
 class _Callable(ModuleType):

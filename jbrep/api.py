@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from jbrep.dataset import Dataset, ScaledDataset
+    from jbrep.dataset import Dataset
     from jbrep.encoders import Encoder
     from jbrep.envs.task import Task
     from jbrep.evaluate.evaluation import Diagnostics, Evaluation
@@ -188,7 +188,7 @@ def train_encoder(
     """
     from jbrep.methods.fit import Fitter
 
-    fitter = Fitter(_scaled(data), Path(out), device)
+    fitter = Fitter(data, Path(out), device)
     return fitter.fit(kind, name=name, **settings).encoder
 
 
@@ -211,6 +211,7 @@ def evaluate(
     Raises:
         InputError: an encoder that isn't one of this task's, or two of one name.
     """
+    from jbrep.dataset import ScaledDataset
     from jbrep.encoders.shipped import find_all
     from jbrep.evaluate.diagnosis import diagnose, write
     from jbrep.play.sources import find_good_policy
@@ -218,7 +219,7 @@ def evaluate(
 
     if out is not None:
         check_writable(Path(out))
-    scaled = _scaled(data)
+    scaled = ScaledDataset.of(data)
     found, good = find_all(encoders, scaled.task), find_good_policy(policy, scaled.task)
     return Judged(
         diagnose(found, scaled, good) if out is None else write(found, scaled, Path(out), good)
@@ -360,12 +361,6 @@ def _study(given: "Study | Mapping[str, Any] | str | Path") -> "Study":
     if isinstance(given, Study):
         return given
     return as_study(given) if isinstance(given, Mapping) else read_study(Path(given))
-
-
-def _scaled(data: "Dataset | str | Path") -> "ScaledDataset":
-    from jbrep.dataset import Dataset, ScaledDataset
-
-    return ScaledDataset(data if isinstance(data, Dataset) else Dataset(data))
 
 
 def _tell_kept(folder: Path, policy: Mapping[str, Any]) -> None:

@@ -9,4 +9,4 @@ if TYPE_CHECKING:
 
 __all__ = ["AE", "DAE"]
 
-__getattr__ = exports(__name__, {"AE": "autoencoder", "DAE": "autoencoder"})
+__getattr__, __dir__ = exports(__name__, {"AE": "autoencoder", "DAE": "autoencoder"})

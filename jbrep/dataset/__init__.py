@@ -26,7 +26,7 @@ __all__ = [
     "Split",
 ]
 
-__getattr__ = exports(
+__getattr__, __dir__ = exports(
     __name__,
     {
         **{"Batches": "columns", "Column": "columns", "DataSettings": "schema"},

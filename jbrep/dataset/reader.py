@@ -279,7 +279,10 @@ class Dataset:
             raise InputError(f"the share to hold out is {test}: it must be between 0 and 1")
         lengths = self.episodes["length"]
         if len(lengths) < 2:
-            raise InputError(f"a split needs at least 2 episodes: {self.folder} has {len(lengths)}")
+            raise InputError(
+                f"a split needs at least 2 episodes: {self.folder} has {len(lengths)}; "
+                "collect more, or cut what is imported into several"
+            )
         count = min(max(1, round(test * len(lengths))), len(lengths) - 1)
         held_out = np.zeros(len(lengths), dtype=bool)
         held_out[np.random.default_rng(seed).permutation(len(lengths))[:count]] = True

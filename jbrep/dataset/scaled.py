@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterator
 from copy import copy
 from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,6 +59,17 @@ class ScaledDataset:
             raise InputError(
                 f"{dataset.folder} has values that aren't finite in {bad}: run jbrep data verify"
             )
+
+    @classmethod
+    def of(cls, data: "ScaledDataset | Dataset | str | Path") -> "ScaledDataset":
+        """What a user gives as data: it may be a data set, or its folder.
+
+        Raises:
+            InputError: as `Dataset` and `ScaledDataset`.
+        """
+        if isinstance(data, ScaledDataset):
+            return data
+        return cls(data if isinstance(data, Dataset) else Dataset(data))
 
     def rescaled(
         self,

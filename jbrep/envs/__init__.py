@@ -11,6 +11,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Feature", "Lanes", "Task", "describe"]
 
-__getattr__ = exports(
+__getattr__, __dir__ = exports(
     __name__, {"Feature": "task", "Lanes": "lanes", "Task": "task", "describe": "description"}
 )

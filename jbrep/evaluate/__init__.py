@@ -9,4 +9,4 @@ if TYPE_CHECKING:
 
 __all__ = ["diagnose"]
 
-__getattr__ = exports(__name__, {"diagnose": "diagnosis"})  # which imports scikit-learn
+__getattr__, __dir__ = exports(__name__, {"diagnose": "diagnosis"})  # which imports scikit-learn

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from jbrep.dataset import ScaledDataset
+from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.scaled import sample
 from jbrep.dataset.settings import IMPORTED
 from jbrep.encoders import FULL, Encoder, find
@@ -69,7 +69,9 @@ def _is_same(
 
 
 def diagnose(
-    encoders: Mapping[str, Any], data: ScaledDataset, policy: GoodPolicy | None = None
+    encoders: Mapping[str, Any],
+    data: ScaledDataset | Dataset | str | Path,
+    policy: GoodPolicy | None = None,
 ) -> Evaluation:
     """Every diagnostic of every encoder; docs/diagnostics.md describes each.
 
@@ -87,6 +89,7 @@ def diagnose(
     Raises:
         InputError: an encoder made for other features, or whose numbers overflow; or as `find`.
     """
+    data = ScaledDataset.of(data)
     held_out = HeldOut(data)
     judged = {label: find(each, data.task) for label, each in encoders.items()}
     for label, encoder in judged.items():

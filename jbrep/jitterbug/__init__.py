@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["JitterbugEnv", "JitterbugVectorEnv", "environment_id", "load", "register_with_suite"]
 
-__getattr__ = exports(
+__getattr__, __dir__ = exports(
     __name__,
     {
         "JitterbugEnv": "gym",

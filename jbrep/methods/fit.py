@@ -10,7 +10,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.coordinates import OBSERVATION
 from jbrep.coordinates.invariance import tried_coordinates
-from jbrep.dataset import ScaledDataset
+from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import Encoder, load, save
 from jbrep.encoders.file import SUFFIX
@@ -96,12 +96,12 @@ class Fitter:
 
     def __init__(
         self,
-        data: ScaledDataset,
+        data: ScaledDataset | Dataset | str | Path,
         folder: Path,
         device: str = "auto",
         memory: int | None = None,
     ):
-        self._data = data
+        self._data = ScaledDataset.of(data)
         self._folder = folder
         self._device = get_device(device)
         self._memory = memory

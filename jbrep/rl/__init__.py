@@ -11,6 +11,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Run", "StoppedError", "train"]
 
-__getattr__ = exports(  # which import torch
+__getattr__, __dir__ = exports(  # which import torch
     __name__, {"Run": "run", "StoppedError": "checkpoint", "train": "trainers"}
 )

@@ -7,7 +7,7 @@ from typing import Any
 from jbrep.collect import collect
 from jbrep.collect.collector import usual_shard_episodes
 from jbrep.collect.derive import derive
-from jbrep.dataset import Dataset, DataSettings, ScaledDataset
+from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import MANIFEST, read_manifest
 from jbrep.encoders import FULL
 from jbrep.encoders.shipped import names
@@ -108,7 +108,7 @@ def prepare(plan: Plan) -> None:
 
 def _check_fits(plan: Plan, task: str, folder: Path, number: int) -> Fitter:
     """Check that the encoders of a task can be made from a data set; what makes them."""
-    fitter = Fitter(ScaledDataset(Dataset(folder)), plan.encoders(task))
+    fitter = Fitter(folder, plan.encoders(task))
     for name, kind, settings in _fits(plan, number):
         try:
             fitter.plan(kind, name=name, **settings)
