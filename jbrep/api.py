@@ -279,7 +279,9 @@ def train(
     if is_one and run.learner.hyperparameters.num_envs > 1:
         run = run.replace(learner=run.learner.overridden({"num_envs": 1}))
     job = Job(run, Path(out), threads or cpu_count(), retries, is_one)
-    if not known.reproducible:
+    if job.result:
+        _note(f"the run in {job.folder} was finished already: nothing was done")
+    elif not known.reproducible:
         _note(
             f"{known.name} is not reproducible: the same seed gives other numbers the next time, "
             "and a run that is stopped can't be resumed"

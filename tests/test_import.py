@@ -37,7 +37,7 @@ from jbrep.envs import describe
 from jbrep.envs.description import features_of
 from jbrep.envs.names import import_modules
 from jbrep.envs.task import check_same
-from jbrep.errors import InputError
+from jbrep.errors import InputError, Notice
 from jbrep.evaluate.diagnosis import seen
 from jbrep.play.rollout import replay
 
@@ -127,7 +127,8 @@ def test_a_list_of_episodes_gives_the_same(written, tmp_path):
 def test_without_the_final_observation_the_last_step_is_left_out(tmp_path):
     given = arrays()
     del given["final_observations"]
-    dataset = Dataset.write(tmp_path / "data", **given)
+    with pytest.warns(Notice, match="the last step of 2 episodes of arrays is left out"):
+        dataset = Dataset.write(tmp_path / "data", **given)
     assert dataset.episodes["length"].tolist() == [6, 11]  # nothing is left of the one of a step
     np.testing.assert_array_equal(
         dataset.episodes["final_observation"], given["observations"][[6, 19]]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import pandas
 import pytest
 import torch
 from command import jbrep, mistake, refused
@@ -117,6 +118,9 @@ def test_a_transformer_of_scikit_learn_is_an_encoder():
         rtol=1e-4,
         atol=1e-5,
     )
+    frame = pandas.DataFrame(rows, columns=["cos", "sin", "speed"])
+    of_frame = as_encoder(PCA(2).fit(frame), describe("Pendulum-v1"))  # warns of nothing
+    assert of_frame.encode(rows).shape == (200, 2)
     with pytest.raises(InputError, match=r"PCA failed: NotFittedError: .*"):
         as_encoder(PCA(2), describe("Pendulum-v1"))
 

@@ -99,6 +99,7 @@ def test_settings_reach_the_agent():
 @pytest.mark.parametrize(
     ("algorithm", "settings", "message"),
     [
+        ("sac", {"lr": 1}, "sac has no setting 'lr': did you mean learning_rate"),
         ("sac", {"learning_rat": 1}, "sac has no setting 'learning_rat': did you mean learning_ra"),
         ("ppo", {"tau": 0.1}, "ppo has no setting 'tau': it has action_repeat, activation_fn, "),
         (

@@ -21,9 +21,9 @@ def _tasks(context: click.Context) -> Iterable[str]:
 
 
 def _kinds(context: click.Context) -> Iterable[str]:
-    from jbrep.methods.registry import METHODS  # imports torch: this one takes seconds
+    from jbrep.methods.kinds import KINDS
 
-    return METHODS
+    return KINDS
 
 
 def _shipped(context: click.Context) -> Iterable[str]:

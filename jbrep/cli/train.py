@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from msgspec import inspect
 from jbrep.cli.base import POSITIVE, RESUMES, Variadic, data_option, printable, stoppable
 from jbrep.cli.completion import complete_kind
 from jbrep.errors import InputError, choose
+from jbrep.methods.kinds import KINDS
 from jbrep.records.keys import Key, keys_of
 from jbrep.records.words import bare
 from jbrep.text import terminal_width, wrapped
@@ -27,6 +29,13 @@ class _Making(Variadic):
     """A command with an option for each setting of the methods that it offers."""
 
     kinds: tuple[str, ...] = ()  # all of them if empty
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Check the kind before its settings are asked for, which imports torch."""
+        for option, value in pairwise(args):
+            if option == "--kind":
+                choose(value, KINDS, "kind")
+        return super().parse_args(ctx, args)
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """The command's own options, those of its methods, and --help."""

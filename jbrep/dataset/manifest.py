@@ -275,8 +275,8 @@ def open_shard(
     if checked is None or state not in checked:
         if len(content) != entry.bytes or file_hash(content) != entry.xxh3:
             raise DamageError(
-                f"{path} is damaged: its {len(content):,} bytes aren't the {entry.bytes:,} bytes "
-                f"that were committed; {REPAIR}"
+                f"{path} is damaged: its content isn't what was committed: its checksum doesn't "
+                f"match; {REPAIR}"
             )
         if checked is not None:
             checked.add(state)

@@ -243,6 +243,9 @@ class OwnEncoder(BaseEncoder):
 
     def _call(self, function: Callable[..., Any], rows: Float32) -> Any:
         if not self.is_module:
+            names, pandas = self._has("feature_names_in_"), sys.modules.get("pandas")
+            if function is self._encode and names is not None and pandas:
+                return function(pandas.DataFrame(rows, columns=names))  # as it was fitted
             return function(rows)
         import torch
 

@@ -177,8 +177,8 @@ def _checked_action(env_id: str, space: spaces.Space[Any]) -> spaces.Box:
         )
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         raise InputError(
-            f"{env_id} has actions without bounds, {space}: wrap it, such as in "
-            "gymnasium.wrappers.RescaleAction, so that they have finite ones"
+            f"{env_id} has actions without bounds, {space}: give its action space finite "
+            f"ones, as in spaces.Box(-1, 1, {space.shape})"
         )
     return space
 

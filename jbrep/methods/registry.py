@@ -1,6 +1,5 @@
-"""Every way of making an encoder, and how names say which."""
+"""The methods that make encoders, and how names say which."""
 
-from collections.abc import Iterator
 from importlib import import_module
 from typing import Any, NamedTuple, get_args
 
@@ -10,33 +9,17 @@ from jbrep.coordinates import System
 from jbrep.dataset.scaling import SCALINGS
 from jbrep.encoders.names import EncoderName
 from jbrep.errors import InputError, choose
+from jbrep.methods.kinds import KINDS
 from jbrep.training.method import Method
 
-_FILES = (  # of methods; each may have several
-    "jbrep.methods.controls",
-    "jbrep.methods.linear",
-    "jbrep.dae.autoencoder",
-    "jbrep.methods.ddae",
-    "jbrep.methods.vae",
-    "jbrep.methods.lld_vae",
-    "jbrep.methods.lagged",
-    "jbrep.methods.linear_forward",
-    "jbrep.methods.forward",
-    "jbrep.methods.self_prediction",
-    "jbrep.methods.deepmdp",
-    "jbrep.methods.ofe",
-    "jbrep.methods.fourier",
-)
+
+def _method(kind: str, file: str) -> type[Method]:
+    """The class of that name in a file."""
+    classes = (each for each in vars(import_module(file)).values() if isinstance(each, type))
+    return next(c for c in classes if issubclass(c, Method) and vars(c).get("name") == kind)
 
 
-def _methods(file: str) -> Iterator[type[Method]]:
-    """The methods of a file, which are its classes with names of their own."""
-    for each in vars(import_module(file)).values():
-        if isinstance(each, type) and issubclass(each, Method) and "name" in vars(each):
-            yield each
-
-
-METHODS: dict[str, type[Method]] = {each.name: each for file in _FILES for each in _methods(file)}
+METHODS = {kind: _method(kind, file) for kind, file in KINDS.items()}
 _WORDS: dict[str, tuple[str, Any]] = {  # in names, of settings that aren't the usual ones
     **{name: ("scaling", name) for name in SCALINGS},
     **{system: ("on", system) for system in get_args(System)},

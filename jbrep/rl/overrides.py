@@ -151,7 +151,8 @@ def _check_name(algorithm: str, name: str) -> None:
         raise InputError(f"{name} can't be set: {_REFUSED[name]}")
     names = setting_names(algorithm)
     if name not in names:
-        near = get_close_matches(name, names, cutoff=0.5)
+        meant = [each for each in names if name == "".join(word[0] for word in each.split("_"))]
+        near = meant or get_close_matches(name, names, cutoff=0.5)
         told = f"did you mean {' or '.join(near)}?" if near else f"it has {', '.join(names)}"
         raise InputError(f"{algorithm} has no setting {name!r}: {told}")
 

@@ -43,6 +43,7 @@ class Incoming(NamedTuple):
     terminated: bool
     seed: int
     missing: int = 0  # numbers in whose place are others, or at which it was divided
+    is_cut: bool = False  # whether its last step was left out, for want of a final observation
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,8 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
         raise InputError(f"{where} has the seed {seed}: it must be from 0 to 2**63 - 1, or -1")
     action = _flat(rows["action"][:steps])
     reward = _flat(rows["reward"][:steps])[:, 0] if "reward" in rows else np.zeros(steps)
-    yield Incoming(where, observation, action, reward, last, terminated, seed)
+    is_cut = final is None
+    yield Incoming(where, observation, action, reward, last, terminated, seed, is_cut=is_cut)
 
 
 def _check_steps(where: str, rows: Rows) -> None:

@@ -297,13 +297,13 @@ def write(dataset: Dataset, out: Path) -> str:
     """Add a data set to a folder of Minari data sets; returns how to open it."""
     settings = dataset.manifest.settings
     name = f"{_namespace(settings.task)}/{settings.policy['kind']}-v0"
-    path = inside(out, name)
+    path, spec = inside(out, name), _env_spec(settings)
     make_folder(path.parent)
     with unfinished(path) as root:  # Minari ignores hidden folders
         root.mkdir()
         with _datasets_in(root.resolve()), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on the missing author and address
-            _create(dataset, name)
+            _create(dataset, name, spec)
         _write_checksums(root / name / "data")
         for namespace in Path(name).parents[:-1]:
             metadata = namespace / NAMESPACE_METADATA_FILENAME
@@ -326,14 +326,14 @@ def _namespace(task: Task) -> str:
     return name if len(name) > 1 else f"task-{name}"  # Minari takes no single letter
 
 
-def _create(dataset: Dataset, name: str) -> None:
+def _create(dataset: Dataset, name: str, spec: EnvSpec | None) -> None:
     settings, versions = dataset.manifest.settings, dataset.manifest.versions
     task = settings.task
     low, high = (np.array(ends, np.float32) for ends in (task.action_low, task.action_high))
     minari.create_dataset_from_buffers(
         name,
         _buffers(dataset),
-        env=_env_spec(settings),
+        env=spec,
         observation_space=spaces.Box(-np.inf, np.inf, (task.size,), np.float32),
         action_space=spaces.Box(low, high, dtype=np.float32),
         algorithm_name=settings.policy["kind"],

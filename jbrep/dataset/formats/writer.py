@@ -25,6 +25,7 @@ from jbrep.envs.task import Task
 from jbrep.errors import InputError, Notice, kind_and_line
 from jbrep.progress import Progress
 from jbrep.records.storage import check_space, make_folder, publish_folder, unfinished
+from jbrep.text import counted
 
 _SHARD_ROWS = 20_000
 _MOST_SHARDS = 5_000
@@ -116,13 +117,13 @@ def _episodes(source: Source, missing: str) -> Iterator[Incoming]:
 
 
 def _survey(source: Source, missing: str) -> _Survey:
-    sizes, lengths, count = (0, 0), list[int](), 0
+    sizes, lengths, count, cut = (0, 0), list[int](), 0, 0
     signals: Signals | None = None
     low: Any = np.inf
     high: Any = -np.inf
     with Progress(total=source.rows, unit="step", unit_scale=True, desc="read") as progress:
         for episode in _episodes(source, missing):
-            count += episode.missing
+            count, cut = count + episode.missing, cut + episode.is_cut
             found = episode.observation.shape[1], episode.action.shape[1]
             sizes = sizes if lengths else found
             if found != sizes:
@@ -138,6 +139,9 @@ def _survey(source: Source, missing: str) -> _Survey:
             progress.update(lengths[-1])
     if count:
         warnings.warn(f"{source.name} had {count:,} missing readings ({missing})", Notice, 2)
+    if cut:
+        told = f"the last step of {counted(cut, 'episode')} of {source.name} is left out"
+        warnings.warn(f"{told}: what was observed after it isn't known", Notice, 2)
     if signals is None:
         raise InputError(
             f"{source.name} has no episode with a step, the last one's observation being the final "

@@ -1,0 +1,25 @@
+"""Every way of making an encoder, by name: the file whose class makes it. Nothing is imported."""
+
+KINDS = {
+    "full": "jbrep.methods.controls",
+    "coordinates": "jbrep.methods.controls",
+    "symmetry": "jbrep.methods.controls",
+    "subset": "jbrep.methods.controls",
+    "noise": "jbrep.methods.controls",
+    "random": "jbrep.methods.controls",
+    "untrained": "jbrep.methods.controls",
+    "pca": "jbrep.methods.linear",
+    "ae": "jbrep.dae.autoencoder",
+    "dae": "jbrep.dae.autoencoder",
+    "ddae": "jbrep.methods.ddae",
+    "vae": "jbrep.methods.vae",
+    "lld-vae": "jbrep.methods.lld_vae",
+    "slow": "jbrep.methods.lagged",
+    "vamp": "jbrep.methods.lagged",
+    "linear-forward": "jbrep.methods.linear_forward",
+    "forward": "jbrep.methods.forward",
+    "self-prediction": "jbrep.methods.self_prediction",
+    "deepmdp": "jbrep.methods.deepmdp",
+    "ofe": "jbrep.methods.ofe",
+    "fourier": "jbrep.methods.fourier",
+}
