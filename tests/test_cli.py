@@ -101,9 +101,16 @@ def test_a_studys_dry_run_and_its_mistakes(tmp_path):
 
 @pytest.mark.parametrize("group", ["", *GROUPS])
 def test_lists_of_commands_say_what_each_does_in_whole_sentences(group):
-    _, _, below = jbrep(*group.split(), "--help").output.partition("Commands:")
+    above, _, below = jbrep(*group.split(), "--help").output.partition("Commands:")
     assert below
     assert "..." not in below
+    assert not group or "Options:" in above
+
+
+def test_a_terminal_of_24_lines_holds_all_commands():
+    text = jbrep("--help").output
+    assert len(text.splitlines()) <= 24
+    assert text.index("  collect ") < text.index("  evaluate ") < text.index("  behaviour ")
 
 
 def test_folders_of_other_things_are_left_alone(tmp_path):

@@ -16,10 +16,15 @@ from jbrep.cli.train import train_dae, train_encoder
 from jbrep.text import facts, terminal_width
 
 
-@click.group(cls=Cli, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=Cli,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Reduced-order representations of robots, and what they do to learning. Each command's "
+    "--help has an example.",
+)
 @click.version_option(package_name="jbrep")
 def main() -> None:
-    """Reduced-order representations of robots, and what they do to learning."""
+    """The command line."""
 
 
 @click.command(epilog="Example: jbrep doctor")

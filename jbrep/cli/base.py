@@ -18,6 +18,7 @@ from typing import Any, NoReturn, TextIO, TypeVar
 import click
 
 from jbrep.errors import InputError, Notice
+from jbrep.text import terminal_width, wrapped
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -151,6 +152,11 @@ def say(line: str, err: bool = False) -> None:
     click.echo(printable(line), err=err)
 
 
+def tell(line: str, err: bool = False) -> None:
+    """Print a line as `say` does, wrapped at the terminal's edge: one that has no path to copy."""
+    click.echo(wrapped(printable(line), terminal_width()), err=err)
+
+
 def echo_text(text: str) -> None:
     """Print several lines, each as `printable` makes it."""
     for line in text.splitlines():
@@ -229,6 +235,14 @@ def _leave(number: int, frame: FrameType | None) -> NoReturn:
 
 class Cli(click.Group):
     """A user's mistake is one line and exit code 2; anything else shows its traceback."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """In the order of work."""
+        return list(self.commands)
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands: with the options, a terminal of 24 lines wouldn't hold them."""
+        self.format_commands(ctx, formatter)
 
     def main(self, *args: Any, **options: Any) -> Any:
         """Run the command line; close what it has opened."""

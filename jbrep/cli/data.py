@@ -21,11 +21,12 @@ from jbrep.cli.base import (
 )
 from jbrep.cli.completion import complete_task
 from jbrep.cli.environment import (
+    environment_options,
     given_task,
     import_option,
     needed_task,
     retries_option,
-    task_options,
+    task_option,
     threads_option,
     view_options,
 )
@@ -49,7 +50,7 @@ _data = click.argument("data", type=PATH)
 
 
 @click.command(epilog="Example: jbrep collect --task face_direction --steps 5M --out data/face")
-@task_options
+@task_option
 @record_options(CollectSettings, shard_episodes=None)
 @click.option(
     "--policy",
@@ -64,6 +65,7 @@ _data = click.argument("data", type=PATH)
 @retries_option
 @click.option("--backend", default="local", show_default=True, help="local, or ray for a cluster.")
 @click.option("--out", required=True, type=PATH, help="A folder.")
+@environment_options
 def collect(out: Path, **options: Any) -> None:
     """Collect the states that a policy visits.
 
@@ -246,12 +248,13 @@ def export(data: Path, to: str, out: Path) -> None:
 
 @data.command("import", epilog="Example: jbrep data import D4RL/hopper/expert-v0 --out data/hopper")
 @click.argument("source", nargs=-1, required=True)
-@task_options
+@task_option
+@click.option("--out", required=True, type=PATH, help="A new folder.")
 @record_options(Layout)
 @click.option(
     "--layout", type=PATH, help="A TOML file with the options from --observations to --fill."
 )
-@click.option("--out", required=True, type=PATH, help="A new folder.")
+@environment_options
 def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
     """Make a data set of one that was made elsewhere, or of a robot's logs.
 

@@ -18,7 +18,7 @@ from jbrep.cli.base import (
     stoppable,
 )
 from jbrep.cli.completion import complete_encoder, complete_task
-from jbrep.cli.environment import given_task, needed_task, task_options
+from jbrep.cli.environment import environment_options, given_task, needed_task, task_option
 from jbrep.errors import InputError
 from jbrep.text import facts, r2_text, slug, table, terminal_width, wrapped
 
@@ -208,7 +208,8 @@ _which = click.argument("encoder", shell_complete=complete_encoder)
 
 @encoder.command(epilog="Example: jbrep encoder info dae-8 --task face_direction")
 @_which
-@task_options
+@task_option
+@environment_options
 @as_json
 def info(encoder: str, as_json: bool, **options: Any) -> None:
     """Show what an encoder is and where it comes from.
@@ -233,8 +234,9 @@ def info(encoder: str, as_json: bool, **options: Any) -> None:
     epilog="Example: jbrep encoder export dae-8 --task face_direction --out dae-8.onnx"
 )
 @_which
-@task_options
+@task_option
 @click.option("--out", required=True, type=PATH, help="A new .onnx file.")
+@environment_options
 def export(encoder: str, out: Path, **options: Any) -> None:
     """Write an encoder, with its decoder, as ONNX.
 
@@ -265,7 +267,7 @@ def export(encoder: str, out: Path, **options: Any) -> None:
     "--out encoders/mine.safetensors",
 )
 @click.argument("model", type=PATH)
-@task_options
+@task_option
 @click.option(
     "--decoder",
     type=PATH,
@@ -273,6 +275,7 @@ def export(encoder: str, out: Path, **options: Any) -> None:
 )
 @click.option("--name", help="What tables will call it; by default the name of the file.")
 @click.option("--out", required=True, type=PATH, help="A new encoder file.")
+@environment_options
 def import_model(
     model: Path, decoder: Path | None, name: str | None, out: Path, **options: Any
 ) -> None:

@@ -48,7 +48,7 @@ view_options = with_options(
         "between.",
     ),
 )
-_argument_options = with_options(
+environment_options = with_options(
     click.option(
         "--env",
         multiple=True,
@@ -87,13 +87,10 @@ retries_option = click.option(
     show_default=True,
     help="How often in a row an environment that fails is made anew and tried again.",
 )
-task_options = with_options(  # from which `given_task` makes a task
-    click.option(
-        "--task",
-        shell_complete=complete_task,
-        help="One of the Jitterbug's, such as face_direction, or a Gymnasium id: Hopper-v5.",
-    ),
-    _argument_options,
+task_option = click.option(  # from which, with `environment_options`, `given_task` makes a task
+    "--task",
+    shell_complete=complete_task,
+    help="One of the Jitterbug's, such as face_direction, or a Gymnasium id: Hopper-v5.",
 )
 
 
@@ -139,7 +136,7 @@ def parse_arguments(given: tuple[str, ...], option: str = "--env") -> dict[str, 
 
 @click.command(epilog="Example: jbrep env Hopper-v5")
 @click.argument("task", shell_complete=complete_task)
-@_argument_options
+@environment_options
 @as_json
 def env(as_json: bool, **options: Any) -> None:
     """Say what a task is.

@@ -12,7 +12,7 @@ import click
 
 from jbrep.cli.base import COUNT, PATH, say, stoppable
 from jbrep.cli.completion import complete_encoder
-from jbrep.cli.environment import given_task, task_options
+from jbrep.cli.environment import environment_options, given_task, task_option
 from jbrep.errors import InputError
 
 _ADDRESS = "127.0.0.1"
@@ -23,7 +23,7 @@ _KEEPER = ("sh", "-c", "read -r _; kill 0")
 @click.command(epilog="Example: jbrep inspect data/face --episode 3 --encoder dae-8 --view")
 @click.argument("source", required=False)
 @click.option("--episode", type=COUNT, help="Its number, from 0; 0 if not given.")
-@task_options
+@task_option
 @click.option(
     "--encoder",
     shell_complete=complete_encoder,
@@ -44,6 +44,7 @@ _KEEPER = ("sh", "-c", "read -r _; kill 0")
     help="Show it to a browser on this machine until Ctrl-C. Meanwhile every user and program of "
     "the machine can read the recording, too; Rerun asks for no password and checks no host name.",
 )
+@environment_options
 def inspect(
     source: str | None,
     episode: int | None,

@@ -14,9 +14,16 @@ from jbrep.cli.base import (
     echo_text,
     say,
     stoppable,
+    tell,
 )
 from jbrep.cli.completion import complete_encoder
-from jbrep.cli.environment import given_task, retries_option, task_options, threads_option
+from jbrep.cli.environment import (
+    environment_options,
+    given_task,
+    retries_option,
+    task_option,
+    threads_option,
+)
 from jbrep.errors import InputError
 from jbrep.text import interval_of, percentiles, table, terminal_width
 
@@ -34,7 +41,7 @@ _TASK = "face_direction"
     "--episodes", default=20, show_default=True, type=POSITIVE, help="How many, the same each time."
 )
 @click.option("--trust", is_flag=True, help="Read a zip file from elsewhere, which can run code.")
-@task_options
+@task_option
 @threads_option
 @retries_option
 @click.option("--algorithm", default="sac", show_default=True, help="Of a zip file.")
@@ -50,6 +57,7 @@ _TASK = "face_direction"
     help="What a zip file was trained on, or what a policy by name observes through: a file, the "
     "name of one that ships, or code, mymodule:MyEncoder; of a run that was made with code, that.",
 )
+@environment_options
 @as_json
 @click.pass_context
 def evaluate_policy(
@@ -105,9 +113,9 @@ def evaluate_policy(
         if source is not None:
             say(f"encoder: {source}")
         title = _title(policy, player)
-        say(f"{title}: median return {interval_of(returns)} (10-90 % of {len(returns)} episodes)")
+        tell(f"{title}: median return {interval_of(returns)} (10-90 % of {len(returns)} episodes)")
         if told := shares_text(values):
-            say(told)
+            tell(told)
     if failure:
         say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
         context.exit(1)
@@ -237,12 +245,13 @@ def policies(as_json: bool) -> None:
 
 @click.command(epilog="Example: jbrep behaviour runs/full runs/dae-4 --out behaviour")
 @click.argument("policies", nargs=-1, required=True)
-@task_options
+@task_option
 @click.option("--episodes", default=100, show_default=True, type=POSITIVE, help="Of each run.")
 @click.option(
     "--target-yaw", default=45.0, show_default=True, help="Where every target points [degrees]."
 )
 @click.option("--out", required=True, type=PATH, help="A folder.")
+@environment_options
 def behaviour(
     policies: tuple[str, ...], episodes: int, target_yaw: float, out: Path, **options: Any
 ) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from jbrep.cli.base import PATH, POSITIVE, say
-from jbrep.cli.environment import given_task, task_options
+from jbrep.cli.environment import environment_options, given_task, task_option
 from jbrep.text import interval_of
 
 
@@ -53,7 +53,8 @@ def export(run: Path, form: str, out: Path) -> None:
 @click.argument("model", type=PATH)
 @click.option("--run", type=PATH, help="That it was taken from, to play beside it.")
 @click.option("--episodes", default=20, show_default=True, type=POSITIVE, help="How many.")
-@task_options
+@task_option
+@environment_options
 def check(model: Path, run: Path | None, episodes: int, **options: Any) -> None:
     """Play an exported policy in its environment.
 

@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from jbrep.cli.base import COUNT, PATH, say, stoppable
-from jbrep.cli.environment import given_task, task_options
+from jbrep.cli.environment import environment_options, given_task, task_option
 
 
 class _Size(click.ParamType[tuple[int, int]]):
@@ -31,7 +31,7 @@ class _Size(click.ParamType[tuple[int, int]]):
 )
 @click.argument("sources", nargs=-1, required=True)
 @click.option("--out", required=True, type=PATH, help="A new file, .mp4 or .gif.")
-@task_options
+@task_option
 @click.option("--episode", default=0, show_default=True, type=COUNT, help="Its number, from 0.")
 @click.option(
     "--camera",
@@ -44,6 +44,7 @@ class _Size(click.ParamType[tuple[int, int]]):
 @click.option(
     "--seconds", type=float, help="Simulated seconds to show, from the start; all if not given."
 )
+@environment_options
 def render(
     sources: tuple[str, ...],
     out: Path,

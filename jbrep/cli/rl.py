@@ -20,10 +20,17 @@ from jbrep.cli.base import (
     on_stop,
     say,
     stoppable,
+    tell,
     with_options,
 )
 from jbrep.cli.completion import complete_encoder
-from jbrep.cli.environment import needed_task, parse_arguments, retries_option, task_options
+from jbrep.cli.environment import (
+    environment_options,
+    needed_task,
+    parse_arguments,
+    retries_option,
+    task_option,
+)
 from jbrep.cli.options import record_options
 from jbrep.errors import choose
 from jbrep.records.record import converted
@@ -36,6 +43,14 @@ if TYPE_CHECKING:
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 _BESIDE = 10  # episodes of policies that don't learn
 learner_options = with_options(  # which `checked` reads
+    click.option(
+        "--encoder",
+        shell_complete=complete_encoder,
+        default="full",
+        show_default=True,
+        help="A file, a shipped encoder's name, or code as module:Class, which is run; full is "
+        "the whole observation, scaled alike.",
+    ),
     click.option(
         "--algorithm", default="sac", show_default=True, help=f"One of {', '.join(CLASSES)}."
     ),
@@ -58,14 +73,6 @@ learner_options = with_options(  # which `checked` reads
         is_flag=True,
         help="Normalise what the agent sees by its running mean and variance.",
     ),
-    click.option(
-        "--encoder",
-        shell_complete=complete_encoder,
-        default="full",
-        show_default=True,
-        help="A file, a shipped encoder's name, or code as module:Class, which is run; full is "
-        "the whole observation, scaled alike.",
-    ),
 )
 
 
@@ -73,7 +80,7 @@ def checked(options: dict[str, Any]) -> dict[str, Any]:
     """The options of a command as `jbrep.train` takes them; code that they name is imported.
 
     Args:
-        options: of `task_options`, `learner_options` and `record_options`.
+        options: of `task_option`, `environment_options`, `learner_options` and `record_options`.
 
     Raises:
         InputError: a word is wrong, before anything heavy is imported.
@@ -103,7 +110,8 @@ def checked(options: dict[str, Any]) -> dict[str, Any]:
 @click.command(
     epilog="Example: jbrep rl --task face_direction --algorithm ddpg --encoder dae-8 --out runs/a"
 )
-@task_options
+@task_option
+@click.option("--out", required=True, type=PATH, help="A folder for this run.")
 @learner_options
 @click.option("--seed", default=0, show_default=True, type=COUNT, help="Of agent and episodes.")
 @record_options(TrainingSettings)
@@ -128,7 +136,7 @@ def checked(options: dict[str, Any]) -> dict[str, Any]:
     metavar="PROJECT",
     help="Log to Weights & Biases, too; WANDB_MODE=offline keeps it in the folder.",
 )
-@click.option("--out", required=True, type=PATH, help="A folder for this run.")
+@environment_options
 @click.pass_context
 def rl(context: click.Context, /, out: Path, **options: Any) -> None:
     """Train and evaluate one agent.
@@ -159,15 +167,13 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
         context.exit(1)
     returns = agent.returns
     name = agent.record.settings.representation
-    click.echo(
-        f"returns on {name} at the end: {interval_of(returns)}, median [10 %, 90 %] of "
-        f"{len(returns)} episodes"
-    )
+    spread = f"median [10 %, 90 %] of {len(returns)} episodes"
+    tell(f"returns on {name} at the end: {interval_of(returns)}, {spread}")
     if told := shares_text(last_infos(read_infos(out), read_evaluations(out))):
-        say(told)
+        tell(told)
     with stoppable("the run itself is finished"):
         if compared := beside(task, returns, min(len(returns), _BESIDE)):
-            say(str(compared))
+            tell(str(compared))
     source = source_of(options["encoder"], task)
     say(f"encoder: {source}; all evaluations: {out / EVALUATIONS}")
 
@@ -193,7 +199,7 @@ def stop_signals() -> Iterator[list[int]]:
     epilog="Example: jbrep tune --task face_direction --algorithm sac --preset modern --trials 20 "
     "--steps 20k --out runs/tune"
 )
-@task_options
+@task_option
 @learner_options
 @click.option("--trials", default=20, show_default=True, type=POSITIVE, help="In all.")
 @click.option("--seeds", default=1, show_default=True, type=POSITIVE, help="Runs of each trial.")
@@ -202,6 +208,7 @@ def stop_signals() -> Iterator[list[int]]:
     TrainingSettings, "steps", "evaluation_episodes", steps=20_000, evaluation_episodes=10
 )
 @click.option("--out", required=True, type=PATH, help="A folder for this search.")
+@environment_options
 @click.pass_context
 def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **options: Any) -> None:
     """Search for an algorithm's settings with Optuna.

@@ -14,9 +14,10 @@ from jbrep.cli.base import (
     echo_text,
     say,
     stoppable,
+    tell,
 )
 from jbrep.cli.environment import import_option
-from jbrep.text import terminal_width, wrapped
+from jbrep.text import terminal_width
 
 _COUNT = click.IntRange(1, 1024)
 
@@ -82,7 +83,7 @@ def study(
     run = choose(backend, BACKENDS, "backend")
     expected = forecast(plan, workers, width) if dry_run else None
     for notice in plan.study.notices:
-        click.echo(wrapped(notice, terminal_width()), err=True)
+        tell(notice, err=True)
     if expected:
         click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
         return
@@ -147,4 +148,4 @@ def report(
     more = "" if everything else " --all prints every table."
     click.echo()
     say(str(made.page))
-    return click.echo(wrapped(f"Beside it: {beside}.{more}", terminal_width()))
+    return tell(f"Beside it: {beside}.{more}")

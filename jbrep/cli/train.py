@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 import click
 from msgspec import inspect
 
-from jbrep.cli.base import POSITIVE, RESUMES, Variadic, data_option, printable, stoppable
+from jbrep.cli.base import POSITIVE, RESUMES, Variadic, data_option, stoppable, tell
 from jbrep.cli.completion import complete_kind
 from jbrep.errors import InputError, choose
 from jbrep.methods.kinds import KINDS
 from jbrep.records.keys import Key, keys_of
 from jbrep.records.words import bare
-from jbrep.text import terminal_width, wrapped
 
 if TYPE_CHECKING:
     from jbrep.dataset import ScaledDataset
@@ -259,4 +258,4 @@ def _report(fitted: "Fitted", data: "ScaledDataset") -> None:
     encoder, path, is_new = fitted
     told = purpose(encoder, data) or "jbrep evaluate shows what it keeps"
     line = f"{encoder.name}: {told}; {path}{'' if is_new else ', already complete'}"
-    click.echo(wrapped(printable(line), terminal_width()))
+    tell(line)
