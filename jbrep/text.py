@@ -66,7 +66,7 @@ def html(*parts: "str | Table") -> str:
     return "".join(
         each.html()
         if isinstance(each, Table)
-        else f"<div style='white-space:pre-wrap'>{escape(each)}</div>"
+        else f"<p style='white-space:pre-wrap'>{escape(each)}</p>"
         for each in parts
     )
 

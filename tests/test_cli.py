@@ -154,6 +154,7 @@ def test_every_command_has_help_with_an_example(command):
 
 MISTAKES = {
     "collect --task fly --steps 1k --out x": "unknown task 'fly'",
+    "env environments:Sledge": "Sledge in environments is a class: register it there, as in",
     "collect --task face_direction --steps -1 --out x": "must be a whole number from 1 to",
     "train-dae --data none --latent 8 --out x": "no data set in none",
     "data info none": "no data set in none",

@@ -69,9 +69,12 @@ def test_the_commands_of_the_readme_follow_one_another(tmp_path, monkeypatch):
     (tmp_path / "my_package.py").write_text(MY_ROBOT)
     (tmp_path / "studies").mkdir()
     demo = re.sub(r"^evaluations = .*\n", "", (ROOT / "studies/demo.toml").read_text(), flags=re.M)
-    for key, value in STUDY.items():
-        demo = re.sub(rf"^{key} = .*$", f"{key} = {value}", demo, flags=re.M)
-    (tmp_path / "studies/demo.toml").write_text(f"episode_steps = 100\n{demo}")
+    (mine,) = re.findall(r"^```toml\n(.*?)^```", (ROOT / "README.md").read_text(), re.M | re.S)
+    for path, study in (("studies/demo.toml", demo), ("mine.toml", mine)):
+        for key, value in STUDY.items():
+            study = re.sub(rf"^{key} = .*\n", "", study, flags=re.M)
+            study = f"{key} = {value}\n{study}"
+        (tmp_path / path).write_text(f"episode_steps = 100\n{study}")
     try:
         for words in commands():
             told = jbrep(*lessened(words))
@@ -79,5 +82,5 @@ def test_the_commands_of_the_readme_follow_one_another(tmp_path, monkeypatch):
     finally:
         sys.modules.pop("my_package", None)
         gymnasium.registry.pop("MyRobot-v0", None)
-    for made in ("ddpg.onnx", "walk.mp4", "runs/demo/report.html", "runs/tune/best.toml"):
+    for made in ("ddpg.onnx", "walk.mp4", "runs/study/report.html", "runs/tune/best.toml"):
         assert (tmp_path / made).stat().st_size, made

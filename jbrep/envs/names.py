@@ -55,9 +55,7 @@ def spec_of(task: Task) -> EnvSpec:
     try:
         return find_spec(task.id)
     except InputError:
-        parts = [part.partition(" ") for part in task.made_from or ()]
-        modules = dict.fromkeys(name.split(".")[0] for kind, _, name in parts if kind == "module")
-        if not modules:
+        if not (modules := modules_of(task)):
             raise
         which = (
             f"--import {shlex.quote(min(modules))}"
@@ -68,6 +66,12 @@ def spec_of(task: Task) -> EnvSpec:
             f"unknown task {task.id!r}: it was made by {', '.join(modules)}; add {which}"
             f"{'' if len(modules) == 1 else ', as --import MODULE'}: this runs its code"
         ) from None
+
+
+def modules_of(task: Task) -> list[str]:
+    """The user's own modules that a task was made by; none where packages have it."""
+    parts = [part.partition(" ") for part in task.made_from or ()]
+    return [*dict.fromkeys(name.split(".")[0] for kind, _, name in parts if kind == "module")]
 
 
 def import_modules(modules: Iterable[str]) -> None:
@@ -146,6 +150,13 @@ def name_given(text: str) -> str:
     module, colon, name = text.rpartition(":")
     if colon:
         import_modules([module])
+        known = vars(sys.modules[module]).get(name)
+        if name not in gymnasium.registry and isinstance(known, type):
+            raise InputError(
+                f"{name} in {module} is a class: register it there, as in gymnasium.register("
+                f"'{name}-v0', entry_point={name}, max_episode_steps=200), then give "
+                f"{module}:{name}-v0"
+            )
     return name
 
 

@@ -4,10 +4,12 @@ import json
 import shlex
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 from jbrep.encoders import FULL
 from jbrep.encoders.base import OWN
+from jbrep.envs.names import modules_of
 from jbrep.records.record import to_plain
 from jbrep.report.tables import Tables
 from jbrep.report.words import shown_number
@@ -15,7 +17,7 @@ from jbrep.rl.files import FAILED
 from jbrep.rl.settings import TrainingSettings
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study
-from jbrep.study.record import EACH_ITS_OWN, EncoderFacts, Label
+from jbrep.study.record import EACH_ITS_OWN, EncoderFacts, Label, RunsRecord
 from jbrep.study.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, number, slug
 
@@ -64,6 +66,8 @@ def full_scaling(tables: Tables) -> str:
         {e.encoder.shown.train_rows for e in labels if (e in full) == is_full} - {None}
         for is_full in (True, False)
     )
+    if ways == {"none"}:
+        return "The full state isn't scaled."
     told = f"The full state is scaled by {' or '.join(sorted(ways))}"
     if rows:
         told += f" of {_states(rows)} states"
@@ -217,6 +221,8 @@ def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield name, ", ".join(f"{each} {_shown(own)}" for each, own in value.items()) or None
         elif isinstance(value, Mapping):
             yield from _flat(value)
+        elif name == "features":
+            yield name, [feature[0] for feature in value]
         else:
             yield name, value
 
@@ -244,16 +250,18 @@ def reproduce(tables: Tables) -> list[tuple[str, str]]:
     report = ("The tables, the figures and this page, from the runs:", f"jbrep report {folder}")
     if record.study:
         toml = ("This file, as study.toml:", record.study.toml().rstrip())
-        command = f"jbrep study study.toml --out {folder}{_imports(record.study)}"
+        command = f"jbrep study study.toml --out {folder}{_imports(record, record.study)}"
         return [first, toml, ("All runs:", command), report]
     commands = "\n".join(_command(shared, tables.name) for shared in record.labels.values())
     return [first, ("Each run, here with one seed:", commands), report]
 
 
-def _imports(study: Study) -> str:
-    """The options that import the modules of a study's own encoders."""
+def _imports(record: RunsRecord, study: Study) -> str:
+    """The options that import the modules of a study's own robots and encoders."""
+    tasks = (shared.settings.environment for shared in record.labels.values())
     own = (each for each in study.representations if isinstance(each, Mapping))
-    modules = dict.fromkeys(str(each["code"]).partition(":")[0] for each in own if "code" in each)
+    codes = [str(each["code"]).partition(":")[0] for each in own if "code" in each]
+    modules = dict.fromkeys((*chain.from_iterable(map(modules_of, tasks)), *codes))
     return "".join(f" --import {shlex.quote(module)}" for module in modules)
 
 

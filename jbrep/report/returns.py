@@ -126,9 +126,12 @@ def steps(label: RepresentationResult, name: str) -> str:
 
 
 def return_form(groups: Sequence[GroupAnalysis], more: int = 0) -> str:
-    """A format for returns: three digits of the range of final returns, or more of them."""
+    """A format for returns: three digits of the range of final returns, or more of them.
+
+    Of a range that is small beside the returns themselves, as many as give these five.
+    """
     returns = [each for group in groups for each in group.profile_returns[[0, -1]]]
-    width = max(returns) - min(returns)
+    width = max(max(returns) - min(returns), max(map(abs, returns)) / 100)
     return f",.{np.clip(2 - math.floor(math.log10(width)), 0, _MOST_DIGITS) + more}f"
 
 
