@@ -12,6 +12,7 @@ import jbrep
 from jbrep import api
 from jbrep.cli import main
 from jbrep.errors import InputError
+from jbrep.rl.shipped import find
 
 QUICK = {"steps": 64, "evaluate_every": 64, "evaluation_episodes": 1, "final_episodes": 3}
 
@@ -96,6 +97,8 @@ def test_modules_are_functions_too_and_nothing_heavy_is_imported():
     code = (
         "import sys, jbrep; assert not {'torch', 'numpy', 'gymnasium'} & {*sys.modules};"
         "assert {*jbrep.__all__} <= {*dir(jbrep)} and jbrep.__version__;"
+        f"jbrep.load_policy({str(find(jbrep.describe('face_direction')))!r});"
+        "assert 'torch' not in sys.modules;"
         "import jbrep.collect.shards; assert callable(jbrep.collect);"
         "from jbrep import report; print(report.report.PAGE, callable(report))"
     )

@@ -13,9 +13,9 @@ from jbrep.errors import InputError
 from jbrep.rl import Run, train
 from jbrep.rl.controller import Controller, load_policy
 from jbrep.rl.normalization import Statistics
-from jbrep.rl.policy_file import acting, build
 from jbrep.rl.settings import CLASSES
 from jbrep.rl.shipped import find as find_shipped
+from jbrep.rl.trained import acting, build
 
 TASK = describe("move_to_pose", max_episode_steps=200)
 SETTINGS = {

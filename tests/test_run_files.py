@@ -42,6 +42,7 @@ from jbrep.rl.from_zip import load_zip
 from jbrep.rl.job import Scalars
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.policy_file import read
+from jbrep.rl.trained import of_file
 from jbrep.study.results import conclude
 
 TASK = describe("face_direction")
@@ -250,7 +251,7 @@ def test_every_field_of_a_policy_s_header_is_checked(run):
         for value in (..., *ODD):
             other = {key: each for key, each in {**header, name: value}.items() if each is not ...}
             container.write(run / POLICY, tensors, other)
-            used = attempt(lambda path: read(path).trained(), run / POLICY)
+            used = attempt(lambda path: of_file(read(path)), run / POLICY)
             assert (used is None) == (value not in allowed.get(name, [])), (name, value)
 
 

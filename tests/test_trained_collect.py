@@ -25,7 +25,8 @@ from jbrep.records import container
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, RUN
 from jbrep.rl.policy import load_run
-from jbrep.rl.policy_file import read, save
+from jbrep.rl.policy_file import read
+from jbrep.rl.trained import of_file, save
 
 import_modules(["environments"])
 SHORT = describe("face_direction", max_episode_steps=40)
@@ -182,14 +183,14 @@ def test_a_policy_s_file_that_means_harm(change, message, runs, tmp_path):
     tensors, header = container.read(path, "policy")
     container.write(path, tensors, {**header, **change})
     with pytest.raises(InputError, match=message):
-        read(path).trained()
+        of_file(read(path))
     weights = {**tensors, "policy.action_net.bias": np.zeros(7, np.float32)}
     container.write(path, weights, header)
     with pytest.raises(InputError, match="doesn't fit the run's settings"):
-        read(path).trained()
+        of_file(read(path))
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(InputError, match="is not a jbrep policy, or is truncated"):
-        read(path).trained()
+        of_file(read(path))
 
 
 def test_what_can_t_be_collected_with_is_said_in_one_line(runs, data, tmp_path):

@@ -23,7 +23,7 @@ from jbrep.rl.shipped import SHIPPED
 
 if TYPE_CHECKING:
     from jbrep.evaluate.control import GoodPolicy
-    from jbrep.rl.policy_file import Trained
+    from jbrep.rl.trained import Trained
 
 _HEURISTIC = "heuristic"  # the Jitterbug's hand-written policy
 _GOOD_EPISODES = 30  # of a good policy
@@ -217,9 +217,10 @@ def find_untrained(folder: Path, task: Task) -> Player:
 def _trained(source: str, task: Task | None, encoder: Any) -> Player:
     from jbrep.rl.policy import load_run  # imports torch
     from jbrep.rl.policy_file import read
+    from jbrep.rl.trained import of_file
 
     folder = run_folder(source)
-    trained = load_run(folder, encoder) if folder else read(policy_file(source, task)).trained()
+    trained = load_run(folder, encoder) if folder else of_file(read(policy_file(source, task)))
     name = str(folder or source)
     _check_task(name, trained.task, task)
     if trained.step is not None:

@@ -115,3 +115,12 @@ def _header(raw: bytes) -> dict[str, Any]:
         raise TypeError("its header is not in the form that jbrep writes")
     json.dumps(header, ensure_ascii=False).encode()  # half a character can't be written again
     return header
+
+
+def without(prefix: str, tensors: Tensors) -> Tensors:
+    """Those tensors whose names begin so, without that beginning."""
+    return {
+        name.removeprefix(prefix): values
+        for name, values in tensors.items()
+        if name.startswith(prefix)
+    }

@@ -131,15 +131,6 @@ def restore(agent: BaseAlgorithm, snapshot: Snapshot) -> None:
     agent.ep_info_buffer.extend(counters["episodes"])
 
 
-def without(prefix: str, tensors: Tensors) -> Tensors:
-    """Those tensors whose names begin so, without that beginning."""
-    return {
-        name.removeprefix(prefix): values
-        for name, values in tensors.items()
-        if name.startswith(prefix)
-    }
-
-
 class CheckpointHeader(Document, frozen=True, kw_only=True):
     """The header of a checkpoint.
 

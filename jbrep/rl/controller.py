@@ -10,13 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 from jbrep.coordinates import library_of
 from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.encoder import Encoder
+from jbrep.encoders.file import load
 from jbrep.encoders.fold import Chain
 from jbrep.encoders.layers import Layer, activate, run
 from jbrep.envs.view import Window
-from jbrep.errors import InputError
+from jbrep.errors import DamageError, InputError
 from jbrep.records.container import Tensors
-from jbrep.rl.files import RunSettings
+from jbrep.records.storage import exists
+from jbrep.rl.files import ENCODER, POLICY, RUN, RunSettings, read_finished
 from jbrep.rl.normalization import CLIP, Statistics
+from jbrep.rl.policy_file import PolicyFile, read
 
 _HIDDEN = "latent_pi.", "mlp_extractor.policy_net.", "mu."  # sequences, numbered from 0
 _LAST = "mu", "action_net"  # single layers after them
@@ -188,6 +191,10 @@ def network_of(settings: RunSettings, inputs: int, weights: Tensors) -> tuple[La
     for name in _LAST:
         if f"{name}.weight" in weights:
             chain = chain.affine(weights[f"{name}.weight"], weights[f"{name}.bias"])
+    if chain.width != settings.environment.action_size:
+        raise InputError(
+            f"the policy doesn't fit the run's settings: it gives {chain.width} actions"
+        )
     return chain.layers()
 
 
@@ -220,11 +227,36 @@ def load_policy(source: str | Path, encoder: Any = None) -> Controller:
         InputError: no run or policy there, or one that can't be taken out; as `load_run`.
         DamageError: a file isn't what was written.
     """
-    from jbrep.rl.policy import load_run  # imports torch
-    from jbrep.rl.policy_file import acting, read
-
     path = Path(source)
-    trained = read(path).trained() if path.is_file() else load_run(path, encoder)
+    if path.is_file():
+        file = read(path)
+        return _of_file(file, file.encoder())
+    if exists(path / RUN) and exists(path / ENCODER) and encoder is None:
+        _, sha256 = read_finished(path)
+        return _of_file(read(path / POLICY, sha256), load(path / ENCODER))
+    from jbrep.rl.policy import load_run  # imports torch
+    from jbrep.rl.trained import acting
+
+    trained = load_run(path, encoder)
     assert trained.settings is not None
     weights = {name: each.numpy() for name, each in acting(trained.policy).state_dict().items()}
     return Controller(trained.settings, trained.encoder, weights, trained.statistics)
+
+
+def _of_file(file: PolicyFile, encoder: Encoder) -> Controller:
+    """The policy in a file, and its encoder.
+
+    Raises:
+        InputError: the encoder is another, or as `Controller`.
+        DamageError: a number that it acts by isn't finite.
+    """
+    settings, weights = file.header.settings, file.weights
+    if encoder.fingerprint != settings.encoder:
+        raise InputError(f"{file.path} is of a run on another encoder than {encoder.name}")
+    encoder.check_task(settings.environment)
+    if not all(np.isfinite(values).all() for values in weights.values()):
+        raise DamageError(f"{file.path} is damaged: the policy's weights are not finite")
+    normalized = settings.hyperparameters.normalize
+    size = encoder.latent_size
+    statistics = Statistics.read(file.tensors, size, file.path) if normalized else None
+    return Controller(settings, encoder, weights, statistics)

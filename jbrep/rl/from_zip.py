@@ -22,9 +22,10 @@ from jbrep.errors import InputError
 from jbrep.records.storage import read_file
 from jbrep.rl.agent import action_repeat, is_action_scaled, one_line
 from jbrep.rl.normalization import Statistics
-from jbrep.rl.policy_file import MAX_BYTES, Trained
+from jbrep.rl.policy_file import MAX_BYTES
 from jbrep.rl.policy_zip import Told, told_by
 from jbrep.rl.presets import sb3_class
+from jbrep.rl.trained import Trained
 
 _PARTS = (spaces.Box, spaces.Discrete, spaces.MultiBinary)  # which `deterministic` knows
 _UNUSED: dict[str, Any] = {  # what only training needs: memory, or an environment to be made with

@@ -14,7 +14,8 @@ from jbrep.errors import DamageError, InputError
 from jbrep.records.storage import exists, read_file
 from jbrep.rl.files import ENCODER, PolicyHeader, is_policy_file
 from jbrep.rl.policy import load_run
-from jbrep.rl.policy_file import MAX_BYTES, Trained, pack, unpack
+from jbrep.rl.policy_file import MAX_BYTES, unpack
+from jbrep.rl.trained import Trained, of_file, pack
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Frozen:
 @lru_cache(maxsize=8)
 def _opened(file: str, content: bytes) -> tuple[PolicyHeader, Trained]:
     policy = unpack(content, Path(file))
-    return policy.header, policy.trained()
+    return policy.header, of_file(policy)
 
 
 def freeze(source: str, path: Path, file: str) -> Frozen:

@@ -44,10 +44,11 @@ from jbrep.rl.files import (
     read_run,
     write_infos,
 )
-from jbrep.rl.policy_file import MAX_BYTES, Trained, pack_whole, read
+from jbrep.rl.policy_file import MAX_BYTES, read
 from jbrep.rl.policy_zip import policy_zip
 from jbrep.rl.run import Run
 from jbrep.rl.settings import CPU, MAX_LINE
+from jbrep.rl.trained import Trained, fill_whole, pack_whole
 
 Watch = Callable[[int, float | None], None]  # steps so far; mean return of the last evaluation
 Ended = tuple["Job", RunRecord]
@@ -196,7 +197,7 @@ class Job:
         """
         if self.settings.begin_from:
             policy = read(Path(self.run.begin_from) / POLICY, self.settings.begin_from)
-            policy.fill_whole(agent.policy)
+            fill_whole(policy, agent.policy)
             restore_statistics(agent, policy.tensors, policy.path)
             write_whole(self.folder / BEGINNING, read_file(policy.path, MAX_BYTES))
         scalars = Scalars(inside(self.folder, "tensorboard"), self.history.first_step)

@@ -2,15 +2,17 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from jbrep.envs.task import Array
 from jbrep.errors import DamageError
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.running_mean_std import RunningMeanStd
+    from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 CLIP = 10.0  # standard deviations
 _EPSILON = 1e-8  # added to the variance
@@ -38,11 +40,13 @@ class Statistics:
     @classmethod
     def untrained(cls, size: int) -> "Statistics":
         """Those that a run begins with."""
+        from stable_baselines3.common.running_mean_std import RunningMeanStd
+
         start = RunningMeanStd(shape=(size,))
         return cls(start.mean, start.var, start.count)
 
     @classmethod
-    def of(cls, env: VecNormalize) -> "Statistics":
+    def of(cls, env: "VecNormalize") -> "Statistics":
         """Those of an environment so far."""
         running = _running(env)
         return cls(running.mean, running.var, float(running.count))
@@ -88,17 +92,19 @@ class Statistics:
         scaled = (seen - self.mean) / np.sqrt(self.variance + self.epsilon)
         return np.clip(scaled, -self.clip, self.clip).astype(np.float32)
 
-    def give(self, env: VecNormalize) -> None:
+    def give(self, env: "VecNormalize") -> None:
         """Let an environment continue from them."""
         running = _running(env)
         running.mean, running.var = self.mean.copy(), self.variance.copy()
         running.count = self.count
 
 
-def _running(env: VecNormalize) -> RunningMeanStd:
-    return cast(RunningMeanStd, env.obs_rms)  # of one array: observations are no dictionaries
+def _running(env: "VecNormalize") -> "RunningMeanStd":
+    return cast("RunningMeanStd", env.obs_rms)  # of one array: observations are no dictionaries
 
 
-def normalized(env: VecEnv) -> VecNormalize:
+def normalized(env: "VecEnv") -> "VecNormalize":
     """An environment whose observations are normalised; its rewards are left as they are."""
+    from stable_baselines3.common.vec_env import VecNormalize
+
     return VecNormalize(env, norm_reward=False, clip_obs=CLIP, epsilon=_EPSILON)

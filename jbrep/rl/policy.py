@@ -8,9 +8,10 @@ from jbrep.encoders.base import BaseEncoder
 from jbrep.encoders.code import make
 from jbrep.encoders.encoder import as_file
 from jbrep.errors import InputError, differences
+from jbrep.records.container import without
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
-from jbrep.rl.checkpoint import PARAMETERS, read_checkpoint, without
+from jbrep.rl.checkpoint import PARAMETERS, read_checkpoint
 from jbrep.rl.files import (
     BEGINNING,
     CHECKPOINT,
@@ -24,7 +25,8 @@ from jbrep.rl.files import (
     read_run,
 )
 from jbrep.rl.overrides import check_shape
-from jbrep.rl.policy_file import Trained, acting, build, read
+from jbrep.rl.policy_file import read
+from jbrep.rl.trained import Trained, acting, build
 from jbrep.training.trainer import single_torch_thread
 
 

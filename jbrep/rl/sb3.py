@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs.lanes import EnvironmentFailedError, NonFiniteActionError
-from jbrep.records.container import Tensors
+from jbrep.records.container import Tensors, without
 from jbrep.rl import checkpoint
 from jbrep.rl.action_noise import RememberedNoise
 from jbrep.rl.agent import make_agent, make_env, training_seed, unchecked_distributions
@@ -31,11 +31,10 @@ from jbrep.rl.checkpoint import (
     DivergedError,
     Snapshot,
     StoppedError,
-    without,
 )
 from jbrep.rl.files import Episode, RunRecord
 from jbrep.rl.job import Ended, Job, Session
-from jbrep.rl.policy_file import acting
+from jbrep.rl.trained import acting
 
 _MEMORIES: dict[type, str] = {  # of noises that depend on what was drawn before
     OrnsteinUhlenbeckActionNoise: "noise_prev",

@@ -11,8 +11,9 @@ from torch import Tensor
 from jbrep.encoders.base import Float32
 from jbrep.envs.endless import Endless
 from jbrep.envs.task import Array
+from jbrep.records.container import without
 from jbrep.rl.agent import training_seed
-from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, LANES, Snapshot, without
+from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, LANES, Snapshot
 from jbrep.rl.cohort import get_algorithm
 from jbrep.rl.cohort.algorithm import Batch, Losses
 from jbrep.rl.cohort.member import Member

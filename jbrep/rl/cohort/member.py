@@ -17,10 +17,10 @@ from torch import Tensor
 from jbrep.encoders.base import Float32
 from jbrep.envs.lanes import EnvironmentFailedError, Flags, NonFiniteActionError
 from jbrep.envs.task import Array
-from jbrep.records.container import Tensors
+from jbrep.records.container import Tensors, without
 from jbrep.rl import checkpoint
 from jbrep.rl.agent import Spaces, make_agent
-from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE, Snapshot, without
+from jbrep.rl.checkpoint import ACTIONS_NOT_FINITE, WEIGHTS_NOT_FINITE, Snapshot
 from jbrep.rl.files import Episode
 from jbrep.rl.job import Job
 from jbrep.rl.noise import Memory, Noise, beginning
