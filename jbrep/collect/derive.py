@@ -82,7 +82,7 @@ def derive(
 
 def derive_view(
     source: Path, folder: Path, hidden: Sequence[str] = (), history: int = 1
-) -> Written:
+) -> Manifest:
     """Write the data set with less to see: without some features, or with those of some last steps.
 
     Args:
