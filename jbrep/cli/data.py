@@ -207,9 +207,9 @@ def derive(
     threads: int | None,
     out: Path,
 ) -> None:
-    """Make a data set of the same motion: of another task, or with less or more to see.
+    """Make another data set of the same motion.
 
-    Another task's equals collecting that task with the same settings, bit for bit, without
+    It is of another task, or has less or more to see. Another task's equals collecting that task with the same settings, bit for bit, without
     simulating again; the source needs its states (collect --store-state) and a policy that doesn't
     depend on observations. What is seen can be changed in any data set: --hide leaves features out,
     --history adds those of the steps before, and the actions since. Such an encoder estimates what
