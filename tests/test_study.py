@@ -466,9 +466,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     monkeypatch.delitem(gymnasium.registry, robots.ID)
     told = jbrep("report", out)
     assert told.exit_code == 0, told.output
-    page = (out / "report.html").read_text()
-    assert f"{robots.ID}/a2c/dae-2" in page
-    assert "jbrep study study.toml --out mixed --import robots" in page
+    assert f"{robots.ID}/a2c/dae-2" in (out / "report.html").read_text()
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["runs"], summary["missing"], summary["failed"]) == (8, [], [])
     returns = {task: [] for task in (robots.ID, "face_direction")}

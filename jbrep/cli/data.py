@@ -209,11 +209,11 @@ def derive(
 ) -> None:
     """Make another data set of the same motion.
 
-    It is of another task, or has less or more to see. Another task's equals collecting that task with the same settings, bit for bit, without
-    simulating again; the source needs its states (collect --store-state) and a policy that doesn't
-    depend on observations. What is seen can be changed in any data set: --hide leaves features out,
-    --history adds those of the steps before, and the actions since. Such an encoder estimates what
-    can't be measured.
+    It is of another task, or has less or more to see. Another task's equals collecting that task
+    with the same settings, bit for bit, without simulating again; the source needs its states
+    (collect --store-state) and a policy that doesn't depend on observations. What is seen can be
+    changed in any data set: --hide leaves features out, --history adds those of the steps before,
+    and the actions since. Such an encoder estimates what can't be measured.
     """
     from jbrep.collect.derive import derive as run
     from jbrep.collect.derive import derive_view
