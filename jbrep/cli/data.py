@@ -256,7 +256,7 @@ def export(data: Path, to: str, out: Path) -> None:
 )
 @environment_options
 def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
-    """Make a data set of one that was made elsewhere, or of a robot's logs.
+    """Make a data set of other tools' data, or of logs.
 
     SOURCE is a file (.csv, .tsv, .txt, .parquet, .npz), the folder of a Minari data set, or its id
     in MINARI_DATASETS_PATH; of several, an episode ends with each. Without --task, the task is the
