@@ -13,6 +13,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from command import jbrep
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
 
 from jbrep.dataset import Dataset, Layout, ScaledDataset
 from jbrep.dataset.verify import find_problems
@@ -373,3 +377,70 @@ def test_damaged_lerobot_data_sets_are_refused(tmp_path):
     done = jbrep("data", "import", folder, "--out", tmp_path / "out")
     assert "has no data/chunk-*/*.parquet" in done.output
     assert not (tmp_path / "out").exists()
+
+
+def write_bag(path, kind):
+    """Joints at 100 Hz in changing order, commands at 10 Hz that pause, and words."""
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
+    if kind == "bag":
+        writer, pack = Writer1(path), store.serialize_ros1
+    else:
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer, pack = Writer2(path, version=9, storage_plugin=plugin), store.serialize_cdr
+    types = store.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    first = {"seq": 0} if kind == "bag" else {}
+    header = types["std_msgs/msg/Header"](**first, stamp=stamp, frame_id="base")
+    empty = np.zeros(0)
+    with writer:
+        made = {
+            topic: writer.add_connection(topic, f"{name}", typestore=store)
+            for topic, name in {
+                "/joint_states": "sensor_msgs/msg/JointState",
+                "/arm/command": "std_msgs/msg/Float64",
+                "/rosout": "std_msgs/msg/String",
+            }.items()
+        }
+        for i in range(300):
+            time = 1_700_000_000_000_000_000 + i * 10_000_000
+            names, angles = ["hip", "knee"], np.array([i / 100, -i / 100])
+            if i % 2:
+                names, angles = names[::-1], angles[::-1].copy()
+            joints = types["sensor_msgs/msg/JointState"](header, names, angles, empty, empty)
+            writer.write(made["/joint_states"], time, pack(joints, joints.__msgtype__))
+            if i % 10 == 5 and not 100 < i < 200:
+                command = types["std_msgs/msg/Float64"](float(i))
+                writer.write(made["/arm/command"], time, pack(command, command.__msgtype__))
+        word = types["std_msgs/msg/String"]("hello")
+        writer.write(made["/rosout"], time, pack(word, word.__msgtype__))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])
+def test_a_bag_of_ros(kind, tmp_path):
+    path = write_bag(tmp_path / ("walk.bag" if kind == "bag" else "walk"), kind)
+    done = jbrep("data", "import", path, "--out", tmp_path / "out")
+    assert "topics with clocks of their own: give --rate" in done.output
+    assert "/joint_states.position.hip" in done.output
+    names = ("--observations", "/joint_states.position.*", "--actions", "/arm/command.data")
+    told, data = imported(path, *names, "--rate", "50", "--gap", "0.15")
+    assert data.task.feature_names == ("joint_states.position.hip", "joint_states.position.knee")
+    assert (data.task.timestep, data.task.id) == (1 / 50, "walk")
+    assert data.episodes["length"].tolist() == [52, 47]
+    hip, knee = data.episode(0)["observation"].T
+    np.testing.assert_allclose(hip, 0.05 + np.arange(52) / 50, atol=1e-6)
+    np.testing.assert_allclose(knee, -hip)
+    assert data.episode(0)["action"][:6, 0].tolist() == [5, 5, 5, 5, 5, 15]
+    assert "no numbers known in /rosout" in told
+    if kind == "mcap":
+        (file,) = path.glob("*.mcap")
+        _, same = imported(file, *names, "--rate", "50", "--gap", "0.15", out="same")
+        np.testing.assert_array_equal(same["observation"], data["observation"])
+
+
+def test_a_damaged_bag_is_refused(tmp_path):
+    for name in ("a.bag", "a.mcap", "a.db3"):
+        (tmp_path / name).write_bytes(b"nonsense" * 20)
+        done = jbrep("data", "import", tmp_path / name, "--rate", "9", "--out", tmp_path / "out")
+        assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+        assert f"{name} can't be read as a bag" in done.stderr

@@ -26,8 +26,12 @@ FORMATS = {
 _FILES = {  # which module reads files that end so
     **{"npz": "npz", "parquet": "parquet"},
     **dict.fromkeys(("csv", "tsv", "txt"), "delimited"),
+    **dict.fromkeys(("bag", "mcap", "db3"), "bags"),
 }
-_FOLDERS = {"meta/info.json": "lerobot"}  # and folders that hold such a file
+_FOLDERS = {
+    "meta/info.json": "lerobot",
+    "metadata.yaml": "bags",
+}  # that a folder holds
 
 
 def load_format(name: str) -> ModuleType:

@@ -84,6 +84,12 @@ def _both(table: Table, given: Layout) -> Layout:
     for name in ("gap", "rate"):
         if getattr(layout, name) and not layout.time:
             raise InputError(f"--{name} needs --time, the column of times")
+    if table.is_sparse and not (layout.observations and layout.actions and layout.rate):
+        names = [name for name in table.schema.names if name != layout.time]
+        raise InputError(
+            f"{table.name} has topics with clocks of their own: give --rate, --observations and "
+            f"--actions, of {', '.join(names)}"
+        )
     return layout
 
 

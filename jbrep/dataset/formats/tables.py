@@ -44,6 +44,7 @@ class Table:
         task, once: what it knows besides, see `Source` and `per_episode`.
         first: the number of the first row in messages, and what rows are called there.
         timestep: of its clock, if its format says it [s].
+        is_sparse: whether a row has numbers of some columns only.
         notes: on what its format leaves out.
     """
 
@@ -57,6 +58,7 @@ class Table:
     once: Mapping[str, Array] = field(default_factory=dict)
     first: tuple[str, int] = ("row", 0)
     timestep: float | None = None
+    is_sparse: bool = False
     notes: tuple[str, ...] = ()
 
 
