@@ -11,6 +11,7 @@ import pytest
 
 from jbrep.cli import main
 from jbrep.coordinates import make_coordinates
+from jbrep.dataset.layout import Layout
 from jbrep.encoders.header import EncoderHeader
 from jbrep.envs import describe
 from jbrep.records.keys import key_table
@@ -88,6 +89,7 @@ SHARED = (*TrainingSettings.__struct_fields__, "data", "learners", "verdicts")
     [
         ("encoder-file", key_table(EncoderHeader)),
         ("learning", key_table(TrainingSettings)),
+        ("logs", key_table(Layout)),
         ("studies", key_table(Study, without=SHARED)),
         ("studies", key_table(Data, of="data")),
         ("studies", key_table(Rules, of="verdicts")),

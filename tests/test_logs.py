@@ -2,9 +2,12 @@
 
 import json
 import math
+import re
+import shlex
 import shutil
 import sys
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 import pandas
@@ -444,3 +447,16 @@ def test_a_damaged_bag_is_refused(tmp_path):
         done = jbrep("data", "import", tmp_path / name, "--rate", "9", "--out", tmp_path / "out")
         assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
         assert f"{name} can't be read as a bag" in done.stderr
+
+
+def test_the_page_on_logs_does_what_it_says(tmp_path, monkeypatch):
+    """Its first block of Python writes a log, its commands import it."""
+    page = (Path(__file__).parent.parent / "docs/logs.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    exec(re.search(r"^```python\n(.*?)^```", page, re.M | re.S)[1], {})
+    told = [jbrep(*shlex.split(line)) for line in re.findall(r"^ {4}jbrep (.*)", page, re.M)]
+    assert [done.exit_code for done in told] == [0] * len(told) == [0] * 6, told
+    assert "3 gaps of more than 0.5 s: an episode ends there" in told[0].output
+    assert "1 missing readings (hold:3)" in told[0].output
+    assert "400 rows at 50 Hz, by the linear readings" in told[1].output
+    sys.modules.pop("my_rewards", None)

@@ -258,10 +258,10 @@ def export(data: Path, to: str, out: Path) -> None:
 def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
     """Make a data set of other tools' data, or of logs.
 
-    SOURCE is a file (.csv, .tsv, .txt, .parquet, .npz), the folder of a Minari data set, or its id
-    in MINARI_DATASETS_PATH; of several, an episode ends with each. Without --task, the task is the
-    one that the source names, or is made from the data alone. See docs/logs.md, and
-    docs/data-format.md for what is known by its name.
+    SOURCE is a file (.csv, .tsv, .txt, .parquet, .npz, .bag, .mcap, .db3), the folder of a bag, of
+    a LeRobot or a Minari data set, or the id of the latter in MINARI_DATASETS_PATH; an episode ends
+    with each of several. Without --task, the task is the one that the source names, or is made from
+    the data alone. See docs/logs.md, and docs/data-format.md for what is known by its name.
     """
     from jbrep.dataset.formats import open_source, together
     from jbrep.dataset.formats.writer import write
