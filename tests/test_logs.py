@@ -343,6 +343,11 @@ def test_a_lerobot_data_set(tmp_path):
     assert "not used: timestamp, index, task_index" in told
     told, few = imported(tmp_path / "arm", "--observations", "observation.state.elbow*", out="few")
     assert few.task.feature_names == ("elbow.pos",)
+    jbrep("data", "export", few.folder, "--to", "lerobot", "--out", tmp_path / "out")
+    file = tmp_path / "out/data/chunk-000/file-000.parquet"
+    assert pq.read_schema(file).field("observation.state").type == pa.float32()  # as LeRobot has it
+    _, again = imported(tmp_path / "out", out="again")
+    assert again.task.feature_names == few.task.feature_names
 
 
 def test_what_is_exported_to_lerobot_has_its_layout_and_comes_back(tmp_path):

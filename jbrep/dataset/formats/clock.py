@@ -141,4 +141,5 @@ def timestep_of(time: Array) -> float | None:
         return None
     low, median, high = np.percentile(steps, (5, 50, 95))
     even = (1 - _EVEN) * median <= low and high <= (1 + _EVEN) * median
-    return float(f"{median:.4g}") if even else None
+    usual = steps[np.abs(steps - median) <= _EVEN * median]
+    return float(f"{usual.mean():.4g}") if even else None

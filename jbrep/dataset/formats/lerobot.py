@@ -92,7 +92,7 @@ def _named(schema: pa.Schema, known: Mapping[str, Any]) -> pa.Schema:
         names = known.get(each.name, {}).get("names")
         if isinstance(names, dict):  # as in {"motors": [...]}
             names = next(iter(names.values()), None)
-        fits = isinstance(names, list) and len(names) == width(each.type)
+        fits = isinstance(names, list) and len(names) == (width(each.type) or 1)
         if fits and all(isinstance(name, str) for name in names):
             schema = schema.set(i, each.with_metadata({NAMES: "\n".join(names).encode()}))
     return schema
@@ -146,7 +146,7 @@ def _write_steps(dataset: Dataset, folder: Path, fps: float) -> list[int]:
         if rows > _FILE_ROWS and rows > length:
             files[-1], rows = files[-1] + 1, length
     schema = pa.schema(
-        pa.field(name, pa.list_(kind, each["shape"][0]) if each["names"] else kind)
+        pa.field(name, pa.list_(kind, each["shape"][0]) if each["shape"] != [1] else kind)
         for name, each in _features(dataset).items()
         for kind in [pa.float32() if each["dtype"] == "float32" else pa.int64()]
     )
@@ -164,9 +164,10 @@ def _write_steps(dataset: Dataset, folder: Path, fps: float) -> list[int]:
         columns |= {"episode_index": np.full(length, number), "task_index": np.zeros(length)}
         columns |= {"next.reward": episode["reward"]} if "next.reward" in schema.names else {}
         wide = {"observation.state": episode["observation"], "action": episode["action"]}
+        columns |= {name: values[:, 0] for name, values in wide.items()}  # where it is one number
         arrays = [
             pa.FixedSizeListArray.from_arrays(wide[each.name].ravel(), each.type.list_size)
-            if each.name in wide
+            if pa.types.is_fixed_size_list(each.type)
             else pa.array(columns[each.name].astype(each.type.to_pandas_dtype()))
             for each in schema
         ]

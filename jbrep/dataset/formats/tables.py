@@ -84,7 +84,7 @@ def _leaves(schema: pa.Schema, layout: Layout) -> Iterator[Leaf]:
         names = said.get(NAMES, b"").decode().split("\n") if NAMES in said else []
         size = width(each.type)
         for i in range(1 if size is None else size):
-            name, short, place = each.name, each.name, None
+            name, short, place = each.name, names[0] if names else each.name, None
             if size is not None:
                 place, short = i, names[i] if names else f"{each.name}_{i}"
                 name = f"{each.name}.{names[i] if names else i}"
