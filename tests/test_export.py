@@ -171,6 +171,9 @@ def test_nothing_is_overwritten_and_no_half_is_left(dataset, tmp_path, monkeypat
     assert not [path.name for path in (tmp_path / "new").rglob("*") if path.is_file()]
 
 
+FOLDERS = dict.fromkeys(("minari", "lerobot"), "folder")
+
+
 def exported(to, folder):
     """What an export to `folder / to` writes: its files, or the folder of its data set."""
     minari = folder / "minari" / "jitterbug" / "face_direction" / "uniform-v0"
@@ -180,11 +183,11 @@ def exported(to, folder):
 @pytest.mark.parametrize("to", FORMATS)
 def test_what_came_after_the_check_is_not_overwritten(to, dataset, tmp_path, monkeypatch):
     path = exported(to, tmp_path)
-    publish = f"jbrep.dataset.formats.{to}.publish_{'folder' if to == 'minari' else 'file'}"
+    publish = f"jbrep.dataset.formats.{to}.publish_{FOLDERS.get(to, 'file')}"
     original = pydoc.locate(publish)
 
     def come_first(partial, name):
-        if name == path and to == "minari":
+        if name == path and to in FOLDERS:
             path.mkdir()
             (path / "precious").write_text("precious")
         elif name == path:
