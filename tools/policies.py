@@ -1,8 +1,8 @@
-"""Ship the best agent for each task: python tools/policies.py FOLDER...
+"""Ship the best agent for each task: python tools/policies.py STUDY...
 
-The folders have the runs of any studies. A task's best run has the highest mean return in the last
-tenth of training; a task that none has learned gets no policy. Those episodes have other starts
-than the evaluation's, so the returns that are written, which are of the evaluation's episodes,
+A task's best run, of those of some finished studies, has the highest mean return in its last 64
+episodes of training; a task that none has learned gets no policy. Those episodes have other starts
+than the evaluation's, so the returns that are written, which are of the last evaluation's episodes,
 aren't what it was chosen by.
 """
 
@@ -13,24 +13,22 @@ from pathlib import Path
 
 import numpy as np
 
-from jbrep.envs.description import describe
-from jbrep.jitterbug.tasks import TASKS
-from jbrep.play.sources import find_player
-from jbrep.rl.files import EPISODES, FINISHED, read_run, runs_below
+from jbrep.jitterbug.tasks import TASKS, Array
+from jbrep.rl.files import EPISODES, FINISHED, last_returns, read_evaluations, read_run, runs_below
 from jbrep.rl.policy import load_run
 from jbrep.rl.policy_file import save
 from jbrep.rl.shipped import SHIPPED, file_of, write_returns
+from jbrep.stats.scale import LOOKING, STILL
+from jbrep.study.tables import REFERENCE_RETURNS, References, read_references, stated
 
-SHOWN = (SHIPPED, "heuristic")
 COUNTED = 100  # episodes
-LAST = 0.1  # part of training
+LAST = 64  # episodes of training, one of each robot
 
 
-def score(run: Path, steps: int) -> float:
-    """Mean return of the episodes that ended in the last part of training."""
+def score(run: Path) -> float:
+    """Mean return of the last episodes of training."""
     with (run / EPISODES).open() as file:
-        episodes = [(int(row["step"]), float(row["return"])) for row in csv.DictReader(file)]
-    return float(np.mean([value for step, value in episodes if step > (1 - LAST) * steps]))
+        return float(np.mean([float(row["return"]) for row in csv.DictReader(file)][-LAST:]))
 
 
 def best(folders: list[Path]) -> dict[str, tuple[float, Path]]:
@@ -40,32 +38,30 @@ def best(folders: list[Path]) -> dict[str, tuple[float, Path]]:
         run = read_run(path)
         task = run.settings.task
         if run.status == FINISHED and task in TASKS:
-            scored = (score(path, run.settings.steps), path)
+            scored = (score(path), path)
             found[task] = max(found.get(task, scored), scored)
     return {task: found[task] for task in TASKS if task in found}
 
 
-def has_learned(run: Path, task: str) -> bool:
-    """Whether a run's median return is nearer to the hand-written policy than to standing still."""
-    still, learned, written = (
-        np.median(find_player(policy, describe(task)).returns(COUNTED))
-        for policy in ("still", str(run), "heuristic")
-    )
-    return bool(learned - still > written - learned)
-
-
 def main() -> None:
     folders = [Path(each) for each in sys.argv[1:]]
-    played = {}
+    played, beside = dict[str, dict[str, Array]](), References()
+    for folder in folders:
+        beside |= read_references(folder, stated(folder)[REFERENCE_RETURNS])
     for task, (value, run) in best(folders).items():
-        if not has_learned(run, task):
+        learned = last_returns(read_evaluations(run))
+        written, still = beside[task][LOOKING], beside[task][STILL]
+        if {len(learned), len(written)} != {COUNTED}:
+            sys.exit(
+                f"{run} was evaluated in {len(learned)} episodes at last: {COUNTED} are needed"
+            )
+        reached, least, most = (float(np.median(each)) for each in (learned, still, written))
+        if reached - least < most - reached:
             print(f"{task}: none shipped, as {run} returns about what standing still does")
             continue
         save(load_run(run), file_of(task), SHIPPED)
-        played[task] = {
-            policy: find_player(policy, describe(task)).returns(COUNTED) for policy in SHOWN
-        }
-        print(f"{task}: {run}, {value:.0f} in the last tenth of training")
+        played[task] = {SHIPPED: np.array(learned), "heuristic": np.array(written)}
+        print(f"{task}: {run}, {value:.0f} in training, at last; median {reached:.0f}")
     write_returns(played)
 
 
