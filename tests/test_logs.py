@@ -223,9 +223,9 @@ def test_data_without_rewards_go_through_what_needs_none(tmp_path):
     assert "no reward is known" in untold(evaluation)
     assert evaluation.encoders["code"].prediction["5"].mean.value is not None
     with pytest.raises(InputError, match="deepmdp needs a reward that varies"):
-        fitter.plan("deepmdp", latent=2)
-    with pytest.raises(InputError, match="no column, group or feature 'reward'"):
-        data["reward"]
+        fitter.plan("deepmdp", latent=1)
+    done = jbrep("data", "export", data.folder, "--to", "minari", "--out", tmp_path / "out")
+    assert f"{data.folder} has no rewards: give some by --reward when importing\n" in done.output
 
 
 BAD = {

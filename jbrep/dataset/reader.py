@@ -220,6 +220,8 @@ class Dataset:
             spec = self._specs[name]
             return Column(lambda k: self._shard(k)[name], self._ends, spec.dtype, spec.row)
         places = self._places
+        if name == "reward" and name not in places:
+            raise InputError(f"{self.folder} has no rewards: give some by --reward when importing")
         if name not in places:
             raise InputError(
                 f"no column, group or feature {name!r}: choose one of "
