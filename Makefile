@@ -67,7 +67,7 @@ bench: $(READY) ## speed as ratios in one run, and what the hand-written policie
 
 pictures: $(READY) ## the pictures in docs/, drawn anew
 	rm -f docs/jitterbug.gif
-	$(BIN)/jbrep render uniform heuristic --task move_to_pose --episode 10 --seconds 3.5 --speed 0.7 --fps 10 --size 240x180 --out docs/jitterbug.gif
+	$(BIN)/jbrep render uniform trained --task move_to_pose --episode 10 --seconds 3.5 --speed 0.7 --fps 10 --size 240x180 --out docs/jitterbug.gif
 	$(BIN)/jbrep inspect data/sample/face_direction --episode 1 --encoder dae-8 --out inspect/shown.rrd
 	$(BIN)/jbrep report results/confirm-move
 	MUJOCO_GL=egl $(BIN)/python tools/pictures.py results/confirm-move/report.html inspect/shown.rrd docs
@@ -135,7 +135,7 @@ trainers: $(READY) ## what results/trainers/ lacks: eight hours for all of it; g
 	done
 	$(BIN)/python tools/trainers.py results/trainers
 
-policies: $(READY) ## the trained policies that ship, anew: hours; goes on where it was stopped
+policies: $(READY) ## the trained policies that ship, anew: an hour; goes on where it was stopped
 	$(BIN)/jbrep study studies/policies.toml --out runs/policies
 	$(BIN)/python tools/policies.py runs/policies
 

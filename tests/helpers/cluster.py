@@ -57,7 +57,7 @@ def run(study, study_folder, data, data_folder):
     with running_cluster() as cluster:
         assert loses_a_node(cluster, learn, lambda: any(study_folder.rglob(PROGRESS))) == 0
         first = data_folder / "shard-00000.h5"
-        assert loses_a_node(cluster, make, first.exists).manifest.complete
+        assert loses_a_node(cluster, make, first.exists).complete
 
 
 if __name__ == "__main__":
