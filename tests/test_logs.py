@@ -190,6 +190,7 @@ def scalar(observations, actions):
 def rewards(tmp_path, monkeypatch):
     (tmp_path / "my_rewards.py").write_text(REWARD)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
     yield
     sys.modules.pop("my_rewards", None)
 
@@ -458,6 +459,7 @@ def test_the_page_on_logs_does_what_it_says(tmp_path, monkeypatch):
     """Its first block of Python writes a log, its commands import it."""
     page = (Path(__file__).parent.parent / "docs/logs.md").read_text()
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])
     exec(re.search(r"^```python\n(.*?)^```", page, re.M | re.S)[1], {})
     told = [jbrep(*shlex.split(line)) for line in re.findall(r"^ {4}jbrep (.*)", page, re.M)]
     assert [done.exit_code for done in told] == [0] * len(told) == [0] * 6, told
