@@ -16,8 +16,8 @@ import numpy as np
 from jbrep.jitterbug.tasks import TASKS, Array
 from jbrep.rl.files import EPISODES, FINISHED, last_returns, read_evaluations, read_run, runs_below
 from jbrep.rl.policy import load_run
-from jbrep.rl.trained import save
 from jbrep.rl.shipped import SHIPPED, file_of, write_returns
+from jbrep.rl.trained import save
 from jbrep.stats.scale import LOOKING, STILL
 from jbrep.study.tables import REFERENCE_RETURNS, References, read_references, stated
 
