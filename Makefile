@@ -67,7 +67,7 @@ bench: $(READY) ## speed as ratios in one run, and what the hand-written policie
 
 pictures: $(READY) ## the pictures in docs/, drawn anew
 	rm -f docs/jitterbug.gif
-	$(BIN)/jbrep render uniform trained --task move_to_pose --episode 10 --seconds 3.5 --speed 0.7 --fps 10 --size 240x180 --out docs/jitterbug.gif
+	$(BIN)/jbrep render uniform trained --task move_to_pose --episode 18 --seconds 4 --speed 0.7 --fps 10 --size 240x180 --out docs/jitterbug.gif
 	$(BIN)/jbrep inspect data/sample/face_direction --episode 1 --encoder dae-8 --out inspect/shown.rrd
 	$(BIN)/jbrep report results/confirm-move
 	MUJOCO_GL=egl $(BIN)/python tools/pictures.py results/confirm-move/report.html inspect/shown.rrd docs
