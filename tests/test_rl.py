@@ -518,8 +518,8 @@ def test_evaluations_take_a_small_share_of_a_run_with_the_defaults():
     run = Run.of(task="face_direction", preset="wide")
     settings = run.settings(run.find_encoder())
     assert (settings.evaluate_every, settings.final_episodes) == (100_000, 50)
-    lanes = settings.hyperparameters.num_envs
-    steps = range(0, settings.steps, lanes)
+    used = settings.hyperparameters
+    steps = range(0, settings.steps, used.num_envs * used.action_repeat)
     times = sum(map(settings.is_evaluation_due, steps))
     assert times == 10
     episodes = times * settings.evaluation_episodes + settings.final_episodes
