@@ -96,7 +96,8 @@ def test_the_units_of_actions_do_not_matter(algorithm, short_rollouts, tmp_path)
     np.testing.assert_allclose(*played, rtol=0.01)
     (rollout,) = find_player(str(tmp_path / "1")).play([0])
     assert 1000 <= rollout.action.min() < rollout.action.max() <= 2000
-    exported = load_policy(tmp_path / "1")(rollout.observation[:-1])
+    controller = load_policy(tmp_path / "1")
+    exported = [controller(observation) for observation in rollout.observation[:-1]]
     np.testing.assert_allclose(exported, rollout.action, rtol=1e-5)
 
 
