@@ -87,10 +87,10 @@ def test_it_holds_actions_and_begins_again(tmp_path):
 
 
 def test_several_robots_at_once_are_like_one_after_the_other():
-    controller = controller_of(randomised("sac", "symmetry"))
+    trained = randomised("sac", "symmetry")
     rows = np.random.default_rng(0).normal(size=(3, TASK.size))
-    one_by_one = np.array([controller(row) for row in rows])
-    np.testing.assert_allclose(controller(rows), one_by_one, atol=1e-6)
+    one_by_one = np.array([controller_of(trained)(row) for row in rows])
+    np.testing.assert_allclose(controller_of(trained)(rows), one_by_one, atol=1e-6)
     assert one_by_one.std() > 0.01
 
 
@@ -116,7 +116,7 @@ def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
         load_policy(tmp_path / "own")
     shipped = find_shipped(describe("face_direction"))
     controller = load_policy(shipped)
-    assert repr(controller) == "Controller(face_direction: 16 numbers to 1, full)"
+    assert repr(controller) == "Controller(face_direction: 16 numbers to 1, symmetry)"
 
 
 def test_what_it_cannot_act_on_is_refused():
