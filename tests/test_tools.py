@@ -62,7 +62,8 @@ def test_the_best_agent_is_the_best_at_the_end_of_training(tmp_path):
         folder.mkdir(parents=True)
         run = Run.of(FACE, "sac", seed=seed, steps=1000, preset="paper")
         write_record(folder, run)
-        rows = [Episode(500, 0, 900.0 - late, 100, False), Episode(1000, 0, late, 100, False)]
+        returns = ((500, 900.0 - late), (1000, late))
+        rows = [Episode(s, i, v, 100, False) for s, v in returns for i in range(policies.LAST)]
         write_rows(folder / EPISODES, rows, Episode)
     assert policies.best([tmp_path]) == {FACE: (500.0, tmp_path / "study" / "1")}
 
