@@ -11,20 +11,19 @@ import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent.parent
-SHOWN = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "LICENSE", "docs")
-BEHIND = ("results", "examples", "studies", "jbrep", "benchmarks", "data/sample")  # their links
+SHOWN = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "LICENSE")
+FOLDERS = ("docs", "results", "examples", "studies", "jbrep", "benchmarks", "data/sample")
+LEFT_OUT = shutil.ignore_patterns("*.safetensors", "*.h5", "__pycache__")
 
 
 def main() -> None:
     out = Path(sys.argv[1]).resolve()
-    listed = ["git", "ls-files", "-z", "--", *SHOWN, *BEHIND]
-    names = subprocess.run(listed, cwd=HERE, capture_output=True, text=True, check=True).stdout
     with tempfile.TemporaryDirectory() as temporary:
         pages = Path(temporary) / "pages"
-        for name in names.rstrip("\0").split("\0"):
-            if not name.endswith((".safetensors", ".h5")):
-                (pages / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy(HERE / name, pages / name)
+        for name in FOLDERS:
+            shutil.copytree(HERE / name, pages / name, ignore=LEFT_OUT)
+        for name in SHOWN:
+            shutil.copy(HERE / name, pages)
         shutil.copy(HERE / "docs" / "zensical.toml", temporary)
         build = [sys.executable, "-m", "zensical", "build", "--strict"]
         subprocess.run(build, cwd=temporary, check=True)
