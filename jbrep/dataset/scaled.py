@@ -124,8 +124,11 @@ class ScaledDataset:
     @cached_property
     def reward_varies(self) -> bool:
         """Whether there are rewards, and not all training rows have the same."""
-        rewards = self.rewards(self.train)
-        return bool((rewards != rewards[:1]).any())
+        if self.dataset.manifest.settings.unrewarded:
+            return False
+        parts = self.dataset["reward"].parts(self.train)
+        first = self.dataset["reward"][self.train[0]]
+        return any((part != first).any() for part in parts)
 
     def rewards(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
         """Rewards of the rows, of the same shape; all 0 where the data have none."""
