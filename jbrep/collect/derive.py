@@ -1,6 +1,6 @@
 """Deriving data sets from the same motion: another task's, or with less or more to see."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jbrep.collect.collector import write_shards
 from jbrep.collect.policies import acts_on_observations
 from jbrep.collect.replay import replay_problems
-from jbrep.collect.shards import Missing
+from jbrep.collect.shards import Missing, Produce
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import Manifest, new_manifest, open_shard
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns
@@ -57,8 +57,7 @@ def derive(
         )
     if not settings.store_state:
         raise InputError(f"{source} has no states: collect it with --store-state")
-    if not dataset.manifest.complete:
-        raise InputError(f"{source} is unfinished: resume it with the same jbrep collect")
+    _check_finished(dataset)
     if acts_on_observations(settings.policy):
         raise InputError(
             f"{source} was collected by a {settings.policy['kind']} policy, which acts on "
@@ -70,14 +69,15 @@ def derive(
     task, before = get_task(task_name), dataset.task
     described = task.describe(before.arguments, before.max_episode_steps)
     settings = settings.replace(task=described, store_state=store_state)
-    versions = new_manifest(settings).versions
-    _check_versions(dataset, versions, num_threads)
+    _check_versions(dataset, settings)
+    _check_replay(dataset, settings, num_threads)
     if (dataset.episodes["length"] < before.max_episode_steps).any():
         raise InputError(
             f"the physics diverged in {source}, after which no state is stored: run jbrep collect "
             f"--task {task_name} instead"
         )
-    return write_shards(settings, folder, _Deriver(dataset, task, settings, num_threads))
+    derived = _Deriver(task, settings, num_threads)
+    return write_shards(settings, folder, _each_shard(dataset, derived))
 
 
 def derive_view(
@@ -96,55 +96,64 @@ def derive_view(
             `collect`.
     """
     dataset = Dataset(source)
-    manifest = dataset.manifest
-    if not manifest.complete:
-        raise InputError(f"{source} is unfinished: resume it with the same jbrep collect")
+    _check_finished(dataset)
     task = with_view(dataset.task, hidden, history)
-    settings = manifest.settings.replace(task=task)
-    versions = new_manifest(settings).versions
-    if differing := differences({**manifest.versions, "jbrep": versions["jbrep"]}, versions):
-        raise InputError(f"{source} was made with other versions: {differing}")
+    settings = dataset.manifest.settings.replace(task=task)
+    _check_versions(dataset, settings)
+    final = EPISODES + "final_observation"
+    given = "observation", "action", final, EPISODES + "length"
 
-    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
-        for shard in range(first, len(manifest.shards)):
-            columns = open_shard(dataset.folder, manifest, shard)
-            final = EPISODES + "final_observation"
-            given = "observation", "action", final, EPISODES + "length"
-            before, last = seen_in_episodes(task, *(columns[name][:] for name in given))
-            yield settings.columns({**columns, "observation": before, final: last})
+    def seen(columns: Columns) -> Columns:
+        before, last = seen_in_episodes(task, *(columns[name][:] for name in given))
+        return settings.columns({**columns, "observation": before, final: last})
 
-    return write_shards(settings, folder, produce)
+    return write_shards(settings, folder, _each_shard(dataset, seen))
 
 
-def _check_versions(dataset: Dataset, versions: Mapping[str, str], num_threads: int | None) -> None:
-    """Check that this jbrep, MuJoCo and NumPy give the states of a data set; jbrep may be later."""
-    earlier = dataset.manifest.versions
+def _check_finished(dataset: Dataset) -> None:
+    if not dataset.manifest.complete:
+        raise InputError(f"{dataset.folder} is unfinished: resume it with the same jbrep collect")
+
+
+def _check_versions(dataset: Dataset, settings: DataSettings) -> None:
+    """Check that MuJoCo, NumPy and h5py are those of a data set; jbrep may be later."""
+    earlier, versions = dataset.manifest.versions, new_manifest(settings).versions
     if differing := differences({**earlier, "jbrep": versions["jbrep"]}, versions):
         raise InputError(
             f"{dataset.folder} was collected with other versions: {differing}; a derived data set "
             "needs the same"
         )
-    if earlier["jbrep"] != versions["jbrep"] and (
+
+
+def _check_replay(dataset: Dataset, settings: DataSettings, num_threads: int | None) -> None:
+    """Check that this jbrep gives the states of a data set, if another has made it."""
+    now = new_manifest(settings).versions["jbrep"]
+    if dataset.manifest.versions["jbrep"] != now and (
         problem := next(replay_problems(dataset, 1, num_threads), None)
     ):
         raise InputError(f"{problem} A derived data set needs the same states")
+
+
+def _each_shard(dataset: Dataset, change: Callable[[Columns], Columns]) -> Produce:
+    """Makes the shards of a data set from those of another."""
+
+    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
+        manifest = dataset.manifest
+        for shard in range(first, len(manifest.shards)):
+            yield change(open_shard(dataset.folder, manifest, shard))
+
+    return produce
 
 
 @dataclass(frozen=True)
 class _Deriver:
     """Makes the shards of a data set as another task observes and rewards them."""
 
-    dataset: Dataset
     task: JitterbugTask
     settings: DataSettings
     num_threads: int | None
 
-    def __call__(self, first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
-        manifest = self.dataset.manifest
-        for shard in range(first, len(manifest.shards)):
-            yield self._derived(open_shard(self.dataset.folder, manifest, shard))
-
-    def _derived(self, columns: Columns) -> Columns:
+    def __call__(self, columns: Columns) -> Columns:
         own = episode_columns(columns)
         length = own["length"]
         starts = [self.task.start(np.random.default_rng(int(seed))) for seed in own["seed"]]
