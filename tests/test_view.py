@@ -79,9 +79,27 @@ def test_a_lane_that_begins_anew_forgets():
     assert again[0, -1] == np.float32(0.5)
 
 
-@pytest.mark.parametrize("name", [TASK, "Sledges/Sledge-v0"])
-def test_a_derived_data_set_is_as_if_it_were_collected(name, tmp_path):
-    task = describe(name, {}, 20 if name == TASK else None)
+def test_a_step_that_is_lost_is_not_seen():
+    broken = describe("Sledges/Broken-v0", {"how": "nan", "seed": 5}, 30, missing="skip")
+    lanes = Lanes(with_view(broken, history=3), 1)
+    lanes.reset([0], [5])
+    while not lanes.lost.any():
+        before = lanes.observation
+        lanes.step(np.full((1, 3), 0.5))
+    np.testing.assert_array_equal(lanes.observation, before)
+    assert lanes.steps.tolist() == [3]
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "steps", "missing"),
+    [
+        (TASK, {}, 20, None),
+        ("Sledges/Sledge-v0", {}, None, None),
+        ("Sledges/Broken-v0", {"how": "nan", "seed": (1 << 32) + 2}, 30, "skip"),  # in episode 2
+    ],
+)
+def test_a_derived_data_set_is_as_if_it_were_collected(name, arguments, steps, missing, tmp_path):
+    task = describe(name, arguments, steps, missing=missing)
     hidden = task.feature_names[1:2]
     settings = DataSettings(task=task, steps=300, shard_episodes=4)
     collect(settings, tmp_path / "whole", num_threads=1)
@@ -91,6 +109,7 @@ def test_a_derived_data_set_is_as_if_it_were_collected(name, tmp_path):
     )
     derived, collected = Dataset(tmp_path / "derived"), Dataset(tmp_path / "collected")
     assert len(derived.episodes["length"]) > 4
+    assert missing is None or derived.episodes["length"][2] == 3
     assert derived.task.size == 3 * (task.size - 1) + 2 * task.action_size
     for column in collected.columns:
         assert derived[column][:].tobytes() == collected[column][:].tobytes(), column

@@ -113,7 +113,7 @@ class Still(Constants, frozen=True):
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Nothing is drawn."""
-        actions = np.tile(np.clip(0.0, task.action_low, task.action_high), (len(seeds), 1))
+        actions = np.tile(task.rest, (len(seeds), 1))
         return lambda observation: actions
 
 

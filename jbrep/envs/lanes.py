@@ -15,7 +15,7 @@ from jbrep.envs.separate import Retries as Retries
 from jbrep.envs.separate import Separate, not_the_same
 from jbrep.envs.separate import State as State
 from jbrep.envs.task import Array, Task
-from jbrep.envs.view import Window
+from jbrep.envs.view import Seen
 from jbrep.errors import InputError
 
 
@@ -123,13 +123,14 @@ class Lanes:
     ):
         check_counts(num_lanes, num_threads)
         self.task, self.num_lanes = task, num_lanes
-        self._window = Window(task, num_lanes, task.view.places) if task.view else None
         if is_batched(task):
             self._batch: Any = make_batch(task, num_lanes, num_threads)
             self.envs: Any = self._batch
         else:
             self._batch = Separate(task.whole, num_lanes, retries or Retries())
             self.envs = self._batch.envs
+        if task.view:
+            self._batch = Seen(self._batch, task, num_lanes)
         self.lost = np.zeros(num_lanes, np.bool_)
         self.missing: NDArray[np.int64] = getattr(
             self._batch, "missing", np.zeros(num_lanes, np.int64)
@@ -181,8 +182,6 @@ class Lanes:
         every = [given.get(lane) for lane in range(self.num_lanes)]
         mask = np.isin(np.arange(self.num_lanes), lanes)
         observation, info = self._batch.reset(seed=every, options={"reset_mask": mask})
-        if self._window:
-            observation = self._window.begin(at, observation)
         self._check(observation, np.zeros(self.num_lanes), "reset gave")
         self._see(observation, info)
         return observation
@@ -200,9 +199,6 @@ class Lanes:
         active = self.active
         self._steps += active
         observation, reward, terminated, truncated, info = self._batch.step(checked)
-        self.lost = getattr(self._batch, "lost", self.lost)
-        if self._window:
-            observation = self._window.step(active & ~self.lost, checked, observation)
         arrays = {name: info[name] for name in self._names}
         if self.num_active < self.num_lanes:
             here = active[:, None]
@@ -214,6 +210,7 @@ class Lanes:
         self._check(observation, reward, "gave")
         self.observation, self.arrays, self.info = observation, arrays, info
         self.terminated, self.truncated = terminated, truncated
+        self.lost = getattr(self._batch, "lost", self.lost)
         self._steps -= self.lost
         self._count()
         return Step(observation, reward, terminated, truncated, arrays)
@@ -228,8 +225,7 @@ class Lanes:
             "truncated": self.truncated.copy(),
             "observation": self.observation.copy(),
         }
-        window = self._window.state if self._window else {}
-        return own | window | self._batch.state
+        return own | self._batch.state
 
     def restore(self, state: State) -> None:
         """Continue from where the state was taken, to the same bits.
@@ -242,11 +238,7 @@ class Lanes:
         self.terminated, self.truncated = batch.pop("terminated"), batch.pop("truncated")
         self._count()
         expected = batch.pop("observation")
-        if self._window:
-            self._window.restore(batch)
         observation, info = self._batch.restore(batch)
-        if self._window:
-            observation = self._window.now(observation)
         observation = np.where(self.active[:, None], observation, expected)
         if observation.tobytes() != expected.astype(np.float64).tobytes():
             raise not_the_same(self.task)

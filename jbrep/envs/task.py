@@ -275,6 +275,11 @@ class Task(Record, frozen=True):
         """Length k of an action."""
         return len(self.action_low)
 
+    @property
+    def rest(self) -> Array:
+        """The action of 0, or the nearest to it, (k,)."""
+        return np.clip(0.0, self.action_low, self.action_high)
+
     @cached_property
     def feature_names(self) -> tuple[str, ...]:
         """Names of all features, in order."""

@@ -1,6 +1,6 @@
 """What is seen of an environment that gives more: some of its features, and their history."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -66,7 +66,7 @@ class Window:
         assert view
         self._places = np.array(places)
         self._states = np.zeros((num_lanes, view.history, len(self._places)))
-        self._rest = np.clip(0.0, task.action_low, task.action_high)
+        self._rest = task.rest
         self._actions = np.zeros((num_lanes, view.history - 1, task.action_size))
 
     def begin(self, lanes: Sequence[int] | NDArray[np.int64], given: NDArray[Any]) -> Array:
@@ -103,15 +103,51 @@ class Window:
         """A copy of what `restore` takes."""
         return {"window_states": self._states.copy(), "window_actions": self._actions.copy()}
 
-    def restore(self, state: dict[str, Array]) -> None:
-        """Go on from where the state was taken; what is taken from it, is removed."""
-        self._states[:] = state.pop("window_states")
-        self._actions[:] = state.pop("window_actions")
-
-    def now(self, given: NDArray[Any]) -> Array:
-        """What is seen, (n, d), when the last that was given is given once more, (n, D)."""
+    def restore(self, state: dict[str, Array], given: NDArray[Any]) -> Array:
+        """What is seen, (n, d), where the state was taken and (n, D) is given once more."""
+        self._states[:], self._actions[:] = state["window_states"], state["window_actions"]
         self._states[:, 0] = given[:, self._places]
         return self._seen()
+
+
+class Seen:
+    """A batch of environments, of which only what a task's view shows is seen.
+
+    Args:
+        batch: as `Lanes` steps one.
+        task: with a view.
+        num_lanes: n.
+    """
+
+    def __init__(self, batch: Any, task: Task, num_lanes: int):
+        assert task.view
+        self._batch = batch
+        self._window = Window(task, num_lanes, task.view.places)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._batch, name)
+
+    def reset(self, seed: Any, options: Mapping[str, Any]) -> tuple[Array, Any]:
+        """As the batch does."""
+        given, info = self._batch.reset(seed=seed, options=options)
+        return self._window.begin(np.flatnonzero(options["reset_mask"]), given), info
+
+    def step(self, actions: Array) -> tuple[Any, ...]:
+        """As the batch does; what a step that is lost led to isn't seen."""
+        given, *others = self._batch.step(actions)
+        moved = ~getattr(self._batch, "lost", np.zeros(len(given), np.bool_))
+        return self._window.step(moved, actions, given), *others
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """A copy of what `restore` takes."""
+        return self._window.state | self._batch.state
+
+    def restore(self, state: Mapping[str, Any]) -> tuple[Array, Any]:
+        """As the batch does."""
+        own = self._window.state.keys()
+        given, info = self._batch.restore({n: v for n, v in state.items() if n not in own})
+        return self._window.restore({name: state[name] for name in own}, given), info
 
 
 def seen_in_episodes(
@@ -134,14 +170,13 @@ def seen_in_episodes(
     assert view
     ends = np.cumsum(length)
     states = np.insert(observation, ends, final, axis=0)[:, view.places]
-    rest = np.clip(0.0, task.action_low, task.action_high)
-    actions = np.insert(action, ends, rest, axis=0)
+    actions = np.insert(action, ends, task.rest, axis=0)
     last = ends + np.arange(len(length))  # rows of the final states
     first = np.repeat(last - length, length + 1)
     row = np.arange(len(states))
     past = [actions[row - lag] for lag in range(1, view.history)]
     for lag, taken in enumerate(past, 1):
-        taken[row - lag < first] = rest
+        taken[row - lag < first] = task.rest
     parts = [states[np.maximum(row - lag, first)] for lag in range(view.history)] + past
     seen = np.hstack(parts).astype(np.float32)
     return np.delete(seen, last, axis=0), seen[last]
