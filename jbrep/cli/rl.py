@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -36,9 +36,6 @@ from jbrep.errors import choose
 from jbrep.records.record import converted
 from jbrep.rl.settings import CLASSES, Seed, TrainingSettings
 from jbrep.text import interval_of, rounded
-
-if TYPE_CHECKING:
-    pass
 
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 _BESIDE = 10  # episodes of policies that don't learn
