@@ -62,3 +62,16 @@ def adopt(document, *names):
 def contents(folder):
     """The bytes of all files in a data set's folder."""
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def written(folder, write):
+    """The numbers of the shards in a folder that a call writes, or writes again."""
+
+    def stamps():
+        files = {path: path.stat() for path in folder.glob("*.h5")}
+        return {path: (each.st_ino, each.st_mtime_ns) for path, each in files.items()}
+
+    before = stamps()
+    write()
+    changed = [path for path, stamp in stamps().items() if before.get(path) != stamp]
+    return sorted(int(path.stem.removeprefix("shard-")) for path in changed)
