@@ -52,7 +52,7 @@ class Controller:
         """The action at a control step; None for sensors that can't be believed."""
         if not np.isfinite(sensors).all() or ((sensors < self._low) | (sensors > self._high)).any():
             return None
-        if step == 0:  # before the start it stood still
+        if step == 0 or not self._states:  # before the start it stood still
             self._states.extend([sensors] * (self._states.maxlen or 1))
             self._actions.extend([self.safe] * (self._actions.maxlen or 0))
         self._states.appendleft(sensors)
