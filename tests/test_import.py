@@ -504,7 +504,7 @@ def test_a_gap_between_an_observation_and_the_next_is_noticed(tmp_path):
 
 
 def test_files_that_are_no_data_are_refused(tmp_path, minari_folder):
-    for name in ("a.npz", "a.parquet", "a.hdf5"):
+    for name in ("a.npz", "a.parquet", "a.pkl"):
         (tmp_path / name).write_bytes(b"nonsense" * 50)
     with zipfile.ZipFile(tmp_path / "cut.npz", "w") as archive:
         for name in ("observations", "actions", "rewards", "terminals"):
@@ -519,12 +519,12 @@ def test_files_that_are_no_data_are_refused(tmp_path, minari_folder):
     for name, problem in {
         "a.npz": "can't be read as an npz file",
         "a.parquet": "can't be read as a Parquet file",
-        "a.hdf5": "unknown format '.hdf5': choose one of npz, parquet",
+        "a.pkl": "unknown format '.pkl': choose one of npz, parquet",
         "no.npz": "there is no file",
         "cut.npz": "is damaged: observations is no array",
         "bits.npz": "is damaged: observations is no array, or has other bytes",
         "names.npz": "has 3 features, and names of 1",
-        "spoiled": "can't be read as a Minari data set",
+        "spoiled": "main_data.hdf5 can't be read as an HDF5 file",
     }.items():
         with pytest.raises(InputError, match=problem) as caught:
             import_data(str(tmp_path / name), tmp_path / "data")

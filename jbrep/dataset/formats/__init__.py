@@ -27,6 +27,7 @@ _FILES = {  # which module reads files that end so
     **{"npz": "npz", "parquet": "parquet"},
     **dict.fromkeys(("csv", "tsv", "txt"), "delimited"),
     **dict.fromkeys(("bag", "mcap", "db3"), "bags"),
+    **dict.fromkeys(("hdf5", "h5"), "hdf5"),
 }
 _FOLDERS = {
     "meta/info.json": "lerobot",

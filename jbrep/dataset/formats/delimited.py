@@ -55,7 +55,7 @@ def open_table(given: str) -> Table:
         label(path.stem),
         schema,
         lambda columns: _batches(path, form, schema, columns),
-        first=("line", form.begin + 1),
+        place=lambda row: f"line {form.begin + 1 + row}",
     )
 
 

@@ -16,11 +16,11 @@ from jbrep.dataset.formats.flat import split
 from jbrep.dataset.formats.missing import without_missing
 from jbrep.dataset.formats.tables import (
     DEGREES,
-    MOST_SHOWN,
     Leaf,
     Roles,
     Table,
     features_of_table,
+    listed,
     roles_of,
     width,
 )
@@ -178,8 +178,7 @@ class _Reader:
         return _SECONDS[unit]
 
     def _at(self, row: int) -> str:
-        word, begin = self._table.first
-        return f"{self._table.name}, {word} {begin + row}"
+        return f"{self._table.name}, {self._table.place(row)}"
 
     def _numbers(self, batch: pa.RecordBatch, name: str, first: int) -> Array:
         """A column as an array: numbers, of which empty ones are NaN; or words."""
@@ -219,8 +218,7 @@ class _Reader:
         """What is done to the columns."""
         notes = list(self._table.notes)
         if unused := [name for name in self._table.schema.names if name not in self._columns]:
-            more = ", ..." if unused[MOST_SHOWN:] else ""
-            notes.append(f"not used: {', '.join(unused[:MOST_SHOWN])}{more}")
+            notes.append(f"not used: {listed(unused)}")
         if self._layout.time and not self._layout.rate and self.timestep is None:
             notes.append("the clock is uneven: --rate brings the rows to an even one")
         if self._angles.any():

@@ -13,11 +13,9 @@ import stat
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import h5py
 import minari
 import minari.dataset.minari_storage as storages
 import numpy as np
@@ -30,6 +28,7 @@ from numpy.typing import NDArray
 
 import jbrep.jitterbug.simulation  # noqa: F401  Minari makes the environment: load MuJoCo before
 from jbrep.dataset.formats.episodes import Incoming, Source, check_kind, label, whole_episode
+from jbrep.dataset.formats.hdf5 import opened
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.schema import UNKNOWN_SEED, DataSettings
 from jbrep.dataset.settings import Digest
@@ -54,8 +53,6 @@ Array = NDArray[Any]
 _ROOT = "MINARI_DATASETS_PATH"  # Minari takes the folder of its data sets from there only
 _METADATA, _CHECKSUMS = "metadata.json", "jbrep.json"
 _MAX_BYTES = 1 << 24  # of the metadata
-_MOST_AT_ONCE = 1 << 30  # bytes of an array of an episode
-_SQUEEZED = 2000  # times that HDF5's filters may make an array smaller, at most
 _WORD = re.compile(r"[\w-]{1,40}")
 EPISODE_BYTES = 1 << 14  # that HDF5 takes for each episode besides its rows
 _MOST_SHOWN = 10  # ids of data sets
@@ -81,7 +78,7 @@ def open_source(given: str) -> Source:
         DamageError: it isn't what jbrep exported.
     """
     folder = _folder(given)
-    _check_files(given, folder)
+    _check_files(folder)
     metadata = _metadata(folder)
     storage = _storage(given, folder)
     name = f"Minari {metadata.get('dataset_id', given)}"
@@ -126,7 +123,7 @@ def _folder(given: str) -> Path:
     )
 
 
-def _check_files(given: str, folder: Path) -> None:
+def _check_files(folder: Path) -> None:
     """Make sure that all files are plain ones inside the folder, and as jbrep exported them.
 
     Raises:
@@ -145,13 +142,8 @@ def _check_files(given: str, folder: Path) -> None:
                     "export the data set again"
                 )
     for path in sorted(folder.rglob("*.hdf5")):
-        try:
-            with h5py.File(path) as file:
-                problem = file.visititems_links(partial(_link_problem, file))
-        except Exception as error:  # whatever HDF5 raises at damaged files
-            raise _unreadable(given, error) from None
-        if problem:
-            raise InputError(f"{path}: {problem}")
+        with opened(path, whole=True):
+            pass
 
 
 def _sha256(path: Path) -> str:
@@ -161,24 +153,6 @@ def _sha256(path: Path) -> str:
         return ""
     with file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _link_problem(file: h5py.File, name: str, link: Any) -> str | None:
-    """Why a name in an HDF5 file stands for something else than what is in the file itself."""
-    if not isinstance(link, h5py.HardLink):
-        return f"{name} is a link, which isn't followed"
-    found = file[name]
-    if not isinstance(found, h5py.Dataset):
-        return None
-    if found.external or found.is_virtual:
-        return f"{name} is in another file, which isn't opened"
-    stored = found.id.get_storage_size()
-    if found.nbytes <= min(_MOST_AT_ONCE, _SQUEEZED * (stored + 1)):
-        return None
-    return (
-        f"{name} would have {found.nbytes:,} bytes, of which {stored:,} are stored: at most "
-        f"{_MOST_AT_ONCE:,} are possible, and what is stored"
-    )
 
 
 def _metadata(folder: Path) -> dict[str, Any]:

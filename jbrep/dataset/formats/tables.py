@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from jbrep.dataset.formats.episodes import WHOLE, WIDE, check_kind, check_names
+from jbrep.dataset.formats.episodes import ALIASES, WHOLE, WIDE, check_kind, check_names
 from jbrep.dataset.formats.flat import own_names
 from jbrep.dataset.layout import Layout
 from jbrep.envs.names import is_code
@@ -26,7 +26,7 @@ _ACTION = re.compile(r"actions?(_\d+)?")
 _NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former
 DEGREES = ("deg", "°", "degrees", "degree")
 _WORDS = pa.types.is_string, pa.types.is_large_string, pa.types.is_dictionary
-MOST_SHOWN = 12  # names of columns in a message
+_MOST_SHOWN = 12  # names of columns in a message
 _ONCE = ("reward", "time", "episode", "terminated")  # of a layout: one column each
 
 
@@ -42,7 +42,8 @@ class Table:
         rows: how many there are, if that is known.
         layout: what its format says of its columns.
         task, once: what it knows besides, see `Source` and `per_episode`.
-        first: the number of the first row in messages, and what rows are called there.
+        after: columns with what was observed after the action, by those with what was before it.
+        place: what a row is called in messages, by its number from 0.
         timestep: of its clock, if its format says it [s].
         is_sparse: whether a row has numbers of some columns only.
         notes: on what its format leaves out.
@@ -56,7 +57,8 @@ class Table:
     layout: Layout = field(default_factory=Layout)
     task: Task | None = None
     once: Mapping[str, Array] = field(default_factory=dict)
-    first: tuple[str, int] = ("row", 0)
+    after: Mapping[str, str] = field(default_factory=dict)
+    place: Callable[[int], str] = lambda row: f"row {row}"
     timestep: float | None = None
     is_sparse: bool = False
     notes: tuple[str, ...] = ()
@@ -126,6 +128,8 @@ def roles_of(table: Table, layout: Layout) -> Roles:
     roles.setdefault("action", [each for each in leaves if _ACTION.fullmatch(each.column)])
     roles.setdefault("observation", list(_others(table, leaves, roles)))
     _matching(table, roles["observation"], layout.angles)
+    if layout.observations:
+        roles["next_observation"] = _after(table, leaves, roles["observation"])
     roles = {role: some for role, some in roles.items() if some}
     check_names(name, [*roles, *(["step"] if layout.time or layout.length else [])])
     for role, some in roles.items():
@@ -144,6 +148,14 @@ def _said(table: Table, layout: Layout) -> dict[str, tuple[str, ...]]:
     said |= {role: (given,) for role, given in once.items() if given}
     wide = {"action": layout.actions, "observation": layout.observations}
     return said | {role: given for role, given in wide.items() if given}
+
+
+def _after(table: Table, leaves: list[Leaf], seen: list[Leaf]) -> list[Leaf]:
+    """The columns of the same after the action; none if one is missing."""
+    after = {**{name: f"next_{name}" for name in ALIASES["observation"]}, **table.after}
+    places = {(each.column, each.place): each for each in leaves}
+    found = [places.get((after.get(each.column, ""), each.place)) for each in seen]
+    return [each for each in found if each] if all(found) else []
 
 
 def _others(table: Table, leaves: list[Leaf], roles: Roles) -> Iterator[Leaf]:
@@ -167,11 +179,15 @@ def _matching(table: Table, leaves: list[Leaf], names: tuple[str, ...]) -> list[
     for wanted in names:
         some = [each for each in leaves if _means(wanted, each.name, each.column)]
         if not some:
-            there = [each.name for each in leaves]
-            shown = ", ".join(there[:MOST_SHOWN]) + (", ..." if there[MOST_SHOWN:] else "")
-            raise InputError(f"{table.name} has no column {wanted!r}: it has {shown}")
+            there = listed([each.name for each in leaves])
+            raise InputError(f"{table.name} has no column {wanted!r}: it has {there}")
         found |= {each.name: each for each in some}
     return list(found.values())
+
+
+def listed(names: list[str]) -> str:
+    """Names for a message: the first ones, where there are many."""
+    return ", ".join(names[:_MOST_SHOWN]) + (", ..." if names[_MOST_SHOWN:] else "")
 
 
 def _check_types(table: Table, role: str, leaves: list[Leaf], named: bool) -> None:
