@@ -15,14 +15,16 @@ import polars
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from command import jbrep
+from command import jbrep, mistake
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from jbrep.dataset import Dataset, Layout, ScaledDataset
+from jbrep.collect import collect
+from jbrep.dataset import Dataset, DataSettings, Layout, ScaledDataset
 from jbrep.dataset.verify import find_problems
+from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.evaluate.diagnosis import diagnose
 from jbrep.methods.fit import Fitter
@@ -183,6 +185,8 @@ def upright(observations, actions):
     return np.cos(observations[:, 0]) - 0.01 * (actions**2).sum(axis=1)
 def scalar(observations, actions):
     return 1.0
+def endless(observations, actions):
+    return np.where(np.arange(len(actions)) == 7, np.inf, 0)
 """
 
 
@@ -204,10 +208,43 @@ def test_an_own_reward_after_the_fact(tmp_path, rewards):
     _, data = imported(path, *options, "--reward", "my_rewards:upright")
     expected = np.cos(data["pitch"]) - 0.01 * np.asarray(data["action"])[:, 0] ** 2
     np.testing.assert_allclose(data["reward"], expected, rtol=1e-5)
-    assert data.manifest.settings.policy["reward"] == "my_rewards:upright"
+    assert data.manifest.settings.reward.startswith("my_rewards:upright ")
     done = jbrep("data", "import", path, *options, "--reward", "my_rewards:scalar", "--out", "no")
     assert "gives an array of shape () for 59 steps: it must be (59,)" in done.output
     assert not (tmp_path / "no").exists()
+
+
+def test_rewards_for_data_that_exist_already(tmp_path, rewards):
+    """Collected or imported, with rewards or without; also of what is hidden then."""
+    _, log = imported(write_csv(tmp_path / "a.csv", csv_rows()), *NAMED, "--gap", "1")
+    brief = describe("face_direction", max_episode_steps=30)
+    collect(DataSettings(task=brief, steps=90, seed=1, shard_episodes=2), tmp_path / "collected")
+    code, hidden = ("--reward", "my_rewards:upright"), ("--hide", "gyro", "--history", "2")
+    for source, others in ((log.folder, hidden), (tmp_path / "collected", ())):
+        done = jbrep("data", "derive", source, *code, *others, "--out", f"{source}-rewarded")
+        assert done.exit_code == 0, done.output
+        before, data = Dataset(source), Dataset(f"{source}-rewarded")
+        first, action = np.asarray(before[before.task.feature_names[0]]), before["action"][:, 0]
+        np.testing.assert_allclose(data["reward"], np.cos(first) - 0.01 * action**2, rtol=1e-5)
+        assert "by my_rewards:upright " in jbrep("data", "info", data.folder).output
+        assert not list(find_problems(data.folder))
+        assert (data.task.reward_high, data.task.solved_return) == (None, None)
+    assert data.episodes["return"][0] == data["reward"][:30].astype(float).sum()
+    replayed = jbrep("data", "verify", data.folder, "--replay", "2")
+    assert "2 episodes simulated again: equal in every bit" in replayed.output
+    (data.folder / "shard-00000.h5").unlink()
+    assert "gave the rewards; derive the data set again" in mistake("data", "repair", data.folder)
+    derive = ("data", "derive", tmp_path / "collected", "--out")
+    for name, problem in {
+        "my_rewards:scalar": "gives an array of shape () for 30 steps: it must be (30,)",
+        "my_rewards:endless": "gives inf at step 7 of an episode: it must be finite",
+        "my_rewards:fly": "has no attribute 'fly'",
+        "upright": "--reward upright must be MODULE:FUNCTION",
+    }.items():
+        assert problem in mistake(*derive, tmp_path / name, "--reward", name)
+        assert not list(tmp_path.glob(f"{name}/*.h5"))
+    Path("my_rewards.py").write_text(f"{REWARD}# mended\n")
+    assert "reward my_rewards:upright" in mistake(*derive, data.folder, *code)
 
 
 def test_data_without_rewards_go_through_what_needs_none(tmp_path):
@@ -226,7 +263,7 @@ def test_data_without_rewards_go_through_what_needs_none(tmp_path):
     with pytest.raises(InputError, match="deepmdp needs a reward that varies"):
         fitter.plan("deepmdp", latent=1)
     done = jbrep("data", "export", data.folder, "--to", "minari", "--out", tmp_path / "out")
-    assert f"{data.folder} has no rewards: give some by --reward when importing\n" in done.output
+    assert f"{data.folder} has no rewards: jbrep data derive --reward gives some\n" in done.output
 
 
 BAD = {

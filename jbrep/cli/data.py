@@ -196,6 +196,12 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
 )
 @record_options(CollectSettings, "store_state")
 @view_options
+@click.option(
+    "--reward",
+    default="",
+    metavar="MODULE:FUNCTION",
+    help="For rewards (n,) of the observations (n, d) and actions (n, k) of an episode; is run.",
+)
 @threads_option
 @click.option("--out", required=True, type=PATH, help="A folder.")
 def derive(
@@ -204,26 +210,32 @@ def derive(
     store_state: bool,
     hide: tuple[str, ...],
     history: int,
+    reward: str,
     threads: int | None,
     out: Path,
 ) -> None:
     """Make another data set of the same motion.
 
-    It is of another task, or has less or more to see. Another task's equals collecting that task
-    with the same settings, bit for bit, without simulating again; the source needs its states
-    (collect --store-state) and a policy that doesn't depend on observations. What is seen can be
-    changed in any data set: --hide leaves features out, --history adds those of the steps before,
-    and the actions since. Such an encoder estimates what can't be measured.
+    It is of another task, has other rewards, or less or more to see. Another task's equals
+    collecting that task with the same settings, bit for bit, without simulating again; the source
+    needs its states (collect --store-state) and a policy that doesn't depend on observations. The
+    rest can be changed in any data set: --hide leaves features out, --history adds those of the
+    steps before, and the actions since: an encoder of these estimates what can't be measured.
+    --reward is a function of your own, of what is seen before anything is hidden.
     """
     from jbrep.collect.derive import derive as run
     from jbrep.collect.derive import derive_view
+    from jbrep.envs.names import import_code, is_code
 
-    if bool(task) == (bool(hide) or history > 1):
-        raise InputError("give a --task, or else --hide or --history")
+    if bool(task) == (bool(hide or reward) or history > 1):
+        raise InputError("give a --task, or else --hide, --history or --reward")
+    if reward and not is_code(reward):
+        raise InputError(f"--reward {reward} must be MODULE:FUNCTION")
+    import_code(reward)
     if task:
         _report(out, lambda: run(data, task, out, store_state, threads))
     else:
-        _report(out, lambda: derive_view(data, out, hide, history))
+        _report(out, lambda: derive_view(data, out, hide, history, reward))
 
 
 @data.command(epilog="Example: jbrep data export data/face --to parquet --out face.parquet")

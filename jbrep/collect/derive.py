@@ -1,4 +1,4 @@
-"""Deriving data sets from the same motion: another task's, or with less or more to see."""
+"""Deriving data sets from the same motion: another task's, with other rewards or less to see."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from jbrep.collect.collector import write_shards
@@ -14,9 +15,11 @@ from jbrep.collect.replay import replay_problems
 from jbrep.collect.shards import Missing, Produce
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import Manifest, new_manifest, open_shard
+from jbrep.dataset.rewards import reward_function, with_hash, without_range
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.recording import Tick
+from jbrep.envs.task import Task
 from jbrep.envs.view import seen_in_episodes, with_view
 from jbrep.errors import InputError, differences
 from jbrep.jitterbug.simulation import Simulation
@@ -68,7 +71,7 @@ def derive(
     check_counts(1, num_threads)
     task, before = get_task(task_name), dataset.task
     described = task.describe(before.arguments, before.max_episode_steps)
-    settings = settings.replace(task=described, store_state=store_state)
+    settings = settings.replace(task=described, store_state=store_state, reward=UNSET)
     _check_versions(dataset, settings)
     _check_replay(dataset, settings, num_threads)
     if (dataset.episodes["length"] < before.max_episode_steps).any():
@@ -81,33 +84,70 @@ def derive(
 
 
 def derive_view(
-    source: Path, folder: Path, hidden: Sequence[str] = (), history: int = 1
+    source: Path,
+    folder: Path,
+    hidden: Sequence[str] = (),
+    history: int = 1,
+    reward: str = "",
 ) -> Manifest:
-    """Write the data set with less to see: without some features, or with those of some last steps.
+    """Write the data set with less or more to see, or with other rewards.
 
     Args:
         source: a finished data set, of any robot.
         folder: where to write; an unfinished derivation is resumed.
         hidden: as `with_view` takes it.
         history: likewise.
+        reward: as `reward_function` takes it, for rewards of what the source shows; its own if
+            empty.
 
     Raises:
-        InputError: the source is unfinished or was made with other versions; or as `with_view` or
-            `collect`.
+        InputError: the source is unfinished or was made with other versions; or as `with_view`,
+            `reward_function` or `collect`.
     """
     dataset = Dataset(source)
     _check_finished(dataset)
-    task = with_view(dataset.task, hidden, history)
-    settings = dataset.manifest.settings.replace(task=task)
+    settings = dataset.manifest.settings
+    changes = list[Callable[[Columns], Columns]]()
+    if reward:
+        task = without_range(settings.task)
+        settings = settings.replace(task=task, reward=with_hash(reward), unrewarded=UNSET)
+        changes.append(_rewarded(reward))
+    if hidden or history > 1:
+        settings = settings.replace(task=with_view(settings.task, hidden, history))
+        changes.append(_seen(settings.task))
     _check_versions(dataset, settings)
+
+    def changed(columns: Columns) -> Columns:
+        for change in changes:
+            columns = change(columns)
+        return settings.columns(columns)
+
+    return write_shards(settings, folder, _each_shard(dataset, changed))
+
+
+def _rewarded(code: str) -> Callable[[Columns], Columns]:
+    """Gives columns the rewards of a user's, episode by episode."""
+    rewards = reward_function(code)
+
+    def change(columns: Columns) -> Columns:
+        ends = np.cumsum(columns[EPISODES + "length"])[:-1]
+        parts = (np.split(columns[name], ends) for name in ("observation", "action"))
+        given = [rewards(*episode) for episode in zip(*parts, strict=True)]
+        return {**columns, "reward": np.concatenate(given).astype(np.float32)}
+
+    return change
+
+
+def _seen(task: Task) -> Callable[[Columns], Columns]:
+    """Shows of columns what a task's view does."""
     final = EPISODES + "final_observation"
     given = "observation", "action", final, EPISODES + "length"
 
-    def seen(columns: Columns) -> Columns:
+    def change(columns: Columns) -> Columns:
         before, last = seen_in_episodes(task, *(columns[name][:] for name in given))
-        return settings.columns({**columns, "observation": before, final: last})
+        return {**columns, "observation": before, final: last}
 
-    return write_shards(settings, folder, _each_shard(dataset, seen))
+    return change
 
 
 def _check_finished(dataset: Dataset) -> None:

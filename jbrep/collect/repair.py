@@ -125,6 +125,11 @@ def _restore(
             f"{path} can't be restored: the data set was imported; import its source, "
             f"{settings.policy['source']}, again in another folder"
         )
+    if settings.reward:
+        raise InputError(
+            f"{path} can't be restored: {settings.reward} gave the rewards; derive the data set "
+            "again in another folder"
+        )
     if not settings.task.reproducible:
         raise InputError(
             f"{path} can't be restored: {settings.task.name} is not reproducible, the same seed "

@@ -109,7 +109,9 @@ def _is_equal(recording: Recording, lane: int, episode: Episode) -> bool:
     length, stored = len(episode), episode.record
     if recording.length[lane] < length:
         return False
-    pairs = [(recording.reward[:length, lane], episode["reward"])]
+    pairs: list[tuple[Any, Any]] = []
+    if not episode.dataset.manifest.settings.reward:  # or else the environment gives others
+        pairs.append((recording.reward[:length, lane], episode["reward"]))
     states: dict[str, NDArray[Any]] = {"observation": recording.observation, **recording.arrays}
     for name, values in states.items():
         pairs.append((values[:length, lane], episode[name]))

@@ -83,6 +83,8 @@ def _facts(dataset: "Dataset", about: Mapping[str, Any]) -> dict[str, str]:
             f"median {of['median']} [10 % {of['p10']}, 90 % {of['p90']}], mean {of['mean']}, "
             f"from {of['min']} to {of['max']}"
         )
+    if code := dataset.manifest.settings.reward:
+        named["reward"] = f"by {code}"
     if dataset.manifest.settings.unrewarded:
         named["return"] = "not known: the data have no rewards"
     if dataset.manifest.settings.is_imported:

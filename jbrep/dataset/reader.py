@@ -221,7 +221,7 @@ class Dataset:
             return Column(lambda k: self._shard(k)[name], self._ends, spec.dtype, spec.row)
         places = self._places
         if name == "reward" and name not in places:
-            raise InputError(f"{self.folder} has no rewards: give some by --reward when importing")
+            raise InputError(f"{self.folder} has no rewards: jbrep data derive --reward gives some")
         if name not in places:
             raise InputError(
                 f"no column, group or feature {name!r}: choose one of "

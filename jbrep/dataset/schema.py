@@ -2,14 +2,21 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET, Meta, UnsetType
 from numpy.typing import NDArray
 
-from jbrep.dataset.settings import IMPORTED, MIXTURE, CollectSettings, PolicySettings, check_policy
+from jbrep.dataset.settings import (
+    IMPORTED,
+    MAX_LETTERS,
+    MIXTURE,
+    CollectSettings,
+    PolicySettings,
+    check_policy,
+)
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
@@ -20,6 +27,15 @@ EPISODES = "episodes/"  # the HDF5 group of the columns with one row for each ep
 UNKNOWN_SEED = -1  # of an imported episode
 _PART_STREAM = 0x6D6978  # beside an episode's seed: nothing else is drawn from that stream
 _EPISODE_BITS = {63: 32, 31: 20}  # of a seed, for the number of the episode
+
+_Code = Annotated[
+    str,
+    Meta(
+        pattern=r"(?a)\A[\w.]+:[\w.]+ [0-9a-f]{12}\Z",
+        max_length=MAX_LETTERS,
+        title="module:function and a hash",
+    ),
+]
 
 
 class Spec(NamedTuple):
@@ -104,6 +120,7 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
     task: Task = msgspec.field(name="environment")
     policy: PolicySettings = msgspec.field(default_factory=lambda: {"kind": "uniform"})
     unrewarded: Literal[True] | UnsetType = UNSET  # imported data that have no rewards
+    reward: _Code | UnsetType = UNSET  # what has given the rewards, if not the environment
 
     def check(self) -> None:
         """As for `Record`."""

@@ -59,12 +59,16 @@ def files_of(arguments: Mapping[str, Any]) -> dict[str, str]:
 
 
 def code_of(spec: EnvSpec) -> dict[str, str]:
-    """SHA-256 of the modules that define an environment, with those of a user's that they import.
+    """`code_behind` of what makes an environment."""
+    return code_behind(creator(spec))
+
+
+def code_behind(maker: Any) -> dict[str, str]:
+    """SHA-256 of the modules that define a class or function, and of the user's that they import.
 
     Installed packages are left out, which have versions. Of a script or notebook that is run it is
-    the source of the class alone.
+    the source of the class or function alone.
     """
-    maker: Any = creator(spec)
     maker = getattr(maker, "func", maker)  # of a partial function
     classes = [each for each in getattr(maker, "__mro__", (maker,)) if hasattr(each, "__module__")]
     hashes = {

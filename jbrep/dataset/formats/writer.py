@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from jbrep.dataset.formats.episodes import Incoming, Source, single
 from jbrep.dataset.formats.missing import without_missing
 from jbrep.dataset.manifest import Manifest, commit, new_manifest, write_manifest
+from jbrep.dataset.rewards import reward_function, with_hash, without_range
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings
 from jbrep.dataset.settings import IMPORTED, MAX_LETTERS
 from jbrep.dataset.verify import range_problems
 from jbrep.envs.description import features_of, with_features
-from jbrep.envs.names import code_named
 from jbrep.envs.precision import Signals, precision_problems
 from jbrep.envs.task import Task
 from jbrep.errors import InputError, Notice, kind_and_line
@@ -79,6 +79,7 @@ def write(
             for problem in precision_problems(fitting, survey.signals):
                 warnings.warn(problem, Notice, stacklevel=2)
             fitting = fitting.replace(missing=missing) if missing else fitting
+            fitting = without_range(fitting) if reward else fitting
             settings = _settings(source, survey, fitting, reward)
             check_space(folder.parent, settings.steps * settings.row_bytes())
             partial.mkdir()
@@ -91,21 +92,11 @@ def write(
 
 def _rewarded(source: Source, reward: str, missing: str) -> Source:
     """A source with rewards of its user's."""
-    function = code_named(reward, "reward")
+    rewards = reward_function(reward)
 
     def episodes() -> Iterator[Incoming]:
-        for episode in _episodes(source, missing):
-            try:
-                given = function(episode.observation.copy(), episode.action.copy())
-                values = np.asarray(given, float)
-            except Exception as error:
-                raise InputError(f"the reward {reward} fails: {kind_and_line(error)}") from error
-            if values.shape != episode.reward.shape:
-                raise InputError(
-                    f"the reward {reward} gives an array of shape {values.shape} for "
-                    f"{len(episode.action)} steps: it must be {episode.reward.shape}"
-                )
-            yield episode._replace(reward=values)
+        for each in _episodes(source, missing):
+            yield each._replace(reward=rewards(each.observation, each.action))
 
     return replace(source, episodes=episodes, has_rewards=True)
 
@@ -212,12 +203,9 @@ def _settings(source: Source, survey: _Survey, task: Task, reward: str) -> DataS
     name = "".join(c if c.isprintable() else "?" for c in source.name)
     return DataSettings(
         task=task,
-        policy={
-            "kind": IMPORTED,
-            "source": name[-MAX_LETTERS:],
-            **({"reward": reward} if reward else {}),
-        },
+        policy={"kind": IMPORTED, "source": name[-MAX_LETTERS:]},
         unrewarded=UNSET if source.has_rewards else True,
+        reward=with_hash(reward) if reward else UNSET,
         steps=steps,
         shard_episodes=max(1, rows * len(survey.lengths) // steps),
     )

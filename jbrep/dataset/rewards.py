@@ -1,0 +1,63 @@
+"""Rewards of a user's own for data that exist already, by a function."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.envs.names import code_named
+from jbrep.envs.origin import code_behind
+from jbrep.envs.task import Task
+from jbrep.errors import InputError, kind_and_line
+
+Array = NDArray[Any]
+
+
+def reward_function(code: str) -> Callable[[Array, Array], NDArray[np.float64]]:
+    """A function of observations (n, d) and actions (n, k), for an episode's rewards (n,).
+
+    Args:
+        code: module:function, the module of which has been imported on request.
+
+    Raises:
+        InputError: there is none of the name. The function raises it if it fails, or gives another
+            shape or a number that isn't finite in 32 bits.
+    """
+    function = code_named(code, "reward")
+
+    def rewards(observations: Array, actions: Array) -> NDArray[np.float64]:
+        try:
+            given = np.asarray(function(observations.copy(), actions.copy()), float)
+        except Exception as error:
+            raise InputError(f"the reward {code} fails: {kind_and_line(error)}") from error
+        if given.shape != (len(actions),):
+            raise InputError(
+                f"the reward {code} gives an array of shape {given.shape} for {len(actions)} "
+                f"steps: it must be ({len(actions)},)"
+            )
+        if len(wrong := np.flatnonzero(~(np.abs(given) <= np.finfo(np.float32).max))):
+            raise InputError(
+                f"the reward {code} gives {given[wrong[0]]} at step {wrong[0]} of an episode: it "
+                "must be finite in 32 bits"
+            )
+        return given
+
+    return rewards
+
+
+def with_hash(code: str) -> str:
+    """The name of such a function, and the hash of its code: data of two codes don't go together.
+
+    Raises:
+        InputError: as `reward_function`.
+    """
+    parts = sorted(code_behind(code_named(code, "reward")).items())
+    return f"{code} {hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]}"
+
+
+def without_range(task: Task) -> Task:
+    """The task with other rewards than its own: nothing is known of their range."""
+    return task.replace(reward_low=None, reward_high=None, solved_return=None)
