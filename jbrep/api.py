@@ -198,6 +198,7 @@ def evaluate(
     out: str | Path | None = None,
     *,
     policy: str | None = None,
+    truth: "Dataset | str | Path | None" = None,
 ) -> Judged:
     """Judge encoders on the held-out part of a data set, as `jbrep evaluate` does.
 
@@ -207,11 +208,13 @@ def evaluate(
         data: that they are judged on.
         out: a folder for evaluation.json; None to write nothing.
         policy: that does the task well; None for the task's hand-written one, if there is one.
+        truth: the data set that `data` was derived from, with what it hides.
 
     Raises:
-        InputError: an encoder that isn't one of this task's, or two of one name.
+        InputError: an encoder that isn't one of this task's, or two of one name; or the truth is of
+            another motion.
     """
-    from jbrep.dataset import ScaledDataset
+    from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
     from jbrep.evaluate.diagnosis import diagnose, write
     from jbrep.play.sources import find_good_policy
@@ -221,8 +224,11 @@ def evaluate(
         check_writable(Path(out))
     scaled = ScaledDataset.of(data)
     found, good = find_all(encoders, scaled.task), find_good_policy(policy, scaled.task)
+    whole = Dataset(truth) if isinstance(truth, str | Path) else truth
     return Judged(
-        diagnose(found, scaled, good) if out is None else write(found, scaled, Path(out), good)
+        diagnose(found, scaled, good, whole)
+        if out is None
+        else write(found, scaled, Path(out), good, whole)
     )
 
 

@@ -13,6 +13,7 @@ from jbrep.coordinates.placing import placed
 from jbrep.envs.description import describe
 from jbrep.envs.mujoco import turned_quaternion
 from jbrep.envs.task import Feature
+from jbrep.envs.view import with_view
 from jbrep.errors import InputError
 from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import TASKS
@@ -206,6 +207,16 @@ def test_symmetry_is_tried_not_believed(env, said):
 def test_the_jitterbugs_symmetry_holds():
     for each in TASKS.values():
         check_invariant(make_coordinates(each.plain, "symmetry"))
+
+
+def test_symmetry_is_tried_on_what_is_seen():
+    seen = with_view(TASKS["move_in_direction"].plain, ["*velocity*"])
+    check_invariant(make_coordinates(seen, "symmetry"))
+    past = with_view(TASKS["move_in_direction"].plain, ["*velocity*"], history=3)
+    with pytest.raises(
+        InputError, match=r"history-3 isn't the same for a turned robot: orientation"
+    ):
+        check_invariant(make_coordinates(past, "symmetry"))
 
 
 @pytest.mark.parametrize(

@@ -534,7 +534,7 @@ def test_the_command_says_which_encoders_were_taken_and_fits_the_terminal(
     whole = evaluation_text(evaluation, 80, everything=True)
     assert whole.startswith(shown.partition("\n\nJudged")[0])
     assert "KNN-MSE" in whole
-    monkeypatch.setattr(diagnosis, "diagnose", lambda encoders, data, policy: evaluation)
+    monkeypatch.setattr(diagnosis, "diagnose", lambda *given: evaluation)
     again = jbrep(*command, "--json")
     kept = json.loads(Path("judged", EVALUATION).read_text())
     assert json.loads(again.stdout) | {"sha256": kept["sha256"]} == kept

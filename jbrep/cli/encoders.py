@@ -57,6 +57,12 @@ _LETTERS = 100  # of the name of a folder
     "hand-written policy, if it has one.",
 )
 @click.option(
+    "--truth",
+    type=PATH,
+    help="The data set that DATA was derived from with --hide: how well an encoder estimates what "
+    "isn't seen.",
+)
+@click.option(
     "--all",
     "everything",
     is_flag=True,
@@ -68,6 +74,7 @@ def evaluate(
     data: Path,
     out: Path | None,
     policy: str | None,
+    truth: Path | None,
     everything: bool,
     as_json: bool,
 ) -> None:
@@ -98,7 +105,7 @@ def evaluate(
     }
     out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(encoders))[:_LETTERS])
     with stoppable("the same command starts over"):
-        evaluation = api.evaluate(encoders, whole, out, policy=policy).evaluation
+        evaluation = api.evaluate(encoders, whole, out, policy=policy, truth=truth).evaluation
         pictures = write_plots(encoder_plots(evaluation), out)
     width = terminal_width()
     notes = [wrapped(printable(note), width) for note in _notes(encoders, sources, evaluation)]

@@ -12,6 +12,7 @@ from jbrep.coordinates.made import Ingredient, System, make_coordinates
 from jbrep.envs.make import make_env
 from jbrep.envs.mujoco import quarter_turn
 from jbrep.envs.task import Array, Task
+from jbrep.envs.view import Window
 from jbrep.errors import InputError
 
 _SEEDS, _BEFORE, _AFTER = 3, 10, 5  # episodes; steps before the turn and after it
@@ -74,9 +75,12 @@ def _played(
     """Observations (2, d) and rewards (2,) of some steps of a robot, and of the same one turned."""
     random = np.random.default_rng(seed)
     shift = _SHIFT if any(each.kind == "point" for each in task.features) else (0.0, 0.0)
-    for env in envs:
-        env.reset(seed=seed)
-    for step in range(_BEFORE + _AFTER):
+    window = Window(task, len(envs), task.view.places) if task.view else None
+    turned = _BEFORE + (task.view.history if task.view else 1)  # steps until all that is seen is
+    begun = [env.reset(seed=seed)[0] for env in envs]
+    if window:
+        window.begin(range(len(envs)), _flat(envs, begun))
+    for step in range(turned + _AFTER):
         if step == _BEFORE and not quarter_turn(envs[1], shift):
             raise InputError(
                 f"symmetry can't be tried on {task.name}: its robot isn't a free body of MuJoCo's, "
@@ -84,11 +88,16 @@ def _played(
             )
         action = random.uniform(task.action_low, task.action_high).astype(np.float32)
         moved = [env.step(action) for env in envs]
-        if step >= _BEFORE:
-            seen = [
-                flatten(env.observation_space, each[0])
-                for env, each in zip(envs, moved, strict=True)
-            ]
-            yield np.array(seen, np.float64), np.array([each[1] for each in moved], np.float64)
+        seen = _flat(envs, [each[0] for each in moved])
+        if window:
+            seen = window.step(np.ones(len(envs), bool), np.stack([action] * len(envs)), seen)
+        if step >= turned - 1:
+            yield seen, np.array([each[1] for each in moved], np.float64)
         if any(each[2] or each[3] for each in moved):
             return
+
+
+def _flat(envs: Sequence[gymnasium.Env[Any, Any]], given: Sequence[Any]) -> Array:
+    """What environments gave, (n, D)."""
+    pairs = zip(envs, given, strict=True)
+    return np.array([flatten(env.observation_space, each) for env, each in pairs], np.float64)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.scaled import sample
@@ -36,42 +37,53 @@ def write(
     data: ScaledDataset,
     folder: Path,
     policy: GoodPolicy | None = None,
+    truth: Dataset | None = None,
 ) -> Evaluation:
     """Judge encoders as `diagnose`, and write evaluation.json into a folder, made if needed.
 
     Raises:
         InputError: as `diagnose`, or the folder holds the evaluation of other encoders or data, or
-            with another policy.
+            with another policy or truth.
     """
     path = folder / EVALUATION
     judged = {label: find(each, data.task) for label, each in encoders.items()}
     make_folder(folder)
     with exclusive(path, beside=True):
-        if exists(path) and not _is_same(path, data, hashes(judged), policy):
+        if exists(path) and not _is_same(path, data, hashes(judged), policy, truth):
             raise InputError(
                 f"{path} is not an evaluation of these encoders on this data: choose another --out"
             )
-        evaluation = diagnose(judged, data, policy)
+        evaluation = diagnose(judged, data, policy, truth)
         evaluation.write(path)
     return evaluation
 
 
 def _is_same(
-    path: Path, data: ScaledDataset, encoders: dict[str, str], policy: GoodPolicy | None
+    path: Path,
+    data: ScaledDataset,
+    encoders: dict[str, str],
+    policy: GoodPolicy | None,
+    truth: Dataset | None,
 ) -> bool:
     """Whether a repeated evaluation would replace one of the same."""
     try:
         there = read_document(path, Evaluation)
     except InputError:
         return False
-    wanted = data.dataset.manifest.fingerprint, encoders, policy.name if policy else None
-    return (there.data.fingerprint, there.hashes, there.policy) == wanted
+    on = data.dataset.manifest.fingerprint, _fingerprint(truth)
+    wanted = *on, encoders, policy.name if policy else None
+    return (there.data.fingerprint, there.data.truth, there.hashes, there.policy) == wanted
+
+
+def _fingerprint(truth: Dataset | None) -> str | UnsetType:
+    return truth.manifest.fingerprint if truth else UNSET
 
 
 def diagnose(
     encoders: Mapping[str, Any],
     data: ScaledDataset | Dataset | str | Path,
     policy: GoodPolicy | None = None,
+    truth: Dataset | None = None,
 ) -> Evaluation:
     """Every diagnostic of every encoder; docs/diagnostics.md describes each.
 
@@ -85,12 +97,15 @@ def diagnose(
             part.
         policy: that does the task well; what encoders say of its actions and its value is None
             without one.
+        truth: the data set that this was derived from, with features that it hides: how well they
+            can be read from a code is among the probes.
 
     Raises:
-        InputError: an encoder made for other features, or whose numbers overflow; or as `find`.
+        InputError: an encoder made for other features, or whose numbers overflow; or as `find`
+            or `HeldOut`.
     """
     data = ScaledDataset.of(data)
-    held_out = HeldOut(data)
+    held_out = HeldOut(data, truth)
     judged = {label: find(each, data.task) for label, each in encoders.items()}
     for label, encoder in judged.items():
         _check(label, encoder, data)
@@ -99,7 +114,7 @@ def diagnose(
     results, needed = _side_by_side({FULL: full, **judged}, held_out, policy)
     sha256 = hashes(judged)
     return Evaluation(
-        data=_judged_on(held_out),
+        data=_judged_on(held_out, truth),
         resamples=RESAMPLES,
         seen={label: seen(encoder, data) for label, encoder in judged.items()},
         policy=policy.name if policy else None,
@@ -227,7 +242,7 @@ def seen(encoder: BaseEncoder, data: ScaledDataset) -> Literal["no test row", "n
     return "none" if source["seed"] != manifest.settings.seed else "maybe"
 
 
-def _judged_on(held_out: HeldOut) -> JudgedOn:
+def _judged_on(held_out: HeldOut, truth: Dataset | None) -> JudgedOn:
     data, manifest = held_out.data, held_out.data.dataset.manifest
     return JudgedOn(
         task=data.task.name,
@@ -238,4 +253,6 @@ def _judged_on(held_out: HeldOut) -> JudgedOn:
         test_rows=len(data.test),
         test_episodes=len(held_out),
         constant_features=data.constant_features,
+        truth=_fingerprint(truth),
+        hidden=held_out.hidden or UNSET,
     )

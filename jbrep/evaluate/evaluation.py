@@ -4,6 +4,8 @@ import json
 import re
 from typing import Any, ClassVar, Literal, NamedTuple
 
+from msgspec import UNSET, UnsetType
+
 from jbrep.records.document import Document, sealed
 from jbrep.records.record import Record
 from jbrep.stats.bootstrap import Interval
@@ -169,6 +171,8 @@ class JudgedOn(Record, frozen=True, kw_only=True):
     test_rows: int
     test_episodes: int
     constant_features: tuple[str, ...]
+    truth: str | UnsetType = UNSET  # fingerprint of the data set with what these hide
+    hidden: tuple[str, ...] | UnsetType = UNSET  # features, which are among the probes
 
 
 class Evaluation(Document, frozen=True, kw_only=True):

@@ -8,9 +8,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from jbrep.dataset import ScaledDataset
+from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.dataset.scaled import sample
+from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import Score, scores
+from jbrep.evaluate.truth import Columns, every
 from jbrep.stats.bootstrap import Array, bootstrap, by_episode, r_squared, variation
 
 Rows = NDArray[np.int64]
@@ -30,20 +32,36 @@ class HeldOut:
     Sums are of groups of episodes, which intervals resample: a group for each episode or, of more
     than 1,000 episodes, 1,000 groups of neighbouring ones, equally many in each give or take one.
 
-    Attributes:
+    Args:
         data: the data set, split and scaled.
+        truth: that it was derived from, of the same motion, if it shows more.
+
+    Attributes:
+        data: as given.
+        hidden: names of the features that the truth alone shows.
         numbers: of the held-out episodes within the data set, (episodes,).
         num_groups: groups of episodes.
+
+    Raises:
+        InputError: the truth is of another motion, or shows no more.
     """
 
-    def __init__(self, data: ScaledDataset):
-        self.data = data
+    def __init__(self, data: ScaledDataset, truth: Dataset | None = None):
+        self.data, self._truth = data, truth
+        self.hidden = _hidden(data.dataset, truth) if truth else ()
         self._ends = np.cumsum(data.dataset.episodes["length"], dtype=np.int64)
         self.numbers = np.unique(self._episode(data.test))
         self.num_groups = min(len(self.numbers), MAX_GROUPS)
 
     def __len__(self) -> int:
         return len(self.numbers)
+
+    def truth(self, rows: Rows) -> Columns:
+        """What isn't seen in rows, (n, k) by its name; angles as cosine and sine."""
+        if not self._truth:
+            return {}
+        known = every(self._truth.task, self._truth["observation"][rows])
+        return {name: known[name] for name in self.hidden}
 
     def _episode(self, rows: Rows) -> Rows:
         return np.searchsorted(self._ends, rows, side="right")
@@ -90,6 +108,23 @@ class HeldOut:
         """Sums of scaled features and of their squares over each group, (groups, d)."""
         scaled = (chunk.astype(np.float64) for chunk in self.data.chunks(self.data.test))
         return self.sums_of_parts(self.data.test, ((chunk, chunk**2) for chunk in scaled))
+
+
+def _hidden(dataset: Dataset, truth: Dataset) -> tuple[str, ...]:
+    """The features that a data set of the same motion has beside those of another."""
+    moved, seen = (
+        [shard.sha256["action"] for shard in each.manifest.shards] for each in (truth, dataset)
+    )
+    if moved != seen:
+        raise InputError(
+            f"{truth.folder} has other actions than {dataset.folder}: the truth must be the data "
+            "set that it was derived from"
+        )
+    shown = dataset.task.feature_names
+    hidden = tuple(name for name in truth.task.feature_names if name not in shown)
+    if not hidden:
+        raise InputError(f"{truth.folder} shows nothing that {dataset.folder} hides")
+    return hidden
 
 
 class Episodes(Protocol):

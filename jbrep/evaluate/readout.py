@@ -141,19 +141,23 @@ _Truth = Callable[[Task, NDArray[Any]], Columns]
 
 
 def _problem(encoder: BaseEncoder, held_out: HeldOut, truth: _Truth) -> Problem:
-    data = held_out.data
-    seen = data.dataset["observation"][sample_rows(data.train, _ROWS, data.task.size)]
-    return Problem(encoder.encode(seen), np.hstack(list(truth(data.task, seen).values())))
+    seen, true = _true(held_out, held_out.data.train, truth)[1:]
+    return Problem(encoder.encode(seen), np.hstack(list(true.values())))
 
 
 def _probes(encoder: BaseEncoder, held_out: HeldOut, truth: _Truth, predict: Predictor) -> Scores:
-    data = held_out.data
-    rows = sample_rows(data.test, _ROWS, data.task.size)
-    unseen = data.dataset["observation"][rows]
-    true = truth(data.task, unseen)
+    rows, unseen, true = _true(held_out, held_out.data.test, truth)
     widths = [values.shape[1] for values in true.values()]
     predicted, wanted = predict(encoder.encode(unseen)), np.hstack(list(true.values()))
     return dict(zip(true, explained(predicted, wanted, rows, held_out, widths), strict=True))
+
+
+def _true(held_out: HeldOut, rows: Rows, truth: _Truth) -> tuple[Rows, NDArray[Any], Columns]:
+    """A sample of rows, the observations there, and what is true: what isn't seen, too."""
+    data = held_out.data
+    chosen = sample_rows(rows, _ROWS, data.task.size)
+    seen = data.dataset["observation"][chosen]
+    return chosen, seen, {**truth(data.task, seen), **held_out.truth(chosen)}
 
 
 class _Steps(NamedTuple):

@@ -42,9 +42,13 @@ def quantities(task: Task, observation: ArrayLike) -> Columns:
 
 def quantities_and_features(task: Task, observation: ArrayLike) -> Columns:
     """The quantities, then the features that aren't among them; all angles as cosine and sine."""
-    known = quantities(task, observation)
-    every = _every(_features(task, observation), _angles(task))
-    return known | {name: every[name] for name in every if name not in known}
+    known, features = quantities(task, observation), every(task, observation)
+    return known | {name: features[name] for name in features if name not in known}
+
+
+def every(task: Task, observation: ArrayLike) -> Columns:
+    """All features, (n, k) by name: angles as cosine and sine."""
+    return _every(_features(task, observation), _angles(task))
 
 
 def state(task: Task, observation: ArrayLike) -> Columns:

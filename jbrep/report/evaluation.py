@@ -1,7 +1,7 @@
 """An evaluation of encoders as tables to read on a screen."""
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from jbrep.encoders import FULL
 from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Scores
@@ -43,6 +43,7 @@ def evaluation_text(
     parts = [
         wrapped(serving(evaluation), width),
         _headline(evaluation).text(width),
+        *(table.text(width) for table in _unseen(evaluation)),
         _lacking(evaluation, width),
     ]
     if everything:
@@ -54,7 +55,8 @@ def evaluation_text(
 
 def evaluation_html(evaluation: Evaluation) -> str:
     """Which codes serve and what each lacks, for a notebook."""
-    return html(serving(evaluation), _headline(evaluation), _lacking(evaluation, None))
+    tables = _headline(evaluation), *_unseen(evaluation)
+    return html(serving(evaluation), *tables, _lacking(evaluation, None))
 
 
 def _headline(evaluation: Evaluation) -> Table:
@@ -75,6 +77,25 @@ def _headline(evaluation: Evaluation) -> Table:
             for label, each in numbers.items()
         ],
     )
+
+
+def _unseen(evaluation: Evaluation) -> Iterator[Table]:
+    """How well what isn't seen can be read from each code, where the truth is known."""
+    if hidden := evaluation.data.hidden:
+        yield Table(
+            "What isn't seen, read from the code: R², nonlinear",
+            ("feature", *evaluation.encoders),
+            [
+                (
+                    name,
+                    *(
+                        r2_text(e.nonlinear_probes[name].value)
+                        for e in evaluation.encoders.values()
+                    ),
+                )
+                for name in hidden
+            ],
+        )
 
 
 def _columns(evaluation: Evaluation, width: int | None) -> str:
