@@ -1,67 +1,13 @@
 """HDF5 files of others: D4RL's layout and robomimic's, as their own tools write them."""
 
-import json
-
 import h5py
 import numpy as np
 import pytest
 from command import jbrep
+from foreign import ROWS, STEPS, write_d4rl, write_robomimic
 
 from jbrep.dataset import Dataset
 from jbrep.dataset.verify import find_problems
-
-STEPS = np.concatenate([np.arange(n) for n in (10, 8, 7)])
-ROWS = len(STEPS)
-
-
-def write_d4rl(path, **changes):
-    """Three episodes: a terminal, a timeout and one that is cut off; as hopper-medium-v2 has it."""
-    random = np.random.default_rng(0)
-    arrays = {
-        "observations": np.stack([STEPS, np.repeat(range(3), (10, 8, 7))], 1).astype(np.float32),
-        "actions": random.uniform(-1, 1, (ROWS, 3)).astype(np.float32),
-        "rewards": STEPS.astype(np.float32)[:, None],
-        "terminals": np.arange(ROWS) == 9,
-        "timeouts": np.arange(ROWS) == 17,
-        "infos/qpos": random.normal(size=(ROWS, 4)),
-        "metadata/policy/fc0/weight": random.normal(size=(5, 5)),
-        "metadata/algorithm": np.bytes_("SAC"),
-        **changes,
-    }
-    with h5py.File(path, "w") as file:
-        for name, values in arrays.items():
-            if values is not None:
-                compression = {"compression": "gzip"} if np.ndim(values) else {}
-                file.create_dataset(name, data=values, **compression)
-    return path
-
-
-def write_robomimic(path, counts=(6, 5, 4, *[3] * 8), damage=lambda data: None):
-    """Demos of a robosuite task as dataset_states_to_obs.py writes them, with a camera."""
-    with h5py.File(path, "w") as file:
-        data = file.create_group("data")
-        for number, count in enumerate(counts):
-            demo, states = data.create_group(f"demo_{number}"), np.arange(count + 1)
-            seen = {
-                "object": np.stack([states, states**2, 0 * states + number], 1) / 8,
-                "robot0_eef_pos": states[:, None] * [0.1, 0.2],
-                "robot0_gripper": states / 1.0,
-                "agentview_image": np.zeros((count + 1, 4, 4, 3), np.uint8),
-            }
-            for name, values in seen.items():
-                demo[f"obs/{name}"], demo[f"next_obs/{name}"] = values[:-1], values[1:]
-            demo["actions"] = np.random.default_rng(number).uniform(-1, 1, (count, 7))
-            demo["actions_abs"] = np.asarray(demo["actions"]) * 2
-            demo["states"] = np.zeros((count, 9))
-            demo["rewards"] = (states[1:] == count) * 1.0
-            demo["dones"] = (states[1:] >= count - (number == 1)).astype(int)
-            demo.attrs["num_samples"], demo.attrs["model_file"] = count, "<mujoco/>"
-        data.attrs["total"] = sum(counts)
-        told = {"env_name": "Lift", "type": 1, "env_kwargs": {"control_freq": 20}}
-        data.attrs["env_args"] = json.dumps(told)
-        file["mask/train"] = np.array([b"demo_0"])
-        damage(data)
-    return path
 
 
 def imported(path, *options, out="data"):

@@ -16,10 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from command import jbrep, mistake
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from foreign import GYRO, PITCH, RATE, TIMES, VOLTS, csv_rows, lerobot_folder, write_bag, write_csv
 
 from jbrep.collect import collect
 from jbrep.dataset import Dataset, DataSettings, Layout, ScaledDataset
@@ -29,37 +26,6 @@ from jbrep.errors import InputError
 from jbrep.evaluate.diagnosis import diagnose
 from jbrep.methods.fit import Fitter
 from jbrep.report.serving import untold
-
-RATE = 100
-TIMES = np.concatenate((np.arange(60), 500 + np.arange(60))) / RATE
-TICKS = 420_000_000 + np.arange(120)
-GYRO = 8 + np.arange(120) / 100
-PITCH = (800 * TIMES + 180) % 360 - 180
-VOLTS = np.sin(np.arange(120))
-
-
-def csv_rows(**changes):
-    """A log's cells; some of a column may be replaced."""
-    columns = {
-        "time [s]": [f"{t:.5f}" for t in TIMES],
-        "pitch [deg]": [f"{v:.4f}" for v in PITCH],
-        "gyro (rad/s)": [f"{v:.3f}" for v in GYRO],
-        "ticks": [str(v) for v in TICKS],
-        "u [V]": [f"{v:.4f}" for v in VOLTS],
-        "status": ["OK"] * 120,
-    }
-    for name, cells in changes.items():
-        for row, cell in cells.items():
-            columns[next(n for n in columns if n.startswith(name))][row] = cell
-    return columns
-
-
-def write_csv(path, rows, separator=",", before=(), decimal="."):
-    lines = [separator.join(rows), *map(separator.join, zip(*rows.values(), strict=True))]
-    lines[1:] = [line.replace(".", decimal) for line in lines[1:]]
-    path.write_text("\n".join([*before, *lines]) + "\n", encoding="utf-8-sig")
-    return path
-
 
 NAMED = ("--observations", "pitch,gyro,ticks", "--actions", "u", "--time", "time")
 
@@ -337,40 +303,6 @@ def test_several_logs_are_an_episode_each(tmp_path):
     assert math.isclose(data.task.action_high[0], VOLTS.max(), rel_tol=1e-4)
 
 
-def lerobot_folder(folder, version="v3.0", **features):
-    """A data set as LeRobot's documentation lays it out: three episodes, a camera."""
-    lengths = (10, 11, 12)
-    step = np.concatenate([np.arange(n) for n in lengths])
-    state = np.stack([np.repeat(range(3), lengths), step], axis=1).astype(np.float32)
-    names = {"motors": ["shoulder.pos", "elbow.pos"]}
-    known = {
-        "observation.state": {"dtype": "float32", "shape": [2], "names": names},
-        "action": {"dtype": "float32", "shape": [2], "names": names},
-        "observation.images.top": {"dtype": "video", "shape": [3, 48, 64], "names": None},
-        "next.reward": {"dtype": "float32", "shape": [1], "names": None},
-        **features,
-    }
-    columns = {
-        "observation.state": pa.array(state.tolist(), pa.list_(pa.float32(), 2)),
-        "action": pa.array((state / 12).tolist(), pa.list_(pa.float32())),
-        "next.reward": pa.array(step.astype(np.float32)),
-        "timestamp": pa.array((step / 30).astype(np.float32)),
-        "frame_index": pa.array(step),
-        "episode_index": pa.array(np.repeat(range(3), lengths)),
-        "index": pa.array(np.arange(33)),
-        "task_index": pa.array(np.zeros(33, int)),
-    }
-    table = pa.table(columns)
-    (folder / "data/chunk-000").mkdir(parents=True)
-    (folder / "meta").mkdir()
-    for file, (begin, end) in enumerate([(0, 21), (21, 33)]):
-        path = folder / f"data/chunk-000/file-{file:03d}.parquet"
-        pq.write_table(table.slice(begin, end - begin), path)
-    info = {"codebase_version": version, "fps": 30, "features": known}
-    (folder / "meta/info.json").write_text(json.dumps(info))
-    return folder
-
-
 def test_a_lerobot_data_set(tmp_path):
     told, data = imported(lerobot_folder(tmp_path / "arm"))
     assert data.episodes["length"].tolist() == [9, 10, 11]
@@ -425,43 +357,6 @@ def test_damaged_lerobot_data_sets_are_refused(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def write_bag(path, kind):
-    """Joints at 100 Hz in changing order, commands at 10 Hz that pause, and words."""
-    store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
-    if kind == "bag":
-        writer, pack = Writer1(path), store.serialize_ros1
-    else:
-        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-        writer, pack = Writer2(path, version=9, storage_plugin=plugin), store.serialize_cdr
-    types = store.types
-    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-    first = {"seq": 0} if kind == "bag" else {}
-    header = types["std_msgs/msg/Header"](**first, stamp=stamp, frame_id="base")
-    empty = np.zeros(0)
-    with writer:
-        made = {
-            topic: writer.add_connection(topic, f"{name}", typestore=store)
-            for topic, name in {
-                "/joint_states": "sensor_msgs/msg/JointState",
-                "/arm/command": "std_msgs/msg/Float64",
-                "/rosout": "std_msgs/msg/String",
-            }.items()
-        }
-        for i in range(300):
-            time = 1_700_000_000_000_000_000 + i * 10_000_000
-            names, angles = ["hip", "knee"], np.array([i / 100, -i / 100])
-            if i % 2:
-                names, angles = names[::-1], angles[::-1].copy()
-            joints = types["sensor_msgs/msg/JointState"](header, names, angles, empty, empty)
-            writer.write(made["/joint_states"], time, pack(joints, joints.__msgtype__))
-            if i % 10 == 5 and not 100 < i < 200:
-                command = types["std_msgs/msg/Float64"](float(i))
-                writer.write(made["/arm/command"], time, pack(command, command.__msgtype__))
-        word = types["std_msgs/msg/String"]("hello")
-        writer.write(made["/rosout"], time, pack(word, word.__msgtype__))
-    return path
-
-
 @pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])
 def test_a_bag_of_ros(kind, tmp_path):
     path = write_bag(tmp_path / ("walk.bag" if kind == "bag" else "walk"), kind)
@@ -494,7 +389,7 @@ def test_a_damaged_bag_is_refused(tmp_path):
 
 def test_the_page_on_logs_does_what_it_says(tmp_path, monkeypatch):
     """Its first block of Python writes a log, its commands import it."""
-    page = (Path(__file__).parent.parent / "docs/logs.md").read_text()
+    page = (Path(__file__).parent.parent / "docs/logs.md").read_text().partition("\n## ")[0]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("jbrep.envs.names._imported", [])
     exec(re.search(r"^```python\n(.*?)^```", page, re.M | re.S)[1], {})

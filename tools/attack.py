@@ -1,8 +1,8 @@
 """Kill commands, fill their disk, run two at once and flip bits: python tools/attack.py 100.
 
-Each surface is attacked so many times in each way, and flipped ten times as many bits; or those
-alone that are named after the number. It prints what came of it, and ends with code 1 where
-something false came of an attack.
+Each surface is attacked so many times in each way, and files that it reads are damaged ten times as
+often; or those alone that are named after the number. It prints what came of it, and ends with code
+1 where something false came of an attack.
 """
 
 import sys

@@ -14,7 +14,7 @@ import signal
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -22,11 +22,35 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from small import flip_bit
 
 from jbrep.cli import main
 from jbrep.errors import InputError
 
+
+def a_bit_flipped(content, random):
+    bit, damaged = int(random.integers(8 * len(content))), bytearray(content)
+    damaged[bit // 8] ^= 1 << bit % 8
+    return f"bit {bit}", bytes(damaged)
+
+
+def cut_short(content, random):
+    end = int(random.integers(len(content)))
+    return f"from byte {end}", content[:end]
+
+
+def overwritten(content, random):
+    begin, size = int(random.integers(len(content))), int(random.integers(1, 64))
+    return f"byte {begin} to {begin + size}", (
+        content[:begin] + random.bytes(size) + content[begin + size :]
+    )
+
+
+def repeated(content, random):
+    begin, end = sorted(random.integers(len(content), size=2).tolist())
+    return f"byte {begin} to {end}", content[:end] + content[begin:]
+
+
+MALFORMED = (a_bit_flipped, cut_short, overwritten, repeated)
 SYNCS = ("fsync", "replace", "rename", "link")  # each is a point where a command can end
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -42,6 +66,8 @@ class Surface:
     files: Callable[[Path], list[Path]] = lambda folder: []
     read: Callable[[Path], Any] | None = None
     prepare: Callable[[Path], Any] = lambda folder: None
+    harms: Sequence[Callable[..., tuple[str, bytes]]] = (a_bit_flipped,)  # to a file's content
+    has_checksums: bool = True  # or else other data may come of a damage
 
 
 @dataclass
@@ -251,19 +277,21 @@ class Attacker:
         return child, told
 
     def damages(self, count):
-        """Flip a bit of a file that is read: it is refused in a line, or nothing changes."""
+        """Damage a file that is read: it is refused in a line, or nothing changes."""
         surface = self.surface
         assert surface.read is not None
         expected = surface.read(self.peace)
         files = surface.files(self.peace)
         sizes = np.array([path.stat().st_size for path in files], float)
+        accepted = {"no harm", "refused", *([] if surface.has_checksums else ["other data"])}
         for _ in range(count):
             # small files count as much as large ones, half of the time
             weights = sizes / sizes.sum() if self.random.random() < 0.5 else None
             path = files[self.random.choice(len(files), p=weights)]
+            harm = surface.harms[int(self.random.integers(len(surface.harms)))]
             content = path.read_bytes()
-            bit = int(self.random.integers(8 * len(content)))
-            flip_bit(path, bit)
+            where, damaged = harm(content, self.random)
+            path.write_bytes(damaged)
             try:
                 outcome = "no harm" if surface.read(self.peace) == expected else "other data"
             except (InputError, SystemExit) as error:
@@ -272,9 +300,8 @@ class Attacker:
                 outcome = f"failed: {type(error).__name__}: {error}"
             finally:
                 path.write_bytes(content)
-            is_met = outcome in ("no harm", "refused")
-            fault = "" if is_met else f"bit {bit} of {path.name}: {outcome}"
-            self.tally.note("a bit flipped", outcome.partition(":")[0], fault)
+            fault = "" if outcome in accepted else f"{where} of {path.name}: {outcome}"
+            self.tally.note(harm.__name__.replace("_", " "), outcome.partition(":")[0], fault)
 
 
 def attack(surface, folder, *, kills=0, full=0, twice=0, flips=0, seed=0):

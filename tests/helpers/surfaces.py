@@ -4,11 +4,18 @@ import os
 import shutil
 from pathlib import Path
 
-import numpy as np
 import torch._dynamo  # noqa: F401  or every fork imports it, in seconds
-from attacks import Surface, command, digest, forked
+from attacks import MALFORMED, Surface, command, digest, forked
 from click.testing import CliRunner
 from command import in_this_process
+from foreign import (
+    csv_rows,
+    lerobot_folder,
+    write_bag,
+    write_csv,
+    write_d4rl,
+    write_robomimic,
+)
 from rerun.chunk import RrdReader
 from small import brief
 
@@ -71,6 +78,7 @@ def surfaces(shared):
         _run("sac", overrides=CHEAP, trainer="cohort"),
         _run("ppo", overrides={**SMALL, "n_steps": 8, "batch_size": 8}),
         *(_import(to, path) for to, path in exported.items()),
+        *(_import(to, write(shared), told, **FOREIGN) for to, (write, told) in LOGS.items()),
         *(_export(to, Dataset(data)) for to in exported),
         _encoder_import(model, task),
         _encoder_export(task),
@@ -80,6 +88,19 @@ def surfaces(shared):
     ]
 
 
+_LOG = ("--observations", "pitch,gyro,ticks", "--actions", "u", "--time", "time", "--gap", "0.5")
+_JOINTS = ("--observations", "/joint_states.position.*", "--actions", "/arm/command.data")
+_BAG = (*_JOINTS, "--rate", "50", "--gap", "0.15")
+LOGS = {  # of other tools: what writes them, and what their columns are said to be
+    "csv": (lambda folder: write_csv(folder / "walk.csv", csv_rows()), _LOG),
+    "a bag of ROS 1": (lambda folder: write_bag(folder / "walk.bag", "bag"), _BAG),
+    "mcap": (lambda folder: write_bag(folder / "walk-mcap", "mcap"), _BAG),
+    "a bag of ROS 2": (lambda folder: write_bag(folder / "walk-db3", "db3"), _BAG),
+    "lerobot": (lambda folder: lerobot_folder(folder / "arm"), ()),
+    "d4rl": (lambda folder: write_d4rl(folder / "hopper.hdf5"), ()),
+    "robomimic": (lambda folder: write_robomimic(folder / "lift.hdf5"), ()),
+}
+FOREIGN = {"harms": MALFORMED, "has_checksums": False}
 SMALL = {"net_arch": [4], "num_envs": 1}
 CHEAP = {"net_arch": [8], "learning_starts": 8, "batch_size": 8, "buffer_size": 100}
 OF_A_RUN = {  # in the folder that it stands in, and what that makes
@@ -171,9 +192,11 @@ def _run(algorithm, **settings):
 LAST = {"preset": "modern", "evaluation_episodes": 1, "final_episodes": 1, "evaluate_every": 32}
 
 
-def _import(to, path):
+def _import(to, path, options=(), **how):
+    """Of a file, with that of its episodes if it has one, or of a folder."""
+
     def act(folder):
-        command("data", "import", path, "--out", folder / "it")
+        command("data", "import", path, *options, "--out", folder / "it")
 
     def result(folder):
         return read_manifest(folder / "it").fingerprint
@@ -191,14 +214,22 @@ def _import(to, path):
         there = copied(folder)
         if to == "parquet":
             return [there, there.with_stem(f"{there.stem}-episodes")]
-        return sorted(there.iterdir()) if there.is_dir() else [there]
+        found = there.rglob("*") if there.is_dir() else [there]
+        return sorted(each for each in found if each.is_file())
 
     def read(folder):
-        source = open_source(str(copied(folder)))
-        episodes = [[np.asarray(each).tolist() for each in e] for e in source.episodes()]
-        return episodes, source.features or source.task
+        """What the command makes: whole, or nothing."""
+        out = folder / "damaged" / "it"
+        try:
+            command_or_refusal("data", "import", copied(folder), *options, "--out", out)
+        finally:
+            left = [each.name for each in out.parent.iterdir()]
+            assert left in ([], ["it"]), left
+        manifest = read_manifest(out)
+        shutil.rmtree(out)
+        return manifest.fingerprint, manifest.settings.as_json()
 
-    return Surface(f"import of {to}", act, result, files, read)
+    return Surface(f"import of {to}", act, result, files, read, **how)
 
 
 def _export(to, dataset):
