@@ -1,6 +1,7 @@
 """The scripts in examples/ walk through to their ends."""
 
 import os
+import re
 import runpy
 import socket
 import struct
@@ -14,6 +15,7 @@ import pytest
 from command import in_this_process
 
 from jbrep.envs.description import describe
+from jbrep.evaluate import regression
 from jbrep.play.sources import find_player
 from jbrep.rl.controller import load_policy
 from jbrep.rl.export import export
@@ -22,6 +24,8 @@ from jbrep.study.runner import BACKENDS
 
 OWN = Path("examples/own/own.py").resolve()
 ROBOT = Path("examples/robot").resolve()
+LOG = Path("examples/log/notebook.py").resolve()
+SITE = Path("tools/site.py").resolve()
 
 
 @pytest.mark.usefixtures("one_figure")
@@ -41,6 +45,25 @@ def test_everything_that_one_can_bring(tmp_path, monkeypatch, capfd):
     for made in ("study/report.html", "mine.rrd", "pendulum-encoders/pca-2.safetensors"):
         assert (tmp_path / "out" / made).stat().st_size > 1000, made
     assert (tmp_path / "out/mixed-encoders/pca-2.safetensors").stat().st_size > 1000
+
+
+@pytest.mark.filterwarnings("ignore::jbrep.errors.Notice")
+def test_the_notebook_goes_from_a_log_to_a_controller(tmp_path, monkeypatch, capsys):
+    """At toy size; and as a page it has all its cells."""
+    monkeypatch.syspath_prepend(LOG.parent)
+    monkeypatch.setattr(regression, "_STEPS", 50)
+    monkeypatch.chdir(tmp_path)
+    usual = "EPISODES, LIMIT, STEPS = 40, 1000, 150_000\n"
+    code = LOG.read_text()
+    assert usual in code
+    exec(compile(code.replace(usual, "EPISODES, LIMIT, STEPS = 6, 60, 128\n"), LOG, "exec"), {})
+    told = capsys.readouterr().out
+    assert "6 of 60 steps" in told
+    alone, run = re.search(r"controller returns (.*), its run (.*) \(", told).groups()
+    assert float(alone) == pytest.approx(float(run), abs=0.1)
+    page = runpy.run_path(str(SITE))["page_of"](code)
+    assert page.startswith("# From a log to a controller\n\nWhat a robot")
+    assert page.count("```python\n") == code.count("# %%\n") == 7
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from command import jbrep, mistake
 from foreign import GYRO, PITCH, RATE, TIMES, VOLTS, csv_rows, lerobot_folder, write_bag, write_csv
+from small import flip_bit
 
 from jbrep.collect import collect
 from jbrep.dataset import Dataset, DataSettings, Layout, ScaledDataset
@@ -355,6 +356,14 @@ def test_damaged_lerobot_data_sets_are_refused(tmp_path):
     done = jbrep("data", "import", folder, "--out", tmp_path / "out")
     assert "has no data/chunk-*/*.parquet" in done.output
     assert not (tmp_path / "out").exists()
+
+
+def test_a_footer_of_which_pyarrow_dies_is_refused(tmp_path):
+    """It ends the process where the sizes of a column are asked for."""
+    folder = lerobot_folder(tmp_path / "arm")
+    flip_bit(folder / "data/chunk-000/file-000.parquet", 10168)
+    done = mistake("data", "import", folder, "--out", tmp_path / "out")
+    assert "can't be read as a Parquet file: Definition level histogram size" in done
 
 
 @pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])

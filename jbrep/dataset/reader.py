@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ from jbrep.dataset.schema import EPISODES, episode_bounds, episode_columns
 from jbrep.dataset.shard import FileState, Shard, file_state
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
+
+if TYPE_CHECKING:
+    from jbrep.dataset.formats.episodes import Source
 
 _OPEN_SHARDS = 256  # memory-mapped at a time, at most: each takes a file descriptor
 _MEMORY = 4 << 30  # [bytes]
@@ -179,15 +182,40 @@ class Dataset:
         """
         from jbrep.dataset.formats import source_from
         from jbrep.dataset.formats.arrow import table_of
-        from jbrep.dataset.formats.writer import write
-        from jbrep.envs.description import as_task
-        from jbrep.envs.names import is_code
 
         opened = source_from(table_of(table, source), layout, missing)
-        reward = layout.reward if layout and is_code(layout.reward) else ""
-        known = None if task is None else as_task(task)
-        write(opened, Path(folder), known, missing=missing, reward=reward)
-        return Dataset(folder)
+        return _written(folder, opened, layout, missing, task)
+
+    @staticmethod
+    def from_file(
+        folder: str | Path,
+        file: str | Path,
+        *more: str | Path,
+        layout: Layout | None = None,
+        missing: str = "",
+        task: Task | str | None = None,
+    ) -> "Dataset":
+        """Write a data set of others' files, whole or not at all, as `jbrep data import` does.
+
+        Args:
+            folder: new.
+            file: a log, or a data set of another tool, see docs/logs.md.
+            more: such files; an episode ends with each.
+            layout: as `from_table` takes it, like missing and task.
+            missing: likewise.
+            task: likewise; by default the one that the files name, if they do.
+
+        Returns:
+            The data set.
+
+        Raises:
+            InputError: the folder exists already, or the files can't be used.
+            ModuleNotFoundError: their format needs a package that isn't installed.
+        """
+        from jbrep.dataset.formats import open_source, together
+
+        opened = together([open_source(str(each), layout, missing) for each in (file, *more)])
+        return _written(folder, opened, layout, missing, task)
 
     def _shard(self, shard: int) -> Shard:
         """A shard as it is on disk now: another state of its file is another entry of the cache."""
@@ -320,3 +348,21 @@ def _open_at_once() -> int:
     """How many shards to have open: they take half of the files that the process may, at most."""
     most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return _OPEN_SHARDS if most == resource.RLIM_INFINITY else min(_OPEN_SHARDS, most // 2)
+
+
+def _written(
+    folder: str | Path,
+    source: "Source",
+    layout: Layout | None,
+    missing: str,
+    task: Task | str | None,
+) -> Dataset:
+    """A data set of what was opened."""
+    from jbrep.dataset.formats.writer import write
+    from jbrep.envs.description import as_task
+    from jbrep.envs.names import is_code
+
+    reward = layout.reward if layout and is_code(layout.reward) else ""
+    known = None if task is None else as_task(task)
+    write(source, Path(folder), known, missing=missing, reward=reward)
+    return Dataset(folder)

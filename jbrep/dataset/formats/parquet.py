@@ -22,7 +22,7 @@ from jbrep.dataset.formats.flat import CHUNK, per_episode
 from jbrep.dataset.formats.tables import Table, with_widths
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.settings import Digest
-from jbrep.envs.task import Task
+from jbrep.envs.task import MAX_FEATURES, Task
 from jbrep.errors import DamageError, InputError, first_line
 from jbrep.progress import Progress
 from jbrep.records.document import Document, document_in
@@ -41,6 +41,7 @@ _SETTINGS, _CHECKSUMS = b"jbrep", b"jbrep checksums"  # in a file's metadata
 _MAX_COLUMNS = 1 << 14
 _MAX_BYTES = 1 << 31  # of the file of episodes
 _ROW_BYTES = 64  # of a number in a column, before compression, at most
+_LIST_BYTES = 8 * MAX_FEATURES  # of a list of them
 
 
 class Checksums(Document, frozen=True, kw_only=True):
@@ -91,17 +92,21 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def check_sizes(name: str, metadata: pq.FileMetaData, schema: pa.Schema) -> None:
-    """Refuse what would take much more memory than its numbers."""
+    """Refuse what would take much more memory than its numbers.
+
+    Sizes of groups of rows are looked at, not those of columns: where these are damaged, pyarrow
+    ends the process.
+    """
     names = schema.names
     if len(names) > _MAX_COLUMNS:
         raise InputError(f"{name} has {len(names):,} columns: the limit is {_MAX_COLUMNS:,}")
+    row = sum(_LIST_BYTES if pa.types.is_nested(each.type) else _ROW_BYTES for each in schema)
     for group in map(metadata.row_group, range(metadata.num_row_groups)):
-        for column in map(group.column, range(group.num_columns)):
-            if column.total_uncompressed_size > _ROW_BYTES * (column.num_values + CHUNK):
-                raise InputError(
-                    f"{name} has {column.total_uncompressed_size:,} bytes for "
-                    f"{column.num_values:,} numbers in its column {column.path_in_schema!r}"
-                )
+        if group.total_byte_size > row * (group.num_rows + CHUNK):
+            raise InputError(
+                f"{name} has {group.total_byte_size:,} bytes in {group.num_rows:,} rows of "
+                f"{len(names):,} columns: at most {row:,} in a row are possible"
+            )
 
 
 def _checksums(path: Path, metadata: Mapping[bytes, bytes]) -> Checksums | None:
