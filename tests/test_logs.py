@@ -358,6 +358,33 @@ def test_damaged_lerobot_data_sets_are_refused(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_file_of_a_lerobot_data_set_that_lacks_a_column(tmp_path):
+    folder = lerobot_folder(tmp_path / "arm")
+    file = folder / "data/chunk-000/file-001.parquet"
+    pq.write_table(pq.read_table(file).drop_columns("next.reward"), file)
+    done = mistake("data", "import", folder, "--out", tmp_path / "out")
+    assert "file-001.parquet has no column 'next.reward', unlike file-000.parquet" in done
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "told"),
+    [
+        ("next.reward", ["x"], "string, not float"),
+        ("action", [["a", "b"]], "list<element: string>, not fixed_size_list"),
+        ("observation.state", [1.0], "double, not fixed_size_list"),
+        ("episode_index", [{"a": 1}], "struct<a: int64>, not int64"),
+    ],
+)
+def test_a_file_of_other_types_is_refused(name, values, told, tmp_path):
+    folder = lerobot_folder(tmp_path / "arm")
+    file = folder / "data/chunk-000/file-001.parquet"
+    table = pq.read_table(file)
+    column = table.schema.names.index(name)
+    pq.write_table(table.set_column(column, name, pa.array(values * len(table))), file)
+    done = mistake("data", "import", folder, "--out", tmp_path / "out")
+    assert f"arm, row 21: '{name}' has {told}" in done
+
+
 def test_a_footer_of_which_pyarrow_dies_is_refused(tmp_path):
     """It ends the process where the sizes of a column are asked for."""
     folder = lerobot_folder(tmp_path / "arm")

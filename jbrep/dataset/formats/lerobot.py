@@ -53,6 +53,8 @@ def open_table(given: str) -> Table:
         with reading(path), pq.ParquetFile(path) as file:
             check_sizes(str(path), file.metadata, file.schema_arrow)
             schema = schema or with_widths(file.schema_arrow, next(file.iter_batches(1), None))
+            if lacking := [n for n in schema.names if n not in file.schema_arrow.names]:
+                raise InputError(f"{path} has no column {lacking[0]!r}, unlike {paths[0].name}")
             rows += file.metadata.num_rows
     assert schema is not None
     known = info["features"]

@@ -22,6 +22,7 @@ from jbrep.dataset.formats.tables import (
     features_of_table,
     listed,
     roles_of,
+    sort_of,
     width,
 )
 from jbrep.dataset.layout import Layout
@@ -182,9 +183,10 @@ class _Reader:
 
     def _numbers(self, batch: pa.RecordBatch, name: str, first: int) -> Array:
         """A column as an array: numbers, of which empty ones are NaN; or words."""
-        column = batch.column(name)
-        kind, empty = column.type, column.null_count
-        size = width(self._table.schema.field(name).type)
+        column, known = batch.column(name), self._table.schema.field(name).type
+        kind, empty, size = column.type, column.null_count, width(known)
+        if sort_of(kind) != sort_of(known):
+            raise InputError(f"{self._at(first)}: {name!r} has {kind}, not {known} as before")
         if empty and (size or not (pa.types.is_floating(kind) or self._may_miss)):
             row = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
             raise InputError(f"{self._at(first + row)}: {name!r} has an empty cell: fill it")

@@ -114,6 +114,16 @@ def width(kind: pa.DataType) -> int | None:
     return kind.list_size if pa.types.is_fixed_size_list(kind) else None
 
 
+def sort_of(kind: pa.DataType) -> str:
+    """What a column holds: a number, words, a list of numbers or something else."""
+    is_number = pa.types.is_integer(kind) or pa.types.is_floating(kind)
+    if is_number or pa.types.is_boolean(kind) or pa.types.is_decimal(kind):
+        return "number"
+    if any(each(kind) for each in (pa.types.is_list, pa.types.is_large_list)) or width(kind):
+        return f"list of {sort_of(kind.value_type)}"
+    return "word" if any(each(kind) for each in _WORDS) else str(kind)
+
+
 def roles_of(table: Table, layout: Layout) -> Roles:
     """Which columns are what, by the layout, or else by their names.
 
@@ -198,13 +208,11 @@ def _check_types(table: Table, role: str, leaves: list[Leaf], named: bool) -> No
     for each in leaves:
         kind = table.schema.field(each.column).type
         kind = kind if each.place is None else kind.value_type
-        is_number = pa.types.is_integer(kind) or pa.types.is_floating(kind)
-        is_number |= pa.types.is_boolean(kind) or pa.types.is_decimal(kind)
         if (role == "time" and pa.types.is_temporal(kind)) or (
             role == "episode" and any(each(kind) for each in _WORDS)
         ):
             continue
-        if not is_number:
+        if sort_of(kind) != "number":
             raise InputError(
                 f"{table.name} has {kind} in the column {each.column!r}: it must be plain numbers; "
                 "or name the observations and actions without it"
