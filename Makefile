@@ -109,6 +109,8 @@ confirm-move: ## results/confirm-move/ anew: two hours after the screen, on its 
 longer: ## results/longer/ anew: half an hour after the screen, on its encoders
 breadth: ## results/breadth/ anew: an hour
 cheetah: ## results/cheetah/ anew: half an hour
+coordinates coordinates-direction: ## results/coordinates/ and -direction/ anew: 20 minutes each
+recipe: ## results/recipe/ anew: half an hour
 # the columns of a study's line in studies/judged.txt
 column = $(shell sed -n 's/^$@ *;//p' studies/judged.txt | cut -d ';' -f $(1))
 .SECONDEXPANSION:

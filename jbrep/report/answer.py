@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 
+from jbrep.encoders import FULL
 from jbrep.report.returns import by_task, named, shown_return
 from jbrep.report.tables import Tables
 from jbrep.report.words import listed
@@ -19,6 +20,10 @@ _ALIKE = {
     UNCLEAR: "Whether any learned isn't clear.",
     NO: "None learned.",
 }
+_NOTHING = (
+    f"There is nothing to compare: no cell has two runs of {FULL} and of another representation "
+    "that have ended."
+)
 _ALONE = {
     YES: "They learned.",
     NO: "They didn't learn.",
@@ -29,7 +34,7 @@ _ALONE = {
 def answer(tables: Tables) -> list[str]:
     """Final returns beside policies that don't learn, by task; then what follows from them."""
     if tables.analysis is None:
-        return ["There is nothing to compare yet: no cell has two runs that have ended."]
+        return [_NOTHING]
     tasks = by_task(tables.analysis)
     return [*map(_returns, tasks), " ".join(_conclusion(tables.analysis))]
 
