@@ -199,6 +199,7 @@ def evaluate(
     *,
     policy: str | None = None,
     truth: "Dataset | str | Path | None" = None,
+    worth: Sequence[str] = (),
 ) -> Judged:
     """Judge encoders on the held-out part of a data set, as `jbrep evaluate` does.
 
@@ -209,6 +210,7 @@ def evaluate(
         out: a folder for evaluation.json; None to write nothing.
         policy: that does the task well; None for the task's hand-written one, if there is one.
         truth: the data set that `data` was derived from, with what it hides.
+        worth: ways of finding out what codes are worth: agent, fitted, planning; see docs/worth.md.
 
     Raises:
         InputError: an encoder that isn't one of this task's, or two of one name; or the truth is of
@@ -216,20 +218,29 @@ def evaluate(
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
+    from jbrep.errors import choose
     from jbrep.evaluate.diagnosis import diagnose, write
+    from jbrep.evaluate.evaluation import WORTH
     from jbrep.play.sources import find_good_policy
     from jbrep.records.storage import check_writable
 
+    for kind in worth:
+        choose(kind, WORTH, "way of worth")
     if out is not None:
         check_writable(Path(out))
+    elif worth:
+        raise InputError("what codes are worth takes runs, which are kept: give out, a folder")
     scaled = ScaledDataset.of(data)
     found, good = find_all(encoders, scaled.task), find_good_policy(policy, scaled.task)
     whole = Dataset(truth) if isinstance(truth, str | Path) else truth
-    return Judged(
-        diagnose(found, scaled, good, whole)
-        if out is None
-        else write(found, scaled, Path(out), good, whole)
-    )
+    if out is None:
+        return Judged(diagnose(found, scaled, good, whole))
+    evaluation = write(found, scaled, Path(out), good, whole)
+    if worth:
+        from jbrep.worth.worth import work_out
+
+        evaluation = work_out(evaluation, found, scaled.dataset, Path(out), worth)
+    return Judged(evaluation)
 
 
 def train(

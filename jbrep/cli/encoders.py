@@ -63,6 +63,12 @@ _LETTERS = 100  # of the name of a folder
     "isn't seen.",
 )
 @click.option(
+    "--worth",
+    multiple=True,
+    help="What each code is worth: agent trains two small agents on it, some five minutes of a "
+    "core; fitted and planning learn from the data alone, a minute each, and say less.",
+)
+@click.option(
     "--all",
     "everything",
     is_flag=True,
@@ -75,6 +81,7 @@ def evaluate(
     out: Path | None,
     policy: str | None,
     truth: Path | None,
+    worth: tuple[str, ...],
     everything: bool,
     as_json: bool,
 ) -> None:
@@ -105,7 +112,9 @@ def evaluate(
     }
     out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(encoders))[:_LETTERS])
     with stoppable("the same command starts over"):
-        evaluation = api.evaluate(encoders, whole, out, policy=policy, truth=truth).evaluation
+        evaluation = api.evaluate(
+            encoders, whole, out, policy=policy, truth=truth, worth=worth
+        ).evaluation
         pictures = write_plots(encoder_plots(evaluation), out)
     width = terminal_width()
     notes = [wrapped(printable(note), width) for note in _notes(encoders, sources, evaluation)]

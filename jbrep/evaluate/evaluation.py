@@ -12,6 +12,11 @@ from jbrep.stats.bootstrap import Interval
 
 EVALUATION = "evaluation.json"
 _DIGITS = 6
+WORTH = {  # ways of finding out what a code is worth, and the ways of learning in each
+    "agent": ("agent",),
+    "fitted": ("trees", "fourier"),
+    "planning": ("linear model", "network model"),
+}
 
 
 class Score(NamedTuple):
@@ -160,6 +165,25 @@ class Diagnostics(Record, frozen=True, kw_only=True):
     sha256: str | None = None  # of the encoder; None of the full observation
 
 
+class Learned(Record, frozen=True, kw_only=True):
+    """What a way of learning made of a code."""
+
+    score: Score  # the mean return of an episode
+    again: Score | None = None  # learned again with steps of its own beside those of the data
+    seconds: float  # of CPU time that it took
+
+
+class Worth(Record, frozen=True, kw_only=True):
+    """What codes are worth to ways of learning; docs/worth.md describes each."""
+
+    estimated: bool  # whether returns are estimated from data, not played
+    runs: int = 0  # of agents, of each code
+    steps: int = 0  # that these learned for
+    learned: dict[str, dict[str, Learned]]  # by way of learning, by label
+    references: dict[str, float]  # mean returns of policies that don't learn
+    rewards: tuple[float, float]  # of the data: mean and standard deviation
+
+
 class JudgedOn(Record, frozen=True, kw_only=True):
     """The data set that encoders were judged on, and its parts."""
 
@@ -189,6 +213,7 @@ class Evaluation(Document, frozen=True, kw_only=True):
     policy: str | None  # the name of the good policy
     needs: dict[str, float]  # how much a controller needs each feature, 0 to 1
     encoders: dict[str, Diagnostics]  # by label
+    worth: Worth | None = None  # if it was asked for
 
     @property
     def hashes(self) -> dict[str, str]:

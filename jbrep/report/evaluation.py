@@ -4,10 +4,10 @@ import sys
 from collections.abc import Iterator, Mapping
 
 from jbrep.encoders import FULL
-from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Scores
+from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Learned, Scores
 from jbrep.evaluate.table import headline
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.report.serving import lacking, serving, unreadable, untold
+from jbrep.report.serving import lacking, serving, unreadable, untold, valued
 from jbrep.text import Table, counted, facts, html, interval, number, r2_text, wrapped
 
 _Encoders = Mapping[str, Diagnostics]  # by label
@@ -40,7 +40,9 @@ def evaluation_text(
     evaluation: Evaluation, width: int | None = None, everything: bool = False
 ) -> str:
     """Which codes serve and what each lacks, in lines of that width; everything else if wanted."""
+    worth = [wrapped(valued(evaluation), width), _worth(evaluation).text(width)]
     parts = [
+        *(worth if evaluation.worth else ()),
         wrapped(serving(evaluation), width),
         _headline(evaluation).text(width),
         *(table.text(width) for table in _unseen(evaluation)),
@@ -96,6 +98,31 @@ def _unseen(evaluation: Evaluation) -> Iterator[Table]:
                 for name in hidden
             ],
         )
+
+
+def _worth(evaluation: Evaluation) -> Table:
+    """What each code returns, by way of learning; learned again with own steps behind an arrow."""
+    known = evaluation.worth
+    learned = known.learned if known else {}
+    return Table(
+        "Mean returns"
+        + (" as the data let estimate them" if known and known.estimated else " of 20 episodes")
+        + (
+            f"; of agents after {known.steps:,} steps, {known.runs} runs"
+            if known and known.runs
+            else ""
+        ),
+        ("encoder", *learned),
+        [
+            (label, *(_returned(each[label]) for each in learned.values()))
+            for label in next(iter(learned.values()), {})
+        ],
+    )
+
+
+def _returned(each: Learned) -> str:
+    shown = interval(each.score, ".0f")
+    return shown if each.again is None else f"{shown}, then {interval(each.again, '.0f')}"
 
 
 def _columns(evaluation: Evaluation, width: int | None) -> str:

@@ -1,5 +1,6 @@
 """Which codes serve a controller as the full observation does, in a sentence."""
 
+import math
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
@@ -7,6 +8,7 @@ from jbrep.encoders import FULL
 from jbrep.evaluate.evaluation import Evaluation, Lost
 from jbrep.evaluate.table import headline
 from jbrep.report.words import listed
+from jbrep.stats.scale import best_blind
 from jbrep.text import r2_text
 
 _MEASURES = {  # the first that the full observation tells anything of counts
@@ -58,6 +60,41 @@ def serving(evaluation: Evaluation) -> str:
         f"{answer} But see what {listed(lost)} {'lacks' if len(lost) == 1 else 'lack'}."
         if lost
         else answer
+    )
+
+
+def valued(evaluation: Evaluation) -> str:
+    """Which code is worth as much as the best one, by the first way of learning that was asked for.
+
+    That is a code whose interval reaches the best one's, above the policies that don't look.
+    """
+    if evaluation.worth is None or not evaluation.worth.learned:
+        return ""
+    worth = evaluation.worth
+    mean, deviation = worth.rewards
+    if not deviation and "agent" not in worth.learned:
+        return (
+            f"Every reward of the data is {mean:g}: what codes are worth can't be learned from it."
+        )
+    way, learned = next(iter(worth.learned.items()))
+    means = {label: each.again or each.score for label, each in learned.items()}
+    blind = best_blind(worth.references)
+    floor = worth.references[blind] if blind else -math.inf
+    best = max(means.values(), key=lambda each: each.value or -math.inf)
+    good = [
+        label
+        for label, each in means.items()
+        if each.high is not None and best.low is not None and each.high >= best.low
+        if each.low is not None and each.low > floor
+    ]
+    if not good:
+        return (
+            f"By {way}, no code is clearly worth more than not looking at all ({floor:.0f}): "
+            "nothing can be said of them yet."
+        )
+    smallest = min(good, key=lambda label: evaluation.encoders[label].latent)
+    return f"By {way}, {listed(good)} {'is' if len(good) == 1 else 'are'} worth the most" + (
+        f"; the smallest is {smallest}." if len(good) > 1 else "."
     )
 
 

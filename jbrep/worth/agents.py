@@ -1,0 +1,77 @@
+"""Small agents on codes: the most direct way to find out what these are worth."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from joblib import cpu_count
+
+from jbrep.envs.task import Task
+from jbrep.evaluate.evaluation import Learned, score
+from jbrep.progress import Progress
+from jbrep.rl.files import last_returns, read_evaluations
+from jbrep.rl.job import Job, Session
+from jbrep.rl.run import Run
+from jbrep.rl.trainers import train_jobs
+from jbrep.stats.intervals import LEVEL, mean_within
+from jbrep.worth.offline import EPISODES, bounds_of
+
+_ALGORITHM = "sac"
+AGENT_STEPS, AGENT_RUNS = 100_000, 2
+
+
+def learned(
+    encoders: Mapping[str, Any], task: Task, folder: Path, steps: int, runs: int
+) -> dict[str, Learned]:
+    """What agents of the usual preset return in the end, by the code that they observe.
+
+    All learn together. Stopped or killed, the same call resumes them.
+
+    Args:
+        encoders: by label, as a run takes them.
+        task: that is learned.
+        folder: for the runs.
+        steps: of each.
+        runs: of each code.
+
+    Raises:
+        InputError: the folder holds other runs; or as `Run.settings`.
+    """
+    began = time.process_time()
+    jobs = {
+        (label, seed): Job(
+            Run.of(
+                task,
+                _ALGORITHM,
+                encoder=encoder,
+                representation=label,
+                seed=seed,
+                steps=steps,
+                evaluate_every=steps,
+                final_episodes=EPISODES,
+            ),
+            folder / label / f"seed-{seed}",
+            cpu_count(),
+        )
+        for label, encoder in encoders.items()
+        for seed in range(runs)
+    }
+    done = dict.fromkeys(jobs.values(), 0)
+    with Progress(total=steps * len(jobs), unit="step", unit_scale=True, desc="agents") as bar:
+
+        def watch(job: Job, step: int, mean: float | None) -> None:
+            bar.update(step - done[job])
+            done[job] = step
+
+        for _ in train_jobs([*jobs.values()], Session(watch)):
+            pass
+    seconds = (time.process_time() - began) / len(encoders)
+    found = {}
+    for label in encoders:
+        own = [jobs[label, seed].folder for seed in range(runs)]
+        returns = np.concatenate([last_returns(read_evaluations(each)) for each in own])
+        worth = score(mean_within(returns, bounds_of(task), LEVEL))
+        found[label] = Learned(score=worth, seconds=seconds)
+    return found

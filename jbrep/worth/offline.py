@@ -1,0 +1,173 @@
+"""What is learned from stored steps through a code, and what acting by it returns."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from jbrep.dataset import Dataset
+from jbrep.encoders.base import BaseEncoder
+from jbrep.envs.lanes import Lanes
+from jbrep.envs.recording import Actor, episode_returns, held, record
+from jbrep.envs.task import Array, Task
+from jbrep.evaluate.evaluation import Learned, Score, score
+from jbrep.rl.files import EVALUATION_SEED
+from jbrep.stats.intervals import LEVEL, Bounds, mean_within
+from jbrep.worth import fitted, planning
+from jbrep.worth.fitted import Choose, Coded, Fourier, Trees, Values
+from jbrep.worth.steps import Held, choices, joined, most, recorded, stored
+
+_Learn = Callable[[Coded, Task, float], Choose]  # with the discount of a held step
+
+EPISODES = 20  # that are played, and again for steps of its own
+_GAMMA = 0.99  # of a control step
+_DECISIONS = 100  # in an episode of full length
+_EXPLORED = 0.2  # share of actions at random in steps of its own
+_OWN_SEED = EVALUATION_SEED // 2
+
+
+def _fitted(kind: Callable[[Coded], Values], steps: Coded, task: Task, gamma: float) -> Choose:
+    return fitted.q_iteration(kind(steps), steps, gamma, choices(task))
+
+
+def _planned(model: Callable[[Coded], Any], steps: Coded, task: Task, gamma: float) -> Choose:
+    return planning.planned(model(steps), gamma, task.action_size)
+
+
+_WAYS: Mapping[str, _Learn] = {
+    "trees": partial(_fitted, Trees),
+    "fourier": partial(_fitted, Fourier),
+    "linear model": partial(_planned, planning.linear_model),
+    "network model": partial(_planned, planning.network_model),
+}
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Stored steps, and where what is learned from them is played.
+
+    Args:
+        task: what is done.
+        hold: control steps in which an action is held.
+        seen: steps to learn from.
+        unseen: of held-out episodes.
+        lanes: to play in, one for each episode; None where the environment can't be made.
+    """
+
+    task: Task
+    hold: int
+    seen: Held
+    unseen: Held
+    lanes: Lanes | None
+
+    @classmethod
+    def of(cls, data: Dataset, lanes: Lanes | None) -> "Ground":
+        """The training and the held-out part of a data set.
+
+        Raises:
+            InputError: as `stored`.
+        """
+        longest = int(data.episodes["length"].max())
+        hold = max(1, longest // _DECISIONS)
+        numbers = np.random.default_rng(0).permutation(len(data.episodes["length"]))
+        held_out = max(1, len(numbers) // 5)
+        room = most(data.task) - EPISODES * _DECISIONS
+        return cls(
+            data.task,
+            hold,
+            stored(data, numbers[held_out:], hold, room),
+            stored(data, numbers[:held_out], hold, room),
+            lanes,
+        )
+
+    @property
+    def gamma(self) -> float:
+        """The discount of a held step."""
+        return float(_GAMMA**self.hold)
+
+
+def learned(encoder: BaseEncoder, ground: Ground, way: str) -> Learned:
+    """What a code is worth to a way of learning from stored steps.
+
+    With an environment that is the true return of what was learned, and then again of what was
+    learned once more, with steps of its own beside the stored ones. Without, it is estimated from
+    the held-out episodes.
+    """
+    began, task = time.process_time(), ground.task
+    learn = _WAYS[way]
+    choose = learn(_coded(encoder, ground.seen), task, ground.gamma)
+    if ground.lanes is None:
+        first, again = _estimated(encoder, ground, choose), None
+    else:
+        act = _acting(encoder, task, choose)
+        first = _played(ground, act)
+        own = _own_steps(ground, act)
+        more = _coded(encoder, joined([ground.seen, own]))
+        again = _played(ground, _acting(encoder, task, learn(more, task, ground.gamma)))
+    return Learned(score=first, again=again, seconds=time.process_time() - began)
+
+
+def bounds_of(task: Task) -> Bounds:
+    """Of the returns of its episodes."""
+    return Bounds.of(task.return_floor, task.return_ceiling)
+
+
+def _coded(encoder: BaseEncoder, steps: Held) -> Coded:
+    before, after = (
+        np.asarray(encoder.encode(each), np.float32)
+        for each in (steps.observation, steps.following)
+    )
+    return Coded(before, after, steps)
+
+
+def _acting(encoder: BaseEncoder, task: Task, choose: Choose) -> Actor:
+    """A policy on observations, of one on codes."""
+
+    def act(observation: Array) -> Array:
+        code = np.asarray(encoder.encode(observation.astype(np.float32)), np.float32)
+        return task.unscale_action(choose(code))
+
+    return act
+
+
+def _played(ground: Ground, act: Actor) -> Score:
+    """The mean return of 20 episodes, with its interval over them."""
+    assert ground.lanes is not None
+    returns = episode_returns(ground.lanes, held(act, ground.hold), EVALUATION_SEED)
+    return score(mean_within(returns, bounds_of(ground.task), LEVEL))
+
+
+def _own_steps(ground: Ground, act: Actor) -> Held:
+    """Steps of a policy that explores."""
+    lanes, task, random = ground.lanes, ground.task, np.random.default_rng(0)
+    assert lanes is not None
+    drawn = choices(task)
+
+    def explore(observation: Array) -> Array:
+        chosen, count = act(observation), len(observation)
+        at_random = task.unscale_action(drawn[random.integers(0, len(drawn), count)])
+        return np.where(random.random((count, 1)) < _EXPLORED, at_random, chosen)
+
+    lanes.reset(range(EPISODES), range(_OWN_SEED, _OWN_SEED + EPISODES))
+    return recorded(
+        record(lanes, held(explore, ground.hold), lambda steps: None), task, ground.hold
+    )
+
+
+def _estimated(encoder: BaseEncoder, ground: Ground, choose: Choose) -> Score:
+    """The return of an episode by fitted Q-evaluation on held-out steps (Le et al. 2019).
+
+    That is the discounted mean reward from the held-out starts on, times the steps of an episode.
+    Its interval is over the starts alone: the error of the fit is not in it.
+    """
+    steps, task = _coded(encoder, ground.unseen), ground.task
+    values = Trees(steps)
+    ahead = values.prepare(steps.following, choose(steps.following))
+    fitted.backup(values, steps.held, ground.gamma, lambda: values.at(ahead))
+    starts = steps.code[steps.held.first]
+    value = values.at(values.prepare(starts, choose(starts)))
+    returns = value * (1 - ground.gamma) * task.max_episode_steps
+    return score(mean_within(returns, bounds_of(task), LEVEL))
