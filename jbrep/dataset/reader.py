@@ -305,19 +305,29 @@ class Dataset:
         Raises:
             InputError: fewer than two episodes, or a share out of range.
         """
-        if not 0 < test < 1:
-            raise InputError(f"the share to hold out is {test}: it must be between 0 and 1")
         lengths = self.episodes["length"]
-        if len(lengths) < 2:
-            raise InputError(
-                f"a split needs at least 2 episodes: {self.folder} has {len(lengths)}; "
-                "collect more, or cut what is imported into several"
-            )
-        count = min(max(1, round(test * len(lengths))), len(lengths) - 1)
         held_out = np.zeros(len(lengths), dtype=bool)
-        held_out[np.random.default_rng(seed).permutation(len(lengths))[:count]] = True
+        held_out[self.split_episodes(test, seed).test] = True
         is_test = np.repeat(held_out, lengths)
         return Split(np.flatnonzero(~is_test), np.flatnonzero(is_test))
+
+    def split_episodes(self, test: float = 0.2, seed: int = 0) -> Split:
+        """The same split as `split`, by the numbers of the episodes, sorted.
+
+        Raises:
+            InputError: likewise.
+        """
+        if not 0 < test < 1:
+            raise InputError(f"the share to hold out is {test}: it must be between 0 and 1")
+        number = len(self.episodes["length"])
+        if number < 2:
+            raise InputError(
+                f"a split needs at least 2 episodes: {self.folder} has {number}; "
+                "collect more, or cut what is imported into several"
+            )
+        count = min(max(1, round(test * number)), number - 1)
+        order = np.random.default_rng(seed).permutation(number)
+        return Split(np.sort(order[count:]), np.sort(order[:count]))
 
     def fit_scaler(self, rows: NDArray[np.int64]) -> Scaler:
         """The scaling of observations to [-1, 1] over some rows, such as the training part."""

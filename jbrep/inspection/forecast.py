@@ -52,9 +52,8 @@ def from_dataset(dataset: Dataset, shown: int | None = None) -> Examples | None:
     lengths = dataset.episodes["length"]
     if np.count_nonzero(lengths) < 2:
         return None
-    ends = np.cumsum(lengths, dtype=np.int64)
-    numbers = np.unique(np.searchsorted(ends, dataset.split().train, side="right"))
-    chosen = sample(numbers[numbers != shown], _EPISODES)
+    numbers = dataset.split_episodes().train
+    chosen = sample(numbers[(numbers != shown) & (lengths[numbers] > 0)], _EPISODES)
     if not len(chosen):
         return None
     most = max(_SHORTEST, _ROWS // len(chosen))

@@ -37,7 +37,8 @@ class WideDataset:
         folder: for a file of the observations, which is mapped; None keeps them in memory.
     """
 
-    split, fit_scaler = Dataset.split, Dataset.fit_scaler
+    split, split_episodes = Dataset.split, Dataset.split_episodes
+    fit_scaler = Dataset.fit_scaler
 
     def __init__(self, lengths, features=348, folder=None):
         self.task = make_task([make_feature(f"obs_{i}") for i in range(features)])
