@@ -15,6 +15,7 @@ from jbrep.worth import fitted, planning
 from jbrep.worth.fitted import Coded, Fourier, Trees
 from jbrep.worth.offline import Ground, learned
 from jbrep.worth.steps import Held, choices, stored
+from jbrep.worth.worth import _lanes
 
 
 def line(seed=0, steps=4000):
@@ -101,6 +102,30 @@ def test_evaluate_says_what_codes_are_worth(data, tmp_path):
     assert set(kept.learned) == {"trees", "fourier"}
     assert set(kept.learned["trees"]) == {"full", "pca-8"}
     assert kept.learned["trees"]["full"].again is not None
+    again = jbrep(*("evaluate", *arguments[:4]), "--out", tmp_path / "a").output
+    assert "Mean returns of 20 episodes" in again  # of what is known already nothing is lost
+    assert read_document(tmp_path / "a" / "evaluation.json", Evaluation).worth == kept
+
+
+def test_own_rewards_are_never_compared_with_those_of_the_environment(data, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])  # other tests' workers lack it
+    (tmp_path / "turned.py").write_text("def reward(seen, done):\n    return 0 * seen[:, 0] + 7\n")
+    own = tmp_path / "own"
+    jbrep("data", "derive", data.folder, "--reward", "turned:reward", "--out", own)
+    with _lanes(Dataset(own)) as lanes:
+        assert lanes is None
+    arguments = "--encoder", "pca-8", "--data", own, "--worth", "agent", "--out", tmp_path / "c"
+    assert "gives other rewards" in jbrep("evaluate", *arguments).output
+
+
+def test_steps_are_held_out_as_from_encoders(data):
+    rows, episodes = data.split(), data.split_episodes()
+    lengths = data.episodes["length"]
+    at = np.repeat(np.arange(len(lengths)), lengths)
+    assert [np.unique(at[each]).tolist() for each in rows] == [e.tolist() for e in episodes]
+    first = {each.tobytes() for each in Ground.of(data, None).unseen.observation}
+    assert first <= {each.tobytes() for each in data["observation"][rows.test]}
 
 
 def test_an_unknown_worth_is_told_in_a_line(data, tmp_path):

@@ -65,8 +65,9 @@ _LETTERS = 100  # of the name of a folder
 @click.option(
     "--worth",
     multiple=True,
-    help="What each code is worth: agent trains two small agents on it, some five minutes of a "
-    "core; fitted and planning learn from the data alone, a minute each, and say less.",
+    help="What each code is worth: agent trains two small agents on it, two or three "
+    "minutes of a core; "
+    "fitted and planning learn from the data alone, half a minute each way, and say less.",
 )
 @click.option(
     "--all",

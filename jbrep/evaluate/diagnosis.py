@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -49,30 +50,37 @@ def write(
     judged = {label: find(each, data.task) for label, each in encoders.items()}
     make_folder(folder)
     with exclusive(path, beside=True):
-        if exists(path) and not _is_same(path, data, hashes(judged), policy, truth):
-            raise InputError(
-                f"{path} is not an evaluation of these encoders on this data: choose another --out"
-            )
+        before = _before(path, data, hashes(judged), policy, truth)
         evaluation = diagnose(judged, data, policy, truth)
+        if before:
+            evaluation = evaluation.replace(worth=before.worth)
         evaluation.write(path)
     return evaluation
 
 
-def _is_same(
+def _before(
     path: Path,
     data: ScaledDataset,
     encoders: dict[str, str],
     policy: GoodPolicy | None,
     truth: Dataset | None,
-) -> bool:
-    """Whether a repeated evaluation would replace one of the same."""
-    try:
-        there = read_document(path, Evaluation)
-    except InputError:
-        return False
+) -> Evaluation | None:
+    """The evaluation of the same that a repeated one replaces, if there is one.
+
+    Raises:
+        InputError: what is there is something else.
+    """
+    if not exists(path):
+        return None
     on = data.dataset.manifest.fingerprint, _fingerprint(truth)
     wanted = *on, encoders, policy.name if policy else None
-    return (there.data.fingerprint, there.data.truth, there.hashes, there.policy) == wanted
+    with suppress(InputError):
+        there = read_document(path, Evaluation)
+        if (there.data.fingerprint, there.data.truth, there.hashes, there.policy) == wanted:
+            return there
+    raise InputError(
+        f"{path} is not an evaluation of these encoders on this data: choose another --out"
+    )
 
 
 def _fingerprint(truth: Dataset | None) -> str | UnsetType:

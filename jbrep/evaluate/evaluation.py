@@ -170,13 +170,14 @@ class Learned(Record, frozen=True, kw_only=True):
 
     score: Score  # the mean return of an episode
     again: Score | None = None  # learned again with steps of its own beside those of the data
-    seconds: float  # of CPU time that it took
+    seconds: float  # of CPU time, beyond that of runs that had been made before
 
 
 class Worth(Record, frozen=True, kw_only=True):
     """What codes are worth to ways of learning; docs/worth.md describes each."""
 
     estimated: bool  # whether returns are estimated from data, not played
+    episodes: int  # in which each is played
     runs: int = 0  # of agents, of each code
     steps: int = 0  # that these learned for
     learned: dict[str, dict[str, Learned]]  # by way of learning, by label

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterator, Mapping
 
 from jbrep.encoders import FULL
-from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Learned, Scores
+from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Learned, Scores, Worth
 from jbrep.evaluate.table import headline
 from jbrep.jitterbug.tasks import TASKS
 from jbrep.report.serving import lacking, serving, unreadable, untold, valued
@@ -40,9 +40,9 @@ def evaluation_text(
     evaluation: Evaluation, width: int | None = None, everything: bool = False
 ) -> str:
     """Which codes serve and what each lacks, in lines of that width; everything else if wanted."""
-    worth = [wrapped(valued(evaluation), width), _worth(evaluation).text(width)]
+    worth = evaluation.worth
     parts = [
-        *(worth if evaluation.worth else ()),
+        *((wrapped(valued(evaluation, worth), width), _worth(worth).text(width)) if worth else ()),
         wrapped(serving(evaluation), width),
         _headline(evaluation).text(width),
         *(table.text(width) for table in _unseen(evaluation)),
@@ -57,8 +57,10 @@ def evaluation_text(
 
 def evaluation_html(evaluation: Evaluation) -> str:
     """Which codes serve and what each lacks, for a notebook."""
+    worth = evaluation.worth
+    first = (valued(evaluation, worth), _worth(worth)) if worth else ()
     tables = _headline(evaluation), *_unseen(evaluation)
-    return html(serving(evaluation), *tables, _lacking(evaluation, None))
+    return html(*first, serving(evaluation), *tables, _lacking(evaluation, None))
 
 
 def _headline(evaluation: Evaluation) -> Table:
@@ -100,23 +102,15 @@ def _unseen(evaluation: Evaluation) -> Iterator[Table]:
         )
 
 
-def _worth(evaluation: Evaluation) -> Table:
-    """What each code returns, by way of learning; learned again with own steps behind an arrow."""
-    known = evaluation.worth
-    learned = known.learned if known else {}
+def _worth(worth: Worth) -> Table:
+    """What each code returns, by way of learning; first, and learned again with own steps."""
+    where = "as the data let estimate them" if worth.estimated else f"of {worth.episodes} episodes"
+    agents = f"; of agents after {worth.steps:,} steps, {worth.runs} runs" if worth.runs else ""
+    labels = next(iter(worth.learned.values()))
     return Table(
-        "Mean returns"
-        + (" as the data let estimate them" if known and known.estimated else " of 20 episodes")
-        + (
-            f"; of agents after {known.steps:,} steps, {known.runs} runs"
-            if known and known.runs
-            else ""
-        ),
-        ("encoder", *learned),
-        [
-            (label, *(_returned(each[label]) for each in learned.values()))
-            for label in next(iter(learned.values()), {})
-        ],
+        f"Mean returns {where}{agents}",
+        ("encoder", *worth.learned),
+        [(label, *(_returned(each[label]) for each in worth.learned.values())) for label in labels],
     )
 
 

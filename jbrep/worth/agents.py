@@ -62,8 +62,8 @@ def learned(
     with Progress(total=steps * len(jobs), unit="step", unit_scale=True, desc="agents") as bar:
 
         def watch(job: Job, step: int, mean: float | None) -> None:
-            bar.update(step - done[job])
-            done[job] = step
+            bar.update(min(step, steps) - done[job])
+            done[job] = min(step, steps)
 
         for _ in train_jobs([*jobs.values()], Session(watch)):
             pass

@@ -72,16 +72,12 @@ class Ground:
         """
         longest = int(data.episodes["length"].max())
         hold = max(1, longest // _DECISIONS)
-        numbers = np.random.default_rng(0).permutation(len(data.episodes["length"]))
-        held_out = max(1, len(numbers) // 5)
         room = most(data.task) - EPISODES * _DECISIONS
-        return cls(
-            data.task,
-            hold,
-            stored(data, numbers[held_out:], hold, room),
-            stored(data, numbers[:held_out], hold, room),
-            lanes,
+        seen, unseen = (
+            stored(data, np.random.default_rng(0).permutation(numbers), hold, room)
+            for numbers in data.split_episodes()
         )
+        return cls(data.task, hold, seen, unseen, lanes)
 
     @property
     def gamma(self) -> float:
@@ -102,11 +98,12 @@ def learned(encoder: BaseEncoder, ground: Ground, way: str) -> Learned:
     if ground.lanes is None:
         first, again = _estimated(encoder, ground, choose), None
     else:
-        act = _acting(encoder, task, choose)
-        first = _played(ground, act)
-        own = _own_steps(ground, act)
+        lanes, act = ground.lanes, _acting(encoder, task, choose)
+        first = _played(lanes, act, ground.hold)
+        own = _own_steps(lanes, act, ground.hold)
         more = _coded(encoder, joined([ground.seen, own]))
-        again = _played(ground, _acting(encoder, task, learn(more, task, ground.gamma)))
+        again_act = _acting(encoder, task, learn(more, task, ground.gamma))
+        again = _played(lanes, again_act, ground.hold)
     return Learned(score=first, again=again, seconds=time.process_time() - began)
 
 
@@ -133,17 +130,15 @@ def _acting(encoder: BaseEncoder, task: Task, choose: Choose) -> Actor:
     return act
 
 
-def _played(ground: Ground, act: Actor) -> Score:
+def _played(lanes: Lanes, act: Actor, hold: int) -> Score:
     """The mean return of 20 episodes, with its interval over them."""
-    assert ground.lanes is not None
-    returns = episode_returns(ground.lanes, held(act, ground.hold), EVALUATION_SEED)
-    return score(mean_within(returns, bounds_of(ground.task), LEVEL))
+    returns = episode_returns(lanes, held(act, hold), EVALUATION_SEED)
+    return score(mean_within(returns, bounds_of(lanes.task), LEVEL))
 
 
-def _own_steps(ground: Ground, act: Actor) -> Held:
+def _own_steps(lanes: Lanes, act: Actor, hold: int) -> Held:
     """Steps of a policy that explores."""
-    lanes, task, random = ground.lanes, ground.task, np.random.default_rng(0)
-    assert lanes is not None
+    task, random = lanes.task, np.random.default_rng(0)
     drawn = choices(task)
 
     def explore(observation: Array) -> Array:
@@ -152,9 +147,7 @@ def _own_steps(ground: Ground, act: Actor) -> Held:
         return np.where(random.random((count, 1)) < _EXPLORED, at_random, chosen)
 
     lanes.reset(range(EPISODES), range(_OWN_SEED, _OWN_SEED + EPISODES))
-    return recorded(
-        record(lanes, held(explore, ground.hold), lambda steps: None), task, ground.hold
-    )
+    return recorded(record(lanes, held(explore, hold), lambda steps: None), task, hold)
 
 
 def _estimated(encoder: BaseEncoder, ground: Ground, choose: Choose) -> Score:

@@ -74,11 +74,12 @@ def stored(data: Dataset, episodes: NDArray[np.int64], hold: int, limit: int) ->
             seen = np.concatenate((each["observation"], each.record["final_observation"][None]))
             yield _Episode(seen, each["action"], each["reward"], bool(each.record["terminated"]))
 
-    found, count = [], 0
+    found = list[Held]()
     for each in opened():
-        if len(each.reward) >= hold and count < limit:
+        if sum(map(len, found)) >= limit:
+            break
+        if len(each.reward) >= hold:
             found.append(_held(each, data.task, hold))
-            count += len(found[-1])
     if not found:
         raise InputError(
             f"no episode of {data.folder} has {hold} steps, for which an action is held: nothing "

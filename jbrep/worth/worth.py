@@ -10,10 +10,10 @@ from jbrep.dataset import Dataset
 from jbrep.encoders import FULL, find
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.lanes import Lanes
-from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import EVALUATION, WORTH, Evaluation, Learned, Worth
 from jbrep.progress import Progress
+from jbrep.records.lock import exclusive
 from jbrep.study.tables import references_of
 from jbrep.training.trainer import single_torch_thread
 from jbrep.worth import agents, offline
@@ -47,11 +47,11 @@ def work_out(
     """
     every = {FULL: find(FULL, data.task), **encoders}
     ways = [way for kind in kinds for way in WORTH[kind] if way != _AGENT]
-    with _lanes(data.task) as lanes, single_torch_thread():
+    with _lanes(data) as lanes, single_torch_thread():
         if lanes is None and _AGENT in kinds:
             raise InputError(
-                f"{data.task.name} can't be made here, so no agent can be trained: ask for fitted "
-                "or planning, which learn from the data alone"
+                f"the environment of {data.folder} can't be made here, or gives other rewards: no "
+                "agent can be trained; ask for fitted or planning, which learn from the data alone"
             )
         rewards = np.asarray(data["reward"][:], np.float64)
         learned = dict[str, dict[str, Learned]]()
@@ -62,21 +62,25 @@ def work_out(
         played = references_of(data.task, EPISODES) if lanes else {}
     worth = Worth(
         estimated=lanes is None,
+        episodes=EPISODES,
         runs=runs if _AGENT in kinds else 0,
         steps=steps if _AGENT in kinds else 0,
         learned=learned,
         references={policy: float(each.mean()) for policy, each in played.items()},
         rewards=(float(rewards.mean()), float(rewards.std())),
     )
-    added = evaluation.replace(worth=worth)
-    added.write(folder / EVALUATION)
+    path, added = folder / EVALUATION, evaluation.replace(worth=worth)
+    with exclusive(path, beside=True):
+        added.write(path)
     return added
 
 
-def _lanes(task: Task) -> "closing[Lanes] | nullcontext[None]":
-    """Where what was learned is played; nothing if the environment isn't here."""
+def _lanes(data: Dataset) -> "closing[Lanes] | nullcontext[None]":
+    """Where what was learned is played; nothing if that isn't here, or gives other rewards."""
+    if data.manifest.settings.reward:
+        return nullcontext()
     try:
-        return closing(Lanes(task, EPISODES))
+        return closing(Lanes(data.task, EPISODES))
     except (InputError, ModuleNotFoundError):
         return nullcontext()
 
