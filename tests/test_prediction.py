@@ -45,7 +45,8 @@ class Cart:
     wanders by itself, and nothing depends on it. The reward is for being at 0.
     """
 
-    split, fit_scaler = Dataset.split, Dataset.fit_scaler
+    split, split_episodes = Dataset.split, Dataset.split_episodes
+    fit_scaler = Dataset.fit_scaler
     folder = "cart"
 
     def __init__(self):
