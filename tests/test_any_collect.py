@@ -291,6 +291,7 @@ def test_arguments_are_settings(sledges, tmp_path):
     ("change", "message"),
     [
         ({"task": SLEDGE.replace(seed_bits=31), "seed": 2047}, "seeds of 31 bits: the data set's"),
+        ({"task": SLEDGE.replace(seed_bits=31), "steps": (40 << 20) + 1}, "1,048,576 episodes"),
         ({"policy": {"kind": "heuristic"}}, f"{ID} has no hand-written policy"),
     ],
 )

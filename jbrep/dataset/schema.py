@@ -126,7 +126,7 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
         """As for `Record`."""
         check_policy(self.policy)
         self.specs()
-        episode_seed(self.task, self.seed, 0)
+        episode_seed(self.task, self.seed, (self.steps - 1) // self.task.max_episode_steps)
         if self.store_state and not self.task.state:
             raise InputError(f"{self.task.name} has no states to store: its observations are all")
 

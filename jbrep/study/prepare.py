@@ -29,8 +29,9 @@ def check(plan: Plan) -> None:
     """Check, before anything is collected or trained, that the runs can start.
 
     Raises:
-        InputError: as `describe` for a task; no such shipped encoder, a latent size out of range,
-            no data set of the task, or an encoder of the user's that can't be used.
+        InputError: as `describe` for a task, as `DataSettings` for what is to be collected; no such
+            shipped encoder, a latent size out of range, no data set of the task, or an encoder of
+            the user's that can't be used.
     """
     data = plan.study.data
     for name in plan.study.tasks:
@@ -39,6 +40,9 @@ def check(plan: Plan) -> None:
             folder = _existing(data, name)
             check_same(task, Dataset(folder).task, f"the data set {folder}")
             _check_fits(plan, name, folder, 0)
+        elif data:
+            for number in range(data.sets):
+                _to_collect(data, task, number)
         for each in _by_name(plan):
             latent = int(each.training.get("latent", 0))
             if data is None:
@@ -132,14 +136,17 @@ def _collect(plan: Plan, data: Data, task: str, number: int) -> Path:
     if task != collected:
         derive(plan.data(collected, number), task, folder)
     else:
-        described = plan.task(task)
-        with_state = bool(described.state)
-        settings = DataSettings(
-            task=described, steps=data.steps, seed=data.seed + number, store_state=with_state
-        )
+        settings = _to_collect(data, plan.task(task), number)
         episodes = usual_shard_episodes(settings, folder)
         collect(settings.replace(shard_episodes=episodes), folder)
     return folder
+
+
+def _to_collect(data: Data, task: Task, number: int) -> DataSettings:
+    """The settings of the data set of that number, with states where the task has them."""
+    return DataSettings(
+        task=task, steps=data.steps, seed=data.seed + number, store_state=bool(task.state)
+    )
 
 
 def _collected(plan: Plan, number: int) -> str:
