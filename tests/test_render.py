@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import environments
 import mujoco
 import numpy as np
 import pytest
@@ -146,8 +147,7 @@ def test_a_camera_that_follows_the_robot():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"motion": None}, "Hopper-v5 has no MuJoCo model and data: only MuJoCo's robots can be"),
-        ({"motion": None, "note": "It differs"}, "It differs: only MuJoCo's robots can be filmed"),
+        ({"note": "It differs"}, "It differs: it can't be filmed; jbrep inspect shows signals"),
         ({"task": {"timestep": None}}, "the time step of Hopper-v5 is not known: give it as"),
     ],
 )
@@ -157,6 +157,42 @@ def test_what_can_t_be_filmed(change, message, camera):
         change = {"task": episode.task.replace(**change["task"])}
     with pytest.raises(InputError, match=message):
         Film([replace(episode, **change)], camera, Pace())
+
+
+def test_an_environment_without_mujoco_is_filmed_as_it_draws_itself():
+    task = describe("Sledges/Drawn-v0", hidden=["obs_1"], history=2)
+    episodes = [find_episode(policy, 1, task) for policy in ("uniform", "constant:drive=0.5")]
+    film = Film(episodes, Camera(None, *SIZE), Pace(fps=10))
+    assert film.timestep == 1 / 20  # by its metadata, as it doesn't say
+    assert film.states.tolist() == [*range(0, 2 * len(film), 2)]
+    for frame, state in zip(film.frames(), film.states, strict=True):
+        for episode, left in zip(episodes, (0, SIZE[0]), strict=True):
+            pixels = np.asarray(frame)[band_height(SIZE[1]) + 2 :, left + 1 : left + SIZE[0] - 1]
+            place = episode.observation[min(state, len(episode)), 0]
+            red = np.flatnonzero((pixels[0] == (200, 0, 0)).all(axis=1))
+            assert (
+                abs(red.mean() + 1 - SIZE[0] / 90 * (environments.Drawn.pixel(place) + 0.5)) < 1.5
+            )
+
+
+@needs_egl
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("Sledge", (), "can't draw itself: can't make Sledges/Sledge-v0 with {'render_mode': "),
+        ("Drawn", ("--env", "broken=true"), "its render() gives None: it must be a picture"),
+        ("Drawn", ("--camera", "side"), "draws itself, without a camera: leave out --camera"),
+        ("Moody", (), "has no MuJoCo model and data, and is not reproducible: it can't be played"),
+    ],
+)
+def test_what_neither_mujoco_nor_the_environment_draws_is_one_line(
+    name, arguments, message, tmp_path
+):
+    out = tmp_path / "new" / "a.mp4"
+    told = render("uniform", "--task", f"Sledges/{name}-v0", *arguments, "--out", out)
+    assert told.exit_code == 2
+    assert message in told.stderr.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
 
 
 @needs_egl

@@ -59,7 +59,8 @@ def render(
     """Make a video of episodes, side by side.
 
     A source is the folder of a data set or of a run, or the name of a policy, such as uniform,
-    heuristic, trained or constant:drive=0.5, which needs a --task. The robot must be one of MuJoCo.
+    heuristic, trained or constant:drive=0.5, which needs a --task. Robots of MuJoCo are seen by a
+    camera; another environment draws itself, by its own render() with render_mode="rgb_array".
     The Jitterbug's motor turns up to 23 times a second: at full speed and 25 frames per second it
     seems to creep backwards; --speed 0.25 shows how it turns.
     """

@@ -216,6 +216,15 @@ class Lanes:
         return Step(observation, reward, terminated, truncated, arrays)
 
     @property
+    def metadata(self) -> Mapping[str, Any]:
+        """What an environment says of itself, such as its `render_fps`."""
+        return self._batch.metadata
+
+    def render(self) -> Sequence[Any]:
+        """What the environment of each lane draws, as its `render_mode` says."""
+        return self._batch.render()
+
+    @property
     def state(self) -> State:
         """A copy of what `restore` takes."""
         own = {

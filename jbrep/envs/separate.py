@@ -81,6 +81,7 @@ class Separate:
         envs: the environments; None where one failed, until the lane is reset.
         lost: whether the last step of each lane led to nothing that can be used, (n,): the
             observation is still the one before it, and the episode is truncated.
+        metadata: what the environments say of themselves.
         failed: whether the environment failed in each lane's episode, (n,).
         missing: readings that were missing in each lane's episode, (n,).
     """
@@ -94,6 +95,7 @@ class Separate:
         except BaseException:
             self.close()
             raise
+        self.metadata: Mapping[str, Any] = self.envs[0].metadata
         self._flat = flattener(self.envs[0].observation_space)
         space: Any = self.envs[0].action_space
         self._action_type, self._action_shape = space.dtype, space.shape
@@ -256,6 +258,11 @@ class Separate:
                 lane,
             )
         self._retries.failed(error)
+
+    def render(self) -> tuple[Any, ...]:
+        """As a vector environment."""
+        with aside():
+            return tuple(env.render() for env in self.envs)
 
     @property
     def numbers(self) -> list[Numbers]:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +17,7 @@ from PIL import Image
 from jbrep.errors import InputError
 from jbrep.play.pictures import Camera, add_caption, join
 from jbrep.play.rollout import Rollout
+from jbrep.play.scenes import Scene, scene_of
 from jbrep.progress import Progress
 from jbrep.records.storage import exists, make_folder, taken, write_new
 
@@ -60,7 +62,7 @@ class Pace:
 class Film:
     """Episodes side by side; one that ends before the others stands still afterwards.
 
-    Their robots must have been simulated by MuJoCo, and the time step of their task be known.
+    Robots of MuJoCo are seen by a camera of their model; other environments draw themselves.
 
     Args:
         rollouts: the episodes, of the same task and from the same start.
@@ -68,7 +70,7 @@ class Film:
         pace: how fast to show them.
 
     Raises:
-        InputError: there is no robot to show, the tasks or starts differ, or the frames would be
+        InputError: an episode can't be shown, the tasks or starts differ, or the frames would be
             too wide.
     """
 
@@ -82,14 +84,12 @@ class Film:
                 f"{len(self.rollouts)} pictures side by side are {self.width:,} pixels wide: at "
                 f"most {_WIDEST:,} are possible; choose a smaller --size"
             )
-        for rollout in self.rollouts:
-            _check_shown(rollout)
-        first = self.rollouts[0]
-        for other in self.rollouts[1:]:
-            if not _start_alike(first, other):
+        for rollout, scene in zip(self.rollouts, self.scenes, strict=True):
+            if scene.start != self.scenes[0].start:
                 raise InputError(
-                    f"{first.name} and {other.name} differ in their task or start: only episodes "
-                    "that share both can be shown side by side, as those of policies of one task"
+                    f"{self.rollouts[0].name} and {rollout.name} differ in their task or start: "
+                    "only episodes that share both can be shown side by side, as those of policies "
+                    "of one task"
                 )
 
     @property
@@ -107,12 +107,15 @@ class Film:
         shown = longest if self.pace.seconds is None else min(self.pace.seconds, longest)
         return max(1, round(shown / self.pace.speed * self.pace.fps))
 
+    @cached_property
+    def scenes(self) -> Sequence[Scene]:
+        """What is shown of each episode."""
+        return [scene_of(rollout, self.camera) for rollout in self.rollouts]
+
     @property
     def timestep(self) -> float:
         """From one state to the next [s]."""
-        timestep = self.rollouts[0].task.timestep
-        assert timestep is not None  # checked
-        return timestep
+        return self.scenes[0].timestep
 
     @property
     def states(self) -> NDArray[np.int_]:
@@ -122,16 +125,17 @@ class Film:
 
     def frames(self) -> Iterator[Image.Image]:
         """The frames in order."""
-        for state in self.states:
-            yield join([self._picture(rollout, state) for rollout in self.rollouts])
+        every = [self._pictures(*each) for each in zip(self.rollouts, self.scenes, strict=True)]
+        for pictures in zip(*every, strict=True):
+            yield join(pictures)
 
-    def _picture(self, rollout: Rollout, state: int) -> Image.Image:
-        state = min(state, len(rollout))
-        assert rollout.motion is not None  # checked
-        so_far, now = rollout.reward[:state].sum(dtype=np.float64), self.timestep * state
-        picture = Image.fromarray(self.camera.picture(rollout.motion, state))
-        add_caption(picture, rollout.name, f"return {so_far:.0f}    {now:.2f} s")
-        return picture
+    def _pictures(self, rollout: Rollout, scene: Scene) -> Iterator[Image.Image]:
+        """Those of an episode in each frame, with captions."""
+        states = np.minimum(self.states, len(rollout)).tolist()
+        for state, picture in zip(states, scene.pictures(states), strict=True):
+            so_far, now = rollout.reward[:state].sum(dtype=np.float64), self.timestep * state
+            add_caption(picture, rollout.name, f"return {so_far:.0f}    {now:.2f} s")
+            yield picture
 
     def write(self, path: Path, show: bool = False) -> None:
         """Encode it into a new file, whole or not at all.
@@ -161,28 +165,6 @@ class Film:
             encoded = Path(folder) / path.name
             form.encode(bar, encoded, self.pace.fps)
             write_new(path, encoded.read_bytes())
-
-
-def _check_shown(rollout: Rollout) -> None:
-    """Make sure that an episode has all that a film needs."""
-    if rollout.motion is None:
-        why = rollout.note or f"{rollout.task.name} has no MuJoCo model and data"
-        raise InputError(f"{why}: only MuJoCo's robots can be filmed; jbrep inspect shows signals")
-    if rollout.task.timestep is None:
-        raise InputError(
-            f"the time step of {rollout.task.name} is not known: give it as timestep in a file of "
-            "--features"
-        )
-
-
-def _start_alike(one: Rollout, other: Rollout) -> bool:
-    if one.task != other.task or one.motion is None or other.motion is None:
-        return False
-    places = [
-        (one.motion.arrays[name][0], other.motion.arrays[name][0])
-        for name in ("qpos", "mocap_pos", "mocap_quat")
-    ]
-    return all(np.array_equal(a, b) for a, b in places)
 
 
 class Format(NamedTuple):

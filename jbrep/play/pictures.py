@@ -56,7 +56,7 @@ class Camera:
     """
 
     def __init__(self, name: str | None = None, width: int = 640, height: int = 480):
-        self._name, self.width, self.height = name, width, height
+        self.name, self.width, self.height = name, width, height
         low, high = _SIZES
         if not all(low <= side <= high and side % 2 == 0 for side in (width, height)):
             raise InputError(
@@ -93,7 +93,7 @@ class Camera:
         for studio in self._studios:
             if studio.motion_model is model:
                 return studio
-        camera, own = find_camera(model, self._name), copy(model)
+        camera, own = find_camera(model, self.name), copy(model)
         own.vis.global_.offwidth, own.vis.global_.offheight = self.width, self.height
         own.vis.quality.shadowsize, own.vis.quality.offsamples = _SHADOW_PIXELS, _SAMPLES
         own.vis.map.shadowscale = _SHADOW_CONE
