@@ -219,13 +219,14 @@ def evaluate(
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
     from jbrep.errors import choose
-    from jbrep.evaluate.diagnosis import diagnose, write
-    from jbrep.evaluate.evaluation import WORTH
-    from jbrep.play.sources import find_good_policy
     from jbrep.records.storage import check_writable
+    from jbrep.worth import WORTH
 
     for kind in worth:
         choose(kind, WORTH, "way of worth")
+    from jbrep.evaluate.diagnosis import diagnose, write  # imports torch
+    from jbrep.play.sources import find_good_policy
+
     if out is not None:
         check_writable(Path(out))
     elif worth:
@@ -235,12 +236,13 @@ def evaluate(
     whole = Dataset(truth) if isinstance(truth, str | Path) else truth
     if out is None:
         return Judged(diagnose(found, scaled, good, whole))
-    evaluation = write(found, scaled, Path(out), good, whole)
-    if worth:
-        from jbrep.worth.worth import work_out
+    if not worth:
+        return Judged(write(found, scaled, Path(out), good, whole))
+    from jbrep.worth.worth import check, work_out
 
-        evaluation = work_out(evaluation, found, scaled.dataset, Path(out), worth)
-    return Judged(evaluation)
+    check(scaled.dataset, worth)
+    evaluation = write(found, scaled, Path(out), good, whole)
+    return Judged(work_out(evaluation, found, scaled.dataset, Path(out), worth))
 
 
 def train(

@@ -350,7 +350,9 @@ given = (
     "tune --task face_direction --steps 0 --out x",
     "train-encoder --kind fly --data nothing --out x",
     "collect --task fly --steps 10 --out x", "collect --task face_direction --steps -5 --out x",
-    "evaluate --encoder dae-8 --data nothing", "evaluate-policy nothing", "inspect nothing",
+    "evaluate --encoder dae-8 --data nothing",
+    "evaluate --encoder dae-8 --data nothing --worth gold",
+    "evaluate-policy nothing", "inspect nothing",
     "behaviour nothing --out x", "study nothing.toml", "report nothing", "encoder info nothing",
 )
 for words in given:
@@ -366,7 +368,7 @@ def test_mistakes_in_words_are_found_before_torch_is_imported(tmp_path):
     command = [sys.executable, "-c", _MISTAKES]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("Error: ") == done.stderr.count("\n") == 19
+    assert done.stderr.count("Error: ") == done.stderr.count("\n") == 20
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """What codes are worth: fitted Q-iteration, planning and small agents on codes."""
 
+import time
+
 import numpy as np
 import pytest
 from helpers.command import jbrep, mistake
@@ -9,13 +11,15 @@ from jbrep.collect import collect
 from jbrep.dataset import Dataset
 from jbrep.encoders import find
 from jbrep.envs import describe
-from jbrep.evaluate.evaluation import Evaluation
+from jbrep.evaluate.evaluation import Evaluation, Learned, Lost, Score
 from jbrep.records.document import read_document
-from jbrep.worth import fitted, planning
+from jbrep.report.evaluation import evaluation_text
+from jbrep.report.worth import condition
+from jbrep.worth import agents, fitted, offline, planning
 from jbrep.worth.fitted import Coded, Fourier, Trees
 from jbrep.worth.offline import Ground, learned
 from jbrep.worth.steps import Held, choices, stored
-from jbrep.worth.worth import _lanes
+from jbrep.worth.worth import _lanes, work_out
 
 
 def line(seed=0, steps=4000):
@@ -94,17 +98,151 @@ def test_without_the_environment_returns_are_estimated(data):
     assert 0 <= found.score.value <= data.task.max_episode_steps
 
 
-def test_evaluate_says_what_codes_are_worth(data, tmp_path):
-    arguments = "--encoder", "pca-8", "--data", data.folder, "--worth", "fitted"
-    told = jbrep("evaluate", *arguments, "--out", tmp_path / "a").output
-    assert "Mean returns of 20 episodes" in told
-    kept = read_document(tmp_path / "a" / "evaluation.json", Evaluation).worth
-    assert set(kept.learned) == {"trees", "fourier"}
-    assert set(kept.learned["trees"]) == {"full", "pca-8"}
-    assert kept.learned["trees"]["full"].again is not None
-    again = jbrep(*("evaluate", *arguments[:4]), "--out", tmp_path / "a").output
-    assert "Mean returns of 20 episodes" in again  # of what is known already nothing is lost
-    assert read_document(tmp_path / "a" / "evaluation.json", Evaluation).worth == kept
+@pytest.fixture(scope="module")
+def told(data, tmp_path_factory):
+    """What `jbrep evaluate --worth fitted` prints, and its folder."""
+    out = tmp_path_factory.mktemp("told") / "a"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitted, "_TREES", 4)
+        patch.setattr(fitted, "_BACKUPS", 10)
+        arguments = "--encoder", "pca-8", "--data", data.folder, "--out", out
+        return jbrep("evaluate", *arguments, "--worth", "fitted").output, out
+
+
+def known(told):
+    return read_document(told[1] / "evaluation.json", Evaluation)
+
+
+def test_evaluate_says_what_codes_are_worth(data, told):
+    text, out = told
+    worth = known(told).worth
+    assert "Mean return of fitted Q-iteration with trees from steps that earn 0." in text
+    assert set(worth.learned) == {"trees", "fourier"}
+    assert set(worth.learned["trees"]) == {"full", "pca-8"}
+    assert worth.learned["trees"]["full"].again is not None
+    rewards = Ground.of(data, None).seen.reward
+    assert worth.rewards == pytest.approx((rewards.mean(), rewards.std()), rel=1e-5)
+    again = jbrep("evaluate", "--encoder", "pca-8", "--data", data.folder, "--out", out).output
+    assert text.endswith(again)  # of what is known already nothing is lost
+    assert known(told).worth == worth
+
+
+def test_what_is_known_stays_and_the_rest_goes_on(data, told, tmp_path, monkeypatch):
+    """Stopped after one code, the same call learns from the others alone."""
+    whole, asked = known(told), []
+    encoders = {"pca-8": find("pca-8", data.task)}
+    some = whole.worth.learned["trees"]["full"]
+
+    def stopped(encoder, ground, way):
+        asked.append((way, encoder.name))
+        if len(asked) == 2:
+            raise SystemExit
+        return some
+
+    monkeypatch.setattr(offline, "learned", stopped)
+    monkeypatch.setattr("jbrep.worth.worth.references_of", lambda task, episodes: {})
+    arguments = encoders, data, tmp_path, ["fitted"]
+    with pytest.raises(SystemExit):
+        work_out(whole.replace(worth=None), *arguments)
+    there = read_document(tmp_path / "evaluation.json", Evaluation)
+    assert there.worth.learned == {"trees": {"full": some}}
+    assert "isn't known yet" not in evaluation_text(there)
+    assert set(work_out(there, *arguments).worth.learned) == {"trees", "fourier"}
+    assert asked[2:] == [("trees", "pca-8"), ("fourier", "full"), ("fourier", "pca-8")]
+
+
+def test_the_time_of_agents_that_were_stopped_counts(data, told, tmp_path, monkeypatch):
+    clock, score = iter([0, 5, 10, 14]), Score(1.0, 0.5, 2.0)
+    monkeypatch.setattr(time, "process_time", lambda: next(clock))
+
+    def stopped(*given):
+        raise SystemExit
+
+    arguments = {"pca-8": find("pca-8", data.task)}, data, tmp_path, ["agent"]
+    monkeypatch.setattr(agents, "learned", stopped)
+    monkeypatch.setattr("jbrep.worth.worth.references_of", lambda task, episodes: {})
+    with pytest.raises(SystemExit):
+        work_out(known(told), *arguments)
+    there = read_document(tmp_path / "evaluation.json", Evaluation)
+    monkeypatch.setattr(agents, "learned", lambda codes, *given: dict.fromkeys(codes, score))
+    worth = work_out(there, *arguments).worth
+    assert list(worth.learned) == ["agent", "trees", "fourier"]  # the surest first, none lost
+    assert worth.learned["agent"]["pca-8"] == Learned(score=score, seconds=4.5)
+
+
+def test_agents_learn_from_codes(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(agents, "STEPS", 200)
+    monkeypatch.setattr(agents, "RUNS", 1)
+    codes = {label: find(label, data.task) for label in ("full", "pca-8")}
+    returns = agents.learned(codes, data.task, tmp_path)
+    assert all(0 <= low < mean < high <= 100 for mean, low, high in returns.values())
+
+
+def returns_of(told, **learned):
+    """The evaluation, with other returns: by way, of the full observation and of pca-8."""
+    evaluation = known(told)
+    means = {
+        way: {
+            label: Learned(score=Score(mean, mean - 5, mean + 5), seconds=1.0)
+            for label, mean in zip(("full", "pca-8"), each, strict=True)
+        }
+        for way, each in learned.items()
+    }
+    worth = evaluation.worth.replace(learned=means, references={"standing still": 30.0})
+    lost = Lost(name="motor_velocity", kept=0.1, need=0.9)
+    loses = {"full": (), "pca-8": (lost,)}
+    codes = {name: each.replace(loses=loses[name]) for name, each in evaluation.encoders.items()}
+    return evaluation.replace(
+        worth=worth, encoders=codes, needs=evaluation.needs | {"motor_velocity": 0.9}
+    )
+
+
+@pytest.mark.parametrize(
+    ("learned", "first", "line"),
+    [
+        ({"agent": (90, 88)}, "Take pca-8: by small agents, the smallest of those", "88 [83, 93]"),
+        ({"agent": (90, 50)}, "Take the full observation: by small agents", "50 [45, 55]"),
+        ({"agent": (25, 20)}, "Nothing can be said of the codes: by small agents, none", "20"),
+        (
+            {"trees": (90, 70), "fourier": (88, 40)},
+            "Take the full observation: by fitted",
+            "70 [65, 75]; lacks motor_velocity (0.10); badly conditioned: trees make 70 of it",
+        ),
+    ],
+)
+def test_a_code_is_recommended_with_reasons(told, learned, first, line):
+    text = evaluation_text(returns_of(told, **learned))
+    assert text.startswith(first)
+    assert f"\npca-8 {line}" in text
+    assert "lacks motor_velocity (0.10)" in text
+
+
+def test_of_a_constant_reward_nothing_can_be_learned(told):
+    evaluation = returns_of(told, trees=(90, 50))
+    constant = evaluation.replace(worth=evaluation.worth.replace(rewards=(0.0, 0.0)))
+    text = evaluation_text(constant)
+    assert text.startswith("Every reward of the data is 0: what codes are worth can't be learned")
+    assert "90" not in text.partition("\n\n")[0]
+    by_agents = returns_of(told, agent=(90, 50))
+    worth = by_agents.worth.replace(rewards=(0.0, 0.0))
+    assert evaluation_text(by_agents.replace(worth=worth)).startswith("Take the full observation")
+
+
+def test_a_code_that_hardly_varies_in_a_direction_is_badly_conditioned(told):
+    units = known(told).encoders["pca-8"].latent_units
+    codes = np.random.default_rng(0).normal(size=(1000, 3)) @ np.diag([1, 300, 2])
+    mixed = codes @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    correlation = tuple(map(tuple, np.corrcoef(mixed.T).tolist()))
+    few = units.replace(
+        variance=tuple(mixed.var(axis=0).tolist()), correlation=correlation, dead=()
+    )
+    assert condition(few) == pytest.approx(np.linalg.cond(np.cov(mixed.T)) ** 0.5, rel=1e-3)
+    with_dead = few.replace(
+        variance=(*few.variance, 0.0),
+        correlation=(*((*row, None) for row in correlation), (None,) * 4),
+        dead=(3,),
+    )
+    assert condition(with_dead) == pytest.approx(condition(few))
 
 
 def test_own_rewards_are_never_compared_with_those_of_the_environment(data, tmp_path, monkeypatch):
@@ -116,7 +254,8 @@ def test_own_rewards_are_never_compared_with_those_of_the_environment(data, tmp_
     with _lanes(Dataset(own)) as lanes:
         assert lanes is None
     arguments = "--encoder", "pca-8", "--data", own, "--worth", "agent", "--out", tmp_path / "c"
-    assert "gives other rewards" in jbrep("evaluate", *arguments).output
+    assert "gives other rewards" in mistake("evaluate", *arguments)
+    assert not (tmp_path / "c").exists()  # nothing takes time before
 
 
 def test_steps_are_held_out_as_from_encoders(data):
@@ -126,10 +265,3 @@ def test_steps_are_held_out_as_from_encoders(data):
     assert [np.unique(at[each]).tolist() for each in rows] == [e.tolist() for e in episodes]
     first = {each.tobytes() for each in Ground.of(data, None).unseen.observation}
     assert first <= {each.tobytes() for each in data["observation"][rows.test]}
-
-
-def test_an_unknown_worth_is_told_in_a_line(data, tmp_path):
-    arguments = "--encoder", "pca-8", "--data", data.folder, "--worth", "gold"
-    told = mistake("evaluate", *arguments, "--out", tmp_path / "b")
-    assert "agent, fitted, planning" in told
-    assert not (tmp_path / "b").exists()

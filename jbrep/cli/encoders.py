@@ -19,7 +19,7 @@ from jbrep.cli.base import (
 )
 from jbrep.cli.completion import complete_encoder, complete_task
 from jbrep.cli.environment import environment_options, given_task, needed_task, task_option
-from jbrep.errors import InputError
+from jbrep.errors import InputError, choose
 from jbrep.text import facts, r2_text, slug, table, terminal_width, wrapped
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 
 _LETTERS = 100  # of the name of a folder
+_KEPT = "the same command keeps what is known of each code's worth, and resumes agents"
 
 
 @click.command(
@@ -65,9 +66,9 @@ _LETTERS = 100  # of the name of a folder
 @click.option(
     "--worth",
     multiple=True,
-    help="What each code is worth: agent trains two small agents on it, two or three "
-    "minutes of a core; "
-    "fitted and planning learn from the data alone, half a minute each way, and say less.",
+    help="What each code is worth, and which one to take: agent trains two small agents on it, two "
+    "or three minutes of a core; fitted and planning learn from the data alone, at most half a "
+    "minute each way, and say less.",
 )
 @click.option(
     "--all",
@@ -93,6 +94,10 @@ def evaluate(
     the latent's units and dimensions, nearest neighbours, and the prediction of the next latent. An
     encoder of your own is code such as mymodule:MyEncoder; its module is imported, which runs it.
     """
+    from jbrep.worth import WORTH
+
+    for kind in worth:
+        choose(kind, WORTH, "way of worth")
     from jbrep import api
     from jbrep.dataset import Dataset
     from jbrep.encoders.shipped import check_found, find_all, source_of
@@ -112,7 +117,7 @@ def evaluate(
         label: source_of(name, whole.task) for label, name in zip(encoders, encoder, strict=True)
     }
     out = out or Path("evaluation", slug(data.resolve().name), slug("+".join(encoders))[:_LETTERS])
-    with stoppable("the same command starts over"):
+    with stoppable(_KEPT if worth else "the same command starts over"):
         evaluation = api.evaluate(
             encoders, whole, out, policy=policy, truth=truth, worth=worth
         ).evaluation

@@ -12,11 +12,6 @@ from jbrep.stats.bootstrap import Interval
 
 EVALUATION = "evaluation.json"
 _DIGITS = 6
-WORTH = {  # ways of finding out what a code is worth, and the ways of learning in each
-    "agent": ("agent",),
-    "fitted": ("trees", "fourier"),
-    "planning": ("linear model", "network model"),
-}
 
 
 class Score(NamedTuple):
@@ -170,19 +165,20 @@ class Learned(Record, frozen=True, kw_only=True):
 
     score: Score  # the mean return of an episode
     again: Score | None = None  # learned again with steps of its own beside those of the data
-    seconds: float  # of CPU time, beyond that of runs that had been made before
+    seconds: float  # of CPU time
 
 
 class Worth(Record, frozen=True, kw_only=True):
-    """What codes are worth to ways of learning; docs/worth.md describes each."""
+    """What codes are worth to ways of learning, as far as is known; see docs/worth.md."""
 
     estimated: bool  # whether returns are estimated from data, not played
     episodes: int  # in which each is played
     runs: int = 0  # of agents, of each code
     steps: int = 0  # that these learned for
-    learned: dict[str, dict[str, Learned]]  # by way of learning, by label
-    references: dict[str, float]  # mean returns of policies that don't learn
-    rewards: tuple[float, float]  # of the data: mean and standard deviation
+    agent_seconds: float = 0.0  # of CPU time that all agents took so far
+    learned: dict[str, dict[str, Learned]] = {}  # by way of learning, by label
+    references: dict[str, float] = {}  # mean returns of policies that don't learn
+    rewards: tuple[float, float] | None = None  # that was learned from: mean, standard deviation
 
 
 class JudgedOn(Record, frozen=True, kw_only=True):

@@ -4,10 +4,12 @@ import sys
 from collections.abc import Iterator, Mapping
 
 from jbrep.encoders import FULL
-from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Learned, Scores, Worth
+from jbrep.evaluate.evaluation import Diagnostics, Evaluation, Scores, Worth
 from jbrep.evaluate.table import headline
 from jbrep.jitterbug.tasks import TASKS
-from jbrep.report.serving import lacking, serving, unreadable, untold, valued
+from jbrep.report.serving import lacking, serving, unreadable, untold
+from jbrep.report.worth import Ranked, advice, conditioning, ranked, shown, worth_table
+from jbrep.report.worth import title as worth_title
 from jbrep.text import Table, counted, facts, html, interval, number, r2_text, wrapped
 
 _Encoders = Mapping[str, Diagnostics]  # by label
@@ -39,14 +41,9 @@ _MANY = 8  # quantities from which probes are summed up
 def evaluation_text(
     evaluation: Evaluation, width: int | None = None, everything: bool = False
 ) -> str:
-    """Which codes serve and what each lacks, in lines of that width; everything else if wanted."""
-    worth = evaluation.worth
+    """Which code to take and what each lacks, in lines of that width; everything else if wanted."""
     parts = [
-        *((wrapped(valued(evaluation, worth), width), _worth(worth).text(width)) if worth else ()),
-        wrapped(serving(evaluation), width),
-        _headline(evaluation).text(width),
-        *(table.text(width) for table in _unseen(evaluation)),
-        _lacking(evaluation, width),
+        part.text(width) if isinstance(part, Table) else part for part in _parts(evaluation, width)
     ]
     if everything:
         encoders = evaluation.encoders
@@ -56,11 +53,24 @@ def evaluation_text(
 
 
 def evaluation_html(evaluation: Evaluation) -> str:
-    """Which codes serve and what each lacks, for a notebook."""
+    """Which code to take and what each lacks, for a notebook."""
+    return html(*_parts(evaluation, None))
+
+
+def _parts(evaluation: Evaluation, width: int | None) -> Iterator[str | Table]:
+    """What tells codes that serve from others; first what they are worth, if that is known."""
     worth = evaluation.worth
-    first = (valued(evaluation, worth), _worth(worth)) if worth else ()
+    found = ranked(worth)
     tables = _headline(evaluation), *_unseen(evaluation)
-    return html(*first, serving(evaluation), *tables, _lacking(evaluation, None))
+    if worth:
+        yield wrapped(advice(evaluation, worth), width)
+    if worth and found:
+        yield _worths(evaluation, worth, found, width)
+        yield from (worth_table(worth), *tables) if len(worth.learned) > 1 else tables
+    else:
+        yield wrapped(serving(evaluation), width)
+        yield from tables
+        yield _lacking(evaluation, width)
 
 
 def _headline(evaluation: Evaluation) -> Table:
@@ -102,23 +112,6 @@ def _unseen(evaluation: Evaluation) -> Iterator[Table]:
         )
 
 
-def _worth(worth: Worth) -> Table:
-    """What each code returns, by way of learning; first, and learned again with own steps."""
-    where = "as the data let estimate them" if worth.estimated else f"of {worth.episodes} episodes"
-    agents = f"; of agents after {worth.steps:,} steps, {worth.runs} runs" if worth.runs else ""
-    labels = next(iter(worth.learned.values()))
-    return Table(
-        f"Mean returns {where}{agents}",
-        ("encoder", *worth.learned),
-        [(label, *(_returned(each[label]) for each in worth.learned.values())) for label in labels],
-    )
-
-
-def _returned(each: Learned) -> str:
-    shown = interval(each.score, ".0f")
-    return shown if each.again is None else f"{shown}, then {interval(each.again, '.0f')}"
-
-
 def _columns(evaluation: Evaluation, width: int | None) -> str:
     """What the columns of the headline are."""
     named = {
@@ -129,10 +122,33 @@ def _columns(evaluation: Evaluation, width: int | None) -> str:
     return facts(named, width or sys.maxsize, indent=0)
 
 
+def _worths(evaluation: Evaluation, worth: Worth, found: Ranked, width: int | None) -> str:
+    """A line for each code, the best first: its mean return, and why it isn't more."""
+    lacks = {} if untold(evaluation) else _lacks(evaluation)
+    lines, learned = {}, worth.learned[found.way]
+    for label in found.means:
+        why = [f"lacks {lacks[label]}"] if lacks.get(label) else []
+        if label not in found.best:
+            why += filter(None, [conditioning(evaluation, worth, label)])
+            why = why or ["why isn't known"]
+        lines[label] = "; ".join((interval(shown(learned[label]), ".0f"), *why))
+    title = worth_title(worth, found) + (f". {_LACKING}" if lacks else "")
+    told = facts(lines, width or sys.maxsize, indent=0)
+    return "\n".join((wrapped(title, width), told, *_unsaid(evaluation, width)))
+
+
 def _lacking(evaluation: Evaluation, width: int | None) -> str:
     """What each code lacks of what a controller needs, as far as that can be said."""
-    if reason := untold(evaluation):
-        return wrapped(f"What each lacks can't be said: {reason}.", width)
+    unsaid = _unsaid(evaluation, width)
+    if untold(evaluation):
+        return "\n".join(unsaid)
+    lines = {label: lacks or "nothing" for label, lacks in _lacks(evaluation).items()}
+    told = facts(lines, width or sys.maxsize, indent=0)
+    return "\n".join((wrapped(_LACKING, width), told, *unsaid))
+
+
+def _lacks(evaluation: Evaluation) -> dict[str, str]:
+    """What each code lacks, in words."""
     task = evaluation.data.task
     lines = {}
     for label, features in lacking(evaluation).items():
@@ -141,12 +157,18 @@ def _lacking(evaluation: Evaluation, width: int | None) -> str:
             said.setdefault(in_words(task, each.name), each.kept)
         more = len(said) - _MANY
         some = [f"{words} ({r2_text(kept)})" for words, kept in list(said.items())[:_MANY]]
-        lines[label] = ", ".join(some) + (f" and {more} more" if more > 0 else "") or "nothing"
-    told = f"{wrapped(_LACKING, width)}\n{facts(lines, width or sys.maxsize, indent=0)}"
-    if unread := dict.fromkeys(in_words(task, each.name) for each in unreadable(evaluation)):
-        nor = f"Not even from the full observation can be read here: {', '.join(unread)}."
-        told += f"\n{wrapped(nor, width)}"
-    return told
+        lines[label] = ", ".join(some) + (f" and {more} more" if more > 0 else "")
+    return lines
+
+
+def _unsaid(evaluation: Evaluation, width: int | None) -> list[str]:
+    """Why it can't be said what each lacks, or what not even the full observation tells."""
+    if reason := untold(evaluation):
+        return [wrapped(f"What each lacks can't be said: {reason}.", width)]
+    task = evaluation.data.task
+    unread = dict.fromkeys(in_words(task, each.name) for each in unreadable(evaluation))
+    nor = f"Not even from the full observation can be read here: {', '.join(unread)}."
+    return [wrapped(nor, width)] if unread else []
 
 
 def in_words(task: str, feature: str) -> str:

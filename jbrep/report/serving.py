@@ -1,15 +1,12 @@
 """Which codes serve a controller as the full observation does, in a sentence."""
 
-import math
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 from jbrep.encoders import FULL
-from jbrep.evaluate.evaluation import Evaluation, Lost, Score, Worth
+from jbrep.evaluate.evaluation import Evaluation, Lost
 from jbrep.evaluate.table import headline
 from jbrep.report.words import listed
-from jbrep.stats.bootstrap import Interval
-from jbrep.stats.scale import best_blind
 from jbrep.text import r2_text
 
 _MEASURES = {  # the first that the full observation tells anything of counts
@@ -62,40 +59,6 @@ def serving(evaluation: Evaluation) -> str:
         if lost
         else answer
     )
-
-
-def valued(evaluation: Evaluation, worth: Worth) -> str:
-    """Which code is worth as much as the best one, by the first way of learning that was asked for.
-
-    That is a code whose interval reaches the best one's, above the policies that don't look.
-    """
-    mean, deviation = worth.rewards
-    if not deviation and "agent" not in worth.learned:
-        return (
-            f"Every reward of the data is {mean:g}: what codes are worth can't be learned from it."
-        )
-    way, learned = next(iter(worth.learned.items()))
-    means = {label: _bounded(each.again or each.score) for label, each in learned.items()}
-    blind = best_blind(worth.references)
-    floor = worth.references[blind] if blind else -math.inf
-    best = max(means.values())
-    good = [label for label, each in means.items() if each.high >= best.low and each.low > floor]
-    if not good:
-        return (
-            f"By {way}, no code is clearly worth more than not looking at all ({floor:.0f}): "
-            "nothing can be said of them yet."
-        )
-    smallest = min(good, key=lambda label: evaluation.encoders[label].latent)
-    return f"By {way}, {listed(good)} {'is' if len(good) == 1 else 'are'} worth the most" + (
-        f"; the smallest is {smallest}." if len(good) > 1 else "."
-    )
-
-
-def _bounded(mean: Score) -> Interval:
-    """A mean with its interval, which is the mean alone where no return differs from another."""
-    value, low, high = mean
-    at = -math.inf if value is None else value
-    return Interval(at, at if low is None else low, at if high is None else high)
 
 
 def _told(measured: _Measured, r2: Collection[float]) -> str:

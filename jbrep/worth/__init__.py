@@ -2,3 +2,10 @@
 
 See docs/worth.md.
 """
+
+AGENT = "agent"
+WORTH = {  # what can be asked for, and the ways of learning in each, the surest first
+    AGENT: (AGENT,),
+    "fitted": ("trees", "fourier"),
+    "planning": ("linear model", "network model"),
+}

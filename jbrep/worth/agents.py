@@ -1,6 +1,5 @@
 """Small agents on codes: the most direct way to find out what these are worth."""
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ import numpy as np
 from joblib import cpu_count
 
 from jbrep.envs.task import Task
-from jbrep.evaluate.evaluation import Learned, score
+from jbrep.evaluate.evaluation import Score, score
 from jbrep.progress import Progress
 from jbrep.rl.files import last_returns, read_evaluations
 from jbrep.rl.job import Job, Session
@@ -19,12 +18,10 @@ from jbrep.stats.intervals import LEVEL, mean_within
 from jbrep.worth.offline import EPISODES, bounds_of
 
 _ALGORITHM = "sac"
-AGENT_STEPS, AGENT_RUNS = 100_000, 2
+STEPS, RUNS = 100_000, 2  # of a run, of a code
 
 
-def learned(
-    encoders: Mapping[str, Any], task: Task, folder: Path, steps: int, runs: int
-) -> dict[str, Learned]:
+def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, Score]:
     """What agents of the usual preset return in the end, by the code that they observe.
 
     All learn together. Stopped or killed, the same call resumes them.
@@ -33,13 +30,10 @@ def learned(
         encoders: by label, as a run takes them.
         task: that is learned.
         folder: for the runs.
-        steps: of each.
-        runs: of each code.
 
     Raises:
         InputError: the folder holds other runs; or as `Run.settings`.
     """
-    began = time.process_time()
     jobs = {
         (label, seed): Job(
             Run.of(
@@ -48,30 +42,28 @@ def learned(
                 encoder=encoder,
                 representation=label,
                 seed=seed,
-                steps=steps,
-                evaluate_every=steps,
+                steps=STEPS,
+                evaluate_every=STEPS,
                 final_episodes=EPISODES,
             ),
             folder / label / f"seed-{seed}",
             cpu_count(),
         )
         for label, encoder in encoders.items()
-        for seed in range(runs)
+        for seed in range(RUNS)
     }
     done = dict.fromkeys(jobs.values(), 0)
-    with Progress(total=steps * len(jobs), unit="step", unit_scale=True, desc="agents") as bar:
+    with Progress(total=STEPS * len(jobs), unit="step", unit_scale=True, desc="agents") as bar:
 
         def watch(job: Job, step: int, mean: float | None) -> None:
-            bar.update(min(step, steps) - done[job])
-            done[job] = min(step, steps)
+            bar.update(min(step, STEPS) - done[job])
+            done[job] = min(step, STEPS)
 
         for _ in train_jobs([*jobs.values()], Session(watch)):
             pass
-    seconds = (time.process_time() - began) / len(encoders)
     found = {}
     for label in encoders:
-        own = [jobs[label, seed].folder for seed in range(runs)]
+        own = [jobs[label, seed].folder for seed in range(RUNS)]
         returns = np.concatenate([last_returns(read_evaluations(each)) for each in own])
-        worth = score(mean_within(returns, bounds_of(task), LEVEL))
-        found[label] = Learned(score=worth, seconds=seconds)
+        found[label] = score(mean_within(returns, bounds_of(task), LEVEL))
     return found

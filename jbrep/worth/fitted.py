@@ -9,7 +9,7 @@ Both keep their structure while targets change, trees their splits and features 
 so that an iteration is a few sums, and with trees it converges (Gordon 1995).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -144,16 +144,15 @@ def q_iteration(values: Values, steps: Coded, gamma: float, tries: Actions) -> C
         What chooses the action of the highest value.
     """
 
-    def prepared(codes: Codes) -> Iterator[Any]:
-        return (values.prepare(codes, _each(tries, i, len(codes))) for i in range(len(tries)))
+    def prepared(codes: Codes) -> Any:
+        return values.prepare(np.repeat(codes, len(tries), axis=0), np.tile(tries, (len(codes), 1)))
 
-    following = [*prepared(steps.following)]
-    backup(values, steps.held, gamma, lambda: np.max([*map(values.at, following)], axis=0))
+    def of_each(prepared: Any) -> Array:
+        return values.at(prepared).reshape(-1, len(tries))
 
-    def choose(codes: Codes) -> Actions:
-        return tries[np.argmax([*map(values.at, prepared(codes))], axis=0)]
-
-    return choose
+    following = prepared(steps.following)
+    backup(values, steps.held, gamma, lambda: of_each(following).max(axis=1))
+    return lambda codes: tries[of_each(prepared(codes)).argmax(axis=1)]
 
 
 def backup(values: Values, held: Held, gamma: float, ahead: Callable[[], Array]) -> None:
@@ -171,8 +170,3 @@ def backup(values: Values, held: Held, gamma: float, ahead: Callable[[], Array])
         values.fit(wanted)
         wanted = held.reward + gamma * held.goes_on * np.clip(ahead(), least, largest)
     values.fit(wanted)
-
-
-def _each(tries: Actions, number: int, count: int) -> Actions:
-    """One of the actions, so many times, (count, k)."""
-    return np.broadcast_to(tries[number], (count, tries.shape[1]))

@@ -80,6 +80,11 @@ class Ground:
         return cls(data.task, hold, seen, unseen, lanes)
 
     @property
+    def rewards(self) -> tuple[float, float]:
+        """Mean and standard deviation of what the steps to learn from earn, each a step."""
+        return float(self.seen.reward.mean()), float(self.seen.reward.std())
+
+    @property
     def gamma(self) -> float:
         """The discount of a held step."""
         return float(_GAMMA**self.hold)

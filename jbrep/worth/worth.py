@@ -1,25 +1,43 @@
 """What codes are worth, side by side."""
 
-from collections.abc import Mapping, Sequence
-from contextlib import closing, nullcontext
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from jbrep.dataset import Dataset
 from jbrep.encoders import FULL, find
 from jbrep.encoders.base import BaseEncoder
 from jbrep.envs.lanes import Lanes
 from jbrep.errors import InputError
-from jbrep.evaluate.evaluation import EVALUATION, WORTH, Evaluation, Learned, Worth
+from jbrep.evaluate.evaluation import EVALUATION, Evaluation, Learned, Worth
 from jbrep.progress import Progress
 from jbrep.records.lock import exclusive
 from jbrep.study.tables import references_of
 from jbrep.training.trainer import single_torch_thread
-from jbrep.worth import agents, offline
+from jbrep.worth import AGENT, WORTH, agents, offline
 from jbrep.worth.offline import EPISODES, Ground
 
-_AGENT = "agent"
+
+def check(data: Dataset, kinds: Sequence[str]) -> None:
+    """Check, before anything else takes time, that what was asked for can be found out.
+
+    Args:
+        data: to learn from.
+        kinds: keys of WORTH.
+
+    Raises:
+        InputError: agents where the environment can't be made; or data without rewards.
+    """
+    if set(kinds) - {AGENT}:
+        data["reward"]  # says what to do if there are none
+    with _lanes(data) as lanes:
+        if lanes is None and AGENT in kinds:
+            raise InputError(
+                f"the environment of {data.folder} can't be made here, or gives other rewards: no "
+                "agent can be trained; ask for fitted or planning, which learn from the data alone"
+            )
 
 
 def work_out(
@@ -28,10 +46,10 @@ def work_out(
     data: Dataset,
     folder: Path,
     kinds: Sequence[str],
-    steps: int = agents.AGENT_STEPS,
-    runs: int = agents.AGENT_RUNS,
 ) -> Evaluation:
-    """Add what codes are worth to an evaluation, in its file, too.
+    """Add what codes are worth to an evaluation, and each to its file as soon as it is known.
+
+    What the evaluation has already stays.
 
     Args:
         evaluation: of the encoders.
@@ -39,40 +57,89 @@ def work_out(
         data: that fitted and planning learn from.
         folder: of the evaluation; agents' runs are kept there, and go on if they were stopped.
         kinds: keys of WORTH.
-        steps: of an agent.
-        runs: of agents, of each code.
-
-    Raises:
-        InputError: agents where the environment can't be made; or there are no rewards.
     """
     every = {FULL: find(FULL, data.task), **encoders}
-    ways = [way for kind in kinds for way in WORTH[kind] if way != _AGENT]
     with _lanes(data) as lanes, single_torch_thread():
-        if lanes is None and _AGENT in kinds:
-            raise InputError(
-                f"the environment of {data.folder} can't be made here, or gives other rewards: no "
-                "agent can be trained; ask for fitted or planning, which learn from the data alone"
-            )
-        rewards = np.asarray(data["reward"][:], np.float64)
-        learned = dict[str, dict[str, Learned]]()
-        if _AGENT in kinds:
-            learned[_AGENT] = agents.learned(every, data.task, folder / "agents", steps, runs)
-        if ways:
-            learned |= _offline(every, Ground.of(data, lanes), ways)
-        played = references_of(data.task, EPISODES) if lanes else {}
-    worth = Worth(
-        estimated=lanes is None,
-        episodes=EPISODES,
-        runs=runs if _AGENT in kinds else 0,
-        steps=steps if _AGENT in kinds else 0,
-        learned=learned,
-        references={policy: float(each.mean()) for policy, each in played.items()},
-        rewards=(float(rewards.mean()), float(rewards.std())),
+        found = _Found(evaluation, folder / EVALUATION, lanes is None)
+        missing = {
+            way: new
+            for kind in kinds
+            for way in WORTH[kind]
+            if (new := {label: every[label] for label in found.missing(way, every)})
+        }
+        if missing and lanes:
+            played = references_of(data.task, EPISODES)
+            found.keep(references={policy: float(each.mean()) for policy, each in played.items()})
+        if missing.pop(AGENT, None):
+            _train(found, every, data, folder)
+        if missing:
+            _learn(found, missing, Ground.of(data, lanes))
+    return found.evaluation
+
+
+class _Found:
+    """An evaluation whose file has what codes are worth, as far as that is known.
+
+    Args:
+        evaluation: to begin with; what was estimated isn't compared with what was played.
+        path: of its file.
+        estimated: whether the environment can't be made.
+    """
+
+    def __init__(self, evaluation: Evaluation, path: Path, estimated: bool):
+        fresh = Worth(estimated=estimated, episodes=EPISODES)
+        before = evaluation.worth
+        self.worth = before if before and before.estimated == estimated else fresh
+        self.evaluation, self._path = evaluation, path
+
+    def missing(self, way: str, labels: Mapping[str, Any]) -> list[str]:
+        """Which codes aren't known by a way of learning."""
+        return [label for label in labels if label not in self.worth.learned.get(way, {})]
+
+    def keep(self, **known: Any) -> None:
+        """Write what became known of the worth."""
+        self.worth = self.worth.replace(**known)
+        self.evaluation = self.evaluation.replace(worth=self.worth)
+        with exclusive(self._path, beside=True):
+            self.evaluation.write(self._path)
+
+    def learned(self, way: str, known: Mapping[str, Learned]) -> None:
+        """Write what a way of learning made of codes; the surest way stays the first."""
+        ways = dict(self.worth.learned)
+        ways[way] = {**ways.get(way, {}), **known}
+        order = [each for several in WORTH.values() for each in several]
+        self.keep(learned={each: ways[each] for each in order if each in ways})
+
+    @contextmanager
+    def counting(self) -> Iterator[None]:
+        """Add CPU seconds to those that agents took, however they end."""
+        began = time.process_time()
+        try:
+            yield
+        finally:
+            seconds = self.worth.agent_seconds + time.process_time() - began
+            self.keep(agent_seconds=seconds)
+
+
+def _train(found: _Found, encoders: Mapping[str, BaseEncoder], data: Dataset, folder: Path) -> None:
+    with found.counting():
+        scores = agents.learned(encoders, data.task, folder / "agents")
+    seconds = found.worth.agent_seconds / len(encoders)
+    found.keep(runs=agents.RUNS, steps=agents.STEPS)
+    found.learned(
+        AGENT, {label: Learned(score=each, seconds=seconds) for label, each in scores.items()}
     )
-    path, added = folder / EVALUATION, evaluation.replace(worth=worth)
-    with exclusive(path, beside=True):
-        added.write(path)
-    return added
+
+
+def _learn(found: _Found, missing: Mapping[str, Mapping[str, BaseEncoder]], ground: Ground) -> None:
+    """Learn from the data in each way what isn't known of each code."""
+    found.keep(rewards=ground.rewards)
+    with Progress(total=sum(map(len, missing.values())), unit="code") as progress:
+        for way, encoders in missing.items():
+            for label, encoder in encoders.items():
+                progress.set_description_str(f"{label} {way}", refresh=False)
+                found.learned(way, {label: offline.learned(encoder, ground, way)})
+                progress.update()
 
 
 def _lanes(data: Dataset) -> "closing[Lanes] | nullcontext[None]":
@@ -83,17 +150,3 @@ def _lanes(data: Dataset) -> "closing[Lanes] | nullcontext[None]":
         return closing(Lanes(data.task, EPISODES))
     except (InputError, ModuleNotFoundError):
         return nullcontext()
-
-
-def _offline(
-    encoders: Mapping[str, BaseEncoder], ground: Ground, ways: Sequence[str]
-) -> dict[str, dict[str, Learned]]:
-    """Of each way of learning from data, by label."""
-    learned: dict[str, dict[str, Learned]] = {way: {} for way in ways}
-    with Progress(total=len(ways) * len(encoders), unit="code") as progress:
-        for way in ways:
-            for label, encoder in encoders.items():
-                progress.set_description_str(f"{label} {way}", refresh=False)
-                learned[way][label] = offline.learned(encoder, ground, way)
-                progress.update()
-    return learned
