@@ -11,6 +11,7 @@ it is used.
 import sys
 from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -36,33 +37,17 @@ if TYPE_CHECKING:
     from jbrep.rl.controller import load_policy as load_policy
     from jbrep.study.config import Study as Study
 
-_CALLABLE = "collect", "evaluate", "report", "study"  # modules that are functions, too
-_PLACES = {
-    **dict.fromkeys(("train", "train_encoder"), "api"),
-    "Dataset": "dataset.reader",
-    "Encoded": "encoders.wrapper",
-    "Encoder": "encoders.encoder",
-    "Feature": "envs.task",
-    "JitterbugVecEnv": "encoders.vec_env",
-    "Lanes": "envs.lanes",
-    "Study": "study.config",
-    "Task": "envs.task",
-    "describe": "envs.description",
-    "load_policy": "rl.controller",
-}
-__all__ = [*_CALLABLE, *_PLACES]
-
-_load, _ = exports(__name__, _PLACES)
+_load, _, __all__ = exports(__name__)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _CALLABLE:
+    if name in __all__ and find_spec(f"{__name__}.{name}"):
         return import_module(f"{__name__}.{name}")
     return version(__name__) if name == "__version__" else _load(name)
 
 
 def __dir__() -> list[str]:
-    return sorted((*__all__, "__version__"))
+    return [*__all__, "__version__"]
 
 
 class _Callable(ModuleType):
@@ -78,7 +63,7 @@ class _Package(ModuleType):
     """This package, in which some modules can be called as soon as they are imported."""
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in _CALLABLE and isinstance(value, ModuleType):
+        if name in __all__ and isinstance(value, ModuleType):
             value.__class__ = _Callable
         super().__setattr__(name, value)
 

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 from jbrep.lazy import exports
 
 if TYPE_CHECKING:
-    from jbrep.dae.autoencoder import AE, DAE
+    from jbrep.dae.autoencoder import AE as AE
+    from jbrep.dae.autoencoder import DAE as DAE
 
-__all__ = ["AE", "DAE"]
-
-__getattr__, __dir__ = exports(__name__, {"AE": "autoencoder", "DAE": "autoencoder"})
+__getattr__, __dir__, __all__ = exports(__name__)

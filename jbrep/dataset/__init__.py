@@ -2,35 +2,18 @@
 
 from typing import TYPE_CHECKING
 
-from jbrep.errors import DamageError
 from jbrep.lazy import exports
 
 if TYPE_CHECKING:
-    from jbrep.dataset.columns import Batches, Column
-    from jbrep.dataset.layout import Layout
-    from jbrep.dataset.reader import Dataset, Episode, Split
-    from jbrep.dataset.scaled import ScaledDataset
-    from jbrep.dataset.scaling import Scaler
-    from jbrep.dataset.schema import DataSettings
+    from jbrep.dataset.columns import Batches as Batches
+    from jbrep.dataset.columns import Column as Column
+    from jbrep.dataset.layout import Layout as Layout
+    from jbrep.dataset.reader import Dataset as Dataset
+    from jbrep.dataset.reader import Episode as Episode
+    from jbrep.dataset.reader import Split as Split
+    from jbrep.dataset.scaled import ScaledDataset as ScaledDataset
+    from jbrep.dataset.scaling import Scaler as Scaler
+    from jbrep.dataset.schema import DataSettings as DataSettings
+    from jbrep.errors import DamageError as DamageError
 
-__all__ = [
-    "Batches",
-    "Column",
-    "DamageError",
-    "DataSettings",
-    "Dataset",
-    "Episode",
-    "Layout",
-    "ScaledDataset",
-    "Scaler",
-    "Split",
-]
-
-__getattr__, __dir__ = exports(
-    __name__,
-    {
-        **{"Batches": "columns", "Column": "columns", "DataSettings": "schema"},
-        **{"Layout": "layout", "Dataset": "reader", "Episode": "reader", "Split": "reader"},
-        **{"ScaledDataset": "scaled", "Scaler": "scaling"},
-    },
-)
+__getattr__, __dir__, __all__ = exports(__name__)

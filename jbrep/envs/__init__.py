@@ -5,12 +5,9 @@ from typing import TYPE_CHECKING
 from jbrep.lazy import exports
 
 if TYPE_CHECKING:
-    from jbrep.envs.description import describe
-    from jbrep.envs.lanes import Lanes
-    from jbrep.envs.task import Feature, Task
+    from jbrep.envs.description import describe as describe
+    from jbrep.envs.lanes import Lanes as Lanes
+    from jbrep.envs.task import Feature as Feature
+    from jbrep.envs.task import Task as Task
 
-__all__ = ["Feature", "Lanes", "Task", "describe"]
-
-__getattr__, __dir__ = exports(
-    __name__, {"Feature": "task", "Lanes": "lanes", "Task": "task", "describe": "description"}
-)
+__getattr__, __dir__, __all__ = exports(__name__)

@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING
 from jbrep.lazy import exports
 
 if TYPE_CHECKING:
-    from jbrep.evaluate.diagnosis import diagnose
+    from jbrep.evaluate.diagnosis import diagnose as diagnose
 
-__all__ = ["diagnose"]
-
-__getattr__, __dir__ = exports(__name__, {"diagnose": "diagnosis"})  # which imports scikit-learn
+__getattr__, __dir__, __all__ = exports(__name__)  # it imports scikit-learn

@@ -9,19 +9,10 @@ from typing import TYPE_CHECKING
 from jbrep.lazy import exports
 
 if TYPE_CHECKING:
-    from jbrep.jitterbug.domain import load, register_with_suite
-    from jbrep.jitterbug.gym import JitterbugEnv, JitterbugVectorEnv
-    from jbrep.jitterbug.tasks import environment_id
+    from jbrep.jitterbug.domain import load as load
+    from jbrep.jitterbug.domain import register_with_suite as register_with_suite
+    from jbrep.jitterbug.gym import JitterbugEnv as JitterbugEnv
+    from jbrep.jitterbug.gym import JitterbugVectorEnv as JitterbugVectorEnv
+    from jbrep.jitterbug.tasks import environment_id as environment_id
 
-__all__ = ["JitterbugEnv", "JitterbugVectorEnv", "environment_id", "load", "register_with_suite"]
-
-__getattr__, __dir__ = exports(
-    __name__,
-    {
-        "JitterbugEnv": "gym",
-        "JitterbugVectorEnv": "gym",
-        "environment_id": "tasks",
-        "load": "domain",
-        "register_with_suite": "domain",
-    },
-)
+__getattr__, __dir__, __all__ = exports(__name__)

@@ -5,12 +5,8 @@ from typing import TYPE_CHECKING
 from jbrep.lazy import exports
 
 if TYPE_CHECKING:
-    from jbrep.rl.checkpoint import StoppedError
-    from jbrep.rl.run import Run
-    from jbrep.rl.trainers import train
+    from jbrep.rl.checkpoint import StoppedError as StoppedError
+    from jbrep.rl.run import Run as Run
+    from jbrep.rl.trainers import train as train
 
-__all__ = ["Run", "StoppedError", "train"]
-
-__getattr__, __dir__ = exports(  # which import torch
-    __name__, {"Run": "run", "StoppedError": "checkpoint", "train": "trainers"}
-)
+__getattr__, __dir__, __all__ = exports(__name__)  # they import torch
