@@ -137,6 +137,7 @@ def test_a_policy_without_what_training_needs_is_none_to_begin_with(source, tmp_
     run = Run.of(**SETTINGS, steps=40, begin_from=str(folder))
     with pytest.raises(DamageError, match=r"its SHA-256 isn't in run\.json"):
         train(run, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
     record = json.loads((folder / RUN).read_text())
     record["policy_sha256"] = hashlib.sha256((folder / POLICY).read_bytes()).hexdigest()
     forge(folder / RUN, record)

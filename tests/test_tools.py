@@ -80,3 +80,22 @@ def test_the_search_for_a_gait_tells_constants_and_returns(capsys, monkeypatch):
     told = capsys.readouterr().out.splitlines()
     assert told[0].startswith("generation 1: ")
     assert "Turn(" in told[0]
+
+
+@pytest.mark.parametrize(
+    ("given", "code", "line"),
+    [
+        (["--help"], 0, "usage: attack"),
+        (["1", "report", "reprot"], 2, "unknown surface 'reprot': choose from tune, checkpoints"),
+        (["0"], 2, "usage: attack"),
+    ],
+)
+def test_what_can_be_attacked_is_told(given, code, line, capsys, monkeypatch):
+    import attack
+
+    monkeypatch.syspath_prepend(attack.HELPERS)
+    monkeypatch.setattr(sys, "argv", ["attack.py", *given])
+    with pytest.raises(SystemExit) as ended:
+        attack.main()
+    assert ended.value.code == code
+    assert "".join(capsys.readouterr()).startswith(line)

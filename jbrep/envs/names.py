@@ -4,7 +4,8 @@ import difflib
 import re
 import shlex
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from functools import cache
 from importlib import import_module, metadata
 from pathlib import Path
 from types import ModuleType
@@ -172,10 +173,15 @@ def environment_versions(env_id: str) -> dict[str, str]:
     package = module.partition(":")[0].partition(".")[0]
     if package == "jbrep":
         return {}
-    distributions = metadata.packages_distributions().get(package, [])
     behind = ["dm-control"] if package == "shimmy" else []
-    names = {"gymnasium", *distributions, *behind}
+    names = {"gymnasium", *_distributions().get(package, []), *behind}
     return {name: metadata.version(name) for name in sorted(names)}
+
+
+@cache
+def _distributions() -> Mapping[str, list[str]]:
+    """What every package that is installed belongs to: each has a list of its files to be read."""
+    return metadata.packages_distributions()
 
 
 def _import_shimmy() -> None:

@@ -138,6 +138,7 @@ def policy_to_begin_with(folder: Path, settings: RunSettings, latent_size: int) 
             f"can't begin with the policy in {folder}, whose algorithm, network and sizes must be "
             f"the same: {differing}"
         )
+    read(folder / POLICY, sha256)  # before anything of the run is written
     return sha256
 
 

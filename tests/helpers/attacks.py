@@ -11,6 +11,7 @@ import json
 import os
 import resource
 import signal
+import sys
 import time
 import traceback
 from collections import Counter
@@ -18,6 +19,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +61,6 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 class Surface:
     """What is attacked."""
 
-    name: str
     act: Callable[[Path], Any]  # makes something in a folder
     result: Callable[[Path], Any]  # what it made, which is the same each time
     # damages: the files, what reads them, and what that gives
@@ -168,16 +169,29 @@ def in_one_line(told):
 class Attacker:
     """Attacks a surface, in folders of its own."""
 
-    def __init__(self, surface: Surface, folder: Path, seed: int = 0):
-        self.surface, self.folder, self.tally = surface, folder / surface.name, Tally()
-        self.random = np.random.default_rng([seed, *surface.name.encode()])
+    def __init__(self, surface: Surface, folder: Path, seed: Sequence[int]):
+        self.surface, self.folder, self.tally = surface, folder, Tally()
+        self.random = np.random.default_rng(seed)
         self._number = 0
         self.peace = self._new()
-        begun = time.monotonic()
-        code, told = forked(surface.act, self.peace)
-        assert code == 0, (surface.name, told)
-        self.seconds = time.monotonic() - begun
+        self._import_what_it_imports()
         self.expected = surface.result(self.peace)
+
+    def _import_what_it_imports(self):
+        """Do it once in peace; import its modules here, or every fork does, in seconds."""
+        names = self.folder / "modules"
+
+        def act(folder):
+            try:
+                self.surface.act(folder)
+            finally:
+                names.write_text("\n".join(sys.modules))
+
+        code, told = forked(act, self.peace)
+        assert code == 0, told
+        for name in names.read_text().split():
+            with suppress(ImportError):  # some have no file
+                import_module(name)
 
     def _new(self):
         folder = self.folder / f"{self._number:05d}"
@@ -187,8 +201,8 @@ class Attacker:
         return folder
 
     @cached_property
-    def points(self):
-        """How often it comes to a point of synchronisation."""
+    def measured(self):
+        """How often it comes to a point of synchronisation, and how long it takes [s]."""
         folder, counted = self._new(), self.folder / "points"
 
         def count():
@@ -203,8 +217,9 @@ class Attacker:
 
                 setattr(os, name, noted)
 
+        begun = time.monotonic()
         assert forked(self.surface.act, folder, before=count)[0] == 0
-        return len(counted.read_text())
+        return len(counted.read_text()), time.monotonic() - begun
 
     def again(self, attack, folder, code):
         """The same once more must come to what it comes to in peace."""
@@ -218,7 +233,7 @@ class Attacker:
 
     def kills(self, count):
         """At points of synchronisation, every one where there are few, and at any time."""
-        total = self.points
+        total, seconds = self.measured
         some = range(1, total + 1)
         if total > count:
             some = sorted(self.random.choice(total, count, replace=False) + 1)
@@ -228,13 +243,13 @@ class Attacker:
             self.again("killed at a sync", folder, code)
         for _ in range(count // 2):
             folder = self._new()
-            wait = self.random.uniform(0, self.seconds)
+            wait = self.random.uniform(0, seconds)
             code, _ = forked(self.surface.act, folder, seconds=wait)
             self.again("killed at any time", folder, code)
 
     def full_disks(self, count):
         """An error at a point of synchronisation, and files that can't grow."""
-        total = self.points
+        total, _ = self.measured
         some = range(1, total + 1)
         if total > count:
             some = sorted(self.random.choice(total, count, replace=False) + 1)
@@ -304,8 +319,8 @@ class Attacker:
             self.tally.note(harm.__name__.replace("_", " "), outcome.partition(":")[0], fault)
 
 
-def attack(surface, folder, *, kills=0, full=0, twice=0, flips=0, seed=0):
-    """Attack in each way so many times; the tally."""
+def attack(surface, folder, *, kills=0, full=0, twice=0, flips=0, seed=(0,)):
+    """Attack in each way so many times, in a new folder; the tally."""
     attacker = Attacker(surface, folder, seed)
     for way, count in (
         (attacker.kills, kills),

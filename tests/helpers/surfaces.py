@@ -2,9 +2,9 @@
 
 import os
 import shutil
+from functools import cached_property
 from pathlib import Path
 
-import torch._dynamo  # noqa: F401  or every fork imports it, in seconds
 from attacks import MALFORMED, Surface, command, digest, forked
 from click.testing import CliRunner
 from command import in_this_process
@@ -26,7 +26,7 @@ from jbrep.dataset.formats import export, open_source
 from jbrep.dataset.manifest import read_manifest
 from jbrep.encoders import load
 from jbrep.envs import describe
-from jbrep.inspection import inspect  # noqa: F401  the same
+from jbrep.envs.names import environment_versions
 from jbrep.records.document import read_document
 from jbrep.report import make_report
 from jbrep.report.report import STATISTICS, SUMMARY
@@ -34,7 +34,6 @@ from jbrep.report.tables import read_tables
 from jbrep.rl import Run
 from jbrep.rl.files import CHECKPOINT, ENCODER, EVALUATIONS, POLICY, RUN
 from jbrep.rl.job import Job, Session
-from jbrep.rl.policy import load_run
 from jbrep.rl.trainers import train_jobs
 from jbrep.rl.tune import BEST, SEARCH
 from jbrep.study.config import Study
@@ -45,6 +44,7 @@ from jbrep.study.runner import run_study
 from jbrep.study.tables import REFERENCE_RETURNS, RETURNS
 
 PENDULUM = describe("Pendulum-v1", max_episode_steps=20)
+environment_versions(PENDULUM.id)  # or every fork looks through the files of all packages
 SHORT = ("--task", "Pendulum-v1", "--episode-steps", 20, "--steps", 40, "--evaluation-episodes", 1)
 TINY = Study(
     tasks=("face_direction",),
@@ -59,35 +59,42 @@ TINY = Study(
 )
 
 
-def surfaces(shared):
-    """All of them; what they read is made once in a folder, before the first fork."""
-    data, model = shared / "data", shared / "model.onnx"
-    collect(brief(), data)
-    task = ("--task", "face_direction")
-    command_or_refusal("encoder", "export", "pca-4", *task, "--out", model)
-    exported = {to: shared / f"data.{to}" for to in ("npz", "parquet", "minari")}
-    for to, path in exported.items():
-        export(Dataset(data), to, path)
-    exported["minari"] = next(exported["minari"].rglob("main_data.hdf5")).parent
-    tables = shared / "study"
-    code, told = forked(_study, tables)
-    assert code == 0, told
-    run = next(tables.rglob(POLICY)).parent
-    return [
-        _tune(),
-        _run("sac", overrides=CHEAP, trainer="cohort"),
-        _run("ppo", overrides={**SMALL, "n_steps": 8, "batch_size": 8}),
-        *(_import(to, path) for to, path in exported.items()),
-        *(_import(to, write(shared), told, **FOREIGN) for to, (write, told) in LOGS.items()),
-        *(_export(to, Dataset(data)) for to in exported),
-        _encoder_import(model, task),
-        _encoder_export(task),
-        _registration(),
-        _report(tables),
-        *(_of_a_run(name, run, *each) for name, each in OF_A_RUN.items()),
-    ]
+class Shared:
+    """What surfaces read: each is made once in a folder, in peace, when it is first needed."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        folder.mkdir()
+
+    @cached_property
+    def data(self):
+        collect(brief(), self.folder / "data")
+        return Dataset(self.folder / "data")
+
+    @cached_property
+    def model(self):
+        path = self.folder / "model.onnx"
+        command_or_refusal("encoder", "export", "pca-4", *TASK, "--out", path)
+        return path
+
+    @cached_property
+    def study(self):
+        folder = self.folder / "study"
+        code, told = forked(_study, folder)
+        assert code == 0, told
+        return folder
+
+    @property
+    def run(self):
+        return next(self.study.rglob(POLICY)).parent
+
+    def exported(self, to):
+        path = self.folder / f"data.{to}"
+        export(self.data, to, path)
+        return next(path.rglob("main_data.hdf5")).parent if to == "minari" else path
 
 
+TASK = ("--task", "face_direction")
 _LOG = ("--observations", "pitch,gyro,ticks", "--actions", "u", "--time", "time", "--gap", "0.5")
 _JOINTS = ("--observations", "/joint_states.position.*", "--actions", "/arm/command.data")
 _BAG = (*_JOINTS, "--rate", "50", "--gap", "0.15")
@@ -100,19 +107,8 @@ LOGS = {  # of other tools: what writes them, and what their columns are said to
     "d4rl": (lambda folder: write_d4rl(folder / "hopper.hdf5"), ()),
     "robomimic": (lambda folder: write_robomimic(folder / "lift.hdf5"), ()),
 }
-FOREIGN = {"harms": MALFORMED, "has_checksums": False}
 SMALL = {"net_arch": [4], "num_envs": 1}
 CHEAP = {"net_arch": [8], "learning_starts": 8, "batch_size": 8, "buffer_size": 100}
-OF_A_RUN = {  # in the folder that it stands in, and what that makes
-    "rl --from": (
-        "rl --task face_direction --algorithm a2c --preset paper --episode-steps 20 --steps 40 "
-        "--evaluation-episodes 1 --from run --out it",
-        "it/*.csv",
-    ),
-    "inspect": ("inspect run --out it.rrd", "it.rrd"),
-    "render": ("render run --size 64x64 --out it.gif", "it.gif"),
-    "behaviour": ("behaviour run --episodes 1 --out it", "it/*"),
-}
 
 
 def _study(folder):
@@ -137,7 +133,7 @@ def _tune():
     def files(folder):
         return [folder / "it" / SEARCH, *folder.rglob(RUN), *folder.rglob(EVALUATIONS)]
 
-    return Surface("tune", act, result, files, read)
+    return Surface(act, result, files, read)
 
 
 def command_or_refusal(*arguments):
@@ -186,7 +182,7 @@ def _run(algorithm, **settings):
             if one
         ]
 
-    return Surface(f"checkpoints of {algorithm}", act, result, files, read)
+    return Surface(act, result, files, read)
 
 
 LAST = {"preset": "modern", "evaluation_episodes": 1, "final_episodes": 1, "evaluate_every": 32}
@@ -229,7 +225,7 @@ def _import(to, path, options=(), **how):
         shutil.rmtree(out)
         return manifest.fingerprint, manifest.settings.as_json()
 
-    return Surface(f"import of {to}", act, result, files, read, **how)
+    return Surface(act, result, files, read, **how)
 
 
 def _export(to, dataset):
@@ -243,12 +239,12 @@ def _export(to, dataset):
         left = [path.name for path in folder.rglob(".*")]
         return known, left
 
-    return Surface(f"export to {to}", act, result)
+    return Surface(act, result)
 
 
-def _encoder_import(model, task):
+def _encoder_import(model):
     def act(folder):
-        command("encoder", "import", model, *task, "--out", folder / "it.safetensors")
+        command("encoder", "import", model, *TASK, "--out", folder / "it.safetensors")
 
     def result(folder):
         return load(folder / "it.safetensors").fingerprint
@@ -256,14 +252,14 @@ def _encoder_import(model, task):
     def files(folder):
         return [folder / "it.safetensors"]
 
-    return Surface("encoder import", act, result, files, result)
+    return Surface(act, result, files, result)
 
 
-def _encoder_export(task):
+def _encoder_export():
     def act(folder):
-        command("encoder", "export", "dae-4", *task, "--out", folder / "it.onnx")
+        command("encoder", "export", "dae-4", *TASK, "--out", folder / "it.onnx")
 
-    return Surface("encoder export", act, lambda folder: digest(folder / "it.onnx"))
+    return Surface(act, lambda folder: digest(folder / "it.onnx"))
 
 
 def _registration():
@@ -283,7 +279,7 @@ def _registration():
         plan.write()
         return plan.registration
 
-    return Surface("registration", act, result, files, read)
+    return Surface(act, result, files, read)
 
 
 def _report(study: Path):
@@ -313,30 +309,86 @@ def _report(study: Path):
         tables = read_tables(folder / "alone")
         return tables.returns, tables.references, tables.record.text()
 
-    return Surface("report", act, result, files, read, prepare)
+    return Surface(act, result, files, read, prepare)
 
 
-def _of_a_run(name, run: Path, line, made):
-    """A command that begins with a run, which is damaged."""
+def _of_a_run(run: Path, line, made, says=digest, reads=(RUN, POLICY, ENCODER)):
+    """A command that begins with a run, of which some files are read, and what it makes."""
+
+    def prepare(folder):
+        shutil.copytree(run, folder / "run")
 
     def act(folder):
         os.chdir(folder)  # as what is made tells the paths that it was made from
         command(*line.split())
 
     def result(folder):
-        paths = sorted(folder.glob(made))
-        if name != "inspect":
-            return digest(*paths)
-        chunks = RrdReader(*paths).stream()  # rows have the time at which they were sent
-        return sorted((each.entity_path, each.num_rows) for each in chunks)
+        return says(*sorted(folder.glob(made)))
 
     def files(folder):
-        return [folder / "run" / name for name in (RUN, POLICY, ENCODER)]
+        """Of a copy."""
+        if not (folder / "damaged").exists():
+            prepare(folder / "damaged")
+        return [folder / "damaged" / "run" / name for name in reads]
 
     def read(folder):
-        trained = load_run(folder / "run")
-        return trained.settings, [each.tolist() for each in trained.policy.parameters()]
+        """What the command makes: whole, or nothing."""
+        files(folder)
+        os.chdir(folder / "damaged")
+        try:
+            command_or_refusal(*line.split())
+            return result(Path.cwd())
+        except SystemExit:
+            left = sorted(path.name for path in Path.cwd().iterdir())
+            assert left == ["run"], left
+            raise
+        finally:
+            for path in Path.cwd().glob("it*"):
+                (shutil.rmtree if path.is_dir() else Path.unlink)(path)
 
-    return Surface(
-        name, act, result, files, read, lambda folder: shutil.copytree(run, folder / "run")
-    )
+    return Surface(act, result, files, read, prepare)
+
+
+def _rows(recording):
+    """What a recording has, as its rows tell the time at which they were sent."""
+    chunks = RrdReader(recording).stream()
+    return sorted((each.entity_path, each.num_rows) for each in chunks)
+
+
+SHORT_RUN = (
+    "rl --task face_direction --algorithm a2c --preset paper --episode-steps 20 --steps 40 "
+    "--evaluation-episodes 1 --from run --out it"
+)
+SURFACES = {  # by name, what makes them of `Shared`
+    "tune": lambda shared: _tune(),
+    "checkpoints of sac": lambda shared: _run("sac", overrides=CHEAP, trainer="cohort"),
+    "checkpoints of ppo": lambda shared: _run(
+        "ppo", overrides={**SMALL, "n_steps": 8, "batch_size": 8}
+    ),
+    **{
+        f"import of {to}": lambda shared, to=to: _import(to, shared.exported(to))
+        for to in ("npz", "parquet", "minari")
+    },
+    **{
+        f"import of {to}": lambda shared, to=to, write=write, told=told: _import(
+            to, write(shared.folder), told, harms=MALFORMED, has_checksums=False
+        )
+        for to, (write, told) in LOGS.items()
+    },
+    **{
+        f"export to {to}": lambda shared, to=to: _export(to, shared.data)
+        for to in ("npz", "parquet", "minari")
+    },
+    "encoder import": lambda shared: _encoder_import(shared.model),
+    "encoder export": lambda shared: _encoder_export(),
+    "registration": lambda shared: _registration(),
+    "report": lambda shared: _report(shared.study),
+    "rl --from": lambda shared: _of_a_run(shared.run, SHORT_RUN, "it/*.csv", reads=(RUN, POLICY)),
+    "inspect": lambda shared: _of_a_run(shared.run, "inspect run --out it.rrd", "it.rrd", _rows),
+    "render": lambda shared: _of_a_run(
+        shared.run, "render run --size 64x64 --out it.gif", "it.gif"
+    ),
+    "behaviour": lambda shared: _of_a_run(
+        shared.run, "behaviour run --episodes 1 --out it", "it/*"
+    ),
+}
