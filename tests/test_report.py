@@ -22,6 +22,7 @@ from jbrep.envs import describe
 from jbrep.errors import InputError
 from jbrep.evaluate.table import DIAGNOSTICS, SCALARS, Diagnosed, write_diagnostics
 from jbrep.play.sources import find_episode
+from jbrep.records.document import read_document
 from jbrep.records.tables import write_csv, write_rows
 from jbrep.report import make_report, report, write_report
 from jbrep.report.answer import answer
@@ -34,9 +35,10 @@ from jbrep.report.tables import read_tables
 from jbrep.report.words import answers
 from jbrep.rl.files import ENCODER, EVALUATIONS, Evaluation
 from jbrep.stats.claims import CLAIMS, FASTER
+from jbrep.stats.rules import Rules
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan
-from jbrep.study.record import RECORD
+from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.results import conclude
 from jbrep.study.tables import REFERENCE_RETURNS, write_references
 from jbrep.text import SIGNIFICANT, Table, number
@@ -453,7 +455,17 @@ def test_where_nothing_was_compared_the_claims_say_so(whole):
     (first, *_) = answers(alone)
     assert first.headline.endswith("of the gain: no reduced state was compared")
     told = answer(read_tables(whole)._replace(analysis=alone))
-    assert told[-1] == "No reduced state was compared with the full one."
+    assert told[-1] == "Nothing was compared with full."
+
+
+def test_a_report_compares_with_the_study_s_baseline(whole, tmp_path):
+    copy_tables(whole, tmp_path)
+    record = read_document(tmp_path / RECORD, RunsRecord)
+    against = record.study.replace(verdicts=Rules(baseline="dae-8"))
+    record.replace(study=against).write(tmp_path / RECORD)
+    told = markdown(read_tables(tmp_path), [], [], "figure.png")
+    assert "of dae-8's gain" in told
+    assert "full's" not in told
 
 
 def test_where_the_baseline_did_not_learn_nothing_is_compared(whole, tmp_path):

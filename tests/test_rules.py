@@ -329,6 +329,15 @@ def test_nothing_follows_from_agents_that_learn_nothing():
     assert found[0].reason == "agents on the full state didn't learn"
 
 
+def test_the_baseline_and_the_error_are_the_study_s():
+    other = "face_direction/ddpg/full"
+    groups = {KEY: {"dae-12": arm("dae-12", drawn(250, 20, 20, 0)), "full": FULL}}
+    rules = Rules(primary=(other,), baseline="dae-12", error=0.01, looks=(1.0,))
+    (found, *_) = Planned(rules, tuple(range(20)))(groups)[KEY]["full"]
+    assert found.reason == "agents on dae-12 didn't learn"
+    assert found.level == pytest.approx(0.01)
+
+
 def test_nothing_is_said_between_looks():
     early = verdicts(FULL[:9], BETTER[:9], seeds=tuple(range(20)))["dae-12"]
     assert words(early) == ["not yet"] * 4

@@ -26,6 +26,7 @@ from jbrep.stats.intervals import (
 )
 from jbrep.stats.nested import components
 from jbrep.stats.reliability import drawdown, expected_shortfall, fixed_policy, within_runs
+from jbrep.stats.rules import Planned, Rules
 from jbrep.text import SIGNIFICANT, interval
 
 GRID = np.arange(0, 10_001, 1000)
@@ -67,6 +68,17 @@ def runs():
 @pytest.fixture(scope="module")
 def analysis(runs):
     return analyse(runs)
+
+
+def test_all_are_compared_with_the_baseline(runs, analysis):
+    (against,) = analyse(runs, Planned(Rules(baseline="dae-8"))).groups
+    assert [each.representation for each in against.labels] == ["dae-8", "dae-4", "full"]
+    (group,), tested = analysis.groups, "final_return_difference"
+    (there,) = (c for c in group.comparisons if c.representation == "dae-8")
+    (back,) = (c for c in against.comparisons if c.representation == "full")
+    assert there.numbers[tested].value == pytest.approx(-back.numbers[tested].value)
+    with pytest.raises(InputError, match="no runs of the baseline 'pca-8'"):
+        analyse(runs, Planned(Rules(baseline="pca-8")))
 
 
 def mean(values):

@@ -40,6 +40,7 @@ from jbrep.report.tables import read_tables
 from jbrep.rl import Run, train
 from jbrep.rl.files import CHECKPOINT, RUN, read_run
 from jbrep.rl.presets import PRESETS, get_preset
+from jbrep.stats.rules import Rules
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, as_study, read_study
 from jbrep.study.plan import STUDY, Plan, read_plan
@@ -183,6 +184,10 @@ def test_a_study_without_comparisons_says_so_first(representations, tmp_path, mo
     assert study.comparisons == 0
     assert "compares nothing" in study.notices[0]
     assert TINY.comparisons == 1
+    against = TINY.replace(representations=("pca-8", "pca-4"), verdicts=Rules(baseline="pca-4"))
+    assert against.comparisons == 1
+    with pytest.raises(InputError, match=r"baseline is 'pca-9': it must be one of .*, full, pca-8"):
+        TINY.replace(verdicts=Rules(baseline="pca-9"))
     assert TINY.notices == [
         "This study is exploratory: its report will give no verdicts, as its file names no cell in "
         "verdicts.primary.",

@@ -25,6 +25,7 @@ from jbrep.rl.files import FINISHED
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.intervals import variance_ratio
+from jbrep.stats.rules import Planned, Rules
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.tables import RETURNS, Return
 from jbrep.text import rounded, table
@@ -192,7 +193,7 @@ def main(results: Path) -> None:
     text = "\n\n".join(texts) + "\n"
     print(text, end="")
     write_whole(results / SUMMARY, text.encode())
-    groups = analyse(runs, baseline=SB3).groups
+    groups = analyse(runs, Planned(Rules(baseline=SB3))).groups
     write([curves(groups, {}, partial(styles, ARMS, SB3))], results / "figures")
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 
-from jbrep.encoders import FULL
 from jbrep.report.returns import by_task, named, shown_return
 from jbrep.report.tables import Tables
 from jbrep.report.words import listed
@@ -20,10 +19,6 @@ _ALIKE = {
     UNCLEAR: "Whether any learned isn't clear.",
     NO: "None learned.",
 }
-_NOTHING = (
-    f"There is nothing to compare: no cell has two runs of {FULL} and of another representation "
-    "that have ended."
-)
 _ALONE = {
     YES: "They learned.",
     NO: "They didn't learn.",
@@ -34,7 +29,10 @@ _ALONE = {
 def answer(tables: Tables) -> list[str]:
     """Final returns beside policies that don't learn, by task; then what follows from them."""
     if tables.analysis is None:
-        return [_NOTHING]
+        return [
+            f"There is nothing to compare: no cell has two runs of {tables.baseline} and of "
+            "another representation that have ended."
+        ]
     tasks = by_task(tables.analysis)
     return [*map(_returns, tasks), " ".join(_conclusion(tables.analysis))]
 
@@ -94,7 +92,7 @@ def _conclusion(analysis: Analysis) -> Iterable[str]:
     """What can be concluded of the comparisons with the baseline."""
     compared = [group for group in analysis.groups if group.comparisons]
     if not compared:
-        yield "No reduced state was compared with the full one."
+        yield f"Nothing was compared with {analysis.baseline}."
         return
     silent = [group for group in compared if group.labels[0].learnt != YES]
     if silent:

@@ -10,9 +10,9 @@ from jbrep.records.storage import exists
 from jbrep.records.tables import read_rows
 from jbrep.rl.files import ENCODER
 from jbrep.stats import Analysis
-from jbrep.stats.rules import Planned
+from jbrep.stats.rules import Planned, Rules
 from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.registration import REGISTRATION, read_registration
+from jbrep.study.registration import REGISTRATION, Registration, read_registration
 from jbrep.study.results import found
 from jbrep.study.tables import (
     REFERENCE_RETURNS,
@@ -42,6 +42,19 @@ class Tables(NamedTuple):
     def title(self) -> str:
         """What the study's file calls it, or else the folder."""
         return (self.record.study.title if self.record.study else "") or self.name
+
+    @property
+    def baseline(self) -> str:
+        """The representation that the others are compared with."""
+        return (self.record.study.verdicts if self.record.study else Rules()).baseline
+
+
+def _planned(record: RunsRecord, registration: Registration | None) -> Planned:
+    """What runs are compared with, and what reaches verdicts: only what was registered."""
+    if registration:
+        return registration.registered.planned
+    rules = record.study.verdicts if record.study else Rules()
+    return Planned(rules.replace(primary=()))
 
 
 def check_tables(folder: Path) -> None:
@@ -80,7 +93,6 @@ def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
     told, known = sha256.get(RUN_INFOS), sha256.get(DIAGNOSTICS)
     infos = read_rows(folder / RUN_INFOS, RunInfo, told) if told else []
     rows = read_diagnostics(folder / DIAGNOSTICS, known) if known else []
-    planned = registration.registered.planned if registration else Planned()
-    statistics = found(record, returns, references, planned, across_trainers)
+    statistics = found(record, returns, references, _planned(record, registration), across_trainers)
     name = folder.resolve().name.encode(errors="replace").decode()
     return Tables(name, record, returns, infos, references, by_label(rows), *statistics)

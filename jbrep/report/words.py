@@ -17,7 +17,7 @@ from jbrep.stats.claims import (
     Verdict,
 )
 from jbrep.stats.comparison import Comparison
-from jbrep.stats.rules import ERROR, Planned, Rules
+from jbrep.stats.rules import Planned, Rules
 from jbrep.stats.scale import STILL
 from jbrep.study.record import RegistrationFacts
 from jbrep.text import SIGNIFICANT, interval, number
@@ -25,28 +25,28 @@ from jbrep.text import SIGNIFICANT, interval, number
 EFFECTS = (  # of `jbrep.stats.power`
     f"Power of {NOT_WORSE.name!r} and {WITHIN_HALF.name!r}: if agents keep all of the gain, and "
     "final returns of runs have an SD of 5, 10 or 20 % of it, on either side. Of "
-    f"{LESS_VARIANCE.name!r}: if the spread of curves is 1/2, 1/3 or 1/5 of the full agents'. Of "
+    f"{LESS_VARIANCE.name!r}: if the spread of curves is 1/2, 1/3 or 1/5 of the baseline's. Of "
     f"{FASTER.name!r}: if half of the gain comes earlier by a tenth of training, and the time "
     "varies by an SD of 5, 10 or 20 % of training. Each by itself: claims before it, and runs that "
     "fail to learn, may stop a verdict."
 )
-_KEPT = "gain over {over}, as a share of that on the full state"
+_KEPT = "gain over {over}, as a share of that on {baseline}"
 _HEADS = {  # of columns
-    NOT_WORSE.name: "of full's gain",
-    LESS_VARIANCE.name: "spread of curves, times full's",
-    FASTER.name: "steps to half of full's gain",
-    WITHIN_HALF.name: "of full's gain",
+    NOT_WORSE.name: "of {whose} gain",
+    LESS_VARIANCE.name: "spread of curves, times {whose}",
+    FASTER.name: "steps to half of {whose} gain",
+    WITHIN_HALF.name: "of {whose} gain",
 }
 _OVER = {"blind": "the best policy that doesn't look", "still": "standing still"}
 _CLAIMS = {  # as a sentence, with a place for the percentage that may be lost; what is estimated
     NOT_WORSE.name: ("Agents on less state lose at most {} of the gain", _KEPT),
     LESS_VARIANCE.name: (
         "Their training varies less from run to run",
-        "spread of training curves, as a multiple of that on the full state",
+        "spread of training curves, as a multiple of that on {baseline}",
     ),
     FASTER.name: (
         "They learn faster",
-        "steps to half of the full agents' gain, beside what these take",
+        "steps to half of the gain on {baseline}, beside what agents there take",
     ),
     WITHIN_HALF.name: ("They lose at most {} of it", _KEPT),
 }
@@ -92,15 +92,15 @@ def over(rules: Rules) -> str:
 
 def statements(planned: Planned) -> list[Statement]:
     """What is claimed, in the order of the tests."""
-    found = []
-    for name in planned.rules.claims:
+    found, rules, baseline = [], planned.rules, planned.rules.baseline
+    whose = f"{baseline}'" if baseline.endswith("s") else f"{baseline}'s"
+    for name in rules.claims:
         claim = CLAIMS[name]
-        percent = f"{100 * (1 - claim.boundary(planned.rules.margin)):.3g} %"
+        percent = f"{100 * (1 - claim.boundary(rules.margin)):.3g} %"
         sentence, estimand = _CLAIMS[name]
-        estimated = estimand.format(over=over(planned.rules))
-        found.append(
-            Statement(name, _HEADS[name], sentence.format(percent), estimated, claim.is_ratio)
-        )
+        against = {"whose": whose, "baseline": rules.compared_with, "over": over(rules)}
+        head, estimated = _HEADS[name].format(**against), estimand.format(**against)
+        found.append(Statement(name, head, sentence.format(percent), estimated, claim.is_ratio))
     return found
 
 
@@ -117,8 +117,8 @@ def notes(planned: Planned) -> list[str]:
     levels = ", at O'Brien and Fleming's levels" if len(planned.counts) > 1 else ""
     return [
         f"Claims are tested in the order {', '.join(planned.rules.claims)}, each once the one "
-        f"before it is supported; {shared} an error of {100 * ERROR:.0f} %, two-sided, in Holm's "
-        "way.",
+        f"before it is supported; {shared} an error of {100 * planned.rules.error:.3g} %, "
+        "two-sided, in Holm's way.",
         f"Verdicts may come after {counts} runs of each arm{levels}; other cells are exploratory.",
     ]
 

@@ -24,7 +24,7 @@ class Aggregate:
 
     algorithm: str
     representation: str
-    # their names; those where agents on the full state don't surely learn are left out
+    # their names; those where agents on the baseline don't surely learn are left out
     tasks: tuple[str, ...]
     runs: int  # on each task: the first of those with more
     iqm: Interval  # interquartile mean of scores, with its 95 % interval

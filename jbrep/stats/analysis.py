@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from jbrep.encoders import FULL
 from jbrep.stats.aggregates import Aggregate, aggregates
 from jbrep.stats.bootstrap import Array, Interval, without_nan
 from jbrep.stats.claims import Verdict
@@ -69,11 +68,15 @@ class GroupAnalysis:
 class Analysis:
     """The results of a study."""
 
-    baseline: str  # the representation that the others are compared with
     seed: int  # of all resampling
     planned: Planned  # what reached the verdicts
     groups: tuple[GroupAnalysis, ...]  # by task and algorithm
     aggregates: tuple[Aggregate, ...]  # results across tasks, where an algorithm learned several
+
+    @property
+    def baseline(self) -> str:
+        """The representation that the others are compared with."""
+        return self.planned.rules.baseline
 
     @property
     def open_aggregates(self) -> list[Aggregate]:
@@ -86,7 +89,6 @@ class Analysis:
 def analyse(
     runs: Sequence[RunCurve],
     planned: Planned | None = None,
-    baseline: str = FULL,
     seed: int = 0,
     references: References | None = None,
 ) -> Analysis:
@@ -94,8 +96,8 @@ def analyse(
 
     Args:
         runs: every run of the study.
-        planned: what reaches verdicts; by default there are estimates of each claim alone.
-        baseline: the representation that the others are compared with.
+        planned: what the runs are compared with, and what reaches verdicts; by default the full
+            observation, and there are estimates of each claim alone.
         seed: of all resampling.
         references: returns of policies that don't learn, by task and policy.
 
@@ -103,14 +105,13 @@ def analyse(
         InputError: runs that can't be compared, or would mislead; see jbrep.stats.runs.groups.
     """
     planned = planned or Planned()
-    by_group, played = groups(runs, baseline), references or {}
+    by_group, played = groups(runs, planned.rules.baseline), references or {}
     verdicts = planned(by_group, seed)
     analysed = tuple(
         _analyse_group(group, verdicts[key], played.get(key[0], {}), planned.rules, seed)
         for key, group in by_group.items()
     )
     return Analysis(
-        baseline=baseline,
         seed=seed,
         planned=planned,
         groups=analysed,

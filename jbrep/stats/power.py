@@ -9,7 +9,7 @@ import numpy as np
 from jbrep.stats.arms import FEWEST_UNITS
 from jbrep.stats.claims import CLAIMS, FASTER, LESS_VARIANCE
 from jbrep.stats.intervals import Bounds, difference_within
-from jbrep.stats.rules import ERROR, Planned, Rules, levels, most_failing
+from jbrep.stats.rules import Planned, Rules, levels, most_failing
 from jbrep.stats.spread import PERMUTATIONS, Curves, spread_p
 
 _SDS = (0.05, 0.1, 0.2)
@@ -25,7 +25,7 @@ class Arms(NamedTuple):
 
     runs: int  # of the representation
     units: int  # its encoders, if they are the units of tests, else its runs
-    baseline: int  # runs of the full observation
+    baseline: int  # runs of the baseline
 
 
 class Prospect(NamedTuple):
@@ -68,7 +68,7 @@ def prospects(planned: Planned, arms: Mapping[str, Arms]) -> Iterator[Prospect]:
 
 
 def _level(planned: Planned) -> float:
-    return levels(planned.looks, ERROR / max(1, len(planned.rules.primary)))[-1]
+    return levels(planned.looks, planned.rules.share)[-1]
 
 
 def _least_p(claim: str) -> float:

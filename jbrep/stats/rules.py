@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import binomtest, norm
 
+from jbrep.encoders import FULL
 from jbrep.errors import InputError
 from jbrep.records.record import Record
 from jbrep.stats.arms import FEWEST_UNITS, Sides, learns, measure
@@ -43,8 +44,6 @@ from jbrep.stats.intervals import LEVEL, UNDEFINED, unless_few
 from jbrep.stats.runs import Group, Key
 from jbrep.stats.scale import STILL, best_blind
 
-NOTHING_LEARNT = "agents on the full state didn't learn"
-ERROR = 0.05  # the probability that any of a study's verdicts is wrong, two-sided
 _USUAL_LOOKS = (0.5, 1.0)
 _Share = Annotated[float, Meta(gt=0, lt=1)]
 _POINTS = 401  # of the grid on which paths are integrated, with Simpson's rule
@@ -64,6 +63,13 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
     claims: Annotated[
         tuple[str, ...], Meta(description="In the order in which they are tested.")
     ] = tuple(CLAIMS)
+    baseline: Annotated[
+        str, Meta(description="The representation that the others are compared with.")
+    ] = FULL
+    error: Annotated[
+        _Share,
+        Meta(description="The probability that any of the verdicts is wrong, two-sided."),
+    ] = 0.05
     margin: Annotated[
         _Share, Meta(description='The share of the gain that "not worse" may lose.')
     ] = 0.1
@@ -103,6 +109,21 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
                 "comes first, as agents that learn nothing vary little"
             )
 
+    @property
+    def share(self) -> float:
+        """The level of a cell before any is decided."""
+        return self.error / max(1, len(self.primary))
+
+    @property
+    def compared_with(self) -> str:
+        """What the agents that others are compared with see, in words."""
+        return "the full state" if self.baseline == FULL else self.baseline
+
+    @property
+    def nothing_learnt(self) -> str:
+        """Why there is no verdict where these agents don't learn."""
+        return f"agents on {self.compared_with} didn't learn"
+
     def reference(self, returns: Mapping[str, float]) -> str | None:
         """The policy that gains are counted over, of those whose returns are known."""
         if self.gains_over == "still":
@@ -138,7 +159,7 @@ class Planned:
         Raises:
             InputError: runs of a group have no range of steps in common.
         """
-        cells = {name: _Cell(name, ERROR / len(self.rules.primary)) for name in self.rules.primary}
+        cells = {name: _Cell(name, self.rules.share) for name in self.rules.primary}
         for look in range(len(self.looks)):
             _look(list(cells.values()), groups, self, look, seed)
         return {
@@ -244,7 +265,7 @@ def _reason(claim: Claim, sides: Sides, rules: Rules, direction: int, level: flo
     if fewest < FEWEST_UNITS:
         return f"{fewest} {what}; verdicts take {FEWEST_UNITS}"
     if not learns(y, frame):
-        return NOTHING_LEARNT
+        return rules.nothing_learnt
     if claim.limits_failures and direction > 0:
         most = most_failing(x.units - x.learnt, x.units, level)
         if most > rules.failing:
@@ -281,7 +302,7 @@ def _estimated(claim: Claim, sides: Sides, rules: Rules, seed: int) -> Verdict:
         runs=(x.runs, y.runs),
         encoders=x.units if x.by_encoder else 0,
         look=0,
-        reason=None if compares else NOTHING_LEARNT,
+        reason=None if compares else rules.nothing_learnt,
     )
 
 

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from jbrep.dataset.settings import MAX_ROOT_SEED
-from jbrep.encoders import FULL
 from jbrep.encoders.shipped import UNLEARNED
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES
@@ -206,12 +205,18 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         cells = {
             f"{task}/{algorithm}/{each.name}": each
             for task, algorithm, each in product(self.tasks, self.algorithms, self.observed)
-            if each.name != FULL
+            if each.name != self.verdicts.baseline
         }
         short = {full: name for name, full in SHORT_NAMES.items()}
         if self.verdicts.primary and (long := [task for task in self.tasks if task in short]):
             raise InputError(
                 f"tasks has {long[0]}: say {short[long[0]]}, as tables do, where there are verdicts"
+            )
+        names = [each.name for each in self.observed]
+        if (baseline := self.verdicts.baseline) not in {*names, Rules().baseline}:
+            raise InputError(
+                f"verdicts.baseline is {baseline!r}: it must be one of the representations, "
+                f"{', '.join(names)}"
             )
         counts = self.planned.counts
         if len(set(counts)) < len(counts):
@@ -223,7 +228,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             if cell not in cells or not self.comparisons:
                 raise InputError(
                     f"verdicts.primary has {cell}: it must be of TASK/ALGORITHM/REPRESENTATION of "
-                    f"this study, compared with {FULL}"
+                    f"this study, compared with {self.verdicts.baseline}"
                 )
             for claim in self.verdicts.claims:
                 if reason := obstacle(self.verdicts, claim, self.arms(cells[cell])):
@@ -239,7 +244,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                 )
 
     def arms(self, representation: Representation) -> Arms:
-        """How many runs are planned of a representation, and of the full observation."""
+        """How many runs are planned of a representation, and of the baseline."""
         runs, encoders = len(self.seeds), len(representation.shares(self.seeds))
         return Arms(runs, encoders if encoders >= FEWEST_UNITS else runs, runs)
 
@@ -255,10 +260,10 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
 
     @property
     def comparisons(self) -> int:
-        """How many times a representation is compared with the full observation."""
-        if FULL not in self.representations:
+        """How many times a representation is compared with the baseline."""
+        if self.verdicts.baseline not in {each.name for each in self.observed}:
             return 0
-        return len(self.tasks) * len(self.algorithms) * (len(self.representations) - 1)
+        return len(self.tasks) * len(self.algorithms) * (len(self.observed) - 1)
 
     def toml(self) -> str:
         """The file that describes it."""
@@ -282,8 +287,8 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         ]
         if not self.comparisons:
             lines.append(
-                f"This study compares nothing: representations must have {FULL} and at least one "
-                "other."
+                "This study compares nothing: representations must have "
+                f"{self.verdicts.baseline} and at least one other."
             )
         elif not self.verdicts.primary:
             lines.append(

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jbrep.encoders import FULL
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.evaluate.table import DIAGNOSTICS
@@ -98,7 +97,7 @@ def found(
     runs = _curves(record, returns, references, planned.rules)
     if across_trainers:
         runs = [replace(run, trainer="") for run in runs]
-    compared, left_out = _comparable(runs)
+    compared, left_out = _comparable(runs, planned.rules.baseline)
     try:
         analysis = analyse(compared, planned, references=references) if compared else None
         return analysis, left_out
@@ -133,7 +132,7 @@ def _ended(folder: Path) -> Ended:
     return {each: read_run(each) for each in folders}
 
 
-def _comparable(runs: list[RunCurve]) -> tuple[list[RunCurve], list[str]]:
+def _comparable(runs: list[RunCurve], baseline: str) -> tuple[list[RunCurve], list[str]]:
     """The runs that there can be statistics of, though others are missing; what is left out."""
     counts = Counter((run.task, run.algorithm, run.representation) for run in runs)
     alone = {
@@ -142,9 +141,9 @@ def _comparable(runs: list[RunCurve]) -> tuple[list[RunCurve], list[str]]:
         if count == 1
     }
     alone |= {
-        key: f"{'/'.join(key)}: at least two runs of {FULL} are needed to compare it with"
+        key: f"{'/'.join(key)}: at least two runs of {baseline} are needed to compare it with"
         for key in counts
-        if counts[*key[:2], FULL] < 2 and key not in alone
+        if counts[*key[:2], baseline] < 2 and key not in alone
     }
     kept = [run for run in runs if (run.task, run.algorithm, run.representation) not in alone]
     return kept, sorted(alone.values())

@@ -274,6 +274,6 @@ def _draw(analysis: Analysis, looks: Looks) -> Figure:
             name, colour = each.representation, look[each.representation]["color"]
             draw_profile(axes, each.scores, each.profile, with_runs(name, [each.runs]), colour)
         axes.set_title(plain(f"{algorithm}, {len(own[0].tasks)} tasks"))
-        axes.set_xlabel("share of the full agents' gain")
+        axes.set_xlabel(f"share of the gain on {analysis.baseline}")
     below(figure, panels)
     return figure
