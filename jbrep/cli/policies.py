@@ -1,5 +1,6 @@
 """What policies do."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,7 +26,8 @@ from jbrep.cli.environment import (
     threads_option,
 )
 from jbrep.errors import InputError
-from jbrep.text import interval_of, percentiles, table, terminal_width
+from jbrep.records.record import to_plain
+from jbrep.text import counted, interval_of, percentiles, table, terminal_width
 
 if TYPE_CHECKING:
     from jbrep.envs.infos import Numbers
@@ -57,6 +59,18 @@ _TASK = "face_direction"
     help="What a zip file was trained on, or what a policy by name observes through: a file, the "
     "name of one that ships, or code, mymodule:MyEncoder; of a run that was made with code, that.",
 )
+@click.option(
+    "--perturb",
+    "perturbations",
+    multiple=True,
+    is_flag=False,
+    flag_value="",
+    metavar="[NAME=VALUE]",
+    help="Play the episodes undisturbed, then with noise, delays, other bodies, pushes, ...: all "
+    "that there can be, or what is named, as in --perturb delay=2 or noise=0.1,delay=1..3; may be "
+    "repeated.",
+)
+@click.option("--out", type=PATH, help="A new JSON file for the table of --perturb.")
 @environment_options
 @as_json
 @click.pass_context
@@ -71,6 +85,8 @@ def evaluate_policy(
     algorithm: str,
     vecnormalize: Path | None,
     encoder: str | None,
+    perturbations: tuple[str, ...],
+    out: Path | None,
     as_json: bool,
     **options: Any,
 ) -> None:
@@ -84,15 +100,22 @@ def evaluate_policy(
     jbrep wrote it, or --encoder and --vecnormalize say what it was trained on. A policy by name may
     act on what an encoder's latent is decoded to: the return that it loses measures what the latent
     lacks.
+
+    With --perturb they are a table: how much of its return a policy keeps where sensors are noisy
+    or late, readings are lost, the body or the physics is another, or the robot is pushed.
     """
     from jbrep.encoders.shipped import source_of
     from jbrep.envs.infos import by_name, shares_text
     from jbrep.envs.names import import_code
 
     import_code(encoder)
+    _check_perturbations(perturbations, out)
     zip_file = _Zip(algorithm, trust, vecnormalize)
     player = _find(policy, given_task(options), encoder, zip_file)
     source = None if encoder is None else source_of(encoder, player.task)
+    if perturbations:
+        chosen = [each for each in perturbations if each]
+        return _perturb(policy, player, chosen, (episodes, threads, retries), out, as_json)
     returns, numbers, failure = _outcome(player, episodes, threads, retries)
     values = by_name(numbers)
     if as_json:
@@ -119,6 +142,62 @@ def evaluate_policy(
     if failure:
         say(f"Error: {failure}; {len(returns)} of {episodes} episodes were finished", err=True)
         context.exit(1)
+    return None
+
+
+def _check_perturbations(perturbations: tuple[str, ...], out: Path | None) -> None:
+    from jbrep.play.perturbed import read_perturbation
+    from jbrep.records.storage import exists
+
+    for each in filter(None, perturbations):
+        read_perturbation(each)
+    if out and not perturbations:
+        raise InputError("--out is for the table of --perturb: add that")
+    if out and exists(out):
+        raise InputError(f"{out} exists already: choose another file")
+
+
+def _perturb(
+    policy: str,
+    player: "Player",
+    chosen: Sequence[str],
+    how: tuple[int, int | None, int],
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Show the rows of a table as they are finished, and write those so far."""
+    from jbrep.play.perturbed import HEADER, Table, domains_of, perturb
+
+    domains, lacking = domains_of(player.task, chosen)
+    if lacking and not chosen:
+        told = f"{player.task.name} has no {', '.join(lacking)} that could be changed"
+        tell(f"Note: {told}: left out", err=True)
+    result = Table(
+        policy=policy,
+        task=player.task.name,
+        representation=player.representation,
+        step=player.step,
+        rows=(),
+    )
+    left = max(map(len, (*domains, HEADER[0])))
+    if not as_json:
+        tell(f"{_title(policy, player)}, each row the same {counted(how[0], 'episode')}")
+        say("")
+        say(_line(HEADER, left))
+    with stoppable("the rows so far are complete"):
+        for row in perturb(player, domains, *how):
+            result = result.replace(rows=(*result.rows, row))
+            if out:
+                result.write(out)
+            if not as_json:
+                say(_line(row.cells, left))
+    if as_json:
+        echo_json(to_plain(result))
+
+
+def _line(cells: Sequence[str], left: int) -> str:
+    first, *others = cells
+    return "  ".join((first.ljust(left), *(cell.rjust(25) for cell in others)))
 
 
 def _outcome(

@@ -114,7 +114,8 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
 
     Raises:
         InputError: a field that doesn't fit; a task whose arrays have the names of other columns,
-            or without states that are to be stored; a seed that is too large for it.
+            or without states that are to be stored, or with a domain; a seed that is too large for
+            it.
     """
 
     task: Task = msgspec.field(name="environment")
@@ -129,6 +130,11 @@ class DataSettings(CollectSettings, frozen=True, kw_only=True):
         episode_seed(self.task, self.seed, (self.steps - 1) // self.task.max_episode_steps)
         if self.store_state and not self.task.state:
             raise InputError(f"{self.task.name} has no states to store: its observations are all")
+        if self.task.domain:
+            raise InputError(
+                f"{self.task.name} draws its {self.task.domain} in each episode: data sets are of "
+                "the robot as it is, so describe it without a domain"
+            )
 
     def as_json(self) -> dict[str, Any]:
         """The settings as plain JSON, with the task's name."""

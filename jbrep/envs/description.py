@@ -21,6 +21,7 @@ from jbrep.envs.mujoco import with_kinds
 from jbrep.envs.names import find_spec
 from jbrep.envs.origin import absolute, code_of, files_of
 from jbrep.envs.precision import Signals, precision_problems
+from jbrep.envs.randomized import with_domain
 from jbrep.envs.task import (
     MAX_FEATURES,
     NARROW_SEEDS,
@@ -50,6 +51,7 @@ def describe(
     missing: str | None = None,
     hidden: Iterable[str] = (),
     history: int = 1,
+    domain: Mapping[str, Any] | None = None,
 ) -> Task:
     """Describe a task: its environment is made and played for some steps.
 
@@ -65,6 +67,8 @@ def describe(
         missing: what becomes of readings that aren't finite, see `Task`; by default an error.
         hidden: what isn't seen of it, see `jbrep.envs.view.with_view`.
         history: states that are seen at once, see there.
+        domain: numbers and ranges from which each episode draws, such as {"delay": "0..2"}, see
+            `jbrep.envs.domain.Domain`.
 
     Raises:
         InputError: an unknown task, an environment that can't be made, actions or observations
@@ -84,7 +88,7 @@ def describe(
     for problem in precision_problems(task, signals):
         warnings.warn(problem, Notice, stacklevel=2)
     task = task.replace(missing=missing) if missing else task
-    return with_view(task, hidden, history)
+    return with_domain(with_view(task, hidden, history), domain or {})
 
 
 def as_task(given: Task | str) -> Task:

@@ -13,9 +13,11 @@ from typing import Any, NamedTuple
 import gymnasium
 from gymnasium.wrappers import TimeLimit
 
+from jbrep.envs.domain import Domain
 from jbrep.envs.make import aside, make_env
 from jbrep.envs.names import find_spec
 from jbrep.envs.origin import files_of
+from jbrep.envs.varied import Varied
 from jbrep.errors import Notice, kind_and_line
 
 Env = gymnasium.Env[Any, Any]
@@ -34,25 +36,36 @@ _used: dict[int, _Instance] = {}  # by the identity of what was lent
 _kept: list[_Instance] = []  # one at most
 
 
-def take(env_id: str, arguments: Mapping[str, Any], max_episode_steps: int | None = None) -> Env:
+def take(
+    env_id: str,
+    arguments: Mapping[str, Any],
+    max_episode_steps: int | None = None,
+    domain: Domain | None = None,
+) -> Env:
     """An environment to use: the one that is kept, if it is the same, or else a new one.
 
     Args:
         env_id: in the registry, or a short name.
         arguments: of the environment.
         max_episode_steps: the time limit; None takes the registered one.
+        domain: from which each episode draws its physics, if it does.
 
     Raises:
         InputError: it can't be made; the message says why.
     """
     spec = find_spec(env_id)
     given = {**spec.kwargs, **arguments}
-    key = spec.id, spec.entry_point, repr(given)
+    key = spec.id, spec.entry_point, repr(given), domain
     limit = max_episode_steps or spec.max_episode_steps
-    bare = _take_kept(key, given) or make_env(env_id, arguments, _NO_LIMIT)
+    bare = _take_kept(key, given) or _make(env_id, arguments, domain)
     env = TimeLimit(bare, limit) if limit else bare
     _used[id(env)] = _Instance(key, bare, given)
     return env
+
+
+def _make(env_id: str, arguments: Mapping[str, Any], domain: Domain | None) -> Env:
+    env = make_env(env_id, arguments, _NO_LIMIT)
+    return Varied(env, domain) if domain else env
 
 
 def _take_kept(key: _Key, given: Mapping[str, Any]) -> Env | None:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jbrep.envs.disturbed import Disturbed
 from jbrep.envs.infos import Numbers
 from jbrep.envs.make import is_batched, make_batch
 from jbrep.envs.separate import EnvironmentFailedError as EnvironmentFailedError
@@ -129,6 +130,8 @@ class Lanes:
         else:
             self._batch = Separate(task.whole, num_lanes, retries or Retries())
             self.envs = self._batch.envs
+        if task.domain:
+            self._batch = Disturbed(self._batch, task, num_lanes)
         if task.view:
             self._batch = Seen(self._batch, task, num_lanes)
         self.lost = np.zeros(num_lanes, np.bool_)

@@ -37,21 +37,25 @@ class _Quantity(NamedTuple):
     axis: int  # its place in that
 
 
-def physics_of(env: gymnasium.Env[Any, Any]) -> Physics | None:
-    """An environment's physics, if it is one of Gymnasium's or dm_control's with MuJoCo."""
-    base: Any = env.unwrapped
-    if hasattr(base, "_env"):  # shimmy's, of dm_control
-        physics = getattr(base._env, "physics", None)
-        found = (
-            getattr(getattr(physics, "model", None), "ptr", None),
-            getattr(getattr(physics, "data", None), "ptr", None),
-        )
-    else:
-        found = getattr(base, "model", None), getattr(base, "data", None)
-    model, data = found
-    if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
-        return None
-    return Physics(model, data)
+def physics_of(env: Any) -> Physics | None:
+    """The simulation behind one of Gymnasium's environments; None if it isn't MuJoCo's.
+
+    Known are those of Gymnasium and others like them, which have `model` and `data`, and those of
+    dm_control behind shimmy.
+    """
+    base = env.unwrapped
+    for owner in (base, getattr(getattr(base, "_env", None), "physics", None)):
+        model, data = (getattr(owner, name, None) for name in ("model", "data"))
+        model, data = (getattr(part, "ptr", part) for part in (model, data))  # dm_control wraps
+        if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+            return Physics(model, data)
+    return None
+
+
+def root_of(model: mujoco.MjModel) -> int:
+    """The body that carries the heaviest tree of those that can move; 0 where none can."""
+    roots = model.body_rootid[model.body_dofnum > 0].tolist()
+    return max(roots, key=lambda body: float(model.body_subtreemass[body]), default=0)
 
 
 def with_kinds(env: gymnasium.Env[Any, Any], features: Sequence[Feature]) -> tuple[Feature, ...]:

@@ -2,45 +2,17 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from jbrep.envs.lanes import Lanes
+from jbrep.envs.mujoco import physics_of
 from jbrep.envs.recording import Recording
 from jbrep.envs.task import Array
 
 # of an MjData: what a picture and the contact forces of a state follow from
 _STATE = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
-
-
-class Physics(NamedTuple):
-    """A running simulation."""
-
-    model: mujoco.MjModel
-    data: mujoco.MjData
-
-
-def physics_of(env: Any) -> Physics | None:
-    """The simulation behind one of Gymnasium's environments; None if it isn't MuJoCo's.
-
-    Known are those of Gymnasium and others like them, which have `model` and `data`, and those of
-    dm_control behind shimmy.
-    """
-    base = env.unwrapped
-    for owner in (base, getattr(getattr(base, "_env", None), "physics", None)):
-        model, data = (getattr(owner, name, None) for name in ("model", "data"))
-        model, data = (getattr(part, "ptr", part) for part in (model, data))  # dm_control wraps
-        if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
-            return Physics(model, data)
-    return None
-
-
-def root_of(model: mujoco.MjModel) -> int:
-    """The body that carries the heaviest tree of those that can move; 0 where none can."""
-    roots = model.body_rootid[model.body_dofnum > 0].tolist()
-    return max(roots, key=lambda body: float(model.body_subtreemass[body]), default=0)
 
 
 @dataclass(frozen=True, eq=False)

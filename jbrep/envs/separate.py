@@ -115,7 +115,9 @@ class Separate:
         self.lost, self.failed = np.zeros((2, num_lanes), np.bool_)
 
     def _take(self) -> Any:
-        return instances.take(self._task.id, self._task.arguments, self._task.max_episode_steps)
+        task = self._task
+        domain = task.domain.physics if task.domain else None
+        return instances.take(task.id, task.arguments, task.max_episode_steps, domain)
 
     def reset(
         self, seed: Sequence[int | None], options: Mapping[str, Flags]

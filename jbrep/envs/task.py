@@ -10,6 +10,7 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 from numpy.typing import NDArray
 
+from jbrep.envs.domain import Domain
 from jbrep.errors import InputError
 from jbrep.records.record import Finite, Record
 from jbrep.text import slug
@@ -204,6 +205,7 @@ class Task(Record, frozen=True):
         missing: what becomes of readings that aren't finite: skip ends an episode before one,
             hold:3 has the last one instead, for at most 3 steps. Otherwise they are errors.
         view: what of the environment's observation is seen, if it isn't the current one, whole.
+        domain: from which each episode draws what differs, if anything does.
 
     Raises:
         InputError: a field that doesn't fit this description.
@@ -230,6 +232,7 @@ class Task(Record, frozen=True):
     offsets: Mapping[Word, Finite] | UnsetType = UNSET
     missing: _Missing | UnsetType = UNSET
     view: View | UnsetType = UNSET
+    domain: Domain | UnsetType = UNSET
 
     def check(self) -> None:
         """As for `Record`."""
@@ -252,6 +255,7 @@ class Task(Record, frozen=True):
             raise InputError("its actions must have as many lower bounds as upper ones")
         if not all(map(float.__le__, self.action_low, self.action_high)):
             raise InputError("each lower bound of its actions must be at most the upper one")
+        _check_spread(self.domain, self.whole.size)
         if unknown := set(self.offsets or ()) - set(self.whole.feature_names):
             raise InputError(f"offsets has {min(unknown)}, which is none of its features")
 
@@ -358,6 +362,11 @@ class Task(Record, frozen=True):
     def split(self, observation: NDArray[_Float]) -> dict[str, NDArray[_Float]]:
         """Split flat observations (..., d) by group; the parts are views."""
         return {name: observation[..., place] for name, place in self.groups.items()}
+
+
+def _check_spread(domain: Domain | UnsetType, size: int) -> None:
+    if domain and len(domain.spread) not in (0, size):
+        raise InputError(f"its domain has a spread of {len(domain.spread)} features, not {size}")
 
 
 def _check_range(name: str, low: float | None, high: float | None) -> None:

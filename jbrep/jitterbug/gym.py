@@ -209,6 +209,9 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
     reset with seed s + i. Infos hold `qpos`, `qvel`, `target_position` and `target_quaternion` of
     each lane's state, and the number of its `body`, -1 for the published one.
 
+    Options of `reset` may have the `body`, `friction` and `mass` of each lane that it starts, (n,)
+    each: a number, and factors of what the model has.
+
     Args:
         task, scaled, form, body, materials: as for `JitterbugEnv`.
         num_envs: how many robots.
@@ -222,6 +225,8 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         InputError: unknown task, form, dtype or mode, a number below 1; actions of another shape
             than (num_envs, 1), or not finite.
     """
+
+    changeable = ("friction", "mass", "push", "body")  # by a domain, see `jbrep.envs.domain`
 
     def __init__(
         self,
@@ -276,7 +281,7 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         for lane in lanes:
             if (number := seed[lane]) is not None:
                 self._generators[lane] = np.random.default_rng(number)
-        self._restart(lanes)
+        self._restart(lanes, options or {})
         return self._view(self._observation), self._info()
 
     def step(
@@ -335,8 +340,19 @@ class JitterbugVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         self.simulation.restore(**physics)
         return self._view(self._observation), self._info()
 
-    def _restart(self, lanes: Sequence[int]) -> None:
-        self.simulation.reset(lanes, [self._generators[lane] for lane in lanes])
+    def push(self, velocity: Array) -> None:
+        """As `jbrep.jitterbug.simulation.Simulation.push`."""
+        self.simulation.push(velocity)
+
+    def _restart(self, lanes: Sequence[int], options: Mapping[str, Any] = {}) -> None:
+        usual = np.ones(self.num_envs)
+        factors = [options.get(name, usual) for name in ("friction", "mass")]
+        self.simulation.reset(
+            lanes,
+            [self._generators[lane] for lane in lanes],
+            options["body"][lanes] if "body" in options else None,
+            np.stack(factors, axis=1)[lanes],
+        )
         self._steps[lanes] = 0
         self._observation = self._observation.copy()
         self._observation[lanes] = self.simulation.observe()[lanes]

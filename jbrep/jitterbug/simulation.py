@@ -1,6 +1,8 @@
 """Many Jitterbugs, stepped together on a pool of threads."""
 
+import copy
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -9,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.mujoco import turned, turned_quaternion
+from jbrep.envs.varied import put_factors, velocity_after
 from jbrep.jitterbug import bodies, model
 from jbrep.jitterbug.tasks import QUATERNION, Array, JitterbugTask, Readings, yaw_direction
 
@@ -58,6 +61,7 @@ class Simulation:
         self._materials = materials
         first = body if isinstance(body, int) else bodies.PUBLISHED
         self._numbers = np.full(num_lanes, first, np.int64)
+        self._factors = np.ones((num_lanes, 2))  # of friction and mass
         self._models = [model.fast_model(self._drawn(first))] * num_lanes
         self._shown: dict[int, mujoco.MjModel] = {}
         # persistent: a step reuses what has already been computed for the readings
@@ -80,13 +84,27 @@ class Simulation:
     def __repr__(self) -> str:
         return f"Simulation({self.task.name}, {self.num_lanes:,} lanes)"
 
-    def reset(self, lanes: Sequence[int], randoms: Iterable[np.random.Generator]) -> None:
+    def reset(
+        self,
+        lanes: Sequence[int],
+        randoms: Iterable[np.random.Generator],
+        numbers: Iterable[float] | None = None,
+        factors: ArrayLike = 1.0,
+    ) -> None:
         """Start an episode in each of the lanes, drawn from its own generator.
 
         A random body doesn't change what else is drawn from the generator, now or later.
+
+        Args:
+            lanes: k of them.
+            randoms: the generator of each.
+            numbers: of their bodies; None for the body of all.
+            factors: of friction and of mass, (k, 2); 1 for the model's.
         """
         randoms = list(randoms)
-        self._put_bodies(lanes, [bodies.number_of(self._body, random) for random in randoms])
+        if numbers is None:
+            numbers = [bodies.number_of(self._body, random) for random in randoms]
+        self._put_models(lanes, numbers, np.broadcast_to(factors, (len(lanes), 2)))
         self._batch.reset(lanes, stage=mujoco.mjtStage.mjSTAGE_NONE)
         for lane, random in zip(lanes, randoms, strict=True):
             start = self.task.start(random)
@@ -113,6 +131,8 @@ class Simulation:
         }
         if self._body is not None or (self._numbers != bodies.PUBLISHED).any():
             state["body"] = self.body_numbers
+        if (self._factors != 1).any():
+            state["factors"] = self._factors.copy()
         return state
 
     @property
@@ -134,16 +154,18 @@ class Simulation:
         target_quaternion: Array,
         warmstart: ArrayLike = 0.0,
         body: Array | None = None,
+        factors: Array | None = None,
     ) -> None:
         """Put all lanes in stored states: (n, 16), (n, 15), (n, 3) and (n, 4).
 
         The same actions then lead through the same states, bit for bit. After an episode's first
         state this also takes the warm start (n, 15) of MuJoCo's solver. `body` holds the numbers
-        of the bodies (n,), -1 for the published robot's; without it, the lanes keep theirs.
+        of the bodies (n,), -1 for the published robot's, and `factors` those of friction and mass,
+        (n, 2); without them, the lanes keep theirs.
         """
         lanes = range(self.num_lanes)
-        if body is not None:
-            self._put_bodies(lanes, body)
+        kept = self._numbers.copy() if body is None else body
+        self._put_models(lanes, kept, self._factors.copy() if factors is None else factors)
         self._batch.reset(lanes, stage=mujoco.mjtStage.mjSTAGE_NONE)
         self.readings.qpos[:] = qpos
         self.readings.qvel[:] = qvel
@@ -166,16 +188,42 @@ class Simulation:
     def _drawn(self, number: int) -> bodies.Body | None:
         return None if number == bodies.PUBLISHED else bodies.draw(number, self._materials)
 
-    def _put_bodies(self, lanes: Sequence[int], numbers: Iterable[float]) -> None:
+    def _put_models(self, lanes: Sequence[int], numbers: Iterable[float], factors: Array) -> None:
         changed = False
-        for lane, number in zip(lanes, numbers, strict=True):
-            if number != self._numbers[lane]:
-                self._numbers[lane] = number
-                self._models[lane] = model.fast_model(self._drawn(int(number)))
+        for lane, number, own in zip(lanes, numbers, factors, strict=True):
+            if number != self._numbers[lane] or (own != self._factors[lane]).any():
+                self._numbers[lane], self._factors[lane] = number, own
+                self._models[lane] = self._model(int(number), *own.tolist())
                 changed = True
         if changed:
             self._batch.set_models(self._models)
             self._shown.clear()
+
+    def _model(self, number: int, friction: float, mass: float) -> mujoco.MjModel:
+        usual = model.fast_model(self._drawn(number))
+        if friction == mass == 1:
+            return usual
+        varied = copy.copy(usual)
+        put_factors(varied, usual, friction, mass, self._scratch)
+        return varied
+
+    @cached_property
+    def _scratch(self) -> mujoco.MjData:
+        """Of the sizes that all bodies' models have."""
+        return mujoco.MjData(self._models[0])
+
+    def push(self, velocity: Array) -> None:
+        """Push robots in the middle of their episodes.
+
+        Args:
+            velocity: the impulse on each lane's core by the robot's mass, (n, 3) [m/s]; 0 is none.
+        """
+        lanes = np.flatnonzero(velocity.any(axis=1)).tolist()
+        for lane in lanes:
+            now, scratch = self.readings.qpos[lane], self._scratch
+            added = velocity_after(self._models[lane], now, velocity[lane], scratch)
+            self.readings.qvel[lane] += added
+        self._forward(lanes)
 
     def _forward(self, lanes: Sequence[int]) -> None:
         self.readings.target_axis[:] = yaw_direction(self.target_quaternion)

@@ -62,10 +62,15 @@ def turn_targets(lanes: Lanes, yaw: float) -> None:
         yaw: orientation of the targets [rad].
 
     Raises:
-        InputError: another robot.
+        InputError: another robot, or one with a domain.
     """
     if jitterbug_task(lanes.task) is None:
         raise InputError(f"{lanes.task.name} has no target to turn: only the Jitterbug's tasks do")
+    if lanes.task.domain:
+        raise InputError(
+            f"{lanes.task.name} draws its {lanes.task.domain} in each episode, in which no target "
+            f"is turned: add --task {lanes.task.name} to play it as it is"
+        )
     simulation = lanes.envs.simulation
     turned = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
     targets = {"target_quaternion": np.tile(turned, (lanes.num_lanes, 1))}

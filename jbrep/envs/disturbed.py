@@ -1,0 +1,128 @@
+"""A batch of environments whose sensors, motors, bodies and physics each episode draws."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jbrep.envs.domain import Drawn, Draws
+from jbrep.envs.separate import not_the_same
+from jbrep.envs.task import Array, Task
+
+_OPTIONS = ("friction", "mass", "body")  # of a batch that has them, when it is reset
+
+
+class Disturbed:
+    """A batch of environments as a task's domain has it.
+
+    What an episode draws follows from its seed, and what a step draws from its number, too.
+
+    Args:
+        batch: as `Lanes` steps one; what of the physics is drawn, it does itself, or else takes it
+            as options of `reset` and in `push`.
+        task: with a domain.
+        num_lanes: n.
+    """
+
+    def __init__(self, batch: Any, task: Task, num_lanes: int):
+        assert task.domain
+        self._batch, self._task, self._domain = batch, task, task.domain
+        whole = task.whole
+        self._draws = Draws(num_lanes, whole.size)
+        self._push = getattr(batch, "push", None)
+        self._options = _OPTIONS[: 3 if task.domain.body else 2]
+        self._spread = np.array(task.domain.spread or np.zeros(whole.size))
+        turns = [f.is_full_turn for f in whole.features]
+        self._turns = np.flatnonzero(turns)
+        self._low = np.array([f.low for f in whole.features if f.is_full_turn])
+        self._rest, delays = whole.rest, (task.domain.delay[1], task.domain.action_delay[1])
+        self._drawn: dict[str, Array] = {n: np.zeros(num_lanes) for n in Drawn._fields}
+        self._given = np.zeros((num_lanes, whole.size))
+        self._measured = np.zeros((num_lanes, delays[0] + 1, whole.size))  # the latest first
+        self._commands = np.zeros((num_lanes, delays[1] + 1, whole.action_size))
+        self._shown = np.zeros((num_lanes, whole.size))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._batch, name)
+
+    def reset(self, seed: Any, options: Mapping[str, Any]) -> tuple[Array, Any]:
+        """As the batch does."""
+        lanes = np.flatnonzero(options["reset_mask"])
+        seeds = np.array([seed[lane] for lane in lanes], np.int64)
+        self._draws.begin(lanes, seeds)
+        self._draw(lanes, seeds)
+        drawn = {name: self._drawn[name] for name in self._options} if self._push else {}
+        given, info = self._batch.reset(seed=seed, options={**options, **drawn})
+        self._given = given
+        self._measured[lanes] = self._measure(given)[lanes, None]
+        self._shown[lanes] = self._measured[lanes, 0]
+        self._commands[lanes] = self._rest
+        return self._shown.copy(), info
+
+    def _draw(self, lanes: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
+        for lane, seed in zip(lanes.tolist(), seeds.tolist(), strict=True):
+            for name, value in self._domain.draw(seed)._asdict().items():
+                self._drawn[name][lane] = 0 if value is None else value
+
+    def step(self, actions: Array) -> tuple[Any, ...]:
+        """As the batch does; of a step that is lost nothing is seen."""
+        self._draws.move()
+        if self._push and (pushes := self._draws.pushes(self._drawn["push"])).any():
+            self._push(pushes)
+        _put_first(self._commands, actions)
+        given, *others = self._batch.step(self._late(self._commands, "action_delay"))
+        arrived = self._draws.uniform >= self._drawn["dropped"]
+        if hasattr(self._batch, "lost"):
+            arrived &= ~self._batch.lost
+        _put_first(self._measured, self._measure(given))
+        late = self._late(self._measured, "delay")
+        self._shown = np.where(arrived[:, None], late, self._shown)
+        self._given = given
+        return self._shown, *others
+
+    def _measure(self, given: Array) -> Array:
+        """What sensors say, (n, d): a lane without noise has what is given, to the bit."""
+        noise = self._drawn["noise"][:, None]
+        noisy = given + noise * self._spread * self._draws.normal
+        turns = noisy[:, self._turns]
+        noisy[:, self._turns] = self._low + np.mod(turns - self._low, 2 * np.pi)
+        return np.where(noise > 0, noisy, given)
+
+    def _late(self, values: Array, name: str) -> Array:
+        """Those of so many steps before, (n, ...), as the episode has drawn."""
+        return values[np.arange(len(values)), self._drawn[name].astype(np.int64)]
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """A copy of what `restore` takes."""
+        own = {
+            "domain_given": self._given,
+            "domain_measured": self._measured,
+            "domain_commands": self._commands,
+            "domain_shown": self._shown,
+        }
+        copies = {name: values.copy() for name, values in own.items()}
+        return copies | self._draws.state | self._batch.state
+
+    def restore(self, state: Mapping[str, Any]) -> tuple[Array, Any]:
+        """As the batch does.
+
+        Raises:
+            InputError: the environment isn't reproducible.
+        """
+        own = {name: each for name, each in state.items() if name.startswith("domain_")}
+        given, info = self._batch.restore({n: v for n, v in state.items() if n not in own})
+        if given.tobytes() != own["domain_given"].tobytes():
+            raise not_the_same(self._task)
+        self._given, self._shown = given, own["domain_shown"].copy()
+        self._measured[:], self._commands[:] = own["domain_measured"], own["domain_commands"]
+        self._draws.restore(own)
+        self._draw(np.arange(len(given)), own["domain_seeds"])
+        return self._shown.copy(), info
+
+
+def _put_first(values: Array, newest: Array) -> None:
+    """Put the newest (n, ...) before those of earlier steps, (n, k, ...); the oldest goes."""
+    values[:, 1:] = values[:, :-1].copy()
+    values[:, 0] = newest

@@ -1,0 +1,237 @@
+"""What episodes draw: sensors, motors, bodies and physics, by their seeds alone."""
+
+import json
+
+import environments
+import mujoco
+import numpy as np
+import pytest
+from command import jbrep, mistake, refused
+
+from jbrep.envs import Lanes, describe
+from jbrep.envs.domain import Domain, Draws, read_ranges
+from jbrep.envs.randomized import with_domain
+from jbrep.envs.varied import put_factors, velocity_after
+from jbrep.envs.view import with_view
+
+TASKS = {
+    "face_direction": describe("face_direction", {}, 12),
+    "Hopper-v5": describe("Hopper-v5", {}, 12),
+    "Pendulum-v1": describe("Pendulum-v1", {}, 12),
+}
+SEEDS = [7, 8, 9]
+NEUTRAL = {"noise": 0, "delay": 0, "dropped": 0, "action_delay": 0}
+SIGNALS = {"noise": "0..0.5", "delay": "0..2", "dropped": 0.3, "action_delay": "0..2"}
+PHYSICS = {"friction": "0.5..1.5", "mass": "0.5..2", "push": 2}
+BODIES = {"body": "0..3", "friction": "0.5..1.5"}
+
+
+def tape(task, seeds=SEEDS, delay=0, broken_at=None):
+    """Observations, rewards and whether each lane's episode goes on, of the same actions."""
+    random = np.random.default_rng(1)
+    rows = random.uniform(task.action_low, task.action_high, (11, task.action_size))
+    rows = np.concatenate((np.tile(task.rest, (delay, 1)), rows))
+    lanes = Lanes(task, len(seeds), 1)
+    steps = [(lanes.reset(range(len(seeds)), seeds), np.zeros(len(seeds)))]
+    for number, action in enumerate(rows[:11]):
+        if number == broken_at:
+            state = lanes.state
+            lanes.close()
+            lanes = Lanes(task, len(seeds), 1)
+            lanes.restore(state)
+        steps.append(lanes.step(np.tile(action, (len(seeds), 1)))[:2])
+    lanes.close()
+    observations, rewards = zip(*steps, strict=True)
+    return np.stack(observations), np.stack(rewards)
+
+
+def assert_same(one, other, lanes=slice(None)):
+    for a, b in zip(one, other, strict=True):
+        assert a[:, lanes].tobytes() == b.tobytes()
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_a_domain_of_what_there_is_changes_no_bit(task):
+    usual = {"friction": 1, "mass": 1, "push": 0} if task.id != "Pendulum-v1" else {}
+    assert_same(tape(task), tape(with_domain(task, NEUTRAL | usual)))
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_what_is_late_or_lost(task):
+    seen, rewards = tape(task)
+    late, same = tape(with_domain(task, {"delay": 2}))
+    np.testing.assert_array_equal(late[3:], seen[1:-2])
+    np.testing.assert_array_equal(late[:3], seen[[0, 0, 0]])
+    np.testing.assert_array_equal(same, rewards)
+    held, _ = tape(with_domain(task, {"dropped": 1}))
+    assert (held == seen[0]).all()
+    commanded, _ = tape(with_domain(task, {"action_delay": 2}))
+    np.testing.assert_array_equal(commanded, tape(task, delay=2)[0])
+    some, _ = tape(with_domain(task, {"dropped": 0.5}))
+    is_new = (some[1:] == seen[1:]).all(axis=2)
+    assert (is_new | (some[1:] == some[:-1]).all(axis=2)).all()
+    assert 0.2 < is_new.mean() < 0.8
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [(name, SIGNALS) for name in TASKS]
+    + [("face_direction", PHYSICS), ("face_direction", BODIES), ("Hopper-v5", PHYSICS)],
+)
+def test_the_same_seed_gives_the_same_bytes_whatever_is_beside_it(name, given, monkeypatch):
+    monkeypatch.setattr("jbrep.envs.domain._PUSHES", 0.3)
+    task = with_domain(TASKS[name], given)
+    whole = tape(task)
+    assert not (whole[0] == tape(TASKS[name])[0]).all(axis=(0, 2)).any()
+    assert_same(whole, tape(task, SEEDS[1:2]), [1])
+    assert_same(whole, tape(task, broken_at=5))
+    assert_same(whole, tape(task))  # in instances that have played other episodes
+
+
+def test_a_history_is_of_what_was_seen():
+    task = with_domain(TASKS["face_direction"], SIGNALS)
+    seen, _ = tape(task)
+    both, _ = tape(with_view(task, history=2))
+    size = task.size
+    np.testing.assert_array_equal(both[..., :size], seen)
+    np.testing.assert_array_equal(both[1:, :, size : 2 * size], seen[:-1])
+
+
+def test_noise_is_a_share_of_what_features_spread():
+    task = describe("Pendulum-v1", max_episode_steps=200, domain={"noise": 0.1})
+    (cosine, _, speed) = task.domain.spread
+    assert 0.5 < cosine < 1
+    assert 1 < speed < 8
+    still, noise = np.zeros((20, 1)), []
+    lanes = [Lanes(each, 20, 1) for each in (task, with_domain(task, {}))]
+    for each in lanes:
+        each.reset(range(20), range(20))
+    while lanes[0].num_active:
+        noisy, plain = (each.step(still).observation for each in lanes)
+        noise.append(noisy - plain)
+    noise = np.stack(noise)
+    np.testing.assert_allclose(noise.std(axis=(0, 1)) / task.domain.spread, 0.1, rtol=0.05)
+    now, before = noise[1:].reshape(-1, 3), noise[:-1].reshape(-1, 3)
+    assert np.abs(np.corrcoef(now.T, before.T)[:3, 3:]).max() < 0.07
+
+
+def test_an_angle_stays_in_its_turn():
+    task = with_domain(TASKS["face_direction"], {"noise": 1})
+    places = [i for i, each in enumerate(task.features) if each.is_full_turn]
+    seen = tape(task, range(50))[0][..., places]
+    assert np.abs(seen).max() <= np.pi
+    assert (np.abs(seen) > 3).any()
+
+
+def test_an_episode_draws_each_number_from_its_range_and_apart_from_the_others():
+    domain = Domain(**read_ranges({"delay": "1..3", "friction": [0.5, 1.5], "body": "4..5"}))
+    drawn = [domain.draw(seed) for seed in range(300)]
+    for name, values in (("delay", {1, 2, 3}), ("body", {4, 5}), ("mass", {1.0})):
+        assert {getattr(each, name) for each in drawn} == values
+    friction = np.array([each.friction for each in drawn])
+    np.testing.assert_allclose(np.quantile(friction, (0, 0.5, 1)), (0.5, 1, 1.5), atol=0.1)
+    alone = Domain(friction=(0.5, 1.5))
+    assert [alone.draw(seed).friction for seed in range(300)] == friction.tolist()
+    assert alone.draw(0).body is None
+    assert str(domain) == "delay=1..3,friction=0.5..1.5,body=4..5"
+
+
+def test_pushes_come_in_a_hundredth_of_all_steps_from_all_sides():
+    draws = Draws(50, 0)
+    draws.begin(np.arange(50), np.arange(50))
+    pushes = []
+    for _ in range(1000):
+        draws.move()
+        pushes.append(draws.pushes(np.full(50, 0.2)))
+    pushes = np.concatenate(pushes)
+    pushes = pushes[pushes.any(axis=1)]
+    assert 400 < len(pushes) < 600
+    np.testing.assert_allclose(np.linalg.norm(pushes[:, :2], axis=1), 0.2)
+    assert np.abs(pushes.mean(axis=0)).max() < 0.03
+
+
+LEGGED = """<mujoco><worldbody><body pos="0 0 1"><freejoint/><geom size=".1" mass="2"/>
+<body pos=".2 0 0"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02"/>
+</body></body><geom type="plane" size="1 1 1" friction=".7"/></worldbody></mujoco>"""
+
+
+def test_a_push_gives_the_whole_robot_its_velocity():
+    model = mujoco.MjModel.from_xml_string(LEGGED)
+    data, push = mujoco.MjData(model), np.array([0.3, -0.1, 0])
+    qpos = data.qpos.copy()
+    qpos[3:] = 0.5, 0.5, -0.5, 0.5, 0.7
+    added = velocity_after(model, qpos, push, mujoco.MjData(model))
+    data.qpos, data.qvel = qpos, added
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    np.testing.assert_allclose(data.subtree_linvel[1], push, atol=1e-12)
+    assert np.abs(added[-1]) > 0.01  # the leg swings
+
+
+def test_factors_are_of_the_model_s_friction_and_masses():
+    usual, varied = (mujoco.MjModel.from_xml_string(LEGGED) for _ in range(2))
+    data = mujoco.MjData(usual)
+    put_factors(varied, usual, 0.5, 3, data)
+    np.testing.assert_allclose(varied.body_subtreemass, 3 * usual.body_subtreemass)
+    np.testing.assert_allclose(varied.dof_invweight0, usual.dof_invweight0 / 3)
+    np.testing.assert_allclose(varied.geom_friction, usual.geom_friction / 2)
+    put_factors(varied, usual, 1, 1, data)
+    for name in ("body_mass", "body_inertia", "dof_invweight0", "geom_friction"):
+        assert getattr(varied, name).tobytes() == getattr(usual, name).tobytes()
+
+
+def test_a_step_that_is_lost_is_not_seen():
+    assert environments
+    broken = describe("Sledges/Broken-v0", {"how": "nan", "seed": 5}, 30, missing="skip")
+    lanes = Lanes(with_domain(broken, {"noise": 0.1}), 1)
+    lanes.reset([0], [5])
+    while not lanes.lost.any():
+        before = lanes.observation
+        lanes.step(np.full((1, 3), 0.5))
+    np.testing.assert_array_equal(lanes.observation, before)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"wind": 1}, "unknown 'wind' in a domain: it must be one of noise, delay, dropped, "),
+        ({"delay": "soon"}, "delay is 'soon': it must be a number, or a range such as delay=0..3;"),
+        ({"delay": 0.5}, "delay is 0.5: it must be a number, or a range"),
+        ({"delay": "3..1"}, "delay is 3..1: swap them"),
+        ({"dropped": 2}, "dropped is 2: it must be a number, or a range"),
+        ({"friction": 2}, "friction can't be changed in Pendulum-v1: it must be one of noise, "),
+    ],
+)
+def test_what_a_domain_refuses(given, said):
+    assert said in refused(with_domain, TASKS["Pendulum-v1"], given)
+
+
+def test_the_command_shows_what_a_policy_keeps(tmp_path):
+    played = ("evaluate-policy", "heuristic", "--task", "move_in_direction", "--episodes", 2)
+    played += ("--episode-steps", 30)
+    file = tmp_path / "table.json"
+    told = jbrep(*played, "--perturb", "--out", file)
+    assert told.exit_code == 0, told.output
+    lines = told.output.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert [line.split()[0] for line in lines[3:6]] == ["undisturbed", "noise=0.03", "noise=0.1"]
+    rows = json.loads(file.read_text())["rows"]
+    assert [row["name"] for row in rows][-2:] == ["push=0.1", "push=0.3"]
+    assert rows[0]["returns"] == json.loads(jbrep(*played, "--json").output)["returns"]
+    assert rows[0]["share"] == [1, 1, 1]
+    one = json.loads(jbrep(*played, "--perturb", "delay=2", "--json").output)["rows"]
+    assert [row["name"] for row in one] == ["undisturbed", "delay=2"]
+    assert one[1] == next(row for row in rows if row["name"] == "delay=2")
+    assert "exists already" in mistake(*played, "--perturb", "--out", file)
+    assert "--perturb soon is no perturbation: write" in mistake(*played, "--perturb", "soon")
+    assert "--out is for the table of --perturb" in mistake(*played, "--out", tmp_path / "x")
+
+
+def test_a_robot_without_mujoco_has_the_rows_that_it_can_have():
+    played = ("evaluate-policy", "uniform", "--task", "Pendulum-v1", "--episodes", 1)
+    told = jbrep(*played, "--episode-steps", 5, "--perturb").output
+    assert "Pendulum-v1 has no friction, mass, push, body that could be changed" in told
+    assert "delay=3" in told
+    assert "push=" not in told
+    assert told.splitlines()[-1].endswith(" -")  # no shares of returns below 0
+    assert "push can't be changed in Pendulum-v1" in mistake(*played, "--perturb", "push=1")
