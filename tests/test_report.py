@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import time
+import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -33,10 +34,10 @@ from jbrep.report.page import page as page_of
 from jbrep.report.report import FIGURES, MARKDOWN, PAGE, STATISTICS, SUMMARY
 from jbrep.report.tables import read_tables
 from jbrep.report.words import answers
-from jbrep.rl.files import ENCODER, EVALUATIONS, Evaluation
+from jbrep.rl.files import ENCODER, EVALUATIONS, Evaluation, read_run
 from jbrep.stats.claims import CLAIMS, FASTER
 from jbrep.stats.rules import Rules
-from jbrep.study.config import Study
+from jbrep.study.config import Study, as_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.results import conclude
@@ -59,6 +60,15 @@ TABLES = ("runs.json", "returns.csv", "references.csv")
 TRAP = "<script>document.title = 'run'</script>"
 
 
+DRAWN = as_study(
+    {
+        **{"tasks": ["face_direction"], "representations": ["full", "dae-8"], "seeds": 4},
+        **{"steps": 2000, "evaluate_every": 1000, "evaluation_episodes": 2},
+        "algorithms": {"drawn": {"base": "sac", "draws": {"tau": [0.01, 0.02], "gamma": [0.9, 1]}}},
+    }
+)
+
+
 def write_a_run(plan, cell, failed=False, reason=TRAP):
     """A run's files as jbrep rl leaves them, with returns made up."""
     folder = plan.folder_of(cell)
@@ -79,8 +89,8 @@ def write_a_run(plan, cell, failed=False, reason=TRAP):
     write_record(folder, run, reason if failed else None, steps=1500 if failed else 2000, **facts)
 
 
-def make_study(folder, left=0, failed=()):
-    plan = Plan(STUDY, folder)
+def make_study(folder, left=0, failed=(), study=STUDY):
+    plan = Plan(study, folder)
     plan.write()
     for i, cell in enumerate(plan.cells[: len(plan.cells) - left]):
         write_a_run(plan, cell, failed=i in failed)
@@ -458,13 +468,31 @@ def test_where_nothing_was_compared_the_claims_say_so(whole):
     assert told[-1] == "Nothing was compared with full."
 
 
+def test_settings_that_seeds_draw_are_alike_for_all_that_agents_observe(tmp_path):
+    plan = make_study(tmp_path, study=DRAWN)
+    drawn = {}
+    for cell in plan.cells:
+        settings = read_run(plan.folder_of(cell)).settings
+        values = settings.overrides["tau"], settings.overrides["gamma"]
+        assert settings.hyperparameters.algorithm_kwargs["tau"] == values[0]
+        drawn.setdefault(cell.seed, set()).add(values)
+    assert {len(each) for each in drawn.values()} == {1}
+    assert len(set.union(*drawn.values())) > 1
+    conclude(tmp_path)
+    tables = read_tables(tmp_path)
+    assert len(tables.analysis.groups[0].comparisons) == 1
+    rows = dict(row[:2] for row in setting_table(tables).rows)
+    assert (rows["tau"], rows["overrides"]) == ("one of 0.01, 0.02, by seed", "-")
+    assert as_study(tomllib.loads(tables.record.study.toml())) == DRAWN
+
+
 def test_a_report_compares_with_the_study_s_baseline(whole, tmp_path):
     copy_tables(whole, tmp_path)
     record = read_document(tmp_path / RECORD, RunsRecord)
-    against = record.study.replace(verdicts=Rules(baseline="dae-8"))
+    against = record.study.replace(verdicts=Rules(baseline="pca-8"))
     record.replace(study=against).write(tmp_path / RECORD)
     told = markdown(read_tables(tmp_path), [], [], "figure.png")
-    assert "of dae-8's gain" in told
+    assert "of pca-8's gain" in told
     assert "full's" not in told
 
 

@@ -247,6 +247,8 @@ def test_learners_of_tables():
         ("mine", {"base": "sac-modern", "preset": "paper"}, None),
         ("a/b", {"base": "sac"}, "name is 'a/b': it must be at most 100 letters"),
         ("mine", {"base": 3}, "base and preset must be text"),
+        ("mine", {"base": "sac", "draws": {"tau": []}}, "it must be a table of lists, such as"),
+        ("mine", {"base": "sac", "draws": {"tau": [0.1, -1]}}, "tau is -1: it must be"),
     ):
         with pytest.raises(InputError, match=message):
             Learner.of_table(name, table)

@@ -205,7 +205,13 @@ def setting_table(tables: Tables) -> Table:
     columns: dict[str, Mapping[str, Any]] = {}
     for shared in tables.record.labels.values():
         settings = to_plain(shared.settings)
-        columns.setdefault(f"{settings['task']}/{settings['learner']}", dict(_flat(settings)))
+        drawn = {
+            name: f"one of {_shown([*map(_shown, values)])}, by seed"
+            for name, values in tables.record.draws_of(settings["learner"]).items()
+        }
+        own = {name: value for name, value in settings["overrides"].items() if name not in drawn}
+        flat = dict(_flat({**settings, "overrides": own})) | drawn
+        columns.setdefault(f"{settings['task']}/{settings['learner']}", flat)
     names = dict.fromkeys(name for settings in columns.values() for name in settings)
     rows = [
         (name, *(_shown(settings.get(name)) for settings in columns.values()))

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jbrep.errors import InputError
 from jbrep.records.record import Record
 from jbrep.records.toml import read_toml, toml_text
@@ -28,6 +30,7 @@ class Learner(Record, frozen=True, kw_only=True):
         algorithm: a key of CLASSES.
         preset: the base, a key of PRESETS.
         overrides: what is set differently there.
+        draws: the values of settings, one of which each seed of a study draws.
 
     Raises:
         InputError: the name isn't one.
@@ -37,6 +40,7 @@ class Learner(Record, frozen=True, kw_only=True):
     algorithm: str
     preset: str
     overrides: Mapping[str, Any] = {}
+    draws: Mapping[str, tuple[Any, ...]] = {}
 
     @classmethod
     def of(cls, name: str) -> "Learner":
@@ -77,12 +81,14 @@ class Learner(Record, frozen=True, kw_only=True):
         Args:
             name: of the learner.
             table: `base`, an algorithm with or without a preset, by default the name; `preset`, if
-                `base` names none, which may be a file; and overrides.
+                `base` names none, which may be a file; `draws`, lists of values by setting; and
+                overrides.
 
         Raises:
             InputError: a base, preset or setting is unknown, or its value isn't allowed.
         """
         overrides = dict(table)
+        draws = _draws(overrides.pop("draws", {}))
         base, preset = overrides.pop("base", name), overrides.pop("preset", "")
         if not isinstance(base, str) or not isinstance(preset, str):
             raise InputError("base and preset must be text")
@@ -90,7 +96,8 @@ class Learner(Record, frozen=True, kw_only=True):
         if preset and start.preset != PAPER:
             raise InputError(f"base is {base} and preset {preset}: only one may name a preset")
         learner = cls.given(start.algorithm, preset or start.preset, overrides, name)
-        _ = learner.hyperparameters
+        learner = learner.replace(draws=draws)
+        learner.check_settings()
         presets = {base_name(each, its) for its in PRESETS for each in PRESETS[its]}
         if name in presets and learner != cls.of(name):
             raise InputError(f'it is a preset\'s name: give it another and base = "{base}"')
@@ -100,6 +107,25 @@ class Learner(Record, frozen=True, kw_only=True):
         """The same with more set differently, which its name then says."""
         name = usual_name(self.name, overrides)
         return self.replace(name=name, overrides={**self.overrides, **overrides})
+
+    def drawn(self, seed: int) -> "Learner":
+        """The same under its name, with the values that a seed draws, whatever else is drawn."""
+        chosen = {
+            name: values[np.random.default_rng([seed, *name.encode()]).integers(len(values))]
+            for name, values in self.draws.items()
+        }
+        return self.replace(overrides={**self.overrides, **chosen}, draws={})
+
+    def check_settings(self) -> None:
+        """Check its hyperparameters, with each value that may be drawn.
+
+        Raises:
+            InputError: as `hyperparameters`.
+        """
+        for name, values in {"": (None,), **self.draws}.items():
+            for value in values:
+                drawn = {name: value} if name else {}
+                overridden(self.algorithm, self.preset, {**self.overrides, **drawn})
 
     @property
     def hyperparameters(self) -> Hyperparameters:
@@ -114,7 +140,23 @@ class Learner(Record, frozen=True, kw_only=True):
     def table(self) -> dict[str, Any]:
         """A table that `of_table` takes, without a file; empty for a preset."""
         base = base_name(self.algorithm, self.preset)
-        return {"base": base, **self.overrides} if self.overrides or self.name != base else {}
+        draws = {name: [*values] for name, values in self.draws.items()}
+        own = {**self.overrides, **({"draws": draws} if draws else {})}
+        return {"base": base, **own} if own or self.name != base else {}
+
+
+def _draws(given: Any) -> dict[str, tuple[Any, ...]]:
+    """The values by setting that a table says.
+
+    Raises:
+        InputError: it doesn't.
+    """
+    if not isinstance(given, dict) or not all(isinstance(v, list) and v for v in given.values()):
+        raise InputError(
+            f"draws is {given!r}: it must be a table of lists, such as "
+            "{learning_rate = [1e-4, 3e-4, 1e-3]}"
+        )
+    return {name: tuple(values) for name, values in given.items()}
 
 
 def usual_name(base: str, overrides: Mapping[str, Any]) -> str:

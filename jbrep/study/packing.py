@@ -61,7 +61,7 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
             seen = cell.task, cell.representation.name
             if seen not in observed:
                 observed[seen] = _observed(plan, cell)
-            groups[cell.task, cell.learner.name, observed[seen]].append(cell)
+            groups[*cell.kind, observed[seen]].append(cell)
         else:
             alone.append((cell,))
     widest = _WIDEST[plan.device]
@@ -155,7 +155,7 @@ def forecast(plan: Plan, workers: int | None = None, width: int | None = None) -
 def _kind(pack: Pack) -> tuple[object, ...]:
     """What the duration of a pack depends on."""
     own = [c.representation.name for c in pack if isinstance(c.representation, ByCode)]
-    return pack[0].task, pack[0].learner.name, len(pack), tuple(own)
+    return *pack[0].kind, len(pack), tuple(own)
 
 
 def _example(run: Run) -> Run:

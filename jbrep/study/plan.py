@@ -1,5 +1,6 @@
 """A study's folder: where its files are, and which runs it has."""
 
+import json
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -50,6 +51,11 @@ class Cell:
         return f"{self.task}/{self.learner.name}/{self.representation.name}"
 
     @property
+    def kind(self) -> tuple[str, str]:
+        """What it shares with the runs that it can learn together with: task and settings."""
+        return self.task, json.dumps([self.learner.name, self.learner.table], sort_keys=True)
+
+    @property
     def name(self) -> str:
         """Its folder below the study's folder of runs."""
         parts = (slug(self.task), self.learner.name, self.representation.name, f"seed-{self.seed}")
@@ -74,7 +80,7 @@ class Plan:
         study = self.study
         learners = [study.learner(algorithm) for algorithm in study.algorithms]
         grid = product(study.seeds, study.tasks, learners, study.observed)
-        return tuple(Cell(task, learner, seen, seed) for seed, task, learner, seen in grid)
+        return tuple(Cell(task, each.drawn(seed), seen, seed) for seed, task, each, seen in grid)
 
     @cached_property
     def registration(self) -> Registration | None:

@@ -137,6 +137,10 @@ class RunsRecord(Document, frozen=True, kw_only=True):
         for run in self.runs:
             self.settings_of(run)
 
+    def draws_of(self, learner: str) -> Mapping[str, tuple[Any, ...]]:
+        """The values of settings, one of which each seed of the study draws, of a learner."""
+        return self.study.learner(learner).draws if self.study else {}
+
     def settings_of(self, run: RunFacts) -> LabelSettings:
         """The settings of a run, without its seed and what depends on it."""
         shared = self.labels[run.label].settings

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -180,8 +180,14 @@ def _curves(
     evaluated = by_run(returns)
     counted_over = {task: _reference(played, rules) for task, played in references.items()}
     return [
-        _curve(run, record.settings_of(run), evaluated.get((run.label, run.seed), {}), counted_over)
-        for run in record.runs
+        _curve(
+            run,
+            settings,
+            record.draws_of(settings.learner),
+            evaluated.get((run.label, run.seed), {}),
+            counted_over,
+        )
+        for run, settings in ((run, record.settings_of(run)) for run in record.runs)
     ]
 
 
@@ -195,11 +201,15 @@ def _reference(played: Mapping[str, Sequence[float]], rules: Rules) -> float | N
 def _curve(
     run: RunFacts,
     shared: LabelSettings,
+    drawn: Collection[str],
     by_step: Mapping[int, list[float]],
     counted_over: Mapping[str, float | None],
 ) -> RunCurve:
-    """A run, from its settings without the seed, and the returns of its evaluations by step."""
+    """A run, from its settings without the seed and what that draws, and its returns by step."""
     task, settings = shared.environment, to_plain(shared)
+    if drawn:  # the overrides say the hyperparameters
+        del settings["hyperparameters"]
+        settings["overrides"] = {n: v for n, v in shared.overrides.items() if n not in drawn}
     trainer = [settings.pop(name) for name in ("trainer", "precision", "device")]
     steps = sorted(by_step)
     returns = [by_step[step] for step in steps]
