@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from jbrep.api import study as study
     from jbrep.api import train as train
     from jbrep.api import train_encoder as train_encoder
+    from jbrep.api import train_encoders as train_encoders
     from jbrep.dataset.reader import Dataset as Dataset
     from jbrep.encoders.encoder import Encoder as Encoder
     from jbrep.encoders.vec_env import JitterbugVecEnv as JitterbugVecEnv

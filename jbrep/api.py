@@ -6,7 +6,7 @@ one. What a function works with is imported when it is called.
 """
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from jbrep.encoders import Encoder
     from jbrep.envs.task import Task
     from jbrep.evaluate.evaluation import Diagnostics, Evaluation
+    from jbrep.methods.fit import Fitted, Fitter
     from jbrep.report.report import Report
     from jbrep.rl.controller import Controller
     from jbrep.rl.files import RunRecord
@@ -169,6 +170,7 @@ def train_encoder(
     kind: str = "dae",
     *,
     name: str | None = None,
+    preset: str | None = None,
     device: str = "auto",
     **settings: Any,
 ) -> "Encoder":
@@ -179,6 +181,7 @@ def train_encoder(
         out: a folder for the encoder's file; a training that was stopped goes on from there.
         kind: dae, pca, slow, ...; the command lists them.
         name: of the encoder and its file; None for what it is, such as dae-8.
+        preset: named settings; of dae: authors, its authors' own.
         device: cpu, cuda or auto.
         settings: of the kind, such as latent=8 or on="symmetry".
 
@@ -186,10 +189,52 @@ def train_encoder(
         InputError: a setting that the kind doesn't take, or one that is missing; or the file
             that it would have is another encoder's.
     """
-    from jbrep.methods.fit import Fitter
+    from jbrep.methods.registry import with_preset
 
-    fitter = Fitter(data, Path(out), device)
-    return fitter.fit(kind, name=name, **settings).encoder
+    settings = with_preset(kind, preset, settings)
+    return _fitter(data, out, device).fit(kind, name=name, **settings).encoder
+
+
+def train_encoders(
+    data: "Dataset | str | Path",
+    out: str | Path,
+    kind: str = "dae",
+    *,
+    latent: Sequence[int | str] = (),
+    seeds: int | None = None,
+    name: str | None = None,
+    preset: str | None = None,
+    device: str = "auto",
+    **settings: Any,
+) -> "Iterator[Fitted]":
+    """Make several encoders of a kind, one of each latent size and seed.
+
+    All settings are checked at once; an encoder is made when the next one is asked for:
+
+        for made in jbrep.train_encoders("data/face", "encoders", "dae", latent=[12, 8, 4]):
+            print(made)
+
+    Args:
+        data: as for `train_encoder`.
+        out: a folder for all of them.
+        kind: of all of them.
+        latent: sizes; empty for a kind that has none.
+        seeds: n for one of each of the seeds 0 to n - 1, as NAME-s0; None for the usual one.
+        name: of one latent size; None for what they are.
+        preset: named settings.
+        device: cpu, cuda or auto.
+        settings: of the kind, for all of them.
+
+    Raises:
+        InputError: as `train_encoder`.
+    """
+    from jbrep.methods.registry import each_named, with_preset
+
+    named = each_named(kind, latent, seeds, name, with_preset(kind, preset, settings))
+    fitter = _fitter(data, out, device)
+    for called, each in named:  # every mistake is reported before the first training
+        fitter.plan(kind, name=called, **each)
+    return (fitter.fit(kind, name=called, **each) for called, each in named)
 
 
 def evaluate(
@@ -339,10 +384,13 @@ def study(
     from jbrep.errors import choose
     from jbrep.study import Plan, run_study
     from jbrep.study.runner import BACKENDS
+    from jbrep.text import counted
 
-    plan = Plan(_study(study), Path(out))
-    if crashed := run_study(plan, choose(backend, BACKENDS, "backend"), workers, width):
-        _note(f"{crashed} runs crashed: the same call tries them again")
+    plan, run = Plan(_study(study), Path(out)), choose(backend, BACKENDS, "backend")
+    for notice in plan.study.notices:
+        _note(notice)
+    if crashed := run_study(plan, run, workers, width):
+        _note(f"{counted(crashed, 'run')} crashed: the same study in that folder tries again")
     return report(plan.folder)
 
 
@@ -373,6 +421,16 @@ def report(
     from jbrep.report.report import make_report  # imports torch
 
     return make_report(Path(folder), Path(out) if out else None, evaluation, across_trainers)
+
+
+def _fitter(data: "Dataset | str | Path", out: str | Path, device: str) -> "Fitter":
+    from jbrep.dataset import ScaledDataset
+    from jbrep.methods.fit import Fitter
+
+    scaled = ScaledDataset.of(data)
+    for constant in scaled.constant_features:
+        _note(f"{constant} is constant in the training part: it is scaled to 0")
+    return Fitter(scaled, Path(out), device)
 
 
 def _study(given: "Study | Mapping[str, Any] | str | Path") -> "Study":

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 import jbrep
 from jbrep import api
 from jbrep.cli import main
-from jbrep.errors import InputError
+from jbrep.errors import InputError, Notice
 from jbrep.rl.shipped import find
 
 QUICK = {"steps": 64, "evaluate_every": 64, "evaluation_episodes": 1, "final_episodes": 3}
@@ -43,6 +43,21 @@ def test_from_states_to_a_policy(home):
     np.testing.assert_array_equal(policy(row), agent.policy(row))
 
 
+def test_several_encoders_are_made_when_they_are_asked_for(home):
+    out = home / "several"
+    mistake = {"latent": [2, 99], "seeds": 2}
+    with pytest.raises(InputError, match="latent size is 99: with 16 features it must"):
+        jbrep.train_encoders(home / "data", out, "random", **mistake)
+    made = jbrep.train_encoders(home / "data", out, "random", latent=[2, 3], seeds=2)
+    assert not out.exists()
+    assert [each.encoder.name for each in made] == [
+        *("random-2-s0", "random-2-s1", "random-3-s0", "random-3-s1")
+    ]
+    (again,) = jbrep.train_encoders(home / "data", home / "encoders", "pca", latent=[4])
+    assert str(again).startswith("pca-4: reconstructs held-out states with a mean squared error of")
+    assert str(again).endswith("pca-4.safetensors, already complete")
+
+
 def test_encoders_are_judged_by_names_and_as_a_dictionary(home):
     path = home / "encoders/pca-4.safetensors"
     by_name = jbrep.evaluate([path, lambda rows: rows[:, :2]], home / "data")
@@ -65,7 +80,8 @@ def test_a_study_without_a_file(home):
         seeds=(0, 1),
         **QUICK,
     )
-    found = jbrep.study(study, home / "study", workers=1)
+    with pytest.warns(Notice, match="This study compares nothing: representations must have full"):
+        found = jbrep.study(study, home / "study", workers=1)
     assert {row.seed for row in found.returns} == {0, 1}
     assert found.page.exists()
     assert "Pendulum-v1" in repr(found)
@@ -80,6 +96,7 @@ def test_a_study_without_a_file(home):
     [
         ("collect", "collect"),
         ("train_encoder", "train-encoder"),
+        ("train_encoders", "train-encoder"),
         ("train", "rl"),
         ("study", "study"),
     ],

@@ -457,11 +457,12 @@ def test_tables_fit_the_terminal(done):
 def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     path = written(tmp_path)
     out = shutil.copytree(done.folder, tmp_path / "out")
-    monkeypatch.setattr("jbrep.study.run_study", lambda *given: 2)
+    shutil.rmtree(next(out.rglob("run.json")).parent)
+    monkeypatch.setattr("jbrep.study.run_study", lambda *given: 1)
     monkeypatch.setattr("jbrep.report.report.write_report_of", lambda tables, out: [out])
     told = jbrep("study", path, "--out", out)
     assert told.exit_code == 1
-    assert told.stderr.endswith("2 runs crashed: the same command tries them again\n")
+    assert "Note: 1 run crashed: the same study in that folder tries again\n" in told.stderr
 
 
 MIXED = (

@@ -201,12 +201,12 @@ def stoppable(afterwards: str) -> Iterator[None]:
 
 @contextmanager
 def _notices() -> Iterator[None]:
-    """Show each notice as a line on standard error."""
+    """Show each notice on standard error."""
     usual = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
         if issubclass(category, Notice):
-            say(f"Note: {message}", err=True)
+            tell(f"Note: {message}", err=True)
         else:
             usual(message, category, *where, **options)
 

@@ -1,6 +1,7 @@
 """Studies: many agents, and what the statistics say of them."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -18,6 +19,9 @@ from jbrep.cli.base import (
 )
 from jbrep.cli.environment import import_option
 from jbrep.text import terminal_width
+
+if TYPE_CHECKING:
+    from jbrep.report.report import Report
 
 _COUNT = click.IntRange(1, 1024)
 
@@ -67,39 +71,42 @@ def study(
     Data sets and encoders are made first. Stopped or killed, the same command resumes the study;
     runs that have ended are never run again.
     """
-    from jbrep.errors import InputError, choose
+    from jbrep.errors import InputError
     from jbrep.records.toml import read_toml
 
     if not study.exists():
         raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)
+    folder = out or Path("runs") / study.stem
+    if dry_run or register:
+        _announce(study, folder, dry_run, workers, width)
+        return
+    from jbrep import api
+
+    with stoppable(RESUMES):
+        made = api.study(study, folder, workers=workers, width=width, backend=backend)
+    _show(made)
+    context.exit(bool(made.tables.record.missing))
+
+
+def _announce(
+    path: Path, folder: Path, dry_run: bool, workers: int | None, width: int | None
+) -> None:
+    """Say what a study is going to do, or write it down before the first run."""
     from jbrep.report.statistics import forecast_text
-    from jbrep.study import Plan, read_study, register_study, run_study
+    from jbrep.study import Plan, read_study, register_study
     from jbrep.study.packing import forecast
     from jbrep.study.registration import REGISTRATION
-    from jbrep.study.runner import BACKENDS
 
-    plan = Plan(read_study(study), out or Path("runs") / study.stem)
-    run = choose(backend, BACKENDS, "backend")
+    plan = Plan(read_study(path), folder)
     expected = forecast(plan, workers, width) if dry_run else None
     for notice in plan.study.notices:
         tell(notice, err=True)
     if expected:
-        click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
-        return
-    if register:
-        registered = register_study(plan)
-        click.echo(f"registered on {registered.date} (SHA-256 {registered.sha256})")
-        echo_paths([plan.folder / REGISTRATION])
-        return
-    with stoppable(RESUMES):
-        crashed = run_study(plan, run, workers, width)
-    if crashed:
-        click.echo(f"{crashed} runs crashed: the same command tries them again", err=True)
-    if any(map(plan.has_ended, plan.cells)):
-        context.invoke(report, folder=plan.folder)
-    if crashed:
-        context.exit(1)
+        return click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
+    registered = register_study(plan)
+    click.echo(f"registered on {registered.date} (SHA-256 {registered.sha256})")
+    return echo_paths([plan.folder / REGISTRATION])
 
 
 @click.command(cls=Variadic, epilog="Example: jbrep report runs/demo")
@@ -130,11 +137,15 @@ def report(
     FOLDER holds a study, finished or not, or any runs. Where there are no runs, as in
     results/confirm, the report is made from the tables alone.
     """
-    import json
-
     from jbrep import api
 
     made = api.report(folder, evaluation=evaluation, across_trainers=across_trainers, out=out)
+    _show(made, everything, as_json)
+
+
+def _show(made: "Report", everything: bool = False, as_json: bool = False) -> None:
+    import json
+
     from jbrep.report.report import SUMMARY
     from jbrep.report.statistics import results_text
 

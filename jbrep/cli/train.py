@@ -17,8 +17,6 @@ from jbrep.records.keys import Key, keys_of
 from jbrep.records.words import bare
 
 if TYPE_CHECKING:
-    from jbrep.dataset import ScaledDataset
-    from jbrep.methods.fit import Fitted
     from jbrep.training.method import Method
 
 _FEW = 3  # kinds: where only so many don't take a setting, help names those
@@ -113,11 +111,11 @@ def _shown(key: Key) -> str:
     return "" if key.default is False else key.default_shown
 
 
-def _given(kind: str, options: Mapping[str, Any], preset: str | None) -> dict[str, Any]:
-    """The settings of a method that options and a preset give, most as text.
+def _given(kind: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a method that options give, as text; sizes of the latent as a list.
 
     Raises:
-        InputError: the method doesn't take one, or needs another, or has no such preset.
+        InputError: the method doesn't take one, or needs another.
     """
     from jbrep.methods.registry import METHODS, get_method
 
@@ -131,13 +129,11 @@ def _given(kind: str, options: Mapping[str, Any], preset: str | None) -> dict[st
         if not method.takes(name):
             kinds = ", ".join(each for each, m in METHODS.items() if m.takes(name))
             raise InputError(f"{kind} takes no {_option(name)}: leave it out; it is for {kinds}")
-    if method.takes("latent") and "latent" not in given:
-        raise InputError(f"{kind} needs --latent, such as --latent 12 8 4")
-    if preset is None:
+    if not method.takes("latent"):
         return given
-    if not method.presets:
-        raise InputError(f"{kind} has no presets: leave out --preset")
-    return {**choose(preset, method.presets, f"preset of {kind}"), **given}
+    if "latent" not in given:
+        raise InputError(f"{kind} needs --latent, such as --latent 12 8 4")
+    return {**given, "latent": given["latent"].rstrip(",").split(",")}
 
 
 class _Dae(_Making):
@@ -210,52 +206,12 @@ def _fit(
     preset: str | None,
     **options: Any,
 ) -> None:
-    from jbrep.dataset import Dataset, ScaledDataset
-    from jbrep.methods.fit import Fitter
+    from jbrep import api
 
-    named = _named(kind, name, _given(kind, options, preset), seeds)
-    scaled = ScaledDataset(Dataset(data))
-    for constant in scaled.constant_features:
-        click.echo(f"{constant} is constant in the training part: it is scaled to 0", err=True)
-    fitter = Fitter(scaled, out, device)
-    for called, settings in named:  # every mistake is reported before the first training
-        fitter.plan(kind, name=called, **settings)
+    given = _given(kind, options)
+    made = api.train_encoders(
+        data, out, kind, seeds=seeds, name=name, preset=preset, device=device, **given
+    )
     with stoppable(f"{RESUMES}; the best so far is in {out}"):
-        for called, settings in named:
-            _report(fitter.fit(kind, name=called, **settings), scaled)
-
-
-def _named(
-    kind: str, name: str | None, given: Mapping[str, Any], seeds: int | None
-) -> list[tuple[str | None, Mapping[str, Any]]]:
-    """The name and settings of each encoder: one of each latent size and seed."""
-    from jbrep.encoders.names import of_seed
-    from jbrep.methods.registry import get_method, name_of
-
-    method = get_method(kind)
-    sizes = given["latent"].rstrip(",").split(",") if "latent" in given else []
-    if name and len(sizes) > 1:
-        raise InputError("one --name is for one latent size: give each its own")
-    each: list[Mapping[str, Any]] = [{**given, "latent": size} for size in sizes] or [given]
-    names = [name or name_of(method.of(settings)) for settings in each]
-    if seeds is None:
-        return [(name, settings) for settings in each]
-    if not method.takes("seed"):
-        raise InputError(f"{kind} has no seed, so all its encoders are the same: leave out --seeds")
-    if "seed" in given:
-        raise InputError("--seed is for one encoder: leave it out, or --seeds")
-    return [
-        (of_seed(called, seed), {**settings, "seed": seed})
-        for called, settings in zip(names, each, strict=True)
-        for seed in range(seeds)
-    ]
-
-
-def _report(fitted: "Fitted", data: "ScaledDataset") -> None:
-    """Say whether an encoder that was fitted to that data is good at what its kind is for."""
-    from jbrep.methods.purpose import purpose
-
-    encoder, path, is_new = fitted
-    told = purpose(encoder, data) or "jbrep evaluate shows what it keeps"
-    line = f"{encoder.name}: {told}; {path}{'' if is_new else ', already complete'}"
-    tell(line)
+        for each in made:
+            tell(str(each))

@@ -18,6 +18,7 @@ from jbrep.encoders.header import HELD_OUT_MSE, EncoderHeader
 from jbrep.encoders.names import check_name
 from jbrep.errors import InputError, differences
 from jbrep.methods.held_out import held_out_error
+from jbrep.methods.purpose import purpose
 from jbrep.methods.registry import get_method, name_of
 from jbrep.methods.shape import complete
 from jbrep.progress import Progress
@@ -43,6 +44,14 @@ class Fitted(NamedTuple):
     encoder: Encoder
     path: Path
     is_new: bool  # False if the file was complete already
+    data: ScaledDataset  # that it was made from
+
+    def __repr__(self) -> str:
+        """Whether it is good at what its kind is for."""
+        told = purpose(self.encoder, self.data) or "jbrep evaluate shows what it keeps"
+        return (
+            f"{self.encoder.name}: {told}; {self.path}{'' if self.is_new else ', already complete'}"
+        )
 
 
 class Plan(NamedTuple):
@@ -130,7 +139,7 @@ class Fitter:
                 is_complete = plan.is_complete()  # another process may have made it meanwhile
                 if not is_complete:
                     self._make(plan)
-        return Fitted(load(plan.path), plan.path, not is_complete)
+        return Fitted(load(plan.path), plan.path, not is_complete, self._data)
 
     def plan(self, kind: str, *, name: str | None = None, **settings: Any) -> Plan:
         """What `fit` would make.

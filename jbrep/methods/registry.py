@@ -1,5 +1,6 @@
 """The methods that make encoders, and how names say which."""
 
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple, get_args
 
@@ -7,7 +8,7 @@ from msgspec.structs import asdict
 
 from jbrep.coordinates import System
 from jbrep.dataset.scaling import SCALINGS
-from jbrep.encoders.names import EncoderName
+from jbrep.encoders.names import EncoderName, of_seed
 from jbrep.errors import InputError, choose
 from jbrep.methods.kinds import KINDS
 from jbrep.training.method import Method
@@ -37,6 +38,53 @@ def get_method(name: str) -> type[Method]:
         InputError: the name is unknown; the message lists the methods.
     """
     return choose(name, METHODS, "kind")
+
+
+def with_preset(kind: str, preset: str | None, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a method, beside those of one of its presets, if there is one.
+
+    Raises:
+        InputError: an unknown kind, or it has no such preset.
+    """
+    method = get_method(kind)
+    if preset is None:
+        return dict(settings)
+    if not method.presets:
+        raise InputError(f"{kind} has no presets: leave out --preset")
+    return {**choose(preset, method.presets, f"preset of {kind}"), **settings}
+
+
+def each_named(
+    kind: str, latents: Sequence[Any], seeds: int | None, name: str | None, settings: dict[str, Any]
+) -> list[tuple[str, dict[str, Any]]]:
+    """The name and settings of several encoders: one of each latent size and seed.
+
+    Args:
+        kind: of all of them.
+        latents: their sizes; empty for one of a kind that has none.
+        seeds: n for one of each of the seeds 0 to n - 1; None for the usual one.
+        name: of the only one of each seed; None for what they are.
+        settings: of all of them.
+
+    Raises:
+        InputError: a setting that the kind doesn't take, or one that is missing.
+    """
+    method = get_method(kind)
+    if name and len(latents) > 1:
+        raise InputError("one --name is for one latent size: give each its own")
+    each = [{**settings, "latent": size} for size in latents] or [settings]
+    named = [(name or name_of(method.of(one)), one) for one in each]
+    if seeds is None:
+        return named
+    if not method.takes("seed"):
+        raise InputError(f"{kind} has no seed, so all its encoders are the same: leave out --seeds")
+    if "seed" in settings:
+        raise InputError("--seed is for one encoder: leave it out, or --seeds")
+    return [
+        (of_seed(called, seed), {**one, "seed": seed})
+        for called, one in named
+        for seed in range(seeds)
+    ]
 
 
 class Recipe(NamedTuple):
