@@ -417,7 +417,8 @@ def test_diagnostics_stand_against_final_returns(analysis, returns):
         ("face_direction", "pca-2"): {"forward": 0.1, "error": 0.4},  # without runs
     }
     which = Diagnostic("forward", "of changes", 1), Diagnostic("error", "of the state", -1)
-    found = associations(analysis.groups, known, which)
+    kinds = {code: code[1].partition("-")[0] for code in known}
+    found = associations(analysis.groups, known, which, kinds)
     assert [(each.group.algorithm, each.diagnostic.name, len(each.values)) for each in found] == [
         *(("ddpg", "forward", 3), ("ddpg", "error", 2)),
         *(("sac", "forward", 3), ("sac", "error", 2)),
@@ -425,7 +426,7 @@ def test_diagnostics_stand_against_final_returns(analysis, returns):
     assert np.isnan(found[0].correlation.value)
     (plot,) = [p for p in study_plots(analysis, [], {}, {}, found) if p.name == "diagnostics"]
     final = analysis.groups[0].labels[1].numbers["final_return_mean"].value
-    row = ("face_direction", "ddpg", "forward", "dae-8", "0.5", f"{final:.7g}", "", "", "", 3)
+    row = ("face_direction", "ddpg", "forward", "dae-8", "0.5", f"{final:.7g}", "", "", "", 3, 3)
     assert plot.rows[1] == row
     forward, error, *_ = drawn(plot).axes  # no panel of correlations, as there are none
     assert forward.lines[1].get_xydata().tolist() == [[0.5, final]]

@@ -544,16 +544,28 @@ def test_the_correlation_of_ranks_is_spearman_s(ties):
     y = x + noise
     if ties:
         x, y = x.round(), y.round()
-    value, low, high = rank_correlation(x, y)
+    codes = [*"abcdefghijkl"]
+    value, low, high = rank_correlation(x, y, codes)
     assert value == pytest.approx(stats.spearmanr(x, y).statistic)
     assert -1 <= low < value < high <= 1
-    assert rank_correlation(x, y) == rank_correlation(np.exp(x), 3 * y)  # ranks alone count
-    assert rank_correlation(x, y, seed=1) != rank_correlation(x, y)
-    assert rank_correlation(-x, y).value == pytest.approx(-value)
+    assert rank_correlation(x, y, codes) == rank_correlation(np.exp(x), 3 * y, codes)  # ranks alone
+    assert rank_correlation(x, y, codes, seed=1) != rank_correlation(x, y, codes)
+    assert rank_correlation(-x, y, codes).value == pytest.approx(-value)
+
+
+def test_families_of_codes_are_resampled_as_a_whole():
+    """Each code twice says as much as each code once; drawn one by one, twice as much."""
+    x, noise = np.random.default_rng(0).normal(size=(2, 8))
+    once = rank_correlation(x, x + noise, [*"abcdefgh"])
+    twice = np.repeat((x, x + noise), 2, axis=1)
+    assert rank_correlation(*twice, [*"aabbccddeeffgghh"]) == pytest.approx(once)
+    _, low, high = rank_correlation(*twice, [*"abcdefghijklmnop"])
+    assert high - low < 0.8 * (once.high - once.low)
+    assert np.isnan(rank_correlation(*twice, [*"aaaabbbbccccdddd"]).low)
 
 
 def test_few_pairs_and_constant_values_say_nothing():
     x = np.arange(5.0)
-    assert np.isnan(rank_correlation(x[:4], x[:4])).all()
-    assert np.isnan(rank_correlation(x, np.ones(5))).all()
-    assert rank_correlation(x, x).value == 1
+    assert np.isnan(rank_correlation(x[:4], x[:4], [*"abcd"])).all()
+    assert np.isnan(rank_correlation(x, np.ones(5), [*"abcde"])).all()
+    assert rank_correlation(x, x, [*"abcde"]).value == 1

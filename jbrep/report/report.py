@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jbrep.encoders.base import OWN
 from jbrep.evaluate.table import SCALARS
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import inside, make_folder, write_whole
@@ -161,7 +162,13 @@ def _associated(tables: Tables) -> list[Association]:
     if tables.analysis is None:
         return []
     known = [Diagnostic(name, each.words, each.better) for name, each in SCALARS.items()]
-    return associations(tables.analysis.groups, tables.diagnostics, known, tables.analysis.seed)
+    families = {}
+    for label in tables.record.labels.values():
+        task, name = label.settings.task, label.settings.representation
+        kind = label.encoder.kind
+        families[task, name] = name if kind == OWN else kind
+    analysis = tables.analysis
+    return associations(analysis.groups, tables.diagnostics, known, families, analysis.seed)
 
 
 def statistics(analysis: Analysis) -> dict[str, Any]:

@@ -294,13 +294,14 @@ def association_tables(associated: list[Association]) -> list[Table]:
         Table.of(
             f"{name}: do diagnostics predict learning? Rank correlation with the final return over "
             "codes, positive where the better value goes with the higher return; 95 % bootstrap "
-            "intervals over codes",
+            "intervals over families of codes, by how they are made",
             [each for each in associated if each.group.name == name],
             {
                 "diagnostic": lambda each: each.diagnostic.name,
                 "what it is": lambda each: each.diagnostic.words,
                 "rank correlation": lambda each: shown(each.correlation, ".2f"),
                 "codes": lambda each: str(len(each.values)),
+                "families": lambda each: str(len(set(each.families))),
             },
         )
         for name in dict.fromkeys(each.group.name for each in associated)

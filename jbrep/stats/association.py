@@ -4,14 +4,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import rankdata
 
 from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.bootstrap import Array, Interval
 from jbrep.stats.intervals import UNDEFINED, percentile
 
-_FEWEST = 5  # pairs: with fewer, ranks agree by chance too often
+_FEWEST = 5  # pairs, or families for an interval: with fewer, ranks agree by chance too often
 Diagnosed = Mapping[tuple[str, str], Mapping[str, float | None]]  # by task and representation
+Families = Mapping[tuple[str, str], str]  # likewise: how a code is made
 
 
 class Diagnostic(NamedTuple):
@@ -30,6 +30,7 @@ class Association(NamedTuple):
     representations: tuple[str, ...]  # that it is known of, the full observation among them
     values: Array  # of the diagnostic, (n,)
     returns: Array  # mean final return over runs, (n,)
+    families: tuple[str, ...]  # of the codes, by how they are made, (n,)
     correlation: Interval  # of ranks; positive if the better value goes with the higher return
 
 
@@ -37,6 +38,7 @@ def associations(
     groups: Iterable[GroupAnalysis],
     diagnosed: Diagnosed,
     diagnostics: Sequence[Diagnostic],
+    families: Families,
     seed: int = 0,
 ) -> list[Association]:
     """Each diagnostic with the final returns of each group, where both are known of some code."""
@@ -54,29 +56,56 @@ def associations(
             }
             if known:
                 x, y = np.array(list(known.values())), np.array([returns[name] for name in known])
-                correlation = rank_correlation(each.better * x, y, seed)
-                result.append(Association(group, each, tuple(known), x, y, correlation))
+                kin = tuple(families[group.task, name] for name in known)
+                correlation = rank_correlation(each.better * x, y, kin, seed)
+                result.append(Association(group, each, tuple(known), x, y, kin, correlation))
     return result
 
 
-def rank_correlation(x: Array, y: Array, seed: int = 0) -> Interval:
+def rank_correlation(x: Array, y: Array, families: Sequence[str], seed: int = 0) -> Interval:
     """Spearman's rank correlation of finite x and y, (n,), with its percentile bootstrap interval.
 
     Spearman 1904, "The proof and measurement of association between two things": Pearson's
     correlation of ranks, equal values sharing their mean rank. All is NaN for fewer than five
     pairs, and where x or y doesn't vary.
 
+    Codes of one family, such as the autoencoders of several sizes, are much alike, so whole
+    families are resampled; of fewer than five there is no interval.
+
     In 300 samples each of normal pairs with correlations of 0, 0.6 and 0.9, the intervals covered
-    88, 95 and 71 % for 5 pairs, 95, 96 and 98 % for 8, and 96, 97 and 98 % for 12: of five pairs in
-    the same order the interval has no width, which says little.
+    88, 94 and 74 % for 5 codes, each a family, 97 % for 8, and 93, 97 and 98 % for 12: of five
+    pairs in the same order the interval has no width, which says little. Of 8 families of two
+    codes, which share .8 of the variance, they covered 95, 96 and 97 %.
+
+    Args:
+        x: a number of each code.
+        y: another one.
+        families: that the codes belong to, (n,).
+        seed: of the resamples.
     """
     if len(x) < _FEWEST or np.ptp(x) == 0 or np.ptp(y) == 0:
         return UNDEFINED
-    return percentile(_of_ranks, np.stack((x, y)), seed=seed)
+    names, family = np.unique(families, return_inverse=True)
+    numbers = np.arange(len(names), dtype=np.float64)
+
+    def statistic(drawn: Array) -> Array:
+        times = (drawn[..., None] == numbers).sum(axis=-2)
+        return _of_ranks(x, y, times[..., family])
+
+    found = percentile(statistic, numbers, seed=seed)
+    return found if len(names) >= _FEWEST else UNDEFINED._replace(value=found.value)
 
 
-def _of_ranks(pairs: Array) -> Array:
-    """Correlation of the ranks of x and y, (2, ..., n), over the last axis, (...)."""
-    x, y = rankdata(pairs, axis=-1) - (pairs.shape[-1] + 1) / 2
-    correlation: Array = (x * y).sum(-1) / np.sqrt((x * x).sum(-1) * (y * y).sum(-1))
+def _of_ranks(x: Array, y: Array, times: Array) -> Array:
+    """Correlation of the ranks of x and y, (n,), each pair so many times, (..., n); (...)."""
+    x, y = _ranks(x, times), _ranks(y, times)
+    correlation: Array = (times * x * y).sum(-1) / np.sqrt(
+        (times * x * x).sum(-1) * (times * y * y).sum(-1)
+    )
     return correlation
+
+
+def _ranks(values: Array, times: Array) -> Array:
+    """The mean rank of each value, (n,), that comes so many times, (..., n), about the middle."""
+    above = np.sign(values[:, None] - values)  # of a value over each other one
+    return times @ above.T / 2

@@ -29,17 +29,17 @@ def diagnostics(associations: Sequence[Association], looks: Looks) -> Plot:
         "Final return against diagnostics",
         "Each code by the main diagnostics, better ones to the right, with its mean final return. "
         "Where there are five codes or more, on the left: the rank correlation of each diagnostic "
-        "with the final return, with its 95 % bootstrap interval over codes: 1 if the better value "
-        "always goes with the higher return.",
+        "with the final return, with its 95 % bootstrap interval over families of codes: 1 if the "
+        "better value always goes with the higher return.",
         (
             *("task", "algorithm", "diagnostic", "representation", "value", "final_return"),
-            *("rank_correlation", "low", "high", "codes"),
+            *("rank_correlation", "low", "high", "codes", "families"),
         ),
         [
             (
                 *(each.group.task, each.group.algorithm, each.diagnostic.name, name),
                 *(cell(value), cell(final)),
-                *(*map(cell, each.correlation), len(each.values)),
+                *(*map(cell, each.correlation), len(each.values), len(set(each.families))),
             )
             for each in associations
             for name, value, final in zip(
