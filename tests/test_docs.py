@@ -38,6 +38,7 @@ PYTHON = found(r"^```python\n(.*?)^```")
 (NUMBERS,) = (block for block in PYTHON if "genfromtxt" in block.values[0])  # in test_verdicts
 
 
+@pytest.mark.filterwarnings("ignore:This study:jbrep.errors.Notice")  # that it is a small one
 @pytest.mark.parametrize(
     "block", [block for block in PYTHON if block not in (ENVIRONMENT, NUMBERS)]
 )
