@@ -153,9 +153,9 @@ def forecast(plan: Plan, workers: int | None = None, width: int | None = None) -
 
 
 def _kind(pack: Pack) -> tuple[object, ...]:
-    """What the duration of a pack depends on."""
+    """What the duration of a pack depends on, whatever of its settings seeds draw."""
     own = [c.representation.name for c in pack if isinstance(c.representation, ByCode)]
-    return *pack[0].kind, len(pack), tuple(own)
+    return pack[0].task, pack[0].learner.name, len(pack), tuple(own)
 
 
 def _example(run: Run) -> Run:
