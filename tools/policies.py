@@ -1,9 +1,9 @@
 """Ship the best agent for each task: python tools/policies.py STUDY...
 
 A task's best run, of those of some finished studies, has the highest mean return in its last 64
-episodes of training; a task that none has learned gets no policy. Those episodes have other starts
-than the evaluation's, so the returns that are written, which are of the last evaluation's episodes,
-aren't what it was chosen by.
+episodes of training; a task that none has learned keeps what ships. Those episodes have other
+starts than the evaluation's, so the returns that are written, which are of the last evaluation's
+episodes, aren't what it was chosen by.
 """
 
 import csv
@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jbrep.jitterbug.tasks import TASKS, Array
+from jbrep.jitterbug.tasks import TASKS
 from jbrep.rl.files import EPISODES, FINISHED, last_returns, read_evaluations, read_run, runs_below
 from jbrep.rl.policy import load_run
-from jbrep.rl.shipped import SHIPPED, file_of, write_returns
+from jbrep.rl.shipped import SHIPPED, Returns, file_of, shipped, write_returns
 from jbrep.rl.trained import save
 from jbrep.stats.scale import LOOKING, STILL
 from jbrep.study.tables import REFERENCE_RETURNS, References, read_references, stated
@@ -45,7 +45,8 @@ def best(folders: list[Path]) -> dict[str, tuple[float, Path]]:
 
 def main() -> None:
     folders = [Path(each) for each in sys.argv[1:]]
-    played, beside = dict[str, dict[str, Array]](), References()
+    played: dict[str, Returns] = {each.task: each.returns for each in shipped()}
+    beside = References()
     for folder in folders:
         beside |= read_references(folder, stated(folder)[REFERENCE_RETURNS])
     for task, (value, run) in best(folders).items():
