@@ -373,6 +373,13 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
     assert failed == {"a2c": [0, 0], "a2c-modern": [2, 2]}
 
 
+def test_each_run_says_which_module_is_not_here(tmp_path):
+    plan = Plan(TINY.replace(representations=("full",)), tmp_path)
+    ended = work(plan.assigned(plan.cells), modules=["robots_elsewhere"])
+    assert [each.status for each in ended] == ["crashed"] * 2
+    assert all("can't import robots_elsewhere" in each.message for each in ended)
+
+
 def tables_with(plan, folder, runs, **settings):
     """The tables of a study of which some runs have other settings."""
     shutil.copytree(plan.folder / "runs", folder / "runs")

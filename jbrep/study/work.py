@@ -66,7 +66,7 @@ def work(
     except Exception as error:
         if len(assigned) == 1:
             return [_crashed(assigned[0], error)]
-        alone = [work([each], stop) for each in assigned]  # to see whose error it is
+        alone = [work([each], stop, modules) for each in assigned]  # to see whose error it is
         return None if None in alone else [outcome for each in alone for outcome in each or ()]
     return [_ended(each, results[each.folder]) for each in assigned]
 
