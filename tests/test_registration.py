@@ -8,10 +8,11 @@ from command import in_this_process, jbrep
 from small import forge
 from test_study import TINY, written
 
+from jbrep.encoders import load
 from jbrep.errors import InputError
 from jbrep.records.document import read_document
 from jbrep.rl.files import RUN, read_run, runs_below
-from jbrep.study.config import read_study
+from jbrep.study.config import Data, read_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.registration import REGISTRATION, read_registration
@@ -43,6 +44,33 @@ def test_a_plan_is_written_down(tmp_path):
     assert not list((tmp_path / "out").rglob(RUN))
     assert jbrep(*command).exit_code == 0  # the same once more
     assert read_registration(tmp_path / "out") == registration
+
+
+def test_encoders_that_the_study_makes_are_registered_by_their_hashes(tmp_path):
+    """So it is told if other ones ran, as of data or by code that changed since."""
+    codes = ("pca-2", {"name": "random-2", "encoders": 2})
+    study = TINIER.replace(
+        representations=("full", *codes), data=Data(steps=1000), steps=16, evaluate_every=16
+    )
+    plan = Plan(study, tmp_path / "study")
+    registration = register_study(plan)
+    assert not list(plan.folder.rglob(RUN))
+    made = {path.stem: load(path) for path in plan.encoders("face_direction").glob("*.safetensors")}
+    assert registration.encoders == {
+        f"face_direction/a2c/{code}/seed-{seed}": made[name].fingerprint
+        for seed in (0, 1)
+        for code, name in (
+            ("full", "full"),
+            ("pca-2", "pca-2"),
+            ("random-2", f"random-2-s{seed}"),
+        )
+    }
+    assert run_study(Plan(study, plan.folder), in_this_process, 1) == 0
+    runs = [read_run(folder) for folder in runs_below(plan.folder)]
+    assert registration.deviations(study, runs) == []
+    name = runs[-1].settings.name
+    other = registration.replace(encoders={**registration.encoders, name: "0" * 64})
+    assert "1 of its runs have other encoders than were registered" in other.deviations(study, runs)
 
 
 def test_what_ran_as_registered_says_so(registered):
@@ -86,7 +114,7 @@ def test_every_deviation_is_told(registered):
         "settings differ: steps 80 (now: 81)",
         "seeds were added, whose runs are exploratory: 7",
         "1 of its runs weren't made under this registration",
-        "1 of its runs have other encoders than there were",
+        "1 of its runs have other encoders than were registered",
         f"torch was 2.0.0, not {registration.versions['torch']}",
         "some runs were made by other commits of jbrep's code",
     ]

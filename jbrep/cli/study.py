@@ -49,7 +49,8 @@ _COUNT = click.IntRange(1, 1024)
 @click.option(
     "--register",
     is_flag=True,
-    help="Only write down the plan, with its hash and the code's version, before the first run.",
+    help="Make data and encoders, and write down the plan, with their hashes and the code's "
+    "version, before the first run.",
 )
 @import_option
 @click.pass_context
@@ -104,7 +105,8 @@ def _announce(
         tell(notice, err=True)
     if expected:
         return click.echo(forecast_text(expected, plan.study.planned, terminal_width()))
-    registered = register_study(plan)
+    with stoppable(RESUMES):
+        registered = register_study(plan)
     click.echo(f"registered on {registered.date} (SHA-256 {registered.sha256})")
     return echo_paths([plan.folder / REGISTRATION])
 

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -137,12 +136,15 @@ class Plan:
 
     @property
     def fingerprints(self) -> dict[str, str]:
-        """The SHA-256 of each run's encoder, by the run's label and seed, of those that exist."""
-        found = {}
-        for cell in self.cells:
-            with suppress(InputError):  # the study will make it
-                found[f"{cell.label}/seed-{cell.seed}"] = self.run(cell).find_encoder().fingerprint
-        return found
+        """The SHA-256 of each run's encoder, by the run's label and seed.
+
+        Raises:
+            InputError: one is missing.
+        """
+        return {
+            f"{cell.label}/seed-{cell.seed}": self.run(cell).find_encoder().fingerprint
+            for cell in self.cells
+        }
 
     def assigned(self, cells: Iterable[Cell]) -> list[Assigned]:
         """Runs for a worker.
@@ -189,9 +191,8 @@ class Plan:
         """Write down what is going to be run; what is registered already stays as it is.
 
         Raises:
-            InputError: as `write`, or there are runs already.
+            InputError: there are runs already, or an encoder is missing.
         """
-        self.write()
         if self.registration is None:
             if self.has_begun:
                 raise InputError(

@@ -25,7 +25,7 @@ class Registration(Document, frozen=True, kw_only=True):
     format_version = 1
 
     study: dict[str, Any]  # as it was written
-    encoders: dict[str, str]  # of those that were there: SHA-256 by the name of the run
+    encoders: dict[str, str]  # SHA-256 by the name of the run; older ones: of those that were there
     date: str  # ISO 8601, in UTC
     versions: dict[Version, Version]  # by package
     commits: dict[str, str]
@@ -51,7 +51,7 @@ class Registration(Document, frozen=True, kw_only=True):
 
         Args:
             study: its settings.
-            encoders: the SHA-256 of those that are there, by the name of the run.
+            encoders: their SHA-256, by the name of the run.
         """
         return cls(
             study=_explicit(study),
@@ -83,7 +83,7 @@ class Registration(Document, frozen=True, kw_only=True):
             found.append(f"{len(strays)} of its runs weren't made under this registration")
         used = ((run.settings.name, run.settings.encoder) for run in runs)
         if other := [name for name, each in used if self.encoders.get(name, each) != each]:
-            found.append(f"{len(other)} of its runs have other encoders than there were")
+            found.append(f"{len(other)} of its runs have other encoders than were registered")
         for name, version in self.versions.items():
             if others := {run.versions.get(name, "none") for run in runs} - {version}:
                 found.append(f"{name} was {_listed(sorted(others))}, not {version}")

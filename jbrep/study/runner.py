@@ -128,9 +128,9 @@ def run_study(
     make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
         plan.write()
+        prepare(plan)
         if plan.study.verdicts.primary and not plan.has_begun:
             plan.register()
-        prepare(plan)
         for cell in plan.cells:  # so that any mistake shows before the first run
             Job(plan.run(cell), plan.folder_of(cell)).clear()
         if not unfinished:
@@ -143,7 +143,7 @@ def run_study(
 
 
 def register_study(plan: Plan) -> Registration:
-    """Write down what is going to be run, before the first run.
+    """Collect data and train encoders, and write down what is going to be run on these.
 
     Raises:
         InputError: as `run_study`, or there are runs already.
@@ -151,6 +151,8 @@ def register_study(plan: Plan) -> Registration:
     check(plan)
     make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
+        plan.write()
+        prepare(plan)
         return plan.register()
 
 
