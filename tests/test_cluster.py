@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from test_any_collect import some
 from test_study import TINY
 
 from jbrep.collect import collect
+from jbrep.study import runner
 from jbrep.study.plan import Plan
 from jbrep.study.results import read_runs
 from jbrep.study.work import work
@@ -39,3 +41,20 @@ def test_on_a_cluster_that_loses_a_node_they_come_to_the_same_end(tmp_path):
     for ours, theirs in pairs:
         assert (ours.label, ours.settings) == (theirs.label, theirs.settings)
         np.testing.assert_array_equal(ours.returns, theirs.returns)
+
+
+def test_runs_whose_workers_are_killed_say_so(tmp_path, monkeypatch):
+    """Without a cluster, whose five workers would take a minute."""
+    ray = pytest.importorskip("ray")
+
+    def get(reference):
+        raise ray.exceptions.WorkerCrashedError
+
+    never = SimpleNamespace(remote=lambda *arguments: "a reference")
+    monkeypatch.setattr(runner, "on_cluster", lambda *arguments, **resources: never)
+    monkeypatch.setattr(ray, "wait", lambda references: (references, []))
+    monkeypatch.setattr(ray, "get", get)
+    plan = Plan(STUDY, tmp_path)
+    ended = list(runner.on_ray(plan, [plan.cells], 1))
+    assert [each.name for each in ended] == [cell.name for cell in plan.cells]
+    assert all("its worker was killed 5 times, perhaps" in each.message for each in ended)

@@ -80,6 +80,8 @@ def on_ray(plan: Plan, packs: Iterable[Pack], workers: int) -> Generator[Outcome
             pack = under_way.pop(done)
             try:
                 outcomes = ray.get(done)
+            except ray.exceptions.WorkerCrashedError:
+                outcomes = [_killed(cell.name) for cell in pack]
             except ray.exceptions.RayError as error:
                 reason = str(error).strip().rpartition("\n")[2]
                 outcomes = [Outcome(cell.name, CRASHED, reason) for cell in pack]
