@@ -1,10 +1,12 @@
 """Exceptions for what a user can fix, and words for their messages."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
 from typing import Any, TypeVar
 
 _Choice = TypeVar("_Choice")
 
+_MOST_NAMES = 20
 _MOST_SHOWN = 3  # settings that differ
 _MOST_LETTERS = 40  # of a value
 
@@ -41,6 +43,40 @@ def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:
     if name not in choices:
         raise InputError(f"unknown {what} {name!r}: choose one of {', '.join(choices)}")
     return choices[name]
+
+
+def matching(
+    wanted: Iterable[str], names: Sequence[str], groups: Sequence[str], of: str
+) -> list[int]:
+    """Places of what is wanted, in that order and each once.
+
+    Args:
+        wanted: a name, the name of a group, or a pattern of either, such as velocity_*; each.
+        names: of all that there is.
+        groups: of each of them.
+        of: what has them, for the message: "face_direction has no feature".
+
+    Raises:
+        InputError: there is nothing of a name, or that fits a pattern.
+    """
+    pairs, places = [*zip(names, groups, strict=True)], dict[str, list[int]]()
+    for place, pair in enumerate(pairs):
+        for name in dict.fromkeys(pair):
+            places.setdefault(name, []).append(place)
+    found: dict[int, None] = {}
+    for name in wanted:
+        some = places.get(name) or [
+            place for place, pair in enumerate(pairs) if any(fnmatchcase(p, name) for p in pair)
+        ]
+        if not some:
+            raise InputError(f"{of} {name!r}: it has {listed([*places])}")
+        found |= dict.fromkeys(some)
+    return [*found]
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names for a message: the first ones, where there are many."""
+    return ", ".join(names[:_MOST_NAMES]) + (", ..." if names[_MOST_NAMES:] else "")
 
 
 def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:

@@ -148,7 +148,7 @@ def test_a_weighted_feature_is_reconstructed_better(data, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"weights": "speed=2"}, "no feature 'speed': face_direction has position_x,"),
+        ({"weights": "speed=2"}, "face_direction has no feature 'speed': it has position_x,"),
         ({"weights": {"velocity_x": 2}, "keep": "velocity_x"}, "velocity_x passes around the enc"),
     ],
 )

@@ -185,7 +185,7 @@ def test_an_environment_that_is_not_reproducible(tmp_path):
     told = jbrep(*rl, "--evaluation-episodes", 1, "--out", tmp_path / "run")
     assert told.exit_code == 0, told.output
     assert told.stderr.startswith("Note: Test/Cart-v0 is not reproducible: ")
-    assert told.stderr.endswith(" and a run that is stopped can't be resumed\n")
+    assert told.stderr.count("\n") == 1
     drifting = describe(cart.ID, {"drifts": True})
     run = Run.of(task=drifting, algorithm="a2c", steps=80, evaluation_episodes=1, preset="paper")
     with pytest.raises(StoppedError):

@@ -172,7 +172,7 @@ def test_an_observation_survives_sine_and_cosine_and_what_is_kept_survives_the_l
         ({"clip": True}, "clip is True: it must be a number"),
         ({"clip": "1"}, "clip is '1': it must be a number"),
         ({"clip": 10**400}, "clip is 1000.*: it must be a number"),
-        ({"keep": ["wing"]}, "no feature 'wing': face_direction has"),
+        ({"keep": ["wing"]}, "face_direction has no feature 'wing': it has"),
         ({"keep": ["velocity_x"] * 2}, "what it keeps must be different features"),
         ({"keep": [1]}, r"keep\[0\] is 1: it must be text"),
     ],

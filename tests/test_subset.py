@@ -46,7 +46,11 @@ def test_a_subset_of_an_angle_is_its_sine_and_cosine(fit, observations):
     ("kind", "settings", "said"),
     [
         ("subset", {}, "subset needs features"),
-        ("subset", {"features": "speed"}, "no feature 'speed': face_direction has position_x, "),
+        (
+            "subset",
+            {"features": "speed"},
+            "face_direction has no feature 'speed': it has position_x",
+        ),
         ("subset", {"features": "position_x,speed_*"}, r"no feature 'speed_\*'"),
         ("subset", {"features": "position_*", "latent": 3}, "subset takes no latent"),
         ("noise", {"latent": 16}, "latent size is 16: with 16 features .* at least 17"),

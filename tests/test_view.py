@@ -144,7 +144,7 @@ def test_a_robot_keeps_the_history_of_an_exported_policy(seen, tmp_path, monkeyp
 
 def test_what_a_view_refuses(task, seen):
     for hidden, history, said in (
-        (["speed"], 1, "no feature of move_in_direction is called speed: it has position_x, "),
+        (["speed"], 1, "move_in_direction has no feature 'speed': it has position_x, "),
         (["*"], 1, "all features are hidden: leave some to see"),
         (["orientation_w"], 1, "orientation is a quaternion of 3 numbers: it must have 4"),
         ((), 5000, "history"),

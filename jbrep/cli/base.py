@@ -206,7 +206,8 @@ def _notices() -> Iterator[None]:
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
         if issubclass(category, Notice):
-            tell(f"Note: {message}", err=True)
+            line = f"Note: {message}"
+            (say if os.sep in line else tell)(line, err=True)  # a path may be copied
         else:
             usual(message, category, *where, **options)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jbrep.coordinates import Coordinates
 from jbrep.dataset.columns import Column
 from jbrep.envs.task import Feature, Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, matching
 
 Rows = NDArray[np.int64]
 Range = tuple[NDArray[Any], NDArray[Any]]  # what becomes -1 and 1, (d,) each
@@ -67,18 +67,13 @@ class Scaler:
         return self.coordinates.sources if self.coordinates else task.feature_names
 
     def places(self, names: Iterable[str], task: Task) -> list[int]:
-        """Places of the scaled numbers with these names, or of the parts with these.
+        """Places of the scaled numbers with these names, or of parts with these, or patterns.
 
         Raises:
             InputError: there are none of a name.
         """
-        own, parts = [each.name for each in self.features(task)], self.parts(task)
-        wanted = dict.fromkeys(names)
-        if unknown := [name for name in wanted if name not in own and name not in parts]:
-            known = ", ".join(dict.fromkeys((*parts, *own)))
-            raise InputError(f"no feature {unknown[0]!r}: {task.name} has {known}")
-        each = enumerate(zip(own, parts, strict=True))
-        return [i for i, (name, part) in each if name in wanted or part in wanted]
+        own = [each.name for each in self.features(task)]
+        return sorted(matching(names, own, self.parts(task), f"{task.name} has no feature"))
 
     def scale(self, observation: Any) -> Any:
         """Observations (..., d) in physical units to scaled numbers (..., m).

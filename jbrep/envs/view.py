@@ -1,14 +1,13 @@
 """What is seen of an environment that gives more: some of its features, and their history."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.envs.task import Array, Task, View
-from jbrep.errors import InputError
+from jbrep.errors import InputError, matching
 
 
 def with_view(task: Task, hidden: Iterable[str] = (), history: int = 1) -> Task:
@@ -29,27 +28,16 @@ def with_view(task: Task, hidden: Iterable[str] = (), history: int = 1) -> Task:
     """
     if task.view:
         raise InputError(f"some of {task.name} is hidden, or seen with its past, already")
-    names = [name for pattern in hidden for name in _matching(pattern, task)]
-    view = View(features=task.features, hidden=tuple(dict.fromkeys(names)), history=history)
+    names, groups = task.feature_names, [each.group or each.name for each in task.features]
+    places = matching(hidden, names, groups, f"{task.name} has no feature")
+    left_out = tuple(names[i] for i in sorted(places))
+    view = View(features=task.features, hidden=left_out, history=history)
     if not view.hidden and history == 1:
         return task
     without = f".without-{len(view.hidden)}" if view.hidden else ""
     past = f".history-{history}" if history > 1 else ""
     seen = view.seen(task.action_low, task.action_high)
     return task.replace(name=f"{task.name}{without}{past}", features=seen, view=view)
-
-
-def _matching(pattern: str, task: Task) -> list[str]:
-    """The names of the features that a pattern fits, or the name of their group."""
-    found = [
-        each.name
-        for each in task.features
-        if fnmatchcase(each.name, pattern) or fnmatchcase(each.group, pattern)
-    ]
-    if not found:
-        names = ", ".join(task.feature_names)
-        raise InputError(f"no feature of {task.name} is called {pattern}: it has {names}")
-    return found
 
 
 class Window:

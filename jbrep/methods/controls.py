@@ -1,6 +1,5 @@
 """Controls, which learn nothing: the whole observation, some of it, noise, random networks."""
 
-from fnmatch import fnmatchcase
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
@@ -65,18 +64,9 @@ class Subset(ClosedForm, frozen=True, kw_only=True):
 
     def resolved(self, data: ScaledDataset) -> Self:
         """With the names of the features that match the patterns."""
-        names, chosen = data.names, set()
-        parts = [data.scaler.parts(data.task)[i] for i in data.used]
-        for pattern in self.features:
-            each = zip(names, parts, strict=True)
-            matching = [n for n, part in each if fnmatchcase(n, pattern) or part == pattern]
-            if not matching:
-                raise InputError(
-                    f"no feature {pattern!r}: {data.task.name} has {', '.join(names)}; "
-                    "patterns such as velocity_* are understood"
-                )
-            chosen.update(matching)
-        return self.replace(features=tuple(name for name in names if name in chosen))
+        places = set(data.scaler.places(self.features, data.task))
+        each = zip(data.used, data.names, strict=True)
+        return self.replace(features=tuple(name for i, name in each if i in places))
 
     def make(self, data: ScaledDataset) -> Made:
         """As for `ClosedForm`."""

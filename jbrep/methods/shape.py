@@ -48,7 +48,9 @@ def complete(
             encoder, decoder = _rescaled(encoder, decoder, moments, codes)
     if data.size < data.scaler.size:
         encoder, decoder = _widened(encoder, decoder, data)
-    return Complete((encoder, decoder), made.keep or keep)
+    every = data.scaler.features(data.task)
+    kept = tuple(every[i].name for i in data.scaler.places(keep, data.task))
+    return Complete((encoder, decoder), made.keep or kept)
 
 
 def _code_moments(layers: Layers, data: ScaledDataset) -> tuple[Moments, Array]:

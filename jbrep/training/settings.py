@@ -35,7 +35,9 @@ Clip = Annotated[
 ]
 Latent = Annotated[int, Meta(ge=1, le=MAX_UNITS, description="Latent units l.")]
 Names = tuple[Annotated[str, Meta(min_length=1, title="a name, such as velocity_x")], ...]
-Keep = Annotated[Names, Meta(description="Features that pass around the encoder.")]
+Keep = Annotated[
+    Names, Meta(description="Features, or patterns of them, that pass around the encoder.")
+]
 Codes = Annotated[
     Literal["raw", "standard", "white"],
     Meta(
@@ -73,7 +75,7 @@ FeatureWeights = Annotated[
     dict[str, Weight],
     Meta(
         title="weights of features, such as angle_to_target=4,velocity_x=0.5",
-        description="Weights of features in the error; 1 otherwise.",
+        description="Weights of features, or of patterns, in the error; 1 otherwise.",
     ),
 ]
 RewardWeight = Annotated[Weight, Meta(description="Weight of the reward.")]

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from jbrep.dataset.formats.episodes import check_kind, check_lengths, label
 from jbrep.dataset.formats.flat import CHUNK, own_names
-from jbrep.dataset.formats.tables import NAMES, Table, listed, width
+from jbrep.dataset.formats.tables import NAMES, Table, width
 from jbrep.dataset.layout import Layout
-from jbrep.errors import InputError, kind_and_line
+from jbrep.errors import InputError, kind_and_line, listed
 from jbrep.text import counted
 
 Array = NDArray[Any]

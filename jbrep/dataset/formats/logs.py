@@ -20,14 +20,13 @@ from jbrep.dataset.formats.tables import (
     Roles,
     Table,
     features_of_table,
-    listed,
     roles_of,
     sort_of,
     width,
 )
 from jbrep.dataset.layout import Layout
 from jbrep.envs.task import MAX_EPISODE_STEPS
-from jbrep.errors import InputError
+from jbrep.errors import InputError, listed
 from jbrep.text import counted
 
 Array = NDArray[Any]

@@ -5,7 +5,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from jbrep.dataset.formats.flat import own_names
 from jbrep.dataset.layout import Layout
 from jbrep.envs.names import is_code
 from jbrep.envs.task import Feature, Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, matching
 
 Array = NDArray[Any]
 
@@ -26,7 +25,6 @@ _ACTION = re.compile(r"actions?(_\d+)?")
 _NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former
 DEGREES = ("deg", "°", "degrees", "degree")
 _WORDS = pa.types.is_string, pa.types.is_large_string, pa.types.is_dictionary
-_MOST_SHOWN = 12  # names of columns in a message
 _ONCE = ("reward", "time", "episode", "terminated")  # of a layout: one column each
 
 
@@ -90,13 +88,7 @@ def _leaves(schema: pa.Schema, layout: Layout) -> Iterator[Leaf]:
             if size is not None:
                 place, short = i, names[i] if names else f"{each.name}_{i}"
                 name = f"{each.name}.{names[i] if names else i}"
-            is_angle = any(_means(wanted, name, each.name) for wanted in layout.angles)
-            yield Leaf(name, short, each.name, place, unit, is_angle)
-
-
-def _means(wanted: str, name: str, column: str) -> bool:
-    """Whether a name or pattern stands for a part of a column."""
-    return wanted in (name, column) or fnmatchcase(name, wanted)
+            yield Leaf(name, short, each.name, place, unit)
 
 
 def with_widths(schema: pa.Schema, first: pa.RecordBatch | None) -> pa.Schema:
@@ -137,7 +129,8 @@ def roles_of(table: Table, layout: Layout) -> Roles:
     roles = {role: _matching(table, leaves, said) for role, said in _said(table, layout).items()}
     roles.setdefault("action", [each for each in leaves if _ACTION.fullmatch(each.column)])
     roles.setdefault("observation", list(_others(table, leaves, roles)))
-    _matching(table, roles["observation"], layout.angles)
+    angles = _matching(table, roles["observation"], layout.angles)
+    roles["observation"] = [each._replace(is_angle=each in angles) for each in roles["observation"]]
     if layout.observations:
         roles["next_observation"] = _after(table, leaves, roles["observation"])
     roles = {role: some for role, some in roles.items() if some}
@@ -185,19 +178,8 @@ def _matching(table: Table, leaves: list[Leaf], names: tuple[str, ...]) -> list[
     Raises:
         InputError: none has one of the names.
     """
-    found: dict[str, Leaf] = {}
-    for wanted in names:
-        some = [each for each in leaves if _means(wanted, each.name, each.column)]
-        if not some:
-            there = listed([each.name for each in leaves])
-            raise InputError(f"{table.name} has no column {wanted!r}: it has {there}")
-        found |= {each.name: each for each in some}
-    return list(found.values())
-
-
-def listed(names: list[str]) -> str:
-    """Names for a message: the first ones, where there are many."""
-    return ", ".join(names[:_MOST_SHOWN]) + (", ..." if names[_MOST_SHOWN:] else "")
+    own, columns = [each.name for each in leaves], [each.column for each in leaves]
+    return [leaves[i] for i in matching(names, own, columns, f"{table.name} has no column")]
 
 
 def _check_types(table: Table, role: str, leaves: list[Leaf], named: bool) -> None:
