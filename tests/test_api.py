@@ -53,6 +53,8 @@ def test_several_encoders_are_made_when_they_are_asked_for(home):
     assert [each.encoder.name for each in made] == [
         *("random-2-s0", "random-2-s1", "random-3-s0", "random-3-s1")
     ]
+    (some,) = jbrep.train_encoders(home / "data", out, "subset", features="velocity_*")
+    assert some.encoder.name == "subset-3"
     (again,) = jbrep.train_encoders(home / "data", home / "encoders", "pca", latent=[4])
     assert str(again).startswith("pca-4: reconstructs held-out states with a mean squared error of")
     assert str(again).endswith("pca-4.safetensors, already complete")

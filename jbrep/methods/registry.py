@@ -56,8 +56,10 @@ def with_preset(kind: str, preset: str | None, settings: Mapping[str, Any]) -> d
 
 def each_named(
     kind: str, latents: Sequence[Any], seeds: int | None, name: str | None, settings: dict[str, Any]
-) -> list[tuple[str, dict[str, Any]]]:
+) -> list[tuple[str | None, dict[str, Any]]]:
     """The name and settings of several encoders: one of each latent size and seed.
+
+    A name that isn't given is left out where it needs no seed: data may say more of it.
 
     Args:
         kind: of all of them.
@@ -73,16 +75,15 @@ def each_named(
     if name and len(latents) > 1:
         raise InputError("one --name is for one latent size: give each its own")
     each = [{**settings, "latent": size} for size in latents] or [settings]
-    named = [(name or name_of(method.of(one)), one) for one in each]
     if seeds is None:
-        return named
+        return [(name, one) for one in each]
     if not method.takes("seed"):
         raise InputError(f"{kind} has no seed, so all its encoders are the same: leave out --seeds")
     if "seed" in settings:
         raise InputError("--seed is for one encoder: leave it out, or --seeds")
     return [
-        (of_seed(called, seed), {**one, "seed": seed})
-        for called, one in named
+        (of_seed(name or name_of(method.of(one)), seed), {**one, "seed": seed})
+        for one in each
         for seed in range(seeds)
     ]
 
