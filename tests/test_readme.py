@@ -1,4 +1,4 @@
-"""README's commands, one after the other in one empty folder, each with less work to do."""
+"""The commands of README, and of docs/worth.md, one after the other, each with less work to do."""
 
 import os
 import re
@@ -10,10 +10,12 @@ import gymnasium
 import pytest
 from command import in_this_process, jbrep
 
+from jbrep.evaluate import regression
 from jbrep.study.runner import BACKENDS
+from jbrep.worth import agents
 
 ROOT = Path(__file__).parent.parent
-LESS = {  # by command: numbers in place of README's, or beside them
+LESS = {  # by command: numbers in place of a page's, or beside them
     "collect": {"--steps": "1k", "--episode-steps": "100"},
     "train-dae": {"--epochs": "2"},
     "train-encoder": {},
@@ -39,9 +41,9 @@ if "MyRobot-v0" not in gymnasium.registry:
 """
 
 
-def commands():
-    """README's, in order."""
-    text = (ROOT / "README.md").read_text()
+def commands(page):
+    """A page's, in order."""
+    text = (ROOT / page).read_text()
     return [
         shlex.split(line, comments=True) for line in re.findall(r"^ {4}jbrep (.*)$", text, re.M)
     ]
@@ -76,7 +78,7 @@ def test_the_commands_of_the_readme_follow_one_another(tmp_path, monkeypatch):
             study = f"{key} = {value}\n{study}"
         (tmp_path / path).write_text(f"episode_steps = 100\n{study}")
     try:
-        for words in commands():
+        for words in commands("README.md"):
             told = jbrep(*lessened(words))
             assert told.exit_code == 0, (words, told.output)
     finally:
@@ -84,3 +86,18 @@ def test_the_commands_of_the_readme_follow_one_another(tmp_path, monkeypatch):
         gymnasium.registry.pop("MyRobot-v0", None)
     for made in ("ddpg.onnx", "walk.mp4", "runs/study/report.html", "runs/tune/best.toml"):
         assert (tmp_path / made).stat().st_size, made
+
+
+@pytest.mark.filterwarnings("ignore")  # of very short runs
+def test_ten_minutes_lead_from_a_robot_to_a_code(tmp_path, monkeypatch):
+    for where, less in ((agents, "STEPS"), (regression, "_STEPS")):
+        monkeypatch.setattr(where, less, 100)
+    monkeypatch.setattr(agents, "RUNS", 1)
+    monkeypatch.chdir(tmp_path)
+    told = [jbrep(*words) for words in map(lessened, commands("docs/worth.md"))]
+    assert [each.exit_code for each in told] == [0] * 6, told
+    judged = told[-2].output
+    assert "Mean return of small agents, 1 of 100 steps each, in 20 episodes" in judged
+    for code in ("full", "forward-6", "forward-4", "pca-6", "slow-6"):
+        assert re.search(rf"^{code} +-\d+\.?\d* \[-\d.* -\d", judged, re.M), judged
+    assert (tmp_path / "runs/arm/run.json").stat().st_size

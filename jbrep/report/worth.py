@@ -11,7 +11,7 @@ from jbrep.evaluate.evaluation import Evaluation, LatentUnits, Learned, Score, W
 from jbrep.report.words import listed
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.scale import best_blind
-from jbrep.text import Table, interval
+from jbrep.text import SIGNIFICANT, Table, interval, number
 from jbrep.worth import AGENT
 
 _WIDE = 100  # how much more a code varies in one direction than in another: a rule of thumb
@@ -30,7 +30,7 @@ class Ranked(NamedTuple):
     Attributes:
         way: that is the surest of those that were asked for.
         means: returns by label, the best first.
-        best: labels of those whose interval reaches the best one's, and lies above the floor.
+        best: labels of those not clearly below the best one, but clearly above the floor.
         floor: the mean return of the best policy that doesn't look.
     """
 
@@ -52,10 +52,19 @@ def ranked(worth: Worth | None) -> Ranked | None:
     means = {label: _bounded(shown(each)) for label, each in by_way[way].items()}
     blind = best_blind(worth.references)
     floor = worth.references[blind] if blind else -math.inf
-    least = max(means.values()).low
     order = sorted(means, key=lambda label: -means[label].value)
-    best = [label for label in order if means[label].high >= least and means[label].low > floor]
+    first = means[order[0]]
+    best = [
+        label
+        for label in order
+        if means[label].low > floor and not _clearly_below(means[label], first)
+    ]
     return Ranked(way, {label: means[label] for label in order}, best, floor)
+
+
+def _clearly_below(mean: Interval, best: Interval) -> bool:
+    """Whether the interval of a difference says so (Zou and Donner 2008, MOVER)."""
+    return bool(best.value - mean.value > math.hypot(best.value - best.low, mean.high - mean.value))
 
 
 def _is_constant(worth: Worth) -> bool:
@@ -89,7 +98,7 @@ def advice(evaluation: Evaluation, worth: Worth) -> str:
     if not found.best:
         return (
             f"Nothing can be said of the codes: by {by}, none is clearly worth more than not "
-            f"looking at all ({found.floor:.0f}).{_instead(worth)}"
+            f"looking at all ({number(found.floor, SIGNIFICANT)}).{_instead(worth)}"
         )
     smallest = min(found.best, key=lambda label: evaluation.encoders[label].latent)
     if found.best == [FULL]:
@@ -132,8 +141,8 @@ def worth_table(worth: Worth) -> Table:
 def _returned(each: Learned | None) -> str:
     if each is None:
         return "-"
-    first = interval(each.score, ".0f")
-    return first if each.again is None else f"{first}, then {interval(each.again, '.0f')}"
+    first = interval(each.score, SIGNIFICANT)
+    return first if each.again is None else f"{first}, then {interval(each.again, SIGNIFICANT)}"
 
 
 def conditioning(evaluation: Evaluation, worth: Worth, label: str) -> str:
@@ -147,8 +156,8 @@ def conditioning(evaluation: Evaluation, worth: Worth, label: str) -> str:
         trees, fourier = (_bounded(shown(learned[way][label])) for way in ("trees", "fourier"))
         if trees.low > fourier.high:
             return (
-                f"badly conditioned: trees make {trees.value:.0f} of it, Fourier features "
-                f"{fourier.value:.0f}"
+                f"badly conditioned: trees make {number(trees.value, SIGNIFICANT)} of it, Fourier "
+                f"features {number(fourier.value, SIGNIFICANT)}"
             )
     elif (ratio := condition(units)) > _WIDE:
         return f"badly conditioned: one direction varies {ratio:,.0f} times as much as another"
