@@ -75,6 +75,7 @@ def each_named(
     if name and len(latents) > 1:
         raise InputError("one --name is for one latent size: give each its own")
     each = [{**settings, "latent": size} for size in latents] or [settings]
+    named = [(name_of(method.of(one)), one) for one in each]  # a mistake shows before data are read
     if seeds is None:
         return [(name, one) for one in each]
     if not method.takes("seed"):
@@ -82,8 +83,8 @@ def each_named(
     if "seed" in settings:
         raise InputError("--seed is for one encoder: leave it out, or --seeds")
     return [
-        (of_seed(name or name_of(method.of(one)), seed), {**one, "seed": seed})
-        for one in each
+        (of_seed(name or called, seed), {**one, "seed": seed})
+        for called, one in named
         for seed in range(seeds)
     ]
 
