@@ -120,11 +120,12 @@ def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
 
 
 def test_what_it_cannot_act_on_is_refused():
-    controller = controller_of(randomised("sac", "full"))
+    controller = controller_of(randomised("td3", "full"))
     with pytest.raises(InputError, match=f"takes observations of {TASK.size} numbers, but got"):
         controller([0.0])
     with pytest.raises(InputError, match="the policy's action is not finite"):
         controller(np.full(TASK.size, np.nan))
+    assert controller(np.zeros(TASK.size)).shape == (TASK.action_size,)  # there is none to hold
     run = Run.of(TASK, "sac", overrides={"use_sde": True}, trainer="sb3")
     encoder = find("full", TASK)
     trained = build(run.settings(encoder), encoder, Path("here"))

@@ -2,8 +2,8 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import chain, count
-from typing import Any, NamedTuple
+from itertools import chain
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from jbrep.envs.infos import Numbers
 from jbrep.envs.lanes import Lanes, Step
 from jbrep.envs.task import Array
 
+_Seen = TypeVar("_Seen", bound=NDArray[Any])
 Actor = Callable[[Array], NDArray[Any]]  # observations (n, d) to actions (n, k), once for each step
 Tick = Callable[[int], object]  # called with the number of steps just made, over all lanes
 Read = Callable[[Lanes], Mapping[str, Array]]  # of the lanes as they are, (n, ...) each
@@ -34,17 +35,18 @@ def play(lanes: Lanes, act: Actor) -> Iterator[Played]:
         yield Played(observation, action, active, lanes.step(action))
 
 
-def held(act: Actor, repeat: int) -> Actor:
+def held(act: Callable[[_Seen], NDArray[Any]], repeat: int) -> Callable[[_Seen], NDArray[Any]]:
     """The actor that lets another choose an action and holds it for so many steps in all lanes.
 
     Lanes must be at the start of their episodes when it first acts.
     """
-    step, chosen = count(), np.empty(0)
+    left, chosen = 0, np.empty(0)  # steps for which the action is still held
 
-    def choose_or_hold(observation: Array) -> NDArray[Any]:
-        nonlocal chosen
-        if next(step) % repeat == 0:
-            chosen = act(observation)
+    def choose_or_hold(observation: _Seen) -> NDArray[Any]:
+        nonlocal left, chosen
+        if not left:
+            chosen, left = act(observation), repeat
+        left -= 1
         return chosen
 
     return choose_or_hold

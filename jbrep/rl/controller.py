@@ -13,6 +13,7 @@ from jbrep.encoders.encoder import Encoder
 from jbrep.encoders.file import load
 from jbrep.encoders.fold import Chain
 from jbrep.encoders.layers import Layer, activate, run
+from jbrep.envs.recording import held
 from jbrep.envs.view import Window
 from jbrep.errors import DamageError, InputError
 from jbrep.records.container import Tensors
@@ -123,7 +124,8 @@ class Controller:
 
     def reset(self) -> None:
         """Begin another episode: the next call chooses an action."""
-        self._calls, self._held = 0, np.empty(0, np.float32)
+        self._act = held(self._chosen, self.action_repeat)
+        self._held = np.empty(0, np.float32)  # the action of the last call
         self._window: Window | None = None
 
     def __call__(self, observation: ArrayLike) -> NDArray[np.float32]:
@@ -136,10 +138,7 @@ class Controller:
             InputError: observations of another size; or the action isn't finite, as where an
                 observation isn't.
         """
-        seen = self._seen(np.asarray(observation, np.float32))
-        if self._calls % self.action_repeat == 0:
-            self._held = self._chosen(seen)
-        self._calls += 1
+        self._held = self._act(self._seen(np.asarray(observation, np.float32)))
         return self._held.copy()
 
     def _seen(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
