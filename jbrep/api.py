@@ -57,17 +57,13 @@ class Agent(NamedTuple):
 
     def __repr__(self) -> str:
         from jbrep.rl.files import FINISHED
-        from jbrep.text import interval_of
+        from jbrep.text import returns_text
 
         settings = self.record.settings
         what = f"{settings.learner} on {settings.representation}, {settings.task}"
         if self.record.status != FINISHED:
             return f"Agent({what}: {self.record.reason})"
-        count = len(self.returns)
-        return (
-            f"Agent({what}: {interval_of(self.returns)}, median [10 %, 90 %] of {count} episodes; "
-            f"{str(self.folder)!r})"
-        )
+        return f"Agent({what}: {returns_text(self.returns)}; {str(self.folder)!r})"
 
     def _repr_html_(self) -> str:
         from jbrep.rl.files import read_evaluations

@@ -83,7 +83,7 @@ def test_the_returns_of_a_file_are_those_of_its_run(run):
 def test_mistakes_are_a_line(run, tmp_path):
     model, bad, other = run.with_suffix(".onnx"), tmp_path / "bad.onnx", tmp_path / "other.onnx"
     exporting, checking = ("policy", "export", run, "--out"), ("policy", "check")
-    assert f"{model} exists already: choose another file" in mistake(*exporting, model)
+    assert f"{model} exists already: choose another name" in mistake(*exporting, model)
     said = mistake(*exporting, tmp_path / "x", "--format", "tflite")
     assert "unknown format 'tflite': choose one of onnx, torch" in said
     bad.write_bytes(b"no model")

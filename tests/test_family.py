@@ -42,7 +42,7 @@ def explained(encoder, data):
 def test_relatives_learn_to_reconstruct(kind, data, tmp_path):
     epochs, rate, least = RELATIVES[kind]
     settings = {"latent": 8, "epochs": epochs, "learning_rate": rate, "batch_size": 100}
-    encoder, path, _ = Fitter(data, tmp_path).fit(kind, **settings)
+    encoder, path, *_ = Fitter(data, tmp_path).fit(kind, **settings)
     assert path.name == f"{kind}-8.safetensors"
     assert read_name(f"{kind}-8").method is METHODS[kind]
     rows = data.dataset["observation"][data.train]

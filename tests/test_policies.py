@@ -170,7 +170,7 @@ def test_noise_needs_a_time_step_that_is_known_and_small_enough():
     noise = OrnsteinUhlenbeck(theta=101)
     with pytest.raises(InputError, match=r"theta is 101: with steps of 0.01 s .* in \[0, 100\]"):
         noise.begin(TASK, [0])
-    with pytest.raises(InputError, match="the time step of Arm-v0 is not known, which ornstein"):
+    with pytest.raises(InputError, match="the time step of Arm-v0 is not known: give it"):
         noise.begin(ARM.replace(timestep=None), [0])
 
 

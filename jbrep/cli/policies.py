@@ -147,14 +147,14 @@ def evaluate_policy(
 
 def _check_perturbations(perturbations: tuple[str, ...], out: Path | None) -> None:
     from jbrep.play.perturbed import read_perturbation
-    from jbrep.records.storage import exists
+    from jbrep.records.storage import exists, taken
 
     for each in filter(None, perturbations):
         read_perturbation(each)
     if out and not perturbations:
         raise InputError("--out is for the table of --perturb: add that")
     if out and exists(out):
-        raise InputError(f"{out} exists already: choose another file")
+        raise taken(out)
 
 
 def _perturb(

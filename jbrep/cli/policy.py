@@ -8,7 +8,7 @@ import click
 
 from jbrep.cli.base import PATH, POSITIVE, say
 from jbrep.cli.environment import environment_options, given_task, task_option
-from jbrep.text import interval_of
+from jbrep.text import interval_of, returns_text
 
 
 @click.group()
@@ -69,7 +69,7 @@ def check(model: Path, run: Path | None, episodes: int, **options: Any) -> None:
     beside = find_player(str(run), given_task(options)) if run else None
     player = exported_player(model, beside.task if beside else given_task(options))
     returns = player.returns(episodes)
-    say(f"{player.task.name}, {model}: {interval_of(returns)}, median [10 %, 90 %] of {episodes}")
+    say(f"{player.task.name}, {model}: {returns_text(returns)}")
     if beside:
         theirs = beside.returns(episodes)
         apart = float(np.abs(returns - theirs).max())

@@ -35,7 +35,7 @@ from jbrep.cli.options import record_options
 from jbrep.errors import choose
 from jbrep.records.record import converted
 from jbrep.rl.settings import CLASSES, Seed, TrainingSettings
-from jbrep.text import interval_of, rounded
+from jbrep.text import returns_text, rounded
 
 _STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 _BESIDE = 10  # episodes of policies that don't learn
@@ -164,8 +164,7 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
         context.exit(1)
     returns = agent.returns
     name = agent.record.settings.representation
-    spread = f"median [10 %, 90 %] of {len(returns)} episodes"
-    tell(f"returns on {name} at the end: {interval_of(returns)}, {spread}")
+    tell(f"returns on {name} at the end: {returns_text(returns)}")
     if told := shares_text(last_infos(read_infos(out), read_evaluations(out))):
         tell(told)
     with stoppable("the run itself is finished"):

@@ -131,17 +131,13 @@ class OrnsteinUhlenbeck(Constants, frozen=True):
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Draw the actions of the episodes, some steps at a time."""
-        if task.timestep is None:
+        timestep = task.known_timestep
+        if self.theta * timestep > 1:
             raise InputError(
-                f"the time step of {task.name} is not known, which {self.kind} needs: give it as "
-                "timestep in a file of --features"
+                f"theta is {self.theta:g}: with steps of {timestep:g} s it must be in "
+                f"[0, {1 / timestep:g}]"
             )
-        if self.theta * task.timestep > 1:
-            raise InputError(
-                f"theta is {self.theta:g}: with steps of {task.timestep:g} s it must be in "
-                f"[0, {1 / task.timestep:g}]"
-            )
-        return _one_by_one(self._blocks(task, task.timestep, generators(task, seeds)))
+        return _one_by_one(self._blocks(task, timestep, generators(task, seeds)))
 
     def _blocks(
         self, task: Task, timestep: float, randoms: Sequence[np.random.Generator]

@@ -280,6 +280,20 @@ class Task(Record, frozen=True):
         return len(self.action_low)
 
     @property
+    def known_timestep(self) -> float:
+        """From one step to the next [s].
+
+        Raises:
+            InputError: it isn't known.
+        """
+        if self.timestep is None:
+            raise InputError(
+                f"the time step of {self.name} is not known: give it as timestep in a file of "
+                "--features"
+            )
+        return self.timestep
+
+    @property
     def rest(self) -> Array:
         """The action of 0, or the nearest to it, (k,)."""
         return np.clip(0.0, self.action_low, self.action_high)

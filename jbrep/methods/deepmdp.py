@@ -105,10 +105,9 @@ class DeepMDPObjective(Objective):
         self._deviation = deviation.clamp(min=_SMALL)
 
     def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
-        """Rows, actions (n, k), the next rows, and the standardised rewards (n, 1)."""
+        """As `Windows.steps`, and the standardised rewards (n, 1)."""
         rewards = (windows.rewards(numbers) - self._mean) / self._deviation
-        actions = windows.actions(numbers).flatten(1)
-        return windows.rows(numbers), actions, windows.rows(numbers, 1), rewards[:, None]
+        return *windows.steps(numbers), rewards[:, None]
 
     def _errors(self, batch: tuple[Tensor, ...]) -> dict[str, Tensor]:
         """The terms of the loss, by the names of their weights."""

@@ -75,9 +75,8 @@ class LldVaeObjective(VariationalObjective):
         self.transition = stack((count, count, count * (3 + data.task.action_size)), "linear")
 
     def inputs(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
-        """Rows, the next ones, and the actions between."""
-        actions = windows.actions(numbers)[:, 0]
-        return windows.rows(numbers), windows.rows(numbers, 1), actions
+        """As `Windows.steps`."""
+        return windows.steps(numbers)
 
     def step(self, code: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """How codes near these move: v and r of A = I + v r', and B u + o; (n, l) each."""
@@ -89,7 +88,7 @@ class LldVaeObjective(VariationalObjective):
 
     def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
         """As for `Objective`."""
-        now, after, action, noise = batch
+        now, action, after, noise = batch
         mean, log_deviation = posterior(self.encoder(now))
         code = mean + log_deviation.exp() * noise
         left, right, shift = self.step(code, action)

@@ -134,9 +134,8 @@ class OFEObjective(Objective):
             self.next_row = nn.Linear(inputs + sum(widths), data.size)
 
     def batch(self, windows: Windows, numbers: Tensor) -> tuple[Tensor, ...]:
-        """Rows (n, size), actions (n, k), and the next rows (n, size)."""
-        actions = windows.actions(numbers).flatten(1)
-        return windows.rows(numbers), actions, windows.rows(numbers, 1)
+        """As `Windows.steps`."""
+        return windows.steps(numbers)
 
     def loss(self, batch: tuple[Tensor, ...]) -> Tensor:
         """As for `Objective`."""

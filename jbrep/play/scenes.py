@@ -50,7 +50,7 @@ class Simulated:
         self._motion, self._camera = rollout.motion, camera
         places = [rollout.motion.arrays[name][0] for name in ("qpos", "mocap_pos", "mocap_quat")]
         self.start = rollout.task, [place.tolist() for place in places]
-        self.timestep = _known(rollout.task.timestep, rollout)
+        self.timestep = rollout.task.known_timestep
 
     def pictures(self, states: Iterable[int]) -> Iterator[Image.Image]:
         """As for `Scene`."""
@@ -79,7 +79,7 @@ class Drawn:
         with self._begin() as lanes:
             self._draw(lanes)  # or it isn't possible
             fps = lanes.metadata.get("render_fps")
-        self.timestep = _known(task.timestep or (1 / fps if fps else None), rollout)
+        self.timestep = task.timestep or (1 / fps if fps else task.known_timestep)
 
     def pictures(self, states: Iterable[int]) -> Iterator[Image.Image]:
         """As for `Scene`.
@@ -129,12 +129,3 @@ class Drawn:
             f"{self._rollout.task.name} has no MuJoCo model and data, and with "
             f"render_mode='rgb_array' it can't draw itself: {why}"
         )
-
-
-def _known(timestep: float | None, rollout: Rollout) -> float:
-    if timestep is None:
-        raise InputError(
-            f"the time step of {rollout.task.name} is not known: give it as timestep in a file of "
-            "--features"
-        )
-    return timestep

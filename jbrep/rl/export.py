@@ -8,7 +8,7 @@ from typing import Any
 from jbrep.encoders.encoder import Encoder
 from jbrep.errors import InputError, choose
 from jbrep.records.record import to_plain
-from jbrep.records.storage import exists, write_whole
+from jbrep.records.storage import exists, taken, write_whole
 from jbrep.rl.controller import Controller
 
 
@@ -35,7 +35,7 @@ def export(controller: Controller, path: Path, form: str = "onnx") -> None:
             "run an encoder's file, as Encoder.from_torch makes it"
         )
     if exists(path):
-        raise InputError(f"{path} exists already: choose another file")
+        raise taken(path)
     write_whole(path, write(controller))
 
 

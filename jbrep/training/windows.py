@@ -82,6 +82,10 @@ class Windows:
         places = (self._first(numbers)[:, None] + steps).flatten()
         return self._action.index_select(0, places).view(len(numbers), count, -1)
 
+    def steps(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Of each window the first row (n, size), its action (n, k), and the next row (n, size)."""
+        return self.rows(numbers), self.actions(numbers)[:, 0], self.rows(numbers, 1)
+
     def rewards(self, numbers: Tensor, count: int = 1) -> Tensor:
         """The mean of the first rewards of each window, (n,)."""
         first = self._first(numbers)
