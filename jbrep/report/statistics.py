@@ -1,7 +1,7 @@
 """Statistics as tables."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from operator import attrgetter
 
 import numpy as np
@@ -29,6 +29,7 @@ from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.association import Association
 from jbrep.stats.comparison import Comparison
 from jbrep.stats.labels import RepresentationResult
+from jbrep.stats.power import Prospect
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import SOLVED
 from jbrep.study.packing import Forecast
@@ -318,17 +319,21 @@ def forecast_text(forecast: Forecast, planned: Planned, width: int | None = None
     parts = [table(("run", "cohort", "time"), rows, width)] if rows else []
     parts.append(wrapped(summary, width))
     if forecast.prospects:
-        found = Table.of(
-            "",
-            forecast.prospects,
-            {
-                "primary cell: claim": lambda each: f"{each.cell}: {each.claim}",
-                "runs": lambda each: f"{each.arms.units} and {each.arms.baseline}",
-                "level": lambda each: probability(each.level),
-                "least p": lambda each: probability(each.least_p),
-                "power": lambda each: ", ".join(f"{100 * power:.0f} %" for power in each.power),
-            },
-        )
-        parts.append(found.text(width))
+        parts.append(prospects_table(forecast.prospects).text(width))
         parts += [wrapped(each, width) for each in (*notes(planned), EFFECTS)]
     return "\n\n".join(parts)
+
+
+def prospects_table(prospects: Sequence[Prospect]) -> Table:
+    """What can be found of each claim in each primary cell."""
+    return Table.of(
+        "",
+        prospects,
+        {
+            "primary cell: claim": lambda each: f"{each.cell}: {each.claim}",
+            "runs": lambda each: f"{each.arms.units} and {each.arms.baseline}",
+            "level": lambda each: probability(each.level),
+            "least p": lambda each: probability(each.least_p),
+            "power": lambda each: ", ".join(f"{100 * power:.0f} %" for power in each.power),
+        },
+    )
