@@ -254,7 +254,12 @@ class Attacker:
         if total > count:
             some = sorted(self.random.choice(total, count, replace=False) + 1)
         ways = [("full at a sync", at_sync(number, _disk_is_full)) for number in some]
-        largest = max(path.stat().st_size for path in self.peace.rglob("*") if path.is_file())
+        there, prepared = self.peace, self._new()  # what is there before needn't grow
+        largest = max(
+            path.stat().st_size
+            for path in there.rglob("*")
+            if path.is_file() and not (prepared / path.relative_to(there)).exists()
+        )
         # from some 1,000 bytes on: what the command says is in a file, too
         sizes = np.exp(self.random.uniform(7, np.log(largest), count // 2))
         ways += [("files can't grow", limited(int(size))) for size in sizes]
