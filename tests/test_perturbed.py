@@ -1,6 +1,7 @@
 """What episodes draw: sensors, motors, bodies and physics, by their seeds alone."""
 
 import json
+import tomllib
 
 import environments
 import mujoco
@@ -8,11 +9,26 @@ import numpy as np
 import pytest
 from command import jbrep, mistake, refused
 
+from jbrep.dataset import DataSettings
 from jbrep.envs import Lanes, describe
 from jbrep.envs.domain import Domain, Draws, read_ranges
 from jbrep.envs.randomized import with_domain
 from jbrep.envs.varied import put_factors, velocity_after
 from jbrep.envs.view import with_view
+from jbrep.play.jitterbug import turn_targets
+from jbrep.play.perturbed import domains_of
+from jbrep.play.sources import find_player
+from jbrep.rl import Run, StoppedError, train
+from jbrep.rl.files import (
+    EPISODES,
+    EVALUATIONS,
+    last_returns,
+    read_evaluations,
+    read_run,
+)
+from jbrep.study.config import as_study
+from jbrep.study.plan import Plan
+from jbrep.study.prepare import check
 
 TASKS = {
     "face_direction": describe("face_direction", {}, 12),
@@ -195,10 +211,10 @@ def test_a_step_that_is_lost_is_not_seen():
     ("given", "said"),
     [
         ({"wind": 1}, "unknown 'wind' in a domain: it must be one of noise, delay, dropped, "),
-        ({"delay": "soon"}, "delay is 'soon': it must be a number, or a range such as delay=0..3;"),
-        ({"delay": 0.5}, "delay is 0.5: it must be a number, or a range"),
+        ({"delay": "soon"}, "delay is 'soon': it must be a whole number from 0 to 100, or a "),
+        ({"delay": 0.5}, "delay is 0.5: it must be a whole number from 0 to 100, or a range"),
         ({"delay": "3..1"}, "delay is 3..1: swap them"),
-        ({"dropped": 2}, "dropped is 2: it must be a number, or a range"),
+        ({"dropped": 2}, "dropped is 2: it must be a number from 0 to 1, or a range"),
         ({"friction": 2}, "friction can't be changed in Pendulum-v1: it must be one of noise, "),
     ],
 )
@@ -235,3 +251,102 @@ def test_a_robot_without_mujoco_has_the_rows_that_it_can_have():
     assert "push=" not in told
     assert told.splitlines()[-1].endswith(" -")  # no shares of returns below 0
     assert "push can't be changed in Pendulum-v1" in mistake(*played, "--perturb", "push=1")
+
+
+DRAWN = {**BODIES, "delay": "0..2", "noise": "0..0.2", "push": "0..0.5"}
+SHORT = "--steps 40 --evaluation-episodes 1 --final-episodes 1 --preset modern"
+SMALL = {"num_envs": 2, "net_arch": [8], "learning_starts": 20, "batch_size": 4}
+
+
+def stopping(step):
+    """What a run is told as it goes on, and what asks it to stop there."""
+    steps = [0]
+    return {"watch": lambda now, _: steps.append(now), "stop": lambda: steps[-1] >= step}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A run whose episodes draw, and the same by each trainer, stopped within an episode."""
+    folder = tmp_path_factory.mktemp("runs")
+    steps = {"steps": 200, "evaluation_episodes": 2, "final_episodes": 2}
+    task = with_domain(TASKS["face_direction"].replace(max_episode_steps=30), DRAWN)
+    run = Run.of(task, "sac", "modern", SMALL, **steps)
+    train(run, folder / "whole")
+    for trainer in ("cohort", "sb3"):
+        same = run.replace(trainer=trainer)
+        with pytest.raises(StoppedError):
+            train(same, folder / trainer, **stopping(90))
+        train(same, folder / trainer)
+    return folder
+
+
+def test_a_run_that_was_stopped_draws_on_by_either_trainer(runs):
+    for trainer in ("cohort", "sb3"):
+        for name in (EPISODES, EVALUATIONS):
+            assert (runs / trainer / name).read_bytes() == (runs / "whole" / name).read_bytes()
+
+
+def test_whoever_reads_a_run_knows_its_domain(runs):
+    settings = read_run(runs / "whole").settings
+    assert str(settings.environment.domain) == (
+        "noise=0..0.2,delay=0..2,friction=0.5..1.5,push=0..0.5,body=0..3"
+    )
+    player = find_player(str(runs / "whole"))
+    evaluated = last_returns(read_evaluations(runs / "whole"))
+    np.testing.assert_allclose(player.returns(2), evaluated, atol=1e-3)
+    plain = TASKS["face_direction"].replace(max_episode_steps=30)
+    assert not np.allclose(find_player(str(runs / "whole"), plain).returns(2), evaluated, rtol=0.01)
+    rows, _ = domains_of(player.task, ["delay=1"])
+    assert [*rows] == ["undisturbed", "as in training", "delay=1"]
+    assert rows["as in training"] == settings.environment.domain
+    assert settings.differing(settings.replace(environment=plain)) == (
+        "domain noise=0..0.2,delay=0..2,friction=0.5.... (now: none)"
+    )
+
+
+def test_the_command_trains_with_ranges(tmp_path):
+    run = ("rl", "--task", "Pendulum-v1", "--episode-steps", 20, "--out", tmp_path / "run")
+    small = [word for n, v in SMALL.items() for word in ("--set", f"{n}={json.dumps(v)}")]
+    small += SHORT.split()
+    told = jbrep(*run, *small, "--domain", "delay=0..2", "--domain", "dropped=[0,0.5]")
+    assert told.exit_code == 0, told.output
+    domain = read_run(tmp_path / "run").settings.environment.domain
+    assert domain == Domain(delay=(0, 2), dropped=(0, 0.5))
+    assert "friction can't be changed in Pendulum-v1" in mistake(*run, "--domain", "friction=2")
+    assert "--domain delay is no argument" in mistake(*run, "--domain", "delay")
+    another = mistake(*run, *small)
+    assert "holds another run: domain delay=0..2,dropped=0..0.5 (now: none), encoder" in another
+
+
+def test_a_study_s_runs_draw_and_its_data_are_of_the_robot_as_it_is(tmp_path):
+    given = tomllib.loads(
+        """
+tasks = ["face_direction"]
+algorithms = ["sac-modern"]
+representations = ["full", "pca-4"]
+seeds = 1
+steps = 1000
+
+[domain]
+delay = "0..2"
+friction = [0.5, 1.5]
+
+[data]
+steps = 1000
+"""
+    )
+    plan = Plan(as_study(given), tmp_path)
+    again = as_study(tomllib.loads(plan.study.toml()))
+    assert again == plan.study
+    assert str(plan.run(plan.cells[0]).task.domain) == "delay=0..2,friction=0.5..1.5"
+    check(plan)  # also what it would collect
+    said = refused(as_study, {**given, "domain": {"wind": 3}})
+    assert said.startswith("unknown 'wind' in a domain: it must be one of noise, delay")
+
+
+def test_what_can_not_be_with_a_domain():
+    task = with_domain(TASKS["face_direction"], {"delay": 1})
+    said = refused(lambda: DataSettings(task=task, steps=10))
+    assert said.startswith("face_direction draws its delay=1 in each episode: data sets are of")
+    with Lanes(task, 1, 1) as lanes:
+        assert "in which no target is turned" in refused(turn_targets, lanes, 0.0)

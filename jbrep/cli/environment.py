@@ -74,6 +74,13 @@ environment_options = with_options(
     view_options,
     import_option,
 )
+domain_option = click.option(
+    "--domain",
+    multiple=True,
+    metavar="NAME=LOW..HIGH",
+    help="What each episode draws: noise, delay, dropped, action_delay, friction, mass, push or "
+    "body, such as delay=0..2 or friction=0.5..1.5; may be repeated.",
+)
 threads_option = click.option(
     "--threads",
     type=click.IntRange(1, 4096),
@@ -102,6 +109,7 @@ def needed_task(options: dict[str, Any]) -> "Task":
     """
     name = options.pop("task")
     env, *others = (options.pop(option) for option in _ARGUMENTS)
+    others.append(parse_arguments(options.pop("domain", ()), "--domain"))
     if name is None:
         raise InputError("give the --task: one of the Jitterbug's, or a Gymnasium id")
     from jbrep.envs.description import describe

@@ -25,6 +25,7 @@ from jbrep.cli.base import (
 )
 from jbrep.cli.completion import complete_encoder
 from jbrep.cli.environment import (
+    domain_option,
     environment_options,
     needed_task,
     parse_arguments,
@@ -133,6 +134,7 @@ def checked(options: dict[str, Any]) -> dict[str, Any]:
     metavar="PROJECT",
     help="Log to Weights & Biases, too; WANDB_MODE=offline keeps it in the folder.",
 )
+@domain_option
 @environment_options
 @click.pass_context
 def rl(context: click.Context, /, out: Path, **options: Any) -> None:
@@ -204,6 +206,7 @@ def stop_signals() -> Iterator[list[int]]:
     TrainingSettings, "steps", "evaluation_episodes", steps=20_000, evaluation_episodes=10
 )
 @click.option("--out", required=True, type=PATH, help="A folder for this search.")
+@domain_option
 @environment_options
 @click.pass_context
 def tune(context: click.Context, /, out: Path, trials: int, seeds: int, **options: Any) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from jbrep.errors import InputError
 from jbrep.records.record import Finite, Record, converted, shown
+from jbrep.records.words import bare, must_be, type_of
 
 Array = NDArray[np.float64]
 
@@ -17,13 +18,13 @@ _STREAM = 0x646F6D61696E  # nothing else draws from the streams (_STREAM, seed, 
 _BLOCK = 100  # steps whose numbers are drawn at once
 _PUSHES = 0.01  # in a step, on average
 _LATEST = 100  # [steps]
-_RANGE = re.compile(r"(.+?)\.\.(.+)")
+_WHOLE = re.compile(r"\d+", re.ASCII)
 
 _Positive = Annotated[float, Meta(ge=0, le=1000)]
 _Factor = Annotated[float, Meta(ge=0.01, le=100)]
 _Share = Annotated[float, Meta(ge=0, le=1)]
 _Steps = Annotated[int, Meta(ge=0, le=_LATEST)]
-_Body = Annotated[int, Meta(ge=0, lt=1 << 31)]
+_Body = Annotated[int, Meta(ge=0, le=(1 << 31) - 1)]
 
 
 class Drawn(NamedTuple):
@@ -125,24 +126,31 @@ def read_ranges(given: Mapping[str, Any]) -> dict[str, Any]:
         InputError: a name that isn't one, or something else than a number or a range.
     """
     kinds = {field.name: field.type for field in structs.fields(Domain) if field.name in NAMES}
-    ranges = {}
+    ranges, names = {}, ", ".join(NAMES)
     for name, value in given.items():
         if name not in kinds:
-            raise InputError(f"unknown {shown(name)} in a domain: it must be one of {_listed()}")
-        ends = _RANGE.fullmatch(value.strip()) if isinstance(value, str) else None
-        pair = list(ends.groups()) if ends else value if isinstance(value, list) else [value] * 2
+            raise InputError(f"unknown {shown(name)} in a domain: it must be one of {names}")
+        pair = value if isinstance(value, list) else _ends(value)
         try:
-            ranges[name] = converted(pair, kinds[name], name, strict=False)
-        except InputError as error:
+            ranges[name] = converted(pair, kinds[name], name)
+        except InputError:
+            node: Any = bare(type_of(kinds[name]))
+            number = must_be(node.item_types[0])
             raise InputError(
-                f"{name} is {shown(value)}: it must be a number, or a range such as "
-                f"{name}=0..3; {error}"
+                f"{name} is {shown(value)}: it must be {number}, or a range, as in 1..2"
             ) from None
     return ranges
 
 
-def _listed() -> str:
-    return ", ".join(NAMES)
+def _ends(value: Any) -> list[Any]:
+    """The ends of a range, or of a number alone; text that is none of these as it is."""
+    if not isinstance(value, str):
+        return [value] * 2
+    ends = value.split("..", 1) if ".." in value else [value] * 2
+    try:
+        return [int(each) if _WHOLE.fullmatch(each.strip()) else float(each) for each in ends]
+    except ValueError:
+        return ends
 
 
 class Draws:

@@ -6,7 +6,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from msgspec import UNSET
 
 from jbrep.envs import instances
 from jbrep.envs.domain import PHYSICS, SIGNALS, Domain, read_ranges
@@ -27,9 +26,8 @@ def with_domain(task: Task, given: Mapping[str, Any]) -> Task:
     Raises:
         InputError: a name or number that can't be, or nothing that the environment has.
     """
-    without = task.replace(domain=UNSET)
     if not given:
-        return without
+        return task.undisturbed
     ranges, known = read_ranges(given), changeable(task)
     if unknown := [name for name in ranges if name not in known]:
         raise InputError(
@@ -37,7 +35,7 @@ def with_domain(task: Task, given: Mapping[str, Any]) -> Task:
         )
     if "noise" in ranges and ranges["noise"][1]:
         ranges["spread"] = spread(task)
-    return without.replace(domain=Domain(**ranges))
+    return task.replace(domain=Domain(**ranges))
 
 
 def changeable(task: Task) -> tuple[str, ...]:
@@ -53,7 +51,7 @@ def changeable(task: Task) -> tuple[str, ...]:
 
 def spread(task: Task) -> tuple[float, ...]:
     """The standard deviation of each feature in episodes of random actions, (D,)."""
-    return _spread(json.dumps(to_plain(task.whole.replace(domain=UNSET)), sort_keys=True))
+    return _spread(json.dumps(to_plain(task.whole.undisturbed), sort_keys=True))
 
 
 @lru_cache(maxsize=8)

@@ -265,6 +265,11 @@ class Task(Record, frozen=True):
         return self.replace(features=self.view.features, view=UNSET) if self.view else self
 
     @property
+    def undisturbed(self) -> "Task":
+        """The task of the robot as it is, without a domain."""
+        return self.replace(domain=UNSET)
+
+    @property
     def slug(self) -> str:
         """The name as a part of paths."""
         return slug(self.name)

@@ -21,7 +21,7 @@ USUAL = (  # what a table has unless it is said
     *("dropped=0.1", "dropped=0.3", "action_delay=1", "body=0..999"),
     *("friction=0.5..1.5", "mass=0.8..1.2", "push=0.1", "push=0.3"),
 )
-_UNDISTURBED = "undisturbed"
+_UNDISTURBED, _IN_TRAINING = "undisturbed", "as in training"
 
 
 class Row(Record, frozen=True, kw_only=True):
@@ -98,7 +98,7 @@ def domains_of(task: Task, chosen: Sequence[str]) -> tuple[dict[str, Domain | No
         wanted = {text: each for text, each in wanted.items() if not set(each) - set(known)}
     rows: dict[str, Domain | None] = {_UNDISTURBED: None}
     if task.domain:
-        rows[str(task.domain)] = task.domain
+        rows[_IN_TRAINING] = task.domain
     for text, given in wanted.items():
         rows[text] = with_domain(task, given).domain or None
     return rows, lacking

@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 import msgspec
-from msgspec import NODEFAULT, inspect
+from msgspec import NODEFAULT, UNSET, inspect
 
 from jbrep.records.record import Record, default_of
 from jbrep.records.words import must_be, type_of
@@ -23,7 +23,7 @@ class Key(NamedTuple):
     @property
     def default_shown(self) -> str:
         """The default for a reader; empty where there is none, or it says nothing."""
-        if self.default_in_words or self.default in (NODEFAULT, None, ""):
+        if self.default_in_words or self.default in (NODEFAULT, UNSET, None, ""):
             return self.default_in_words
         if isinstance(self.default, Record | dict | tuple | frozenset):
             return ""

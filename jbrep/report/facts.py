@@ -281,6 +281,8 @@ def _command(shared: Label, folder: str) -> str:
         parts += ["--set", f"{name}={json.dumps(value)}"]
     for name, value in settings.environment.arguments.items():
         parts += ["--env", f"{name}={json.dumps(value)}"]
+    for each in str(settings.environment.domain or "").split(","):
+        parts += ["--domain", each] if each else []
     parts += ["--episode-steps", str(settings.environment.max_episode_steps)]
     label = settings.task, settings.learner, settings.representation
     out = "/".join((folder, *map(slug, label), "seed-0"))  # a task's id may contain a slash

@@ -162,8 +162,10 @@ def _flat(settings: RunSettings) -> dict[str, Any]:
     What is learned, by what and from what comes first.
     """
     own = to_plain(settings)
+    parts = own.pop("environment"), own.pop("hyperparameters")
     first = {name: own[name] for name in ("task", "algorithm", "representation")}
-    return {**first, **own, **own.pop("environment"), **own.pop("hyperparameters")}
+    first["domain"] = parts[0]["domain"] = str(settings.environment.domain or "none")
+    return {**first, **own, **parts[0], **parts[1]}
 
 
 class RunRecord(Document, frozen=True, kw_only=True):

@@ -7,10 +7,11 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from jbrep.dataset.settings import MAX_ROOT_SEED
 from jbrep.encoders.shipped import UNLEARNED
+from jbrep.envs.domain import read_ranges
 from jbrep.envs.names import find_spec
 from jbrep.envs.task import MAX_EPISODE_STEPS, SHORT_NAMES
 from jbrep.errors import InputError
@@ -119,6 +120,13 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     environment: Annotated[
         Mapping[str, Any], Meta(description="Arguments of all environments.")
     ] = {}
+    domain: Annotated[
+        Mapping[str, Any] | UnsetType,
+        Meta(
+            title="a table",
+            description='What each episode of all runs draws, such as delay = "0..2".',
+        ),
+    ] = UNSET
     data: Data | None = None  # None: the shipped encoders
     training: Annotated[
         Mapping[str, Any],
@@ -149,6 +157,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             if len(set(values)) < len(values):
                 raise InputError(f"{name} is {values}: it must have each once")
         self._check_tasks()
+        read_ranges(self.domain or {})
         for algorithm in self.algorithms:
             trainer_of(self.learner(algorithm), self)
         self._check_data()

@@ -109,12 +109,13 @@ class Plan:
         return [cell for cell in self.cells if not self.has_ended(cell)]
 
     def task(self, name: str) -> Task:
-        """A task with the study's arguments and time limit; its environment is made once.
+        """A task with the study's arguments, time limit and domain; its environment is made once.
 
         Raises:
             InputError: as `describe`.
         """
-        return describe(name, self.study.environment, self.study.episode_steps)
+        study = self.study
+        return describe(name, study.environment, study.episode_steps, domain=study.domain or {})
 
     def run(self, cell: Cell) -> Run:
         """What to train.

@@ -144,9 +144,9 @@ def _collect(plan: Plan, data: Data, task: str, number: int) -> Path:
 
 def _to_collect(data: Data, task: Task, number: int) -> DataSettings:
     """The settings of the data set of that number, with states where the task has them."""
-    return DataSettings(
-        task=task, steps=data.steps, seed=data.seed + number, store_state=bool(task.state)
-    )
+    seed = data.seed + number
+    task = task.undisturbed
+    return DataSettings(task=task, steps=data.steps, seed=seed, store_state=bool(task.state))
 
 
 def _collected(plan: Plan, number: int) -> str:
