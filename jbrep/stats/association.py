@@ -1,6 +1,6 @@
 """Do diagnostics predict learning? Final returns against what was measured of the codes."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -85,15 +85,58 @@ def rank_correlation(x: Array, y: Array, families: Sequence[str], seed: int = 0)
     """
     if len(x) < _FEWEST or np.ptp(x) == 0 or np.ptp(y) == 0:
         return UNDEFINED
+    found = over_families(lambda times: _of_ranks(x, y, times), families, seed)
+    return found if len({*families}) >= _FEWEST else UNDEFINED._replace(value=found.value)
+
+
+def mean_rank_correlation(
+    pairs: Sequence[tuple[Array, Array]], families: Sequence[str], seed: int = 0
+) -> Interval:
+    """The mean over tasks of rank correlations of x and y, (n,), with its interval over families.
+
+    Args:
+        pairs: of each task, of the same codes.
+        families: that the codes belong to, (n,).
+        seed: of the resamples.
+    """
+    return over_families(lambda times: _mean_of_ranks(pairs, times), families, seed)
+
+
+def difference(
+    pairs: Sequence[tuple[Array, Array]],
+    others: Sequence[tuple[Array, Array]],
+    families: Sequence[str],
+    seed: int = 0,
+) -> Interval:
+    """How much the mean rank correlation of pairs is above that of others, on the same resamples.
+
+    Args:
+        pairs: as for `mean_rank_correlation`.
+        others: of the same codes and tasks.
+        families: that the codes belong to, (n,).
+        seed: of the resamples.
+    """
+    return over_families(
+        lambda times: _mean_of_ranks(pairs, times) - _mean_of_ranks(others, times), families, seed
+    )
+
+
+def over_families(
+    statistic: Callable[[Array], Array], families: Sequence[str], seed: int = 0
+) -> Interval:
+    """A statistic of codes that each come so many times, (..., n), resampled by families."""
     names, family = np.unique(families, return_inverse=True)
     numbers = np.arange(len(names), dtype=np.float64)
 
-    def statistic(drawn: Array) -> Array:
+    def of_drawn(drawn: Array) -> Array:
         times = (drawn[..., None] == numbers).sum(axis=-2)
-        return _of_ranks(x, y, times[..., family])
+        return statistic(times[..., family])
 
-    found = percentile(statistic, numbers, seed=seed)
-    return found if len(names) >= _FEWEST else UNDEFINED._replace(value=found.value)
+    return percentile(of_drawn, numbers, seed=seed)
+
+
+def _mean_of_ranks(pairs: Sequence[tuple[Array, Array]], times: Array) -> Array:
+    return np.mean([_of_ranks(x, y, times) for x, y in pairs], axis=0)
 
 
 def _of_ranks(x: Array, y: Array, times: Array) -> Array:
