@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ from made_up import write_record
 from jbrep.dataset import Dataset
 from jbrep.encoders import load
 from jbrep.envs import describe
+from jbrep.errors import InputError
 from jbrep.records.tables import write_rows
 from jbrep.rl import Run
 from jbrep.rl.files import EPISODES, Episode
+from jbrep.study.tables import Return
 
 ROOT = Path(__file__).parent.parent
 FACE, MOVE = "face_direction", "move_in_direction"
@@ -99,3 +102,47 @@ def test_what_can_be_attacked_is_told(given, code, line, capsys, monkeypatch):
         attack.main()
     assert ended.value.code == code
     assert "".join(capsys.readouterr()).startswith(line)
+
+
+def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatch):
+    import worth
+
+    finals = {
+        "full": 0.0,
+        "vae-8": 10.0,
+        "pca-8": 20.0,
+        "dae-8": 30.0,
+        "slow-8": 40.0,
+        "ofe-64": 9.0,
+    }
+    labels = {
+        code: SimpleNamespace(
+            settings=SimpleNamespace(task=FACE, representation=code),
+            encoder=SimpleNamespace(kind=code.partition("-")[0]),
+        )
+        for code in finals
+    }
+    rows = [
+        Return(FACE, "sac", code, 0, step, 0, value if step else 99.0)
+        for code, value in finals.items()
+        for step in (0, 10)
+    ]
+    runs = [SimpleNamespace(label=code, encoder=f"hash of {code}") for code in finals]
+    tables = SimpleNamespace(returns=rows, record=SimpleNamespace(runs=runs, labels=labels))
+    codes = [code for code in finals if code != "full"]
+    evaluation = SimpleNamespace(
+        data=SimpleNamespace(task=FACE),
+        encoders={code: {"rewarded": -finals[code]} for code in codes},
+        hashes={code: f"hash of {code}" for code in codes},
+        worth=SimpleNamespace(learned={"agent": {code: finals[code] ** 2 for code in codes}}),
+    )
+    monkeypatch.setattr(worth, "read_tables", lambda folder: tables)
+    monkeypatch.setattr(worth, "read_document", lambda path, kind: evaluation)
+    monkeypatch.setattr(worth, "headline", lambda known: known)
+    monkeypatch.setattr(worth, "shown", lambda learned: SimpleNamespace(value=learned))
+    worth.main("study", "scores")
+    told = {line.split()[0]: line.split()[1] for line in capsys.readouterr().out.splitlines()[2:]}
+    assert (told["rewarded"], told["agent"]) == ("-1.00", "1.00")
+    evaluation.hashes["dae-8"] = "of another"
+    with pytest.raises(InputError, match="trained on another dae-8 than the one with scores"):
+        worth.main("study", "scores")
