@@ -82,7 +82,7 @@ def test_a_study_without_a_file(home):
         seeds=(0, 1),
         **QUICK,
     )
-    with pytest.warns(Notice, match="This study compares nothing: representations must have full"):
+    with pytest.warns(Notice, match="This study compares nothing: it has one"):
         found = jbrep.study(study, home / "study", workers=1)
     assert {row.seed for row in found.returns} == {0, 1}
     assert found.page.exists()

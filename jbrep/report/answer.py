@@ -30,7 +30,7 @@ def answer(tables: Tables) -> list[str]:
     """Final returns beside policies that don't learn, by task; then what follows from them."""
     if tables.analysis is None:
         return [
-            f"There is nothing to compare: no cell has two runs of {tables.baseline} and of "
+            f"There is nothing to compare: no cell has two runs of {tables.record.baseline} and of "
             "another representation that have ended."
         ]
     tasks = by_task(tables.analysis)

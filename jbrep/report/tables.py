@@ -1,5 +1,6 @@
 """The tables that a report is made from, read back from a study's folder, and their statistics."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,18 +44,14 @@ class Tables(NamedTuple):
         """What the study's file calls it, or else the folder."""
         return (self.record.study.title if self.record.study else "") or self.name
 
-    @property
-    def baseline(self) -> str:
-        """The representation that the others are compared with."""
-        return (self.record.study.verdicts if self.record.study else Rules()).baseline
-
 
 def _planned(record: RunsRecord, registration: Registration | None) -> Planned:
     """What runs are compared with, and what reaches verdicts: only what was registered."""
-    if registration:
-        return registration.registered.planned
     rules = record.study.verdicts if record.study else Rules()
-    return Planned(rules.replace(primary=()))
+    planned = (
+        registration.registered.planned if registration else Planned(rules.replace(primary=()))
+    )
+    return replace(planned, rules=planned.rules.replace(baseline=record.baseline))
 
 
 def check_tables(folder: Path) -> None:

@@ -12,7 +12,7 @@ McPherson and Rowe 1969, "Repeated significance tests on accumulating data".
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -64,7 +64,11 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
         tuple[str, ...], Meta(description="In the order in which they are tested.")
     ] = tuple(CLAIMS)
     baseline: Annotated[
-        str, Meta(description="The representation that the others are compared with.")
+        str,
+        Meta(
+            description="The representation that the others are compared with; where no agent sees "
+            "it, the first."
+        ),
     ] = FULL
     error: Annotated[
         _Share,
@@ -123,6 +127,11 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
     def nothing_learnt(self) -> str:
         """Why there is no verdict where these agents don't learn."""
         return f"agents on {self.compared_with} didn't learn"
+
+    def baseline_of(self, names: Iterable[str]) -> str:
+        """The representation that others are compared with, of some in the order of tables."""
+        every = [*names]
+        return self.baseline if self.baseline in every else every[0]
 
     def reference(self, returns: Mapping[str, float]) -> str | None:
         """The policy that gains are counted over, of those whose returns are known."""

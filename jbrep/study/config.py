@@ -214,7 +214,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         cells = {
             f"{task}/{algorithm}/{each.name}": each
             for task, algorithm, each in product(self.tasks, self.algorithms, self.observed)
-            if each.name != self.verdicts.baseline
+            if each.name != self.baseline
         }
         short = {full: name for name, full in SHORT_NAMES.items()}
         if self.verdicts.primary and (long := [task for task in self.tasks if task in short]):
@@ -237,7 +237,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             if cell not in cells or not self.comparisons:
                 raise InputError(
                     f"verdicts.primary has {cell}: it must be of TASK/ALGORITHM/REPRESENTATION of "
-                    f"this study, compared with {self.verdicts.baseline}"
+                    f"this study, compared with {self.baseline}"
                 )
             for claim in self.verdicts.claims:
                 if reason := obstacle(self.verdicts, claim, self.arms(cells[cell])):
@@ -251,6 +251,11 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
                     f"{each.name} has {each.encoders} encoders for {len(self.seeds)} seeds: each "
                     "encoder must have as many runs, or at least two"
                 )
+
+    @property
+    def baseline(self) -> str:
+        """The representation that the others are compared with."""
+        return self.verdicts.baseline_of(each.name for each in self.observed)
 
     def arms(self, representation: Representation) -> Arms:
         """How many runs are planned of a representation, and of the baseline."""
@@ -270,8 +275,6 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
     @property
     def comparisons(self) -> int:
         """How many times a representation is compared with the baseline."""
-        if self.verdicts.baseline not in {each.name for each in self.observed}:
-            return 0
         return len(self.tasks) * len(self.algorithms) * (len(self.observed) - 1)
 
     def toml(self) -> str:
@@ -295,10 +298,7 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
             if len(set(each.shares(self.seeds))) > 1
         ]
         if not self.comparisons:
-            lines.append(
-                "This study compares nothing: representations must have "
-                f"{self.verdicts.baseline} and at least one other."
-            )
+            lines.append("This study compares nothing: it has one representation.")
         elif not self.verdicts.primary:
             lines.append(
                 "This study is exploratory: its report will give no verdicts, as its file names no "

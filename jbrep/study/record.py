@@ -18,6 +18,7 @@ from jbrep.records.record import Record, Version, from_plain, to_plain
 from jbrep.records.storage import exists
 from jbrep.rl.files import ENCODER, RunRecord, RunSettings, SharedSettings
 from jbrep.rl.settings import Sha256
+from jbrep.stats.rules import Rules
 from jbrep.stats.runs import in_order
 from jbrep.study.config import Study
 from jbrep.study.plan import Plan, read_plan
@@ -136,6 +137,13 @@ class RunsRecord(Document, frozen=True, kw_only=True):
             raise InputError(f"settings of {unknown[0]} are missing")
         for run in self.runs:
             self.settings_of(run)
+
+    @property
+    def baseline(self) -> str:
+        """The representation that the others are compared with."""
+        if self.study:
+            return self.study.baseline
+        return Rules().baseline_of(each.settings.representation for each in self.labels.values())
 
     def draws_of(self, learner: str) -> Mapping[str, tuple[Any, ...]]:
         """The values of settings, one of which each seed of the study draws, of a learner."""
