@@ -111,6 +111,7 @@ breadth: ## results/breadth/ anew: an hour
 cheetah: ## results/cheetah/ anew: half an hour
 coordinates coordinates-direction: ## results/coordinates/ and -direction/ anew: 20 minutes each
 recipe: ## results/recipe/ anew: half an hour
+figure-7-sac: ## results/figure-7-sac/ anew: an hour
 # the columns of a study's line in studies/judged.txt
 column = $(shell sed -n 's/^$@ *;//p' studies/judged.txt | cut -d ';' -f $(1))
 .SECONDEXPANSION:
