@@ -265,23 +265,26 @@ def evaluate(
 
     for kind in worth:
         choose(kind, WORTH, "way of worth")
+    if worth and out is None:
+        raise InputError("what codes are worth takes runs, which are kept: give out, a folder")
+    scaled = ScaledDataset.of(data)
+    if worth:
+        from jbrep.worth.worth import check
+
+        check(scaled.dataset, worth)
+    if out is not None:
+        check_writable(Path(out))
     from jbrep.evaluate.diagnosis import diagnose, write  # imports torch
     from jbrep.play.sources import find_good_policy
 
-    if out is not None:
-        check_writable(Path(out))
-    elif worth:
-        raise InputError("what codes are worth takes runs, which are kept: give out, a folder")
-    scaled = ScaledDataset.of(data)
     found, good = find_all(encoders, scaled.task), find_good_policy(policy, scaled.task)
     whole = Dataset(truth) if isinstance(truth, str | Path) else truth
     if out is None:
         return Judged(diagnose(found, scaled, good, whole))
     if not worth:
         return Judged(write(found, scaled, Path(out), good, whole))
-    from jbrep.worth.worth import check, work_out
+    from jbrep.worth.worth import work_out
 
-    check(scaled.dataset, worth)
     evaluation = write(found, scaled, Path(out), good, whole)
     return Judged(work_out(evaluation, found, scaled.dataset, Path(out), worth))
 

@@ -106,8 +106,8 @@ def diverging(brief, monkeypatch, tmp_path):
     starts = Dataset(brief).episodes["initial_qpos"][:, QUATERNION]
     reset, step, remaining = Simulation.reset, Simulation.step, {}
 
-    def begin(simulation, lanes, randoms):
-        reset(simulation, lanes, randoms)
+    def begin(simulation, lanes, *others):
+        reset(simulation, lanes, *others)
         for lane in lanes:
             remaining.pop((simulation, lane), None)
             for episode, steps in ((1, 30), (2, 0)):

@@ -120,6 +120,7 @@ def test_an_episode_is_played_again_before_a_data_set_grows(tmp_path, monkeypatc
 def own_module(tmp_path, monkeypatch):
     """A module with a robot, which takes a constant from another one."""
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("jbrep.envs.names._imported", [])  # other tests' workers lack it
     (tmp_path / "gears42.py").write_text("GEAR = 0.5\n")
     (tmp_path / "robot42.py").write_text(
         "import gymnasium\nfrom environments import Sledge\nfrom gears42 import GEAR\n\n\n"
