@@ -112,13 +112,14 @@ cheetah: ## results/cheetah/ anew: half an hour
 coordinates coordinates-direction: ## results/coordinates/ and -direction/ anew: 20 minutes each
 recipe: ## results/recipe/ anew: half an hour
 figure-7-sac: ## results/figure-7-sac/ anew: an hour
+cart-pole: ## results/cart-pole/ anew: twenty minutes
 # the columns of a study's line in studies/judged.txt
 column = $(shell sed -n 's/^$@ *;//p' studies/judged.txt | cut -d ';' -f $(1))
 .SECONDEXPANSION:
 $(STUDIES): $(READY) $$(call column,1)
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
-	cp $$(ls $(addprefix runs/$@/,returns.csv runs.json references.csv registration.json) 2>/dev/null) results/$@/
+	cp $$(ls $(addprefix runs/$@/,returns.csv runs.json references.csv run-infos.csv registration.json) 2>/dev/null) results/$@/
 	$(if $(strip $(call column,4)),for task in $(call column,4); do \
 	  $(BIN)/jbrep evaluate --encoder $(call column,2) --data $(call column,3) --out results/$@/$$task || exit; \
 	done)
