@@ -259,12 +259,10 @@ def evaluate(
     """
     from jbrep.dataset import Dataset, ScaledDataset
     from jbrep.encoders.shipped import find_all
-    from jbrep.errors import choose
     from jbrep.records.storage import check_writable
-    from jbrep.worth import WORTH
+    from jbrep.worth import check_ways
 
-    for kind in worth:
-        choose(kind, WORTH, "way of worth")
+    check_ways(worth)
     if worth and out is None:
         raise InputError("what codes are worth takes runs, which are kept: give out, a folder")
     scaled = ScaledDataset.of(data)

@@ -15,7 +15,6 @@ from jbrep.errors import InputError
 from jbrep.records.tables import write_rows
 from jbrep.rl import Run
 from jbrep.rl.files import EPISODES, Episode
-from jbrep.study.tables import Return
 
 ROOT = Path(__file__).parent.parent
 FACE, MOVE = "face_direction", "move_in_direction"
@@ -122,13 +121,15 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
         )
         for code in finals
     }
-    rows = [
-        Return(FACE, "sac", code, 0, step, 0, value if step else 99.0)
+    numbers = [
+        SimpleNamespace(
+            representation=code, numbers={"final_return_mean": SimpleNamespace(value=value)}
+        )
         for code, value in finals.items()
-        for step in (0, 10)
     ]
+    analysis = SimpleNamespace(groups=[SimpleNamespace(task=FACE, labels=numbers)])
     runs = [SimpleNamespace(label=code, encoder=f"hash of {code}") for code in finals]
-    tables = SimpleNamespace(returns=rows, record=SimpleNamespace(runs=runs, labels=labels))
+    tables = SimpleNamespace(analysis=analysis, record=SimpleNamespace(runs=runs, labels=labels))
     codes = [code for code in finals if code != "full"]
     evaluation = SimpleNamespace(
         data=SimpleNamespace(task=FACE),

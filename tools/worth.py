@@ -37,13 +37,13 @@ def scores(evaluation: Evaluation) -> dict[str, Mapping[str, float]]:
 
 
 def final_returns(tables: Tables, task: str) -> dict[str, float]:
-    """The mean over all final episodes of a task's runs, by code."""
-    last = max(row.step for row in tables.returns)
-    rows = [row for row in tables.returns if (row.task, row.step) == (task, last)]
+    """The mean final return of a task's runs, by code."""
+    groups = tables.analysis.groups if tables.analysis else ()
     return {
-        code: float(np.mean([row.episode_return for row in rows if row.representation == code]))
-        for code in dict.fromkeys(row.representation for row in rows)
-        if code != FULL
+        label.representation: float(label.numbers["final_return_mean"].value)
+        for group in groups
+        for label in group.labels
+        if group.task == task and label.representation != FULL
     }
 
 

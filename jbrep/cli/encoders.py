@@ -19,7 +19,7 @@ from jbrep.cli.base import (
 )
 from jbrep.cli.completion import complete_encoder, complete_task
 from jbrep.cli.environment import environment_options, given_task, needed_task, task_option
-from jbrep.errors import InputError, choose
+from jbrep.errors import InputError
 from jbrep.text import facts, r2_text, slug, table, terminal_width, wrapped
 
 if TYPE_CHECKING:
@@ -94,10 +94,9 @@ def evaluate(
     the latent's units and dimensions, nearest neighbours, and the prediction of the next latent. An
     encoder of your own is code such as mymodule:MyEncoder; its module is imported, which runs it.
     """
-    from jbrep.worth import WORTH
+    from jbrep.worth import check_ways
 
-    for kind in worth:
-        choose(kind, WORTH, "way of worth")
+    check_ways(worth)
     from jbrep import api
     from jbrep.dataset import Dataset
     from jbrep.encoders.shipped import check_found, find_all, source_of

@@ -82,7 +82,7 @@ class Varied(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _vary(self, friction: float, mass: float) -> None:
         physics = physics_of(self.env)
-        assert physics  # as `jbrep.envs.disturbed.with_domain` has seen
+        assert physics  # as `jbrep.envs.randomized.changeable` has seen
         if physics.model is not self._model:
             self._model, self._usual = physics.model, copy.copy(physics.model)
             self._data = mujoco.MjData(self._usual)

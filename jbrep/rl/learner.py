@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +97,8 @@ class Learner(Record, frozen=True, kw_only=True):
             raise InputError(f"base is {base} and preset {preset}: only one may name a preset")
         learner = cls.given(start.algorithm, preset or start.preset, overrides, name)
         learner = learner.replace(draws=draws)
-        learner.check_settings()
+        for each in learner.variants:
+            _ = each.hyperparameters
         presets = {base_name(each, its) for its in PRESETS for each in PRESETS[its]}
         if name in presets and learner != cls.of(name):
             raise InputError(f'it is a preset\'s name: give it another and base = "{base}"')
@@ -116,16 +117,12 @@ class Learner(Record, frozen=True, kw_only=True):
         }
         return self.replace(overrides={**self.overrides, **chosen}, draws={})
 
-    def check_settings(self) -> None:
-        """Check its hyperparameters, with each value that may be drawn.
-
-        Raises:
-            InputError: as `hyperparameters`.
-        """
-        for name, values in {"": (None,), **self.draws}.items():
-            for value in values:
-                drawn = {name: value} if name else {}
-                overridden(self.algorithm, self.preset, {**self.overrides, **drawn})
+    @property
+    def variants(self) -> Iterator["Learner"]:
+        """The same without draws, then with each value that may be drawn, one at a time."""
+        each = ({name: value} for name, values in self.draws.items() for value in values)
+        for drawn in ({}, *each):
+            yield self.replace(overrides={**self.overrides, **drawn}, draws={})
 
     @property
     def hyperparameters(self) -> Hyperparameters:

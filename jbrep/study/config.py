@@ -159,7 +159,8 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         self._check_tasks()
         read_ranges(self.domain or {})
         for algorithm in self.algorithms:
-            trainer_of(self.learner(algorithm), self)
+            for each in self.learner(algorithm).variants:
+                trainer_of(each, self)
         self._check_data()
         self._check_verdicts()
 
