@@ -4,6 +4,7 @@ It prints what came of it, and ends with code 1 where something false came of an
 """
 
 import argparse
+import os
 import sys
 import tempfile
 import time
@@ -35,6 +36,7 @@ def main() -> None:
     if given.times < 1:
         parser.error(f"times is {given.times}: it must be at least 1")
     sys.path.insert(0, str(HELPERS))
+    os.environ["OMP_NUM_THREADS"] = "1"  # a fork waits for ever for threads that it hasn't got
     prepare_opengl()  # before MuJoCo is imported
     from surfaces import SURFACES
 

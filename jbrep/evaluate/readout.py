@@ -50,6 +50,7 @@ _SATURATED = 0.95  # magnitude of a tanh unit
 _DEAD = 0.01  # standard deviation, as a share of the most variable unit's
 _STILL = 1e-6  # standard deviation that rounding alone can cause
 _MLE_NEIGHBOURS = 20  # of the maximum-likelihood estimator
+_DECIMALS = 6  # of the largest magnitude: finer, single precision only holds rounding
 _UNKNOWN = Score(None, None, None)
 
 
@@ -103,12 +104,13 @@ def _unit_correlation(values: NDArray[np.float64], live: NDArray[np.bool_]) -> A
 def intrinsic_dimension(values: NDArray[Any]) -> IntrinsicDimension:
     """Estimates of how many dimensions points (n, k) fill locally, from scikit-dimension.
 
-    TwoNN (Facco et al. 2017) and the maximum likelihood of Levina and Bickel (2005). None where
-    there are too few distinct points.
+    TwoNN (Facco et al. 2017) and the maximum likelihood of Levina and Bickel (2005). Points that
+    only rounding tells apart count once. None where there are too few distinct points.
     """
     from skdim.id import MLE, TwoNN  # not at the top: it takes seconds
 
-    points = np.unique(values, axis=0)
+    largest = np.abs(values).max(initial=np.finfo(float).tiny)
+    points = np.unique(np.round(values / largest, _DECIMALS), axis=0)
     if len(points) <= 2 * _MLE_NEIGHBOURS:
         return IntrinsicDimension(two_nn=None, mle=None)
     points = np.pad(points, ((0, 0), (0, 1)))  # the library refuses a single column
