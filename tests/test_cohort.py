@@ -213,12 +213,16 @@ FOLLOWED = [
 ]
 
 
+NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=NO_GPU)])
 @pytest.mark.parametrize(("algorithm", "preset", "overrides"), FOLLOWED)
-def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, tmp_path):
+def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, device, tmp_path):
     """The same bits until the first gradient step; ten steps later, the same weights nearly."""
     settings = {"learning_starts": 100, **overrides}
     steps = 110 * overridden(algorithm, preset, settings).action_repeat
-    made = runs(steps, preset, algorithm=algorithm, overrides=settings)
+    made = runs(steps, preset, algorithm=algorithm, overrides=settings, device=device)
     members = [Member(Job(run, tmp_path / str(run.seed)), []) for run in made]
     cohort = Cohort(members)
     while cohort.goes_on:
