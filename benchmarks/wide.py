@@ -1,10 +1,11 @@
 """Agents of 64 robots each, against bare physics and stable-baselines3: python benchmarks/wide.py.
 
-Four SAC agents of the preset wide learn on all cores, in a process or in one for each core; one
-agent learns alone, as jbrep rl does it. Rounds are taken in turn.
+SAC agents of the preset wide, four or as many as there are cores, learn on all cores, in a process
+or in one for each core; one agent learns alone, as jbrep rl does it. Rounds are taken in turn. With
+--device cuda, gradient steps are on the GPU, those of stable-baselines3 aside.
 """
 
-import os
+import argparse
 import resource
 import tempfile
 import time
@@ -27,28 +28,30 @@ from jbrep.rl.cohort.cohort import Cohort
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.cohort.replay import capacity_of
 from jbrep.rl.job import Job
-from jbrep.rl.settings import BFLOAT16, FLOAT32, PRECISIONS
+from jbrep.rl.settings import BFLOAT16, CPU, CUDA, FLOAT32, PRECISIONS
 
 TASK = "move_in_direction"
-AGENTS, ROBOTS = 4, 64
+AGENTS, ROBOTS = max(4, cpu_count()), 64
 ROUNDS = 5
 ROLLOUTS = 6  # steps of all robots, of a round
 PAPER_STEPS = 5_000_000
 AT_START = {"learning_starts": 0}
 
 
-def run_of(seed: int, precision: str = FLOAT32, trainer: str = "cohort") -> Run:
+def run_of(seed: int, **settings: str) -> Run:
     """A run that learns from its first step on, and keeps a million transitions."""
-    settings = {"precision": precision, "trainer": trainer}
     return Run.of(TASK, "sac", "wide", AT_START, seed=seed, **settings)
 
 
 @cache  # its process makes it once
-def cohort(agents: int, threads: int, precision: str) -> Cohort:
+def cohort(agents: int, threads: int, precision: str, device: str = CPU) -> Cohort:
     """Agents with some transitions to learn from, whose robots are stepped on so many threads."""
     torch.set_num_threads(1)
     folder = Path(tempfile.mkdtemp())
-    jobs = [Job(run_of(i, precision), folder / str(i), threads) for i in range(agents)]
+    jobs = [
+        Job(run_of(i, precision=precision, device=device), folder / str(i), threads)
+        for i in range(agents)
+    ]
     made = Cohort([Member(job, []) for job in jobs])
     learn(made, 4)
     return made
@@ -62,10 +65,11 @@ def learn(cohort: Cohort, rollouts: int) -> None:
             cohort.learn()
 
 
-def rate_of_cohort(agents: int, threads: int, precision: str, _: int = 0) -> float:
+def rate_of_cohort(agents: int, threads: int, precision: str, device: str, _: int = 0) -> float:
     """Steps of a robot in a second."""
-    made = cohort(agents, threads, precision)
-    return agents * ROBOTS * ROLLOUTS / timed(lambda: learn(made, ROLLOUTS))
+    made = cohort(agents, threads, precision, device)
+    before, seconds = made.step, timed(lambda: learn(made, ROLLOUTS))
+    return agents * (made.step - before) / seconds
 
 
 @cache
@@ -73,7 +77,8 @@ def agent() -> OffPolicyAlgorithm:
     """One that stable-baselines3 trains."""
     torch.set_num_threads(1)
     run = run_of(0, trainer="sb3")
-    env = make_env(run.task, ROBOTS, 0, run.find_encoder())
+    repeat = run.learner.hyperparameters.action_repeat
+    env = make_env(run.task, ROBOTS, 0, run.find_encoder(), action_repeat=repeat)
     made = make_agent("sac", run.learner.hyperparameters, env, 0)
     assert isinstance(made, OffPolicyAlgorithm)
     return made.learn(4 * ROBOTS)
@@ -81,8 +86,9 @@ def agent() -> OffPolicyAlgorithm:
 
 def rate_of_agent(_: int) -> float:
     """The same of stable-baselines3."""
-    made, steps = agent(), ROLLOUTS * ROBOTS
-    return steps / timed(lambda: made.learn(steps, reset_num_timesteps=False))
+    made, actions = agent(), ROLLOUTS * ROBOTS
+    seconds = timed(lambda: made.learn(actions, reset_num_timesteps=False))
+    return run_of(0).learner.hyperparameters.action_repeat * actions / seconds
 
 
 def rate_of_physics(robots: int) -> float:
@@ -119,11 +125,16 @@ def peak_memory() -> float:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default=CPU, choices=(CPU, CUDA))
+    device = parser.parse_args().device
     stop_profiling()
     cores = cpu_count()
     each = AGENTS // cores
     spawn = get_context("spawn")
-    sides = {f"one process, {p}": partial(rate_of_cohort, AGENTS, cores, p) for p in PRECISIONS}
+    sides = {
+        f"one process, {p}": partial(rate_of_cohort, AGENTS, cores, p, device) for p in PRECISIONS
+    }
     rates: dict[str, list[float]] = {}
 
     def measure(name: str, rate: float) -> None:
@@ -135,17 +146,15 @@ def main() -> None:
             for name, side in sides.items():
                 measure(name, side())
             for p in PRECISIONS:
-                work = partial(rate_of_cohort, each, 1, p)
+                work = partial(rate_of_cohort, each, 1, p, device)
                 measure(f"one on each core, {p}", sum(ours.map(work, range(cores))))
             measure("stable-baselines3", sum(theirs.map(rate_of_agent, range(cores))))
             measure("physics of one", rate_of_physics(ROBOTS))
             for p in PRECISIONS:
-                measure(f"alone, {p}", rate_of_cohort(1, cores, p))
+                measure(f"alone, {p}", rate_of_cohort(1, cores, p, device))
     of = {name: np.array(values[1:]) for name, values in rates.items()}  # the first warms up
 
-    print(
-        f"{AGENTS} SAC agents of {ROBOTS} robots on {os.cpu_count()} cores, {time.strftime('%F')}"
-    )
+    print(f"{AGENTS} SAC agents of {ROBOTS} robots, {cores} cores, {device}, {time.strftime('%F')}")
     show("bare physics of all, steps of a robot a second", of["physics"])
     for name in (n for n in of if n.startswith("one ")):
         show(f"cohorts, {name}: share of that", of[name] / of["physics"], ">= 0.5")
