@@ -1,7 +1,7 @@
 """Agents that learn together, against one after the other: python benchmarks/cohorts.py.
 
 A gradient step alone; learning on all cores, a process on each; and a whole study. Rounds are taken
-in turn. With --device cuda, the cohorts' gradient steps are on the GPU.
+in turn. With --device cuda, the cohorts' gradient steps are on the GPU, and one process has all.
 """
 
 import argparse
@@ -27,6 +27,7 @@ from jbrep.rl.cohort.member import Member
 from jbrep.rl.job import Job
 from jbrep.rl.settings import FLOAT32, PRECISIONS
 from jbrep.study.config import Study
+from jbrep.study.packing import usual_workers
 from jbrep.study.plan import Plan
 from jbrep.study.runner import on_this_machine, run_study
 
@@ -155,26 +156,28 @@ def side_by_side(pool: ProcessPoolExecutor, work: Callable[[int], float], proces
 
 def compare_learning(learner: tuple[str, str], device: str) -> None:
     name, cores = "-".join(learner), cpu_count()
-    members = MEMBERS // cores
+    processes = 1 if device == "cuda" else cores
+    members = MEMBERS // processes
     works = [
         partial(seconds_of_member, learner, members, precision, device) for precision in PRECISIONS
     ]
     with ExitStack() as stack:
         first, *others = (
             stack.enter_context(ProcessPoolExecutor(size, mp_context=get_context("spawn")))
-            for size in (cores, *(cores for _ in works))
+            for size in (cores, *(processes for _ in works))
         )
         rounds = []
         for _ in range(ROUNDS + 1):
             alone = side_by_side(first, partial(seconds_of_agent, learner), cores)
             together = [
-                side_by_side(pool, work, cores) for pool, work in zip(others, works, strict=True)
+                side_by_side(pool, work, processes)
+                for pool, work in zip(others, works, strict=True)
             ]
             rounds.append([alone, *together])
     alone, *together = np.array(rounds[1:]).T  # the first one warms up
     show(f"{name}: stable-baselines3 in {cores} processes, steps of all a second", alone)
     for precision, each in zip(PRECISIONS, together, strict=True):
-        show(f"{name}: {cores} cohorts of {members}, {precision}, the same", each)
+        show(f"{name}: {processes} cohorts of {members}, {precision}, the same", each)
         show(f"{name}: times stable-baselines3's rate, {precision}", each / alone)
 
 
@@ -183,7 +186,7 @@ def compare_studies(steps: int, device: str) -> None:
         study = STUDY.replace(steps=steps, trainer=trainer, **changes)
         with tempfile.TemporaryDirectory() as folder:
             plan, before = Plan(study, Path(folder) / "study"), sum(os.times()[:4])
-            seconds = timed(lambda: run_study(plan, on_this_machine, cpu_count()))
+            seconds = timed(lambda: run_study(plan, on_this_machine, usual_workers(plan)))
         return seconds, (sum(os.times()[:4]) - before) / seconds / cpu_count()
 
     alone, _ = measured("sb3")

@@ -1,8 +1,8 @@
 """Agents of 64 robots each, against bare physics and stable-baselines3: python benchmarks/wide.py.
 
-SAC agents of the preset wide, four or as many as there are cores, learn on all cores, in a process
-or in one for each core; one agent learns alone, as jbrep rl does it. Rounds are taken in turn. With
---device cuda, gradient steps are on the GPU, those of stable-baselines3 aside.
+SAC agents of the preset wide learn on all cores, in a process or in one for each core; one agent
+learns alone, as jbrep rl does it. Rounds are taken in turn. With --device cuda, gradient steps are
+on the GPU, those of stable-baselines3 aside.
 """
 
 import argparse
@@ -31,8 +31,7 @@ from jbrep.rl.job import Job
 from jbrep.rl.settings import BFLOAT16, CPU, CUDA, FLOAT32, PRECISIONS
 
 TASK = "move_in_direction"
-AGENTS, ROBOTS = max(4, cpu_count()), 64
-ROUNDS = 5
+IN_MEMORY, ROBOTS = 4, 64
 ROLLOUTS = 6  # steps of all robots, of a round
 PAPER_STEPS = 5_000_000
 AT_START = {"learning_starts": 0}
@@ -115,11 +114,11 @@ def evaluation_share(rate: float) -> float:
 
 def peak_memory() -> float:
     """Of four agents whose replay buffers are full [GB], and the buffers alone."""
-    made = cohort(AGENTS, cpu_count(), FLOAT32)
+    made = cohort(IN_MEMORY, cpu_count(), FLOAT32)
     capacity = capacity_of(made.members[0].job.run)
     part = made._replay.rows_of(0)[:1]
     rows = np.broadcast_to(part, (capacity // ROBOTS, *part.shape[1:]))
-    made._replay.restore([rows] * AGENTS, len(rows))
+    made._replay.restore([rows] * IN_MEMORY, len(rows))
     learn(made, 2)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
@@ -127,13 +126,15 @@ def peak_memory() -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default=CPU, choices=(CPU, CUDA))
-    device = parser.parse_args().device
+    parser.add_argument("--agents", type=int, default=max(4, cpu_count()))
+    parser.add_argument("--rounds", type=int, default=5)
+    given = parser.parse_args()
     stop_profiling()
-    cores = cpu_count()
-    each = AGENTS // cores
+    agents, device, cores = given.agents, given.device, cpu_count()
+    each = agents // cores
     spawn = get_context("spawn")
     sides = {
-        f"one process, {p}": partial(rate_of_cohort, AGENTS, cores, p, device) for p in PRECISIONS
+        f"one process, {p}": partial(rate_of_cohort, agents, cores, p, device) for p in PRECISIONS
     }
     rates: dict[str, list[float]] = {}
 
@@ -141,8 +142,8 @@ def main() -> None:
         rates.setdefault(name, []).append(rate)
 
     with ProcessPoolExecutor(cores, spawn) as ours, ProcessPoolExecutor(cores, spawn) as theirs:
-        for _ in range(ROUNDS + 1):
-            measure("physics", rate_of_physics(AGENTS * ROBOTS))
+        for _ in range(given.rounds + 1):
+            measure("physics", rate_of_physics(agents * ROBOTS))
             for name, side in sides.items():
                 measure(name, side())
             for p in PRECISIONS:
@@ -154,7 +155,7 @@ def main() -> None:
                 measure(f"alone, {p}", rate_of_cohort(1, cores, p, device))
     of = {name: np.array(values[1:]) for name, values in rates.items()}  # the first warms up
 
-    print(f"{AGENTS} SAC agents of {ROBOTS} robots, {cores} cores, {device}, {time.strftime('%F')}")
+    print(f"{agents} SAC agents of {ROBOTS} robots, {cores} cores, {device}, {time.strftime('%F')}")
     show("bare physics of all, steps of a robot a second", of["physics"])
     for name in (n for n in of if n.startswith("one ")):
         show(f"cohorts, {name}: share of that", of[name] / of["physics"], ">= 0.5")

@@ -177,13 +177,13 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def on_cluster(function: Callable[..., Any], cpus: int | None, gpus: float = 0) -> Any:
+def on_cluster(function: Callable[..., Any], cpus: int | None, gpus: int = 0) -> Any:
     """A function as Ray's remote function, on a core each, called again if its node dies.
 
     Args:
         function: to run.
         cpus: of the local cluster that is started where RAY_ADDRESS names none; None takes all.
-        gpus: that it needs, or a share of one.
+        gpus: that it needs.
 
     Raises:
         InputError: no cluster can be reached or started.

@@ -3,12 +3,13 @@
 import os
 
 import pytest
+from joblib import cpu_count
 
 from jbrep.errors import InputError
 from jbrep.rl import Run, speed
 from jbrep.rl.cohort.replay import memory_of
 from jbrep.study.config import Data, Study
-from jbrep.study.packing import packed, until_done
+from jbrep.study.packing import packed, until_done, usual_workers
 from jbrep.study.plan import Plan
 
 STUDY = Study(
@@ -75,6 +76,14 @@ def test_the_last_worker_decides():
     assert until_done([3, 1, 1, 1], 2) == 3
     assert until_done([2, 2, 2], 2) == 4
     assert until_done([], 2) == 0
+
+
+def test_a_gpu_has_one_wide_cohort_at_a_time(tmp_path, monkeypatch):
+    plan = Plan(STUDY.replace(algorithms=("sac-modern",), seeds=tuple(range(20))), tmp_path)
+    assert usual_workers(plan) == cpu_count()
+    monkeypatch.setattr(Plan, "device", "cuda")
+    assert usual_workers(plan) == 1
+    assert [len(pack) for pack in packed(plan, 1)] == [60, 60]
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ _COUNT = click.IntRange(1, 1024)
 @click.option(
     "--workers",
     type=_COUNT,
-    help="Processes at a time.  [default: one for each core]",
+    help="Processes at a time.  [default: one for each core; one if it learns on a GPU]",
 )
 @click.option(
     "--width",

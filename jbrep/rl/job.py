@@ -10,6 +10,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
+from joblib import cpu_count
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 from torch.utils.tensorboard import SummaryWriter
@@ -46,7 +47,7 @@ from jbrep.rl.files import (
 from jbrep.rl.policy_file import MAX_BYTES, read
 from jbrep.rl.policy_zip import policy_zip
 from jbrep.rl.run import Run
-from jbrep.rl.settings import MAX_LINE
+from jbrep.rl.settings import CPU, MAX_LINE
 from jbrep.rl.trained import Trained, fill_whole, pack_whole
 
 Watch = Callable[[int, float | None], None]  # steps so far; mean return of the last evaluation
@@ -115,7 +116,8 @@ class Job:
 
     def threads_for(self, lanes: int) -> int:
         """How many threads step so many of its robots; no bit depends on it."""
-        return min(self.threads, lanes)
+        is_alone = self.settings.device != CPU  # studies have a process for each core otherwise
+        return min(cpu_count() if is_alone else self.threads, lanes)
 
     @property
     def result(self) -> RunRecord | None:

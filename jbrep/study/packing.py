@@ -17,7 +17,7 @@ from jbrep.progress import Progress
 from jbrep.rl import Run
 from jbrep.rl.cohort.replay import memory_of
 from jbrep.rl.run import trainer_of
-from jbrep.rl.settings import COHORT
+from jbrep.rl.settings import COHORT, CPU, CUDA
 from jbrep.rl.speed import estimate
 from jbrep.stats.power import Prospect, prospects
 from jbrep.study.plan import Cell, Plan
@@ -26,10 +26,16 @@ from jbrep.study.representations import ByCode, ByName
 
 Pack = tuple[Cell, ...]
 
-_WIDEST = 16  # agents; wider cohorts don't cost each of theirs less
+# wider cohorts don't cost each of their agents less on a CPU
+_WIDEST = {CPU: 16, CUDA: 64}  # agents; for a GPU not measured yet
 _OVERHEAD = 0.3  # what a step costs besides its agents, in what it costs for each
 _SHARE = 0.7  # of the machine's memory, that replay buffers may take
 _OF_WORKER, _OF_AGENT = 1 << 29, 1 << 25  # bytes that they take besides
+
+
+def usual_workers(plan: Plan) -> int:
+    """How many packs go on at a time: one for each core, or one that has a GPU and all cores."""
+    return cpu_count() if plan.device == CPU else 1
 
 
 def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
@@ -58,14 +64,15 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
             groups[*cell.kind, observed[seen]].append(cell)
         else:
             alone.append((cell,))
+    widest = _WIDEST[plan.device]
     limits = (_most(plan, group[0], size, workers) for (_, _, size), group in groups.items())
-    most = min(limits, default=_WIDEST)
+    most = min(limits, default=widest)
     if width and width > most:
         raise InputError(
             f"the width is {width}: {workers} cohorts of {most} agents are the most that this "
             "machine's memory holds"
         )
-    choices = range(width or min(_WIDEST, max(most, 1)), 0, -1)
+    choices = range(width or min(widest, max(most, 1)), 0, -1)
     each = [alone + [p for group in groups.values() for p in _split(group, n)] for n in choices]
     best = min(each, key=lambda packs: until_done([len(p) + _OVERHEAD for p in packs], workers))
     return sorted(best, key=lambda pack: (-len(pack), place[pack[0].name]))
@@ -117,14 +124,14 @@ def forecast(plan: Plan, workers: int | None = None, width: int | None = None) -
 
     Args:
         plan: the study.
-        workers: how many processes would go on at a time; by default one for each core.
+        workers: how many processes would go on at a time; by default as many as are usual.
         width: the most agents that would learn together in one.
 
     Raises:
         InputError: as `run_study`, as far as that is known beforehand.
     """
     check(plan)
-    workers = workers or cpu_count()
+    workers = workers or usual_workers(plan)
     packs = packed(plan, workers, width)
     examples = {_kind(pack): pack for pack in packs}
     seconds = {

@@ -7,7 +7,6 @@ from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from typing import Any
 
-from joblib import cpu_count
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -19,7 +18,7 @@ from jbrep.records.storage import make_folder
 from jbrep.rl.files import FAILED, FINISHED, read_run
 from jbrep.rl.job import Job
 from jbrep.rl.settings import CUDA
-from jbrep.study.packing import Pack, packed
+from jbrep.study.packing import Pack, packed, usual_workers
 from jbrep.study.plan import STUDY, Cell, Plan
 from jbrep.study.prepare import check, prepare
 from jbrep.study.registration import REGISTRATION, Registration
@@ -29,7 +28,6 @@ from jbrep.text import duration
 
 _OWN = STUDY, REGISTRATION, REFERENCE_RETURNS, "data", "encoders", "runs"  # see `make_folder`
 
-_OF_GPU = 1 / 16  # that a process takes: most of its time goes by in physics, on its core
 Backend = Callable[[Plan, Iterable[Pack], int], Generator[Outcome]]
 
 
@@ -74,7 +72,7 @@ def on_ray(plan: Plan, packs: Iterable[Pack], workers: int) -> Generator[Outcome
     """
     import ray
 
-    task = on_cluster(work, workers, gpus=_OF_GPU * (plan.device == CUDA))
+    task = on_cluster(work, workers, gpus=int(plan.device == CUDA))
     under_way = {task.remote(*_job(plan, pack)): pack for pack in packs}
     try:
         while under_way:
@@ -127,7 +125,7 @@ def run_study(
             doesn't hold as many agents.
     """
     check(plan)
-    workers, unfinished = workers or cpu_count(), plan.unfinished
+    workers, unfinished = workers or usual_workers(plan), plan.unfinished
     packs = packed(plan, workers, width)
     make_folder(plan.folder, _OWN)
     with exclusive(plan.folder):
