@@ -213,7 +213,9 @@ FOLLOWED = [
 ]
 
 
-ROUNDING = {"cpu": 1e-5, "cuda": 1e-4}  # of weights: a GPU sums products in another order
+# of a parameter's weights: a GPU sums products in another order, and a first step of Adam has the
+# same size for a gradient that is hardly more than rounding
+APART = {"cpu": 0, "cuda": 0.01}
 NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 
 
@@ -243,7 +245,8 @@ def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, d
         for (name, there), (_, here) in zip(
             parameters(agent), parameters(members[number].agent), strict=True
         ):
-            np.testing.assert_allclose(here, there, rtol=0, atol=ROUNDING[device], err_msg=name)
+            apart = abs(here - there) > 1e-5
+            assert apart.float().mean() <= APART[device], name
 
 
 def alone(run):
