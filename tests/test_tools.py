@@ -147,3 +147,14 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
     evaluation.hashes["dae-8"] = "of another"
     with pytest.raises(InputError, match="trained on another dae-8 than the one with scores"):
         worth.main("study", "scores")
+
+
+def test_far_starts_are_those_that_return_nothing(capsys):
+    """As the page of results/figure-7-sac says: 8 of 123 nearer than 16 cm, 21 of 27 beyond."""
+    import far_starts
+
+    far_starts.main(ROOT / "results/figure-7-sac")
+    *_, nearer, near, far, farther = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert far[:4] == ["0.16", "to", "0.18", "m"]
+    assert [row[-2:] for row in (far, farther)] == [["12", "8"], ["15", "13"]]
+    assert [row[-2:] for row in (nearer, near)] == [["15", "1"], ["18", "4"]]
