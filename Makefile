@@ -131,6 +131,17 @@ data/unseen: $(READY)
 	$(BIN)/jbrep collect --task face_direction --steps 500k --seed 100 --store-state --out $@/face_direction
 	$(BIN)/jbrep data derive $@/face_direction --task move_in_direction --out $@/move_in_direction
 
+# what the answer rests on, in the order in which it runs
+PROGRAMME = $(addprefix answer-,move-to-position face-direction move-in-direction move-from-origin move-to-pose) \
+  $(addprefix identify-,face-direction move-in-direction) $(addprefix size-,face-direction move-in-direction move-to-position)
+programme: $(READY) ## all studies of the answer, each registered before it runs: a night; goes on where it was stopped
+	for study in $(PROGRAMME); do \
+	  test -e runs/$$study/registration.json || $(BIN)/jbrep study studies/$$study.toml --register --out runs/$$study || exit; \
+	  $(BIN)/jbrep study studies/$$study.toml --out runs/$$study || exit; \
+	done
+programme-time: $(READY) ## how long that takes here, without what has ended
+	for study in $(PROGRAMME); do $(BIN)/jbrep study studies/$$study.toml --dry-run --out runs/$$study || exit; done
+
 trainers: $(READY) ## what results/trainers/ lacks: eight hours for all of it; goes on where it was stopped
 	for study in $(basename $(notdir $(wildcard studies/trainers/*.toml))); do \
 	  test ! -e results/trainers/$$study/returns.csv || continue; \
