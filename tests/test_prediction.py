@@ -14,7 +14,7 @@ from jbrep.dataset import Column, Dataset, ScaledDataset
 from jbrep.encoders import Encoder, Layer
 from jbrep.encoders.header import EncoderHeader
 from jbrep.errors import InputError
-from jbrep.evaluate import diagnose, regression
+from jbrep.evaluate import control, diagnose, regression
 from jbrep.evaluate.control import GoodPolicy, PlayedEpisode, lost, needs, returns_to_go
 from jbrep.evaluate.diagnosis import networks
 from jbrep.evaluate.evaluation import Lost, Score
@@ -214,6 +214,21 @@ def test_without_a_policy_its_value_and_action_are_none(held_out, policy, monkey
     assert set(networks(code(held_out.data, "place"), held_out, short).of_policy) == {"action"}
     with pytest.raises(InputError, match="policy uniform doesn't act on what it observes"):
         find_good_policy("uniform", held_out.data.task)
+
+
+def test_an_episodes_values_are_judged_by_what_was_fitted_to_others(held_out, policy):
+    """An oracle of the episodes that it was fitted to, which knows nothing of the others."""
+    seen, it = policy.states, code(held_out.data, "place")
+    told = control.problems(it, held_out, policy)
+    assert [name for name in told if name != "action"] == ["value 0", "value 1", "value 2"]
+    assert np.sum(seen.folds, axis=0).tolist() == [1] * len(seen.value)
+
+    def oracle(problem):
+        known = {tuple(row): value for row, value in zip(*problem[:2], strict=True)}
+        return lambda values: np.array([known.get(tuple(row), [1e3]) for row in values])
+
+    known = {name: oracle(problem) for name, problem in told.items()}
+    assert control.value(it, policy, known).value < 0
 
 
 def test_actions_after_the_horizon_do_not_enter(held_out, monkeypatch):

@@ -18,7 +18,7 @@ from jbrep.stats.bootstrap import Array, by_episode
 
 GAMMA = 0.99
 _UNKNOWN = 300  # last steps of an episode cut short, whose return to go isn't known: .99^300 = .05
-_EVERY = 3  # one of three episodes is judged on
+_FOLDS = 3  # of the episodes: values in each are judged by what was fitted to the others
 _SHARE = 0.1  # of the usual steps of training
 _ROWS = 50_000  # at most, to fit on and to judge on
 _HORIZON = 10  # steps ahead
@@ -57,16 +57,10 @@ class GoodPolicy:
     episodes: Sequence[PlayedEpisode]
 
     @cached_property
-    def states(self) -> "tuple[States, States] | None":
-        """States to fit to, of two thirds of the episodes, and to judge on.
-
-        None where too few episodes have steps whose return to go is known.
-        """
+    def states(self) -> "States | None":
+        """States whose return to go is known; None where too few episodes have any."""
         known = [episode for episode in self.episodes if _known(episode)]
-        if len(known) < 2:
-            return None
-        fitted_on = [episode for i, episode in enumerate(known) if i % _EVERY]
-        return States(fitted_on), States(known[::_EVERY])
+        return States(known) if len(known) > 1 else None
 
 
 class States:
@@ -76,6 +70,7 @@ class States:
         rows: numbers of the steps, (n,).
         observation: (n, d).
         value: their discounted returns to go, (n, 1).
+        folds: which of them are in each fold, (n,) each; whole episodes are.
     """
 
     def __init__(self, episodes: Sequence[PlayedEpisode]):
@@ -87,6 +82,8 @@ class States:
         self.observation = np.concatenate(together)[self.rows]
         values = [returns_to_go(e.reward)[:n] for e, n in zip(episodes, known, strict=True)]
         self.value = np.concatenate(values)[self.rows, None]
+        fold = episode[self.rows] % _FOLDS
+        self.folds = [fold == number for number in range(min(_FOLDS, len(episodes)))]
 
     def sums(self, rows: Rows, *values: NDArray[Any]) -> list[Array]:
         """Sums of each array (n, k) over the rows of each episode, (episodes, k)."""
@@ -108,16 +105,22 @@ def returns_to_go(reward: NDArray[Any]) -> Array:
 
 
 def problems(encoder: BaseEncoder, held_out: HeldOut, policy: GoodPolicy) -> dict[str, Problem]:
-    """The policy's `action` and `value`, its return to go, from the latent.
+    """The policy's `action` and its return to go from the latent: `value 0` for fold 0, and so on.
 
-    No value where too few episodes are left to fit to and to judge on.
+    No values where too few episodes are left to fit to and to judge on.
     """
     seen, taken, _ = _acting(held_out, policy, "train")
     told = {"action": Problem(encoder.encode(seen), taken)}
-    if policy.states:
-        states, _ = policy.states
-        told["value"] = Problem(encoder.encode(states.observation), states.value, share=_SHARE)
+    if states := policy.states:
+        latent = encoder.encode(states.observation)
+        for name, judged in _named(states):
+            told[name] = Problem(latent[~judged], states.value[~judged], share=_SHARE)
     return told
+
+
+def _named(states: States) -> list[tuple[str, NDArray[np.bool_]]]:
+    """The name of the value for each fold, and which states are in it."""
+    return [(f"value {number}", judged) for number, judged in enumerate(states.folds)]
 
 
 def value(
@@ -125,13 +128,15 @@ def value(
 ) -> Score | None:
     """R^2 of the policy's return to go, discounted by .99, from the latent, nonlinearly.
 
-    Fitted on two thirds of its episodes, judged on the others; None without them. The last 300
-    steps of an episode are left out unless a state ended it.
+    By cross-validation: each third of its episodes is judged by what was fitted to the others; None
+    without them. The last 300 steps of an episode are left out unless a state ended it.
     """
     if policy is None or policy.states is None:
         return None
-    _, states = policy.states
-    predicted = predictors["value"](encoder.encode(states.observation))
+    states = policy.states
+    latent, predicted = encoder.encode(states.observation), np.empty_like(states.value)
+    for name, judged in _named(states):
+        predicted[judged] = predictors[name](latent[judged])
     return explained(predicted, states.value, states.rows, states)[0]
 
 
@@ -227,9 +232,13 @@ def _of_policy(
         return _shares(lambda seen: predict(full.encode(seen)), observation, wanted).max(axis=1)
 
     asked = [shares("action", seen, policy.act(seen))]
-    if policy.states:
-        _, states = policy.states
-        asked.append(shares("value", states.observation[: len(seen)], states.value[: len(seen)]))
+    if states := policy.states:
+        count = len(seen) // len(states.folds)
+        of_folds = [
+            shares(name, states.observation[judged][:count], states.value[judged][:count])
+            for name, judged in _named(states)
+        ]
+        asked.append(np.mean(of_folds, axis=0))
     return asked
 
 

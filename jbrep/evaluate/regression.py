@@ -61,8 +61,8 @@ class Networks(NamedTuple):
     Attributes:
         forward: what comes next, by the number of steps ahead.
         probe: the state.
-        of_policy: a good policy's `action` and, unless its episodes are too few, its `value`;
-            nothing without one.
+        of_policy: a good policy's `action` and, unless its episodes are too few, its `value 0` and
+            so on, of each fold; nothing without one.
     """
 
     forward: dict[int, Predictor]
