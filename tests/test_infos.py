@@ -56,6 +56,10 @@ def test_what_counts_as_a_number():
     assert numbers_in({"a": 1, 2: 3, "b\n": 1, "": 1, "c" * 65: 1, "d": {"e": 1}}) == {"a": 1.0}
 
 
+def test_what_dm_control_tells_of_steps_is_no_share():
+    assert shares({"timestep.discount": [1.0, 1.0], "timestep.step_type": [2.0, 2.0]}) == {}
+
+
 def test_shares_are_numbers_that_are_0_or_1():
     values = by_name([{"a": 1.0, "b": 0.5}, {"a": 0.0, "c": 1.0}, {"a": 0.0}])
     assert values == {"a": [1.0, 0.0, 0.0], "b": [0.5], "c": [1.0]}

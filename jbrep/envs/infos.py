@@ -11,6 +11,7 @@ SUCCESS = "is_success"  # what robots of Gymnasium and stable-baselines3 call it
 Numbers = dict[str, float]  # by name; of a truth, 1 or 0
 _MOST = 1 << 53  # a float holds whole ones exactly
 _MAX_NAME = 64
+_OF_STEPS = "timestep."  # begins what Shimmy tells of dm_control's steps: whether they are the last
 
 
 def number_of(value: Any) -> float | None:
@@ -41,7 +42,8 @@ def by_name(episodes: Iterable[Mapping[str, float]]) -> dict[str, list[float]]:
 
 def shares(values: Mapping[str, list[float]]) -> dict[str, list[float]]:
     """Those numbers that are 0 or 1 in every episode, so that their mean is a share."""
-    return {name: each for name, each in values.items() if {*each} <= {0.0, 1.0}}
+    told = {name: each for name, each in values.items() if not name.startswith(_OF_STEPS)}
+    return {name: each for name, each in told.items() if {*each} <= {0.0, 1.0}}
 
 
 def shares_text(values: Mapping[str, list[float]]) -> str:

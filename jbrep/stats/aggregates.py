@@ -39,11 +39,12 @@ def aggregates(
 ) -> Iterator[Aggregate]:
     """The results of each algorithm and representation that has runs on two tasks or more.
 
+    Nothing of one that is alone, whose scores would be its own.
     Gains are by algorithm, task and representation, the baseline first, (runs,) each.
     """
     for algorithm, by_task in gains.items():
         names = dict.fromkeys(name for by_name in by_task.values() for name in by_name)
-        for name in names if len(by_task) > 1 else ():
+        for name in names if min(len(by_task), len(names)) > 1 else ():
             if all(name in by_name for by_name in by_task.values()):
                 yield _aggregate(algorithm, name, by_task, seed)
 
