@@ -1,8 +1,10 @@
 """Statistics as tables."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +35,7 @@ from jbrep.stats.power import Prospect
 from jbrep.stats.rules import Planned
 from jbrep.stats.scale import SOLVED
 from jbrep.study.packing import Forecast
+from jbrep.study.plan import Cell
 from jbrep.study.tables import by_run
 from jbrep.text import SIGNIFICANT, Table, duration, number, rounded, table, wrapped
 
@@ -311,17 +314,44 @@ def association_tables(associated: list[Association]) -> list[Table]:
 
 def forecast_text(forecast: Forecast, planned: Planned, width: int | None = None) -> str:
     """The runs to go, how long they would take, and what could be found in primary cells."""
-    rows = [(cell.name, str(cohort), duration(time)) for cell, cohort, time in forecast.runs]
     summary = (
-        f"{len(rows)} runs to go, {forecast.done} done; {duration(forecast.seconds)} on one core, "
-        f"{duration(forecast.elapsed)} with {forecast.workers} workers, besides data and encoders"
+        f"{len(forecast.runs)} runs to go, {forecast.done} done; "
+        f"{duration(forecast.seconds)} on one core, {duration(forecast.elapsed)} with "
+        f"{forecast.workers} workers, besides data and encoders"
     )
-    parts = [table(("run", "cohort", "time"), rows, width)] if rows else []
+    parts = [_to_go(forecast.runs).text(width)] if forecast.runs else []
     parts.append(wrapped(summary, width))
     if forecast.prospects:
         parts.append(prospects_table(forecast.prospects).text(width))
         parts += [wrapped(each, width) for each in (*notes(planned), EFFECTS)]
     return "\n\n".join(parts)
+
+
+def _to_go(runs: Sequence[tuple[Cell, int, float]]) -> Table:
+    """A row for the runs of each label: how many learn at once, and how long these take."""
+    sizes = Counter(cohort for _, cohort, _ in runs)
+    of_labels: dict[str, list[tuple[int, float]]] = {}
+    for cell, cohort, time in runs:
+        of_labels.setdefault(cell.label, []).append((sizes[cohort], time))
+
+    def spread(show: Callable[[Any], str], values: Iterable[Any]) -> str:
+        shown = dict.fromkeys(map(show, sorted(values)))
+        first, last = next(iter(shown)), next(reversed(shown))
+        return first if first == last else f"{first} to {last}"
+
+    return Table(
+        "",
+        ("agents", "runs", "at once", "time"),
+        [
+            (
+                label,
+                str(len(each)),
+                spread(str, (size for size, _ in each)),
+                spread(duration, (time for _, time in each)),
+            )
+            for label, each in of_labels.items()
+        ],
+    )
 
 
 def prospects_table(prospects: Sequence[Prospect]) -> Table:
