@@ -10,7 +10,7 @@ TASKS := move_from_origin face_direction move_in_direction move_to_position move
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures docs figures samples data encoders decoded $(STUDIES) trainers policies behaviour clean
+.PHONY: help setup demo test coverage check bench pictures docs figures samples data encoders decoded $(STUDIES) programme programme-time trainers policies behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -132,13 +132,8 @@ data/unseen: $(READY)
 	$(BIN)/jbrep data derive $@/face_direction --task move_in_direction --out $@/move_in_direction
 
 # what the answer rests on, in the order in which it runs
-PROGRAMME = $(addprefix answer-,move-to-position face-direction move-in-direction move-from-origin move-to-pose) \
-  $(addprefix identify-,face-direction move-in-direction) $(addprefix size-,face-direction move-in-direction move-to-position)
-programme: $(READY) ## all studies of the answer, each registered before it runs: a night; goes on where it was stopped
-	for study in $(PROGRAMME); do \
-	  test -e runs/$$study/registration.json || $(BIN)/jbrep study studies/$$study.toml --register --out runs/$$study || exit; \
-	  $(BIN)/jbrep study studies/$$study.toml --out runs/$$study || exit; \
-	done
+PROGRAMME := $(shell sed -n 's/^\(\(answer\|identify\|size\)-[a-z-]*\) *;.*/\1/p' studies/judged.txt)
+programme: $(PROGRAMME) ## all studies of the answer, one after another: a night; goes on where it was stopped
 programme-time: $(READY) ## how long that takes here, without what has ended
 	for study in $(PROGRAMME); do $(BIN)/jbrep study studies/$$study.toml --dry-run --out runs/$$study || exit; done
 
