@@ -117,6 +117,7 @@ cart-pole: ## results/cart-pole/ anew: twenty minutes
 column = $(shell sed -n 's/^$@ *;//p' studies/judged.txt | cut -d ';' -f $(1))
 .SECONDEXPANSION:
 $(STUDIES): $(READY) $$(call column,1)
+	test -e runs/$@/registration.json || $(BIN)/jbrep study studies/$@.toml --register --out runs/$@
 	$(BIN)/jbrep study studies/$@.toml --out runs/$@
 	mkdir -p results/$@
 	cp $$(ls $(addprefix runs/$@/,returns.csv runs.json references.csv run-infos.csv registration.json) 2>/dev/null) results/$@/
