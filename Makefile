@@ -5,7 +5,7 @@ VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2
 READY_DEMO := $(VENV)/.ready-$(VERSION)-for-the-demo
 READY := $(VENV)/.ready-$(VERSION)
 DEMO := demo
-STUDIES := $(shell sed -n 's/^\([a-z-]*\) *;.*/\1/p' studies/judged.txt)
+STUDIES := $(shell sed -n 's/^\([a-z0-9-]*\) *;.*/\1/p' studies/judged.txt)
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
@@ -133,7 +133,7 @@ data/unseen: $(READY)
 	$(BIN)/jbrep data derive $@/face_direction --task move_in_direction --out $@/move_in_direction
 
 # what the answer rests on, in the order in which it runs
-PROGRAMME := $(shell sed -n 's/^\(\(answer\|identify\|size\)-[a-z-]*\) *;.*/\1/p' studies/judged.txt)
+PROGRAMME := $(shell sed -n 's/^\(\(answer\|identify\|size\|body\)-[a-z0-9-]*\) *;.*/\1/p' studies/judged.txt)
 programme: $(PROGRAMME) ## all studies of the answer, one after another: a night; goes on where it was stopped
 programme-time: $(READY) ## how long that takes here, without what has ended
 	for study in $(PROGRAMME); do $(BIN)/jbrep study studies/$$study.toml --dry-run --out runs/$$study || exit; done
