@@ -69,8 +69,8 @@ pictures: $(READY) ## the pictures in docs/, drawn anew
 	rm -f docs/jitterbug.gif
 	$(BIN)/jbrep render uniform trained --task move_to_pose --episode 18 --seconds 4 --speed 0.7 --fps 10 --size 240x180 --out docs/jitterbug.gif
 	$(BIN)/jbrep inspect data/sample/face_direction --episode 1 --encoder dae-8 --out inspect/shown.rrd
-	$(BIN)/jbrep report results/confirm-move
-	MUJOCO_GL=egl $(BIN)/python tools/pictures.py results/confirm-move/report.html inspect/shown.rrd docs
+	$(BIN)/jbrep report results/answer-move-to-position
+	MUJOCO_GL=egl $(BIN)/python tools/pictures.py results/answer-move-to-position/report.html inspect/shown.rrd docs
 
 docs: $(READY) ## the documentation as a site, in site/
 	$(BIN)/python tools/site.py site
@@ -113,6 +113,7 @@ coordinates coordinates-direction: ## results/coordinates/ and -direction/ anew:
 recipe: ## results/recipe/ anew: half an hour
 figure-7-sac: ## results/figure-7-sac/ anew: an hour
 cart-pole: ## results/cart-pole/ anew: twenty minutes
+answer-move-to-position: ## results/answer-move-to-position/ anew: two hours
 # the columns of a study's line in studies/judged.txt
 column = $(shell sed -n 's/^$@ *;//p' studies/judged.txt | cut -d ';' -f $(1))
 .SECONDEXPANSION:
