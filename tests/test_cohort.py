@@ -245,7 +245,7 @@ def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, d
         for (name, there), (_, here) in zip(
             parameters(agent), parameters(members[number].agent), strict=True
         ):
-            apart = abs(here - there) > 1e-5
+            apart = ~(abs(here - there) <= 1e-5)  # also where one is NaN
             assert apart.float().mean() <= APART[device], name
 
 

@@ -42,8 +42,11 @@ def by_name(episodes: Iterable[Mapping[str, float]]) -> dict[str, list[float]]:
 
 def shares(values: Mapping[str, list[float]]) -> dict[str, list[float]]:
     """Those numbers that are 0 or 1 in every episode, so that their mean is a share."""
-    told = {name: each for name, each in values.items() if not name.startswith(_OF_STEPS)}
-    return {name: each for name, each in told.items() if {*each} <= {0.0, 1.0}}
+    return {
+        name: each
+        for name, each in values.items()
+        if {*each} <= {0.0, 1.0} and not name.startswith(_OF_STEPS)
+    }
 
 
 def shares_text(values: Mapping[str, list[float]]) -> str:
