@@ -6,11 +6,12 @@ READY_DEMO := $(VENV)/.ready-$(VERSION)-for-the-demo
 READY := $(VENV)/.ready-$(VERSION)
 DEMO := demo
 STUDIES := $(shell sed -n 's/^\([a-z0-9-]*\) *;.*/\1/p' studies/judged.txt)
+SCORED := $(addprefix scored-,$(filter worth-%,$(STUDIES)))
 TASKS := move_from_origin face_direction move_in_direction move_to_position move_to_pose
 
 export PYTHONDONTWRITEBYTECODE :=# empty: kept, or each process that a test starts compiles torch anew
 
-.PHONY: help setup demo test coverage check bench pictures docs figures samples data encoders decoded $(STUDIES) programme programme-time trainers policies behaviour clean
+.PHONY: help setup demo test coverage check bench pictures docs figures samples data encoders decoded $(STUDIES) answer programme programme-time worth $(SCORED) trainers policies behaviour clean
 help: ## what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
@@ -135,9 +136,18 @@ data/unseen: $(READY)
 
 # what the answer rests on, in the order in which it runs
 PROGRAMME := $(shell sed -n 's/^\(\(answer\|identify\|size\|body\)-[a-z0-9-]*\) *;.*/\1/p' studies/judged.txt)
+answer: $(READY) ## all its tasks side by side, from the tables: results/answer.png
+	$(BIN)/python tools/answer.py results/answer.png $(sort $(wildcard results/answer-*))
 programme: $(PROGRAMME) ## all studies of the answer, one after another: a night; goes on where it was stopped
 programme-time: $(READY) ## how long that takes here, without what has ended
 	for study in $(PROGRAMME); do $(BIN)/jbrep study studies/$$study.toml --dry-run --out runs/$$study || exit; done
+
+# whether scores tell which codes serve: scored as soon as they are registered, before agents train on them
+worth: $(filter worth-%,$(STUDIES)) ## how well they do: six hours; goes on where it was stopped
+	$(BIN)/python tools/worth.py $(addprefix results/,$^)
+$(SCORED): scored-%: $(READY)
+	test -e runs/$*/registration.json || $(BIN)/jbrep study studies/$*.toml --register --out runs/$*
+	$(BIN)/jbrep evaluate --encoder $$(ls runs/$*/encoders/*/*.safetensors) --data runs/$*/data/* --worth fitted planning --out results/$*/scores
 
 trainers: $(READY) ## what results/trainers/ lacks: eight hours for all of it; goes on where it was stopped
 	for study in $(basename $(notdir $(wildcard studies/trainers/*.toml))); do \

@@ -1,0 +1,153 @@
+"""Studies of one question, each of a task, side by side: python tools/answer.py OUT.png FOLDER ...
+
+Prints a table of the tasks and what agents on each representation return in the end, with the
+verdict on *not worse*, and draws all final returns. The tables of the studies are read.
+"""
+
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jbrep.errors import InputError
+from jbrep.records.storage import write_whole
+from jbrep.report.figures.plot import Plot
+from jbrep.report.figures.style import PAGE, reference, styles
+from jbrep.report.tables import read_tables
+from jbrep.report.words import shown
+from jbrep.stats.analysis import GroupAnalysis
+from jbrep.stats.claims import CONTRADICTED, NOT_WORSE, UNDECIDED, Verdict
+from jbrep.stats.labels import RepresentationResult
+
+ORDER = ("coordinates", "symmetry")  # first; the others as their names are
+INSIDE = {CONTRADICTED: "white", UNDECIDED: "lightgrey"}  # of a mean's marker; else as the rest
+
+
+class Judged(NamedTuple):
+    """A task and the verdicts on *not worse* there, by representation."""
+
+    group: GroupAnalysis
+    verdicts: dict[str, Verdict]
+
+    @property
+    def labels(self) -> dict[str, RepresentationResult]:
+        """Results by representation."""
+        return {each.representation: each for each in self.group.labels}
+
+
+def read(folder: Path) -> Judged:
+    """The one task of a study.
+
+    Raises:
+        InputError: it has several, or nothing was compared; or as `read_tables`.
+    """
+    analysis = read_tables(folder).analysis
+    if analysis is None or len(analysis.groups) != 1:
+        raise InputError(f"{folder} isn't a study of one task with comparisons")
+    (group,) = analysis.groups
+    verdicts = {
+        each.representation: verdict
+        for each in group.comparisons
+        for verdict in each.verdicts
+        if verdict.claim == NOT_WORSE.name
+    }
+    return Judged(group, verdicts)
+
+
+def representations(studies: Iterable[Judged]) -> list[str]:
+    """All of them, in the order of ORDER and then of their names."""
+    every = {name for study in studies for name in study.labels}
+    return [name for name in ORDER if name in every] + sorted(every - {*ORDER})
+
+
+def rows(studies: Sequence[Judged]) -> Iterator[list[str]]:
+    """Cells of a table, the head first: a row for each representation, a column for each task."""
+    yield ["agents on", *(study.group.task for study in studies)]
+    for name in representations(studies):
+        yield [name, *(_cell(study, name) for study in studies)]
+    policies = dict.fromkeys(policy for study in studies for policy in study.group.references)
+    for policy in policies:
+        played = (study.group.references.get(policy) for study in studies)
+        yield [policy, *(f"{each.value:.0f}" if each else "" for each in played)]
+
+
+def _cell(study: Judged, name: str) -> str:
+    if name not in study.labels:
+        return ""
+    returned = shown(study.labels[name].numbers["final_return_mean"], ".0f")
+    if name not in study.verdicts:
+        return returned
+    verdict = study.verdicts[name]
+    return f"{returned}, {verdict.estimate.value:.2f}, {verdict.verdict}"
+
+
+def plot(studies: Sequence[Judged]) -> Plot:
+    """The final return of each run, a panel for each task."""
+    return Plot(
+        "answer",
+        "Final returns",
+        "Each run, and means with 95 % intervals. Filled: not worse is supported; white: "
+        "contradicted; grey: undecided. Dashed: the best policy that doesn't look; dotted: what "
+        "has to be kept.",
+        ("task", "representation", "seed", "final_return"),
+        [
+            (study.group.task, name, seed, value)
+            for study in studies
+            for name, label in study.labels.items()
+            for seed, value in zip(label.seeds, label.by_run["final_return"], strict=True)
+        ],
+        lambda: draw(studies),
+    )
+
+
+def draw(studies: Sequence[Judged]) -> Figure:
+    names = representations(studies)
+    figure = Figure(figsize=(PAGE, 0.7 + 0.22 * len(names)))
+    panels = figure.subplots(1, len(studies), squeeze=False, sharey=True)[0]
+    look = styles(names, first=ORDER[0])
+    for axes, study in zip(panels, studies, strict=True):
+        for row, name in enumerate(names):
+            if name in study.labels:
+                _draw_runs(axes, row, study, name, look[name])
+        axes.axvline(study.group.reference, **reference())
+        for boundary in {_boundary(study, each) for each in study.verdicts.values()}:
+            axes.axvline(boundary, **{**reference(), "linestyle": ":"})
+        axes.set_title(study.group.task)
+        axes.set(xlim=(-30, 1030), xticks=(0, 500, 1000), xlabel="final return")
+        axes.grid(visible=False, axis="y")
+    panels[0].set_yticks(range(len(names)), names)
+    panels[0].set_ylim(len(names) - 0.4, -0.6)
+    return figure
+
+
+def _boundary(study: Judged, verdict: Verdict) -> float:
+    """The return at which the share of the gain is on the verdict's boundary."""
+    baseline = study.group.labels[0].numbers["final_return_mean"].value
+    return float(study.group.reference + verdict.boundary * (baseline - study.group.reference))
+
+
+def _draw_runs(axes: Axes, row: int, study: Judged, name: str, style: dict[str, Any]) -> None:
+    label, colour = study.labels[name], style["color"]
+    finals = label.by_run["final_return"]
+    axes.plot(finals, [row - 0.22] * len(finals), "|", color=colour, ms=4, alpha=0.5)
+    mean = label.numbers["final_return_mean"]
+    axes.plot([mean.low, mean.high], [row, row], color=colour, linewidth=1.6)
+    verdict = study.verdicts.get(name)
+    inside = INSIDE.get(verdict.verdict, colour) if verdict else colour
+    place = ([mean.value], [row], style["marker"])
+    axes.plot(*place, color=colour, ms=4.5, markerfacecolor=inside)
+
+
+def main(out: str, *folders: str) -> None:
+    studies = [read(Path(each)) for each in folders]
+    head, *body = rows(studies)
+    for row in (head, ["---"] * len(head), *body):
+        print(f"| {' | '.join(row)} |")
+    write_whole(Path(out), plot(studies).on_paper.picture("png"))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
