@@ -1,5 +1,6 @@
 """The tools that make what ships and what results/ shows, at small size."""
 
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from jbrep.errors import InputError
 from jbrep.records.tables import write_rows
 from jbrep.rl import Run
 from jbrep.rl.files import EPISODES, Episode
+from jbrep.study.tables import Return
 
 ROOT = Path(__file__).parent.parent
 FACE, MOVE = "face_direction", "move_in_direction"
@@ -121,32 +123,60 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
         )
         for code in finals
     }
-    numbers = [
-        SimpleNamespace(
-            representation=code, numbers={"final_return_mean": SimpleNamespace(value=value)}
-        )
-        for code, value in finals.items()
+    codes, seeds, grid = (
+        [code for code in finals if code != "full"],
+        (0, 1),
+        np.array([0, 300, 1000]),
+    )
+    group = SimpleNamespace(
+        task=FACE,
+        algorithm="sac",
+        grid=grid,
+        labels=[
+            SimpleNamespace(
+                representation=code, seeds=seeds, by_run={"final_return": np.full(2, finals[code])}
+            )
+            for code in finals
+        ],
+    )
+    returns = [  # at first those are ahead that end behind
+        Return(FACE, "sac", code, seed, int(step), 0, finals[code] * (1 if step == 1000 else -1))
+        for code in codes
+        for seed in seeds
+        for step in grid
     ]
-    analysis = SimpleNamespace(groups=[SimpleNamespace(task=FACE, labels=numbers)])
-    runs = [SimpleNamespace(label=code, encoder=f"hash of {code}") for code in finals]
-    tables = SimpleNamespace(analysis=analysis, record=SimpleNamespace(runs=runs, labels=labels))
-    codes = [code for code in finals if code != "full"]
+    tables = SimpleNamespace(
+        name="a study",
+        analysis=SimpleNamespace(groups=[group]),
+        returns=returns,
+        record=SimpleNamespace(
+            runs=[SimpleNamespace(label=code, encoder=f"hash of {code}") for code in finals],
+            labels=labels,
+        ),
+    )
     evaluation = SimpleNamespace(
         data=SimpleNamespace(task=FACE),
         encoders={code: {"rewarded": -finals[code]} for code in codes},
         hashes={code: f"hash of {code}" for code in codes},
-        worth=SimpleNamespace(learned={"agent": {code: finals[code] ** 2 for code in codes}}),
+        worth=SimpleNamespace(learned={"trees": {code: finals[code] ** 2 for code in codes}}),
     )
     monkeypatch.setattr(worth, "read_tables", lambda folder: tables)
     monkeypatch.setattr(worth, "read_document", lambda path, kind: evaluation)
     monkeypatch.setattr(worth, "headline", lambda known: known)
     monkeypatch.setattr(worth, "shown", lambda learned: SimpleNamespace(value=learned))
-    worth.main("study", "scores")
-    told = {line.split()[0]: line.split()[1] for line in capsys.readouterr().out.splitlines()[2:]}
-    assert (told["rewarded"], told["agent"]) == ("-1.00", "1.00")
+    worth.main("study")
+    lines = [re.split(" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
+    assert lines[2] == ["told by", FACE, "mean", "above rewarded", "above 30% of a run"]
+    told = {name: [cell.split()[0] for cell in cells] for name, *cells in lines[3:]}
+    assert told == {
+        "rewarded": ["-1.00", "-1.00", "0.00", "0.00"],
+        "trees": ["1.00", "1.00", "2.00", "2.00"],
+        "30% of a run": ["-1.00", "-1.00", "0.00", "0.00"],
+        "100% of a run": ["1.00", "1.00", "2.00", "2.00"],
+    }
     evaluation.hashes["dae-8"] = "of another"
-    with pytest.raises(InputError, match="trained on another dae-8 than the one with scores"):
-        worth.main("study", "scores")
+    with pytest.raises(InputError, match="dae-8: agents trained on another code than the one sco"):
+        worth.main("study")
 
 
 def test_far_starts_are_those_that_return_nothing(capsys):
