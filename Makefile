@@ -115,6 +115,7 @@ recipe: ## results/recipe/ anew: half an hour
 figure-7-sac: ## results/figure-7-sac/ anew: an hour
 cart-pole: ## results/cart-pole/ anew: twenty minutes
 answer-move-to-position: ## results/answer-move-to-position/ anew: two hours
+answer-face-direction: ## results/answer-face-direction/ anew: an hour
 # the columns of a study's line in studies/judged.txt
 column = $(shell sed -n 's/^$@ *;//p' studies/judged.txt | cut -d ';' -f $(1))
 .SECONDEXPANSION:

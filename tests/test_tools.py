@@ -179,12 +179,37 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
         worth.main("study")
 
 
-def test_far_starts_are_those_that_return_nothing(capsys):
+def test_hard_starts_are_those_where_episodes_fail(capsys):
     """As the page of results/figure-7-sac says: 8 of 123 nearer than 16 cm, 21 of 27 beyond."""
-    import far_starts
+    import hard_starts
 
-    far_starts.main(ROOT / "results/figure-7-sac")
-    *_, nearer, near, far, farther = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert far[:4] == ["0.16", "to", "0.18", "m"]
-    assert [row[-2:] for row in (far, farther)] == [["12", "8"], ["15", "13"]]
-    assert [row[-2:] for row in (nearer, near)] == [["15", "1"], ["18", "4"]]
+    hard_starts.main(ROOT / "results/figure-7-sac")
+    told = capsys.readouterr().out
+    *_, position = told.split("\n\n")[:-1]
+    rows = [line.split()[-3:] for line in position.splitlines()[2:]]
+    assert [(int(failed), int(count)) for failed, _, count in rows] == [
+        *((1, 57), (2, 33), (5, 33), (21, 27))
+    ]
+
+
+def test_agents_without_a_jump_hesitate_where_the_target_is_behind(capsys):
+    """As the page of results/answer-face-direction says."""
+    import hard_starts
+
+    hard_starts.main(ROOT / str(ROOT / "results/answer-face-direction"))
+    *_, behind = capsys.readouterr().out.strip().splitlines()
+    assert behind.startswith("2.8 to 3.142 rad to the target")
+    counts = [each.strip() for each in behind.split("target")[1].split("  ") if each.strip()]
+    assert counts == ["55 of 80", "80 of 80", "63 of 80", "4 of 80", "59 of 80"]
+
+
+def test_the_table_of_the_answer_is_the_one_on_its_page(capsys, tmp_path):
+    import answer
+
+    answer.main(str(tmp_path / "a.png"), str(ROOT / "results/answer-face-direction"))
+    page = [line.split("|") for line in (ROOT / "results/README.md").read_text().splitlines()]
+    shown = {tuple(cell.strip() for cell in cells[1:3]) for cells in page if len(cells) > 3}
+    told = [line.split("|") for line in capsys.readouterr().out.splitlines()]
+    assert len(told) == 10
+    assert {tuple(cell.strip() for cell in cells[1:3]) for cells in told} <= shown
+    assert (tmp_path / "a.png").stat().st_size > 10_000

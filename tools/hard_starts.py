@@ -1,0 +1,86 @@
+"""Where robots begin whose episodes fail: python tools/hard_starts.py FOLDER.
+
+Takes the last evaluation of every run of a study, or what tools/starts.py wrote beside it, and
+prints for ranges of starts how many episodes fail of how many, by representation: on
+move_to_position and move_to_pose by the distance of the target, on face_direction by the angle to
+it.
+"""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from jbrep.jitterbug.simulation import Simulation
+from jbrep.jitterbug.tasks import TASKS, Array, Readings
+from jbrep.rl.files import EVALUATION_SEED
+
+
+class Measured(NamedTuple):
+    """What tells a hard start of a task."""
+
+    name: str
+    of: Callable[[Readings], Array]
+    edges: tuple[float, ...]  # of the ranges
+    failed: float  # an episode with a lower return
+
+
+def distance(readings: Readings) -> Array:
+    return np.hypot(*(readings.target_position - readings.qpos[:, :3])[:, :2].T)
+
+
+def angle(readings: Readings) -> Array:
+    return np.abs(readings.angle_to_target)
+
+
+BY_DISTANCE = Measured("m to the target", distance, (0.04, 0.08, 0.12, 0.16, 0.2), 5)
+BY_TASK = {
+    "move_to_position": BY_DISTANCE,
+    "move_to_pose": BY_DISTANCE,
+    "face_direction": Measured("rad to the target", angle, (0, 1, 2, 2.5, 2.8, np.pi), 400),
+}
+
+
+def last_episodes(folder: Path) -> pd.DataFrame:
+    """Columns task, representation, episode and return, of trained policies."""
+    returns = pd.read_csv(folder / "returns.csv")
+    if (folder / "starts.csv").exists():
+        (task,) = returns["task"].unique()
+        starts = pd.read_csv(folder / "starts.csv").dropna(subset="seed")
+        return starts.rename(columns={"value": "return"}).assign(task=task)
+    return returns[returns["step"] == returns.groupby("task")["step"].transform("max")]
+
+
+def measured(task: str, episodes: int) -> Array:
+    """What tells hard starts, of the first episodes that runs are evaluated in, (episodes,)."""
+    robots = Simulation(TASKS[task], episodes)
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + episodes)
+    robots.reset(range(episodes), [np.random.default_rng(seed) for seed in seeds])
+    return BY_TASK[task].of(robots.readings)
+
+
+def main(folder: Path) -> None:
+    """Print a table for each task."""
+    for task, episodes in last_episodes(folder).groupby("task"):
+        if task in BY_TASK:
+            print(f"{table(task, episodes)}\n")
+
+
+def table(task: str, episodes: pd.DataFrame) -> str:
+    """Ranges of starts by representations: how many episodes fail of how many."""
+    name, _, edges, failed = BY_TASK[task]
+    values = measured(task, episodes["episode"].max() + 1)[episodes["episode"]]
+    ranges = pd.cut(values, edges)
+    fails = (episodes["return"] < failed).groupby(
+        [ranges, episodes["representation"]], observed=True
+    )
+    counts = fails.agg(lambda each: f"{each.sum()} of {len(each)}").unstack()
+    counts.index = [f"{each.left:g} to {each.right:g} {name}" for each in counts.index]
+    return f"{task}: episodes that return less than {failed:g}\n{counts.to_string()}"
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
