@@ -16,6 +16,7 @@ from typing import Any
 from jbrep.dataset import Dataset, ScaledDataset
 from jbrep.encoders import FULL, load
 from jbrep.encoders.file import SUFFIX
+from jbrep.encoders.shipped import UNLEARNED
 from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.evaluate.evaluation import EVALUATION, Diagnostics, Evaluation
@@ -61,7 +62,7 @@ def names_and_settings(kinds: list[str]) -> dict[str, tuple[str, Any]]:
 
 
 def make(data: ScaledDataset, folder: Path, wanted: dict[str, tuple[str, Any]]) -> list[Path]:
-    """The files of the encoders: those that ship, and those that are made."""
+    """The files of the encoders: those that ship, among them coordinates, and those made."""
     fitter, there = Fitter(data, folder), SHIPPED / data.task.slug
     ours = {name: there / f"{name}{SUFFIX}" for name in wanted}
     missing = {name: how for name, how in wanted.items() if not ours[name].exists()}
@@ -70,7 +71,11 @@ def make(data: ScaledDataset, folder: Path, wanted: dict[str, tuple[str, Any]]) 
     fitted = {
         name: fitter.fit(kind, name=name, **how).path for name, (kind, how) in missing.items()
     }
-    return [fitted.get(name, ours[name]) for name in wanted]
+    unlearned = (there / f"{name}{SUFFIX}" for name in UNLEARNED if name != FULL)
+    return [
+        *(fitted.get(name, ours[name]) for name in wanted),
+        *(file for file in unlearned if file.exists()),
+    ]
 
 
 def evaluate(files: list[Path], data: Path, results: Path) -> None:
