@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from command import in_this_process
 
 from jbrep.envs.description import describe
@@ -25,6 +26,7 @@ from jbrep.study.runner import BACKENDS
 OWN = Path("examples/own/own.py").resolve()
 ROBOT = Path("examples/robot").resolve()
 LOG = Path("examples/log/notebook.py").resolve()
+JUMP = Path("examples/jump").resolve()
 SITE = Path("tools/site.py").resolve()
 
 
@@ -118,3 +120,16 @@ def test_a_robot_is_stopped_where_its_sensors_cannot_be_believed(on_robot):
         assert struct.unpack("<If", robot.recv(100)) == (4, 0)  # the watchdog, after three periods
         assert answer(7, good) != 0
         assert counted.result(10) > 3
+
+
+def test_an_angle_with_and_without_its_jump(monkeypatch):
+    """Two states on either side of the jump: one encoder tells them apart, the other doesn't."""
+    monkeypatch.syspath_prepend(JUMP)
+    jump = import_module("jump")
+    sides = torch.zeros(2, 16)
+    sides[:, 3] = 1  # upright
+    sides[:, -1] = torch.tensor([3.14, -3.14])
+    for encoder, size, apart in ((jump.WithJump(), 22, 2), (jump.WithoutJump(), 17, 0)):
+        codes = encoder(sides)
+        assert codes.shape == (2, size)
+        assert float((codes[0] - codes[1]).abs().max()) == pytest.approx(apart, abs=0.01)

@@ -24,6 +24,7 @@ class WithJump(torch.nn.Module):
         self.coordinates = find("coordinates", _TASK)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Codes (n, l) of observations (n, d)."""
         angle = observation[..., [_ANGLE]]
         return torch.cat((self.coordinates.encode(observation), angle / math.pi), -1)
 
@@ -36,6 +37,7 @@ class WithoutJump(torch.nn.Module):
         self.full = find("full", _TASK)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Codes (n, l) of observations (n, d)."""
         angle = observation[..., [_ANGLE]]
         others = [i for i in range(_TASK.size) if i != _ANGLE]
         return torch.cat((self.full.encode(observation)[..., others], angle.cos(), angle.sin()), -1)
