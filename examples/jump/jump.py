@@ -1,6 +1,6 @@
 """Encoders with and without the jump of an angle, for `face_direction`, as a study takes them.
 
-    jbrep study examples/jump/study.toml --import jump --out runs/jump
+    jbrep study studies/jump-face-direction.toml --import jump --out runs/jump
 
 with examples/jump on the PYTHONPATH. An angle to a target jumps where the target is behind.
 """
