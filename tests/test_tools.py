@@ -123,11 +123,8 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
         )
         for code in finals
     }
-    codes, seeds, grid = (
-        [code for code in finals if code != "full"],
-        (0, 1),
-        np.array([0, 300, 1000]),
-    )
+    codes = [code for code in finals if code != "full"]
+    seeds, grid = (0, 1), np.array([0, 300, 1000])
     group = SimpleNamespace(
         task=FACE,
         algorithm="sac",
