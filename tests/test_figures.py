@@ -183,7 +183,7 @@ def test_titles_of_many_representations_do_not_overlap(returns):
     names = [f"representation-{number}" for number in range(7)]
     full = [row for row in returns if row[:3] == (*GROUPS[0], "full")]
     rows = [row._replace(representation=name) for name in names for row in full]
-    figure = Drawing(every_run(rows, {}, lambda: styles(names)), PAPER)._figure
+    figure = every_run(rows, {}, lambda: styles(names)).on_paper._figure
     check_apart(figure, "(n = 4)", len(names))
 
 
@@ -191,7 +191,7 @@ def test_titles_of_many_algorithms_do_not_overlap():
     full = of_first_group("full")
     many = [replace(run, algorithm=f"algorithm-{number}") for number in range(6) for run in full]
     (curves,) = (p for p in study_plots(analyse(many), [], {}, {}) if p.name == "representations")
-    figure = Drawing(curves, PAPER)._figure
+    figure = curves.on_paper._figure
     check_apart(figure, "algorithm-", 6)
 
 
@@ -203,7 +203,7 @@ def test_a_study_of_many_representations_can_be_read():
     plots = study_plots(analyse(full + many), [], {}, {})
     for plot in plots:
         if plot.name in ("representations", "profiles", "learning_rate", "claims"):
-            figure = Drawing(plot, PAPER)._figure
+            figure = Drawing(plot.draw, PAPER)._figure
             heights = [axes.get_window_extent().height / figure.dpi for axes in figure.axes]
             assert min(heights) > 0.8, plot.name
     colours = {style["color"] for style in styles(["full", *names], "full").values()}
@@ -342,10 +342,10 @@ def test_diagrams_show_what_any_method_does():
 
 def test_pages_have_a_light_and_a_dark_style(plots):
     plot = plots["claims"]
-    light, dark = plot.on_paper.picture("svg"), Drawing(plot, DARK).picture("svg")
+    light, dark = plot.on_paper.picture("svg"), Drawing(plot.draw, DARK).picture("svg")
     assert b"#dddddd" in dark.lower()
     assert b"#dddddd" not in light.lower()
-    assert Drawing(plot, DARK).picture("svg") == dark
+    assert Drawing(plot.draw, DARK).picture("svg") == dark
 
 
 def test_policies_with_dollar_signs_are_no_formulas(analysis, returns):
@@ -360,7 +360,7 @@ def test_policies_with_dollar_signs_are_no_formulas(analysis, returns):
 def test_names_with_dollar_signs_are_no_formulas(returns):
     odd = [row._replace(representation="$x^{") for row in returns]
     (plot, *_) = study_plots(None, odd, {}, {})
-    assert Image.open(io.BytesIO(Drawing(plot, PAPER).picture("png"))).size[0] > 0
+    assert Image.open(io.BytesIO(Drawing(plot.draw, PAPER).picture("png"))).size[0] > 0
 
 
 def test_figures_of_encoders_come_from_their_evaluation(tmp_path):

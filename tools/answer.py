@@ -6,6 +6,7 @@ verdict on *not worse*, and draws all final returns. The tables of the studies a
 
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,8 +15,8 @@ from matplotlib.figure import Figure
 
 from jbrep.errors import InputError
 from jbrep.records.storage import write_whole
-from jbrep.report.figures.plot import Plot
-from jbrep.report.figures.style import PAGE, reference, styles
+from jbrep.report.figures.plot import Drawing
+from jbrep.report.figures.style import PAGE, PAPER, reference, styles
 from jbrep.report.tables import read_tables
 from jbrep.report.words import shown
 from jbrep.stats.analysis import GroupAnalysis
@@ -84,26 +85,12 @@ def _cell(study: Judged, name: str) -> str:
     return f"{returned}, {verdict.estimate.value:.2f}, {verdict.verdict}"
 
 
-def plot(studies: Sequence[Judged]) -> Plot:
-    """The final return of each run, a panel for each task."""
-    return Plot(
-        "answer",
-        "Final returns",
-        "Each run, and means with 95 % intervals. Filled: not worse is supported; white: "
-        "contradicted; grey: undecided. Dashed: the best policy that doesn't look; dotted: what "
-        "has to be kept.",
-        ("task", "representation", "seed", "final_return"),
-        [
-            (study.group.task, name, seed, value)
-            for study in studies
-            for name, label in study.labels.items()
-            for seed, value in zip(label.seeds, label.by_run["final_return"], strict=True)
-        ],
-        lambda: draw(studies),
-    )
-
-
 def draw(studies: Sequence[Judged]) -> Figure:
+    """The final return of each run and their means with 95 % intervals, a panel for each task.
+
+    A marker is filled where *not worse* is supported, white where it is contradicted, grey where it
+    is undecided. Dashed: the best policy that doesn't look; dotted: what has to be kept.
+    """
     names = representations(studies)
     figure = Figure(figsize=(PAGE, 0.7 + 0.22 * len(names)))
     panels = figure.subplots(1, len(studies), squeeze=False, sharey=True)[0]
@@ -146,7 +133,7 @@ def main(out: str, *folders: str) -> None:
     head, *body = rows(studies)
     for row in (head, ["---"] * len(head), *body):
         print(f"| {' | '.join(row)} |")
-    write_whole(Path(out), plot(studies).on_paper.picture("png"))
+    write_whole(Path(out), Drawing(partial(draw, studies), PAPER).picture("png"))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pandas as pd
 from joblib import cpu_count
 
@@ -22,10 +21,7 @@ from jbrep.play.sources import find_player
 from jbrep.progress import Progress
 from jbrep.report.words import shown
 from jbrep.rl.files import RunRecord, read_run, runs_below
-from jbrep.stats.arms import Arm, Frame, Sides
-from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.claims import kept_gain
-from jbrep.stats.intervals import LEVEL, Bounds, mean_within
+from jbrep.stats.intervals import LEVEL, Bounds, mean_within, share_of_gain
 from jbrep.stats.scale import best_blind
 from jbrep.study.tables import references_of
 from jbrep.text import table
@@ -89,18 +85,12 @@ def cells(known: pd.DataFrame, bounds: Bounds) -> Iterator[tuple[str, str, str]]
     blind = best_blind(by_policy)
     assert blind
     for name in sorted(finals, key=lambda name: (name != BASELINE, name)):
-        share = shown(kept(finals[name], finals[BASELINE], by_policy[blind], bounds), ".2f")
+        of_baseline = finals[name], finals[BASELINE], by_policy[blind]
+        share = shown(share_of_gain(*of_baseline, bounds, LEVEL), ".2f")
         mean = shown(mean_within(finals[name], bounds, LEVEL), ".0f")
         yield name, mean, "" if name == BASELINE else share
     for policy, value in by_policy.items():
         yield policy, f"{value:.0f}", ""
-
-
-def kept(x: Array, y: Array, reference: float, bounds: Bounds) -> Interval:
-    """The gain of x over the reference as a share of that of y, with its interval."""
-    sides = [Arm(each, each, each[:, None], len(each), 0, False) for each in (x, y)]
-    frame = Frame(reference, np.nan, bounds, np.nan, np.ones(1), np.nan)
-    return kept_gain(Sides(x=sides[0], y=sides[1], frame=frame), LEVEL)
 
 
 def main() -> None:

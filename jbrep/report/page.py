@@ -88,7 +88,7 @@ def _figure(plot: Plot) -> dict[str, Any]:
         "width": round(min(_WIDEST, _WIDEST * max(plot.on_paper.width, 0.62 * PAGE) / PAGE)),
         "narrowest": round(_PER_INCH * plot.on_paper.width),
         "light": _base64(plot.on_paper.picture("svg")),
-        "dark": _base64(Drawing(plot, DARK).picture("svg")),
+        "dark": _base64(Drawing(plot.draw, DARK).picture("svg")),
         "table": _base64(csv_text(plot.columns, plot.rows).encode()),
     }
 

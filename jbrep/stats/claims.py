@@ -5,18 +5,14 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
-import numpy as np
-from scipy.optimize import brentq
-
 from jbrep.stats.arms import FEWEST_UNITS, Sides
 from jbrep.stats.bootstrap import Interval
-from jbrep.stats.intervals import UNDEFINED, Bounds, difference_within, p_of_difference
+from jbrep.stats.intervals import Bounds, difference_within, p_of_difference, share_of_gain
 from jbrep.stats.runs import Key
 from jbrep.stats.spread import PERMUTATIONS, TO_SHOW, Curves, ratio_of_spreads, spread_p
 
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 NOT_YET, EXPLORATORY = "not yet", "exploratory"
-_FURTHEST = 1e3  # shares of a gain that are looked for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,35 +64,9 @@ class Claim(NamedTuple):
 
 
 def kept_gain(sides: Sides, level: float, seed: int = 0) -> Interval:
-    """The gain of x over the reference as a share of that of y, with its interval.
-
-    The interval has the shares c with which the interval of mean(x) - c mean(y) has what the
-    reference would give (Fieller 1954), as far as they are looked for: an end is 1,000 or -1,000
-    where y may not gain anything.
-    """
+    """The gain of x over the reference as a share of that of y, with its interval."""
     x, y, frame = sides
-    gained, of_y = x.final.mean() - frame.reference, y.final.mean() - frame.reference
-    if of_y <= 0:
-        return UNDEFINED
-    value = float(gained / of_y)
-
-    def room(share: float, direction: int) -> float:
-        _, low, high = difference_within(x.final, y.final, frame.bounds, level, share)
-        return float((low if direction < 0 else high) - (1 - share) * frame.reference) * direction
-
-    return Interval(value, *(_end(room, value, direction) for direction in (-1, 1)))
-
-
-def _end(room: Callable[[float, int], float], value: float, direction: int) -> float:
-    """The share in a direction from which on the interval is on one side; NaN if it has none."""
-    if np.isnan(room(value, direction)):
-        return np.nan
-    step = 0.25
-    while step < _FURTHEST:
-        if room(value + direction * step, direction) < 0:
-            return float(brentq(room, value, value + direction * step, (direction,)))
-        step *= 2
-    return direction * _FURTHEST
+    return share_of_gain(x.final, y.final, frame.reference, frame.bounds, level)
 
 
 def _kept_p(sides: Sides, boundary: float, seed: int) -> float:

@@ -62,6 +62,7 @@ UNDEFINED = Interval(np.nan, np.nan, np.nan)
 _FEWEST_FOR_RATIOS = 3  # with two runs Bonett's interval of a ratio covers 86 %
 FEWEST_RUNS = 4  # for an interval: three or fewer are better shown as points
 _LEAST_P, _MOST_P = 1e-12, 1 - 1e-12
+_FURTHEST = 1e3  # shares of a gain that are looked for
 
 
 def percentile(statistic: Callable[..., Array], *samples: Array, seed: int = 0) -> Interval:
@@ -232,3 +233,34 @@ def p_of_difference(x: Array, y: Array, bounds: Bounds, boundary: float, share: 
     if room(_LEAST_P) <= 0:
         return _LEAST_P
     return float(brentq(room, _LEAST_P, _MOST_P)) if room(_MOST_P) < 0 else 1.0
+
+
+def share_of_gain(x: Array, y: Array, reference: float, bounds: Bounds, level: float) -> Interval:
+    """The gain of x (n,) over a reference as a share of that of y (m,), with its interval.
+
+    The interval has the shares c with which the interval of mean(x) - c mean(y) has what the
+    reference would give (Fieller 1954), as far as they are looked for: an end is 1,000 or -1,000
+    where y may not gain anything.
+    """
+    gained, of_y = x.mean() - reference, y.mean() - reference
+    if of_y <= 0:
+        return UNDEFINED
+    value = float(gained / of_y)
+
+    def room(share: float, direction: int) -> float:
+        _, low, high = difference_within(x, y, bounds, level, share)
+        return float((low if direction < 0 else high) - (1 - share) * reference) * direction
+
+    return Interval(value, *(_end(room, value, direction) for direction in (-1, 1)))
+
+
+def _end(room: Callable[[float, int], float], value: float, direction: int) -> float:
+    """The share in a direction from which on the interval is on one side; NaN if it has none."""
+    if np.isnan(room(value, direction)):
+        return np.nan
+    step = 0.25
+    while step < _FURTHEST:
+        if room(value + direction * step, direction) < 0:
+            return float(brentq(room, value, value + direction * step, (direction,)))
+        step *= 2
+    return direction * _FURTHEST

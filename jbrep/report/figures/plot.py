@@ -37,15 +37,15 @@ class Plot:
     @cached_property
     def on_paper(self) -> "Drawing":
         """The figure in the style of a paper."""
-        return Drawing(self, PAPER)
+        return Drawing(self.draw, PAPER)
 
 
 class Drawing:
     """A figure drawn and laid out once in a style, for any number of files."""
 
-    def __init__(self, plot: Plot, style: Any):
+    def __init__(self, draw: Callable[[], Figure], style: Any):
         with mpl.rc_context(style):
-            self._figure = plot.draw()
+            self._figure = draw()
             self._figure.draw_without_rendering()
         # a layout engine, even one that does nothing, has savefig draw everything twice
         self._style = {**style, "figure.constrained_layout.use": False}
