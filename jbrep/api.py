@@ -409,9 +409,9 @@ def report(
     Raises:
         InputError: there is nothing of a study, or a file is damaged.
     """
-    from jbrep.records.storage import check_writable
+    from jbrep.records.storage import check_writable, exists
 
-    if not Path(folder).exists():
+    if not exists(folder):
         raise InputError(f"{folder} is not the folder of a study: there is no such folder")
     if out:
         check_writable(Path(out))

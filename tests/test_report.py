@@ -558,7 +558,8 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
     path = tmp_path / REFERENCE_RETURNS
     rows = list(csv.reader(path.read_text().splitlines()))
     assert rows[0] == ["task", "policy", "episode", "return"]
-    policies = {"standing still": "still", "random": "uniform", "hand-written": "heuristic"}
+    policies = {"standing still": "still", "constant drive": "constant:drive=0.75"}
+    policies |= {"random": "uniform", "hand-written": "heuristic"}
     assert [row[1] for row in rows[1:]] == [name for name in policies for _ in range(2)]
     for _, name, episode, played in rows[1:]:
         alone = find_episode(policies[name], int(episode), tasks[0][0]).reward.sum()

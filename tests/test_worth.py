@@ -206,7 +206,7 @@ def returns_of(told, **learned):
         (
             {"trees": (90, 70), "fourier": (88, 40)},
             "Take the full observation: by fitted",
-            "70 [65, 75]; lacks motor_velocity (0.10); badly conditioned: trees make 70 of it",
+            "70 [65, 75]; lacks motor_velocity (0.10); ill-conditioned: trees make 70 of it",
         ),
     ],
 )
@@ -228,7 +228,7 @@ def test_of_a_constant_reward_nothing_can_be_learned(told):
     assert evaluation_text(by_agents.replace(worth=worth)).startswith("Take the full observation")
 
 
-def test_a_code_that_hardly_varies_in_a_direction_is_badly_conditioned(told):
+def test_a_code_that_hardly_varies_in_a_direction_is_ill_conditioned(told):
     units = known(told).encoders["pca-8"].latent_units
     codes = np.random.default_rng(0).normal(size=(1000, 3)) @ np.diag([1, 300, 2])
     mixed = codes @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]

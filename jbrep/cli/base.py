@@ -257,13 +257,7 @@ class Cli(click.Group):
         except InputError as error:
             raise _Mistake(str(error)) from None
         except OSError as error:  # of what writes files in its own way, as TensorBoard does
-            if error.errno not in _FULL:
-                raise
-            what = f" {error.filename}" if error.filename else ""
-            raise _Mistake(
-                f"can't write{what}: {os.strerror(error.errno)}; free some space, then run the "
-                "same command again"
-            ) from None
+            raise _mistake_of(error) from None
         except click.UsageError as error:
             command = error.ctx.command_path if error.ctx else "jbrep"
             message = error.format_message()
@@ -276,6 +270,19 @@ class Cli(click.Group):
             if extra is None:
                 raise
             raise _Mistake(f"this needs {error.name}: pip install 'jbrep[{extra}]'") from None
+
+
+def _mistake_of(error: OSError) -> Exception:
+    """What the system refuses as a user's mistake if it is one; else the error itself."""
+    what = f" {error.filename}" if error.filename else ""
+    if error.errno in _FULL:
+        return _Mistake(
+            f"can't write{what}: {os.strerror(error.errno)}; free some space, then run the same "
+            "command again"
+        )
+    if error.errno == errno.ENAMETOOLONG:
+        return _Mistake(f"can't use{what}: {os.strerror(error.errno).lower()}; choose another")
+    return error
 
 
 class Variadic(click.Command):

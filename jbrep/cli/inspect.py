@@ -69,12 +69,13 @@ def inspect(
     from jbrep.encoders.shipped import check_found
     from jbrep.envs.names import import_code
     from jbrep.play.sources import check_source
+    from jbrep.records.storage import exists
 
     task = given_task(options)
     import_code(encoder)
     if task and encoder is not None:
         check_found(encoder, task)
-    if source and not Path(source).exists():
+    if source and not exists(source):
         check_source(source)
     from jbrep.inspection import inspect as record  # imports torch
 

@@ -261,10 +261,11 @@ def _find(policy: str, task: "Task | None", encoder: str | None, zip_file: _Zip)
     path, folder = Path(policy), sources.run_folder(policy)
     if sources.is_by_name(policy):
         task = task or describe(_TASK)
-    is_zip = not (sources.is_by_name(policy) or sources.is_trained(policy) or path.is_dir())
+    is_folder = exists(path) and path.is_dir()
+    is_zip = not (sources.is_by_name(policy) or sources.is_trained(policy) or is_folder)
     if zip_file.vecnormalize and not is_zip:
         raise InputError("--vecnormalize is for zip files: others have their own statistics")
-    if sources.is_trained(policy) or (exists(path) and path.is_dir()):
+    if sources.is_trained(policy) or is_folder:
         if encoder and not (folder and encoder == _code_of(folder)):
             raise InputError(
                 f"{policy} is a trained policy, which has its own encoder: leave out --encoder"
@@ -344,10 +345,11 @@ def behaviour(
 
     from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
     from jbrep.play.sources import check_source
+    from jbrep.records.storage import exists
 
     yaw, task = np.deg2rad(target_yaw), given_task(options)
     for policy in policies:
-        if not Path(policy).exists():
+        if not exists(policy):
             check_source(policy)
     from jbrep.report.figures import behaviour_plots, write  # imports torch
 

@@ -73,9 +73,10 @@ def study(
     runs that have ended are never run again.
     """
     from jbrep.errors import InputError
+    from jbrep.records.storage import exists
     from jbrep.records.toml import read_toml
 
-    if not study.exists():
+    if not exists(study):
         raise InputError(f"no study at {study}: it must be a TOML file")
     read_toml(study)
     folder = out or Path("runs") / study.stem

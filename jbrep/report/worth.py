@@ -146,7 +146,7 @@ def _returned(each: Learned | None) -> str:
 
 
 def conditioning(evaluation: Evaluation, worth: Worth, label: str) -> str:
-    """How badly conditioned a code is, if it is; else nothing.
+    """How ill-conditioned a code is, if it is; else nothing.
 
     It is if trees, to which scale doesn't matter, find more in it than Fourier features do; or,
     where these weren't tried, if it varies a hundred times as much in one direction as in another.
@@ -156,11 +156,11 @@ def conditioning(evaluation: Evaluation, worth: Worth, label: str) -> str:
         trees, fourier = (_bounded(shown(learned[way][label])) for way in ("trees", "fourier"))
         if trees.low > fourier.high:
             return (
-                f"badly conditioned: trees make {number(trees.value, SIGNIFICANT)} of it, Fourier "
+                f"ill-conditioned: trees make {number(trees.value, SIGNIFICANT)} of it, Fourier "
                 f"features {number(fourier.value, SIGNIFICANT)}"
             )
     elif (ratio := condition(units)) > _WIDE:
-        return f"badly conditioned: one direction varies {ratio:,.0f} times as much as another"
+        return f"ill-conditioned: one direction varies {ratio:,.0f} times as much as another"
     return ""
 
 

@@ -96,7 +96,7 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
     precision: Annotated[
         Literal["float32", "bfloat16"],
         Meta(
-            description="Of a cohort's products of matrices: float32, or bfloat16, which some "
+            description="Of a cohort's matrix multiplications: float32, or bfloat16, which some "
             "processors compute several times as fast."
         ),
     ] = "float32"

@@ -31,7 +31,12 @@ from jbrep.text import slug
 RETURNS = "returns.csv"
 REFERENCE_RETURNS = "references.csv"
 RUN_INFOS = "run-infos.csv"  # a run may be in the same folder: its own table is infos.csv
-_POLICIES = {STILL: "still", "random": "uniform", LOOKING: "heuristic"}
+_POLICIES = {
+    STILL: "still",
+    "constant drive": "constant:drive=0.75",  # of five, what moves the Jitterbug furthest
+    "random": "uniform",
+    LOOKING: "heuristic",
+}
 References = dict[str, dict[str, list[float]]]  # returns by task and policy
 
 _TASK = "{task}"  # in an evaluation's path: the task's name as in folders
@@ -98,7 +103,7 @@ def stated(folder: Path) -> Mapping[str, str]:
 def write_references(
     tasks: Iterable[tuple[Task, int]], folder: Path, before: Mapping[str, str]
 ) -> str | None:
-    """Play the reference policies of tasks: standing still, random, and hand-written if there is.
+    """Play the reference policies of tasks: three that don't look, and hand-written if there is.
 
     What the file has already isn't played again; what can't be played here stays in it.
 

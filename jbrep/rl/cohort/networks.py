@@ -197,7 +197,7 @@ class Stack:
         agents: stable-baselines3's, of one algorithm and with the same settings; with the state of
             their optimisers allocated.
         size: to which observations are padded.
-        precision: of products of matrices.
+        precision: of matrix multiplications.
         device: of the stack.
 
     Attributes:
