@@ -353,7 +353,7 @@ def train(
 
         writers.append(Tracker(wandb, job.folder, job.settings))
     with closing(Bar(run.steps, f"{algorithm} on {job.encoder.name}")) as bar:
-        session = Session(bar.show, stop=stop, writers=writers, keeps=True)
+        session = Session(bar.show, stop=stop, writers=writers, keep_checkpoint=True)
         ((_, record),) = train_jobs([job], session)
     return Agent(job.folder, record)
 

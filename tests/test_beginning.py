@@ -16,7 +16,7 @@ from small import forge
 from jbrep.envs import describe
 from jbrep.errors import DamageError, InputError
 from jbrep.records import container
-from jbrep.rl import Run, StoppedError, train
+from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import BEGINNING, POLICY, POLICY_ZIP, RUN, read_evaluations, read_run
 from jbrep.rl.policy import load_run, load_untrained
 
@@ -95,7 +95,7 @@ def test_the_policy_is_part_of_what_decides_a_run(source, later, tmp_path):
 def test_it_is_resumed_to_the_same_bits(source, later, tmp_path):
     run = Run.of(**SETTINGS, seed=1, steps=40, begin_from=str(source))
     with pytest.raises(StoppedError):
-        train(run, tmp_path, stop=iter([False] * 5 + [True]).__next__)
+        train(run, tmp_path, Session(stop=iter([False] * 5 + [True]).__next__))
     assert load_untrained(tmp_path).task == CART
     train(run, tmp_path)
     for name in (POLICY, BEGINNING, "evaluations.csv"):

@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from jbrep.encoders import find
 from jbrep.envs import describe
-from jbrep.envs.endless import Endless
+from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
 from jbrep.rl import Run, StoppedError
@@ -29,7 +29,7 @@ from jbrep.rl.cohort.algorithm import Batch
 from jbrep.rl.cohort.cohort import Cohort
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.cohort.networks import Stack
-from jbrep.rl.cohort.replay import Ahead, ReplayBuffer
+from jbrep.rl.cohort.replay import ReplayBuffer
 from jbrep.rl.job import Job, Session
 from jbrep.rl.overrides import overridden
 from jbrep.rl.presets import PRESETS
@@ -266,7 +266,7 @@ def test_transitions_of_several_steps_are_those_of_stable_baselines3(added):
     """Over the ends of episodes, of the buffer and of what has been added."""
     space, random = spaces.Box(-1, 1, (1,), np.float32), np.random.default_rng(added)
     theirs = NStepReplayBuffer(20, space, space, n_envs=2, n_steps=4, gamma=0.9)
-    ours = ReplayBuffer(1, 2, 20, 1, 1, Ahead(4, 0.9))
+    ours = ReplayBuffer(1, 2, 20, 1, 1, 4, 0.9)
     for _ in range(added):
         seen, action, final = random.random((3, 1, 2, 1), np.float32)
         reward, ended = random.random((2,), np.float32), random.random(2) < 0.2
@@ -303,14 +303,14 @@ def test_a_member_that_diverges_fails_alone(done, tmp_path):
 
 def test_an_environment_that_fails_ends_its_run_alone(done, tmp_path, monkeypatch):
     """The others go back to their last checkpoints."""
-    asked, step = count(), Endless.step
+    asked, step = count(), AutoresetLanes.step
 
     def fail_once(self, actions):
         if next(asked) == 130:
             raise EnvironmentFailedError("the motor is broken", 2)
         return step(self, actions)
 
-    monkeypatch.setattr(Endless, "step", fail_once)
+    monkeypatch.setattr(AutoresetLanes, "step", fail_once)
     results = together(runs(260, **SAC), tmp_path, save_every=0)
     assert results[2].reason == "the motor is broken after 130 steps"
     assert_same(tmp_path, done, "01")

@@ -13,7 +13,7 @@ from jbrep.dae import DAE
 from jbrep.dae.autoencoder import Reconstruction
 from jbrep.errors import DamageError, InputError
 from jbrep.records import container
-from jbrep.rl import Run, train
+from jbrep.rl import Run, Session, train
 from jbrep.rl.files import CHECKPOINT
 from jbrep.training import checkpoint
 from jbrep.training.trainer import Schedule, Trainer
@@ -70,12 +70,12 @@ def stopped(tmp_path_factory):
         task="face_direction", algorithm="a2c", steps=40, evaluation_episodes=1, preset="paper"
     )
 
-    def watch(step, mean):
+    def watch(job, step):
         if (folder / CHECKPOINT).exists():
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(run, folder, watch, save_every=0)
+        train(run, folder, Session(watch, save_every=0))
     return run, folder
 
 

@@ -13,6 +13,7 @@ from jbrep.report import write_report
 from jbrep.report.figures import study_plots, write
 from jbrep.report.figures.style import limits
 from jbrep.report.statistics import statistics_text
+from jbrep.report.tables import read_tables
 from jbrep.stats import RunCurve, analyse
 from jbrep.stats.bootstrap import Interval
 from jbrep.stats.rules import Planned, Rules
@@ -283,7 +284,7 @@ def folder(runs, returns, tmp_path_factory):
     ).write(folder / RECORD)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jbrep.report.report.write", lambda plots, path: write(plots[:1], path))
-        write_report(folder)
+        write_report(read_tables(folder), folder)
     return folder
 
 

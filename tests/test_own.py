@@ -33,7 +33,7 @@ from jbrep.inspection import inspect
 from jbrep.jitterbug import JitterbugEnv
 from jbrep.report.evaluation import evaluation_text
 from jbrep.report.figures import encoder_plots
-from jbrep.rl import Run, train
+from jbrep.rl import Run, Session, train
 from jbrep.rl.files import CHECKPOINT, ENCODER, RUN
 from jbrep.rl.policy import load_run
 
@@ -416,7 +416,7 @@ def test_a_run_whose_encoder_fails_keeps_its_checkpoint(tmp_path):
         task=TASK, algorithm="a2c", encoder=spoilt, steps=80, evaluation_episodes=1, preset="paper"
     )
     with pytest.raises(InputError, match="Spoilt returned numbers that are not finite"):
-        train(run, tmp_path, save_every=0)
+        train(run, tmp_path, Session(save_every=0))
     assert (tmp_path / CHECKPOINT).exists()
     assert not (tmp_path / RUN).exists()
     spoilt.left = 1000

@@ -18,7 +18,7 @@ from jbrep.envs.view import with_view
 from jbrep.play.jitterbug import turn_targets
 from jbrep.play.perturbed import domains_of
 from jbrep.play.sources import find_player
-from jbrep.rl import Run, StoppedError, train
+from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import (
     EPISODES,
     EVALUATIONS,
@@ -259,9 +259,9 @@ SMALL = {"num_envs": 2, "net_arch": [8], "learning_starts": 20, "batch_size": 4}
 
 
 def stopping(step):
-    """What a run is told as it goes on, and what asks it to stop there."""
+    """A session that ends after so many steps."""
     steps = [0]
-    return {"watch": lambda now, _: steps.append(now), "stop": lambda: steps[-1] >= step}
+    return Session(lambda _, now: steps.append(now), stop=lambda: steps[-1] >= step)
 
 
 @pytest.fixture(scope="module")
@@ -275,7 +275,7 @@ def runs(tmp_path_factory):
     for trainer in ("cohort", "sb3"):
         same = run.replace(trainer=trainer)
         with pytest.raises(StoppedError):
-            train(same, folder / trainer, **stopping(90))
+            train(same, folder / trainer, stopping(90))
         train(same, folder / trainer)
     return folder
 

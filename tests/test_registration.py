@@ -16,7 +16,7 @@ from jbrep.study.config import Data, read_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.registration import REGISTRATION, read_registration
-from jbrep.study.results import conclude
+from jbrep.study.results import write_tables
 from jbrep.study.runner import register_study, run_study
 
 TINIER = TINY.replace(representations=("full",), seeds=(0, 1))
@@ -28,7 +28,7 @@ def registered(tmp_path_factory):
     folder = tmp_path_factory.mktemp("registered") / "study"
     register_study(Plan(TINIER, folder))
     assert run_study(Plan(TINIER, folder), in_this_process, 1) == 0
-    conclude(folder)
+    write_tables(folder)
     return Plan(TINIER, folder)
 
 

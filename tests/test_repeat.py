@@ -12,7 +12,7 @@ from jbrep.collect import collect
 from jbrep.dataset import Dataset
 from jbrep.encoders.vec_env import JitterbugVecEnv
 from jbrep.envs import describe
-from jbrep.envs.endless import Endless
+from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.lanes import Lanes
 from jbrep.errors import InputError
 from jbrep.play.sources import find_player, find_policy
@@ -48,7 +48,7 @@ class Failing:
 
 
 def test_a_held_action_is_the_same_as_its_steps_one_by_one():
-    endless, lanes = Endless(TASK, 2, repeat=REPEAT), Lanes(TASK, 2)
+    endless, lanes = AutoresetLanes(TASK, 2, repeat=REPEAT), Lanes(TASK, 2)
     np.testing.assert_array_equal(endless.reset([3, 4]), lanes.reset(range(2), [3, 4]))
     random = np.random.default_rng(0)
     for step in range(13):
@@ -60,7 +60,7 @@ def test_a_held_action_is_the_same_as_its_steps_one_by_one():
         np.testing.assert_array_equal(moved.final, lanes.observation)
         np.testing.assert_array_equal(moved.length, min(REPEAT * (step + 1), 50))
         np.testing.assert_array_equal(moved.ended, step == 12)
-    usual = Endless(TASK, 2)
+    usual = AutoresetLanes(TASK, 2)
     usual.reset([3, 4])
     for _ in range(50):
         following = usual.step(np.zeros((2, 1)))
@@ -68,7 +68,7 @@ def test_a_held_action_is_the_same_as_its_steps_one_by_one():
 
 
 def test_a_lane_that_diverges_while_an_action_is_held_waits_for_the_others():
-    endless = Endless(TASK, 2, repeat=REPEAT)
+    endless = AutoresetLanes(TASK, 2, repeat=REPEAT)
     endless.lanes._batch = Failing(endless.lanes._batch, lane=1, step=6)
     endless.reset([0, 1])
     moved = [endless.step(np.ones((2, 1))) for _ in range(3)]
@@ -152,7 +152,7 @@ def test_whoever_plays_the_policy_holds_its_actions(run, tmp_path):
     assert moved.action_repeat == REPEAT
     agent = sb3_class("sac").load(run / POLICY_ZIP)
     assert agent.action_repeat == REPEAT
-    returns = Evaluator(TASK, moved.encoder, 3).returns(agent)
+    returns = Evaluator(Lanes(TASK, 3), moved.encoder, 3).returns(agent)
     np.testing.assert_allclose(returns, last, atol=6e-4)
 
 

@@ -40,7 +40,7 @@ from jbrep.stats.rules import Rules
 from jbrep.study.config import Study, as_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD, RunsRecord
-from jbrep.study.results import conclude
+from jbrep.study.results import write_tables
 from jbrep.study.tables import REFERENCE_RETURNS, write_references
 from jbrep.text import SIGNIFICANT, Table, number
 
@@ -116,8 +116,8 @@ def whole(tmp_path_factory, one_picture):
         for episode in range(20)
     ]
     write_csv(folder / REFERENCE_RETURNS, ("task", "policy", "episode", "return"), rows)
-    conclude(folder)
-    write_report(folder)
+    write_tables(folder)
+    write_report(read_tables(folder), folder)
     return folder
 
 
@@ -378,7 +378,7 @@ def test_diagnostics_are_set_against_returns_where_they_are_known(whole, tmp_pat
     monkeypatch.setattr(report, "study_plots", lambda *parts: plots.extend(study_plots(*parts)))
     monkeypatch.setattr(report, "page", lambda *parts: page_of(parts[0], [], *parts[2:]))
     monkeypatch.setattr(report, "write", lambda *_: [])
-    page, _, text, *_ = write_report(tmp_path / "study")
+    page, _, text, *_ = write_report(read_tables(tmp_path / "study"), tmp_path / "study")
     assert "diagnostics" in [plot.name for plot in plots]
     row = ("forward", SCALARS["forward"].words, "-", "3")  # three codes are too few to correlate
     assert f"| {' | '.join(row)} |" in text.read_text()
@@ -389,7 +389,7 @@ def test_diagnostics_are_set_against_returns_where_they_are_known(whole, tmp_pat
 def test_names_that_are_not_utf_8_are_written_all_the_same(whole, tmp_path):
     folder = Path(f"{tmp_path}/studi\udce9")  # as Linux gives a folder named in Latin-1
     copy_tables(whole, folder)
-    page, summary, text, *_ = write_report(folder)
+    page, summary, text, *_ = write_report(read_tables(folder), folder)
     assert "<h1>studi?</h1>" in page.read_text()
     assert json.loads(summary.read_text())["study"] == "studi?"
     assert text.read_text().startswith("# studi?\n")
@@ -398,7 +398,7 @@ def test_names_that_are_not_utf_8_are_written_all_the_same(whole, tmp_path):
 def test_it_can_be_made_from_the_tables_alone(whole, tmp_path):
     alone = tmp_path / "a-study"
     copy_tables(whole, alone)
-    write_report(alone)
+    write_report(read_tables(alone), alone)
     for name in (PAGE, SUMMARY, MARKDOWN, STATISTICS):
         assert (alone / name).read_bytes() == (whole / name).read_bytes()
     figures = [{f.name: f.read_bytes() for f in (d / FIGURES).iterdir()} for d in (alone, whole)]
@@ -478,7 +478,7 @@ def test_settings_that_seeds_draw_are_alike_for_all_that_agents_observe(tmp_path
         drawn.setdefault(cell.seed, set()).add(values)
     assert {len(each) for each in drawn.values()} == {1}
     assert len(set.union(*drawn.values())) > 1
-    conclude(tmp_path)
+    write_tables(tmp_path)
     tables = read_tables(tmp_path)
     assert len(tables.analysis.groups[0].comparisons) == 1
     rows = dict(row[:2] for row in setting_table(tables).rows)
@@ -513,8 +513,8 @@ def test_an_unfinished_study_says_what_is_missing(tmp_path):
     plan = make_study(tmp_path / "half", left=5)
     (plan.folder_of(plan.cells[-1])).mkdir(parents=True)
     (plan.folder_of(plan.cells[-1]) / "progress").write_text("700 12")
-    conclude(plan.folder)
-    write_report(plan.folder)
+    write_tables(plan.folder)
+    write_report(read_tables(plan.folder), plan.folder)
     summary = json.loads((plan.folder / SUMMARY).read_text())
     assert summary["missing"] == [cell.name for cell in plan.cells[-5:]]
     assert summary["runs"] == 7
@@ -526,8 +526,8 @@ def test_an_unfinished_study_says_what_is_missing(tmp_path):
 
 def test_of_single_runs_it_shows_what_there_is(tmp_path):
     plan = make_study(tmp_path / "young", left=9)  # a run of each representation
-    conclude(plan.folder)
-    write_report(plan.folder)
+    write_tables(plan.folder)
+    write_report(read_tables(plan.folder), plan.folder)
     assert not (plan.folder / STATISTICS).exists()
     text = (plan.folder / PAGE).read_text()
     assert "dae-8: one run has ended, at least two are needed" in text
@@ -546,7 +546,7 @@ def test_two_reports_of_a_folder_take_turns(whole, tmp_path, monkeypatch):
         events.append("ended")
         return []
 
-    monkeypatch.setattr(report, "write_report_of", write)
+    monkeypatch.setattr(report, "write_report", write)
     with ThreadPoolExecutor() as pool:
         list(pool.map(make_report, [tmp_path] * 2))
     assert events == ["begun", "ended"] * 2
@@ -621,7 +621,7 @@ def test_damaged_tables_are_refused(name, change, message, whole, tmp_path):
             adopt(tmp_path / "runs.json", *TABLES[1:])
     before = sorted(tmp_path.iterdir())
     with pytest.raises(InputError, match=message):
-        write_report(tmp_path)
+        write_report(read_tables(tmp_path), tmp_path)
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -652,7 +652,7 @@ def test_changed_tables_are_refused_or_shown(whole, tmp_path, monkeypatch):
         with suppress(AttributeError):
             forge(tmp_path / "runs.json", changed)
         try:
-            write_report(tmp_path)
+            write_report(read_tables(tmp_path), tmp_path)
         except InputError as error:
             refused.append(str(error))
     assert 50 < len(refused) < 150
@@ -664,7 +664,7 @@ def test_a_run_of_a_newer_jbrep_is_named(tmp_path):
     path = plan.folder_of(plan.cells[0]) / "run.json"
     path.write_text(path.read_text().replace('version": 5', 'version": 7'))
     with pytest.raises(InputError, match=r"run\.json has version 7 of the jbrep run format"):
-        conclude(plan.folder)
+        write_tables(plan.folder)
 
 
 @pytest.mark.parametrize("study", ["ablation-speed", "breadth", "cheetah", "confirm", "longer"])
@@ -673,7 +673,7 @@ def test_committed_results_are_those_of_their_tables(study, tmp_path, monkeypatc
     folder = Path("results") / study
     monkeypatch.setattr(report, "study_plots", lambda *tables: [])
     monkeypatch.setattr(report, "page", lambda *tables: "")
-    write_report(folder, tmp_path)
+    write_report(read_tables(folder), tmp_path)
     assert (tmp_path / MARKDOWN).read_text() == (folder / MARKDOWN).read_text()
     ours, theirs = (json.loads((each / STATISTICS).read_text()) for each in (tmp_path, folder))
     check_close(ours, theirs)

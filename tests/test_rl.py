@@ -28,7 +28,7 @@ from jbrep.envs import Lanes, describe
 from jbrep.envs.recording import Outcome, episode_returns
 from jbrep.errors import InputError
 from jbrep.records import container
-from jbrep.rl import Run, StoppedError, train
+from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.bar import Bar
 from jbrep.rl.checkpoint import History
@@ -162,7 +162,7 @@ def test_evaluation_is_the_deterministic_policys_return():
     for _ in range(STEPS):
         latent = encoder(lanes.observation.astype(np.float32))
         total += lanes.step(agent.predict(latent, deterministic=True)[0]).reward
-    evaluator = Evaluator(TASK, encoder, 2)
+    evaluator = Evaluator(Lanes(TASK, 2), encoder, 2)
     for _ in range(2):  # the same episodes each time
         np.testing.assert_allclose(evaluator.returns(agent), total, rtol=1e-5)
 
@@ -206,7 +206,7 @@ def test_the_full_observation_is_scaled_as_encoders_scale_it():
 
 def test_neither_threads_nor_clock_nor_process_change_a_bit(short, tmp_path):
     text = (
-        "import time, torch; from pathlib import Path; from jbrep.rl import Run, train\n"
+        "import time, torch; from pathlib import Path; from jbrep.rl import Run, Session, train\n"
         f"{IMPORTS}\n"
         "torch.set_num_threads(2)\n"
         "for seconds in (0, 1 << 33):\n"  # zip files can't be dated before 1980 or after 2107
@@ -256,8 +256,8 @@ KILLED = {
 def kill(run, folder, checkpoints=2):
     """Train in another process; kill it when so many checkpoints have been written."""
     text = (
-        f"from pathlib import Path; from jbrep.rl import Run, train; {IMPORTS};"
-        f"train({run!r}, Path({str(folder)!r}), save_every=0.05)"
+        f"from pathlib import Path; from jbrep.rl import Run, Session, train; {IMPORTS};"
+        f"train({run!r}, Path({str(folder)!r}), Session(save_every=0.05))"
     )
     process = subprocess.Popen([sys.executable, "-c", text], stderr=subprocess.PIPE, text=True)
     seen, path = set(), folder / "checkpoint.safetensors"
@@ -276,7 +276,7 @@ def test_a_killed_run_resumes_to_the_same_bits(algorithm, tmp_path):
     killed, error = kill(run, folder)
     assert killed == -signal.SIGKILL, error
     written = (folder / "checkpoint.safetensors").read_bytes()
-    train(run, folder, save_every=0.05)
+    train(run, folder, Session(save_every=0.05))
     train(run, tmp_path / "undisturbed")
     assert_same_run(tmp_path / "undisturbed", folder)
     (tmp_path / "spoilt").mkdir()
@@ -290,11 +290,15 @@ def test_a_killed_run_resumes_to_the_same_bits(algorithm, tmp_path):
 
 def test_a_run_that_is_asked_to_stop_writes_a_checkpoint_and_resumes_from_there(short, tmp_path):
     steps = []
+
+    def watch(job, step):
+        steps.append(step)
+
     with pytest.raises(StoppedError, match="stopped after 40 steps"):
-        train(SHORT, tmp_path, lambda step, _: steps.append(step), stop=lambda: steps[-1] == 40)
+        train(SHORT, tmp_path, Session(watch, stop=lambda: steps[-1] == 40))
     assert not (tmp_path / "run.json").exists()
     assert steps[0] == 0
-    train(SHORT, tmp_path, lambda step, _: steps.append(step))
+    train(SHORT, tmp_path, Session(watch))
     assert steps == sorted(steps)
     assert steps.count(40) == 2  # where it stopped, and where it resumed
     assert_same_run(short, tmp_path)
@@ -419,7 +423,7 @@ def test_a_run_tells_all_its_steps_before_its_last_evaluation(trainer, tmp_path)
     run = Run.of(
         algorithm="ddpg", steps=1200, evaluate_every=600, trainer=trainer, **QUICK, preset="paper"
     )
-    train(run, tmp_path / "run", lambda *each: told.append(each))
+    train(run, tmp_path / "run", Session(lambda job, step: told.append((step, job.history.mean))))
     evaluations = read_evaluations(tmp_path / "run")
     means = [np.mean([e.episode_return for e in evaluations if e.step == s]) for s in (600, 1200)]
     assert means[0] != means[1]
@@ -427,11 +431,11 @@ def test_a_run_tells_all_its_steps_before_its_last_evaluation(trainer, tmp_path)
 
 
 def test_an_error_whose_words_sound_like_divergence_is_not_taken_for_it(tmp_path):
-    def watch(step, mean):
+    def watch(job, step):
         raise ValueError("found invalid values: actions are not finite")
 
     with pytest.raises(ValueError, match="found invalid values"):
-        train(SHORT, tmp_path, watch)
+        train(SHORT, tmp_path, Session(watch))
     assert not (tmp_path / "run.json").exists()
 
 

@@ -8,12 +8,12 @@ import pytest
 from command import jbrep
 
 from jbrep.encoders import find
-from jbrep.envs import describe
+from jbrep.envs import Lanes, describe
 from jbrep.envs.lanes import EnvironmentFailedError
 from jbrep.errors import InputError
 from jbrep.play.sources import find_player
 from jbrep.records import container
-from jbrep.rl import Run, StoppedError, train
+from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, training_seed
 from jbrep.rl.controller import load_policy
 from jbrep.rl.files import (
@@ -105,10 +105,10 @@ def test_evaluations_are_in_the_order_of_their_starts():
     """Episodes of different lengths end in another order."""
     encoder = find("full", HOPPER)
     agent = make_agent("sac", get_preset("modern", "sac"), make_env(HOPPER, 1, 0, encoder), 0)
-    together = Evaluator(HOPPER, encoder, 4).returns(agent)
+    together = Evaluator(Lanes(HOPPER, 4), encoder, 4).returns(agent)
     assert len(set(together.round(3))) == 4
     for i, expected in enumerate(together):
-        (alone,) = Evaluator(HOPPER, encoder, 1, EVALUATION_SEED + i).returns(agent)
+        (alone,) = Evaluator(Lanes(HOPPER, 1), encoder, 1, EVALUATION_SEED + i).returns(agent)
         assert alone == pytest.approx(expected, rel=1e-4)
 
 
@@ -130,7 +130,7 @@ def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, tas
     train(run, one)
     steps = []
     with pytest.raises(StoppedError):
-        train(run, other, lambda step, _: steps.append(step), stop=lambda: steps[-1] >= 64)
+        train(run, other, Session(lambda _, step: steps.append(step), stop=lambda: steps[-1] >= 64))
     lengths = container.read(other / CHECKPOINT, "checkpoint")[0]["lanes.lengths"]
     assert lengths.any()
     train(run, other)
@@ -165,7 +165,7 @@ def test_the_command_says_that_an_environment_failed(tmp_path):
 def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
     run = Run.of(task=CART, algorithm="a2c", steps=320, evaluation_episodes=1, preset="paper")
     with pytest.raises(StoppedError):
-        train(run, tmp_path, stop=iter((False, True)).__next__)
+        train(run, tmp_path, Session(stop=iter((False, True)).__next__))
     before = (tmp_path / CHECKPOINT).read_bytes()
 
     def fail(*_):
@@ -189,7 +189,7 @@ def test_an_environment_that_is_not_reproducible(tmp_path):
     drifting = describe(cart.ID, {"drifts": True})
     run = Run.of(task=drifting, algorithm="a2c", steps=80, evaluation_episodes=1, preset="paper")
     with pytest.raises(StoppedError):
-        train(run, tmp_path / "stopped", stop=iter((False, True)).__next__)
+        train(run, tmp_path / "stopped", Session(stop=iter((False, True)).__next__))
     with pytest.raises(InputError, match="Test/Cart-v0 is not reproducible here"):
         train(run, tmp_path / "stopped")
     assert (tmp_path / "stopped" / CHECKPOINT).exists()
@@ -225,7 +225,7 @@ def test_a_run_goes_on_as_one_that_had_more_steps_at_first(algorithm, overrides,
     settings |= {"evaluate_every": 80, "evaluation_episodes": 2, "final_episodes": 3}
     shorter, longer = (Run.of(CART, steps=steps, **settings) for steps in (160, 320))
     grown, whole = tmp_path / "grown", tmp_path / "whole"
-    train(shorter, grown, keeps=True)
+    train(shorter, grown, Session(keep_checkpoint=True))
     train(shorter, tmp_path / "short")
     assert (grown / EVALUATIONS).read_bytes() == (tmp_path / "short" / EVALUATIONS).read_bytes()
     train(longer, grown)
@@ -241,6 +241,6 @@ def test_a_run_goes_on_as_one_that_had_more_steps_at_first(algorithm, overrides,
 def test_a_run_on_a_schedule_does_not_go_on(tmp_path):
     settings = {"algorithm": "a2c", "evaluation_episodes": 1}
     settings |= {"overrides": {"learning_rate": "linear:1e-3"}}
-    train(Run.of(CART, steps=80, **settings), tmp_path, keeps=True)
+    train(Run.of(CART, steps=80, **settings), tmp_path, Session(keep_checkpoint=True))
     with pytest.raises(InputError, match="its learning_rate fell to 0 in them, which a longer"):
         train(Run.of(CART, steps=160, **settings), tmp_path)

@@ -24,7 +24,7 @@ from jbrep.errors import InputError
 from jbrep.play.sources import find_player
 from jbrep.records import container
 from jbrep.records.record import to_plain
-from jbrep.rl import Run, train
+from jbrep.rl import Run, Session, train
 from jbrep.rl.agent import make_env
 from jbrep.rl.files import (
     CHECKPOINT,
@@ -43,7 +43,7 @@ from jbrep.rl.job import Scalars
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.policy_file import read
 from jbrep.rl.trained import of_file
-from jbrep.study.results import conclude
+from jbrep.study.results import write_tables
 
 TASK = describe("face_direction")
 SETTINGS = Run.of(
@@ -64,7 +64,7 @@ def trained(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(container, "write", keep)
-        train(SETTINGS, folder, save_every=0)
+        train(SETTINGS, folder, Session(save_every=0))
     return folder
 
 
@@ -159,7 +159,7 @@ def test_every_field_of_a_run_is_checked(run):
         if text not in known:
             known.add(text)
             attempt(load_run, run)
-            attempt(conclude, run)
+            attempt(write_tables, run)
     assert 20 < len(known) < 100  # most are refused
 
 

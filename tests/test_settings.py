@@ -20,7 +20,7 @@ from jbrep.envs.recording import episode_returns
 from jbrep.errors import DamageError, InputError
 from jbrep.records import container
 from jbrep.report.tables import read_tables
-from jbrep.rl import Run, StoppedError, train
+from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.agent import Evaluator, make_agent, make_env, statistics_of
 from jbrep.rl.files import EVALUATION_SEED, POLICY, POLICY_ZIP, RUN, read_evaluations, read_run
 from jbrep.rl.from_zip import load_zip
@@ -31,7 +31,7 @@ from jbrep.rl.presets import sb3_class
 from jbrep.rl.settings import CLASSES
 from jbrep.study.config import as_study, read_study
 from jbrep.study.plan import Plan, read_plan
-from jbrep.study.results import conclude
+from jbrep.study.results import write_tables
 
 TASK = describe("Pendulum-v1", max_episode_steps=20)
 PINK = {"kind": "coloured", "beta": 1, "sigma": 0.2}
@@ -258,7 +258,11 @@ def resumed(run, folder, stop_at=40):
     """The run in a folder, stopped once on the way."""
     steps = [0]
     with pytest.raises(StoppedError):
-        train(run, folder, lambda step, _: steps.append(step), stop=lambda: steps[-1] >= stop_at)
+        train(
+            run,
+            folder,
+            Session(lambda _, step: steps.append(step), stop=lambda: steps[-1] >= stop_at),
+        )
     assert load_run(folder).step
     train(run, folder)
     return folder
@@ -352,7 +356,7 @@ def test_gradient_steps_and_evaluations_use_the_statistics_without_changing_them
     stored = agent.replay_buffer.observations[:20]
     batch = agent.replay_buffer._get_samples(np.arange(20), env=agent._vec_normalize_env)
     np.testing.assert_array_equal(batch.observations.numpy(), before(stored[:, 0]))
-    Evaluator(TASK, find("full", TASK), 2).returns(agent)
+    Evaluator(Lanes(TASK, 2), find("full", TASK), 2).returns(agent)
     after = statistics_of(agent)
     assert (before.count, *before.mean) == (after.count, *after.mean)
 
@@ -452,7 +456,7 @@ def test_a_study_of_learners(tmp_path):
     written = json.loads((out / "study.json").read_text())
     assert (written["algorithms"], written["learners"]) == (["a2c-modern", *own], own)
     assert read_plan(out).study == read_study(path)
-    conclude(out)
+    write_tables(out)
     labels = read_tables(out).record.labels
     assert [*labels] == [f"Pendulum-v1/{name}/full" for name in ("a2c-modern", *own)]
     settings = labels["Pendulum-v1/tuned/full"].settings
@@ -471,7 +475,7 @@ def test_settings_are_not_mixed_under_a_label(tmp_path):
     for seed, gamma in enumerate((0.9, 0.9, 0.8)):
         learner = Learner.given("a2c", "modern", {"gamma": gamma}, "mine")
         train(Run(task=TASK, learner=learner, seed=seed, **steps), tmp_path / str(seed))
-    conclude(tmp_path)
+    write_tables(tmp_path)
     assert "other settings" in " ".join(read_tables(tmp_path).left_out)
 
 

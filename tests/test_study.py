@@ -45,7 +45,7 @@ from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, as_study, read_study
 from jbrep.study.plan import STUDY, Plan, read_plan
 from jbrep.study.prepare import prepare
-from jbrep.study.results import conclude, read_runs
+from jbrep.study.results import read_runs, write_tables
 from jbrep.study.runner import Progress, on_this_machine, run_study
 from jbrep.study.tables import REFERENCE_RETURNS, RETURNS, read_references, write_references
 from jbrep.study.work import PROGRESS, Outcome, work
@@ -74,7 +74,7 @@ episode_steps = 100
 
 def tables(folder):
     """The tables of a study, as bytes."""
-    conclude(folder)
+    write_tables(folder)
     found = statistics(read_tables(folder).analysis)
     return (folder / RETURNS).read_bytes(), json.dumps(found).encode()
 
@@ -368,7 +368,7 @@ def test_a_failed_run_and_a_crashed_one_stop_no_other(tmp_path, monkeypatch):
         assert status == ("failed" if "a2c-modern" in name else "finished")
     (blocked / "encoder.safetensors").rmdir()
     assert run_study(plan, in_this_process, 1) == 0
-    conclude(plan.folder)
+    write_tables(plan.folder)
     analysis = read_tables(plan.folder).analysis
     failed = {group.algorithm: [len(x.failed) for x in group.labels] for group in analysis.groups}
     assert failed == {"a2c": [0, 0], "a2c-modern": [2, 2]}
@@ -387,7 +387,7 @@ def tables_with(plan, folder, runs, **settings):
     for path in folder.rglob(f"{runs}/{RUN}"):
         run = json.loads(path.read_text())
         forge(path, {**run, "settings": {**run["settings"], **settings}})
-    conclude(folder)
+    write_tables(folder)
     return read_tables(folder)
 
 
@@ -458,7 +458,7 @@ def test_progress_is_a_line_for_each_run_where_there_is_no_terminal(done, capsys
 
 
 def test_tables_fit_the_terminal(done):
-    conclude(done.folder)
+    write_tables(done.folder)
     assert max(map(len, results_text(read_tables(done.folder), 80).splitlines())) <= 80
 
 
@@ -467,7 +467,7 @@ def test_crashed_runs_are_told_at_the_end(done, tmp_path, monkeypatch):
     out = shutil.copytree(done.folder, tmp_path / "out")
     shutil.rmtree(next(out.rglob("run.json")).parent)
     monkeypatch.setattr("jbrep.study.run_study", lambda *given: 1)
-    monkeypatch.setattr("jbrep.report.report.write_report_of", lambda tables, out: [out])
+    monkeypatch.setattr("jbrep.report.report.write_report", lambda tables, out: [out])
     told = jbrep("study", path, "--out", out)
     assert told.exit_code == 1
     assert "Note: 1 run crashed: the same study in that folder tries again\n" in told.stderr
@@ -487,7 +487,7 @@ def test_a_study_of_a_jitterbug_and_of_a_robot_of_another_package(tmp_path, monk
     """Its workers import the package; its report is made where that is missing."""
     path, out = written(tmp_path, *MIXED), tmp_path / "mixed"
     with monkeypatch.context() as once:
-        once.setattr("jbrep.report.report.write_report_of", lambda tables, out: [out])
+        once.setattr("jbrep.report.report.write_report", lambda tables, out: [out])
         told = jbrep("study", path, "--out", out, "--workers", 1, "--import", "robots")
     assert told.exit_code == 0, told.output
     monkeypatch.delitem(gymnasium.registry, robots.ID)

@@ -31,7 +31,7 @@ from jbrep.report.facts import encoder_table, outline, reproduce
 from jbrep.report.figures.diagrams import autoencoders
 from jbrep.report.figures.style import styles
 from jbrep.report.tables import read_tables
-from jbrep.rl import Run, StoppedError, train
+from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import ENCODER, read_run
 from jbrep.rl.policy import load_run
 from jbrep.study.config import Data, as_study
@@ -39,7 +39,7 @@ from jbrep.study.packing import forecast
 from jbrep.study.plan import Plan, read_plan
 from jbrep.study.prepare import prepare
 from jbrep.study.record import EACH_ITS_OWN, RECORD
-from jbrep.study.results import conclude
+from jbrep.study.results import write_tables
 from jbrep.study.runner import run_study
 from jbrep.study.tables import RETURNS, add_diagnostics
 from jbrep.study.work import Assigned, work
@@ -112,7 +112,7 @@ def done(home):
         patch.chdir(home)
         plan = Plan(with_own(PATTERN, CODE, DENSE, FROM_ONNX), home / "done")
         assert run_study(plan, in_this_process, 1) == 0
-        conclude(plan.folder)
+        write_tables(plan.folder)
     return plan
 
 
@@ -485,7 +485,7 @@ def test_a_run_on_an_object_resumes_with_the_same_object_alone(tmp_path):
     asked = iter([False, True])
     run = Run.of(encoder=FirstFeatures(), **SHARED)
     with pytest.raises(StoppedError):
-        train(run, tmp_path, stop=lambda: next(asked))
+        train(run, tmp_path, Session(stop=lambda: next(asked)))
     with pytest.raises(InputError, match="belongs to another configuration: encoder"):
         train(Run.of(encoder=FirstFeatures(-1), **SHARED), tmp_path)
     result = train(run, tmp_path)

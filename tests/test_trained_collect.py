@@ -22,7 +22,7 @@ from jbrep.errors import InputError
 from jbrep.inspection.subject import _find
 from jbrep.play.sources import find_player, find_policy
 from jbrep.records import container
-from jbrep.rl import Run, train
+from jbrep.rl import Run, Session, train
 from jbrep.rl.files import CHECKPOINT, RUN
 from jbrep.rl.policy import load_run
 from jbrep.rl.policy_file import read
@@ -54,7 +54,7 @@ def runs(tmp_path_factory):
         train(
             Run.of(task=SHORT, algorithm="a2c", encoder="dae-8", steps=80, **usual),
             folder / "jb",
-            save_every=0,
+            Session(save_every=0),
         )
     train(Run.of(SLEDGE, "sac", steps=20, overrides=NORMALIZE, **usual), folder / "sledge")
     return folder

@@ -8,7 +8,7 @@ from command import jbrep
 
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.rl import Run, StoppedError, train
+from jbrep.rl import Run, Session, StoppedError, train
 from jbrep.rl.files import POLICY, read_run, runs_below
 from jbrep.rl.learner import read_preset
 from jbrep.rl.tracker import Tracker
@@ -62,7 +62,7 @@ def test_the_command_writes_a_preset_that_rl_takes(tmp_path):
 def test_weights_and_biases_gets_what_tensorboard_gets(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     tracker = Tracker("jbrep", tmp_path / "run", {"algorithm": "a2c"})
-    train(RUN, tmp_path / "run", writers=[tracker])
+    train(RUN, tmp_path / "run", Session(writers=[tracker]))
     (log,) = (tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb")
     assert b"evaluation/mean_return" in log.read_bytes()
 
@@ -73,6 +73,6 @@ def test_weights_and_biases_ends_no_run(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(wandb, "init", fail)
     tracker = Tracker("jbrep", tmp_path / "run", {})
-    assert train(RUN, tmp_path / "run", writers=[tracker]).status == "finished"
+    assert train(RUN, tmp_path / "run", Session(writers=[tracker])).status == "finished"
     told = "Weights & Biases: no API key; the run goes on without it\n"
     assert capsys.readouterr().err == told

@@ -18,7 +18,7 @@ from jbrep.stats.power import Arms, Prospect, prospects
 from jbrep.stats.rules import Planned, Rules
 from jbrep.study.config import as_study
 from jbrep.study.plan import Plan
-from jbrep.study.results import conclude
+from jbrep.study.results import write_tables
 from jbrep.study.runner import register_study
 
 DOCS = Path(__file__).parent.parent / "docs" / "verdicts.md"
@@ -36,8 +36,8 @@ def looks(tmp_path_factory):
             plan = Plan(STUDY.replace(seeds=tuple(range(max(seeds, SEEDS)))), folder)
             plan.write()
             make_runs(plan, range(seeds))
-            conclude(folder)
-            page, _, text, *_ = write_report(folder)
+            write_tables(folder)
+            page, _, text, *_ = write_report(read_tables(folder), folder)
             analysis = read_tables(folder).analysis
             found[seeds] = analysis, page.read_text(), text.read_text()
             if seeds == SEEDS:

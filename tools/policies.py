@@ -19,7 +19,7 @@ from jbrep.rl.policy import load_run
 from jbrep.rl.shipped import SHIPPED, Returns, file_of, shipped, write_returns
 from jbrep.rl.trained import save
 from jbrep.stats.scale import LOOKING, STILL
-from jbrep.study.tables import REFERENCE_RETURNS, References, read_references, stated
+from jbrep.study.tables import REFERENCE_RETURNS, References, read_references, table_hashes
 
 COUNTED = 100  # episodes
 LAST = 64  # episodes of training, one of each robot
@@ -48,7 +48,7 @@ def main() -> None:
     played: dict[str, Returns] = {each.task: each.returns for each in shipped()}
     beside = References()
     for folder in folders:
-        beside |= read_references(folder, stated(folder)[REFERENCE_RETURNS])
+        beside |= read_references(folder, table_hashes(folder)[REFERENCE_RETURNS])
     for task, (value, run) in best(folders).items():
         learned = last_returns(read_evaluations(run))
         written, still = beside[task][LOOKING], beside[task][STILL]

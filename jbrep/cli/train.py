@@ -1,6 +1,6 @@
 """Making encoders, with options from the settings of the methods."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 import click
 from msgspec import inspect
 
-from jbrep.cli.base import POSITIVE, RESUMES, Variadic, data_option, stoppable, tell
+from jbrep.cli.base import (
+    PATH,
+    POSITIVE,
+    RESUMES,
+    Variadic,
+    data_option,
+    stoppable,
+    tell,
+    with_options,
+)
 from jbrep.cli.completion import complete_kind
 from jbrep.errors import InputError, choose
 from jbrep.methods.kinds import KINDS
@@ -142,28 +151,19 @@ class _Dae(_Making):
     kinds = ("dae",)
 
 
-def _making(command: Callable[..., None]) -> Callable[..., None]:
-    """The options of commands that make encoders, but for the methods' own."""
-    for option in (
-        click.option("--preset", help="Named settings; of dae: authors, its authors' own."),
-        click.option(
-            "--seeds",
-            type=POSITIVE,
-            metavar="N",
-            help="Make N of each, of the seeds 0 to N - 1: NAME-s0, NAME-s1, ...",
-        ),
-        click.option("--device", default="auto", show_default=True, help="cpu, cuda, or auto."),
-        click.option("--name", help="What files and tables call it; by default, what it is."),
-        click.option(
-            "--out",
-            required=True,
-            type=click.Path(path_type=Path),
-            help="A folder for the encoder files.",
-        ),
-        data_option,
-    ):
-        command = option(command)
-    return command
+_making = with_options(
+    data_option,
+    click.option("--out", required=True, type=PATH, help="A folder for the encoder files."),
+    click.option("--name", help="What files and tables call it; by default, what it is."),
+    click.option("--device", default="auto", show_default=True, help="cpu, cuda, or auto."),
+    click.option(
+        "--seeds",
+        type=POSITIVE,
+        metavar="N",
+        help="Make N of each, of the seeds 0 to N - 1: NAME-s0, NAME-s1, ...",
+    ),
+    click.option("--preset", help="Named settings; of dae: authors, its authors' own."),
+)
 
 
 @click.command(

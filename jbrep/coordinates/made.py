@@ -11,7 +11,6 @@ from jbrep.errors import InputError
 
 System = Literal["observation", "angles", "coordinates", "symmetry"]
 Ingredient = Literal["angles", "attitude", "body", "distance", "phases"]
-SYSTEMS: tuple[System, ...] = get_args(System)
 INGREDIENTS: tuple[Ingredient, ...] = get_args(Ingredient)
 OBSERVATION: System = "observation"
 _NEEDED = frozenset(("attitude", "body"))  # without which nothing is invariant

@@ -95,8 +95,7 @@ def _facts(dataset: "Dataset", about: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _task_line(task: Task) -> str:
-    actions = f"{task.action_size} action{'s' if task.action_size > 1 else ''}"
-    parts = [task.name, f"{task.size} features", actions]
+    parts = [task.name, counted(task.size, "feature"), counted(task.action_size, "action")]
     arguments = [f"{name}={value}" for name, value in task.arguments.items()]
     return ", ".join([*parts, *arguments])
 

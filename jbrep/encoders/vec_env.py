@@ -9,8 +9,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from jbrep.encoders.base import BaseEncoder, as_encoder
+from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.description import describe
-from jbrep.envs.endless import Endless
 from jbrep.envs.lanes import State, check_actions
 from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
@@ -83,8 +83,8 @@ class JitterbugVecEnv(VecEnv):
             raise InputError(f"{task.name} is described with its time limit: describe it anew")
         self.task = task
         self._encoder = None if encoder is None else as_encoder(encoder, task)
-        self._endless = Endless(task, num_envs, num_threads, action_repeat, retries)
-        self.lanes = self._endless.lanes
+        self._robots = AutoresetLanes(task, num_envs, num_threads, action_repeat, retries)
+        self.lanes = self._robots.lanes
         observation_space, action_space = agent_spaces(task, self._encoder)
         self._actions = np.zeros((num_envs, task.action_size))
         super().__init__(num_envs, observation_space, action_space)
@@ -92,14 +92,14 @@ class JitterbugVecEnv(VecEnv):
 
     def reset(self) -> Float32:
         """Start an episode in every lane: the first one if seeds were set since, else the next."""
-        observation = self._endless.reset(self._seeds)
+        observation = self._robots.reset(self._seeds)
         self._reset_seeds()
         self._reset_options()
         return self._represent(observation)
 
     def restart(self) -> Float32:
         """Start the episodes of now once more, as after others were played in their lanes."""
-        return self._represent(self._endless.restart())
+        return self._represent(self._robots.restart())
 
     def step_async(self, actions: NDArray[np.floating]) -> None:
         """Keep the actions, (num_envs, k), for `step_wait`; they are clipped to [-1, 1]."""
@@ -108,7 +108,7 @@ class JitterbugVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Hold the actions for a step of every lane; where an episode ends, start the next."""
-        moved = self._endless.step(self._actions)
+        moved = self._robots.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if moved.ended.any():
             ended = np.flatnonzero(moved.ended).tolist()
@@ -125,7 +125,7 @@ class JitterbugVecEnv(VecEnv):
     @property
     def state(self) -> State:
         """A copy of what `restore` takes: everything that decides how the lanes continue."""
-        return self._endless.state
+        return self._robots.state
 
     def restore(self, state: State) -> None:
         """Continue from where the state was taken, to the same bits.
@@ -133,7 +133,7 @@ class JitterbugVecEnv(VecEnv):
         Raises:
             InputError: the environment isn't reproducible.
         """
-        self._endless.restore(state)
+        self._robots.restore(state)
 
     def _represent(self, observation: Array) -> Float32:
         if self._encoder is None:

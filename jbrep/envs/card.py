@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from jbrep.envs.task import Feature, Task
-from jbrep.text import facts, table
+from jbrep.text import counted, facts, table
 
 _HEADER = ("feature", "unit", "usual range", "kind")
 _MOST_FEATURES = 60  # shown
@@ -24,8 +24,8 @@ def _facts(task: Task) -> Iterator[tuple[str, str]]:
         yield "id", task.id
     if task.arguments:
         yield "arguments", ", ".join(f"{n}={value}" for n, value in task.arguments.items())
-    yield "observation", _count(task.size, "feature")
-    yield "action", f"{_count(task.action_size, 'number')} in {_bounds(task)}"
+    yield "observation", counted(task.size, "feature")
+    yield "action", f"{counted(task.action_size, 'number')} in {_bounds(task)}"
     step = "" if task.timestep is None else f" of {task.timestep:g} s"
     yield "time limit", f"{task.max_episode_steps:,} steps{step}"
     if task.terminates is None:
@@ -44,10 +44,6 @@ def _facts(task: Task) -> Iterator[tuple[str, str]]:
     else:
         lost = "data sets can't be repaired and stopped runs can't be resumed"
         yield "reproducible", f"no: {found} differ, so {lost}"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number:,} {what}{'s' if number != 1 else ''}"
 
 
 def _bounds(task: Task) -> str:

@@ -92,8 +92,8 @@ class LldVaeObjective(VariationalObjective):
         mean, log_deviation = posterior(self.encoder(now))
         code = mean + log_deviation.exp() * noise
         left, right, shift = self.step(code, action)
-        error = self._unlikelihood(code, now)
-        error += self._unlikelihood(moved(code, left, right) + shift, after)
+        error = self._negative_log_likelihood(code, now)
+        error += self._negative_log_likelihood(moved(code, left, right) + shift, after)
         ahead = transition_divergence(
             moved(mean, left, right) + shift,
             log_deviation,
@@ -104,7 +104,7 @@ class LldVaeObjective(VariationalObjective):
         prior = divergence(mean, log_deviation).sum(1)
         return (error + self._beta * prior + self._transition_weight * ahead).mean()
 
-    def _unlikelihood(self, code: Tensor, rows: Tensor) -> Tensor:
+    def _negative_log_likelihood(self, code: Tensor, rows: Tensor) -> Tensor:
         """The negative log-likelihood of rows, (n,)."""
         mean, log_deviation = self.decoder(code).chunk(2, 1)
         log_deviation = log_deviation.clamp(_LEAST, _MOST)

@@ -23,7 +23,7 @@ from jbrep.report.words import Answer, answers, notes, statements
 from jbrep.stats import Analysis
 from jbrep.stats.analysis import to_plain
 from jbrep.stats.association import Association, Diagnostic, associations
-from jbrep.study.results import conclude, has_runs
+from jbrep.study.results import has_runs, write_tables
 from jbrep.study.tables import Return, add_diagnostics
 from jbrep.text import html, terminal_width
 
@@ -88,7 +88,7 @@ def make_report(
         across_trainers: compare runs of different trainers, too.
 
     Raises:
-        InputError: as `conclude`, `add_diagnostics` and `write_report`.
+        InputError: as `write_tables`, `add_diagnostics`, `read_tables` and `write_report`.
     """
     out, ran = out or folder, has_runs(folder)
     if not ran:
@@ -99,34 +99,21 @@ def make_report(
         for each in sorted({each.resolve() for each in written}):
             stack.enter_context(exclusive(each / PAGE, beside=True, wait=_MOST_SECONDS))
         if ran:
-            conclude(folder)
+            write_tables(folder)
         notes = add_diagnostics(folder, evaluations)
         tables = read_tables(folder, across_trainers)
-        return Report(out, tables, notes, write_report_of(tables, out))
+        return Report(out, tables, notes, write_report(tables, out))
 
 
-def write_report(
-    folder: Path, out: Path | None = None, across_trainers: bool = False
-) -> list[Path]:
-    """Write the report of the tables in a folder.
+def write_report(tables: Tables, out: Path) -> list[Path]:
+    """Write the report of a study's tables.
 
     Args:
-        folder: with the tables of a study.
-        out: folder for the report; the same one if not given.
-        across_trainers: compare runs of different trainers, too.
+        tables: of the study, as `jbrep.report.tables.read_tables` gives them.
+        out: a folder for it.
 
     Returns:
         The paths of the page, the summaries and the folder of the figures.
-
-    Raises:
-        InputError: the folder is not that of a study, a table is damaged, or the report can't be
-            written.
-    """
-    return write_report_of(read_tables(folder, across_trainers), out or folder)
-
-
-def write_report_of(tables: Tables, out: Path) -> list[Path]:
-    """The same of tables that were read.
 
     Raises:
         InputError: the report can't be written.

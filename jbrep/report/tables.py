@@ -72,7 +72,7 @@ def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
     """The tables in a folder, with statistics if they allow any.
 
     Args:
-        folder: of a study, or any that `jbrep.study.results.conclude` wrote tables into.
+        folder: of a study, or any that `jbrep.study.results.write_tables` wrote tables into.
         across_trainers: compare runs of different trainers, too.
 
     Raises:

@@ -6,6 +6,7 @@ from jbrep.lazy import exports
 
 if TYPE_CHECKING:
     from jbrep.rl.checkpoint import StoppedError as StoppedError
+    from jbrep.rl.job import Session as Session
     from jbrep.rl.run import Run as Run
     from jbrep.rl.trainers import train as train
 

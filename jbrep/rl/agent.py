@@ -30,7 +30,7 @@ from jbrep.rl.normalization import Statistics, normalized
 from jbrep.rl.presets import LINEAR, Hyperparameters, sb3_class
 from jbrep.training.trainer import allocate_adam_state, single_torch_thread
 
-See = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+Preprocess = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     "relu": torch.nn.ReLU,
     "tanh": torch.nn.Tanh,
@@ -161,7 +161,9 @@ def unchecked_distributions() -> Iterator[None]:
         Distribution.set_default_validate_args(before)
 
 
-def deterministic(policy: BasePolicy, task: Task, see: See, batch_size: int | None = None) -> Actor:
+def deterministic_actor(
+    policy: BasePolicy, task: Task, preprocess: Preprocess, batch_size: int | None = None
+) -> Actor:
     """The policy's most likely actions, within their bounds despite rounding.
 
     They are not finite where its weights aren't. A policy whose own actions are in [-1, 1] has them
@@ -170,20 +172,20 @@ def deterministic(policy: BasePolicy, task: Task, see: See, batch_size: int | No
     Args:
         policy: which to play.
         task: what is played.
-        see: what the policy sees of observations (n, d) in single precision.
+        preprocess: what the policy sees of observations (n, d) in single precision.
         batch_size: how many go through the network at once, since it rounds differently in batches
             of other sizes; all of them if not given.
     """
     policy.set_training_mode(False)
     low, high = (np.array(bound, np.float32) for bound in (task.action_low, task.action_high))
-    is_scaled = is_action_scaled(policy.action_space)
+    is_scaled, space = is_action_scaled(policy.action_space), policy.observation_space
 
     def act(observation: Array) -> NDArray[np.float32]:
         size = batch_size or len(observation)
         batches = torch.from_numpy(observation.astype(np.float32)).split(size)
         with single_torch_thread(), torch.no_grad(), unchecked_distributions():
             chosen = [
-                policy._predict(_as_observed(policy.observation_space, see(each.numpy())), True)
+                policy._predict(_as_observed(space, preprocess(each.numpy())), True)
                 for each in batches
             ]
         actions = torch.cat(chosen).numpy()
@@ -211,7 +213,7 @@ def is_action_scaled(space: gymnasium.Space[Any]) -> bool:
     return bool((space.low == -1).all() and (space.high == 1).all())
 
 
-def seeing(encode: See, statistics: Statistics | None) -> See:
+def preprocessor(encode: Preprocess, statistics: Statistics | None) -> Preprocess:
     """What a policy sees of observations: an encoder's latents, perhaps normalised."""
     return lambda rows: statistics(encode(rows)) if statistics else encode(rows)
 
@@ -237,24 +239,20 @@ class Evaluator:
     """Plays deterministic policies, in the same episodes each time.
 
     Args:
-        task: what is played.
+        lanes: to play in.
         encoder: the policy's view of the observation.
-        episodes: how many are played at once.
+        episodes: how many are played.
         seed: of the first episode; the others take the numbers that follow.
-        num_threads: as for `Lanes`.
-        lanes: to play in; new ones by default.
     """
 
     def __init__(
         self,
-        task: Task,
+        lanes: Lanes,
         encoder: BaseEncoder,
         episodes: int,
         seed: int = EVALUATION_SEED,
-        num_threads: int | None = 1,
-        lanes: Lanes | None = None,
     ):
-        self._lanes = lanes or Lanes(task, episodes, num_threads)
+        self._lanes = lanes
         self._encoder, self._seed, self._episodes = encoder, seed, episodes
 
     def close(self) -> None:
@@ -274,8 +272,9 @@ class Evaluator:
             NonFiniteActionError: the policy's actions are not finite.
             EnvironmentFailedError: the environment fails in the middle of an episode.
         """
-        see = seeing(self._encoder.encode, statistics_of(agent))
-        act, repeat = deterministic(agent.policy, self._lanes.task, see), action_repeat(agent)
+        preprocess = preprocessor(self._encoder.encode, statistics_of(agent))
+        act = deterministic_actor(agent.policy, self._lanes.task, preprocess)
+        repeat = action_repeat(agent)
         count = self._episodes if episodes is None else episodes
         seeds = range(self._seed, self._seed + count, self._lanes.num_lanes)
         played = (whole_outcome(self._lanes, lambda: held(act, repeat), seed) for seed in seeds)

@@ -22,7 +22,7 @@ class Bar:
         self._name = name if len(name) <= _NAME else f"{name[: _NAME - 3]}..."
         self._progress: Any = None
 
-    def show(self, job: Job, step: int, mean: float | None) -> None:
+    def show(self, job: Job, step: int) -> None:
         """Show the steps so far and the mean returns of the evaluations.
 
         The final evaluation can take minutes: all steps are told before it, and after it again.

@@ -197,7 +197,7 @@ class CheckpointFile:
             return None
         tensors, header = read_checkpoint(self.path)
         versions, settings = differences(header.versions, self._versions), header.settings
-        if settings.begins(self._settings) and not settings.schedules:
+        if settings.is_extended_by(self._settings) and not settings.schedules:
             settings = self._settings
         if others := settings.differing(self._settings) or versions:
             raise InputError(

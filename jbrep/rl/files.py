@@ -117,13 +117,13 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
         """The label with the seed: face_direction/sac-modern/dae-8/seed-0."""
         return f"{self.label}/seed-{self.seed}"
 
-    def is_evaluation_due(self, step: int, keeps: bool = False) -> bool:
+    def is_evaluation_due(self, step: int, keep_checkpoint: bool = False) -> bool:
         """Whether the policy is to be evaluated after so many steps, which aren't all.
 
         Where the run is kept, to go on later, they may be: the last evaluation comes after it.
         """
         at_once = self.control_steps(self.hyperparameters.num_envs)
-        return step % self.evaluate_every < at_once and (keeps or step < self.steps)
+        return step % self.evaluate_every < at_once and (keep_checkpoint or step < self.steps)
 
     @property
     def schedules(self) -> list[str]:
@@ -131,8 +131,8 @@ class RunSettings(SharedSettings, frozen=True, kw_only=True):
         chosen = self.hyperparameters.algorithm_kwargs.items()
         return [name for name, value in chosen if str(value).startswith(LINEAR)]
 
-    def begins(self, longer: "RunSettings") -> bool:
-        """Whether a longer run does the same as far as this one goes."""
+    def is_extended_by(self, longer: "RunSettings") -> bool:
+        """Whether `longer` differs in having more steps alone, so that it may go on from here."""
         return self.steps < longer.steps and not self.replace(steps=longer.steps).differing(longer)
 
     @property

@@ -23,11 +23,11 @@ from jbrep.records.storage import read_file
 from jbrep.rl.agent import action_repeat, is_action_scaled, one_line
 from jbrep.rl.normalization import Statistics
 from jbrep.rl.policy_file import MAX_BYTES
-from jbrep.rl.policy_zip import Told, told_by
+from jbrep.rl.policy_zip import ZipMetadata, read_metadata
 from jbrep.rl.presets import sb3_class
 from jbrep.rl.trained import Trained
 
-_PARTS = (spaces.Box, spaces.Discrete, spaces.MultiBinary)  # which `deterministic` knows
+_PARTS = (spaces.Box, spaces.Discrete, spaces.MultiBinary)  # which `deterministic_actor` knows
 _UNUSED: dict[str, Any] = {  # what only training needs: memory, or an environment to be made with
     "buffer_size": 1,
     "replay_buffer_class": None,
@@ -91,7 +91,7 @@ def load_zip(
 
 def _as_told(
     agent: BaseAlgorithm,
-    told: Told,
+    told: ZipMetadata,
     path: Path,
     task: Task | None,
     encoder: str | None,
@@ -130,14 +130,14 @@ def _checked(agent: BaseAlgorithm, task: Task, seen: BaseEncoder, path: Path) ->
     return Trained(agent.policy, task, seen, action_repeat=action_repeat(agent))
 
 
-def _loaded(raw: bytes, path: Path, algorithm: str) -> tuple[BaseAlgorithm, Told | None]:
+def _loaded(raw: bytes, path: Path, algorithm: str) -> tuple[BaseAlgorithm, ZipMetadata | None]:
     kind = sb3_class(algorithm)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of schedules that another Python pickled
             unused = _UNUSED | {"replay_buffer_kwargs": {}}  # to which loading may add
             agent = kind.load(io.BytesIO(raw), device="cpu", custom_objects=unused)
-        return agent, told_by(raw, path)
+        return agent, read_metadata(raw, path)
     except InputError:
         raise
     except Exception as error:  # whatever its pickled parts do

@@ -50,7 +50,6 @@ from jbrep.rl.run import Run
 from jbrep.rl.settings import CPU, MAX_LINE
 from jbrep.rl.trained import Trained, fill_whole, pack_whole
 
-Watch = Callable[[int, float | None], None]  # steps so far; mean return of the last evaluation
 Ended = tuple["Job", RunRecord]
 _PACKAGES = ("jbrep", "mujoco", "numpy", "sb3-contrib", "stable-baselines3", "torch")
 
@@ -64,18 +63,18 @@ class Session(NamedTuple):
     """What goes on around training.
 
     Attributes:
-        watch: called with a run, its steps so far and the mean return of its last evaluation.
+        watch: called with a run and its steps so far.
         save_every: seconds between checkpoints, at least.
         stop: asked before each rollout; once it is true, checkpoints are written and training ends.
         writers: of stable-baselines3's logger, that get what TensorBoard gets.
-        keeps: whether a run that has ended keeps a checkpoint, from which it can go on.
+        keep_checkpoint: whether a run that has ended keeps a checkpoint, from which it can go on.
     """
 
-    watch: Callable[["Job", int, float | None], None] = lambda job, step, mean: None
+    watch: Callable[["Job", int], None] = lambda job, step: None
     save_every: float = 60
     stop: Callable[[], bool] = lambda: False
     writers: Sequence[KVWriter] = ()
-    keeps: bool = False
+    keep_checkpoint: bool = False
 
 
 class Job:
@@ -129,7 +128,7 @@ class Job:
         if not exists(self.folder / RUN):
             return None
         result = read_run(self.folder)
-        if result.settings.begins(self.settings):
+        if result.settings.is_extended_by(self.settings):
             self._check_goes_on(result)
             return None
         if others := result.settings.differing(self.settings):
@@ -142,7 +141,7 @@ class Job:
             return settings
         before = read_run(self.folder).settings
         same = settings.replace(evaluate_every=before.evaluate_every)
-        return same if before.begins(same) else settings
+        return same if before.is_extended_by(same) else settings
 
     def _check_goes_on(self, before: RunRecord) -> None:
         """Make sure that a run with fewer steps can go on.
@@ -219,20 +218,20 @@ class Job:
         lanes = lanes or lanes_at_once(
             task, episodes, None if threads == 1 else threads, self.retries
         )
-        return Evaluator(task, self.encoder, episodes, lanes=lanes)
+        return Evaluator(lanes, self.encoder, episodes)
 
-    def is_evaluation_due(self, step: int, is_between: bool, keeps: bool) -> bool:
+    def is_evaluation_due(self, step: int, episode_ended: bool, keep_checkpoint: bool) -> bool:
         """Whether to evaluate after so many steps.
 
         Args:
             step: of training.
-            is_between: whether an episode of training has just ended.
-            keeps: as for `RunSettings.is_evaluation_due`.
+            episode_ended: whether an episode of training has just ended.
+            keep_checkpoint: as for `RunSettings.is_evaluation_due`.
         """
         every, last = self.settings.evaluate_every, self.history.evaluations[-1].step
         if not self.is_one_robot:
-            return self.settings.is_evaluation_due(step, keeps)
-        return is_between and step < self.settings.steps and step // every > last // every
+            return self.settings.is_evaluation_due(step, keep_checkpoint)
+        return episode_ended and step < self.settings.steps and step // every > last // every
 
     def close(self) -> None:
         """Free what the evaluations hold."""
@@ -243,7 +242,7 @@ class Job:
     def evaluate_finally(self, agent: BaseAlgorithm) -> None:
         """Evaluate a trained agent, in more episodes; see `evaluate`.
 
-        What was evaluated after the last step already, in case that the run goes on, makes room.
+        This replaces an evaluation that was made after the last step as the run is kept to go on.
         """
         self.history.forget_from(self.settings.steps)
         self.evaluate(agent, self.settings.final_episodes)

@@ -66,7 +66,7 @@ def load_run(folder: Path, encoder: Any = None) -> Trained:
     return built.with_weights(weights, tensors, path)
 
 
-def load_untrained(folder: Path, encoder: Any = None) -> Trained:
+def load_untrained(folder: Path) -> Trained:
     """The policy that a run began with.
 
     Raises:
@@ -74,7 +74,7 @@ def load_untrained(folder: Path, encoder: Any = None) -> Trained:
         DamageError: a file isn't what was written.
     """
     settings = run_settings(folder)
-    built = _untrained(folder, settings, encoder)
+    built = _untrained(folder, settings, None)
     if settings.begin_from is None:
         return built
     policy = read(folder / BEGINNING, settings.begin_from)

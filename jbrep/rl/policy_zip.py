@@ -34,7 +34,7 @@ _OF_THIS_PROCESS = {  # wall times, and where the environment was: `load` starts
 }
 
 
-class Told(NamedTuple):
+class ZipMetadata(NamedTuple):
     """What a zip file that jbrep wrote says beside what stable-baselines3 reads."""
 
     header: ZipHeader
@@ -68,7 +68,7 @@ def policy_zip(agent: BaseAlgorithm, settings: RunSettings) -> bytes:
     return content.getvalue()
 
 
-def told_by(raw: bytes, path: Path) -> Told | None:
+def read_metadata(raw: bytes, path: Path) -> ZipMetadata | None:
     """What a zip file's bytes say; None if jbrep didn't write them. The path is for messages.
 
     Raises:
@@ -81,7 +81,7 @@ def told_by(raw: bytes, path: Path) -> Told | None:
     header = document_in(members.read(_HEADER), path, ZipHeader)
     has_statistics = STATISTICS in names
     statistics = safetensors.numpy.load(members.read(STATISTICS)) if has_statistics else {}
-    return Told(header, statistics)
+    return ZipMetadata(header, statistics)
 
 
 def _header(settings: RunSettings) -> ZipHeader:

@@ -134,8 +134,8 @@ class _Follower(BaseCallback):
             total, length = float(info["episode"]["r"]), info["control_steps"]
             row = Episode(step, lane, total, length, info.get("non_finite", False))
             self._job.history.episodes.append(row)
-        is_between = bool(self.locals["dones"].any())
-        if self._job.is_evaluation_due(step, is_between, self._session.keeps):
+        episode_ended = bool(self.locals["dones"].any())
+        if self._job.is_evaluation_due(step, episode_ended, self._session.keep_checkpoint):
             self._evaluate(self.locals["new_obs"])
         return True
 
@@ -158,14 +158,14 @@ class _Follower(BaseCallback):
     def _on_training_end(self) -> None:
         check_finite(self.model)
         self._tell()  # the last evaluation can take minutes
-        if self._session.keeps:
+        if self._session.keep_checkpoint:
             _draw_noise(self.model)
             self._job.checkpoint.write(take(self.model))
         self._job.evaluate_finally(self.model)
         self._tell()
 
     def _tell(self) -> None:
-        self._session.watch(self._job, self._job.step_of(self.model), self._job.history.mean)
+        self._session.watch(self._job, self._job.step_of(self.model))
 
 
 def check_finite(agent: BaseAlgorithm) -> None:

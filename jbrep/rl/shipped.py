@@ -65,7 +65,7 @@ def shipped() -> list[Shipped]:
     return found
 
 
-def write_returns(played: Mapping[str, Returns], folder: Path = FOLDER) -> None:
+def write_returns(played: Mapping[str, Returns]) -> None:
     """Write what policies return, by task."""
     rows: Iterable[tuple[str, str, int, str]] = (
         (task, policy, episode, f"{value:.3f}")
@@ -73,7 +73,7 @@ def write_returns(played: Mapping[str, Returns], folder: Path = FOLDER) -> None:
         for policy, values in returns.items()
         for episode, value in enumerate(values)
     )
-    write_csv(folder / _RETURNS, [*_COLUMNS], rows)
+    write_csv(FOLDER / _RETURNS, [*_COLUMNS], rows)
 
 
 def _read_returns() -> dict[str, Returns]:

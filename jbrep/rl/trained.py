@@ -17,7 +17,7 @@ from jbrep.errors import DamageError, InputError
 from jbrep.records import container
 from jbrep.records.container import Tensors, without
 from jbrep.records.storage import write_whole
-from jbrep.rl.agent import Spaces, deterministic, make_agent, one_line, seeing
+from jbrep.rl.agent import Spaces, deterministic_actor, make_agent, one_line, preprocessor
 from jbrep.rl.files import PolicyHeader, RunSettings
 from jbrep.rl.normalization import Statistics
 from jbrep.rl.overrides import check_shape
@@ -50,14 +50,16 @@ class Trained(NamedTuple):
 
         The actor raises an InputError for actions that are not finite.
         """
-        see = seeing(self.encoder.encode, self.statistics)
-        return self._held(deterministic(self.policy, self.task, see))
+        preprocess = preprocessor(self.encoder.encode, self.statistics)
+        return self._held(deterministic_actor(self.policy, self.task, preprocess))
 
     def one_by_one(self) -> Actor:
         """The same with an encoder in torch, in one episode at a time."""
         encode = self.encoder.encode
-        see = seeing(lambda row: encode(torch.from_numpy(row)).numpy(), self.statistics)
-        return self._held(deterministic(self.policy, self.task, see, batch_size=1))
+        preprocess = preprocessor(
+            lambda row: encode(torch.from_numpy(row)).numpy(), self.statistics
+        )
+        return self._held(deterministic_actor(self.policy, self.task, preprocess, batch_size=1))
 
     def _held(self, act: Actor) -> Actor:
         return held(_finite(act), self.action_repeat)

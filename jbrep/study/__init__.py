@@ -3,7 +3,7 @@
 from jbrep.stats.rules import Rules
 from jbrep.study.config import Data, Study, read_study
 from jbrep.study.plan import Plan
-from jbrep.study.results import conclude
+from jbrep.study.results import write_tables
 from jbrep.study.runner import register_study, run_study
 
 __all__ = [
@@ -11,8 +11,8 @@ __all__ = [
     "Plan",
     "Rules",
     "Study",
-    "conclude",
     "read_study",
     "register_study",
     "run_study",
+    "write_tables",
 ]

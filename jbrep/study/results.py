@@ -38,14 +38,14 @@ from jbrep.study.tables import (
     RunInfo,
     by_run,
     read_references,
-    stated,
+    table_hashes,
     write_references,
 )
 
 Ended = dict[Path, RunRecord]  # what run.json says of each run that has ended, by folder
 
 
-def conclude(folder: Path) -> list[Path]:
+def write_tables(folder: Path) -> list[Path]:
     """Write the tables of the runs below a folder, of a study or not, as far as they have ended.
 
     Args:
@@ -57,7 +57,7 @@ def conclude(folder: Path) -> list[Path]:
     Raises:
         InputError: there is no such run, a file is damaged, or a table can't be written.
     """
-    ended, before = _ended(folder), stated(folder)
+    ended, before = _ended(folder), table_hashes(folder)
     references = write_references(_tasks(ended.values()), folder, before)
     rows, infos = list(_returns(ended)), list(_of_runs(ended, read_infos))
     tables = {name: before[name] for name in (DIAGNOSTICS,) if name in before}
@@ -112,7 +112,7 @@ def read_runs(folder: Path) -> list[RunCurve]:
         InputError: there is none, or a file of one is damaged.
     """
     ended = _ended(folder)
-    references = read_references(folder, stated(folder).get(REFERENCE_RETURNS))
+    references = read_references(folder, table_hashes(folder).get(REFERENCE_RETURNS))
     return _curves(runs_record(folder, ended, {}), _returns(ended), references, Rules())
 
 

@@ -109,7 +109,7 @@ def run_study(
 
     A study that names primary cells is registered first, unless it has begun.
 
-    `jbrep.study.results.conclude` then writes what came of it.
+    `jbrep.study.results.write_tables` then writes what came of it.
 
     Args:
         plan: the study.

@@ -92,8 +92,8 @@ def by_run(returns: Iterable[Return]) -> dict[tuple[str, int], dict[int, list[fl
     return found
 
 
-def stated(folder: Path) -> Mapping[str, str]:
-    """The SHA-256 of each table that runs.json in a folder says; nothing where that is no use."""
+def table_hashes(folder: Path) -> Mapping[str, str]:
+    """The SHA-256 of each table by runs.json; none where that is missing or can't be read."""
     try:
         return read_document(folder / RECORD, RunsRecord).tables
     except InputError:

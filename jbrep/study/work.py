@@ -99,8 +99,8 @@ class _ProgressFiles:
         self._steps = steps  # of each run
         self._written: dict[Path, float] = {}
 
-    def __call__(self, job: Job, step: int, mean: float | None) -> None:
-        now, folder = time.monotonic(), job.folder
+    def __call__(self, job: Job, step: int) -> None:
+        now, folder, mean = time.monotonic(), job.folder, job.history.mean
         if step >= self._steps or now - self._written.get(folder, 0.0) >= _WRITE_EVERY:
             shown = "-" if mean is None else rounded(mean)[0]
             write_note(folder / PROGRESS, f"{step} {shown}")

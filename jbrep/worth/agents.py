@@ -55,7 +55,7 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
     done = dict.fromkeys(jobs.values(), 0)
     with Progress(total=STEPS * len(jobs), unit="step", unit_scale=True, desc="agents") as bar:
 
-        def watch(job: Job, step: int, mean: float | None) -> None:
+        def watch(job: Job, step: int) -> None:
             bar.update(min(step, STEPS) - done[job])
             done[job] = min(step, STEPS)
 

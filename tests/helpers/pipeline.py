@@ -55,7 +55,7 @@ def in_peace(folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(BACKENDS, "local", in_this_process)
         with pytest.MonkeyPatch.context() as once:
-            once.setattr("jbrep.report.report.write_report_of", lambda tables, out: [out])
+            once.setattr("jbrep.report.report.write_report", lambda tables, out: [out])
             said = {stage: jbrep(*given).output for stage, given in stages(folder).items()}
         return said | {"report": jbrep("report", folder / "study").output}
 

@@ -106,7 +106,7 @@ def _draw_features(task: str, encoders: _Encoders) -> Figure:
         else f"the {MOST} worst of {len(features)} features"
     )
     title = f"{task}:\nreconstruction of {which}"
-    return heat_map(values[worst], names, list(encoders), title, "R² on held-out episodes")
+    return heat_map(values[worst], names, list(encoders), title)
 
 
 def _error_by_latent(task: str, encoders: _Encoders) -> Plot:

@@ -24,9 +24,7 @@ _CHARACTER = 0.06  # of a title [inches]
 _LOWEST = -0.1  # R² on an axis
 
 
-def heat_map(
-    values: Array, rows: Sequence[str], columns: Sequence[str], title: str, label: str
-) -> Figure:
+def heat_map(values: Array, rows: Sequence[str], columns: Sequence[str], title: str) -> Figure:
     """A cell for each R² (rows, columns), coloured from 0 to 1; NaN where it isn't defined."""
     width = max(COLUMN, 1.7 + 0.29 * len(columns))
     figure = Figure(figsize=(width, 1.0 + 0.16 * len(rows)))
@@ -41,7 +39,7 @@ def heat_map(
     bare(axes)
     lines = (fill(plain(line), int(width / _CHARACTER)) for line in title.splitlines())
     figure.suptitle("\n".join(lines), x=0.01, ha="left", size=7.5)
-    figure.colorbar(picture, label=label)
+    figure.colorbar(picture, label="R² on held-out episodes")
     return figure
 
 
@@ -110,7 +108,6 @@ def _draw_features(task: str, encoders: Encoders, steps: str) -> Figure:
         [*(features[i] for i in shown), *_SUMS.values()],
         list(encoders),
         f"{task}:\nprediction of changes and reward over {steps} steps",
-        "R² on held-out episodes",
     )
     figure.axes[0].axhline(len(shown) - 0.5, color="white", linewidth=1.5)
     return figure

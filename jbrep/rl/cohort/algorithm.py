@@ -85,7 +85,7 @@ class Algorithm(ABC):
         """Reward and discounted value of the next state, (n, b, 1)."""
         return batch.reward + (1 - batch.terminated) * batch.discount * next_value
 
-    def td_error(self, critic: Sequence[Network], batch: Batch, target: Tensor) -> Tensor:
+    def critic_loss(self, critic: Sequence[Network], batch: Batch, target: Tensor) -> Tensor:
         """The sum of the mean squared errors of a critic's networks, (n,)."""
         q_values = self.q_values(critic, batch.observation, batch.action)
         return torch.stack([((q - target) ** 2).mean((1, 2)) for q in q_values]).sum(0)
@@ -113,20 +113,9 @@ def optimizer_step(optimizer: Optimizer) -> Iterator[None]:
     optimizer.zero_grad()
 
 
-class Following:
-    """The weights of target networks that follow those of others.
-
-    Args:
-        weights: of networks.
-        targets: the same of their targets.
-    """
-
-    def __init__(self, weights: Any, targets: Any):
-        self._weights, self._targets = tree_leaves(weights), tree_leaves(targets)
-
-    def move(self, tau: float) -> None:
-        """Move the targets' weights by a share of the distance."""
-        torch._foreach_lerp_(self._targets, self._weights, tau)
+def polyak_update(networks: Any, targets: Any, tau: float) -> None:
+    """Move the weights of target networks towards those of networks by a share tau."""
+    torch._foreach_lerp_(tree_leaves(targets), tree_leaves(networks), tau)
 
 
 def check(algorithm: str, hyperparameters: Hyperparameters) -> None:

@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import Tensor
 
 from jbrep.encoders.base import Float32
-from jbrep.envs.endless import Endless
+from jbrep.envs.autoreset import AutoresetLanes
 from jbrep.envs.task import Array
 from jbrep.records.container import without
 from jbrep.rl.agent import training_seed
@@ -18,7 +19,7 @@ from jbrep.rl.cohort import get_algorithm
 from jbrep.rl.cohort.algorithm import Batch, Losses
 from jbrep.rl.cohort.member import Member
 from jbrep.rl.cohort.networks import Stack
-from jbrep.rl.cohort.replay import Ahead, ReplayBuffer, capacity_of
+from jbrep.rl.cohort.replay import ReplayBuffer, capacity_of
 from jbrep.rl.job import Job
 
 
@@ -38,20 +39,20 @@ class Cohort:
         self._settings, self._lanes = settings, settings.hyperparameters.num_envs
         self._size = padded_size(job)
         sizes = self._size, task.action_size
-        ahead = Ahead(self._shared.n_steps, self._shared.gamma)
+        looks = self._shared.n_steps, self._shared.gamma
         capacity = capacity_of(job.run)
-        self._replay = ReplayBuffer(len(members), self._lanes, capacity, *sizes, ahead)
+        self._replay = ReplayBuffer(len(members), self._lanes, capacity, *sizes, *looks)
         lanes, repeat = len(members) * self._lanes, settings.hyperparameters.action_repeat
-        self._endless = Endless(task, lanes, job.threads_for(lanes), repeat, job.retries)
+        self._robots = AutoresetLanes(task, lanes, job.threads_for(lanes), repeat, job.retries)
         self._device = torch.device(settings.device)
         agents = [member.agent for member in members]
         self._stack = Stack(agents, self._size, settings.precision, settings.device)
         self._algorithm = get_algorithm(settings.algorithm)(self._stack)
         self._stack.read_from_agents()
-        job.share(self._endless.lanes)
+        job.share(self._robots.lanes)
         seeds = [training_seed(m.job.run.seed) + i for m in members for i in range(self._lanes)]
-        self._observation = self._encode(self._endless.reset(seeds))
-        self._is_between = False  # whether an episode has just ended
+        self._observation = self._encode(self._robots.reset(seeds))
+        self._episode_ended = False  # whether an episode has just ended
         self._update_statistics()
 
     @property
@@ -73,8 +74,8 @@ class Cohort:
         scaled = self._choose_actions()
         action = self._shared.policy.unscale_action(scaled)
         lanes = action.reshape(-1, action.shape[2]).astype(float)
-        moved = self._endless.step(self._endless.lanes.task.unscale_action(lanes))
-        self._is_between = bool(moved.ended.any())
+        moved = self._robots.step(self._robots.lanes.task.unscale_action(lanes))
+        self._episode_ended = bool(moved.ended.any())
         self.agent_step += self._lanes
         ended, terminated = self._by_member(moved.ended), self._by_member(moved.terminated)
         reward = self._by_member(moved.reward).astype(np.float32)
@@ -189,28 +190,28 @@ class Cohort:
 
     def evaluate(self) -> None:
         """Let each member play its policy that hasn't failed."""
-        self._let_play(lambda member: member.job.evaluate)
+        self._let_play(Job.evaluate)
 
     def evaluate_finally(self) -> None:
         """The same after training, in more episodes."""
-        self._let_play(lambda member: member.job.evaluate_finally)
+        self._let_play(Job.evaluate_finally)
 
-    def _let_play(self, evaluation: Callable[[Member], Callable[[Any], None]]) -> None:
+    def _let_play(self, evaluation: Callable[[Job, BaseAlgorithm], None]) -> None:
         self.write_to_agents()
         for member in self.members:
             if not member.failure:
-                member.evaluate(evaluation(member))
+                member.evaluate(evaluation)
         if self.members[0].job.is_one_robot:
-            self._observation = self._encode(self._endless.restart())
+            self._observation = self._encode(self._robots.restart())
 
-    def evaluate_if_due(self, keeps: bool) -> None:
+    def evaluate_if_due(self, keep_checkpoint: bool) -> None:
         """Evaluate, if it is time; see `RunSettings.is_evaluation_due`."""
-        if self.members[0].job.is_evaluation_due(self.step, self._is_between, keeps):
+        if self.members[0].job.is_evaluation_due(self.step, self._episode_ended, keep_checkpoint):
             self.evaluate()
 
     def close(self) -> None:
         """Free what the environments hold."""
-        self._endless.lanes.close()
+        self._robots.lanes.close()
         for member in self.members:
             member.job.close()
 
@@ -249,7 +250,7 @@ class Cohort:
         tensors, counters = member.take()
         number = self.members.index(member)
         own = slice(number * self._lanes, (number + 1) * self._lanes)
-        tensors |= {f"{LANES}{name}": each[own] for name, each in self._endless.state.items()}
+        tensors |= {f"{LANES}{name}": each[own] for name, each in self._robots.state.items()}
         tensors |= {"observation": self._observation[number]}
         tensors |= {"replay": self._replay.rows_of(number)}
         return Snapshot(tensors, {**counters, "added": self._replay.added})
@@ -264,7 +265,7 @@ class Cohort:
         self._observation = np.stack([each["observation"] for each in tensors])
         self._replay.restore([each["replay"] for each in tensors], snapshots[0].counters["added"])
         lanes = [without(LANES, each) for each in tensors]
-        self._endless.restore({n: joined([each[n] for each in lanes]) for n in lanes[0]})
+        self._robots.restore({n: joined([each[n] for each in lanes]) for n in lanes[0]})
 
 
 def padded_size(job: Job) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import Tensor
@@ -123,10 +124,10 @@ class Member:
         if not math.isfinite(weights):
             self.fail(WEIGHTS_NOT_FINITE)
 
-    def evaluate(self, evaluation: Callable[[Any], None]) -> None:
+    def evaluate(self, evaluation: Callable[[Job, BaseAlgorithm], None]) -> None:
         """Let an evaluation of its job's play its agent's policy."""
         try:
-            evaluation(self.agent)
+            evaluation(self.job, self.agent)
         except NonFiniteActionError:
             self.fail(ACTIONS_NOT_FINITE)
         except EnvironmentFailedError as error:

@@ -63,7 +63,7 @@ class MLP(NamedTuple):
 
     def __call__(self, network: Network, inputs: Tensor) -> Tensor:
         """The outputs (n, b, out) of networks on inputs (n, b, in)."""
-        outputs: Tensor = _Compute.apply(
+        outputs: Tensor = _StackedMLP.apply(
             inputs, self, *(each for layer in network for each in layer)
         )
         return outputs
@@ -78,8 +78,8 @@ class _Done(NamedTuple):
     after: Tensor
 
 
-class _Compute(Function):
-    """Networks, and their gradients: some from layer to layer, then the next.
+class _StackedMLP(Function):
+    """Forward and backward of stacked MLPs, some networks at a time.
 
     So what a layer leaves is still in the processor's cache when the next one takes it.
     """

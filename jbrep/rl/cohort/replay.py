@@ -1,7 +1,6 @@
 """Replay buffers of n agents."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from jbrep.rl.run import Run
 
 
 def capacity_of(run: Run) -> int:
-    """The most transitions that a run keeps: no more than it makes, in whole rollouts."""
+    """The most transitions that a run keep_checkpoint: no more than it makes, in whole rollouts."""
     chosen = run.learner.hyperparameters
     usual, _ = parameters_of(run.learner.algorithm)
     size, steps = (
@@ -34,13 +33,6 @@ def _sizes(observation: int, action: int) -> tuple[int, ...]:
     return observation, action, observation, 1, 1, 1
 
 
-class Ahead(NamedTuple):
-    """How far transitions look ahead that are learned from."""
-
-    n_steps: int
-    gamma: float
-
-
 class ReplayBuffer:
     """The last transitions of each agent, as stable-baselines3's ReplayBuffer keeps them.
 
@@ -52,16 +44,25 @@ class ReplayBuffer:
         capacity: transitions of each agent.
         observation: numbers in an observation.
         action: numbers in an action.
-        ahead: how far those that are sampled look.
+        n_steps: rewards that are summed, of a sample.
+        gamma: by which each of them is discounted.
 
     Attributes:
         added: steps since the start.
     """
 
     def __init__(
-        self, agents: int, lanes: int, capacity: int, observation: int, action: int, ahead: Ahead
+        self,
+        agents: int,
+        lanes: int,
+        capacity: int,
+        observation: int,
+        action: int,
+        n_steps: int,
+        gamma: float,
     ):
-        self._sizes, self.added, self._ahead = _sizes(observation, action), 0, ahead
+        self._sizes, self.added = _sizes(observation, action), 0
+        self._n_steps, self._gamma = n_steps, gamma
         self._steps = max(capacity // lanes, 1)
         self._rows = np.empty((agents, self._steps, lanes, sum(self._sizes)), np.float32)
 
@@ -95,14 +96,14 @@ class ReplayBuffer:
         One is shorter where its episode ends, or where the newest step is. Its reward is the
         discounted sum of those on the way.
         """
-        agents, ahead = np.arange(len(steps))[:, None, None], np.arange(self._ahead.n_steps)
+        agents, ahead = np.arange(len(steps))[:, None, None], np.arange(self._n_steps)
         places = (steps[..., None] + ahead) % self._steps
         rows = self._rows[agents, places, lanes[..., None]]  # (n, b, n_steps, width)
         ends = (rows[..., -1] > 0) | (places == (self.added - 1) % self._steps)
         last = np.where(ends.any(2), ends.argmax(2), len(ahead) - 1)[..., None]  # (n, b, 1)
-        discounts = self._ahead.gamma ** ahead.astype(np.float32)
+        discounts = self._gamma ** ahead.astype(np.float32)
         reward = np.where(ahead <= last, rows[..., -3] * discounts, 0).sum(2, keepdims=True)
-        discount = self._ahead.gamma ** (last + 1).astype(np.float32)
+        discount = self._gamma ** (last + 1).astype(np.float32)
         observation, action, *_ = self._split(rows[:, :, 0])
         *_, final, _, terminated, _ = self._split(
             np.take_along_axis(rows, last[..., None], 2)[:, :, 0]

@@ -7,7 +7,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from jbrep.rl.cohort.algorithm import Algorithm, Batch, Following, Losses, min_q, optimizer_step
+from jbrep.rl.cohort.algorithm import (
+    Algorithm,
+    Batch,
+    Losses,
+    min_q,
+    optimizer_step,
+    polyak_update,
+)
 from jbrep.rl.cohort.networks import Stack
 
 _LOG_STD = (-20.0, 2.0)  # the limits of stable-baselines3's actor
@@ -33,7 +40,6 @@ class SAC(Algorithm):
             lambda each: [[*each.actor.latent_pi, [each.actor.mu, each.actor.log_std]]]
         )
         self.actor_optimizer = stack.adam(self.actor, lambda each: each.actor.optimizer)
-        self.targets = Following(self.critic, self.critic_target)
         self.ent_coef_optimizer = None  # the coefficient is fixed
         if agent.ent_coef_optimizer is None:
             self.log_ent_coef = stack.numbers(lambda each: each.ent_coef_tensor.log())
@@ -71,7 +77,7 @@ class SAC(Algorithm):
             **self.update_ent_coef(log_prob),
         }
         if gradient_step % self.target_update_interval == 0:
-            self.targets.move(self.tau)
+            polyak_update(self.critic, self.critic_target, self.tau)
         return losses
 
     def update_critic(self, batch: Batch, normal: Tensor, ent_coef: Tensor) -> Tensor:
@@ -80,7 +86,7 @@ class SAC(Algorithm):
         next_q = min_q(self.q_values(self.critic_target, batch.next_observation, next_action))
         target = self.td_target(batch, next_q - ent_coef * next_log_prob)
         with optimizer_step(self.critic_optimizer):
-            loss = 0.5 * self.td_error(self.critic, batch, target)
+            loss = 0.5 * self.critic_loss(self.critic, batch, target)
             loss.sum().backward()
         return loss.detach()
 

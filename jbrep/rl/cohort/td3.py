@@ -9,7 +9,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from jbrep.rl.cohort.algorithm import Algorithm, Batch, Following, Losses, min_q, optimizer_step
+from jbrep.rl.cohort.algorithm import (
+    Algorithm,
+    Batch,
+    Losses,
+    min_q,
+    optimizer_step,
+    polyak_update,
+)
 from jbrep.rl.cohort.networks import Network, Stack
 
 
@@ -28,8 +35,6 @@ class TD3(Algorithm):
         self.target_noise_clip: float = agent.target_noise_clip
         (self.actor,) = stack.networks(lambda each: [each.actor.mu])
         (self.actor_target,) = stack.networks(lambda each: [each.actor_target.mu])
-        pair = [self.critic, self.actor], [self.critic_target, self.actor_target]
-        self.targets = Following(*pair)
         self.actor_optimizer = stack.adam(self.actor, lambda each: each.actor.optimizer)
 
     def explore(self, observation: Tensor, normals: Sequence[Tensor]) -> Tensor:
@@ -47,7 +52,8 @@ class TD3(Algorithm):
         losses = {"critic_loss": self.update_critic(batch, normals[0])}
         if n_updates % self.policy_delay == 0:
             losses["actor_loss"] = self.update_actor(batch.observation)
-            self.targets.move(self.tau)
+            polyak_update(self.critic, self.critic_target, self.tau)
+            polyak_update(self.actor, self.actor_target, self.tau)
         return losses
 
     def update_critic(self, batch: Batch, normal: Tensor) -> Tensor:
@@ -58,7 +64,7 @@ class TD3(Algorithm):
         next_q = min_q(self.q_values(self.critic_target, batch.next_observation, next_action))
         target = self.td_target(batch, next_q)
         with optimizer_step(self.critic_optimizer):
-            loss = self.td_error(self.critic, batch, target)
+            loss = self.critic_loss(self.critic, batch, target)
             loss.sum().backward()
         return loss.detach()
 

@@ -73,10 +73,10 @@ def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
             _save(cohort, session)
             for _ in range(cohort.rollout):
                 cohort.act()
-                cohort.evaluate_if_due(session.keeps)
+                cohort.evaluate_if_due(session.keep_checkpoint)
             cohort.learn()
         _tell(cohort, session)  # the last evaluation can take minutes
-        if session.keeps:
+        if session.keep_checkpoint:
             _write(cohort)
         cohort.evaluate_finally()
         _tell(cohort, session)
@@ -95,7 +95,7 @@ def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
 
 def _tell(cohort: Cohort, session: Session) -> None:
     for member in cohort.members:
-        session.watch(member.job, cohort.step, member.job.history.mean)
+        session.watch(member.job, cohort.step)
 
 
 def _save(cohort: Cohort, session: Session) -> None:

@@ -1,4 +1,4 @@
-"""Lanes that never stop: where an episode ends, the next one begins."""
+"""Lanes with autoreset: where an episode ends, the same step begins the next one."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from jbrep.envs.task import Array, Task
 from jbrep.errors import InputError
 
 
-class Moved(NamedTuple):
+class AutoresetStep(NamedTuple):
     """What an action in each of n lanes led to."""
 
     observation: Array  # (n, d); the first of the next episode where one ended
@@ -35,7 +35,7 @@ class Moved(NamedTuple):
         return told
 
 
-class Endless:
+class AutoresetLanes:
     """Lanes whose episodes follow one another.
 
     The first episode of a lane has the lane's seed, as in a Gymnasium environment; episode k from 1
@@ -80,7 +80,7 @@ class Endless:
         """Start the episodes of now once more, as after others were played in their lanes."""
         return self._start(range(self.lanes.num_lanes))
 
-    def step(self, actions: Array) -> Moved:
+    def step(self, actions: Array) -> AutoresetStep:
         """Hold an action in every lane for its steps; actions (n, k).
 
         Raises:
@@ -93,7 +93,7 @@ class Endless:
             self._episodes[numbers] += 1
             observation = self._start(numbers)
         final, terminated = step.observation, step.terminated
-        return Moved(observation, final, reward, length, ended, terminated, non_finite)
+        return AutoresetStep(observation, final, reward, length, ended, terminated, non_finite)
 
     def _hold(self, actions: Array) -> tuple[Step, Array, Flags | None]:
         """The last step, the sum of rewards, and whether the physics diverged in any."""
