@@ -54,17 +54,9 @@ check: docs ## lint, types, import direction, links of the documentation
 	$(BIN)/lint-imports
 
 bench: $(READY) ## speed as ratios in one run, and what the hand-written policies return
-	$(BIN)/python benchmarks/quick.py
-	$(BIN)/python benchmarks/throughput.py
-	$(BIN)/python benchmarks/dataset.py
-	$(BIN)/python benchmarks/encoders.py
-	$(BIN)/python benchmarks/methods.py
-	$(BIN)/python benchmarks/learning.py
-	$(BIN)/python benchmarks/cohorts.py
-	$(BIN)/python benchmarks/wide.py
-	$(BIN)/python benchmarks/inspection.py
-	$(BIN)/python benchmarks/heuristics.py
-	$(BIN)/python benchmarks/environments.py
+	for each in quick throughput dataset encoders methods learning cohorts wide inspection heuristics environments; do \
+	  $(BIN)/python benchmarks/$$each.py || exit; \
+	done
 
 pictures: $(READY) ## the pictures in docs/, drawn anew
 	rm -f docs/jitterbug.gif

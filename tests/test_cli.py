@@ -16,7 +16,8 @@ from stable_baselines3 import A2C
 from test_study import TOML
 
 from jbrep.cli import main
-from jbrep.cli.base import COUNT, stoppable
+from jbrep.cli.base import COUNT
+from jbrep.cli.signals import stoppable
 from jbrep.encoders import find, load, save
 from jbrep.encoders.shipped import unlearned
 from jbrep.envs import describe

@@ -8,13 +8,13 @@ from pathlib import Path
 import click
 import gymnasium
 import pytest
+from key_table import key_table
 
 from jbrep.cli import main
 from jbrep.coordinates import make_coordinates
 from jbrep.dataset.layout import Layout
 from jbrep.encoders.header import EncoderHeader
 from jbrep.envs import describe
-from jbrep.records.keys import key_table
 from jbrep.rl.settings import TrainingSettings
 from jbrep.stats.rules import Rules
 from jbrep.study.config import Data, Study, as_study

@@ -5,11 +5,11 @@ from typing import Annotated, Literal
 import click
 import pytest
 from click.testing import CliRunner
+from key_table import key_table
 from msgspec import Meta, field
 
 from jbrep.cli.options import record_options
 from jbrep.errors import InputError
-from jbrep.records.keys import key_table
 from jbrep.records.record import Record
 
 

@@ -10,11 +10,11 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 import numpy as np
 import pytest
+from key_table import key_table
 from msgspec import Meta
 
 from jbrep.errors import DamageError, InputError
 from jbrep.records.document import Document, read_document, sealed
-from jbrep.records.keys import key_table
 from jbrep.records.record import Finite, Record, from_plain, from_text, to_plain
 from jbrep.records.toml import toml_text
 

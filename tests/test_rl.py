@@ -327,7 +327,7 @@ def test_ctrl_c_stops_the_command_with_a_checkpoint(tmp_path):
 
 def test_a_second_signal_ends_the_command_at_once():
     text = (
-        "import os, signal, time; from jbrep.cli.rl import stop_signals\n"
+        "import os, signal, time; from jbrep.cli.signals import stop_signals\n"
         "with stop_signals() as received:\n"
         "    os.kill(os.getpid(), signal.SIGTERM); print(len(received), flush=True)\n"
         "    os.kill(os.getpid(), signal.SIGINT); time.sleep(60)"

@@ -2,11 +2,12 @@
 
 import click
 
-from jbrep.cli.base import Cli, printable
+from jbrep.cli.base import Cli
 from jbrep.cli.data import collect, data
 from jbrep.cli.encoders import encoder, evaluate
 from jbrep.cli.environment import env
 from jbrep.cli.inspect import inspect
+from jbrep.cli.output import printable
 from jbrep.cli.policies import behaviour, evaluate_policy, policies
 from jbrep.cli.policy import policy
 from jbrep.cli.render import render

@@ -1,101 +1,24 @@
-"""What the commands share: how mistakes are shown, Ctrl-C, numbers as people write them."""
+"""What the commands share: how mistakes are shown, options, numbers as people write them."""
 
-import _thread
 import errno
-import json
 import math
 import os
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import Any, NoReturn, TextIO, TypeVar
+from typing import Any, TypeVar
 
 import click
 
+from jbrep.cli.output import lasting_output, printable, say, tell
+from jbrep.cli.signals import leave
 from jbrep.errors import InputError, Notice
-from jbrep.text import terminal_width, wrapped
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
-
-
-@contextmanager
-def lasting_output() -> Iterator[None]:
-    """Let a command finish its work whatever becomes of its output.
-
-    A reader that has seen enough, as `head` has, is no error. Output that is lost for want of
-    space is told on standard error once the work is done, and ends the command with code 1.
-    """
-    _open_standard_descriptors()
-    streams = sys.stdout, sys.stderr
-    out, err = _Lasting(sys.stdout), _Lasting(sys.stderr)
-    sys.stdout, sys.stderr = out, err
-    try:
-        yield
-    except SystemExit as ending:
-        out.flush()
-        if out.is_incomplete and not ending.code:
-            err.write(f"Error: can't write the output: {os.strerror(out.error)}\n")
-            raise SystemExit(1) from None
-        raise
-    finally:
-        out.flush()
-        err.flush()
-        sys.stdout, sys.stderr = streams
-
-
-def _open_standard_descriptors() -> None:
-    """Fill those that are closed, or else the next files to be opened would take their places."""
-    for descriptor in range(3):
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest free one
-
-
-class _Lasting:
-    """A text stream that goes quiet at the first error.
-
-    Attributes:
-        error: the number of that error; 0 before it.
-    """
-
-    def __init__(self, stream: TextIO | None):
-        self._stream: Any = stream or open(os.devnull, "w")  # noqa: PTH123, SIM115
-        self.error = 0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    @property
-    def is_incomplete(self) -> bool:
-        """Whether something is missing of what a reader still waits for."""
-        return self.error not in (0, errno.EPIPE)
-
-    def write(self, text: str) -> int:
-        try:
-            return self._stream.write(text)
-        except OSError as error:
-            self._silence(error)
-            return len(text)
-
-    def flush(self) -> None:
-        try:
-            self._stream.flush()
-        except OSError as error:
-            self._silence(error)
-
-    def _silence(self, error: OSError) -> None:
-        """Send what is still buffered, and all that follows, nowhere."""
-        self.error = self.error or error.errno or errno.EIO
-        with suppress(OSError, ValueError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
 
 
 class _Count(click.ParamType[int]):
@@ -131,7 +54,6 @@ class _Count(click.ParamType[int]):
 
 COUNT, POSITIVE = _Count(), _Count(least=1)
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 RESUMES = "the same command resumes it"
 
 
@@ -140,63 +62,6 @@ class _Mistake(click.ClickException):
 
     def __init__(self, message: str):
         super().__init__(printable(message))
-
-
-def printable(line: str) -> str:
-    """The line without characters that could control a terminal, as names of files may hold."""
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
-
-
-def say(line: str, err: bool = False) -> None:
-    """Print a line as `printable` makes it."""
-    click.echo(printable(line), err=err)
-
-
-def tell(line: str, err: bool = False) -> None:
-    """Print a line as `say` does, wrapped at the terminal's edge: one that has no path to copy."""
-    click.echo(wrapped(printable(line), terminal_width()), err=err)
-
-
-def echo_text(text: str) -> None:
-    """Print several lines, each as `printable` makes it."""
-    for line in text.splitlines():
-        say(line)
-
-
-@contextmanager
-def on_stop(handle: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Install a handler of Ctrl-C and SIGTERM, and put back those before at the end."""
-    before = [signal.signal(number, handle) for number in STOP_SIGNALS]
-    try:
-        yield
-    finally:
-        for number, handler in zip(STOP_SIGNALS, before, strict=True):
-            signal.signal(number, handler)
-
-
-@contextmanager
-def stoppable(afterwards: str) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the command, with a line on what follows from that."""
-
-    def stop(number: int, frame: FrameType | None) -> NoReturn:
-        raise SystemExit(128 + number)
-
-    def repeat(dropped: "sys.UnraisableHookArgs") -> None:
-        """Send the signal again: Python drops what is raised while an object is destroyed."""
-        if isinstance(stopped := dropped.exc_value, SystemExit) and isinstance(stopped.code, int):
-            threading.Timer(0.1, _thread.interrupt_main, [stopped.code - 128]).start()
-        else:
-            usual(dropped)
-
-    usual, sys.unraisablehook = sys.unraisablehook, repeat
-    with on_stop(stop):
-        try:
-            yield
-        except SystemExit:
-            click.echo(f"stopped; {afterwards}", err=True)
-            raise
-        finally:
-            sys.unraisablehook = usual
 
 
 @contextmanager
@@ -222,16 +87,12 @@ def _closing() -> Iterator[None]:
     """Close every environment at the end, also where SIGTERM is the end: it may be a robot."""
     is_main = threading.current_thread() is threading.main_thread()
     if is_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, _leave)
+        signal.signal(signal.SIGTERM, leave)
     try:
         yield
     finally:
         if instances := sys.modules.get("jbrep.envs.instances"):  # only if there may be any
             instances.close_all()
-
-
-def _leave(number: int, frame: FrameType | None) -> NoReturn:
-    raise SystemExit(128 + number)
 
 
 class Cli(click.Group):
@@ -318,13 +179,3 @@ def with_options(*several: Callable[[_Command], _Command]) -> Callable[[_Command
 PATH = click.Path(path_type=Path)
 data_option = click.option("--data", required=True, type=PATH, help="A folder from jbrep collect.")
 as_json = click.option("--json", "as_json", is_flag=True, help="As JSON, for programs.")
-
-
-def echo_json(value: Any) -> None:
-    """Print plain dictionaries, lists, numbers and texts as JSON."""
-    click.echo(json.dumps(value, indent=2, allow_nan=False))
-
-
-def echo_paths(paths: Iterable[Path]) -> None:
-    """Print where files are, after an empty line."""
-    click.echo("\n" + "\n".join(printable(str(path)) for path in paths))

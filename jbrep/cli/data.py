@@ -1,24 +1,13 @@
 """Collecting data sets, and working with them."""
 
-import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from jbrep.cli.base import (
-    PATH,
-    RESUMES,
-    as_json,
-    echo_json,
-    echo_text,
-    on_stop,
-    say,
-    stoppable,
-)
+from jbrep.cli.base import PATH, RESUMES, as_json
 from jbrep.cli.completion import complete_task
 from jbrep.cli.environment import (
     environment_options,
@@ -31,6 +20,8 @@ from jbrep.cli.environment import (
     view_options,
 )
 from jbrep.cli.options import record_options
+from jbrep.cli.output import echo_json, echo_text, say
+from jbrep.cli.signals import deferred_stop, stoppable
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.settings import CollectSettings
 from jbrep.errors import InputError
@@ -253,7 +244,7 @@ def export(data: Path, to: str, out: Path) -> None:
     from jbrep.dataset.formats import load_format
 
     with stoppable("the export was discarded"):
-        with _deferred_stop():
+        with deferred_stop():
             load_format(to)
         click.echo(f"open it with {run(Dataset(data), to, out)}")
 
@@ -288,7 +279,7 @@ def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
         options |= dict.fromkeys(told)
     task = given_task(options)
     with stoppable("nothing was imported"):
-        with _deferred_stop():
+        with deferred_stop():
             missing = told["missing"] or (task.missing if task else "") or ""
             opened = together([open_source(each, layout, missing) for each in source])
         said = {} if task else _given(told)
@@ -321,15 +312,3 @@ def _layout(options: dict[str, Any]) -> Layout:
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
-
-
-@contextmanager
-def _deferred_stop() -> Iterator[None]:
-    """Deliver Ctrl-C and SIGTERM at the end: an extension module turns them into ImportError."""
-    pending: list[int] = []
-    try:
-        with on_stop(lambda number, frame: pending.append(number)):
-            yield
-    finally:
-        if pending:
-            signal.raise_signal(pending[0])

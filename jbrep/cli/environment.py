@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from jbrep.cli.base import PATH, POSITIVE, as_json, echo_json, echo_text, with_options
+from jbrep.cli.base import PATH, POSITIVE, as_json, with_options
 from jbrep.cli.completion import complete_task
+from jbrep.cli.output import echo_json, echo_text
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.text import terminal_width

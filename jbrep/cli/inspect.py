@@ -10,9 +10,11 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, PATH, say, stoppable
+from jbrep.cli.base import COUNT, PATH
 from jbrep.cli.completion import complete_encoder
 from jbrep.cli.environment import environment_options, given_task, task_option
+from jbrep.cli.output import say
+from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
 
 _ADDRESS = "127.0.0.1"

@@ -6,17 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from jbrep.cli.base import (
-    PATH,
-    POSITIVE,
-    as_json,
-    echo_json,
-    echo_paths,
-    echo_text,
-    say,
-    stoppable,
-    tell,
-)
+from jbrep.cli.base import PATH, POSITIVE, as_json
 from jbrep.cli.completion import complete_encoder
 from jbrep.cli.environment import (
     environment_options,
@@ -25,6 +15,8 @@ from jbrep.cli.environment import (
     task_option,
     threads_option,
 )
+from jbrep.cli.output import echo_json, echo_paths, echo_text, say, tell
+from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.text import counted, interval_of, percentiles, table, terminal_width

@@ -6,8 +6,9 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import PATH, POSITIVE, say
+from jbrep.cli.base import PATH, POSITIVE
 from jbrep.cli.environment import environment_options, given_task, task_option
+from jbrep.cli.output import say
 from jbrep.text import interval_of, returns_text
 
 

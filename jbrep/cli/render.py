@@ -5,8 +5,10 @@ from typing import Any
 
 import click
 
-from jbrep.cli.base import COUNT, PATH, say, stoppable
+from jbrep.cli.base import COUNT, PATH
 from jbrep.cli.environment import environment_options, given_task, task_option
+from jbrep.cli.output import say
+from jbrep.cli.signals import stoppable
 
 
 class _Size(click.ParamType[tuple[int, int]]):

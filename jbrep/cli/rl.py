@@ -1,28 +1,11 @@
 """Training one agent, and a search for an algorithm's settings."""
 
-import os
-import signal
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import click
 
-from jbrep.cli.base import (
-    COUNT,
-    PATH,
-    POSITIVE,
-    RESUMES,
-    STOP_SIGNALS,
-    on_stop,
-    say,
-    stoppable,
-    tell,
-    with_options,
-)
+from jbrep.cli.base import COUNT, PATH, POSITIVE, RESUMES, with_options
 from jbrep.cli.completion import complete_encoder
 from jbrep.cli.environment import (
     domain_option,
@@ -33,12 +16,13 @@ from jbrep.cli.environment import (
     task_option,
 )
 from jbrep.cli.options import record_options
+from jbrep.cli.output import say, tell
+from jbrep.cli.signals import stop_signals, stoppable
 from jbrep.errors import choose
 from jbrep.records.record import converted
 from jbrep.rl.settings import CLASSES, Seed, TrainingSettings
 from jbrep.text import returns_text, rounded
 
-_STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
 _BESIDE = 10  # episodes of policies that don't learn
 learner_options = with_options(  # which `checked` reads
     click.option(
@@ -174,23 +158,6 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
             tell(str(compared))
     source = source_of(options["encoder"], task)
     say(f"encoder: {source}; all evaluations: {out / EVALUATIONS}")
-
-
-@contextmanager
-def stop_signals() -> Iterator[list[int]]:
-    """The signals received so far, Ctrl-C or SIGTERM; the second ends the process at once."""
-    received: list[int] = []
-
-    def receive(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-        for each in STOP_SIGNALS:
-            signal.signal(each, signal.SIG_DFL)
-        if sys.stderr is not None:  # written directly: Python's streams may be in use right now
-            with suppress(OSError, ValueError):
-                os.write(sys.stderr.fileno(), _STOPPING)
-
-    with on_stop(receive):
-        yield received
 
 
 @click.command(

@@ -5,19 +5,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from jbrep.cli.base import (
-    PATH,
-    RESUMES,
-    Variadic,
-    as_json,
-    echo_json,
-    echo_paths,
-    echo_text,
-    say,
-    stoppable,
-    tell,
-)
+from jbrep.cli.base import PATH, RESUMES, Variadic, as_json
 from jbrep.cli.environment import import_option
+from jbrep.cli.output import echo_json, echo_paths, echo_text, say, tell
+from jbrep.cli.signals import stoppable
 from jbrep.text import terminal_width
 
 if TYPE_CHECKING:

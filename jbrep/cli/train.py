@@ -9,17 +9,10 @@ from typing import TYPE_CHECKING, Any
 import click
 from msgspec import inspect
 
-from jbrep.cli.base import (
-    PATH,
-    POSITIVE,
-    RESUMES,
-    Variadic,
-    data_option,
-    stoppable,
-    tell,
-    with_options,
-)
+from jbrep.cli.base import PATH, POSITIVE, RESUMES, Variadic, data_option, with_options
 from jbrep.cli.completion import complete_kind
+from jbrep.cli.output import tell
+from jbrep.cli.signals import stoppable
 from jbrep.errors import InputError, choose
 from jbrep.methods.kinds import KINDS
 from jbrep.records.keys import Key, keys_of

@@ -1,7 +1,7 @@
 """The methods that make encoders, and how names say which."""
 
 from collections.abc import Mapping, Sequence
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any, NamedTuple, get_args
 
 from msgspec.structs import asdict
@@ -13,14 +13,7 @@ from jbrep.errors import InputError, choose
 from jbrep.methods.kinds import KINDS
 from jbrep.training.method import Method
 
-
-def _method(kind: str, file: str) -> type[Method]:
-    """The class of that name in a file."""
-    classes = (each for each in vars(import_module(file)).values() if isinstance(each, type))
-    return next(c for c in classes if issubclass(c, Method) and vars(c).get("name") == kind)
-
-
-METHODS = {kind: _method(kind, file) for kind, file in KINDS.items()}
+METHODS: dict[str, type[Method]] = {kind: resolve_name(path) for kind, path in KINDS.items()}
 _WORDS: dict[str, tuple[str, Any]] = {  # in names, of settings that aren't the usual ones
     **{name: ("scaling", name) for name in SCALINGS},
     **{system: ("on", system) for system in get_args(System)},

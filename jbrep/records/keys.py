@@ -6,7 +6,7 @@ import msgspec
 from msgspec import NODEFAULT, UNSET, inspect
 
 from jbrep.records.record import Record, default_of
-from jbrep.records.words import must_be, type_of
+from jbrep.records.words import type_of
 
 
 class Key(NamedTuple):
@@ -58,20 +58,3 @@ def _words(node: inspect.Type) -> tuple[str, str]:
         return "", ""
     described, extra = node.extra_json_schema or {}, node.extra or {}
     return str(described.get("description", "")), str(extra.get("default", ""))
-
-
-def key_table(kind: type[Record], *, of: str = "", without: tuple[str, ...] = ()) -> str:
-    """The keys as a table in Markdown, as the docs have it.
-
-    Args:
-        kind: the record's class.
-        of: the key that the record stands under: "data" for data.steps.
-        without: names of keys to leave out.
-    """
-    rows = [
-        f"| `{f'{of}.' if of else ''}{key.name}` | {must_be(key.kind)} | {key.default_shown} "
-        f"| {key.help} |"
-        for key in keys_of(kind)
-        if key.name not in without
-    ]
-    return "\n".join(["| key | must be | default | |", "|---|---|---|---|", *rows])

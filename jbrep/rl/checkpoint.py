@@ -22,7 +22,8 @@ from jbrep.records.document import Document, document_from
 from jbrep.records.record import Version
 from jbrep.records.storage import exists
 from jbrep.rl.agent import parameters, restore_statistics, statistics_of
-from jbrep.rl.files import Episode, Evaluation, Info, RunSettings
+from jbrep.rl.files import Episode, Evaluation, Info
+from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import MAX_STEPS
 
 MAX_BYTES = 1 << 34

@@ -18,9 +18,10 @@ from jbrep.envs.view import Window
 from jbrep.errors import DamageError, InputError
 from jbrep.records.container import Tensors
 from jbrep.records.storage import exists
-from jbrep.rl.files import ENCODER, POLICY, RUN, RunSettings, read_finished
+from jbrep.rl.files import ENCODER, POLICY, RUN, read_finished
 from jbrep.rl.normalization import CLIP, Statistics
 from jbrep.rl.policy_file import PolicyFile, read
+from jbrep.rl.run_settings import RunSettings
 
 _HIDDEN = "latent_pi.", "mlp_extractor.policy_net.", "mu."  # sequences, numbered from 0
 _LAST = "mu", "action_net"  # single layers after them

@@ -40,13 +40,13 @@ from jbrep.rl.files import (
     Episode,
     Evaluation,
     RunRecord,
-    RunSettings,
     read_run,
     write_infos,
 )
 from jbrep.rl.policy_file import MAX_BYTES, read
 from jbrep.rl.policy_zip import policy_zip
 from jbrep.rl.run import Run
+from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import CPU, MAX_LINE
 from jbrep.rl.trained import Trained, fill_whole, pack_whole
 

@@ -19,13 +19,13 @@ from jbrep.rl.files import (
     POLICY,
     RUN,
     SOON,
-    RunSettings,
     is_run,
     read_finished,
     read_run,
 )
 from jbrep.rl.overrides import check_shape
 from jbrep.rl.policy_file import read
+from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.trained import Trained, acting, build
 from jbrep.training.trainer import single_torch_thread
 

@@ -15,7 +15,8 @@ from stable_baselines3.common.save_util import data_to_json
 
 from jbrep.records.document import document_in
 from jbrep.rl.agent import statistics_of
-from jbrep.rl.files import RunSettings, ZipHeader
+from jbrep.rl.files import ZipHeader
+from jbrep.rl.run_settings import RunSettings
 
 STATISTICS = "observation_statistics.safetensors"  # by which an agent normalises what it sees
 _HEADER = "trained_on.json"

@@ -14,10 +14,10 @@ from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.rl.cohort import ALGORITHMS
 from jbrep.rl.cohort.algorithm import check as check_for_cohort
-from jbrep.rl.files import RunSettings
 from jbrep.rl.learner import Learner
 from jbrep.rl.policy import policy_to_begin_with
 from jbrep.rl.presets import usual_preset
+from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.settings import (
     COHORT,
     CPU,

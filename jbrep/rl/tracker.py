@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import KVWriter
 from jbrep.errors import first_line
 from jbrep.records.record import to_plain
 from jbrep.records.storage import inside
-from jbrep.rl.files import RunSettings
+from jbrep.rl.run_settings import RunSettings
 
 TENSORBOARD = "tensorboard"  # what is kept from it is kept from here, too
 

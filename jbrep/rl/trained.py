@@ -18,10 +18,11 @@ from jbrep.records import container
 from jbrep.records.container import Tensors, without
 from jbrep.records.storage import write_whole
 from jbrep.rl.agent import Spaces, deterministic_actor, make_agent, one_line, preprocessor
-from jbrep.rl.files import PolicyHeader, RunSettings
+from jbrep.rl.files import PolicyHeader
 from jbrep.rl.normalization import Statistics
 from jbrep.rl.overrides import check_shape
 from jbrep.rl.policy_file import ACTING, ENCODER, TRAINING, PolicyFile
+from jbrep.rl.run_settings import RunSettings
 
 
 class Trained(NamedTuple):

@@ -16,11 +16,12 @@ from jbrep.records.document import Document, read_document
 from jbrep.records.lock import exclusive
 from jbrep.records.record import Version
 from jbrep.records.storage import exists, inside, make_folder, write_whole
-from jbrep.rl.files import FINISHED, RunSettings, last_returns, read_evaluations
+from jbrep.rl.files import FINISHED, last_returns, read_evaluations
 from jbrep.rl.job import Job, Session
 from jbrep.rl.learner import preset_text
 from jbrep.rl.overrides import setting_names
 from jbrep.rl.run import Run
+from jbrep.rl.run_settings import RunSettings
 from jbrep.rl.trainers import train_jobs
 
 SEARCH, BEST = "search.json", "best.toml"

@@ -16,7 +16,8 @@ from jbrep.errors import InputError
 from jbrep.records.document import Document
 from jbrep.records.record import Record, Version, from_plain, to_plain
 from jbrep.records.storage import exists
-from jbrep.rl.files import ENCODER, RunRecord, RunSettings, SharedSettings
+from jbrep.rl.files import ENCODER, RunRecord
+from jbrep.rl.run_settings import RunSettings, SharedSettings
 from jbrep.rl.settings import Sha256
 from jbrep.stats.rules import Rules
 from jbrep.stats.runs import in_order

@@ -1,0 +1,83 @@
+"""What Ctrl-C and SIGTERM do."""
+
+import _thread
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import NoReturn
+
+import click
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_STOPPING = b"\nstopping: writing a checkpoint, within seconds; Ctrl-C again ends at once\n"
+
+
+def leave(number: int, frame: FrameType | None) -> NoReturn:
+    """End the process as the signal would, with what is to be done at its end."""
+    raise SystemExit(128 + number)
+
+
+@contextmanager
+def on_stop(handle: Callable[[int, FrameType | None], object]) -> Iterator[None]:
+    """Install a handler of Ctrl-C and SIGTERM, and put back those before at the end."""
+    before = [signal.signal(number, handle) for number in STOP_SIGNALS]
+    try:
+        yield
+    finally:
+        for number, handler in zip(STOP_SIGNALS, before, strict=True):
+            signal.signal(number, handler)
+
+
+@contextmanager
+def stoppable(afterwards: str) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the command, with a line on what follows from that."""
+
+    def repeat(dropped: "sys.UnraisableHookArgs") -> None:
+        """Send the signal again: Python drops what is raised while an object is destroyed."""
+        if isinstance(stopped := dropped.exc_value, SystemExit) and isinstance(stopped.code, int):
+            threading.Timer(0.1, _thread.interrupt_main, [stopped.code - 128]).start()
+        else:
+            usual(dropped)
+
+    usual, sys.unraisablehook = sys.unraisablehook, repeat
+    with on_stop(leave):
+        try:
+            yield
+        except SystemExit:
+            click.echo(f"stopped; {afterwards}", err=True)
+            raise
+        finally:
+            sys.unraisablehook = usual
+
+
+@contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """The signals received so far, Ctrl-C or SIGTERM; the second ends the process at once."""
+    received: list[int] = []
+
+    def receive(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        for each in STOP_SIGNALS:
+            signal.signal(each, signal.SIG_DFL)
+        if sys.stderr is not None:  # written directly: Python's streams may be in use right now
+            with suppress(OSError, ValueError):
+                os.write(sys.stderr.fileno(), _STOPPING)
+
+    with on_stop(receive):
+        yield received
+
+
+@contextmanager
+def deferred_stop() -> Iterator[None]:
+    """Deliver Ctrl-C and SIGTERM at the end: an extension module turns them into ImportError."""
+    pending: list[int] = []
+    try:
+        with on_stop(lambda number, frame: pending.append(number)):
+            yield
+    finally:
+        if pending:
+            signal.raise_signal(pending[0])

@@ -1,0 +1,133 @@
+"""All settings of a run."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from jbrep.envs.task import Id, Task, changed_parts
+from jbrep.errors import InputError, differences
+from jbrep.records.record import to_plain
+from jbrep.rl.presets import LINEAR, Hyperparameters
+from jbrep.rl.settings import (
+    CLASSES,
+    Episodes,
+    LearnerName,
+    Line,
+    Name,
+    Seed,
+    Sha256,
+    Steps,
+    TrainingSettings,
+)
+
+_Algorithm = Annotated[
+    str,
+    Meta(pattern=rf"\A({'|'.join(CLASSES)})\Z", title=f"one of {', '.join(CLASSES)}"),
+]
+
+
+class SharedSettings(TrainingSettings, frozen=True, kw_only=True):
+    """All settings that runs of one task, learner and representation share."""
+
+    task: Id  # its name
+    environment: Task
+    algorithm: _Algorithm
+    preset: Name
+    overrides: Mapping[str, Any]  # what is set differently from the preset
+    learner: LearnerName  # what tables call the algorithm with its settings
+    hyperparameters: Hyperparameters  # the preset's, overridden
+    representation: Name  # what tables call that which the agent observes
+    encoder_code: Line | None  # module:Class, if it is code that no file can hold
+    evaluate_every: Steps
+    final_episodes: Episodes
+    trainer: Literal["cohort", "sb3"]
+    device: Literal["cpu", "cuda"]
+
+    def check(self) -> None:
+        """As for `Record`."""
+        if self.environment.name != self.task:
+            raise InputError(f"task is {self.task}, but environment is of {self.environment.name}")
+        if self.final_episodes < self.evaluation_episodes:
+            raise InputError(
+                f"final_episodes is {self.final_episodes}: it must be as many as "
+                f"evaluation_episodes, {self.evaluation_episodes}, or more"
+            )
+
+    @property
+    def label(self) -> str:
+        """What runs of other seeds have, too: TASK/LEARNER/REPRESENTATION."""
+        return f"{self.task}/{self.learner}/{self.representation}"
+
+
+class RunSettings(SharedSettings, frozen=True, kw_only=True):
+    """All settings of a run; together with versions they decide every number, on one kind of CPU.
+
+    Attributes:
+        encoder: its fingerprint.
+        encoder_seed: that the encoder was made with, if each run has its own.
+        begin_from: SHA-256 of the policy of another run that this one begins with, if it does.
+        registration: SHA-256 of that of its study, if that is registered.
+    """
+
+    seed: Seed
+    encoder: Sha256
+    encoder_seed: Seed | None
+    begin_from: Sha256 | None = msgspec.field(name="from")
+    registration: Sha256 | None
+
+    @property
+    def name(self) -> str:
+        """The label with the seed: face_direction/sac-modern/dae-8/seed-0."""
+        return f"{self.label}/seed-{self.seed}"
+
+    def is_evaluation_due(self, step: int, keep_checkpoint: bool = False) -> bool:
+        """Whether the policy is to be evaluated after so many steps, which aren't all.
+
+        Where the run is kept, to go on later, they may be: the last evaluation comes after it.
+        """
+        at_once = self.control_steps(self.hyperparameters.num_envs)
+        return step % self.evaluate_every < at_once and (keep_checkpoint or step < self.steps)
+
+    @property
+    def schedules(self) -> list[str]:
+        """The names of what changes from a run's first step to its last."""
+        chosen = self.hyperparameters.algorithm_kwargs.items()
+        return [name for name, value in chosen if str(value).startswith(LINEAR)]
+
+    def is_extended_by(self, longer: "RunSettings") -> bool:
+        """Whether `longer` differs in having more steps alone, so that it may go on from here."""
+        return self.steps < longer.steps and not self.replace(steps=longer.steps).differing(longer)
+
+    @property
+    def agent_steps(self) -> int:
+        """Of training, as its agent counts them."""
+        return self.hyperparameters.agent_steps(self.steps)
+
+    def control_steps(self, agent_steps: int) -> int:
+        """An agent's steps as runs count them: each for all control steps that hold its action."""
+        return agent_steps * self.hyperparameters.action_repeat
+
+    @property
+    def episode_steps(self) -> int:
+        """That an agent takes in the longest episode."""
+        return self.hyperparameters.agent_steps(self.environment.max_episode_steps)
+
+    def differing(self, wanted: "RunSettings") -> str:
+        """How they differ from those of the run at hand, for a message; empty if they don't."""
+        if changed := changed_parts(self.environment, wanted.environment):
+            return f"{self.task} as it was before {changed} changed"
+        return differences(_flat(self), _flat(wanted))
+
+
+def _flat(settings: RunSettings) -> dict[str, Any]:
+    """Settings with those of the environment and the hyperparameters among them.
+
+    What is learned, by what and from what comes first.
+    """
+    own = to_plain(settings)
+    parts = own.pop("environment"), own.pop("hyperparameters")
+    first = {name: own[name] for name in ("task", "algorithm", "representation")}
+    first["domain"] = parts[0]["domain"] = str(settings.environment.domain or "none")
+    return {**first, **own, **parts[0], **parts[1]}
