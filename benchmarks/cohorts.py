@@ -157,7 +157,7 @@ def side_by_side(pool: ProcessPoolExecutor, work: Callable[[int], float], proces
 def compare_learning(learner: tuple[str, str], device: str) -> None:
     name, cores = "-".join(learner), cpu_count()
     processes = 1 if device == "cuda" else cores
-    members = MEMBERS // processes
+    members = max(1, MEMBERS // processes)
     works = [
         partial(seconds_of_member, learner, members, precision, device) for precision in PRECISIONS
     ]

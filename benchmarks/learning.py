@@ -51,7 +51,7 @@ def agent_on_shimmy() -> BaseAlgorithm:
     preset = get_preset("paper", "ddpg")
     environment = FlattenObservation(DmControlCompatibilityV0(jitterbug.load(TASK, seed=0)))
     network = {"net_arch": list(preset.net_arch), "activation_fn": torch.nn.ReLU}
-    noise = {"action_noise": preset.noise.make(1)}
+    noise = {"action_noise": preset.noise.make(1, 1000)}
     kwargs = {"seed": 0, "device": "cpu", "policy_kwargs": network, **preset.algorithm_kwargs}
     return DDPG("MlpPolicy", environment, **kwargs, **noise).learn(4 * STEPS)
 

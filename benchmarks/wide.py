@@ -131,7 +131,7 @@ def main() -> None:
     given = parser.parse_args()
     stop_profiling()
     agents, device, cores = given.agents, given.device, cpu_count()
-    each = agents // cores
+    each = max(1, agents // cores)
     spawn = get_context("spawn")
     sides = {
         f"one process, {p}": partial(rate_of_cohort, agents, cores, p, device) for p in PRECISIONS

@@ -81,9 +81,9 @@ def listed(names: Sequence[str]) -> str:
 
 def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
     """The settings that differ, as text for a message: at most three; empty if none does."""
-    differing = [name for name, value in wanted.items() if there.get(name) != value]
+    differing = [name for name in {**wanted, **there} if there.get(name) != wanted.get(name)]
     shown = [
-        f"{name} {_shown(there.get(name))} (now: {_shown(wanted[name])})"
+        f"{name} {_shown(there.get(name))} (now: {_shown(wanted.get(name))})"
         for name in differing[:_MOST_SHOWN]
     ]
     more = len(differing) - _MOST_SHOWN

@@ -284,6 +284,25 @@ def test_transitions_of_several_steps_are_those_of_stable_baselines3(added):
         np.testing.assert_array_equal(values, getattr(expected, name), err_msg=name)
 
 
+def test_what_led_to_nothing_is_not_learned_from():
+    """As a step in which the environment failed: the one before it ends the episode."""
+    memory, ones = ReplayBuffer(1, 2, 8, 1, 1, 3, 0.9), np.ones((1, 2, 1), np.float32)
+    for number in range(4):
+        reward, goes_on = np.full_like(ones, number), np.zeros((1, 2, 2), bool)
+        memory.add(number * ones, ones, (number + 1) * ones, reward, goes_on)
+    memory.drop(np.array([[False, True]]))
+    kept, lost = memory.rows_of(0)[:, 0], memory.rows_of(0)[:, 1]
+    np.testing.assert_array_equal(kept[:, 0], [0, 1, 2, 3])
+    np.testing.assert_array_equal(lost[:, 0], [0, 1, 2, 2])
+    assert lost[:, -1].tolist() == [0, 0, 1, 1]
+    (observation, _, final, reward, terminated, discount) = memory.sample(
+        np.array([[1]]), np.array([[1]])
+    )
+    assert (observation.item(), final.item(), terminated.item()) == (1, 3, 0)
+    assert reward.item() == pytest.approx(1 + 0.9 * 2)
+    assert discount.item() == pytest.approx(0.9**2)
+
+
 class Huge:
     """An encoder with which a critic's loss is infinite."""
 

@@ -25,3 +25,4 @@ def test_at_most_three_settings_are_named_and_long_values_are_cut():
     assert text == f"a 1 (now: {'x' * 37}...), b 1 (now: 2), c 1 (now: 3), and 2 more"
     assert differences(there, there) == ""
     assert differences({}, {"a": 1}) == "a None (now: 1)"
+    assert differences({"a": 1}, {}) == "a 1 (now: None)"

@@ -1,6 +1,8 @@
 """Studies whose plan is written down before the first run, and held against what ran."""
 
+import hashlib
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,14 +13,18 @@ from test_study import TINY, written
 from jbrep.encoders import load
 from jbrep.errors import InputError
 from jbrep.records.document import read_document
+from jbrep.report.tables import read_tables
 from jbrep.rl.files import RUN, read_run, runs_below
+from jbrep.stats.scale import CONSTANT, STILL
 from jbrep.study.config import Data, read_study
 from jbrep.study.plan import Plan
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.study.registration import REGISTRATION, read_registration
 from jbrep.study.results import write_tables
 from jbrep.study.runner import register_study, run_study
+from jbrep.study.tables import REFERENCE_RETURNS
 
+ROOT = Path(__file__).parent.parent
 TINIER = TINY.replace(representations=("full",), seeds=(0, 1))
 
 
@@ -118,6 +124,23 @@ def test_every_deviation_is_told(registered):
         f"torch was 2.0.0, not {registration.versions['torch']}",
         "some runs were made by other commits of jbrep's code",
     ]
+
+
+def test_a_policy_that_came_later_changes_no_registered_study(tmp_path):
+    """Gains count over the better of standing still and random actions, as was registered then."""
+    folder = shutil.copytree(ROOT / "results" / "answer-face-direction", tmp_path / "study")
+    path = folder / REFERENCE_RETURNS
+    rows = path.read_text().splitlines()
+    drive = [row.replace("standing still", CONSTANT).rsplit(",", 1) for row in rows[1:6]]
+    assert all(CONSTANT in row for row, _ in drive)
+    path.write_text("\n".join([*rows, *(f"{row},900.0" for row, _ in drive)]) + "\n")
+    record = read_document(folder / RECORD, RunsRecord)
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    record.replace(tables={**record.tables, REFERENCE_RETURNS: sha256}).write(folder / RECORD)
+    (group,) = read_tables(folder).analysis.groups
+    assert group.references[CONSTANT].value == 900
+    assert group.reference_policy == STILL
+    assert round(group.reference) == 251
 
 
 def test_a_registration_comes_first_and_stays_as_it_is(tmp_path):

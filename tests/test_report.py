@@ -567,6 +567,9 @@ def test_references_are_played_once_on_the_starts_of_evaluation(tmp_path, monkey
     monkeypatch.setattr("jbrep.study.tables.find_player", None)
     assert write_references(tasks, tmp_path, {}) == sha256
     monkeypatch.undo()
+    longer = tasks[0][0].replace(max_episode_steps=60)
+    assert write_references([(longer, 2)], tmp_path, {}, {longer.name: tasks[0][0]}) != sha256
+    assert write_references(tasks, tmp_path, {}, {longer.name: longer}) == sha256
     path.write_text(path.read_text().replace(",1,", ",1,1"))  # what is another is played again
     assert write_references(tasks, tmp_path, {REFERENCE_RETURNS: sha256}) == sha256
 

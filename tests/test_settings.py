@@ -131,6 +131,11 @@ def test_settings_reach_the_agent():
             {"noise": {"kind": "coloured", "beta": 2.5}},
             "noise.beta is 2.5: it must be a number from 0 to 2",
         ),
+        (
+            "sac",
+            {"noise": {"kind": "normal", "sigma": -0.1}},
+            "noise.sigma is -0.1: it must be a number from 0",
+        ),
         ("sac", {"n_steps": 0}, "n_steps is 0: it must be a whole number from 1"),
         (
             "sac",

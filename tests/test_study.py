@@ -141,6 +141,10 @@ def test_a_study_from_toml(tmp_path):
         ("steps = 0", "steps is 0: it must be"),
         (f"steps = {10**23}", "steps"),
         ("steps = '80'", "steps is '80': it must be a whole number"),
+        (
+            "evaluation_episodes = 5\nfinal_episodes = 2",
+            "final_episodes is 2: it must be as many as evaluation_episodes, 5, or more",
+        ),
         ("episode_steps = 1.5", "episode_steps is 1.5: it must be a whole"),
         ("environment = 7", "environment is 7: it must be a table"),
         ("environment = {g = 1979-05-27}", "environment has a date, or a num"),
@@ -283,6 +287,12 @@ def test_two_workers_of_which_one_is_killed_give_the_same_tables(done, tmp_path)
     killer.join()
     assert killed
     assert tables(plan.folder) == tables(done.folder)
+
+
+def test_a_setting_that_is_left_out_now_makes_another_study(tmp_path):
+    Plan(TINY.replace(domain={"delay": "0..2"}), tmp_path).write()
+    with pytest.raises(InputError, match=r"another study: domain .* \(now: None\)"):
+        Plan(TINY, tmp_path).write()
 
 
 def test_what_is_finished_is_not_run_again_and_seeds_may_come(done, tmp_path, monkeypatch):

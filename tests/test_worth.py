@@ -11,10 +11,12 @@ from jbrep.collect import collect
 from jbrep.dataset import Dataset
 from jbrep.encoders import find
 from jbrep.envs import describe
+from jbrep.errors import Notice
 from jbrep.evaluate.evaluation import Evaluation, Learned, Lost, Score
 from jbrep.records.document import read_document
 from jbrep.report.evaluation import evaluation_text
 from jbrep.report.worth import condition
+from jbrep.rl.trainers import train_jobs
 from jbrep.worth import agents, fitted, offline, planning
 from jbrep.worth.fitted import Coded, Fourier, Trees
 from jbrep.worth.offline import Ground, learned
@@ -45,6 +47,17 @@ def test_what_is_learned_goes_where_the_reward_is(way):
     choose = WAYS[way](line(), describe("face_direction"))
     places = np.array([[-0.8], [-0.5], [0.5], [0.8]], np.float32)
     assert np.sign(choose(places)).ravel().tolist() == [1, 1, -1, -1]
+
+
+@pytest.mark.parametrize("reward", [1.0, -1.0])
+def test_by_constant_rewards_ends_are_avoided_or_sought(reward):
+    """The left end of a line: avoided where each step earns one, sought where it costs one."""
+    code, after, held = line()
+    goes_on = (after[:, 0] > -1).astype(float)
+    reward_of_each = np.full(len(code), reward)
+    steps = Coded(code, after, Held(code, held.action, reward_of_each, after, goes_on, held.first))
+    choose = fitted.q_iteration(Trees(steps), steps, 0.9, choices(describe("face_direction")))
+    assert np.sign(choose(np.array([[-0.9], [-0.75]], np.float32))).ravel().tolist() == [reward] * 2
 
 
 def test_a_code_of_noise_teaches_nothing():
@@ -178,6 +191,19 @@ def test_agents_learn_from_codes(data, tmp_path, monkeypatch):
     assert all(0 <= low < mean < high <= 100 for mean, low, high in returns.values())
 
 
+def test_agents_that_fail_count_with_the_least_return(data, tmp_path, monkeypatch):
+    def failing(jobs, session):
+        for job, record in train_jobs(jobs, session):
+            yield job, record.replace(status="failed", reason="the loss is inf", policy_sha256=None)
+
+    monkeypatch.setattr(agents, "STEPS", 200)
+    monkeypatch.setattr(agents, "RUNS", 1)
+    monkeypatch.setattr(agents, "train_jobs", failing)
+    with pytest.warns(Notice, match="/full/seed-0 failed: the loss is inf"):
+        returns = agents.learned({"full": find("full", data.task)}, data.task, tmp_path)
+    assert returns["full"].value == 0
+
+
 def returns_of(told, **learned):
     """The evaluation, with other returns: by way, of the full observation and of pca-8."""
     evaluation = known(told)
@@ -220,6 +246,8 @@ def test_a_code_is_recommended_with_reasons(told, learned, first, line):
 def test_of_a_constant_reward_nothing_can_be_learned(told):
     evaluation = returns_of(told, trees=(90, 50))
     constant = evaluation.replace(worth=evaluation.worth.replace(rewards=(0.0, 0.0)))
+    ending = constant.replace(worth=constant.worth.replace(ends=True))
+    assert evaluation_text(ending).startswith("Take the full observation")
     text = evaluation_text(constant)
     assert text.startswith("Every reward of the data is 0: what codes are worth can't be learned")
     assert "90" not in text.partition("\n\n")[0]

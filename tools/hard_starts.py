@@ -18,6 +18,8 @@ from jbrep.jitterbug.simulation import Simulation
 from jbrep.jitterbug.tasks import TASKS, Array, Readings
 from jbrep.rl.files import EVALUATION_SEED
 
+RUN = ["task", "algorithm", "representation", "seed"]  # columns that tell it
+
 
 class Measured(NamedTuple):
     """What tells a hard start of a task."""
@@ -51,7 +53,7 @@ def last_episodes(folder: Path) -> pd.DataFrame:
         (task,) = returns["task"].unique()
         starts = pd.read_csv(folder / "starts.csv").dropna(subset="seed")
         return starts.rename(columns={"value": "return"}).assign(task=task)
-    return returns[returns["step"] == returns.groupby("task")["step"].transform("max")]
+    return returns[returns["step"] == returns.groupby(RUN)["step"].transform("max")]
 
 
 def measured(task: str, episodes: int) -> Array:

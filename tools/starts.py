@@ -9,11 +9,13 @@ runs of each representation, and the gain as a share of the baseline's, with 95 
 """
 
 import argparse
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 from joblib import cpu_count
 
@@ -52,7 +54,9 @@ def played(folder: Path, starts: int) -> list[Start]:
 def play(runs: dict[Path, RunRecord], out: Path, starts: int) -> pd.DataFrame:
     """The table, of all runs; each is written as soon as it is known."""
     rows = [*pd.read_csv(out).itertuples(index=False, name=None)] if out.exists() else []
-    there = {row[:2] for row in rows}
+    there = Counter(row[:2] for row in rows if not np.isnan(row[1]))
+    if any(count != starts for count in there.values()):
+        raise SystemExit(f"{out} has other numbers of starts than {starts}: choose another file")
     missing = [
         folder
         for folder, run in runs.items()

@@ -159,7 +159,10 @@ def _perturb(
 ) -> None:
     """Show the rows of a table as they are finished, and write those so far."""
     from jbrep.play.perturbed import HEADER, Table, domains_of, perturb
+    from jbrep.records.storage import check_writable
 
+    if out:
+        check_writable(out.parent)
     domains, lacking = domains_of(player.task, chosen)
     if lacking and not chosen:
         told = f"{player.task.name} has no {', '.join(lacking)} that could be changed"
@@ -337,12 +340,15 @@ def behaviour(
 
     from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
     from jbrep.play.sources import check_source
-    from jbrep.records.storage import exists
+    from jbrep.records.storage import check_writable, exists
 
+    if not np.isfinite(target_yaw):
+        raise InputError(f"--target-yaw is {target_yaw}: it must be a number of degrees")
     yaw, task = np.deg2rad(target_yaw), given_task(options)
     for policy in policies:
         if not exists(policy):
             check_source(policy)
+    check_writable(out)
     from jbrep.report.figures import behaviour_plots, write  # imports torch
 
     with stoppable("the same command starts again"):

@@ -21,6 +21,7 @@ class AutoresetStep(NamedTuple):
     ended: Flags  # (n,)
     terminated: Flags  # (n,) whether a state ended it
     non_finite: Flags | None  # (n,) whether the physics diverged, where the environment says so
+    lost: Flags  # (n,) whether it led to nothing, as the environment failed at once
 
     @property
     def diverged(self) -> Flags:
@@ -86,14 +87,18 @@ class AutoresetLanes:
         Raises:
             InputError, NonFiniteActionError, EnvironmentFailedError: as `Lanes.step`.
         """
+        before = self.lanes.steps
         step, reward, non_finite = self._hold(actions)
+        lost = self.lanes.steps == before
         ended, observation, length = self.lanes.ended, step.observation, self.lanes.steps
         if ended.any():
             numbers = np.flatnonzero(ended).tolist()
             self._episodes[numbers] += 1
             observation = self._start(numbers)
         final, terminated = step.observation, step.terminated
-        return AutoresetStep(observation, final, reward, length, ended, terminated, non_finite)
+        return AutoresetStep(
+            observation, final, reward, length, ended, terminated, non_finite, lost
+        )
 
     def _hold(self, actions: Array) -> tuple[Step, Array, Flags | None]:
         """The last step, the sum of rewards, and whether the physics diverged in any."""

@@ -179,6 +179,7 @@ class Worth(Record, frozen=True, kw_only=True):
     learned: dict[str, dict[str, Learned]] = {}  # by way of learning, by label
     references: dict[str, float] = {}  # mean returns of policies that don't learn
     rewards: tuple[float, float] | None = None  # that was learned from: mean, standard deviation
+    ends: bool = False  # whether a state ended an episode in what was learned from
 
 
 class JudgedOn(Record, frozen=True, kw_only=True):

@@ -68,8 +68,9 @@ def _clearly_below(mean: Interval, best: Interval) -> bool:
 
 
 def _is_constant(worth: Worth) -> bool:
-    """Whether all that is known was learned from rewards that are always the same."""
-    return worth.rewards is not None and not worth.rewards[1] and AGENT not in worth.learned
+    """Whether all that is known was learned from data in which no step is better than another."""
+    is_alike = worth.rewards is not None and not worth.rewards[1] and not worth.ends
+    return is_alike and AGENT not in worth.learned
 
 
 def shown(learned: Learned) -> Score:

@@ -70,7 +70,7 @@ class Spaces(gymnasium.Env[Any, Any]):
 
 
 def training_seed(seed: int) -> int:
-    """The environment's seed in the run with this seed: no two runs share a lane's seed."""
+    """The environment's seed in the run with this seed: its first lane's; the others count on."""
     return int(np.random.SeedSequence(seed).generate_state(1)[0]) >> 1
 
 

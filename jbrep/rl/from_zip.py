@@ -3,6 +3,7 @@
 import io
 import pickle
 import warnings
+import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -132,6 +133,8 @@ def _checked(agent: BaseAlgorithm, task: Task, seen: BaseEncoder, path: Path) ->
 
 def _loaded(raw: bytes, path: Path, algorithm: str) -> tuple[BaseAlgorithm, ZipMetadata | None]:
     kind = sb3_class(algorithm)
+    if not zipfile.is_zipfile(io.BytesIO(raw)):
+        raise InputError(f"{path} is no {algorithm} policy: it isn't a zip file")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of schedules that another Python pickled

@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Meta
 
 from jbrep.envs.task import Array
-from jbrep.records.record import Finite, Record
+from jbrep.records.record import Record
 
 if TYPE_CHECKING:
     from stable_baselines3.common.noise import ActionNoise
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _DT = 1e-2  # stable-baselines3's unit of time for a step
 _SHORTEST = 2  # numbers that have a spectrum
 Memory = list[Array]  # of each lane, (m, k)
+_Sigma = Annotated[float, Meta(ge=0, le=1e6)]  # standard deviation
 
 
 def beginning(lanes: int, size: int) -> Memory:
@@ -29,7 +30,7 @@ def beginning(lanes: int, size: int) -> Memory:
 class NormalNoise(Record, frozen=True, tag_field="kind", tag="normal"):
     """Independent Gaussian noise on each number of an action, with mean 0."""
 
-    sigma: Finite
+    sigma: _Sigma
 
     def make(self, size: int, steps: int) -> "ActionNoise":
         """The noise in one lane, as a stable-baselines3 object.
@@ -50,9 +51,9 @@ class NormalNoise(Record, frozen=True, tag_field="kind", tag="normal"):
 class OrnsteinUhlenbeckNoise(Record, frozen=True, tag_field="kind", tag="ornstein-uhlenbeck"):
     """Noise that drifts back to its mean, starting from 0 in each episode."""
 
-    mean: Finite
-    sigma: Finite
-    theta: Finite
+    mean: Annotated[float, Meta(ge=-1e6, le=1e6)]
+    sigma: _Sigma
+    theta: Annotated[float, Meta(ge=0, le=1 / _DT)]  # beyond, it would swing about its mean
 
     def make(self, size: int, steps: int) -> "ActionNoise":
         """As for `NormalNoise`; stable-baselines3 takes a step for 0.01 units of time."""
@@ -78,7 +79,7 @@ class ColouredNoise(Record, frozen=True, tag_field="kind", tag="coloured"):
     """
 
     beta: Annotated[float, Meta(ge=0, le=2)] = 1.0
-    sigma: Annotated[float, Meta(ge=0, le=1e6)] = 0.2
+    sigma: _Sigma = 0.2
 
     def make(self, size: int, steps: int) -> "ActionNoise":
         """As for `NormalNoise`."""

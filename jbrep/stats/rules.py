@@ -42,10 +42,15 @@ from jbrep.stats.claims import (
 )
 from jbrep.stats.intervals import LEVEL, UNDEFINED, unless_few
 from jbrep.stats.runs import Group, Key
-from jbrep.stats.scale import STILL, best_blind
+from jbrep.stats.scale import CONSTANT, RANDOM, STILL, best_blind
 
 _USUAL_LOOKS = (0.5, 1.0)
 _Share = Annotated[float, Meta(gt=0, lt=1)]
+_OVER = {  # which of them gains are counted over, by the words of a study
+    "drives": (STILL, CONSTANT, RANDOM),
+    "blind": (STILL, RANDOM),
+    "still": (STILL,),
+}
 _POINTS = 401  # of the grid on which paths are integrated, with Simpson's rule
 
 
@@ -89,12 +94,13 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
         ),
     ] = ()
     gains_over: Annotated[
-        Literal["blind", "still"],
+        Literal["drives", "blind", "still"],
         Meta(
-            description="What gains are counted over: the best policy that doesn't look, or "
+            description="What gains are counted over: the best of standing still, a constant drive "
+            "and random actions (drives), the best of these without the constant drive (blind), or "
             "standing still."
         ),
-    ] = "blind"
+    ] = "drives"
 
     def check(self) -> None:
         """Check what no field can say alone."""
@@ -135,9 +141,8 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
 
     def reference(self, returns: Mapping[str, float]) -> str | None:
         """The policy that gains are counted over, of those whose returns are known."""
-        if self.gains_over == "still":
-            return STILL if STILL in returns else None
-        return best_blind(returns)
+        counted = _OVER[self.gains_over]
+        return best_blind({name: value for name, value in returns.items() if name in counted})
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from jbrep.stats.runs import RunCurve
 
 SHARES = {"50_percent": 0.5, "90_percent": 0.9}  # of the gain of the baseline's median run
 SOLVED = "steps_to_solved"
-STILL, LOOKING = "standing still", "hand-written"  # of policies that don't learn; one looks
+STILL, CONSTANT, RANDOM = "standing still", "constant drive", "random"  # policies that don't look
+LOOKING = "hand-written"  # nor does this one learn
 STEPS_TO = (*(f"steps_to_{name}" for name in SHARES), SOLVED)
 _POINTS = 50  # of a performance profile, about, or half as many: round numbers
 

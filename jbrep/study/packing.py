@@ -66,7 +66,12 @@ def packed(plan: Plan, workers: int, width: int | None = None) -> list[Pack]:
             alone.append((cell,))
     widest = _WIDEST[plan.device]
     limits = (_most(plan, group[0], size, workers) for (_, _, size), group in groups.items())
-    most = min(limits, default=widest)
+    most = min(limits, default=width or widest)
+    if most < 1 < workers:
+        raise InputError(
+            f"this machine's memory doesn't hold an agent for each of {workers} workers: give "
+            "fewer --workers"
+        )
     if width and width > most:
         raise InputError(
             f"the width is {width}: {workers} cohorts of {most} agents are the most that this "

@@ -205,13 +205,19 @@ class Plan:
 
 
 def _differing(there: Study, study: Study) -> str:
-    """What differs of two studies besides their grids; empty if nothing does."""
+    """What differs of two studies besides their grids; empty if nothing does.
+
+    A learner that only one of them has is part of its grid.
+    """
     before, now = (
         {name: value for name, value in to_plain(each).items() if name not in _GRID}
-        | {f"learner {name}": table for name, table in each.learners.items()}
         for each in (there, study)
     )
-    return differences(before, {name: value for name, value in now.items() if name in before})
+    for name in there.learners.keys() & study.learners.keys():
+        before[f"learner {name}"], now[f"learner {name}"] = (
+            each.learners[name] for each in (there, study)
+        )
+    return differences(before, now)
 
 
 def read_plan(folder: Path) -> Plan | None:

@@ -53,6 +53,10 @@ def check(plan: Plan) -> None:
                     "smaller latent size"
                 )
     _check_own(plan)
+    of_each = {cell.kind: cell for cell in plan.cells}
+    for cell in of_each.values():  # the representation decides no setting of a learner
+        run = plan.run(cell).replace(encoder=FULL)
+        run.settings(run.find_encoder())
 
 
 def _by_name(plan: Plan) -> list[ByName]:

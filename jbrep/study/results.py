@@ -37,6 +37,7 @@ from jbrep.study.tables import (
     Return,
     RunInfo,
     by_run,
+    former_tasks,
     read_references,
     table_hashes,
     write_references,
@@ -58,7 +59,7 @@ def write_tables(folder: Path) -> list[Path]:
         InputError: there is no such run, a file is damaged, or a table can't be written.
     """
     ended, before = _ended(folder), table_hashes(folder)
-    references = write_references(_tasks(ended.values()), folder, before)
+    references = write_references(_tasks(ended.values()), folder, before, former_tasks(folder))
     rows, infos = list(_returns(ended)), list(_of_runs(ended, read_infos))
     tables = {name: before[name] for name in (DIAGNOSTICS,) if name in before}
     tables[RETURNS] = write_rows(folder / RETURNS, rows, Return)

@@ -24,7 +24,7 @@ from jbrep.play.sources import find_player
 from jbrep.records.document import read_document
 from jbrep.records.storage import exists
 from jbrep.records.tables import read_rows, write_csv
-from jbrep.stats.scale import LOOKING, STILL
+from jbrep.stats.scale import CONSTANT, LOOKING, RANDOM, STILL
 from jbrep.study.record import RECORD, RunsRecord
 from jbrep.text import slug
 
@@ -33,8 +33,8 @@ REFERENCE_RETURNS = "references.csv"
 RUN_INFOS = "run-infos.csv"  # a run may be in the same folder: its own table is infos.csv
 _POLICIES = {
     STILL: "still",
-    "constant drive": "constant:drive=0.75",  # of five, what moves the Jitterbug furthest
-    "random": "uniform",
+    CONSTANT: "constant:drive=0.75",  # of five, what moves the Jitterbug furthest
+    RANDOM: "uniform",
     LOOKING: "heuristic",
 }
 References = dict[str, dict[str, list[float]]]  # returns by task and policy
@@ -100,8 +100,20 @@ def table_hashes(folder: Path) -> Mapping[str, str]:
         return {}
 
 
+def former_tasks(folder: Path) -> Mapping[str, Task]:
+    """The tasks by their names that runs.json tells of; none where that can't be read."""
+    try:
+        labels = read_document(folder / RECORD, RunsRecord).labels.values()
+    except InputError:
+        return {}
+    return {each.settings.task: each.settings.environment for each in labels}
+
+
 def write_references(
-    tasks: Iterable[tuple[Task, int]], folder: Path, before: Mapping[str, str]
+    tasks: Iterable[tuple[Task, int]],
+    folder: Path,
+    before: Mapping[str, str],
+    played_on: Mapping[str, Task] = {},
 ) -> str | None:
     """Play the reference policies of tasks: three that don't look, and hand-written if there is.
 
@@ -111,6 +123,7 @@ def write_references(
         tasks: each with its number of episodes.
         folder: for the file.
         before: what runs.json says of the tables. A file that is another is written anew.
+        played_on: tasks by name as they were then; those that were others are played anew.
 
     Returns:
         The SHA-256 of the file; None if there is nothing to write.
@@ -128,6 +141,8 @@ def write_references(
         for policy in _POLICIES:
             if policy != LOOKING or task.name in HEURISTICS:
                 own = [row for row in there if (row.task, row.policy) == (task.name, policy)]
+                if played_on.get(task.name, task) != task:
+                    own = []
                 if [row.episode for row in own] != [*range(episodes)]:
                     own = _played(task, policy, episodes) or own
                 if damage and not own:

@@ -1,5 +1,6 @@
 """Small agents on codes: the most direct way to find out what these are worth."""
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -7,10 +8,11 @@ from typing import Any
 import numpy as np
 from joblib import cpu_count
 
-from jbrep.envs.task import Task
+from jbrep.envs.task import Array, Task
+from jbrep.errors import Notice
 from jbrep.evaluate.evaluation import Score, score
 from jbrep.progress import Progress
-from jbrep.rl.files import last_returns, read_evaluations
+from jbrep.rl.files import FAILED, RunRecord, last_returns, read_evaluations
 from jbrep.rl.job import Job, Session
 from jbrep.rl.run import Run
 from jbrep.rl.trainers import train_jobs
@@ -59,11 +61,21 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
             bar.update(min(step, STEPS) - done[job])
             done[job] = min(step, STEPS)
 
-        for _ in train_jobs([*jobs.values()], Session(watch)):
-            pass
+        ended = dict(train_jobs([*jobs.values()], Session(watch)))
     found = {}
     for label in encoders:
-        own = [jobs[label, seed].folder for seed in range(RUNS)]
-        returns = np.concatenate([last_returns(read_evaluations(each)) for each in own])
+        own = [jobs[label, seed] for seed in range(RUNS)]
+        returns = np.concatenate([_returns(job, ended[job]) for job in own])
         found[label] = score(mean_within(returns, bounds_of(task), LEVEL))
     return found
+
+
+def _returns(job: Job, record: RunRecord) -> Array:
+    """The last returns of an agent; of one that failed the least possible, or its worst."""
+    evaluations = read_evaluations(job.folder)
+    if record.status != FAILED:
+        return np.array(last_returns(evaluations))
+    warnings.warn(f"{job.settings.name} failed: {record.reason}", Notice, stacklevel=2)
+    least = bounds_of(job.run.task).low
+    worst = min(each.episode_return for each in evaluations)
+    return np.full(EPISODES, least if np.isfinite(least) else worst)

@@ -50,19 +50,20 @@ class Values(Protocol):
 
 
 class Trees:
-    """Extremely randomised trees (Geurts et al. 2006), split by rewards and changes of the code."""
+    """Extremely randomised trees (Geurts et al. 2006), split by rewards, ends, changes of codes."""
 
     def __init__(self, steps: Coded):
         from sklearn.ensemble import ExtraTreesRegressor  # not at the top: it takes seconds
 
         given = np.hstack((steps.code, steps.held.action))
-        split_by = np.column_stack((steps.held.reward, steps.following - steps.code))
+        held = steps.held
+        split_by = np.column_stack((held.reward, held.goes_on, steps.following - steps.code))
         deviation = split_by.std(axis=0)
         split_by = split_by[:, deviation > 0] / deviation[deviation > 0]
         if not split_by.size:
             split_by = np.zeros((len(given), 1))
         forest = ExtraTreesRegressor(_TREES, min_samples_leaf=_LEAF, random_state=0)
-        self._forest = forest.fit(given, split_by)
+        self._forest = forest.fit(given, split_by if split_by.shape[1] > 1 else split_by[:, 0])
         nodes = [tree.tree_.node_count for tree in forest.estimators_]
         self._first, self._nodes = np.cumsum([0, *nodes[:-1]]), sum(nodes)
         self._leaves = self.prepare(steps.code, steps.held.action)
@@ -165,6 +166,8 @@ def backup(values: Values, held: Held, gamma: float, ahead: Callable[[], Array])
         ahead: by the values of now, what comes after each step, (n,).
     """
     least, largest = held.reward.min() / (1 - gamma), held.reward.max() / (1 - gamma)
+    if not held.goes_on.all():  # nothing comes after an end
+        least, largest = min(least, 0.0), max(largest, 0.0)
     wanted = held.reward
     for _ in range(_BACKUPS):
         values.fit(wanted)

@@ -133,7 +133,7 @@ def _train(found: _Found, encoders: Mapping[str, BaseEncoder], data: Dataset, fo
 
 def _learn(found: _Found, missing: Mapping[str, Mapping[str, BaseEncoder]], ground: Ground) -> None:
     """Learn from the data in each way what isn't known of each code."""
-    found.keep(rewards=ground.rewards)
+    found.keep(rewards=ground.rewards, ends=not ground.seen.goes_on.all())
     with Progress(total=sum(map(len, missing.values())), unit="code") as progress:
         for way, encoders in missing.items():
             for label, encoder in encoders.items():

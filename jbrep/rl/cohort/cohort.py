@@ -84,6 +84,8 @@ class Cohort:
             final = np.where(ended[..., None], self._encode(moved.final), observation)
         flags = np.stack((ended & terminated, ended), axis=2)
         self._replay.add(self._observation, scaled, final, reward[..., None], flags)
+        if moved.lost.any():
+            self._replay.drop(self._by_member(moved.lost))
         self._observation = observation
         self._update_statistics()
         length, diverged = self._by_member(moved.length), self._by_member(moved.diverged)

@@ -12,7 +12,7 @@ from jbrep.rl.run import Run
 
 
 def capacity_of(run: Run) -> int:
-    """The most transitions that a run keep_checkpoint: no more than it makes, in whole rollouts."""
+    """The most transitions that a run keeps: no more than it makes, in whole rollouts."""
     chosen = run.learner.hyperparameters
     usual, _ = parameters_of(run.learner.algorithm)
     size, steps = (
@@ -89,6 +89,16 @@ class ReplayBuffer:
         """
         self._rows[:, self.added % self._steps] = np.concatenate(columns, axis=2)
         self.added += 1
+
+    def drop(self, lost: Flags) -> None:
+        """Forget the newest transition of lanes (n, lanes): the one before it ends the episode.
+
+        That one then stands in its place, too.
+        """
+        if self.added > 1:
+            newest, before = (self._rows[:, (self.added - k) % self._steps] for k in (1, 2))
+            before[lost, -1] = 1
+            newest[lost] = before[lost]
 
     def sample(self, steps: NDArray[np.int64], lanes: NDArray[np.int64]) -> list[Float32]:
         """Transitions of n_steps from steps and lanes, (n, b) each, as a `Batch` has them.
