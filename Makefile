@@ -104,7 +104,8 @@ breadth: ## results/breadth/ anew: an hour
 cheetah: ## results/cheetah/ anew: half an hour
 coordinates coordinates-direction: ## results/coordinates/ and -direction/ anew: 20 minutes each
 recipe: ## results/recipe/ anew: half an hour
-figure-7-sac: ## results/figure-7-sac/ anew: an hour
+figure-7-sac figure-7-td3: ## results/figure-7-sac/ and -td3/ anew: an hour each
+figure-7-ddpg: ## results/figure-7-ddpg/ anew: half an hour
 cart-pole: ## results/cart-pole/ anew: twenty minutes
 answer-move-to-position: ## results/answer-move-to-position/ anew: two hours
 answer-face-direction: ## results/answer-face-direction/ anew: an hour
