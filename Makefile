@@ -51,6 +51,8 @@ check: docs ## lint, types, import direction, links of the documentation
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy tools/*.py
+	$(BIN)/mypy benchmarks/*.py
 	$(BIN)/lint-imports
 
 bench: $(READY) ## speed as ratios in one run, and what the hand-written policies return

@@ -174,9 +174,10 @@ def compare_learning(learner: tuple[str, str], device: str) -> None:
                 for pool, work in zip(others, works, strict=True)
             ]
             rounds.append([alone, *together])
-    alone, *together = np.array(rounds[1:]).T  # the first one warms up
+    columns = np.array(rounds[1:]).T  # the first one warms up
+    alone, ours = columns[0], columns[1:]
     show(f"{name}: stable-baselines3 in {cores} processes, steps of all a second", alone)
-    for precision, each in zip(PRECISIONS, together, strict=True):
+    for precision, each in zip(PRECISIONS, ours, strict=True):
         show(f"{name}: {processes} cohorts of {members}, {precision}, the same", each)
         show(f"{name}: times stable-baselines3's rate, {precision}", each / alone)
 

@@ -9,7 +9,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from functools import cache
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -155,7 +155,7 @@ def compare_readers(folder: Path) -> None:
     for _ in range(2 * ROUNDS):
         for name, code in codes.items():
             run = [sys.executable, "-c", code]
-            seconds[name].append(timed(lambda run=run: subprocess.run(run, check=True)))
+            seconds[name].append(timed(partial(subprocess.run, run, check=True)))
     for name, values in seconds.items():
         print(f"cold process to a first random batch: {name:40} {np.median(values):.3f} s")
     print("  aim: < 0.5 s; jbrep checks the hash of every shard in that time", flush=True)

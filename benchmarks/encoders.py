@@ -4,7 +4,9 @@ python benchmarks/encoders.py; ratios are medians over rounds taken in turn, so 
 slows down slows both sides.
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -20,6 +22,7 @@ from jbrep.encoders.layers import run
 from jbrep.envs import describe
 from jbrep.training.network import ARCHITECTURES, stacks
 from jbrep.training.trainer import Schedule, Trainer
+from jbrep.training.windows import Windows
 
 ROWS = 4_000_000
 SIZE = 16
@@ -47,6 +50,11 @@ class Rows:
         return self._rows.index_select(0, numbers)
 
 
+def repeated(work: Callable[[], object], times: int) -> None:
+    for _ in range(times):
+        work()
+
+
 def usual_epoch(rows: torch.Tensor) -> None:
     """The loop of every tutorial."""
     network = nn.Sequential(*stacks(ARCHITECTURES["paper"], SIZE, LATENT, seed=0)).to(rows.device)
@@ -60,7 +68,8 @@ def usual_epoch(rows: torch.Tensor) -> None:
 def our_epoch(rows: torch.Tensor) -> None:
     network = Reconstruction(DAE(latent=LATENT), SIZE, noise=NOISE)
     how = Schedule(epochs=1, batch_size=BATCH, learning_rate=5e-4)
-    next(Trainer(network.to(rows.device), how, Rows(rows), Rows(rows[:1])).epochs())
+    train, held_out = cast("Windows", Rows(rows)), cast("Windows", Rows(rows[:1]))
+    next(Trainer(network.to(rows.device), how, train, held_out).epochs())
 
 
 def compare_epochs() -> None:
@@ -79,7 +88,7 @@ def compare_epochs() -> None:
 def compare_gradients() -> None:
     for name, architecture in ARCHITECTURES.items():
         network = nn.Sequential(*stacks(architecture, SIZE, LATENT, seed=0))
-        gradient = Gradient((*network[0], *network[1]), BATCH)
+        gradient = Gradient([*network[0].children(), *network[1].children()], BATCH)
         rows = torch.empty(BATCH, SIZE).uniform_(-1, 1)
         columns = rows.T.contiguous()
 
@@ -90,27 +99,27 @@ def compare_gradients() -> None:
         written_out = partial(gradient, columns, columns)
         ratios = []
         for _ in range(2 * ROUNDS):
-            theirs = timed(lambda work=autograd: [work() for _ in range(STEPS)])
-            mine = timed(lambda work=written_out: [work() for _ in range(STEPS)])
+            theirs = timed(partial(repeated, autograd, STEPS))
+            mine = timed(partial(repeated, written_out, STEPS))
             ratios.append(theirs / mine)
         show(f"gradient of {name}, a batch of {BATCH}, one thread: autograd's time / ours", ratios)
 
 
 def compare_one_row() -> None:
     """What encode costs on one row beyond its own arithmetic."""
-    encoder = find("dae-8", describe("face_direction"))
+    encoder: Any = find("dae-8", describe("face_direction"))
     row = np.zeros((1, SIZE), np.float32)
     parts = {"NumPy": row, "torch": torch.from_numpy(row)}
     for library, values in parts.items():
         _, there = encoder._prepare(values, SIZE, "observations")
 
-        def bare(values: object = values, there: object = there) -> object:
+        def bare(values: Any = values, there: Any = there) -> object:
             return run(there.encoder, there.scaler.scale(values))
 
         over = []
         for _ in range(2 * ROUNDS):
-            whole = timed(lambda v=values: [encoder.encode(v) for _ in range(CALLS)])
-            over.append((whole - timed(lambda work=bare: [work() for _ in range(CALLS)])) / CALLS)
+            whole = timed(partial(repeated, partial(encoder.encode, values), CALLS))
+            over.append((whole - timed(partial(repeated, bare, CALLS))) / CALLS)
         show(f"encode, one row, {library}: overhead [us]", [1e6 * s for s in over], "aim below 50")
 
 

@@ -55,7 +55,8 @@ def jbrep(*words: object, module: str | None = None) -> None:
 def loop_rate(task: Task) -> float:
     """States a second of a plain loop with random actions."""
     env = make_env(task.id, task.arguments, task.max_episode_steps)
-    space: gymnasium.spaces.Box = env.action_space
+    space = env.action_space
+    assert isinstance(space, gymnasium.spaces.Box)
     random = np.random.default_rng(0)
     env.reset(seed=0)
     steps, began = 0, time.perf_counter()

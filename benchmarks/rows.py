@@ -30,7 +30,7 @@ def make_rows(
         columns = {}
         for name, spec in manifest.settings.specs().items():
             rows = episodes if name.startswith(EPISODES) else episodes * length
-            columns[name] = draw(name, spec.shape(rows)).astype(spec.dtype)
+            columns[name] = draw(name, (rows, *spec.row)).astype(spec.dtype)
         columns[EPISODES + "length"][:] = length
         manifest = commit(folder, manifest, columns)
     return Dataset(folder)

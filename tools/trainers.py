@@ -62,9 +62,9 @@ class Compared(NamedTuple):
     @classmethod
     def of(cls, x: Array, y: Array) -> "Compared":
         """Of the runs of a cohort (n,) and those of stable-baselines3 (m,)."""
-        differences = (difference(x, y, level) for level in (USUAL, SURE))
+        of_means = difference(x, y, USUAL), difference(x, y, SURE)
         ratio, p = variance_ratio(x, y, SURE), variance_p(x, y)
-        return cls(x.mean(), y.mean(), *differences, ratio, p, runs_to_decide(x, y))
+        return cls(x.mean(), y.mean(), *of_means, ratio, p, runs_to_decide(x, y))
 
     @property
     def differs(self) -> bool:
