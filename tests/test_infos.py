@@ -164,7 +164,7 @@ def test_reports_have_a_column_for_each_share(study):
     scored, sledge = returns_tables(read_tables(folder))
     heads = ("share of is_success", "share of slid")
     assert scored.header[-2:] == heads
-    assert [row[-2:] for row in scored.rows] == [("0.50", "0.33"), *[("-", "-")] * 2]
+    assert [row[-2:] for row in scored.rows] == [("0.50", "0.33"), *[("-", "-")] * 3]
     assert not {*heads} & {*sledge.header}
     assert f"  {heads[0]}  {heads[1]}\n" in said
     for name in ("report.html", "summary.md"):

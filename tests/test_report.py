@@ -55,7 +55,7 @@ STUDY = Study(
     evaluate_every=1000,
     evaluation_episodes=2,
 )
-POLICIES = ("standing still", "random", "hand-written")
+POLICIES = ("standing still", "constant drive", "random", "hand-written")
 TABLES = ("runs.json", "returns.csv", "references.csv")
 TRAP = "<script>document.title = 'run'</script>"
 
@@ -216,7 +216,10 @@ def test_a_column_of_numbers_may_have_intervals_and_dashes():
 def test_the_answer_comes_first_and_nothing_is_judged_that_was_not_registered(page):
     lead = page.locator("#answer .lead").all_inner_texts()
     assert lead[0].startswith("face_direction, sac, final returns: full 798, pca-8 830, dae")
-    assert "; without looking standing still 260, random 110; hand-written 950. " in lead[0]
+    assert (
+        "; without looking standing still 260, constant drive 247, random 110; hand-written 950. "
+        in lead[0]
+    )
     assert lead[0].endswith("Learned: full, pca-8; didn't: dae-8.")
     assert (
         lead[1]

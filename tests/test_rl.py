@@ -373,9 +373,9 @@ def test_a_terminal_shows_the_course_of_the_return(encoding, means, course, monk
     terminal = Terminal(encoding)
     monkeypatch.setattr(sys, "stderr", terminal)
     with closing(Bar(5_000_000, "sac on a-long-name-of-an-encoder")) as bar:
-        bar.show(made_up_job(), 1000, None)
+        bar.show(made_up_job(), 1000)
         bar._progress.start_t -= 36_000  # seconds
-        bar.show(made_up_job(*means), 100_000, None)
+        bar.show(made_up_job(*means), 100_000)
         bar._progress.refresh()
         line = terminal.getvalue().split("\r")[-1].rstrip()
         assert len(line) < 80
@@ -386,13 +386,13 @@ def test_a_terminal_shows_the_course_of_the_return(encoding, means, course, monk
 def test_the_rate_after_resuming_counts_the_steps_since():
     job = made_up_job()
     with closing(Bar(1000, "sac")) as bar:
-        bar.show(job, 500, None)
-        bar.show(job, 600, 1.0)
+        bar.show(job, 500)
+        bar.show(job, 600)
         assert (bar._progress.n, bar._progress.initial) == (600, 500)
-        bar.show(job, 1008, 1.0)
+        bar.show(job, 1008)
         assert (bar._progress.n, bar._progress.postfix) == (1000, "returns=final ones under way")
         job.history.evaluated(1000, Outcome(np.array([1.5, 2.5]), [{}, {}]))
-        bar.show(job, 1008, 2.0)
+        bar.show(job, 1008)
         assert bar._progress.postfix == "returns=2.00"
     trained, resumed = agent_of("a2c").learn(80), agent_of("a2c").learn(40)
     restore(resumed, take(trained))

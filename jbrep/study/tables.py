@@ -192,7 +192,7 @@ def _played(task: Task, policy: str, episodes: int) -> list[_Reference]:
     """The rows of a task and policy; none where its environment isn't here."""
     try:
         returns = find_player(_POLICIES[policy], task).returns(episodes)
-    except (InputError, ModuleNotFoundError):  # reports don't need the environments
+    except Exception:  # reports don't need the environments, whatever these lack
         return []
     rounded = (round(float(each), 3) for each in returns)
     return [_Reference(task.name, policy, *row) for row in enumerate(rounded)]
