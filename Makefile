@@ -109,6 +109,7 @@ recipe: ## results/recipe/ anew: half an hour
 figure-7-sac figure-7-td3: ## results/figure-7-sac/ and -td3/ anew: an hour each
 figure-7-ddpg: ## results/figure-7-ddpg/ anew: half an hour
 cart-pole: ## results/cart-pole/ anew: twenty minutes
+cheetah-wide: ## results/cheetah-wide/ anew: forty minutes
 answer-move-to-position: ## results/answer-move-to-position/ anew: two hours
 answer-face-direction: ## results/answer-face-direction/ anew: an hour
 # the columns of a study's line in studies/judged.txt
