@@ -155,8 +155,8 @@ trainers: $(READY) ## what results/trainers/ lacks: eight hours for all of it; g
 	$(BIN)/python tools/trainers.py results/trainers
 
 policies: $(READY) ## the trained policies that ship, anew: an hour and a half; goes on where it was stopped
-	for study in policies policies-face-direction policies-positions; do $(BIN)/jbrep study studies/$$study.toml --out runs/$$study || exit; done
-	$(BIN)/python tools/policies.py runs/policies runs/policies-face-direction runs/policies-positions
+	for study in policies policies-face-direction policies-move-to-pose; do $(BIN)/jbrep study studies/$$study.toml --out runs/$$study || exit; done
+	$(BIN)/python tools/policies.py runs/policies runs/policies-face-direction runs/policies-move-to-pose
 
 behaviour: $(READY) ## results/behaviour/ anew, of the agents of make confirm-move
 	$(BIN)/jbrep behaviour $(addprefix runs/confirm-move/runs/move_in_direction/small-ddpg/,full linear-changes-12 dae-12) \
