@@ -9,13 +9,11 @@ runs of each representation, and the gain as a share of the baseline's, with 95 
 """
 
 import argparse
-from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pandas as pd
 from joblib import cpu_count
 
@@ -53,14 +51,15 @@ def played(folder: Path, starts: int) -> list[Start]:
 
 def play(runs: dict[Path, RunRecord], out: Path, starts: int) -> pd.DataFrame:
     """The table, of all runs; each is written as soon as it is known."""
-    rows = [*pd.read_csv(out).itertuples(index=False, name=None)] if out.exists() else []
-    there = Counter(row[:2] for row in rows if not np.isnan(row[1]))
-    if any(count != starts for count in there.values()):
+    known = pd.read_csv(out) if out.exists() else table_of([])
+    rows = [Start(*row) for row in known.itertuples(index=False, name=None)]
+    there = known.groupby(["representation", "seed"], dropna=False).size()
+    if (there != starts).any():
         raise SystemExit(f"{out} has other numbers of starts than {starts}: choose another file")
     missing = [
         folder
         for folder, run in runs.items()
-        if (run.settings.representation, run.settings.seed) not in there
+        if (run.settings.representation, run.settings.seed) not in there.index
     ]
     if not rows:
         task = next(iter(runs.values())).settings.environment

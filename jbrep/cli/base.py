@@ -118,7 +118,9 @@ class Cli(click.Group):
         except InputError as error:
             raise _Mistake(str(error)) from None
         except OSError as error:  # of what writes files in its own way, as TensorBoard does
-            raise _mistake_of(error) from None
+            if mistake := _mistake_of(error):
+                raise mistake from None
+            raise
         except click.UsageError as error:
             command = error.ctx.command_path if error.ctx else "jbrep"
             message = error.format_message()
@@ -133,8 +135,8 @@ class Cli(click.Group):
             raise _Mistake(f"this needs {error.name}: pip install 'jbrep[{extra}]'") from None
 
 
-def _mistake_of(error: OSError) -> Exception:
-    """What the system refuses as a user's mistake if it is one; else the error itself."""
+def _mistake_of(error: OSError) -> _Mistake | None:
+    """What the system refuses as a user's mistake, if it is one."""
     what = f" {error.filename}" if error.filename else ""
     if error.errno in _FULL:
         return _Mistake(
@@ -143,7 +145,7 @@ def _mistake_of(error: OSError) -> Exception:
         )
     if error.errno == errno.ENAMETOOLONG:
         return _Mistake(f"can't use{what}: {os.strerror(error.errno).lower()}; choose another")
-    return error
+    return None
 
 
 class Variadic(click.Command):

@@ -47,13 +47,9 @@ class SharedSettings(TrainingSettings, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """As for `Record`."""
+        super().check()
         if self.environment.name != self.task:
             raise InputError(f"task is {self.task}, but environment is of {self.environment.name}")
-        if self.final_episodes < self.evaluation_episodes:
-            raise InputError(
-                f"final_episodes is {self.final_episodes}: it must be as many as "
-                f"evaluation_episodes, {self.evaluation_episodes}, or more"
-            )
 
     @property
     def label(self) -> str:

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from jbrep.errors import InputError
 from jbrep.records.record import Record
 
 CLASSES = {  # by the names of algorithms
@@ -104,6 +105,14 @@ class TrainingSettings(Record, frozen=True, kw_only=True):
         Literal["cpu", "cuda", "auto"],
         Meta(description="That a cohort learns on; auto is cuda where there is one."),
     ] = "cpu"
+
+    def check(self) -> None:
+        """As for `Record`."""
+        if 0 < self.final_episodes < self.evaluation_episodes:
+            raise InputError(
+                f"final_episodes is {self.final_episodes}: it must be as many as "
+                f"evaluation_episodes, {self.evaluation_episodes}, or more"
+            )
 
     @property
     def training_settings(self) -> "TrainingSettings":

@@ -150,17 +150,13 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """As for `Record`."""
+        super().check()
         for name in ("tasks", "algorithms", "representations", "seeds"):
             values = list(getattr(self, name))
             if name == "representations":
                 values = [each.name for each in self.observed]
             if len(set(values)) < len(values):
                 raise InputError(f"{name} is {values}: it must have each once")
-        if 0 < self.final_episodes < self.evaluation_episodes:
-            raise InputError(
-                f"final_episodes is {self.final_episodes}: it must be as many as "
-                f"evaluation_episodes, {self.evaluation_episodes}, or more"
-            )
         self._check_tasks()
         read_ranges(self.domain or {})
         for algorithm in self.algorithms:

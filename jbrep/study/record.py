@@ -12,6 +12,7 @@ from jbrep.coordinates import OBSERVATION
 from jbrep.dataset.scaling import EXTREMA
 from jbrep.encoders import FULL, load
 from jbrep.encoders.base import OWN
+from jbrep.envs.task import Task
 from jbrep.errors import InputError
 from jbrep.records.document import Document
 from jbrep.records.record import Record, Version, from_plain, to_plain
@@ -145,6 +146,12 @@ class RunsRecord(Document, frozen=True, kw_only=True):
         if self.study:
             return self.study.baseline
         return Rules().baseline_of(each.settings.representation for each in self.labels.values())
+
+    @property
+    def tasks(self) -> dict[str, Task]:
+        """The tasks of the runs by their names."""
+        settings = (each.settings for each in self.labels.values())
+        return {each.task: each.environment for each in settings}
 
     def draws_of(self, learner: str) -> Mapping[str, tuple[Any, ...]]:
         """The values of settings, one of which each seed of the study draws, of a learner."""

@@ -37,7 +37,7 @@ from jbrep.study.tables import (
     Return,
     RunInfo,
     by_run,
-    former_tasks,
+    former_record,
     read_references,
     table_hashes,
     write_references,
@@ -58,8 +58,9 @@ def write_tables(folder: Path) -> list[Path]:
     Raises:
         InputError: there is no such run, a file is damaged, or a table can't be written.
     """
-    ended, before = _ended(folder), table_hashes(folder)
-    references = write_references(_tasks(ended.values()), folder, before, former_tasks(folder))
+    ended, former = _ended(folder), former_record(folder)
+    before, played_on = (former.tables, former.tasks) if former else ({}, {})
+    references = write_references(_tasks(ended.values()), folder, before, played_on)
     rows, infos = list(_returns(ended)), list(_of_runs(ended, read_infos))
     tables = {name: before[name] for name in (DIAGNOSTICS,) if name in before}
     tables[RETURNS] = write_rows(folder / RETURNS, rows, Return)

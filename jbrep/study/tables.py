@@ -92,21 +92,18 @@ def by_run(returns: Iterable[Return]) -> dict[tuple[str, int], dict[int, list[fl
     return found
 
 
+def former_record(folder: Path) -> RunsRecord | None:
+    """What runs.json in a folder says; None where that is missing or can't be read."""
+    try:
+        return read_document(folder / RECORD, RunsRecord)
+    except InputError:
+        return None
+
+
 def table_hashes(folder: Path) -> Mapping[str, str]:
     """The SHA-256 of each table by runs.json; none where that is missing or can't be read."""
-    try:
-        return read_document(folder / RECORD, RunsRecord).tables
-    except InputError:
-        return {}
-
-
-def former_tasks(folder: Path) -> Mapping[str, Task]:
-    """The tasks by their names that runs.json tells of; none where that can't be read."""
-    try:
-        labels = read_document(folder / RECORD, RunsRecord).labels.values()
-    except InputError:
-        return {}
-    return {each.settings.task: each.settings.environment for each in labels}
+    former = former_record(folder)
+    return former.tables if former else {}
 
 
 def write_references(

@@ -56,6 +56,15 @@ class Algorithm(ABC):
         self.critic_target = stack.networks(lambda each: each.critic_target.q_networks)
         self.critic_optimizer = stack.adam(self.critic, lambda each: each.critic.optimizer)
         self.tau: float = stack.agents[0].tau
+        self.set_targets(self.critic, self.critic_target)
+
+    def set_targets(self, networks: Any, targets: Any) -> None:
+        """Say which networks have targets, for `polyak_update`."""
+        self._weights, self._target_weights = tree_leaves(networks), tree_leaves(targets)
+
+    def polyak_update(self) -> None:
+        """Move the weights of the targets towards those of their networks by a share tau."""
+        torch._foreach_lerp_(self._target_weights, self._weights, self.tau)
 
     @abstractmethod
     def explore(self, observation: Tensor, normals: Sequence[Tensor]) -> Tensor:
@@ -111,11 +120,6 @@ def optimizer_step(optimizer: Optimizer) -> Iterator[None]:
         each.requires_grad_(False)
     optimizer.step()
     optimizer.zero_grad()
-
-
-def polyak_update(networks: Any, targets: Any, tau: float) -> None:
-    """Move the weights of target networks towards those of networks by a share tau."""
-    torch._foreach_lerp_(tree_leaves(targets), tree_leaves(networks), tau)
 
 
 def check(algorithm: str, hyperparameters: Hyperparameters) -> None:

@@ -7,14 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from jbrep.rl.cohort.algorithm import (
-    Algorithm,
-    Batch,
-    Losses,
-    min_q,
-    optimizer_step,
-    polyak_update,
-)
+from jbrep.rl.cohort.algorithm import Algorithm, Batch, Losses, min_q, optimizer_step
 from jbrep.rl.cohort.networks import Stack
 
 _LOG_STD = (-20.0, 2.0)  # the limits of stable-baselines3's actor
@@ -77,7 +70,7 @@ class SAC(Algorithm):
             **self.update_ent_coef(log_prob),
         }
         if gradient_step % self.target_update_interval == 0:
-            polyak_update(self.critic, self.critic_target, self.tau)
+            self.polyak_update()
         return losses
 
     def update_critic(self, batch: Batch, normal: Tensor, ent_coef: Tensor) -> Tensor:

@@ -9,14 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from jbrep.rl.cohort.algorithm import (
-    Algorithm,
-    Batch,
-    Losses,
-    min_q,
-    optimizer_step,
-    polyak_update,
-)
+from jbrep.rl.cohort.algorithm import Algorithm, Batch, Losses, min_q, optimizer_step
 from jbrep.rl.cohort.networks import Network, Stack
 
 
@@ -35,6 +28,7 @@ class TD3(Algorithm):
         self.target_noise_clip: float = agent.target_noise_clip
         (self.actor,) = stack.networks(lambda each: [each.actor.mu])
         (self.actor_target,) = stack.networks(lambda each: [each.actor_target.mu])
+        self.set_targets([self.critic, self.actor], [self.critic_target, self.actor_target])
         self.actor_optimizer = stack.adam(self.actor, lambda each: each.actor.optimizer)
 
     def explore(self, observation: Tensor, normals: Sequence[Tensor]) -> Tensor:
@@ -52,8 +46,7 @@ class TD3(Algorithm):
         losses = {"critic_loss": self.update_critic(batch, normals[0])}
         if n_updates % self.policy_delay == 0:
             losses["actor_loss"] = self.update_actor(batch.observation)
-            polyak_update(self.critic, self.critic_target, self.tau)
-            polyak_update(self.actor, self.actor_target, self.tau)
+            self.polyak_update()
         return losses
 
     def update_critic(self, batch: Batch, normal: Tensor) -> Tensor:
