@@ -11,7 +11,7 @@ import threading
 import time
 import tomllib
 from collections import Counter
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import gymnasium
@@ -44,7 +44,8 @@ from jbrep.stats.rules import Rules
 from jbrep.study import prepare as prepare_module
 from jbrep.study.config import Data, Study, as_study, read_study
 from jbrep.study.plan import STUDY, Plan, read_plan
-from jbrep.study.prepare import prepare
+from jbrep.study.prepare import check, prepare
+from jbrep.study.representations import ByName
 from jbrep.study.results import read_runs, write_tables
 from jbrep.study.runner import Progress, on_this_machine, run_study
 from jbrep.study.tables import REFERENCE_RETURNS, RETURNS, read_references, write_references
@@ -90,12 +91,15 @@ def done(tmp_path_factory):
 @pytest.mark.parametrize(
     "path", sorted(Path("studies").rglob("*.toml")), ids=lambda path: path.stem
 )
-def test_the_studies_that_come_along_are_studies(path):
+def test_the_studies_that_come_along_are_studies(path, tmp_path):
     study = read_study(path)
     if path.stem == "paper":
         assert (study.steps, len(study.seeds), study.data) == (5_000_000, 10, Data(steps=5_000_000))
         assert {"dae-12", "dae-8", "dae-4", "full"} <= {*study.representations}
     assert as_study(tomllib.loads(study.toml())) == study
+    ready = all(isinstance(each, ByName) for each in study.observed)  # else made by others first
+    with nullcontext() if ready else pytest.raises(InputError, match=r"is missing|is code"):
+        check(Plan(study, tmp_path / "it"))
 
 
 def written(folder, *lines):
@@ -235,7 +239,10 @@ def test_arguments_and_time_limit_are_those_of_the_environments(tmp_path):
     ("changes", "message"),
     [
         ({"environment": {"spring": 1}}, "can't make Pendulum-v1 with {'spring': 1}"),
-        ({"representations": ("full", "pca-3"), "data": Data(steps=9)}, "pca-3 doesn't reduce the"),
+        (
+            {"representations": ("full", "pca-4"), "data": Data(steps=9)},
+            "choose a latent size of at most 3",
+        ),
         (
             {"representations": ("full", "pca-2")},
             "no encoder 'pca-2' ships for Pendulum-v1: choose one of full, or let the study train",

@@ -21,7 +21,7 @@ from jbrep.report.tables import read_tables
 from jbrep.report.words import shown
 from jbrep.stats.analysis import GroupAnalysis
 from jbrep.stats.claims import CONTRADICTED, NOT_WORSE, UNDECIDED, Verdict
-from jbrep.stats.labels import RepresentationResult
+from jbrep.stats.labels import YES, RepresentationResult
 
 ORDER = ("coordinates", "symmetry")  # first; the others as their names are
 INSIDE = {CONTRADICTED: "white", UNDECIDED: "lightgrey"}  # of a mean's marker; else as the rest
@@ -69,10 +69,11 @@ def rows(studies: Sequence[Judged]) -> Iterator[list[str]]:
     yield ["agents on", *(study.group.task for study in studies)]
     for name in representations(studies):
         yield [name, *(_cell(study, name) for study in studies)]
-    policies = dict.fromkeys(policy for study in studies for policy in study.group.references)
+    played = sorted((study.group.references for study in studies), key=len, reverse=True)
+    policies = dict.fromkeys(policy for each in played for policy in each)
     for policy in policies:
-        played = (study.group.references.get(policy) for study in studies)
-        yield [policy, *(f"{each.value:.0f}" if each else "" for each in played)]
+        returned = (study.group.references.get(policy) for study in studies)
+        yield [policy, *(f"{each.value:.0f}" if each else "" for each in returned)]
 
 
 def _cell(study: Judged, name: str) -> str:
@@ -82,6 +83,8 @@ def _cell(study: Judged, name: str) -> str:
     if name not in study.verdicts:
         return returned
     verdict = study.verdicts[name]
+    if study.group.labels[0].learnt != YES:  # a share of nothing
+        return f"{returned}, {verdict.verdict}"
     return f"{returned}, {verdict.estimate.value:.2f}, {verdict.verdict}"
 
 

@@ -127,6 +127,11 @@ class PCA(Coded, ClosedForm, frozen=True, kw_only=True):
 
     name: ClassVar[str] = "pca"
 
+    @classmethod
+    def largest(cls, size: int) -> int | None:
+        """As for `Method`: as many directions as features."""
+        return size
+
     def make(self, data: ScaledDataset) -> Made:
         """As for `ClosedForm`."""
         return Made(*principal_code(data, self.latent))
@@ -135,7 +140,10 @@ class PCA(Coded, ClosedForm, frozen=True, kw_only=True):
 class Directions(Coded, ClosedForm, frozen=True, kw_only=True):
     """A method whose units are directions: of features that vary, at most as many as those."""
 
-    reduces: ClassVar[bool] = False
+    @classmethod
+    def largest(cls, size: int) -> int | None:
+        """As for `Method`: as many directions as features."""
+        return size
 
     def check_data(self, data: ScaledDataset) -> None:
         """As for `Method`."""
@@ -144,8 +152,4 @@ class Directions(Coded, ClosedForm, frozen=True, kw_only=True):
                 f"{constant[0]} is constant in {data.dataset.folder}: let it pass around the "
                 f"encoder, with --keep {constant[0]}"
             )
-        if self.latent > data.size:
-            raise InputError(
-                f"latent size is {self.latent}: with {data.size} features it must be from 1 to "
-                f"{data.size}"
-            )
+        super().check_data(data)

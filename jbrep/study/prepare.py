@@ -44,13 +44,13 @@ def check(plan: Plan) -> None:
             for number in range(data.sets):
                 _to_collect(data, task, number)
         for each in _by_name(plan):
-            latent = int(each.training.get("latent", 0))
+            largest = get_method(each.kind).largest(task.size)
             if data is None:
                 _check_shipped(each, task)
-            elif get_method(each.kind).reduces and latent >= task.size:
+            elif largest is not None and each.training.get("latent", 0) > largest:
                 raise InputError(
-                    f"{each.name} doesn't reduce the {task.size} features of {name}: choose a "
-                    "smaller latent size"
+                    f"{each.name} has more numbers than the {task.size} features of {name} allow: "
+                    f"choose a latent size of at most {largest}"
                 )
     _check_own(plan)
     of_each = {cell.kind: cell for cell in plan.cells}

@@ -45,7 +45,6 @@ class Method(Record, frozen=True, kw_only=True):
 
     name: ClassVar[str]
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # named sets of settings
-    reduces: ClassVar[bool] = False  # whether its code must be smaller than the observation
 
     scaling: Scaling = "extrema"
     on: On = "observation"
@@ -103,6 +102,11 @@ class Method(Record, frozen=True, kw_only=True):
         return {name: default for name, default in each.items() if default is not NODEFAULT}
 
     @classmethod
+    def largest(cls, size: int) -> int | None:
+        """The largest latent size for an observation of `size` features; None if any will do."""
+        return None
+
+    @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
         """How good an encoder is at what the method is for, in words; empty if that isn't known.
 
@@ -138,23 +142,27 @@ class Method(Record, frozen=True, kw_only=True):
 class Coded(Method, frozen=True, kw_only=True):
     """A method with a code of its own size."""
 
-    reduces: ClassVar[bool] = True
-
     latent: Latent
     keep: Keep = ()
     codes: Codes = "raw"
 
+    @classmethod
+    def largest(cls, size: int) -> int | None:
+        """As for `Method`: one less than the observation has."""
+        return size - 1
+
     def check_data(self, data: ScaledDataset) -> None:
         """As for `Method`."""
-        if self.reduces and data.size <= 1:
+        largest = self.largest(data.size)
+        if largest is not None and largest < 1:
             raise InputError(
                 f"{data.task.name} has {data.size or 'no'} feature to reduce, which can't be: use "
                 f"{FULL}"
             )
-        if self.reduces and self.latent >= data.size:
+        if largest is not None and self.latent > largest:
             raise InputError(
                 f"latent size is {self.latent}: with {data.size} features it must be from 1 to "
-                f"{data.size - 1}"
+                f"{largest}"
             )
 
 
