@@ -200,13 +200,32 @@ def test_agents_without_a_jump_hesitate_where_the_target_is_behind(capsys):
     assert counts == ["55 of 80", "80 of 80", "63 of 80", "4 of 80", "59 of 80"]
 
 
-def test_the_table_of_the_answer_is_the_one_on_its_page(capsys, tmp_path):
+def cells(line):
+    """The cells of a row of a table in Markdown."""
+    return [cell.strip(" `") for cell in line.strip("|").split("|")]
+
+
+def test_the_tables_of_the_answer_are_those_on_the_pages(capsys, tmp_path):
     import answer
 
-    answer.main(str(tmp_path / "a.png"), str(ROOT / "results/answer-face-direction"))
-    page = [line.split("|") for line in (ROOT / "results/README.md").read_text().splitlines()]
-    shown = {tuple(cell.strip() for cell in cells[1:3]) for cells in page if len(cells) > 3}
-    told = [line.split("|") for line in capsys.readouterr().out.splitlines()]
-    assert len(told) == 10
-    assert {tuple(cell.strip() for cell in cells[1:3]) for cells in told} <= shown
+    folders = sorted(str(each) for each in (ROOT / "results").glob("answer-*"))
+    answer.main(str(tmp_path / "a.png"), *folders)
     assert (tmp_path / "a.png").stat().st_size > 10_000
+    told = capsys.readouterr().out.splitlines()
+    assert set(told) <= {*(ROOT / "results/README.md").read_text().splitlines()}
+    tasks, _, *rows = map(cells, told)
+    means = {
+        (row[0], task): int(cell.partition(" ")[0].strip(","))
+        for row in rows
+        for task, cell in zip(tasks[1:], row[1:], strict=True)
+        if cell
+    }
+    front = (ROOT / "README.md").read_text()
+    table = front[front.index("| agents observe") :].partition("\n\n")[0]
+    names, _, *rows = map(cells, table.splitlines())
+    assert set(names[1:]) == set(tasks[1:])
+    observed = ("full", "coordinates", "symmetry", "forward-8-symmetry", "dae-12")
+    blind = ("standing still", "constant drive", "random")
+    for task, *column in zip(names[1:], *(row[1:] for row in rows), strict=True):
+        best = max(means.get((policy, task), 0) for policy in blind)
+        assert [int(each) for each in column] == [*(means[each, task] for each in observed), best]
