@@ -49,14 +49,15 @@ def test_what_is_learned_goes_where_the_reward_is(way):
     assert np.sign(choose(places)).ravel().tolist() == [1, 1, -1, -1]
 
 
+@pytest.mark.parametrize("way", ["trees", "network"])
 @pytest.mark.parametrize("reward", [1.0, -1.0])
-def test_by_constant_rewards_ends_are_avoided_or_sought(reward):
+def test_by_constant_rewards_ends_are_avoided_or_sought(reward, way):
     """The left end of a line: avoided where each step earns one, sought where it costs one."""
     code, after, held = line()
     goes_on = (after[:, 0] > -1).astype(float)
     reward_of_each = np.full(len(code), reward)
     steps = Coded(code, after, Held(code, held.action, reward_of_each, after, goes_on, held.first))
-    choose = fitted.q_iteration(Trees(steps), steps, 0.9, choices(describe("face_direction")))
+    choose = WAYS[way](steps, describe("face_direction"))
     assert np.sign(choose(np.array([[-0.9], [-0.75]], np.float32))).ravel().tolist() == [reward] * 2
 
 

@@ -23,7 +23,8 @@ class Model(NamedTuple):
     """What comes after a code and an action.
 
     Attributes:
-        predict: codes and actions (n, l + k) to changes of the code and rewards, (n, l + 1).
+        predict: codes and actions (n, l + k) to changes of the code, rewards and, where states
+            ended episodes of the data, whether they go on, (n, l + 1) or (n, l + 2).
         low, high: of the codes that were seen, which predictions stay within, (l,).
     """
 
@@ -31,11 +32,14 @@ class Model(NamedTuple):
     low: Codes
     high: Codes
 
-    def step(self, codes: Codes, actions: Actions) -> tuple[Codes, Array]:
-        """The next codes (n, l) and the rewards (n,)."""
+    def step(self, codes: Codes, actions: Actions) -> tuple[Codes, Array, Array]:
+        """The next codes (n, l), the rewards (n,), and the shares that go on after them, (n,)."""
+        size = codes.shape[1]
         told = self.predict(np.hstack((codes, actions)))
-        following = np.clip(codes + told[:, :-1], self.low, self.high)
-        return following.astype(np.float32), told[:, -1]
+        following = np.clip(codes + told[:, :size], self.low, self.high)
+        ends = told.shape[1] > size + 1
+        goes_on = np.clip(told[:, size + 1], 0, 1) if ends else np.ones(len(codes))
+        return following.astype(np.float32), told[:, size], goes_on
 
 
 def linear_model(steps: Coded) -> Model:
@@ -50,9 +54,11 @@ def network_model(steps: Coded) -> Model:
 
 
 def _told(steps: Coded) -> tuple[NDArray[Any], NDArray[Any]]:
-    """What a model is given, (n, l + k), and what it is to predict, (n, l + 1)."""
-    given = np.hstack((steps.code, steps.held.action))
-    return given, np.column_stack((steps.following - steps.code, steps.held.reward))
+    """What a model is given, (n, l + k), and what it is to predict, as `Model.predict` has it."""
+    held = steps.held
+    given = np.hstack((steps.code, held.action))
+    ends = () if held.goes_on.all() else (held.goes_on,)
+    return given, np.column_stack((steps.following - steps.code, held.reward, *ends))
 
 
 def _model(steps: Coded, predict: Predictor) -> Model:
@@ -86,11 +92,12 @@ def planned(model: Model, gamma: float, size: int) -> Choose:
 
 
 def _worth(model: Model, codes: Codes, drawn: Array, gamma: float) -> Array:
-    """The discounted rewards of each sequence of actions (n, m, horizon, k), (n, m)."""
+    """The discounted rewards of each sequence of actions (n, m, horizon, k) to its end, (n, m)."""
     count, many = drawn.shape[:2]
     flat = drawn.reshape(count * many, *drawn.shape[2:]).astype(np.float32)
-    at, total = np.repeat(codes, many, axis=0), np.zeros(len(flat))
+    at, total, weight = np.repeat(codes, many, axis=0), np.zeros(len(flat)), np.ones(len(flat))
     for ahead in range(drawn.shape[2]):
-        at, reward = model.step(at, flat[:, ahead])
-        total += gamma**ahead * reward
+        at, reward, goes_on = model.step(at, flat[:, ahead])
+        total += weight * reward
+        weight *= gamma * goes_on
     return total.reshape(count, many)
