@@ -326,7 +326,7 @@ def test_what_may_fail_often_is_not_called_as_good():
 def test_nothing_follows_from_agents_that_learn_nothing():
     idle = arm("full", drawn(250, 20, 20, 0))
     found = verdicts(idle, arm("dae-12", drawn(250, 10, 20, 1)))["dae-12"]
-    assert found[0].reason == "agents on the full state didn't learn"
+    assert found[0].reason == "agents on the full state didn't clearly learn"
 
 
 def test_the_baseline_and_the_error_are_the_study_s():
@@ -334,7 +334,7 @@ def test_the_baseline_and_the_error_are_the_study_s():
     groups = {KEY: {"dae-12": arm("dae-12", drawn(250, 20, 20, 0)), "full": FULL}}
     rules = Rules(primary=(other,), baseline="dae-12", error=0.01, looks=(1.0,))
     (found, *_) = Planned(rules, tuple(range(20)))(groups)[KEY]["full"]
-    assert found.reason == "agents on dae-12 didn't learn"
+    assert found.reason == "agents on dae-12 didn't clearly learn"
     assert found.level == pytest.approx(0.01)
 
 

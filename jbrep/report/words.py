@@ -159,11 +159,10 @@ def _answer(position: int, claim: Statement, analysis: Analysis) -> Answer:
 
 def _sentence(claim: Statement, verdict: Verdict, name: str, baseline: str) -> str:
     """The numbers behind a verdict; of an undecided one, why."""
-    estimate = tested(verdict) or told(claim.name, verdict.estimate)
-    parts = [f"{name} against {baseline}: {claim.estimand} {estimate}"]
-    if verdict.reason:
-        parts.append(verdict.reason)
-    return f"{'; '.join(parts)}."
+    found = remark(verdict)
+    if not math.isnan(verdict.estimate.value):
+        found = f"{claim.estimand} {found}"
+    return f"{name} against {baseline}: {found or '-'}."
 
 
 def tested(verdict: Verdict) -> str:

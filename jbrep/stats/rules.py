@@ -132,7 +132,7 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
     @property
     def nothing_learnt(self) -> str:
         """Why there is no verdict where these agents don't learn."""
-        return f"agents on {self.compared_with} didn't learn"
+        return f"agents on {self.compared_with} didn't clearly learn"
 
     def baseline_of(self, names: Iterable[str]) -> str:
         """The representation that others are compared with, of some in the order of tables."""
@@ -253,6 +253,8 @@ def _tested(
     claim: Claim, sides: Sides, planned: Planned, level: float, look: int, seed: int
 ) -> Verdict:
     estimated = _estimated(claim, sides, planned.rules, seed)
+    if estimated.reason:  # a share of no gain is no number to judge
+        return replace(estimated, verdict=UNDECIDED, level=level, look=look)
     boundary = estimated.boundary
     p = claim.p_value(sides, boundary, seed)
     direction = claim.side * np.sign(estimated.estimate.value - boundary) if p <= level else 0
@@ -274,12 +276,10 @@ def _tested(
 
 def _reason(claim: Claim, sides: Sides, rules: Rules, direction: int, level: float) -> str | None:
     """Why there can't be a verdict; None if there can."""
-    x, y, frame = sides
+    x, y, _ = sides
     fewest, what = min(x.units, y.units), "encoders" if x.by_encoder else "runs"
     if fewest < FEWEST_UNITS:
         return f"{fewest} {what}; verdicts take {FEWEST_UNITS}"
-    if not learns(y, frame):
-        return rules.nothing_learnt
     if claim.limits_failures and direction > 0:
         most = most_failing(x.units - x.learnt, x.units, level)
         if most > rules.failing:
