@@ -112,7 +112,7 @@ cart-pole: ## results/cart-pole/ anew: twenty minutes
 cheetah-wide: ## results/cheetah-wide/ anew: forty minutes
 answer-move-to-position: ## results/answer-move-to-position/ anew: two hours
 answer-face-direction: ## results/answer-face-direction/ anew: an hour
-answer-move-from-origin: ## results/answer-move-from-origin/ anew: an hour and a half
+answer-move-from-origin answer-move-in-direction: ## results/answer-move-from-origin/ and -in-direction/ anew: an hour and a half each
 # the columns of a study's line in studies/judged.txt
 column = $(shell sed -n 's/^$@ *;//p' studies/judged.txt | cut -d ';' -f $(1))
 .SECONDEXPANSION:
