@@ -159,9 +159,9 @@ policies: $(READY) ## the trained policies that ship, anew: an hour and a half; 
 	for study in policies policies-face-direction policies-move-to-pose; do $(BIN)/jbrep study studies/$$study.toml --out runs/$$study || exit; done
 	$(BIN)/python tools/policies.py runs/policies runs/policies-face-direction runs/policies-move-to-pose
 
-behaviour: $(READY) ## results/behaviour/ anew, of the agents of make confirm-move
-	$(BIN)/jbrep behaviour $(addprefix runs/confirm-move/runs/move_in_direction/small-ddpg/,full linear-changes-12 dae-12) \
-	  --episodes 7 --out results/behaviour
+behaviour: $(READY) ## results/behaviour/ anew, of the agents of make answer-move-in-direction
+	$(BIN)/jbrep behaviour $(addprefix runs/answer-move-in-direction/runs/move_in_direction/drawn-sac/,full symmetry forward-8-symmetry dae-12) \
+	  --episodes 4 --out results/behaviour
 
 clean: ## remove the environment and the demo's files
 	rm -rf $(VENV) $(DEMO) *.egg-info
