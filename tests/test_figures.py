@@ -187,6 +187,20 @@ def test_titles_of_many_representations_do_not_overlap(returns):
     check_apart(figure, "(n = 4)", len(names))
 
 
+@pytest.mark.parametrize(("word", "tilted"), [("dae-{}", False), ("forward-{}-symmetry", True)])
+def test_names_of_representations_do_not_run_into_each_other(word, tilted):
+    full = of_first_group("full")
+    names = ["full", word.format(8), word.format(4)]
+    three = [replace(run, representation=name) for name in names for run in full]
+    (returned,) = (p for p in study_plots(analyse(three), [], {}, {}) if p.name == "final_return")
+    figure = returned.on_paper._figure
+    labels = [text for text in figure.axes[0].get_xticklabels() if text.get_text()]
+    assert {text.get_rotation() for text in labels} == {30.0 if tilted else 0.0}
+    if not tilted:
+        boxes = [text.get_window_extent() for text in labels]
+        assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+
+
 def test_titles_of_many_algorithms_do_not_overlap():
     full = of_first_group("full")
     many = [replace(run, algorithm=f"algorithm-{number}") for number in range(6) for run in full]

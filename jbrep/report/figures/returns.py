@@ -30,6 +30,7 @@ from jbrep.stats.intervals import FEWEST_RUNS
 _LABEL = ("task", "algorithm", "representation")
 _JITTER = 0.16  # between the outermost runs and the middle of their representation
 _ROOM = 0.04  # of an axis, at its ends, for whole markers
+_MOST, _ACROSS = 3, 60  # names that stand side by side, and letters of so many of the longest
 _DASHED = " Dashed: policies that don't learn, on the same starts."
 _INTERVALS = " Bars: 95 % intervals, from four runs on."
 _TILTED = 0.03  # height that a character of a tilted name takes [inches]
@@ -182,7 +183,8 @@ def _draw_runs(
 def _name_columns(axes: Axes, group: GroupAnalysis) -> None:
     names = list(names_with_runs([group]).values())
     axes.set_title(plain(group.name))
-    tilt: dict[str, Any] = {"rotation": 30, "ha": "right"} if len(names) > 3 else {}
+    fits = len(names) <= _MOST and len(names) * max(map(len, names)) <= _ACROSS
+    tilt: dict[str, Any] = {} if fits else {"rotation": 30, "ha": "right"}
     axes.set_xticks(range(len(names)), names, **tilt)
     axes.set_xlim(-0.6, len(names) - 0.4)
     axes.grid(visible=False, axis="x")
