@@ -274,7 +274,7 @@ def test_observations_that_cannot_be_reduced_are_refused(tmp_path):
     with pytest.raises(
         InputError, match="Humanoid-v5 has 1 feature to reduce, which can't be: use"
     ):
-        single.fit("pca", latent=1)
+        single.fit("dae", latent=1)
     assert single.fit("full", **how("full")).encoder.latent_size == 1
     data = wide([20] * 5)
     data.scaler.high[7] = 1e13

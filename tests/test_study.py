@@ -358,7 +358,7 @@ def test_a_data_set_from_elsewhere(collected, tmp_path):
         assert (plan.encoders("face_direction") / "pca-8.safetensors").exists()
     five = {"representations": ("full", "pca-5"), "data": None}
     for changes, message in (
-        ({"representations": ("full", "pca-16")}, "pca-16 can't be trained for face_direction: la"),
+        ({"representations": ("full", "pca-17")}, "pca-17 can't be trained for face_direction: la"),
         ({"representations": ("full", "pca-99")}, "latent size is 99"),
         (five, r"no encoder 'pca-5' ships for .*: choose one of coordinates, dae-12"),
         ({"tasks": ("move_to_pose",), "data": Data(folder=str(collected))}, "made for face_direc"),

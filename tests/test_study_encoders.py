@@ -355,7 +355,7 @@ def test_each_encoder_of_several_learns_from_its_own_data(tmp_path):
     ("own", "message"),
     [
         ({"name": "a", "kind": "slow", "latent": 4, "keep": ["x"]}, "a can't be trained for face"),
-        ({"name": "b", "kind": "pca", "latent": 16}, "b can't be trained for face_direction: lat"),
+        ({"name": "b", "kind": "pca", "latent": 17}, "b can't be trained for face_direction: lat"),
     ],
 )
 def test_settings_of_encoders_are_checked_with_the_data(own, message, tmp_path, collected):
