@@ -85,13 +85,9 @@ class Noise(Coded, ClosedForm, frozen=True, kw_only=True):
     """
 
     name: ClassVar[str] = "noise"
+    fewer: ClassVar[int | None] = None
 
     seed: Seed = 0
-
-    @classmethod
-    def largest(cls, size: int) -> int | None:
-        """As for `Method`: its codes are as large as wanted."""
-        return None
 
     def check_data(self, data: ScaledDataset) -> None:
         """As for `Method`."""

@@ -15,6 +15,7 @@ class Fourier(Coded, ClosedForm, frozen=True, kw_only=True):
     """Sines of random directions, in which functions of the observation are nearly linear."""
 
     name: ClassVar[str] = "fourier"
+    fewer: ClassVar[int | None] = None
 
     frequency: Annotated[
         float,
@@ -26,11 +27,6 @@ class Fourier(Coded, ClosedForm, frozen=True, kw_only=True):
         ),
     ] = 0.5
     seed: Seed = 0
-
-    @classmethod
-    def largest(cls, size: int) -> int | None:
-        """As for `Method`: its codes are as large as wanted."""
-        return None
 
     def make(self, data: ScaledDataset) -> Made:
         """sin(W x + b), with W of N(0, frequency^2) and b uniform (Rahimi and Recht 2007)."""

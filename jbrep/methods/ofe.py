@@ -24,6 +24,7 @@ class OFE(Learned, frozen=True, kw_only=True):
     """The observation with features beside it, from which the next one follows (OFENet)."""
 
     name: ClassVar[str] = "ofe"
+    fewer: ClassVar[int | None] = None
 
     blocks: Annotated[
         int, Meta(ge=1, le=32, description="Layers, each of which sees all that come before.")
@@ -32,11 +33,6 @@ class OFE(Learned, frozen=True, kw_only=True):
     batch_size: BatchSize = None
     learning_rate: LearningRate = 1e-3
     seed: Seed = 0
-
-    @classmethod
-    def largest(cls, size: int) -> int | None:
-        """As for `Method`: its codes are as large as wanted."""
-        return None
 
     def check_data(self, data: ScaledDataset) -> None:
         """As for `Method`."""

@@ -45,6 +45,7 @@ class Method(Record, frozen=True, kw_only=True):
 
     name: ClassVar[str]
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # named sets of settings
+    fewer: ClassVar[int | None] = None  # than features its code must have; None if any size will do
 
     scaling: Scaling = "extrema"
     on: On = "observation"
@@ -104,7 +105,7 @@ class Method(Record, frozen=True, kw_only=True):
     @classmethod
     def largest(cls, size: int) -> int | None:
         """The largest latent size for an observation of `size` features; None if any will do."""
-        return None
+        return None if cls.fewer is None else size - cls.fewer
 
     @classmethod
     def achieved(cls, metrics: Mapping[str, Any], latent: int) -> str:
@@ -142,14 +143,11 @@ class Method(Record, frozen=True, kw_only=True):
 class Coded(Method, frozen=True, kw_only=True):
     """A method with a code of its own size."""
 
+    fewer: ClassVar[int | None] = 1
+
     latent: Latent
     keep: Keep = ()
     codes: Codes = "raw"
-
-    @classmethod
-    def largest(cls, size: int) -> int | None:
-        """As for `Method`: one less than the observation has."""
-        return size - 1
 
     def check_data(self, data: ScaledDataset) -> None:
         """As for `Method`."""
