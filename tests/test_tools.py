@@ -181,11 +181,9 @@ def test_hard_starts_are_those_where_episodes_fail(capsys):
     import hard_starts
 
     hard_starts.main(ROOT / "results/figure-7-sac")
-    told = capsys.readouterr().out
-    *_, position = told.split("\n\n")[:-1]
-    rows = [line.split()[-3:] for line in position.splitlines()[2:]]
-    assert [(int(failed), int(count)) for failed, _, count in rows] == [
-        *((1, 57), (2, 33), (5, 33), (21, 27))
+    *_, position = starts_told(capsys)
+    assert [*position.values()][:5] == [
+        *(["1 of 57"], ["2 of 33"], ["5 of 33"], ["21 of 27"], ["29 of 150"])
     ]
 
 
@@ -193,11 +191,33 @@ def test_agents_without_a_jump_hesitate_where_the_target_is_behind(capsys):
     """As the page of results/answer-face-direction says."""
     import hard_starts
 
-    hard_starts.main(ROOT / str(ROOT / "results/answer-face-direction"))
-    *_, behind = capsys.readouterr().out.strip().splitlines()
-    assert behind.startswith("2.8 to 3.142 rad to the target")
-    counts = [each.strip() for each in behind.split("target")[1].split("  ") if each.strip()]
-    assert counts == ["55 of 80", "80 of 80", "63 of 80", "4 of 80", "59 of 80"]
+    hard_starts.main(ROOT / "results/answer-face-direction")
+    (rows,) = starts_told(capsys)
+    assert rows["2.8 to 3.142 rad to the target"] == [
+        *("55 of 80", "80 of 80", "63 of 80", "4 of 80", "59 of 80")
+    ]
+
+
+def test_where_no_start_is_hard_failures_are_spread_over_all(capsys):
+    """As the page of results/answer-move-from-origin says."""
+    import hard_starts
+
+    hard_starts.main(ROOT / "results/answer-move-from-origin")
+    (rows,) = starts_told(capsys)
+    on_coordinates = {name: row[0] for name, row in rows.items()}
+    assert on_coordinates["all"] == "110 of 800"
+    assert on_coordinates["starts where any does"] == "44 of 50"
+    assert on_coordinates["at one start, at most"] == "7"
+    assert rows["median return"] == ["968", "815", "951", "945", "969"]
+
+
+def starts_told(capsys):
+    """The rows that tools/hard_starts.py printed, by name, for each task."""
+    tables = capsys.readouterr().out.strip().split("\n\n")
+    return [
+        {name: cells for name, *cells in (re.split(" {2,}", row) for row in rows)}
+        for _, _, *rows in map(str.splitlines, tables)
+    ]
 
 
 def cells(line):
