@@ -169,7 +169,13 @@ def test_gradient_steps_are_those_of_stable_baselines3(in_float64, algorithm, pr
 
 def runs(steps, preset="modern", **settings):
     """Three runs of one learner on different codes."""
-    shared = {"task": TASK, "preset": preset, "evaluate_every": 100, "evaluation_episodes": 2}
+    shared = {
+        "task": TASK,
+        "preset": preset,
+        "evaluate_every": 100,
+        "evaluation_episodes": 2,
+        "final_episodes": 2,
+    }
     return [
         Run.of(encoder=code, seed=seed, steps=steps, **shared, **settings)
         for seed, code in enumerate(CODES)

@@ -67,7 +67,12 @@ def stopped(tmp_path_factory):
     """A run that has written a checkpoint, and the folder that has it."""
     folder = tmp_path_factory.mktemp("stopped") / "run"
     run = Run.of(
-        task="face_direction", algorithm="a2c", steps=40, evaluation_episodes=1, preset="paper"
+        task="face_direction",
+        algorithm="a2c",
+        steps=40,
+        evaluation_episodes=1,
+        final_episodes=1,
+        preset="paper",
     )
 
     def watch(job, step):

@@ -768,7 +768,9 @@ def test_training_curves_are_the_evaluations(tmp_path):
 def test_a_run_under_way_shows_its_checkpoint_and_its_own_encoder(name, tmp_path):
     task = describe("face_direction", max_episode_steps=50)
     write_checkpoint(
-        tmp_path, Run.of(task, "a2c", encoder=name, evaluation_episodes=1, preset="paper"), 12_000
+        tmp_path,
+        Run.of(task, "a2c", encoder=name, evaluation_episodes=1, final_episodes=1, preset="paper"),
+        12_000,
     )
     shown = read(inspect(str(tmp_path), out=tmp_path / "it.rrd"))
     assert f"# {tmp_path} at step 12,000" in text(shown["/provenance"])

@@ -356,6 +356,7 @@ def trained(tmp_path_factory):
             encoder=encoder,
             steps=20,
             evaluation_episodes=1,
+            final_episodes=1,
             preset="paper",
         )
         train(run, folder / name)
@@ -413,7 +414,13 @@ def test_a_policy_by_name_needs_an_encoder_that_decodes():
 def test_a_run_whose_encoder_fails_keeps_its_checkpoint(tmp_path):
     spoilt = Spoilt(lambda rows: rows[:, :2] * np.nan, after=26)
     run = Run.of(
-        task=TASK, algorithm="a2c", encoder=spoilt, steps=80, evaluation_episodes=1, preset="paper"
+        task=TASK,
+        algorithm="a2c",
+        encoder=spoilt,
+        steps=80,
+        evaluation_episodes=1,
+        final_episodes=1,
+        preset="paper",
     )
     with pytest.raises(InputError, match="Spoilt returned numbers that are not finite"):
         train(run, tmp_path, Session(save_every=0))

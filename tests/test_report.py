@@ -54,6 +54,7 @@ STUDY = Study(
     steps=2000,
     evaluate_every=1000,
     evaluation_episodes=2,
+    final_episodes=2,
 )
 POLICIES = ("standing still", "constant drive", "random", "hand-written")
 TABLES = ("runs.json", "returns.csv", "references.csv")
@@ -63,7 +64,8 @@ TRAP = "<script>document.title = 'run'</script>"
 DRAWN = as_study(
     {
         **{"tasks": ["face_direction"], "representations": ["full", "dae-8"], "seeds": 4},
-        **{"steps": 2000, "evaluate_every": 1000, "evaluation_episodes": 2},
+        **{"steps": 2000, "evaluate_every": 1000},
+        **{"evaluation_episodes": 2, "final_episodes": 2},
         "algorithms": {"drawn": {"base": "sac", "draws": {"tau": [0.01, 0.02], "gamma": [0.9, 1]}}},
     }
 )
@@ -111,9 +113,9 @@ def whole(tmp_path_factory, one_picture):
     folder = tmp_path_factory.mktemp("whole") / "a-study"
     make_study(folder, failed=(1,))
     rows = [
-        ("face_direction", policy, episode, mean + episode)
-        for policy, mean in (("standing still", 250), ("random", 100), ("hand-written", 940))
-        for episode in range(20)
+        ("face_direction", policy, episode, mean + 20 * episode)
+        for policy, mean in zip(POLICIES, (250, 237, 100, 940), strict=True)
+        for episode in range(STUDY.final_episodes)
     ]
     write_csv(folder / REFERENCE_RETURNS, ("task", "policy", "episode", "return"), rows)
     write_tables(folder)

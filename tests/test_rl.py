@@ -41,7 +41,7 @@ from jbrep.rl.settings import COHORT, SB3
 
 STEPS = 100  # of an episode: little depends on its length
 TASK = describe("face_direction", max_episode_steps=STEPS)
-QUICK = {"task": TASK, "evaluation_episodes": 1}
+QUICK = {"task": TASK, "evaluation_episodes": 1, "final_episodes": 1}
 # to evaluate the text of a run
 IMPORTS = "from msgspec import UNSET; from jbrep.envs import Feature, Task; "
 IMPORTS += "from jbrep.rl.learner import Learner"
@@ -249,7 +249,9 @@ def test_a_run_that_another_process_has_just_finished_is_left_alone(short, tmp_p
 
 KILLED = {
     "ddpg": Run.of(algorithm="ddpg", encoder="dae-8", steps=300, **QUICK, preset="paper"),
-    "sac": Run.of(task="Hopper-v5", preset="modern", steps=1100, evaluation_episodes=1),
+    "sac": Run.of(
+        task="Hopper-v5", preset="modern", steps=1100, evaluation_episodes=1, final_episodes=1
+    ),
 }
 
 

@@ -66,7 +66,14 @@ def episodes_of(folder):
     ids=lambda given: getattr(given, "slug", given),
 )
 def test_every_algorithm_learns_on_any_task(algorithm, task, short_rollouts, tmp_path):
-    run = Run.of(task=task, algorithm=algorithm, steps=150, evaluation_episodes=1, preset="paper")
+    run = Run.of(
+        task=task,
+        algorithm=algorithm,
+        steps=150,
+        evaluation_episodes=1,
+        final_episodes=1,
+        preset="paper",
+    )
     result = train(run, tmp_path)
     assert result.status == "finished", result.reason
     assert result.settings.task == task.name
@@ -89,7 +96,7 @@ def test_the_units_of_actions_do_not_matter(algorithm, short_rollouts, tmp_path)
     """Pulses of 1,000 to 2,000 us would be clipped nearly always, were they not scaled."""
     played = []
     for name in (cart.ID, cart.SERVO):
-        run = Run.of(name, algorithm=algorithm, steps=160, evaluation_episodes=2)
+        run = Run.of(name, algorithm=algorithm, steps=160, evaluation_episodes=2, final_episodes=2)
         assert train(run, tmp_path / str(len(played))).status == "finished"
         rows = read_evaluations(tmp_path / str(len(played)))
         played.append([row.episode_return for row in rows])
@@ -125,7 +132,14 @@ def test_training_is_told_of_terminations(tmp_path):
 @pytest.mark.parametrize("task", [PENDULUM, HOPPER, CART], ids=lambda task: task.slug)
 @pytest.mark.parametrize("algorithm", ["a2c", "sac"])
 def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, task, tmp_path):
-    run = Run.of(task=task, algorithm=algorithm, preset="modern", steps=320, evaluation_episodes=1)
+    run = Run.of(
+        task=task,
+        algorithm=algorithm,
+        preset="modern",
+        steps=320,
+        evaluation_episodes=1,
+        final_episodes=1,
+    )
     one, other = tmp_path / "one", tmp_path / "other"
     train(run, one)
     steps = []
@@ -139,7 +153,14 @@ def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, tas
 
 
 def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
-    run = Run.of(task=FAILING, algorithm="a2c", steps=800, evaluation_episodes=1, preset="paper")
+    run = Run.of(
+        task=FAILING,
+        algorithm="a2c",
+        steps=800,
+        evaluation_episodes=1,
+        final_episodes=1,
+        preset="paper",
+    )
     result = train(run, tmp_path)
     assert result.status == FAILED
     where = f"failed at step 7 of the episode with seed {training_seed(0) + 3}"
@@ -163,7 +184,14 @@ def test_the_command_says_that_an_environment_failed(tmp_path):
 
 
 def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
-    run = Run.of(task=CART, algorithm="a2c", steps=320, evaluation_episodes=1, preset="paper")
+    run = Run.of(
+        task=CART,
+        algorithm="a2c",
+        steps=320,
+        evaluation_episodes=1,
+        final_episodes=1,
+        preset="paper",
+    )
     with pytest.raises(StoppedError):
         train(run, tmp_path, Session(stop=iter((False, True)).__next__))
     before = (tmp_path / CHECKPOINT).read_bytes()
@@ -187,7 +215,14 @@ def test_an_environment_that_is_not_reproducible(tmp_path):
     assert told.stderr.startswith("Note: Test/Cart-v0 is not reproducible: ")
     assert told.stderr.count("\n") == 1
     drifting = describe(cart.ID, {"drifts": True})
-    run = Run.of(task=drifting, algorithm="a2c", steps=80, evaluation_episodes=1, preset="paper")
+    run = Run.of(
+        task=drifting,
+        algorithm="a2c",
+        steps=80,
+        evaluation_episodes=1,
+        final_episodes=1,
+        preset="paper",
+    )
     with pytest.raises(StoppedError):
         train(run, tmp_path / "stopped", Session(stop=iter((False, True)).__next__))
     with pytest.raises(InputError, match="Test/Cart-v0 is not reproducible here"):
@@ -239,7 +274,7 @@ def test_a_run_goes_on_as_one_that_had_more_steps_at_first(algorithm, overrides,
 
 
 def test_a_run_on_a_schedule_does_not_go_on(tmp_path):
-    settings = {"algorithm": "a2c", "evaluation_episodes": 1}
+    settings = {"algorithm": "a2c", "evaluation_episodes": 1, "final_episodes": 1}
     settings |= {"overrides": {"learning_rate": "linear:1e-3"}}
     train(Run.of(CART, steps=80, **settings), tmp_path, Session(keep_checkpoint=True))
     with pytest.raises(InputError, match="its learning_rate fell to 0 in them, which a longer"):

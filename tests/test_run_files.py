@@ -47,7 +47,13 @@ from jbrep.study.results import write_tables
 
 TASK = describe("face_direction")
 SETTINGS = Run.of(
-    task=TASK, algorithm="a2c", encoder="dae-8", steps=80, evaluation_episodes=1, preset="paper"
+    task=TASK,
+    algorithm="a2c",
+    encoder="dae-8",
+    steps=80,
+    evaluation_episodes=1,
+    final_episodes=1,
+    preset="paper",
 )
 
 

@@ -476,7 +476,7 @@ def test_a_study_of_learners(tmp_path):
 
 
 def test_settings_are_not_mixed_under_a_label(tmp_path):
-    steps = {"steps": 5, "evaluation_episodes": 1}
+    steps = {"steps": 5, "evaluation_episodes": 1, "final_episodes": 1}
     for seed, gamma in enumerate((0.9, 0.9, 0.8)):
         learner = Learner.given("a2c", "modern", {"gamma": gamma}, "mine")
         train(Run(task=TASK, learner=learner, seed=seed, **steps), tmp_path / str(seed))
