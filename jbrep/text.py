@@ -4,15 +4,17 @@ import math
 import re
 import shutil
 import textwrap
+import unicodedata
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from html import escape
-from itertools import pairwise
+from itertools import count, pairwise
 from typing import NamedTuple, TypeVar
 
 SIGNIFICANT = ",.3g"  # a format for `number`: three digits
 _GAP = "  "  # between columns
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _NUMBER = re.compile(r"[<>]? ?-?[\d,]*\.?\d+(e[-+]?\d+)?( \[.*\]| \(\d+/\d+\))?")
+_COLUMN = re.compile(r"(step|action|reward)(_\d+)?")
 _NO_NUMBER = re.compile(r"-( \(\d+/\d+\))?")
 _Item = TypeVar("_Item")
 
@@ -189,6 +191,31 @@ def slug(text: str) -> str:
     Letters are those of ASCII: dm_control/cheetah-run-v0 becomes dm_control-cheetah-run-v0.
     """
     return re.sub(r"[^A-Za-z0-9._-]", "-", text)
+
+
+def words(names: Iterable[str]) -> list[str]:
+    """Different names for features, as close to those given as a feature's may be.
+
+    Of letters of ASCII, digits, '.', '_' and '-', from a letter on: Greek letters are spelled,
+    accents dropped. What is named as a column of every data set gets another name.
+    """
+    found = dict[str, None]()
+    for name in names:
+        word = re.sub(r"[^A-Za-z0-9_.-]+", "_", "".join(map(_spelled, name)))[:90].strip("_")
+        if not word[:1].isalpha() or _COLUMN.fullmatch(word):
+            word = f"obs_{word}".rstrip("_")
+        numbered = (f"{word}_{number}" for number in count(2))
+        found[next(numbered) if word in found else word] = None
+    return [*found]
+
+
+def _spelled(letter: str) -> str:
+    """A letter in ASCII, if there is a way."""
+    if letter.isascii():
+        return letter
+    if (name := unicodedata.name(letter, "")).startswith("GREEK"):
+        return name.split(" WITH ")[0].rpartition(" ")[2].lower()
+    return unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode() or "_"
 
 
 def duration(seconds: float) -> str:

@@ -49,6 +49,17 @@ def test_a_code_of_a_history_tells_what_one_of_an_observation_does_not(swing):
     assert of_history[1] > reward + 0.3
 
 
+def test_a_data_set_of_a_trained_policy_keeps_it(tmp_path):
+    task = ("--task", "face_direction", "--episode-steps", 20)
+    jbrep("collect", *task, "--policy", "trained", "--steps", 40, "--out", tmp_path / "whole")
+    hidden = ("--hide", "*velocity*", "--out", tmp_path / "seen")
+    assert jbrep("data", "derive", tmp_path / "whole", *hidden).exit_code == 0
+    assert "no problems" in jbrep("data", "verify", tmp_path / "seen").output
+    (tmp_path / "seen" / "shard-00000.h5").write_bytes(b"")
+    told = mistake("data", "repair", tmp_path / "seen")
+    assert "derive the data set again in another folder" in " ".join(told.split())
+
+
 def test_the_command_tells_it(swing, monkeypatch):
     monkeypatch.chdir(swing)
     train = ("train-encoder", "--kind", "linear-forward", "--latent", "3", "--data", "history")
@@ -68,3 +79,9 @@ def test_the_truth_is_of_the_same_motion_and_shows_more(swing, tmp_path, monkeyp
     settings = DataSettings(task=describe("Pendulum-v1"), steps=6000, seed=3)
     collect(settings, tmp_path / "other", num_threads=1)
     assert "has other actions than now: the truth must be" in mistake(*judge, tmp_path / "other")
+
+
+def test_a_time_limit_is_no_argument_of_an_environment(tmp_path):
+    given = ("--env", "max_episode_steps=50", "--steps", 200, "--out", tmp_path / "out")
+    told = mistake("collect", "--task", "Pendulum-v1", *given)
+    assert "Pendulum-v1: --episode-steps sets the time limit" in told

@@ -145,6 +145,26 @@ def test_time_that_stands_or_goes_back(tmp_path):
         assert line in told
 
 
+@pytest.mark.parametrize("kind", [np.uint32, np.int8, np.float32])
+def test_time_goes_back_in_whatever_type(kind, tmp_path):
+    time = np.array([*range(100, 120), *range(20)], kind)
+    rows = {"t": time, "x": np.arange(40.0), "u": np.full(40, 0.5)}
+    pq.write_table(pa.table(rows), tmp_path / "a.parquet")
+    names = ("--observations", "x", "--actions", "u", "--time", "t")
+    told, data = imported(tmp_path / "a.parquet", *names)
+    assert data.episodes["length"].tolist() == [19, 19]
+    assert "1 step back in time" in told
+
+
+def test_numbers_of_steps_begin_anew_where_an_episode_is_cut(tmp_path):
+    step = np.arange(25)
+    rows = {"x": step + 0.5, "action": np.full(25, 0.5), "step": step, "next_x": step + 1.5}
+    pq.write_table(pa.table(rows), tmp_path / "a.parquet")
+    _, data = imported(tmp_path / "a.parquet", "--observations", "x", "--length", "10")
+    assert data.episodes["length"].tolist() == [9, 9, 4]
+    assert data["step"][:].tolist() == [*range(9), *range(9), *range(4)]
+
+
 REWARD = """
 import numpy as np
 def upright(observations, actions):
@@ -247,6 +267,7 @@ BAD = {
     "has no column 'u': it has pitch, gyro, ticks": ({}, (*NAMED, "--angles", "u")),
     "an episode comes in two parts": ({"status": {9: "b"}}, (*NAMED, "--episode", "status")),
     "fill is 'cubic': it must be": ({}, (*NAMED, "--fill", "cubic")),
+    "can't be read as rows of text: field larger": ({"status": {3: "a" * 200_000}}, NAMED),
 }
 
 
@@ -302,6 +323,45 @@ def test_several_logs_are_an_episode_each(tmp_path):
     assert data.episodes["length"].tolist() == [99, 19, 99, 19]
     assert "240 rows read" in told
     assert math.isclose(data.task.action_high[0], VOLTS.max(), rel_tol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        (pa.array(range(9), pa.date32()), "has date32[day] in the column 't': times must be"),
+        (pa.array([False] * 9), "has bool in the column 't': times must be numbers"),
+        (pa.array(range(9), pa.timestamp("s")).cast(pa.int64()), None),
+        (pa.array([2 * 10**10] * 9, pa.timestamp("s")), "'t' has a time beyond the years 1678 to"),
+    ],
+)
+def test_times_are_numbers_timestamps_or_durations(values, told, tmp_path):
+    rows = {"t": values, "x": np.arange(9.0), "u": np.full(9, 0.5)}
+    pq.write_table(pa.table(rows), tmp_path / "a.parquet")
+    names = ("--observations", "x", "--actions", "u", "--time", "t", "--out", tmp_path / "out")
+    done = jbrep("data", "import", tmp_path / "a.parquet", *names)
+    if told:
+        assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+        assert told in done.stderr
+    else:
+        assert done.exit_code == 0
+
+
+def test_words_of_polars_tell_episodes(tmp_path):
+    frame = polars.DataFrame({"x": np.arange(6.0), "u": [0.5] * 6, "trial": ["a"] * 3 + ["b"] * 3})
+    layout = Layout(observations=("x",), actions=("u",), episode="trial")
+    data = Dataset.from_table(tmp_path / "out", frame, layout)
+    assert data.episodes["length"].tolist() == [2, 2]
+
+
+def test_logs_of_other_clocks_are_not_joined(tmp_path):
+    first = write_csv(tmp_path / "a.csv", csv_rows())
+    second = write_csv(tmp_path / "b.csv", csv_rows())
+    slow = {name: [*cells] for name, cells in csv_rows().items()}
+    (time,) = [name for name in slow if name.startswith("time")]
+    slow[time] = [str(10 * float(each)) for each in slow[time]]
+    third = write_csv(tmp_path / "c.csv", slow)
+    told = mistake("data", "import", first, second, third, *NAMED, "--out", tmp_path / "out")
+    assert "c.csv has another time from row to row than" in " ".join(told.split())
 
 
 def test_a_lerobot_data_set(tmp_path):
@@ -413,6 +473,14 @@ def test_a_bag_of_ros(kind, tmp_path):
         (file,) = path.glob("*.mcap")
         _, same = imported(file, *names, "--rate", "50", "--gap", "0.15", out="same")
         np.testing.assert_array_equal(same["observation"], data["observation"])
+
+
+def test_messages_without_numbers_end_no_bag(tmp_path):
+    path = write_bag(tmp_path / "walk", "mcap", silent=(0, 50))
+    names = ("--observations", "/joint_states.position.*", "--actions", "/arm/command.data")
+    told, data = imported(path, *names, "--rate", "50", "--gap", "0.15")
+    assert data.episodes["length"].tolist() == [52, 47]
+    assert "no numbers known in /rosout" in told
 
 
 def test_a_damaged_bag_is_refused(tmp_path):

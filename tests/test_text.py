@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 from jbrep.progress import Progress
-from jbrep.text import duration, facts, slug, sparkline, table
+from jbrep.text import duration, facts, slug, sparkline, table, words
 
 HEADER = ("encoder", "error", "ratio", "worst feature")
 ROWS = [("dae-8", "0.01", "1.10", "velocity_x"), ("dae-12", "0.002", "1.05", "motor_angle")]
@@ -21,6 +21,14 @@ with p.Progress(total=3) as bar:
     bar.update()
     bar.set_postfix(error=1)
 """
+
+
+def test_any_names_become_different_words():
+    given = ["t", "θ", "ώ", "é", "q[0]", "q[1]", "_x", "0", "a b", "a_b", "", "step", "action_1"]
+    assert words(given) == [
+        *("t", "theta", "omega", "e", "q_0", "q_1", "x", "obs_0", "a_b", "a_b_2"),
+        *("obs", "obs_step", "obs_action_1"),
+    ]
 
 
 def test_a_curve_goes_from_the_least_to_the_largest():

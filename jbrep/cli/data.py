@@ -187,6 +187,7 @@ def repair(data: Path, lanes: int, threads: int | None) -> None:
 )
 @record_options(CollectSettings, "store_state")
 @view_options
+@import_option
 @click.option(
     "--reward",
     default="",
@@ -220,6 +221,8 @@ def derive(
 
     if bool(task) == (bool(hide or reward) or history > 1):
         raise InputError("give a --task, or else --hide, --history or --reward")
+    if store_state and not task:
+        raise InputError("--store-state is for --task: else states stay as the source has them")
     if reward and not is_code(reward):
         raise InputError(f"--reward {reward} must be MODULE:FUNCTION")
     import_code(reward)

@@ -17,6 +17,7 @@ from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import Manifest, new_manifest, open_shard
 from jbrep.dataset.rewards import reward_function, with_hash, without_range
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns
+from jbrep.dataset.verify import policy_files
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.recording import Tick
 from jbrep.envs.task import Task
@@ -103,6 +104,7 @@ def derive_view(
     Raises:
         InputError: the source is unfinished or was made with other versions; or as `with_view`,
             `reward_function` or `collect`.
+        DamageError: the file of a policy that acted in it is damaged or missing.
     """
     dataset = Dataset(source)
     _check_finished(dataset)
@@ -122,7 +124,8 @@ def derive_view(
             columns = change(columns)
         return settings.columns(columns)
 
-    return write_shards(settings, folder, _each_shard(dataset, changed))
+    files = policy_files(source, dataset.manifest)
+    return write_shards(settings, folder, _each_shard(dataset, changed), files)
 
 
 def _rewarded(code: str) -> Callable[[Columns], Columns]:

@@ -137,7 +137,11 @@ def _restore(
         )
     with Progress(total=entry.rows, unit="step", unit_scale=True, desc=path.name) as progress:
         simulator = Simulator(settings, make(settings.policy), lanes, num_threads)
-        columns = simulator.shard(shard, progress.update, most_episodes=entry.episodes)
+        try:
+            columns = simulator.shard(shard, progress.update, most_episodes=entry.episodes)
+        except InputError as error:
+            again = "; derive the data set again in another folder" if settings.task.view else ""
+            raise InputError(f"{path} can't be restored: {error}{again}") from None
     if column_hashes(columns) != entry.sha256:
         changed = changes_of(settings.task)
         why = (

@@ -72,18 +72,30 @@ def _backup_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
 
 
 def _policy_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
-    """The files of trained policies are there, as they were when they acted."""
-    for policy in parts_of(manifest.settings.policy):
-        if policy["kind"] != TRAINED:
-            continue
+    try:
+        policy_files(folder, manifest)
+    except DamageError as damage:
+        yield str(damage)
+
+
+def policy_files(folder: Path, manifest: Manifest) -> dict[str, bytes]:
+    """The files of the trained policies that acted in a data set, by name.
+
+    Raises:
+        DamageError: one isn't there, or not as it was when it acted.
+    """
+    files = dict[str, bytes]()
+    for policy in (each for each in parts_of(manifest.settings.policy) if each["kind"] == TRAINED):
         path, raw = folder / policy["file"], b""
         with suppress(InputError):
             raw = read_regular(path, _MAX_POLICY_BYTES)
         if hashlib.sha256(raw).hexdigest() != policy["sha256"]:
-            yield (
+            raise DamageError(
                 f"{path} is damaged or missing: it is the policy of {policy['run']} at step "
                 f"{policy['step']:,}, which only a copy can restore"
             )
+        files[policy["file"]] = raw
+    return files
 
 
 def _content_problems(manifest: Manifest, shard: int, columns: Columns) -> Iterator[str]:

@@ -38,6 +38,7 @@ from jbrep.envs.view import with_view
 from jbrep.errors import InputError, Notice
 from jbrep.records.record import Finite, Record, converted, from_plain
 from jbrep.records.toml import read_toml
+from jbrep.text import words
 
 _PROBE_STEPS = 200  # of each instance whose episodes are compared
 _LONGEST_PROBE = 10_000  # steps in search of a time limit
@@ -75,6 +76,10 @@ def describe(
             of a kind that isn't possible, no time limit, or an unusable file of features.
     """
     spec, given = find_spec(name), dict(arguments or {})
+    if "max_episode_steps" in given:
+        raise InputError(
+            f"max_episode_steps is no argument of {spec.id}: --episode-steps sets the time limit"
+        )
     files = files_of({**spec.kwargs, **given})
     key = (spec.entry_point, tuple(files.items()))
     text = json.dumps(absolute(given), sort_keys=True)
@@ -216,23 +221,27 @@ def features_of(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
     flat = flatten_space(space) if space.is_np_flattenable else None
     if not isinstance(flat, spaces.Box):
         raise InputError(f"{env_id} has observations in {space}, which don't make one flat array")
-    if any(_is_image(part) for _, part in _parts("", space)):
+    names, parts = zip(*_parts("", space), strict=True)
+    if any(map(_is_image, parts)):
         raise InputError(
             f"{env_id} has images as observations, {space}: only features are possible"
         )
-    place = 0
-    for name, part in _parts("", space):
-        size = spaces.utils.flatdim(part)
-        for i in range(size):
-            low, high = float(flat.low[place]), float(flat.high[place])
-            bounded = math.isfinite(low) and math.isfinite(high) and max(-low, high) < 1e30
-            yield Feature(
-                name=name if size == 1 and name != "obs" else f"{name}_{i}",
-                low=low if bounded else None,
-                high=high if bounded else None,
-                group=name,
-            )
-            place += 1
+    sizes = [spaces.utils.flatdim(part) for part in parts]
+    numbers = [
+        (group, group if size == 1 and group != "obs" else f"{group}_{i}")
+        for group, size in zip(words(names), sizes, strict=True)
+        for i in range(size)
+    ]
+    groups, features = zip(*numbers, strict=True) if numbers else ((), ())
+    for group, name, *ends in zip(groups, words(features), flat.low, flat.high, strict=True):
+        low, high = map(float, ends)
+        bounded = math.isfinite(low) and math.isfinite(high) and max(-low, high) < 1e30
+        yield Feature(
+            name=name,
+            low=low if bounded else None,
+            high=high if bounded else None,
+            group=group,
+        )
 
 
 def _parts(name: str, space: spaces.Space[Any]) -> Iterator[tuple[str, spaces.Space[Any]]]:
@@ -245,8 +254,7 @@ def _parts(name: str, space: spaces.Space[Any]) -> Iterator[tuple[str, spaces.Sp
         yield name or "obs", space
         return
     for key, part in items:
-        word = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "_" for c in str(key))
-        yield from _parts(f"{name}.{word}" if name else word, part)
+        yield from _parts(f"{name}.{key}" if name else str(key), part)
 
 
 def _is_image(space: spaces.Space[Any]) -> bool:

@@ -78,8 +78,11 @@ def lerobot_folder(folder, version="v3.0", **features):
     return folder
 
 
-def write_bag(path, kind):
-    """Joints at 100 Hz in changing order, commands at 10 Hz that pause, and words."""
+def write_bag(path, kind, silent=()):
+    """Joints at 100 Hz in changing order, commands at 10 Hz that pause, and words.
+
+    Messages of silent joints, by their numbers, have none.
+    """
     store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
     if kind == "bag":
         writer, pack = Writer1(path), store.serialize_ros1
@@ -105,6 +108,8 @@ def write_bag(path, kind):
             names, angles = ["hip", "knee"], np.array([i / 100, -i / 100])
             if i % 2:
                 names, angles = names[::-1], angles[::-1].copy()
+            if i in silent:
+                names, angles = [], empty
             joints = types["sensor_msgs/msg/JointState"](header, names, angles, empty, empty)
             writer.write(made["/joint_states"], time, pack(joints, joints.__msgtype__))
             if i % 10 == 5 and not 100 < i < 200:

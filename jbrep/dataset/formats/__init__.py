@@ -1,5 +1,6 @@
 """Data sets in other tools' formats: exported to them, and imported from them or from logs."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,6 +9,8 @@ from itertools import chain
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from jbrep.dataset.formats.episodes import Source
 from jbrep.dataset.layout import Layout
@@ -33,6 +36,17 @@ _FOLDERS = {
     "meta/info.json": "lerobot",
     "metadata.yaml": "bags",
 }  # that a folder holds
+
+
+_ALIKE = {  # what data that are imported together have in common
+    "task": "is of another task than",
+    "features": "has other features than",
+    "has_rewards": "has rewards, or none, unlike",
+    "action_bounds": "has other bounds of actions than",
+    "is_shifted": "has offsets of features subtracted, or not, unlike",
+    "timestep": "has another time from row to row than",
+}
+_CLOCKS = 0.01  # by which even clocks may differ
 
 
 def load_format(name: str) -> ModuleType:
@@ -122,21 +136,29 @@ def together(sources: Sequence[Source]) -> Source:
     """Several sources as one: the episodes of each in turn.
 
     Raises:
-        InputError: they differ in features, or some only have rewards.
+        InputError: they differ in what `_ALIKE` says.
     """
     first, *others = sources
     for other in others:
-        for what in ("features", "has_rewards", "action_bounds"):
-            if getattr(other, what) != getattr(first, what):
-                raise InputError(
-                    f"{other.name} has other {what} than {first.name}: import it alone"
-                )
+        for what, differs in _ALIKE.items():
+            if not _same(getattr(other, what), getattr(first, what)):
+                raise InputError(f"{other.name} {differs} {first.name}: import it alone")
     rows = [source.rows or 0 for source in sources]
     return replace(
         first,
         name=f"{first.name} and {counted(len(others), 'more')}" if others else first.name,
         episodes=lambda: chain.from_iterable(source.episodes() for source in sources),
         rows=sum(rows) if all(rows) else None,
+        timestep=first.timestep if all(source.timestep for source in sources) else None,
         notes=tuple(dict.fromkeys(note for source in sources for note in source.notes)),
         changes=lambda: sum((Counter(source.changes()) for source in sources), Counter()),
     )
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two sources are alike in something; times that aren't known, with any."""
+    if isinstance(one, float) or isinstance(other, float):
+        return not (one and other) or math.isclose(one, other, rel_tol=_CLOCKS)
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return len(one) == len(other) and all(map(np.array_equal, one, other))
+    return bool(one == other)

@@ -23,6 +23,7 @@ from jbrep.errors import InputError, kind_and_line
 
 _TIME = "time"
 _DEEPEST = 8  # messages in messages
+_PEEKED = 200  # messages of a topic by which its numbers are known
 
 
 def open_table(given: str) -> Table:
@@ -34,11 +35,11 @@ def open_table(given: str) -> Table:
     path, columns, unknown = Path(given), list[str](), list[str]()
     with _opened(path) as reader:
         for topic in sorted(reader.topics):
-            first = next(_messages(reader, {topic}), None)
-            if first is None:
+            messages = islice(_messages(reader, {topic}), _PEEKED)
+            known = dict.fromkeys(name for _, _, numbers in messages for name in numbers)
+            columns += known
+            if not known:
                 unknown.append(topic)
-            else:
-                columns += first[2]
     schema = pa.schema([(_TIME, pa.timestamp("ns")), *((name, pa.float64()) for name in columns)])
     return Table(
         given,
@@ -65,17 +66,14 @@ def _opened(path: Path) -> Iterator[AnyReader]:
 
 
 def _messages(reader: AnyReader, topics: set[str]) -> Iterator[tuple[int, str, dict[str, float]]]:
-    """Time [ns], topic and numbers of each message, in the order of times."""
+    """Time [ns], topic and numbers of each message, if any, in the order of times."""
     connections = [each for each in reader.connections if each.topic in topics]
     for connection, time, raw in reader.messages(connections) if connections else ():
         try:
             message = reader.deserialize(raw, connection.msgtype)
         except KeyError:  # a type that nobody defines
-            return
-        numbers = dict(_numbers(message, connection.topic, 0))
-        if not numbers:
-            return
-        yield time, connection.topic, numbers
+            message = None
+        yield time, connection.topic, dict(_numbers(message, connection.topic, 0))
 
 
 def _numbers(value: Any, name: str, depth: int) -> Iterator[tuple[str, float]]:
@@ -100,13 +98,13 @@ def _batches(path: Path, schema: pa.Schema, names: list[str]) -> Iterator[pa.Rec
     known = {*schema.names}
     with _opened(path) as reader:
         topics = {t for t in reader.topics if any(name.startswith(f"{t}.") for name in names)}
-        messages = _messages(reader, topics)
+        messages = (each for each in _messages(reader, topics) if each[2])
         while some := list(islice(messages, CHUNK)):
             for time, topic, numbers in some:
                 if new := numbers.keys() - known:
                     raise InputError(
-                        f"{path}, {topic} at {time / 1e9:.3f} s: {min(new)} is not in its first "
-                        "message"
+                        f"{path}, {topic} at {time / 1e9:.3f} s: {min(new)} is in none of its "
+                        f"first {_PEEKED} messages"
                     )
             columns = [
                 pa.array([time for time, _, _ in some], pa.timestamp("ns"))

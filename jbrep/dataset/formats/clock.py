@@ -74,7 +74,8 @@ class Clock:
             self._counts["cuts"] += max(0, steps - 1) // max(length, 1)
             for begin in range(0, steps, length or 1):
                 self._counts["last"] += min(length, steps - begin)
-                yield {name: values[begin : begin + length] for name, values in part.items()}
+                some = {name: values[begin : begin + length] for name, values in part.items()}
+                yield some | ({"step": some["step"] - begin} if "step" in some else {})
 
     def _once_each(self, rows: Rows) -> Rows:
         """The rows without those that have the time of the one before."""

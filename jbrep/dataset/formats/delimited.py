@@ -71,9 +71,13 @@ def _form(path: Path) -> _Form:
     if begin is None:
         raise InputError(f"{path} is empty: its first line must name the columns")
     separator = max(_SEPARATORS, key=lines[begin].count)
-    header, *rows = (
-        [cell.strip() for cell in cells] for cells in csv.reader(lines[begin:], delimiter=separator)
-    )
+    try:
+        header, *rows = (
+            [cell.strip() for cell in cells]
+            for cells in csv.reader(lines[begin:], delimiter=separator)
+        )
+    except csv.Error as error:
+        raise InputError(f"{path} can't be read as rows of text: {error}") from None
     if any(map(_is_number, header)):
         raise InputError(f"{path}, line {begin + 1}: a number where the columns must be named")
     names, units = _names(header)
@@ -92,10 +96,11 @@ def _form(path: Path) -> _Form:
 def _names(header: list[str]) -> tuple[list[str], list[str]]:
     """Names and units of a header's cells, such as 'speed [m/s]'."""
     found = [_UNIT.fullmatch(cell) for cell in header]
+    found = [f if f and not f["unit"].strip().isdigit() else None for f in found]  # as in q[0]
     names = [f["name"] if f else cell for f, cell in zip(found, header, strict=True)]
     units = [f["unit"].strip() if f else "" for f in found]
     if len(set(names)) < len(names):
-        names = header
+        names, units = header, [""] * len(header)
     return [name or f"column_{i}" for i, name in enumerate(names)], units
 
 

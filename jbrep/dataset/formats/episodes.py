@@ -61,6 +61,7 @@ class Source:
         why_no_task: for the user.
         rows: how many there are, if that is known.
         has_rewards: whether they are known.
+        is_shifted: whether the offsets of features are subtracted from observations already.
         timestep: for a task made from the data alone [s].
         notes: what is done to its columns, for the user.
         changes: what was done to the rows that were read last, how often: what it is, and what
@@ -77,6 +78,7 @@ class Source:
     why_no_task: str = "it names no environment"
     rows: int | None = None
     has_rewards: bool = True
+    is_shifted: bool = False
     timestep: float | None = None
     notes: tuple[str, ...] = ()
     changes: Callable[[], Mapping[tuple[str, str], int]] = dict

@@ -24,6 +24,7 @@ from jbrep.dataset.formats.episodes import (
 )
 from jbrep.envs.task import MAX_EPISODE_STEPS, Feature
 from jbrep.errors import InputError
+from jbrep.text import words
 
 Array = NDArray[Any]
 
@@ -102,9 +103,11 @@ def split(
             raise InputError(
                 f"{name} has a {few[0]} for {len(known[few[0]]):,} episodes, and more episodes"
             )
-        of_episode = {what: values[count] for what, values in known.items()}
-        for part in parts(rows):
-            yield from checked(f"{name}: episode {number}", part, of_episode)
+        several, ends = list(parts(rows)), {what: values[count] for what, values in known.items()}
+        starts = {"seed": ends.pop("seed")} if "seed" in ends else {}
+        for i, part in enumerate(several):
+            of_part = (starts if i == 0 else {}) | (ends if i == len(several) - 1 else {})
+            yield from checked(f"{name}: episode {number}", part, of_part)
         count += 1
     for what, values in known.items():
         if len(values) != count:
@@ -200,7 +203,7 @@ def _named(observations: Any) -> tuple[Feature, ...]:
     names = [*getattr(observations, "columns", ())]
     if not all(isinstance(each, str) for each in names):
         return ()
-    return tuple(Feature(name=each) for each in names)
+    return tuple(map(Feature, words(names)))
 
 
 def _listed(name: str, columns: Mapping[str, Any], once: dict[str, Any]) -> Source:

@@ -70,6 +70,7 @@ def source_of_table(table: Table, given: Layout | None = None, missing: str = ""
         features=() if table.task else features,
         rows=None if layout.rate else table.rows,
         has_rewards="reward" in roles,
+        is_shifted=table.task is not None,
         timestep=1 / layout.rate if layout.rate else table.timestep or reader.timestep,
         notes=reader.notes(),
         changes=reader.changes,
@@ -143,15 +144,18 @@ class _Reader:
                     self._check(leaf, role, values, first)
                 rows[role] = np.stack(each, axis=1) if role in WIDE else each[0]
             if "time" in rows:
-                origin = rows["time"][:1] if origin is None or not len(origin) else origin
-                passed = (rows["time"] - origin).astype(float)
+                time = rows["time"]
+                time = time if time.dtype.kind == "f" else time.astype(np.int64)
+                origin = time[:1] if origin is None or not len(origin) else origin
+                passed = (time - origin).astype(float)
                 rows["time"] = passed * self._seconds(self._roles["time"][0])
             if "episode" in rows and rows["episode"].dtype.kind not in "iu":
                 numbers = [labels.setdefault(e, len(labels)) for e in rows["episode"].tolist()]
                 rows["episode"] = np.array(numbers, int)
-            if self._angles.any():
-                turned = rows["observation"] * self._factors
-                rows["observation"] = np.where(self._angles, wrapped(turned), turned)
+            for role in ("observation", "next_observation") if self._angles.any() else ():
+                if role in rows:
+                    turned = rows[role] * self._factors
+                    rows[role] = np.where(self._angles, wrapped(turned), turned)
             first += batch.num_rows
             self._counts["rows"] += batch.num_rows
             yield rows
@@ -201,7 +205,12 @@ class _Reader:
             return flat.astype(float).reshape(len(column), size)
         if pa.types.is_temporal(kind):
             wide = pa.timestamp("ns") if pa.types.is_timestamp(kind) else pa.duration("ns")
-            column = column.cast(wide).cast(pa.int64())
+            try:
+                column = column.cast(wide).cast(pa.int64())
+            except pa.ArrowInvalid:
+                raise InputError(
+                    f"{self._at(first)}: {name!r} has a time beyond the years 1678 to 2262"
+                ) from None
         elif pa.types.is_dictionary(kind):
             column = column.dictionary_decode()
         elif pa.types.is_decimal(kind) or (empty and pa.types.is_boolean(kind)):

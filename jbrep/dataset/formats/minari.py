@@ -320,7 +320,8 @@ def _env_spec(settings: DataSettings) -> EnvSpec | None:
     """What Minari recovers the environment from: with the arguments and the time limit.
 
     None for one that was registered with a class or function: only a name can be written down.
-    None, too, for imported data of one that isn't there.
+    None, too, for imported data of one that isn't there, and where offsets are subtracted from what
+    the environment gives.
     """
     task = settings.task
     try:
@@ -331,7 +332,7 @@ def _env_spec(settings: DataSettings) -> EnvSpec | None:
         raise
     spec.kwargs.update(task.arguments)
     spec.max_episode_steps = task.max_episode_steps
-    return None if callable(spec.entry_point) else spec
+    return None if callable(spec.entry_point) or task.offset.any() else spec
 
 
 @contextmanager

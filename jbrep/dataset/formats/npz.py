@@ -18,6 +18,7 @@ from jbrep.envs.task import Feature
 from jbrep.errors import InputError
 from jbrep.progress import Progress
 from jbrep.records.storage import publish_file, unfinished
+from jbrep.text import words
 
 Array = NDArray[Any]
 EPISODE_BYTES = 0  # besides its rows
@@ -28,6 +29,7 @@ _DAMAGE = (  # what zipfile and NumPy raise at damaged files, and encrypted ones
     *(ValueError, TypeError, KeyError, OSError, EOFError, RuntimeError),
     *(NotImplementedError, zipfile.BadZipFile, zlib.error),
 )
+_LENGTHS = "episodes/length"  # which only jbrep writes
 _ONCE = {  # what is known once for each episode
     "final_observation": ("episodes/final_observation", "final_observations"),
     "terminated": ("episodes/terminated",),
@@ -105,7 +107,9 @@ def open_source(given: str) -> Source:
         label(path.stem),
         lambda: split(given, _chunks(path, own), known),
         features=features,
-        rows=math.prod(stored[own["reward"]].shape[:1]),
+        rows=math.prod(stored[own["action"]].shape[:1]),
+        has_rewards="reward" in own,
+        is_shifted=_LENGTHS in stored,
     )
 
 
@@ -173,7 +177,7 @@ def _features(archive: zipfile.ZipFile, names: Collection[str]) -> tuple[Feature
     if units and len(units) != len(given):
         has = f"{len(given)} feature names and {len(units)} units"
         raise InputError(f"{archive.filename} has {has}")
-    return tuple(map(Feature, given, units or [""] * len(given)))
+    return tuple(map(Feature, words(given), units or [""] * len(given)))
 
 
 def write(dataset: Dataset, out: Path) -> str:

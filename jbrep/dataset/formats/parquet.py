@@ -6,6 +6,7 @@ What jbrep exports says the checksums of its columns, and of the file of its epi
 import hashlib
 import io
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -205,11 +206,17 @@ def _episodes(dataset: Dataset) -> bytes:
 
 def _write_steps(dataset: Dataset, path: Path, name: str, episodes: str) -> None:
     """The settings and checksums are in the file's metadata, the units in the columns'."""
+    columns = [*_numeric_columns(dataset)]
+    if twice := [name for name, n in Counter(name for name, *_ in columns).items() if n > 1]:
+        raise InputError(
+            f"{dataset.folder} has a feature {twice[0]!r}, which is the name of another column of "
+            "a table: export it to npz, or name the feature otherwise, by --features"
+        )
     settings = json.dumps(dataset.manifest.settings.as_json())
     schema = pa.schema(
         [
             pa.field(name, pa.from_numpy_dtype(dtype), nullable=False, metadata={"unit": unit})
-            for name, dtype, unit in _numeric_columns(dataset)
+            for name, dtype, unit in columns
         ],
         metadata={_SETTINGS: settings},
     )

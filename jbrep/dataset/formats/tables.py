@@ -17,6 +17,7 @@ from jbrep.dataset.layout import Layout
 from jbrep.envs.names import is_code
 from jbrep.envs.task import Feature, Task
 from jbrep.errors import InputError, matching
+from jbrep.text import words
 
 Array = NDArray[Any]
 
@@ -24,7 +25,11 @@ UNIT, NAMES = b"unit", b"names"  # in a field's metadata: its unit, and those of
 _ACTION = re.compile(r"actions?(_\d+)?")
 _NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former
 DEGREES = ("deg", "°", "degrees", "degree")
-_WORDS = pa.types.is_string, pa.types.is_large_string, pa.types.is_dictionary
+_WORDS = (
+    *(pa.types.is_string, pa.types.is_large_string, pa.types.is_string_view),
+    pa.types.is_dictionary,
+)
+_TIMES = pa.types.is_timestamp, pa.types.is_duration
 _ONCE = ("reward", "time", "episode", "terminated")  # of a layout: one column each
 
 
@@ -190,10 +195,14 @@ def _check_types(table: Table, role: str, leaves: list[Leaf], named: bool) -> No
     for each in leaves:
         kind = table.schema.field(each.column).type
         kind = kind if each.place is None else kind.value_type
-        if (role == "time" and pa.types.is_temporal(kind)) or (
-            role == "episode" and any(each(kind) for each in _WORDS)
-        ):
+        beside = {"time": _TIMES, "episode": _WORDS}.get(role, ())  # what it may be but a number
+        if any(each(kind) for each in beside):
             continue
+        if role == "time" and (pa.types.is_temporal(kind) or pa.types.is_boolean(kind)):
+            raise InputError(
+                f"{table.name} has {kind} in the column {each.column!r}: times must be numbers, "
+                "timestamps or durations"
+            )
         if sort_of(kind) != "number":
             raise InputError(
                 f"{table.name} has {kind} in the column {each.column!r}: it must be plain numbers; "
@@ -212,9 +221,9 @@ def features_of_table(table: Table, leaves: list[Leaf]) -> Iterator[Feature]:
     Raises:
         InputError: an angle in another unit.
     """
-    shorts = Counter(_word(each.short) for each in leaves)
-    for each in leaves:
-        name = _word(each.short if shorts[_word(each.short)] == 1 else each.name)
+    shorts = Counter(each.short for each in leaves)
+    names = words(each.short if shorts[each.short] == 1 else each.name for each in leaves)
+    for each, name in zip(leaves, names, strict=True):
         if not each.is_angle:
             yield Feature(name=name, unit=each.unit[:40])
         elif each.unit in ("", "rad", *DEGREES):
@@ -225,9 +234,3 @@ def features_of_table(table: Table, leaves: list[Leaf]) -> Iterator[Feature]:
                 f"{table.name} has the angle {each.name!r} in {each.unit!r}: it must be in rad or "
                 "deg"
             )
-
-
-def _word(column: str) -> str:
-    """The name of a column as a feature's."""
-    word = re.sub(r"[^A-Za-z0-9_.-]", "_", column.strip("/"))[:90]
-    return word if word[:1].isalpha() else f"obs_{word}"

@@ -217,7 +217,7 @@ def _fill(source: Source, settings: DataSettings, folder: Path) -> Manifest:
     episodes = _episodes(source, settings.task.missing or "")
     with Progress(total=settings.steps, unit="step", unit_scale=True, desc="write") as progress:
         while some := list(islice(episodes, settings.shard_episodes)):
-            columns = _columns(settings, some, manifest.episodes)
+            columns = _columns(settings, some, manifest.episodes, source.is_shifted)
             for problem in range_problems(settings.task, columns):
                 raise InputError(
                     f"{source.name} doesn't fit {settings.task.name}: {problem}; correct the data, "
@@ -230,14 +230,16 @@ def _fill(source: Source, settings: DataSettings, folder: Path) -> Manifest:
     return manifest
 
 
-def _columns(settings: DataSettings, episodes: list[Incoming], first: int) -> Columns:
+def _columns(
+    settings: DataSettings, episodes: list[Incoming], first: int, is_shifted: bool
+) -> Columns:
     """The columns of a shard."""
 
     def rows(what: str, values: list[Array]) -> NDArray[np.float32]:
         given = zip(episodes, values, strict=True)
         return np.concatenate([single(episode.where, what, each) for episode, each in given])
 
-    offset = settings.task.offset
+    offset = settings.task.offset * (not is_shifted)
     action = rows("action", [episode.action for episode in episodes])
     finals = [episode.final[None] - offset for episode in episodes]
     terminated = np.array([episode.terminated for episode in episodes])
