@@ -41,7 +41,7 @@ from jbrep.rl.settings import COHORT, SB3
 
 STEPS = 100  # of an episode: little depends on its length
 TASK = describe("face_direction", max_episode_steps=STEPS)
-QUICK = {"task": TASK, "evaluation_episodes": 1, "final_episodes": 1}
+QUICK = {"task": TASK, "evaluation_episodes": 1, "final_episodes": 2}
 # to evaluate the text of a run
 IMPORTS = "from msgspec import UNSET; from jbrep.envs import Feature, Task; "
 IMPORTS += "from jbrep.rl.learner import Learner"
@@ -136,7 +136,7 @@ def test_a_runs_folder(short):
     assert run.seconds > 0
     assert run.cpu
     played = [(e.step, e.episode) for e in read_evaluations(short)]
-    assert played == [(0, 0), *((80, episode) for episode in range(10))]
+    assert played == [(0, 0), (80, 0), (80, 1)]
     assert (short / "episodes.csv").read_text() == "step,lane,return,length,diverged\n"
     assert list((short / "tensorboard").glob("events.*"))
     assert not (short / "checkpoint.safetensors").exists()

@@ -59,7 +59,6 @@ TINY = Study(
     steps=80,
     evaluate_every=80,
     evaluation_episodes=1,
-    final_episodes=1,
     episode_steps=100,
 )
 TOML = """
@@ -70,7 +69,6 @@ seeds = 2
 steps = 80
 evaluate_every = 80
 evaluation_episodes = 1
-final_episodes = 1
 episode_steps = 100
 """
 

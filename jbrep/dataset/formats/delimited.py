@@ -18,6 +18,7 @@ _SEPARATORS = ",;\t|"
 _COMMENTS = ("#", "%")
 _EMPTY = [*pa_csv.ConvertOptions().null_values, "-", "--", "None", "NAN", "Nan"]
 _UNIT = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\])]*)[\])]")
+_PLACE = re.compile(r"\w[\[(]\d+[\])]$")  # of q[0], which is no unit
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d\S*")
 _ZONE = re.compile(r"(Z|[+-]\d\d:?\d\d)$")
@@ -96,7 +97,7 @@ def _form(path: Path) -> _Form:
 def _names(header: list[str]) -> tuple[list[str], list[str]]:
     """Names and units of a header's cells, such as 'speed [m/s]'."""
     found = [_UNIT.fullmatch(cell) for cell in header]
-    found = [f if f and not f["unit"].strip().isdigit() else None for f in found]  # as in q[0]
+    found = [None if _PLACE.search(cell) else f for f, cell in zip(found, header, strict=True)]
     names = [f["name"] if f else cell for f, cell in zip(found, header, strict=True)]
     units = [f["unit"].strip() if f else "" for f in found]
     if len(set(names)) < len(names):
