@@ -7,6 +7,7 @@ import tracemalloc
 from contextlib import contextmanager
 from importlib import import_module
 from itertools import product
+from pathlib import Path
 from pkgutil import iter_modules
 
 import numpy as np
@@ -324,6 +325,14 @@ def test_the_command_takes_sizes_in_any_form_and_says_what_each_is_good_for(
         refused = jbrep("train-dae", "--latent", nonsense, *out)
         assert refused.exit_code == 2
         assert ": it must be a whole number from 1 to 4,096" in refused.stderr
+
+
+def test_features_that_are_kept_dont_count_in_what_a_code_is_good_for(tmp_path):
+    sample = Path(__file__).parent.parent / "data/sample/face_direction"
+    kept = ("--latent", 2, "--keep", "motor_*", "--data", sample, "--out", tmp_path)
+    told = " ".join(jbrep("train-encoder", "--kind", "slow", *kept).stdout.split())
+    spectrum = load(tmp_path / "slow-2.safetensors").header.metrics["spectrum"]
+    assert f"units correlate {spectrum[0]:.2f} to {spectrum[1]:.2f} with" in told
 
 
 def test_other_settings_or_data_are_refused_and_nothing_is_lost(data, collected, tmp_path):

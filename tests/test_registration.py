@@ -130,7 +130,7 @@ def test_a_policy_that_came_later_changes_no_registered_study(tmp_path):
     """Gains count over the better of standing still and random actions, as was registered then."""
     folder = shutil.copytree(ROOT / "results" / "answer-face-direction", tmp_path / "study")
     path = folder / REFERENCE_RETURNS
-    rows = path.read_text().splitlines()
+    rows = [row for row in path.read_text().splitlines() if CONSTANT not in row]
     drive = [row.replace("standing still", CONSTANT).rsplit(",", 1) for row in rows[1:6]]
     assert all(CONSTANT in row for row, _ in drive)
     path.write_text("\n".join([*rows, *(f"{row},900.0" for row, _ in drive)]) + "\n")
@@ -141,6 +141,13 @@ def test_a_policy_that_came_later_changes_no_registered_study(tmp_path):
     assert group.references[CONSTANT].value == 900
     assert group.reference_policy == STILL
     assert round(group.reference) == 251
+
+
+def test_a_registration_that_is_gone_is_named(tmp_path):
+    folder = shutil.copytree(ROOT / "results" / "answer-face-direction", tmp_path / "study")
+    (folder / REGISTRATION).unlink()
+    with pytest.raises(InputError, match=r"registration.json is missing: put it back"):
+        read_tables(folder)
 
 
 def test_a_registration_comes_first_and_stays_as_it_is(tmp_path):

@@ -30,6 +30,11 @@ HALF = "within half the margin"
 CELL = "face_direction/ddpg/dae-12"
 
 
+def test_looks_for_which_there_are_no_levels_are_told():
+    with pytest.raises(InputError, match="no levels can be computed for looks at 1e-12, 1 of the"):
+        levels((1e-12, 1.0), 0.05)
+
+
 def curve(end, time=50_000, seed=0, name="full", **facts):
     """A run that stands still at 250 until it goes up within 10,000 steps to its final return."""
     rise = np.clip((STEPS - time) / 10_000 + 0.5, 0, 1)

@@ -11,7 +11,7 @@ from made_up import SEEDS, STUDY, make_runs
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.report import report
-from jbrep.report.report import write_report
+from jbrep.report.report import statistics, write_report
 from jbrep.report.statistics import group_tables
 from jbrep.report.tables import read_tables
 from jbrep.stats.power import Arms, Prospect, prospects
@@ -65,6 +65,10 @@ def test_before_a_look_there_are_curves_and_counts_alone(looks):
     assert "Nothing is decided yet: the first look is at 8 runs of each arm." in page
     assert "![Final returns]" in text
     assert [each.representation for each in analysis.open_aggregates] == ["full"]
+    told = statistics(analysis)
+    assert {each["representation"] for each in told["aggregates"]} == {"full"}
+    numbers = [[bool(each["numbers"]) for each in group["comparisons"]] for group in told["groups"]]
+    assert numbers == [[False] * 2, [True] * 2]
     assert words(cell(analysis, "move_in_direction", "dae-8")) == ["exploratory"] * 4
     tables = [group_tables(group, analysis) for group in analysis.groups]
     titles = [[table.title.split(".")[0] for table in each] for each in tables]

@@ -44,7 +44,7 @@ def lost(
     if coordinates is None:
         return (back - rows) / data.scaler.half_width
     error = back - coordinates.inverse(coordinates.forward(rows))
-    turning = [i for i, each in enumerate(data.task.features) if each.is_full_turn]
+    turning = [i for i, each in enumerate(data.task.features) if each.is_angle]
     error[:, turning] = wrapped(error[:, turning])
     return error / data.scaler.half_width
 

@@ -21,7 +21,7 @@ def purpose(encoder: Encoder, data: ScaledDataset) -> str:
     """
     method = METHODS[encoder.kind]
     if not issubclass(method, Reconstructing | PCA):
-        return method.achieved(encoder.header.metrics, encoder.latent_size)
+        return method.achieved(encoder.header.metrics, encoder.latent_size - len(encoder.kept))
     error = f"{encoder.header.metrics[HELD_OUT_MSE]:.5f}, of features scaled to [-1, 1]"
     ratio = ratio_to_pca(encoder, data)
     if method is PCA or ratio is None:

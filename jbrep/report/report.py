@@ -2,8 +2,10 @@
 
 import base64
 import json
+import math
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -159,7 +161,20 @@ def _associated(tables: Tables) -> list[Association]:
 
 
 def statistics(analysis: Analysis) -> dict[str, Any]:
-    """All statistics for programs; an interval is [value, low, high], None if not finite."""
+    """All statistics for programs; an interval is [value, low, high], None if not finite.
+
+    Of comparisons that wait for the first look there are no numbers, as nowhere else.
+    """
+    groups = tuple(
+        replace(
+            group,
+            comparisons=tuple(
+                each if each.is_open else replace(each, numbers={}, brown_forsythe_p=math.nan)
+                for each in group.comparisons
+            ),
+        )
+        for group in analysis.groups
+    )
     return {
         "format": "jbrep statistics",
         "format_version": 4,
@@ -167,8 +182,8 @@ def statistics(analysis: Analysis) -> dict[str, Any]:
         "seed": analysis.seed,
         "claims": [claim._asdict() for claim in statements(analysis.planned)],
         "notes": notes(analysis.planned),
-        "groups": to_plain(analysis.groups),
-        "aggregates": to_plain(analysis.aggregates),
+        "groups": to_plain(groups),
+        "aggregates": to_plain(tuple(analysis.open_aggregates)),
     }
 
 

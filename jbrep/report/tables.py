@@ -82,6 +82,8 @@ def read_tables(folder: Path, across_trainers: bool = False) -> Tables:
     record = read_document(folder / RECORD, RunsRecord)
     registration = read_registration(folder)
     registered = record.registration.sha256 if record.registration else None
+    if registered and registration is None:
+        raise InputError(f"{folder / REGISTRATION} is missing: put it back, as {RECORD} names it")
     if registered != (registration.sha256 if registration else None):
         raise InputError(f"{folder}: {RECORD} is of another registration than {REGISTRATION}")
     sha256 = record.tables

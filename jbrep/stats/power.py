@@ -25,7 +25,7 @@ class Arms(NamedTuple):
 
     runs: int  # of the representation
     units: int  # its encoders, if they are the units of tests, else its runs
-    baseline: int  # runs of the baseline
+    baseline: int  # units of the baseline
 
 
 class Prospect(NamedTuple):
@@ -68,7 +68,7 @@ def prospects(planned: Planned, arms: Mapping[str, Arms]) -> Iterator[Prospect]:
 
 
 def _level(planned: Planned) -> float:
-    return levels(planned.looks, planned.rules.share)[-1]
+    return levels(planned.shares, planned.rules.share)[-1]
 
 
 def _least_p(claim: str) -> float:

@@ -164,6 +164,11 @@ class Planned:
         """How many seeds there are at each look."""
         return tuple(map(self._count, self.looks))
 
+    @cached_property
+    def shares(self) -> tuple[float, ...]:
+        """What the counts are of all seeds."""
+        return tuple(count / len(self.seeds) for count in self.counts)
+
     def _count(self, share: float) -> int:
         return math.ceil(share * len(self.seeds) - 1e-9)
 
@@ -218,7 +223,7 @@ def _look(
             if not cell.is_open or cell.name not in ready:
                 continue
             claim = CLAIMS[rules.claims[len(cell.verdicts)]]
-            level = levels(planned.looks, cell.level)[look]
+            level = levels(planned.shares, cell.level)[look]
             verdict = _tested(claim, ready[cell.name], planned, level, look + 1, seed)
             if verdict.verdict == UNDECIDED:
                 cell.undecided = verdict
@@ -359,11 +364,21 @@ def levels(shares: Sequence[float], level: float) -> tuple[float, ...]:
     """The two-sided level of the test at each look, from shares of the runs that ascend to 1.
 
     All looks together have the level that is given, two-sided, too.
+
+    Raises:
+        InputError: looks that are too close to each other, or to the first run.
     """
     if len(shares) == 1:
         return (level,)
     least = norm.isf(level / 2)
-    constant = brentq(lambda c: _decided(shares, c) - level, least - 0.1, 2 * least + 2)
+    try:
+        constant = brentq(lambda c: _decided(shares, c) - level, least - 0.1, 2 * least + 2)
+    except ValueError:
+        told = ", ".join(f"{share:g}" for share in shares)
+        raise InputError(
+            f"no levels can be computed for looks at {told} of the runs and an error of {level:g}: "
+            "plan fewer looks, further apart"
+        ) from None
     return tuple(2 * norm.sf(constant / np.sqrt(shares)).astype(float))
 
 

@@ -260,9 +260,14 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         return self.verdicts.baseline_of(each.name for each in self.observed)
 
     def arms(self, representation: Representation) -> Arms:
-        """How many runs are planned of a representation, and of the baseline."""
-        runs, encoders = len(self.seeds), len(representation.shares(self.seeds))
-        return Arms(runs, encoders if encoders >= FEWEST_UNITS else runs, runs)
+        """How many runs are planned of a representation, and units of it and of the baseline."""
+        (baseline,) = [each for each in self.observed if each.name == self.baseline]
+        return Arms(len(self.seeds), self._units(representation), self._units(baseline))
+
+    def _units(self, representation: Representation) -> int:
+        """Encoders, if there are enough for tests; else runs."""
+        encoders = len(representation.shares(self.seeds))
+        return encoders if encoders >= FEWEST_UNITS else len(self.seeds)
 
     @property
     def planned(self) -> Planned:
