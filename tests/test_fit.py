@@ -327,6 +327,13 @@ def test_the_command_takes_sizes_in_any_form_and_says_what_each_is_good_for(
         assert ": it must be a whole number from 1 to 4,096" in refused.stderr
 
 
+def test_a_last_batch_of_one_row_ends_no_training(tmp_path):
+    sample = Path(__file__).parent.parent / "data/sample/face_direction"
+    whole = ScaledDataset(Dataset(sample))  # 2,997 windows of training: 7 * 428 and one
+    encoder = Fitter(whole, tmp_path).fit("ofe", latent=24, epochs=1, batch_size=428).encoder
+    assert np.isfinite(encoder.encode(whole.dataset["observation"][:3])).all()
+
+
 def test_features_that_are_kept_dont_count_in_what_a_code_is_good_for(tmp_path):
     sample = Path(__file__).parent.parent / "data/sample/face_direction"
     kept = ("--latent", 2, "--keep", "motor_*", "--data", sample, "--out", tmp_path)

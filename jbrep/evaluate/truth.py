@@ -63,9 +63,11 @@ def state(task: Task, observation: ArrayLike) -> Columns:
 
 
 def _truth(task: Task) -> _Truth:
-    """A task's own ground truth, or every feature."""
+    """A task's own ground truth, unless its features have other names or offsets; or every one."""
     everything = frozenset(task.feature_names)
-    return _TRUTHS.get(task.name, _Truth(partial(_every, angles=_angles(task)), everything))
+    if task.name in _TRUTHS and everything >= _NEEDED and not task.offset.any():
+        return _TRUTHS[task.name]
+    return _Truth(partial(_every, angles=_angles(task)), everything)
 
 
 def _angles(task: Task) -> frozenset[str]:
@@ -101,6 +103,7 @@ def _jitterbug(f: Columns) -> Columns:
     return columns
 
 
+_NEEDED = frozenset((*_ROTATION, "velocity_x", "velocity_y", "motor_angle"))
 _TRUTHS = dict.fromkeys(
     TASKS, _Truth(_jitterbug, frozenset((*_ROTATION, "motor_angle", "angle_to_target")))
 )

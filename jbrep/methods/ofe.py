@@ -1,7 +1,7 @@
 """OFENet: a code larger than the observation, from which the next observation follows."""
 
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -69,7 +69,7 @@ class DenseBlocks(nn.Module):
     def forward(self, values: Tensor) -> Tensor:
         """Numbers (n, size) with all units after them."""
         for linear, norm in zip(self.linears, self.norms, strict=True):
-            units = nn.functional.silu(norm(linear(values)))
+            units = nn.functional.silu(_normalised(norm, linear(values)))
             values = torch.cat((values, units), 1)
         return values
 
@@ -94,6 +94,14 @@ class DenseBlocks(nn.Module):
             )
         assert restore is not None  # there is a block
         return (*chain, dense(restore, np.zeros(len(restore))))
+
+
+def _normalised(norm: Any, units: Tensor) -> Tensor:
+    """A batch of units (n, width); a single row, which has no spread, by those before it."""
+    if not norm.training or len(units) > 1:
+        return cast("Tensor", norm(units))
+    running = norm.running_mean, norm.running_var
+    return nn.functional.batch_norm(units, *running, norm.weight, norm.bias, eps=norm.eps)
 
 
 def _folded(linear: Any, norm: Any) -> tuple[Array, Array]:
