@@ -119,6 +119,21 @@ def test_the_policy_of_a_folder_and_of_a_file(tmp_path):
     assert repr(controller) == "Controller(face_direction: 16 numbers to 1, symmetry)"
 
 
+@pytest.mark.parametrize("history", [1, 2])
+def test_a_policy_that_sees_less_takes_no_more(history):
+    seen = describe("Pendulum-v1", hidden=["obs_0"], history=history)
+    run = Run.of(seen, "sac", preset="paper")
+    encoder = find("full", seen)
+    controller = controller_of(build(run.settings(encoder), encoder, Path("here")))
+    assert controller([0.1, 0.2]).shape == (1,)
+    for wrong in (
+        [0.3],
+        [0.3, 0.1, 0.2],
+    ):  # the whole reading, of which it would take the first two
+        with pytest.raises(InputError, match="numbers observed: it takes 2, of obs_1, obs_2"):
+            controller(wrong)
+
+
 def test_what_it_cannot_act_on_is_refused():
     controller = controller_of(randomised("td3", "full"))
     with pytest.raises(InputError, match=f"takes observations of {TASK.size} numbers, but got"):

@@ -90,11 +90,11 @@ def test_an_environment_of_another_package():
 def test_a_dictionary_s_keys_name_the_features_in_the_order_of_flattening():
     task = describe("Sledges/Nested-v0")
     assert task.feature_names == (
-        *("odd_key__0", "odd_key__1", "signs.part0_0", "signs.part0_1"),
+        *("odd_key_0", "odd_key_1", "signs.part0_0", "signs.part0_1"),
         *("signs.part1_0", "signs.part1_1", "signs.part1_2", "sledge.place", "sledge.speed"),
     )
     assert list(task.groups) == [
-        *("odd_key_", "signs.part0", "signs.part1", "sledge.place", "sledge.speed")
+        *("odd_key", "signs.part0", "signs.part1", "sledge.place", "sledge.speed")
     ]
     lanes = Lanes(task, 1)
     lanes.reset([0], [4])

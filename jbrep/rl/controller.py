@@ -146,10 +146,13 @@ class Controller:
         """The observation with its history, if the policy was trained with one."""
         if not self.task.view:
             return observation
-        rows = np.atleast_2d(observation)
+        rows, shown = np.atleast_2d(observation), len(self.task.view.places)
+        if rows.shape[1] not in (shown, self.task.size):  # now, or with the history that it keeps
+            names = ", ".join(self.task.feature_names[:shown])
+            raise InputError(f"{rows.shape[1]} numbers observed: it takes {shown}, of {names}")
         every = range(len(rows))
         if self._window is None:
-            self._window = Window(self.task, len(rows), range(len(self.task.view.places)))
+            self._window = Window(self.task, len(rows), range(shown))
             seen = self._window.begin(every, rows)
         else:
             taken = np.atleast_2d(self._held)
