@@ -7,7 +7,7 @@ import textwrap
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from html import escape
-from itertools import count, pairwise
+from itertools import chain, count, pairwise
 from typing import NamedTuple, TypeVar
 
 SIGNIFICANT = ",.3g"  # a format for `number`: three digits
@@ -204,8 +204,8 @@ def words(names: Iterable[str]) -> list[str]:
         word = re.sub(r"[^A-Za-z0-9_.-]+", "_", "".join(map(_spelled, name)))[:90].strip("_")
         if not word[:1].isalpha() or _COLUMN.fullmatch(word):
             word = f"obs_{word}".rstrip("_")
-        numbered = (f"{word}_{number}" for number in count(2))
-        found[next(numbered) if word in found else word] = None
+        numbered = chain([word], (f"{word}_{number}" for number in count(2)))
+        found[next(each for each in numbered if each not in found)] = None
     return [*found]
 
 

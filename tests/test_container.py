@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-from small import flip_bit
+from small import ONE_EACH, flip_bit
 from tensors import TensorWindows
 
 from jbrep.dae import DAE
@@ -66,14 +66,7 @@ def test_a_changed_bit_in_a_checkpoint_of_an_encoder_is_noticed(tmp_path):
 def stopped(tmp_path_factory):
     """A run that has written a checkpoint, and the folder that has it."""
     folder = tmp_path_factory.mktemp("stopped") / "run"
-    run = Run.of(
-        task="face_direction",
-        algorithm="a2c",
-        steps=40,
-        evaluation_episodes=1,
-        final_episodes=1,
-        preset="paper",
-    )
+    run = Run.of(task="face_direction", algorithm="a2c", steps=40, preset="paper", **ONE_EACH)
 
     def watch(job, step):
         if (folder / CHECKPOINT).exists():

@@ -15,6 +15,7 @@ import rerun as rr
 from command import jbrep, start, wait_for, wait_for_the_end_of
 from made_up import write_checkpoint, write_record
 from rerun.chunk import RrdReader
+from small import ONE_EACH
 
 from jbrep.dataset import Dataset
 from jbrep.encoders import find
@@ -769,7 +770,7 @@ def test_a_run_under_way_shows_its_checkpoint_and_its_own_encoder(name, tmp_path
     task = describe("face_direction", max_episode_steps=50)
     write_checkpoint(
         tmp_path,
-        Run.of(task, "a2c", encoder=name, evaluation_episodes=1, final_episodes=1, preset="paper"),
+        Run.of(task, "a2c", encoder=name, preset="paper", **ONE_EACH),
         12_000,
     )
     shown = read(inspect(str(tmp_path), out=tmp_path / "it.rrd"))

@@ -17,6 +17,7 @@ from rerun.chunk import RrdReader
 from sklearn.decomposition import PCA
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
+from small import ONE_EACH
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 from wide import wide
@@ -351,13 +352,7 @@ def trained(tmp_path_factory):
     import_code("test_own:Half")
     for name, encoder in (("code", "test_own:Half"), ("object", Whole())):
         run = Run.of(
-            task=TASK,
-            algorithm="a2c",
-            encoder=encoder,
-            steps=20,
-            evaluation_episodes=1,
-            final_episodes=1,
-            preset="paper",
+            task=TASK, algorithm="a2c", encoder=encoder, steps=20, preset="paper", **ONE_EACH
         )
         train(run, folder / name)
     return folder
@@ -413,15 +408,7 @@ def test_a_policy_by_name_needs_an_encoder_that_decodes():
 
 def test_a_run_whose_encoder_fails_keeps_its_checkpoint(tmp_path):
     spoilt = Spoilt(lambda rows: rows[:, :2] * np.nan, after=26)
-    run = Run.of(
-        task=TASK,
-        algorithm="a2c",
-        encoder=spoilt,
-        steps=80,
-        evaluation_episodes=1,
-        final_episodes=1,
-        preset="paper",
-    )
+    run = Run.of(task=TASK, algorithm="a2c", encoder=spoilt, steps=80, preset="paper", **ONE_EACH)
     with pytest.raises(InputError, match="Spoilt returned numbers that are not finite"):
         train(run, tmp_path, Session(save_every=0))
     assert (tmp_path / CHECKPOINT).exists()

@@ -6,6 +6,7 @@ import cart
 import numpy as np
 import pytest
 from command import jbrep
+from small import ONE_EACH
 
 from jbrep.encoders import find
 from jbrep.envs import Lanes, describe
@@ -66,14 +67,7 @@ def episodes_of(folder):
     ids=lambda given: getattr(given, "slug", given),
 )
 def test_every_algorithm_learns_on_any_task(algorithm, task, short_rollouts, tmp_path):
-    run = Run.of(
-        task=task,
-        algorithm=algorithm,
-        steps=150,
-        evaluation_episodes=1,
-        final_episodes=1,
-        preset="paper",
-    )
+    run = Run.of(task=task, algorithm=algorithm, steps=150, preset="paper", **ONE_EACH)
     result = train(run, tmp_path)
     assert result.status == "finished", result.reason
     assert result.settings.task == task.name
@@ -132,14 +126,7 @@ def test_training_is_told_of_terminations(tmp_path):
 @pytest.mark.parametrize("task", [PENDULUM, HOPPER, CART], ids=lambda task: task.slug)
 @pytest.mark.parametrize("algorithm", ["a2c", "sac"])
 def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, task, tmp_path):
-    run = Run.of(
-        task=task,
-        algorithm=algorithm,
-        preset="modern",
-        steps=320,
-        evaluation_episodes=1,
-        final_episodes=1,
-    )
+    run = Run.of(task=task, algorithm=algorithm, preset="modern", steps=320, **ONE_EACH)
     one, other = tmp_path / "one", tmp_path / "other"
     train(run, one)
     steps = []
@@ -153,14 +140,7 @@ def test_a_run_stopped_within_an_episode_resumes_to_the_same_bits(algorithm, tas
 
 
 def test_an_environment_that_fails_makes_the_run_fail(tmp_path):
-    run = Run.of(
-        task=FAILING,
-        algorithm="a2c",
-        steps=800,
-        evaluation_episodes=1,
-        final_episodes=1,
-        preset="paper",
-    )
+    run = Run.of(task=FAILING, algorithm="a2c", steps=800, preset="paper", **ONE_EACH)
     result = train(run, tmp_path)
     assert result.status == FAILED
     where = f"failed at step 7 of the episode with seed {training_seed(0) + 3}"
@@ -184,14 +164,7 @@ def test_the_command_says_that_an_environment_failed(tmp_path):
 
 
 def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
-    run = Run.of(
-        task=CART,
-        algorithm="a2c",
-        steps=320,
-        evaluation_episodes=1,
-        final_episodes=1,
-        preset="paper",
-    )
+    run = Run.of(task=CART, algorithm="a2c", steps=320, preset="paper", **ONE_EACH)
     with pytest.raises(StoppedError):
         train(run, tmp_path, Session(stop=iter((False, True)).__next__))
     before = (tmp_path / CHECKPOINT).read_bytes()
@@ -215,14 +188,7 @@ def test_an_environment_that_is_not_reproducible(tmp_path):
     assert told.stderr.startswith("Note: Test/Cart-v0 is not reproducible: ")
     assert told.stderr.count("\n") == 1
     drifting = describe(cart.ID, {"drifts": True})
-    run = Run.of(
-        task=drifting,
-        algorithm="a2c",
-        steps=80,
-        evaluation_episodes=1,
-        final_episodes=1,
-        preset="paper",
-    )
+    run = Run.of(task=drifting, algorithm="a2c", steps=80, preset="paper", **ONE_EACH)
     with pytest.raises(StoppedError):
         train(run, tmp_path / "stopped", Session(stop=iter((False, True)).__next__))
     with pytest.raises(InputError, match="Test/Cart-v0 is not reproducible here"):
@@ -274,7 +240,7 @@ def test_a_run_goes_on_as_one_that_had_more_steps_at_first(algorithm, overrides,
 
 
 def test_a_run_on_a_schedule_does_not_go_on(tmp_path):
-    settings = {"algorithm": "a2c", "evaluation_episodes": 1, "final_episodes": 1}
+    settings = {"algorithm": "a2c", **ONE_EACH}
     settings |= {"overrides": {"learning_rate": "linear:1e-3"}}
     train(Run.of(CART, steps=80, **settings), tmp_path, Session(keep_checkpoint=True))
     with pytest.raises(InputError, match="its learning_rate fell to 0 in them, which a longer"):

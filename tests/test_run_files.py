@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from command import jbrep, mistake, refused
 from made_up import write_checkpoint
-from small import adopt, forge
+from small import ONE_EACH, adopt, forge
 from stable_baselines3 import A2C
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -51,9 +51,8 @@ SETTINGS = Run.of(
     algorithm="a2c",
     encoder="dae-8",
     steps=80,
-    evaluation_episodes=1,
-    final_episodes=1,
     preset="paper",
+    **ONE_EACH,
 )
 
 

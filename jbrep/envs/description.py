@@ -221,19 +221,19 @@ def features_of(env_id: str, space: spaces.Space[Any]) -> Iterator[Feature]:
     flat = flatten_space(space) if space.is_np_flattenable else None
     if not isinstance(flat, spaces.Box):
         raise InputError(f"{env_id} has observations in {space}, which don't make one flat array")
-    names, parts = zip(*_parts("", space), strict=True)
-    if any(map(_is_image, parts)):
+    parts = [*_parts("", space)]
+    if any(_is_image(part) for _, part in parts):
         raise InputError(
             f"{env_id} has images as observations, {space}: only features are possible"
         )
-    sizes = [spaces.utils.flatdim(part) for part in parts]
+    sizes = [spaces.utils.flatdim(part) for _, part in parts]
     numbers = [
         (group, group if size == 1 and group != "obs" else f"{group}_{i}")
-        for group, size in zip(words(names), sizes, strict=True)
+        for group, size in zip(words(name for name, _ in parts), sizes, strict=True)
         for i in range(size)
     ]
-    groups, features = zip(*numbers, strict=True) if numbers else ((), ())
-    for group, name, *ends in zip(groups, words(features), flat.low, flat.high, strict=True):
+    names = words(name for _, name in numbers)
+    for (group, _), name, *ends in zip(numbers, names, flat.low, flat.high, strict=True):
         low, high = map(float, ends)
         bounded = math.isfinite(low) and math.isfinite(high) and max(-low, high) < 1e30
         yield Feature(

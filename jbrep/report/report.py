@@ -2,10 +2,8 @@
 
 import base64
 import json
-import math
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -165,16 +163,6 @@ def statistics(analysis: Analysis) -> dict[str, Any]:
 
     Of comparisons that wait for the first look there are no numbers, as nowhere else.
     """
-    groups = tuple(
-        replace(
-            group,
-            comparisons=tuple(
-                each if each.is_open else replace(each, numbers={}, brown_forsythe_p=math.nan)
-                for each in group.comparisons
-            ),
-        )
-        for group in analysis.groups
-    )
     return {
         "format": "jbrep statistics",
         "format_version": 4,
@@ -182,7 +170,7 @@ def statistics(analysis: Analysis) -> dict[str, Any]:
         "seed": analysis.seed,
         "claims": [claim._asdict() for claim in statements(analysis.planned)],
         "notes": notes(analysis.planned),
-        "groups": to_plain(groups),
+        "groups": to_plain(analysis.open_groups),
         "aggregates": to_plain(tuple(analysis.open_aggregates)),
     }
 

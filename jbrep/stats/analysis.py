@@ -1,7 +1,7 @@
 """A whole study: results of every representation, comparisons with the baseline, verdicts."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -77,6 +77,20 @@ class Analysis:
     def baseline(self) -> str:
         """The representation that the others are compared with."""
         return self.planned.rules.baseline
+
+    @property
+    def open_groups(self) -> tuple[GroupAnalysis, ...]:
+        """The groups, without the numbers of comparisons that wait for a look."""
+        return tuple(
+            replace(
+                group,
+                comparisons=tuple(
+                    each if each.is_open else replace(each, numbers={}, brown_forsythe_p=np.nan)
+                    for each in group.comparisons
+                ),
+            )
+            for group in self.groups
+        )
 
     @property
     def open_aggregates(self) -> list[Aggregate]:

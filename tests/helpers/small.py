@@ -9,6 +9,8 @@ from jbrep.dataset.manifest import open_shard, read_manifest
 from jbrep.envs import describe
 from jbrep.records.document import sealed
 
+ONE_EACH = {"evaluation_episodes": 1, "final_episodes": 1}  # of a run, in each of its evaluations
+
 
 def settings(task="face_direction", **changes):
     small = {

@@ -36,15 +36,12 @@ _FOLDERS = {
     "meta/info.json": "lerobot",
     "metadata.yaml": "bags",
 }  # that a folder holds
-
-
 _ALIKE = {  # what data that are imported together have in common
     "task": "is of another task than",
     "features": "has other features than",
     "has_rewards": "has rewards, or none, unlike",
     "action_bounds": "has other bounds of actions than",
     "is_shifted": "has offsets of features subtracted, or not, unlike",
-    "timestep": "has another time from row to row than",
 }
 _CLOCKS = 0.01  # by which even clocks may differ
 
@@ -136,13 +133,12 @@ def together(sources: Sequence[Source]) -> Source:
     """Several sources as one: the episodes of each in turn.
 
     Raises:
-        InputError: they differ in what `_ALIKE` says.
+        InputError: they differ in what `_ALIKE` says, or in the time from row to row.
     """
     first, *others = sources
     for other in others:
-        for what, differs in _ALIKE.items():
-            if not _same(getattr(other, what), getattr(first, what)):
-                raise InputError(f"{other.name} {differs} {first.name}: import it alone")
+        if differs := _difference(first, other):
+            raise InputError(f"{other.name} {differs} {first.name}: import it alone")
     rows = [source.rows or 0 for source in sources]
     return replace(
         first,
@@ -155,10 +151,12 @@ def together(sources: Sequence[Source]) -> Source:
     )
 
 
-def _same(one: Any, other: Any) -> bool:
-    """Whether two sources are alike in something; times that aren't known, with any."""
-    if isinstance(one, float) or isinstance(other, float):
-        return not (one and other) or math.isclose(one, other, rel_tol=_CLOCKS)
-    if isinstance(one, tuple) and isinstance(other, tuple):
-        return len(one) == len(other) and all(map(np.array_equal, one, other))
-    return bool(one == other)
+def _difference(one: Source, other: Source) -> str:
+    """In what the other isn't like the one, as in `_ALIKE`; empty if in nothing."""
+    for what, differs in _ALIKE.items():
+        if not np.array_equal(getattr(one, what), getattr(other, what)):
+            return differs
+    step, another = one.timestep, other.timestep
+    if step and another and not math.isclose(step, another, rel_tol=_CLOCKS):
+        return "has another time from row to row than"
+    return ""

@@ -239,7 +239,7 @@ def _columns(
         given = zip(episodes, values, strict=True)
         return np.concatenate([single(episode.where, what, each) for episode, each in given])
 
-    offset = settings.task.offset * (not is_shifted)
+    offset: Array | float = 0.0 if is_shifted else settings.task.offset
     action = rows("action", [episode.action for episode in episodes])
     finals = [episode.final[None] - offset for episode in episodes]
     terminated = np.array([episode.terminated for episode in episodes])
