@@ -41,18 +41,17 @@ def lanes_at_once(task: Task, most: int, threads: int | None, retries: int) -> "
     Args:
         task: whose environment is made.
         most: lanes.
-        threads: to step a batch on; 1 is one instance of other environments.
+        threads: to step a batch on.
         retries: as `Retries` takes them.
 
     Raises:
         InputError: not even one environment can be made.
     """
-    if threads != 1 or is_batched(task):
-        try:
-            return Lanes(task, most, threads, Retries(retries))
-        except InputError:
-            if most == 1 or is_batched(task):
-                raise
+    try:
+        return Lanes(task, most, threads, Retries(retries))
+    except InputError:
+        if most == 1 or is_batched(task):
+            raise
     return Lanes(task, 1, threads, Retries(retries))
 
 

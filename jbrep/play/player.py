@@ -127,7 +127,7 @@ class Player(NamedTuple):
         self, count: int, threads: int | None = None, retries: int = 0
     ) -> Iterator[Outcome]:
         """The same with what `info` tells, some episodes at a time, as they are finished."""
-        most = _BATCH_LANES if is_batched(self.task) else _SEPARATE_LANES
+        most = _BATCH_LANES if is_batched(self.task) else 1 if threads == 1 else _SEPARATE_LANES
         check_episodes(count)
         played = 0
         with _progress(count * self.task.max_episode_steps) as bar:

@@ -215,9 +215,7 @@ class Job:
     def _evaluator(self, lanes: Lanes | None) -> Evaluator:
         task, episodes = self.run.task, self.run.evaluation_episodes
         threads = self.threads_for(episodes)
-        lanes = lanes or lanes_at_once(
-            task, episodes, None if threads == 1 else threads, self.retries
-        )
+        lanes = lanes or lanes_at_once(task, episodes, threads, self.retries)
         return Evaluator(lanes, self.encoder, episodes)
 
     def is_evaluation_due(self, step: int, episode_ended: bool, keep_checkpoint: bool) -> bool:
