@@ -79,6 +79,7 @@ def cohort(learner: tuple[str, str], members: int, precision: str, device: str) 
     folder = Path(tempfile.mkdtemp())
     runs = [run_of(learner, i, precision=precision, device=device) for i in range(members)]
     made = Cohort([Member(Job(run, folder / str(run.seed)), []) for run in runs])
+    made.begin()
     learn_together(made, 400)
     return made
 

@@ -52,6 +52,7 @@ def cohort(agents: int, threads: int, precision: str, device: str = CPU) -> Coho
         for i in range(agents)
     ]
     made = Cohort([Member(job, []) for job in jobs])
+    made.begin()
     learn(made, 4)
     return made
 

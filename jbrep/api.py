@@ -340,8 +340,8 @@ def train(
     if is_one and run.learner.hyperparameters.num_envs > 1:
         run = run.replace(learner=run.learner.overridden({"num_envs": 1}))
     job = Job(run, Path(out), threads or cpu_count(), retries, is_one)
-    if job.result:
-        _note(f"the run in {job.folder} was finished already: nothing was done")
+    if ended := job.result:
+        _note(f"the run in {job.folder} had {ended.status} already: nothing was done")
     elif not known.reproducible:
         _note(
             f"{known.name} is not reproducible: the same seed gives other numbers the next time, "

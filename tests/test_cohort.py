@@ -235,6 +235,7 @@ def test_a_run_follows_that_of_stable_baselines3(algorithm, preset, overrides, d
     made = runs(steps, preset, algorithm=algorithm, overrides=settings, device=device)
     members = [Member(Job(run, tmp_path / str(run.seed)), []) for run in made]
     cohort = Cohort(members)
+    cohort.begin()
     while cohort.goes_on:
         for _ in range(cohort.rollout):
             cohort.act()
@@ -327,18 +328,19 @@ def test_a_member_that_diverges_fails_alone(done, tmp_path):
     assert not (tmp_path / "1" / "policy.zip").exists()
 
 
-def test_an_environment_that_fails_ends_its_run_alone(done, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("call", "steps"), [("reset", 0), ("step", 130)])
+def test_an_environment_that_fails_ends_its_run_alone(call, steps, done, tmp_path, monkeypatch):
     """The others go back to their last checkpoints."""
-    asked, step = count(), AutoresetLanes.step
+    asked, called = count(), getattr(AutoresetLanes, call)
 
-    def fail_once(self, actions):
-        if next(asked) == 130:
+    def fail_once(self, given):
+        if next(asked) == steps:
             raise EnvironmentFailedError("the motor is broken", 2)
-        return step(self, actions)
+        return called(self, given)
 
-    monkeypatch.setattr(AutoresetLanes, "step", fail_once)
+    monkeypatch.setattr(AutoresetLanes, call, fail_once)
     results = together(runs(260, **SAC), tmp_path, save_every=0)
-    assert results[2].reason == "the motor is broken after 130 steps"
+    assert results[2].reason == f"the motor is broken after {steps} steps"
     assert_same(tmp_path, done, "01")
 
 

@@ -74,10 +74,8 @@ def test_the_returns_of_a_file_are_those_of_its_run(run):
     done = jbrep("policy", "check", model, "--run", run, "--episodes", 3)
     assert done.output.startswith(f"Pendulum-v1, {model}: -")
     assert float(done.output.split()[-1]) < 1e-2
-    alone = jbrep(
-        "policy", "check", model, "--episodes", 1, "--episode-steps", 30, "--task", "Pendulum-v1"
-    )
-    assert alone.output.startswith(f"Pendulum-v1, {model}: -")
+    alone = jbrep("policy", "check", model, "--episodes", 3)
+    assert alone.output.splitlines() == done.output.splitlines()[:1]  # in the run's environment
 
 
 def test_mistakes_are_a_line(run, tmp_path):

@@ -28,9 +28,11 @@ from jbrep.rl.files import (
     read_evaluations,
     read_run,
 )
+from jbrep.rl.job import Job
 from jbrep.rl.policy import load_run, load_untrained
 from jbrep.rl.presets import PRESETS, get_preset
 from jbrep.rl.settings import CLASSES
+from jbrep.rl.trainers import train_jobs
 
 CART = describe(cart.ID)
 PENDULUM, HOPPER = describe("Pendulum-v1", max_episode_steps=50), describe("Hopper-v5")
@@ -245,3 +247,56 @@ def test_a_run_on_a_schedule_does_not_go_on(tmp_path):
     train(Run.of(CART, steps=80, **settings), tmp_path, Session(keep_checkpoint=True))
     with pytest.raises(InputError, match="its learning_rate fell to 0 in them, which a longer"):
         train(Run.of(CART, steps=160, **settings), tmp_path)
+
+
+def broken(*_):
+    raise EnvironmentFailedError("out of order", 0)
+
+
+@pytest.mark.parametrize("trainer", ["cohort", "sb3"])
+def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(trainer, tmp_path, monkeypatch):
+    settings = ("rl", "--task", cart.ID, "--algorithm", "sac", "--preset", "modern")
+    settings += ("--trainer", trainer, "--set", "learning_starts=50", "--evaluate-every", 80)
+    settings += ("--evaluation-episodes", 2, "--final-episodes", 3, "--out")
+    folder, whole = tmp_path / "grown", tmp_path / "whole"
+    assert jbrep(*settings, folder, "--steps", 160).exit_code == 0
+    kept = (CHECKPOINT, EPISODES, EVALUATIONS, POLICY, "policy.zip", RUN)
+    before = {name: (folder / name).read_bytes() for name in kept}
+    with monkeypatch.context() as patch:
+        patch.setattr(Lanes, "step", broken)
+        told = jbrep(*settings, folder, "--steps", 320)
+    assert told.exit_code == 1
+    assert f"out of order after 160 steps; {folder} has what its 160 steps before" in told.stderr
+    assert {name: (folder / name).read_bytes() for name in kept} == before
+    assert load_run(folder).settings.steps == 160
+    for each in (folder, whole):
+        assert jbrep(*settings, each, "--steps", 320).exit_code == 0
+    for name in (EPISODES, EVALUATIONS, POLICY):
+        assert (folder / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+def test_a_run_that_was_stopped_can_go_on_with_more_steps(tmp_path):
+    """Its evaluations stay as far apart, although as many more steps would have them further."""
+    settings = {"algorithm": "a2c", **ONE_EACH}
+    with pytest.raises(StoppedError):
+        train(Run.of(CART, steps=200_000, **settings), tmp_path, Session(stop=lambda: True))
+    job = Job(Run.of(CART, steps=400_000, **settings), tmp_path)
+    assert job.settings.evaluate_every == 20_000
+    assert job.checkpoint.read()
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_one_robot_remembers_what_it_saw_before_an_evaluation(normalize, tmp_path):
+    """An evaluation begins the next episode once more; no transition is made of two."""
+    overrides = {"num_envs": 1, "learning_starts": 1000, "normalize": normalize}
+    how = {"algorithm": "sac", "preset": "modern", "trainer": "sb3", "overrides": overrides}
+    run = Run.of(CART, steps=100, evaluate_every=25, **how, **ONE_EACH)
+    [*_] = train_jobs([Job(run, tmp_path, 1, 0, True)], Session(keep_checkpoint=True))
+    assert len({row.step for row in read_evaluations(tmp_path)}) == 5
+    tensors, _ = container.read(tmp_path / CHECKPOINT, "checkpoint")
+    before, after, dones = (
+        tensors[f"buffer.{name}"][:, 0] for name in ("observations", "next_observations", "dones")
+    )
+    goes_on = (dones[:-1] == 0) & (tensors["buffer.timeouts"][:-1, 0] == 0)
+    assert 80 < goes_on.sum() < 99
+    np.testing.assert_array_equal(before[1:][goes_on], after[:-1][goes_on])

@@ -1,5 +1,7 @@
 """What codes are worth: fitted Q-iteration, planning and small agents on codes."""
 
+import dataclasses
+import itertools
 import time
 
 import numpy as np
@@ -10,13 +12,16 @@ from helpers.small import brief
 from jbrep.collect import collect
 from jbrep.dataset import Dataset
 from jbrep.encoders import find
-from jbrep.envs import describe
-from jbrep.errors import Notice
+from jbrep.envs import Lanes, describe
+from jbrep.envs.autoreset import AutoresetLanes
+from jbrep.envs.lanes import EnvironmentFailedError
+from jbrep.errors import InputError, Notice
 from jbrep.evaluate.evaluation import Evaluation, Learned, Lost, Score
 from jbrep.records.document import read_document
 from jbrep.report.evaluation import evaluation_text
 from jbrep.report.worth import condition
 from jbrep.rl.trainers import train_jobs
+from jbrep.stats.intervals import Bounds
 from jbrep.worth import agents, fitted, offline, planning
 from jbrep.worth.fitted import Coded, Fourier, Trees
 from jbrep.worth.offline import Ground, learned
@@ -203,6 +208,37 @@ def test_agents_that_fail_count_with_the_least_return(data, tmp_path, monkeypatc
     with pytest.warns(Notice, match="/full/seed-0 failed: the loss is inf"):
         returns = agents.learned({"full": find("full", data.task)}, data.task, tmp_path)
     assert returns["full"].value == 0
+
+
+def test_an_agent_whose_environment_fails_ends_alone(data, tmp_path, monkeypatch):
+    """Before it was evaluated once: it counts with the least return, if there is one."""
+    reset, numbers = AutoresetLanes.reset, itertools.count()
+
+    def fail_once(self, seeds):
+        if next(numbers) == 0:
+            raise EnvironmentFailedError("no power", 0)
+        return reset(self, seeds)
+
+    monkeypatch.setattr(agents, "STEPS", 200)
+    monkeypatch.setattr(agents, "RUNS", 1)
+    monkeypatch.setattr(AutoresetLanes, "reset", fail_once)
+    codes = {label: find(label, data.task) for label in ("full", "pca-8")}
+    with pytest.warns(Notice, match="/full/seed-0 failed: no power after 0 steps"):
+        returns = agents.learned(codes, data.task, tmp_path)
+    assert returns["full"].value == 0 < returns["pca-8"].value
+    monkeypatch.setattr(agents, "bounds_of", lambda task: Bounds())
+    with (
+        pytest.warns(Notice, match="no power"),
+        pytest.raises(InputError, match="/full/seed-0 has no return to count: no power"),
+    ):
+        agents.learned(codes, data.task, tmp_path)
+
+
+def test_episodes_shorter_than_an_action_is_held_teach_nothing_more(data):
+    with Lanes(data.task, offline.EPISODES) as lanes:
+        ground = dataclasses.replace(Ground.of(data, lanes), hold=data.task.max_episode_steps + 1)
+        found = learned(find("pca-8", data.task), ground, "trees")
+    assert found.again == found.score
 
 
 def returns_of(told, **learned):

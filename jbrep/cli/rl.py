@@ -135,7 +135,7 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
         from jbrep.encoders.shipped import source_of
         from jbrep.envs.infos import shares_text
         from jbrep.rl.checkpoint import StoppedError  # imports torch
-        from jbrep.rl.files import EVALUATIONS, RUN, last_infos, read_evaluations, read_infos
+        from jbrep.rl.files import EVALUATIONS, last_infos, read_evaluations, read_infos
         from jbrep.study.single import beside
 
         task = options["task"]
@@ -146,7 +146,7 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
             click.echo(f"{error}{resumes}", err=True)
             context.exit(128 + received[0])  # as a shell reports a command that a signal ended
     if agent.record.reason is not None:
-        click.echo(f"the run failed: {agent.record.reason}; see {out / RUN}", err=True)
+        click.echo(f"the run failed: {agent.record.reason}; {_left(out)}", err=True)
         context.exit(1)
     returns = agent.returns
     name = agent.record.settings.representation
@@ -158,6 +158,16 @@ def rl(context: click.Context, /, out: Path, **options: Any) -> None:
             tell(str(compared))
     source = source_of(options["encoder"], task)
     say(f"encoder: {source}; all evaluations: {out / EVALUATIONS}")
+
+
+def _left(folder: Path) -> str:
+    """What a run that failed has left."""
+    from jbrep.rl.files import FAILED, RUN, read_run
+
+    left = read_run(folder)
+    if left.status == FAILED:
+        return f"see {folder / RUN}"
+    return f"{folder} has what its {left.steps:,} steps before made, and its last checkpoint"
 
 
 @click.command(

@@ -18,7 +18,7 @@ from jbrep.rl.policy_file import MAX_BYTES
 class Described(msgspec.Struct):
     """What playing needs of what an exported policy says of itself."""
 
-    task: str
+    environment: Task
     action_repeat: Annotated[int, Meta(ge=1)]
 
 
@@ -43,7 +43,7 @@ def read_exported(path: Path) -> tuple[Any, Described]:
     text = session.get_modelmeta().custom_metadata_map.get("jbrep", "")
     try:
         return session, msgspec.json.decode(text, type=Described)
-    except (msgspec.DecodeError, msgspec.ValidationError):
+    except (msgspec.DecodeError, msgspec.ValidationError, InputError):
         raise InputError(f"{path} isn't a policy that jbrep policy export wrote") from None
 
 
@@ -53,10 +53,8 @@ def exported_player(path: Path, task: Task | None = None) -> Player:
     Raises:
         InputError: as `read_exported`, or the task has other features or actions.
     """
-    from jbrep.envs.description import describe
-
     session, said = read_exported(path)
-    known = task or describe(said.task)
+    known = task or said.environment
     (given,), (made,) = session.get_inputs(), session.get_outputs()
     sizes = given.shape[1], made.shape[1]
     if sizes != (known.size, known.action_size):

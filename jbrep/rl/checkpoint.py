@@ -83,14 +83,18 @@ class History:
         """Forget the evaluations after so many steps, or more."""
         self.evaluations = [row for row in self.evaluations if row.step < step]
         self.infos = [row for row in self.infos if row.step < step]
+        self.means = self._means()
 
     def resume(self, header: "CheckpointHeader") -> None:
         """Continue from an earlier process's record."""
         self.episodes, self.evaluations = header.episodes, header.evaluations
         self.infos = header.infos
         self.earlier_seconds, self.first_step = header.seconds, header.step
+        self.means = self._means()
+
+    def _means(self) -> list[float]:
         by_step = groupby(self.evaluations, lambda each: each.step)
-        self.means = [float(np.mean([e.episode_return for e in own])) for _, own in by_step]
+        return [float(np.mean([each.episode_return for each in own])) for _, own in by_step]
 
 
 class StoppedError(Exception):

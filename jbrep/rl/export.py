@@ -46,6 +46,7 @@ def described(controller: Controller) -> dict[str, Any]:
     period = None if task.timestep is None else task.timestep * controller.action_repeat
     return {
         "task": task.name,
+        "environment": to_plain(task),
         "observation": [
             {"name": each.name, "unit": each.unit, "low": each.low, "high": each.high}
             for each in now

@@ -2,7 +2,7 @@
 
 import hashlib
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from importlib.metadata import version
@@ -40,9 +40,11 @@ from jbrep.rl.files import (
     Episode,
     Evaluation,
     RunRecord,
+    is_run,
     read_run,
     write_infos,
 )
+from jbrep.rl.policy import run_settings
 from jbrep.rl.policy_file import MAX_BYTES, read
 from jbrep.rl.policy_zip import policy_zip
 from jbrep.rl.run import Run
@@ -106,7 +108,7 @@ class Job:
         self.run, self.folder, self.threads = run, folder, threads
         self.retries, self.is_one_robot = retries, is_one_robot
         self.encoder = run.find_encoder()
-        self.settings = self._going_on(run.settings(self.encoder))
+        self.settings = self._as_begun(self._going_on(run.settings(self.encoder)))
         self.history = History()
 
     def anew(self) -> "Job":
@@ -137,11 +139,20 @@ class Job:
 
     def _going_on(self, settings: RunSettings) -> RunSettings:
         """Settings with evaluations as far apart as before, where a shorter run goes on."""
-        if self.run.evaluate_every or not exists(self.folder / RUN):
+        if self.run.evaluate_every or not is_run(self.folder):
             return settings
-        before = read_run(self.folder).settings
+        before = run_settings(self.folder)
         same = settings.replace(evaluate_every=before.evaluate_every)
         return same if before.is_extended_by(same) else settings
+
+    def _as_begun(self, settings: RunSettings) -> RunSettings:
+        """Settings with the policy that a run began with, where its source has gone on since."""
+        path = self.folder / BEGINNING
+        if not settings.begin_from or not exists(path):
+            return settings
+        source = read_run(Path(self.run.begin_from)).settings
+        has_gone_on = read(path).header.settings.is_extended_by(source)
+        return settings.replace(begin_from=_sha256(path)) if has_gone_on else settings
 
     def _check_goes_on(self, before: RunRecord) -> None:
         """Make sure that a run with fewer steps can go on.
@@ -194,11 +205,14 @@ class Job:
             InputError: the policy that the run begins with can't be read, or doesn't fit.
             DamageError: that isn't what was written.
         """
-        if self.settings.begin_from:
-            policy = read(Path(self.run.begin_from) / POLICY, self.settings.begin_from)
+        if sha256 := self.settings.begin_from:
+            path = self.folder / BEGINNING
+            if not exists(path) or _sha256(path) != sha256:
+                source = read(Path(self.run.begin_from) / POLICY, sha256).path
+                write_whole(path, read_file(source, MAX_BYTES))
+            policy = read(path, sha256)
             fill_whole(policy, agent.policy)
-            restore_statistics(agent, policy.tensors, policy.path)
-            write_whole(self.folder / BEGINNING, read_file(policy.path, MAX_BYTES))
+            restore_statistics(agent, policy.tensors, path)
         scalars = Scalars(inside(self.folder, "tensorboard"), self.history.first_step)
         agent.set_logger(_Logger(self.settings, [scalars, *writers]))
 
@@ -268,12 +282,14 @@ class Job:
 
         Args:
             agent: trained; the policy of a run that failed isn't kept.
-            failure: why it failed; empty if it didn't.
+            failure: why it failed; empty if it didn't. Where a run went on after fewer steps, what
+                it had left by then stays, and nothing is written.
 
         Returns:
-            The contents of run.json.
+            The contents of run.json; or what they would be.
         """
-        steps = self.step_of(agent)
+        if failure and exists(self.folder / RUN):
+            return self._record(agent, failure, read_run(self.folder).tables, b"")
         (self.folder / RUN).unlink(missing_ok=True)  # of fewer steps, before its files change
         parts = agent.policy, self.run.task, self.encoder, self.settings
         trained = Trained(*parts, None, statistics_of(agent), action_repeat(agent))
@@ -290,7 +306,15 @@ class Job:
         if policy:
             write_whole(self.folder / POLICY, policy)
             write_whole(self.folder / POLICY_ZIP, policy_zip(agent, self.settings))
-        result = RunRecord(
+        result = self._record(agent, failure, tables, policy)
+        result.write(self.folder / RUN)  # last: the run has ended where it exists
+        return result
+
+    def _record(
+        self, agent: BaseAlgorithm, failure: str, tables: Mapping[str, str], policy: bytes
+    ) -> RunRecord:
+        steps = self.step_of(agent)
+        return RunRecord(
             status=FAILED if failure else FINISHED,
             reason=f"{_one_line(failure)} after {steps:,} steps" if failure else None,
             settings=self.settings,
@@ -303,8 +327,10 @@ class Job:
             tables=tables,
             policy_sha256=hashlib.sha256(policy).hexdigest() if policy else None,
         )
-        result.write(self.folder / RUN)  # last: the run has ended where it exists
-        return result
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(read_file(path, MAX_BYTES)).hexdigest()
 
 
 def _one_line(text: str) -> str:

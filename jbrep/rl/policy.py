@@ -33,8 +33,9 @@ from jbrep.training.trainer import single_torch_thread
 def load_run(folder: Path, encoder: Any = None) -> Trained:
     """The policy of a run; nothing that the folder holds is run as code.
 
-    A finished run has its final policy, one that is under way or was stopped its checkpoint's. Only
-    numbers are read of either; the network that they belong to is built from the run's settings.
+    A finished run has its final policy, also while it goes on with more steps; one that is under
+    way or was stopped has its checkpoint's. Only numbers are read of either; the network that they
+    belong to is built from the run's settings.
 
     Args:
         folder: of the run.

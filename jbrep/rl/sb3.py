@@ -151,7 +151,8 @@ class _Follower(BaseCallback):
             first: Any = env.restart()
             if normalizer := self.model.get_vec_normalize_env():
                 normalizer.old_obs = first
-                setattr(self.model, _UNSCALED, first.copy())
+                if observed is self.model._last_obs:  # else the transition isn't stored yet
+                    setattr(self.model, _UNSCALED, first.copy())
                 first = normalizer.normalize_obs(first)
             observed[:] = first
 

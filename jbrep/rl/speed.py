@@ -64,6 +64,7 @@ def _alone(jobs: Sequence[Job]) -> tuple[float, BaseAlgorithm]:
 def _together(jobs: Sequence[Job]) -> tuple[float, BaseAlgorithm]:
     """The same of a cohort: a step of each run."""
     cohort = Cohort([Member(job, []) for job in jobs])
+    cohort.begin()
 
     def learn() -> None:
         while cohort.step * len(jobs) < _MIN_STEPS:

@@ -7,7 +7,7 @@ from pathlib import Path
 from jbrep.records.lock import exclusive
 from jbrep.records.storage import make_folder
 from jbrep.rl.cohort.trainer import train_together
-from jbrep.rl.files import CHECKPOINT, FAILED, OWN, RunRecord
+from jbrep.rl.files import CHECKPOINT, FAILED, OWN, RunRecord, read_run
 from jbrep.rl.job import Ended, Job, Session
 from jbrep.rl.run import Run
 from jbrep.rl.sb3 import train_in_turn
@@ -29,7 +29,8 @@ def train(run: Run, folder: Path, session: Session = _ALONE) -> RunRecord:
         session: what goes on around training.
 
     Returns:
-        The contents of run.json.
+        The contents of run.json; where a run that went on with more steps failed, why: its files
+        are those of the steps before.
 
     Raises:
         InputError: as `Run.settings`; or the folder holds another run, or is in use.
@@ -59,6 +60,7 @@ def train_jobs(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
         for trainer, train_own in _FUNCTIONS.items():
             own = [job for job in jobs if job.settings.trainer == trainer and not results[job]]
             for job, record in train_own(own, session):
-                if not session.keep_checkpoint or record.status == FAILED:
+                keeps = session.keep_checkpoint and record.status != FAILED
+                if not keeps and read_run(job.folder).settings == record.settings:
                     (job.folder / CHECKPOINT).unlink(missing_ok=True)
                 yield job, record

@@ -9,7 +9,7 @@ import numpy as np
 from joblib import cpu_count
 
 from jbrep.envs.task import Array, Task
-from jbrep.errors import Notice
+from jbrep.errors import InputError, Notice
 from jbrep.evaluate.evaluation import Score, score
 from jbrep.progress import Progress
 from jbrep.rl.files import FAILED, RunRecord, last_returns, read_evaluations
@@ -34,7 +34,8 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
         folder: for the runs.
 
     Raises:
-        InputError: the folder holds other runs; or as `Run.settings`.
+        InputError: the folder holds other runs; a run failed before there was a return; or as
+            `Run.settings`.
     """
     jobs = {
         (label, seed): Job(
@@ -54,28 +55,36 @@ def learned(encoders: Mapping[str, Any], task: Task, folder: Path) -> dict[str, 
         for label, encoder in encoders.items()
         for seed in range(RUNS)
     }
-    done = dict.fromkeys(jobs.values(), 0)
+    done = {job.folder: 0 for job in jobs.values()}  # a job is made anew where another's fails
     with Progress(total=STEPS * len(jobs), unit="step", unit_scale=True, desc="agents") as bar:
 
         def watch(job: Job, step: int) -> None:
-            bar.update(min(step, STEPS) - done[job])
-            done[job] = min(step, STEPS)
+            bar.update(min(step, STEPS) - done[job.folder])
+            done[job.folder] = min(step, STEPS)
 
-        ended = dict(train_jobs([*jobs.values()], Session(watch)))
+        trained = train_jobs([*jobs.values()], Session(watch))
+        ended = {job.folder: record for job, record in trained}
     found = {}
     for label in encoders:
         own = [jobs[label, seed] for seed in range(RUNS)]
-        returns = np.concatenate([_returns(job, ended[job]) for job in own])
+        returns = np.concatenate([_returns(job, ended[job.folder]) for job in own])
         found[label] = score(mean_within(returns, bounds_of(task), LEVEL))
     return found
 
 
 def _returns(job: Job, record: RunRecord) -> Array:
-    """The last returns of an agent; of one that failed the least possible, or its worst."""
+    """The last returns of an agent; of one that failed the least possible, or its worst.
+
+    Raises:
+        InputError: it failed before its first evaluation, and no return is the least possible.
+    """
     evaluations = read_evaluations(job.folder)
     if record.status != FAILED:
         return np.array(last_returns(evaluations))
     warnings.warn(f"{job.settings.name} failed: {record.reason}", Notice, stacklevel=2)
     least = bounds_of(job.run.task).low
-    worst = min(each.episode_return for each in evaluations)
-    return np.full(EPISODES, least if np.isfinite(least) else worst)
+    if not np.isfinite(least):
+        if not evaluations:
+            raise InputError(f"{job.settings.name} has no return to count: {record.reason}")
+        least = min(each.episode_return for each in evaluations)
+    return np.full(EPISODES, least)

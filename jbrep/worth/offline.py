@@ -106,7 +106,7 @@ def learned(encoder: BaseEncoder, ground: Ground, way: str) -> Learned:
         lanes, act = ground.lanes, _acting(encoder, task, choose)
         first = _played(lanes, act, ground.hold)
         own = _own_steps(lanes, act, ground.hold)
-        more = _coded(encoder, joined([ground.seen, own]))
+        more = _coded(encoder, joined([ground.seen, *own]))
         again_act = _acting(encoder, task, learn(more, task, ground.gamma))
         again = _played(lanes, again_act, ground.hold)
     return Learned(score=first, again=again, seconds=time.process_time() - began)
@@ -141,8 +141,8 @@ def _played(lanes: Lanes, act: Actor, hold: int) -> Score:
     return score(mean_within(returns, bounds_of(lanes.task), LEVEL))
 
 
-def _own_steps(lanes: Lanes, act: Actor, hold: int) -> Held:
-    """Steps of a policy that explores."""
+def _own_steps(lanes: Lanes, act: Actor, hold: int) -> list[Held]:
+    """Steps of a policy that explores, of each episode."""
     task, random = lanes.task, np.random.default_rng(0)
     drawn = choices(task)
 

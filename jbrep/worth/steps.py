@@ -88,24 +88,22 @@ def stored(data: Dataset, episodes: NDArray[np.int64], hold: int, limit: int) ->
     return joined(found)
 
 
-def recorded(recording: Recording, task: Task, hold: int) -> Held:
-    """Held steps of episodes that were just played."""
-    return joined(
-        [
-            _held(
-                _Episode(
-                    recording.observation[: length + 1, lane],
-                    recording.action[:length, lane],
-                    recording.reward[:length, lane],
-                    bool(recording.terminated[lane]),
-                ),
-                task,
-                hold,
-            )
-            for lane, length in enumerate(recording.length.tolist())
-            if length >= hold
-        ]
-    )
+def recorded(recording: Recording, task: Task, hold: int) -> list[Held]:
+    """Held steps of each episode that was just played, if it is as long as an action is held."""
+    return [
+        _held(
+            _Episode(
+                recording.observation[: length + 1, lane],
+                recording.action[:length, lane],
+                recording.reward[:length, lane],
+                bool(recording.terminated[lane]),
+            ),
+            task,
+            hold,
+        )
+        for lane, length in enumerate(recording.length.tolist())
+        if length >= hold
+    ]
 
 
 def joined(parts: Sequence[Held]) -> Held:

@@ -50,9 +50,18 @@ class Cohort:
         self._algorithm = get_algorithm(settings.algorithm)(self._stack)
         self._stack.read_from_agents()
         job.share(self._robots.lanes)
-        seeds = [training_seed(m.job.run.seed) + i for m in members for i in range(self._lanes)]
-        self._observation = self._encode(self._robots.reset(seeds))
+        self._observation = np.zeros((len(members), self._lanes, self._size), np.float32)
         self._episode_ended = False  # whether an episode has just ended
+
+    def begin(self) -> None:
+        """Begin the first episodes.
+
+        Raises:
+            EnvironmentFailedError: as `act`.
+        """
+        lanes, jobs = range(self._lanes), [member.job for member in self.members]
+        seeds = [training_seed(job.run.seed) + lane for job in jobs for lane in lanes]
+        self._observation = self._encode(self._robots.reset(seeds))
         self._update_statistics()
 
     @property

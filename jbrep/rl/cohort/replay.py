@@ -93,7 +93,7 @@ class ReplayBuffer:
     def drop(self, lost: Flags) -> None:
         """Forget the newest transition of lanes (n, lanes): the one before it ends the episode.
 
-        That one then stands in its place, too.
+        That one then stands in its place, too. The first of all can't be forgotten.
         """
         if self.added > 1:
             newest, before = (self._rows[:, (self.added - k) % self._steps] for k in (1, 2))

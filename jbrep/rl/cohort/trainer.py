@@ -39,9 +39,8 @@ def train_together(jobs: Sequence[Job], session: Session) -> Iterator[Ended]:
     for job in jobs:  # now that no checkpoint of another run is there
         job.keep_encoder()
     for kind in sorted(groups):
-        cohort = _cohort(groups.pop(kind), session)
         with unchecked_distributions():
-            yield from _train(cohort, session)
+            yield from _train(groups.pop(kind), session)
 
 
 def _kind(job: Job, snapshot: Snapshot | None) -> _Kind:
@@ -52,18 +51,21 @@ def _kind(job: Job, snapshot: Snapshot | None) -> _Kind:
     return text, is_new, job.history.first_step, padded_size(job), alone
 
 
-def _cohort(begun: Sequence[_Begun], session: Session) -> Cohort:
-    """A cohort at its start, or where its members' snapshots were taken."""
-    cohort = Cohort([Member(job, session.writers) for job, _ in begun])
-    if snapshots := [snapshot for _, snapshot in begun if snapshot]:
-        with begun[0][0].checkpoint.resuming():
+def _begin(cohort: Cohort, snapshots: Sequence[Snapshot]) -> None:
+    """Begin anew, or go on from where the members' snapshots were taken, if there are any."""
+    if snapshots:
+        with cohort.members[0].job.checkpoint.resuming():
             cohort.restore(snapshots)
-    return cohort
+    else:
+        cohort.begin()
 
 
-def _train(cohort: Cohort, session: Session) -> Iterator[Ended]:
+def _train(begun: list[_Begun], session: Session) -> Iterator[Ended]:
+    cohort = Cohort([Member(job, session.writers) for job, _ in begun])
     everyone = cohort.members
     try:
+        _begin(cohort, [snapshot for _, snapshot in begun if snapshot])
+        begun.clear()  # a replay buffer can be large
         if not everyone[0].job.history.evaluations:
             cohort.evaluate()
         while cohort.goes_on:
