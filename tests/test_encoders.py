@@ -1,5 +1,6 @@
 """Encoders: their arithmetic, their file, what they refuse, and the ones that ship."""
 
+import dataclasses
 import io
 import json
 import os
@@ -96,6 +97,16 @@ def test_numpy_and_torch_agree_in_float32_at_any_shape(encoder, shape):
     back = encoder.decode(tensor)
     assert back.shape == (*shape, 16)
     np.testing.assert_allclose(back.numpy(), encoder.decode(latent), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("on", [None, "symmetry"])
+def test_gradients_flow_after_a_first_use_without_them(on):
+    encoder = make() if on is None else find("symmetry", TASK).with_header(name="anew")
+    with torch.inference_mode():
+        encoder.encode(torch.from_numpy(observations(2)))
+    rows = torch.from_numpy(observations(2)).requires_grad_()
+    encoder.encode(rows).sum().backward()
+    assert rows.grad.any()
 
 
 def test_gradients_flow_through_torch(encoder):
@@ -320,6 +331,18 @@ def test_an_encoder_of_another_environment_or_other_features_is_refused(encoder)
     with pytest.raises(InputError, match="dae-3 was made for other features of Pendulum-v1"):
         make(task=PENDULUM).check_task(renamed)
     make(task=PENDULUM).check_task(describe("Pendulum-v1"))  # with other arguments
+
+
+def test_what_needs_no_data_is_made_of_renamed_or_shifted_features():
+    """Where what ships for the task was made for others."""
+    first, *others = TASK.features
+    renamed = TASK.replace(features=(dataclasses.replace(first, name="x"), *others))
+    for task in (renamed, TASK.replace(offsets={"position_x": 0.5})):
+        assert find("full", task).task == task
+        assert source_of("full", task).startswith("full, ")
+        with pytest.raises(InputError, match="pca-8 was made for "):
+            find("pca-8", task)
+    assert find("full", TASK).header.data  # this ships
 
 
 def test_the_environment_shows_latents_and_refuses_another_task(encoder):

@@ -15,7 +15,14 @@ from PIL import Image
 
 from jbrep.envs import describe
 from jbrep.errors import InputError
-from jbrep.evaluate.evaluation import Evaluation, FeatureError, Prediction, Reconstruction, Score
+from jbrep.evaluate.evaluation import (
+    KEPT,
+    Evaluation,
+    FeatureError,
+    Prediction,
+    Reconstruction,
+    Score,
+)
 from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
 from jbrep.records.document import read_document
 from jbrep.report.figures import behaviour_plots, encoder_plots, study_plots, write
@@ -567,6 +574,14 @@ def test_a_spectrum_shows_which_units_a_code_keeps(of_methods):
     line, *rings = axes.lines  # one line of both, as their spectra are the same
     assert list(line.get_ydata()) == [0.9, 0.8, 0.1, -0.01]
     assert [tuple(ring.get_xydata()[0]) for ring in rings] == [(2, 0.8), (1, 0.9)]
+
+
+def test_features_that_pass_around_the_layers_are_no_units():
+    method = {"spectrum": [0.9, 0.8, 0.1], KEPT: 2}
+    beside = {"slow-1": diagnostics(3, kind="slow", method=method)}
+    plots = {plot.name: plot for plot in encoder_plots(evaluation(beside))}
+    _, ring = drawn(plots["spectrum"]).axes[0].lines
+    assert tuple(ring.get_xydata()[0]) == (1, 0.9)
 
 
 def test_timescales_are_those_of_an_exponential_decay(of_methods):

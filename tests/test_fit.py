@@ -16,6 +16,7 @@ import torch
 from command import jbrep, start, wait_for
 from small import settings
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from threadpoolctl import threadpool_limits
 from wide import wide
 
 from jbrep import methods
@@ -26,10 +27,12 @@ from jbrep.dataset.manifest import open_shard, read_manifest
 from jbrep.dataset.scaling import SCALINGS
 from jbrep.encoders import load
 from jbrep.errors import InputError
+from jbrep.evaluate.held_out import HeldOut
+from jbrep.evaluate.reconstruction import reconstruction
 from jbrep.methods import fit
 from jbrep.methods.controls import Full
 from jbrep.methods.fit import Fitter
-from jbrep.methods.held_out import ratio_to_pca
+from jbrep.methods.held_out import lost, ratio_to_pca
 from jbrep.methods.registry import METHODS, name_of, read_name
 from jbrep.records.lock import exclusive
 from jbrep.training import checkpoint
@@ -272,9 +275,7 @@ def test_constant_huge_and_tiny_features_give_finite_encoders(kind, tmp_path):
 
 def test_observations_that_cannot_be_reduced_are_refused(tmp_path):
     single = Fitter(wide([20] * 5, features=1), tmp_path)
-    with pytest.raises(
-        InputError, match="Humanoid-v5 has 1 feature to reduce, which can't be: use"
-    ):
+    with pytest.raises(InputError, match="Humanoid-v5 has 1 feature to reduce, too few: use"):
         single.fit("dae", latent=1)
     assert single.fit("full", **how("full")).encoder.latent_size == 1
     data = wide([20] * 5)
@@ -292,6 +293,48 @@ def test_an_encoder_is_compared_with_pca(data, tmp_path):
     errors = [encoder.header.metrics["held_out_mse"] for encoder in (short, theirs)]
     assert ratio_to_pca(short, data) == pytest.approx(errors[0] / errors[1])
     assert ratio_to_pca(full, data) is None
+
+
+def test_on_symmetry_an_encoder_is_compared_over_what_symmetry_tells(data, tmp_path):
+    """It leaves out where the robot is, which PCA is not to be blamed for losing."""
+    fitter = Fitter(data, tmp_path)
+    ours = fitter.fit("pca", latent=4, on="symmetry").encoder
+    rows = data.dataset["observation"][data.test]
+    errors = [
+        np.square(lost(each, rows, data), dtype=float).mean(axis=0)
+        for each in (ours, fitter.fit("pca", latent=4).encoder)
+    ]
+    told = [name not in ours.untold for name in data.task.feature_names]
+    assert 0 < sum(told) < len(told)
+    expected = errors[0][told].sum() / errors[1][told].sum()
+    assert ratio_to_pca(ours, data) == pytest.approx(expected, rel=1e-4)
+    judged = reconstruction(ours, HeldOut(data)).ratio_to_pca
+    assert judged.value == pytest.approx(expected, rel=1e-4)
+    assert errors[0].sum() / errors[1].sum() < 0.95 * expected
+
+
+@pytest.mark.parametrize("kind", ["linear-forward", "vamp", "self-prediction"])
+def test_an_encoder_has_the_same_bytes_whatever_the_number_of_threads(kind, data, tmp_path):
+    made = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        try:
+            with threadpool_limits(threads, "blas"):
+                fresh = ScaledDataset(Dataset(data.dataset.folder))
+                made.append(Fitter(fresh, tmp_path / str(threads)).fit(kind, **how(kind)).path)
+        finally:
+            torch.set_num_threads(1)
+    assert made[0].read_bytes() == made[1].read_bytes()
+
+
+def test_a_lag_that_leaves_too_few_pairs_is_refused(data, tmp_path):
+    with pytest.raises(InputError, match="has 4 pairs of rows 999 steps apart to learn from"):
+        Fitter(data, tmp_path).fit("slow", latent=4, lags=(999,))
+
+
+def test_keeping_everything_leaves_nothing_to_reduce(data, tmp_path):
+    with pytest.raises(InputError, match="no feature to reduce beside what is kept, too few: use"):
+        Fitter(data, tmp_path).fit("pca", latent=4, keep=("*",))
 
 
 def test_the_header_has_the_batch_size_that_was_chosen(data, tmp_path):

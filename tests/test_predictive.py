@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from wide import WideDataset, make_feature, make_task
+from wide import WideDataset, make_feature, make_task, wide
 
 from jbrep.dataset import ScaledDataset
 from jbrep.errors import InputError
@@ -143,6 +143,20 @@ def test_forward_finds_what_the_action_moves_among_noise(hidden, weights):
         assert report["1"]["values"] == pytest.approx(noise, abs=0.1)
         said = [each["values"] + each["reward"] for each in report.values()]
         assert history[-1].test_loss == pytest.approx(np.mean(said), rel=1e-4)
+
+
+def test_what_is_constant_counts_as_nothing_predicted():
+    """One of four features here: no prediction loses 1 of the others, not 3/4 of all."""
+    data = wide([100] * 40, features=4)
+    objective = get_method("forward").of({"latent": 2, "reward": 0.0}).objective(data)
+    windows = Windows(data, data.test, objective.horizon)
+    objective.prepare(windows)
+    for last in (objective.predictors.weights[-1], objective.predictors.biases[-1]):
+        last.data.zero_()
+    with torch.no_grad():
+        by_horizon = objective.report(windows)["loss_by_horizon"]
+    for lost in by_horizon.values():
+        assert lost["changes"] == pytest.approx(1, abs=0.1)
 
 
 def test_a_self_predicting_code_has_a_mean_magnitude_of_1(data, tmp_path):

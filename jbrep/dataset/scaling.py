@@ -1,7 +1,7 @@
 """Scaling observations, or coordinates of them, to about [-1, 1]."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -52,6 +52,12 @@ class Scaler:
     def centre(self) -> Any:
         """The value of each number that is scaled to 0, (m,)."""
         return (self.high + self.low) / 2
+
+    def moved(self, move: Callable[[Any], Any]) -> "Scaler":
+        """The same with other arrays, which `move` makes of each of its own."""
+        moved = replace(self, low=move(self.low), high=move(self.high))
+        vars(moved).update(centre=move(self.centre), half_width=move(self.half_width))
+        return moved
 
     @property
     def size(self) -> int:

@@ -1,7 +1,6 @@
 """The encoder: from observations to latents and back, through dense layers."""
 
 import re
-from dataclasses import replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -221,8 +220,9 @@ class Encoder(BaseEncoder):
             def move_all(layers: Layers) -> Layers:
                 return tuple(Layer(move(w), move(b), activation) for w, b, activation in layers)
 
-            scaler = replace(self.scaler, low=move(self.scaler.low), high=move(self.scaler.high))
-            encoder, decoder = move_all(self.encoder), move_all(self.decoder)
+            with torch.inference_mode(False):  # so that gradients can flow through them later
+                scaler = self.scaler.moved(move)
+                encoder, decoder = move_all(self.encoder), move_all(self.decoder)
             self._on[device] = Arrays(scaler, encoder, decoder, self.kept)
         return self._on[device]
 

@@ -204,8 +204,17 @@ def shipped_folder(task: Task) -> Path:
 
 
 def _is_made(name: str | Path, task: Task) -> bool:
-    """Whether the name is of an encoder that needs no data and doesn't ship for a task."""
-    return str(name) in UNLEARNED and str(name) not in _files(task)
+    """Whether the name is of an encoder that needs no data and doesn't ship for these features."""
+    if str(name) not in UNLEARNED:
+        return False
+    if (path := _files(task).get(str(name))) is None:
+        return True
+    ships = load(path)
+    try:
+        ships.check_task(task)
+    except InputError:
+        return True
+    return False
 
 
 def _files(task: Task) -> dict[str, Path]:

@@ -21,7 +21,7 @@ from jbrep.encoders.header import EncoderHeader
 from jbrep.errors import InputError
 from jbrep.evaluate import control, prediction, readout
 from jbrep.evaluate.control import GoodPolicy, Needs, lost, needs
-from jbrep.evaluate.evaluation import EVALUATION, Diagnostics, Evaluation, JudgedOn
+from jbrep.evaluate.evaluation import EVALUATION, KEPT, Diagnostics, Evaluation, JudgedOn
 from jbrep.evaluate.held_out import HeldOut
 from jbrep.evaluate.reconstruction import corruption, reconstruction
 from jbrep.evaluate.regression import Networks, beside, fit
@@ -168,7 +168,7 @@ def _side_by_side(
                     kind=encoder.kind,
                     latent=encoder.latent_size,
                     loses=lost(judged.needs.controller, known["nonlinear_probes"]),
-                    method=dict(encoder.header.metrics) if isinstance(encoder, Encoder) else {},
+                    method=_of_method(encoder) if isinstance(encoder, Encoder) else {},
                     **known,
                 )
 
@@ -178,6 +178,11 @@ def _side_by_side(
                 return results, begun.result()[1].controller
             finally:
                 pool.shutdown(cancel_futures=True)
+
+
+def _of_method(encoder: Encoder) -> dict[str, Any]:
+    kept = len(encoder.kept)
+    return {**encoder.header.metrics, **({KEPT: kept} if kept else {})}
 
 
 class _Judged(NamedTuple):

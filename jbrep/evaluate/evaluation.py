@@ -11,6 +11,7 @@ from jbrep.records.record import Record
 from jbrep.stats.bootstrap import Interval
 
 EVALUATION = "evaluation.json"
+KEPT = "kept_features"  # in what a method says: how many pass around its layers
 _DIGITS = 6
 
 
@@ -156,7 +157,7 @@ class Diagnostics(Record, frozen=True, kw_only=True):
     action: Action | None  # None without a policy
     prediction: dict[str, Prediction]  # by the number of steps ahead
     loses: tuple[Lost, ...]  # the most needed first
-    method: dict[str, Any]  # what the method says of its own fit, such as its spectrum
+    method: dict[str, Any]  # what the method says of its own fit, with KEPT
     sha256: str | None = None  # of the encoder; None of the full observation
 
 

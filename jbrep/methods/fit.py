@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from threadpoolctl import threadpool_limits
 from torch.utils.tensorboard import SummaryWriter
 
 from jbrep.coordinates import OBSERVATION
@@ -131,15 +132,10 @@ class Fitter:
         Raises:
             InputError: as `plan`, or the files can't be written.
         """
-        plan = self.plan(kind, name=name, **settings)
-        is_complete = plan.is_complete()
-        if not is_complete:
-            make_folder(self._folder)
-            with exclusive(plan.path, beside=True):
-                is_complete = plan.is_complete()  # another process may have made it meanwhile
-                if not is_complete:
-                    self._make(plan)
-        return Fitted(load(plan.path), plan.path, not is_complete, self._data)
+        with single_torch_thread(), threadpool_limits(1, "blas"):  # more change the last bits
+            plan = self.plan(kind, name=name, **settings)
+            is_new = not plan.is_complete() and self._make_once(plan)
+        return Fitted(load(plan.path), plan.path, is_new, self._data)
 
     def plan(self, kind: str, *, name: str | None = None, **settings: Any) -> Plan:
         """What `fit` would make.
@@ -181,6 +177,15 @@ class Fitter:
     def _rescaled(self, method: Method) -> ScaledDataset:
         coordinates = tried_coordinates(self._data.task, method.on, method.leave_out)
         return self._data.rescaled(method.scaling, coordinates, method.clip, method.keep)
+
+    def _make_once(self, plan: Plan) -> bool:
+        """Make an encoder, unless another process has made it meanwhile; whether it did."""
+        make_folder(self._folder)
+        with exclusive(plan.path, beside=True):
+            if plan.is_complete():
+                return False
+            self._make(plan)
+            return True
 
     def _make(self, plan: Plan) -> None:
         match plan.method:
@@ -237,7 +242,7 @@ class Fitter:
             "test_loss": trainer.history[best - 1].test_loss,
         }
         objective.eval()
-        with torch.no_grad(), single_torch_thread():
+        with torch.no_grad():
             metrics |= objective.report(watched)
             self._save(plan, Made(*objective.layers(), metrics))
 

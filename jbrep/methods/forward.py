@@ -71,7 +71,8 @@ class Forward(Network, Learned, frozen=True, kw_only=True):
         steps, lost = max(metrics["loss_by_horizon"].items(), key=lambda each: int(each[0]))
         parts = [part for part in ("changes", "reward") if part in lost]
         told = " and ".join(f"{1 - lost[part]:.2f} of the {part}" for part in parts) or "nothing"
-        return f"predicts {told} over {steps} held-out steps (R²)"
+        what = "1 - error / variance in the training part"
+        return f"predicts {told} over {steps} held-out steps ({what})"
 
     def objective(self, data: ScaledDataset) -> Objective:
         """As for `Learned`."""
@@ -222,7 +223,9 @@ class ForwardObjective(Objective):
         errors = self._errors(batch, self.encoder(batch.now.T))
         varies = self._deviation.squeeze(2).isfinite()
         each = zip(PARTS, *(of.split(self._sizes, 1) for of in (errors, varies)), strict=True)
-        by_part = {part: lost.mean(1).tolist() for part, lost, some in each if some.any()}
+        by_part = {
+            part: lost[:, some.any(0)].mean(1).tolist() for part, lost, some in each if some.any()
+        }
         return {
             "loss_by_horizon": {
                 str(k): {part: losses[i] for part, losses in by_part.items()}

@@ -8,6 +8,7 @@ from msgspec import Meta
 
 from jbrep.dataset import ScaledDataset
 from jbrep.dataset.scaled import Moments
+from jbrep.errors import InputError
 from jbrep.methods.linear import Directions, direction_code, whitening
 from jbrep.methods.passes import Array, Block, blocks
 from jbrep.training.method import Made
@@ -66,6 +67,11 @@ class Lagged:
                 self.later_mean[i] += after.sum(axis=0)
                 self.across[i] += first.T @ after
                 self.later[i] += after.T @ after
+        if windows <= width:
+            raise InputError(
+                f"{data.dataset.folder} has {windows} pairs of rows {longest} steps apart to learn "
+                f"from, which must be more than {width}: give a smaller lag, or more data"
+            )
         for total in (self.now_mean, self.now, self.later_mean, self.later, self.across):
             total /= windows
 

@@ -153,8 +153,9 @@ class Coded(Method, frozen=True, kw_only=True):
         """As for `Method`."""
         largest = self.largest(data.size)
         if largest is not None and largest < 1:
+            beside = " beside what is kept" if self.keep else ""
             raise InputError(
-                f"{data.task.name} has {data.size or 'no'} feature to reduce, which can't be: use "
+                f"{data.task.name} has {data.size or 'no'} feature to reduce{beside}, too few: use "
                 f"{FULL}"
             )
         if largest is not None and self.latent > largest:

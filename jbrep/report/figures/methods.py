@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
-from jbrep.evaluate.evaluation import Diagnostics
+from jbrep.evaluate.evaluation import KEPT, Diagnostics
 from jbrep.report.figures.curves import below
 from jbrep.report.figures.plot import Plot
 from jbrep.report.figures.style import (
@@ -81,7 +81,7 @@ def _draw_spectra(task: str, encoders: Encoders) -> Figure:
         sizes: dict[tuple[str, tuple[float, ...]], list[int]] = {}
         for label, e in members.items():
             curve = family(label, e.latent), tuple(e.method["spectrum"])
-            sizes.setdefault(curve, []).append(e.latent)
+            sizes.setdefault(curve, []).append(e.latent - e.method.get(KEPT, 0))
         for (name, spectrum), kept in sizes.items():
             _draw_spectrum(axes, name, spectrum, kept, look[name])
         axes.set(title=plain(kind), xlabel="unit")
