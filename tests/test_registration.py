@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ from jbrep.study.runner import register_study, run_study
 from jbrep.study.tables import REFERENCE_RETURNS
 
 ROOT = Path(__file__).parent.parent
+CAN_NOT = "can't be compared"
 TINIER = TINY.replace(representations=("full",), seeds=(0, 1))
 
 
@@ -32,10 +34,20 @@ TINIER = TINY.replace(representations=("full",), seeds=(0, 1))
 def registered(tmp_path_factory):
     """A study that was registered, and has run since."""
     folder = tmp_path_factory.mktemp("registered") / "study"
-    register_study(Plan(TINIER, folder))
-    assert run_study(Plan(TINIER, folder), in_this_process, 1) == 0
+    with of_a_commit():
+        register_study(Plan(TINIER, folder))
+        assert run_study(Plan(TINIER, folder), in_this_process, 1) == 0
     write_tables(folder)
     return Plan(TINIER, folder)
+
+
+@contextmanager
+def of_a_commit():
+    """Code is of a commit in here, also where a contributor has changed some."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("jbrep.study.registration", "jbrep.rl.job"):
+            patch.setattr(f"{module}.commits", lambda: {"jbrep": "1" * 40})
+        yield
 
 
 def test_a_plan_is_written_down(tmp_path):
@@ -59,7 +71,8 @@ def test_encoders_that_the_study_makes_are_registered_by_their_hashes(tmp_path):
         representations=("full", *codes), data=Data(steps=1000), steps=16, evaluate_every=16
     )
     plan = Plan(study, tmp_path / "study")
-    registration = register_study(plan)
+    with of_a_commit():
+        registration = register_study(plan)
     assert not list(plan.folder.rglob(RUN))
     made = {path.stem: load(path) for path in plan.encoders("face_direction").glob("*.safetensors")}
     assert registration.encoders == {
@@ -71,7 +84,8 @@ def test_encoders_that_the_study_makes_are_registered_by_their_hashes(tmp_path):
             ("random-2", f"random-2-s{seed}"),
         )
     }
-    assert run_study(Plan(study, plan.folder), in_this_process, 1) == 0
+    with of_a_commit():
+        assert run_study(Plan(study, plan.folder), in_this_process, 1) == 0
     runs = [read_run(folder) for folder in runs_below(plan.folder)]
     assert registration.deviations(study, runs) == []
     name = runs[-1].settings.name
@@ -124,6 +138,25 @@ def test_every_deviation_is_told(registered):
         f"torch was 2.0.0, not {registration.versions['torch']}",
         "some runs were made by other commits of jbrep's code",
     ]
+
+
+@pytest.mark.parametrize(
+    ("commit", "told"),
+    [
+        ("1" * 40, []),
+        ("2" * 40, ["some runs were made by other commits of jbrep's code"]),
+        (
+            f"{'1' * 40}+changes",
+            ["jbrep's code had changes that are in no commit, so it " + CAN_NOT],
+        ),
+        (None, ["some of jbrep's code was of no known commit, so it " + CAN_NOT]),
+    ],
+)
+def test_code_that_cannot_be_compared_is_told(commit, told, registered):
+    runs = [read_run(folder) for folder in runs_below(registered.folder)]
+    runs[0] = runs[0].replace(commits={"jbrep": commit} if commit else {})
+    found = registered.registration.deviations(registered.study, runs)
+    assert found == told
 
 
 def test_a_policy_that_came_later_changes_no_registered_study(tmp_path):

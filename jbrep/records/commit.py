@@ -11,11 +11,11 @@ from typing import Annotated
 from msgspec import Meta
 
 _SECONDS = 5
-_CHANGES = "+changes"
+CHANGES = "+changes"
 Commits = Mapping[
     Annotated[str, Meta(pattern=r"\A(jbrep|work)\Z", title="jbrep or work")],
     Annotated[
-        str, Meta(pattern=rf"\A[0-9a-f]{{40,64}}({re.escape(_CHANGES)})?\Z", title="a git commit")
+        str, Meta(pattern=rf"\A[0-9a-f]{{40,64}}({re.escape(CHANGES)})?\Z", title="a git commit")
     ],
 ]
 
@@ -38,7 +38,7 @@ def _commit(folder: Path) -> str:
         return ""  # installed in an environment that may lie in another project's repository
     commit = _git(folder, "rev-parse", "HEAD")
     changes = commit and _git(folder, "status", "--porcelain", "--untracked-files=no")
-    return f"{commit}{_CHANGES}" if changes else commit
+    return f"{commit}{CHANGES}" if changes else commit
 
 
 def _git(folder: Path, *arguments: str) -> str:

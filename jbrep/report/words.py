@@ -37,8 +37,11 @@ _HEADS = {  # of columns
     FASTER.name: "steps to half of {whose} gain",
     WITHIN_HALF.name: "of {whose} gain",
 }
-_BLIND = "the best policy that doesn't look"
-_OVER = {"drives": _BLIND, "blind": _BLIND, "still": "standing still"}
+_OVER = {
+    "drives": "the best policy that doesn't look",
+    "blind": "the better of standing still and random actions",
+    "still": "standing still",
+}
 _CLAIMS = {  # as a sentence, with a place for the percentage that may be lost; what is estimated
     NOT_WORSE.name: ("Agents on less state lose at most {} of the gain", _KEPT),
     LESS_VARIANCE.name: (

@@ -249,9 +249,10 @@ class Study(TrainingSettings, Document, frozen=True, kw_only=True):
         for each in self.observed:
             shares = each.shares(self.seeds)
             if min(shares) < 2 and len(set(shares)) > 1:
+                runs = len(self.seeds)
                 raise InputError(
-                    f"{each.name} has {each.encoders} encoders for {len(self.seeds)} seeds: each "
-                    "encoder must have as many runs, or at least two"
+                    f"{each.name} has {each.encoders} encoders for {runs} seeds: each must have "
+                    f"one run, or each at least two, so give at most {runs // 2}, or {runs}"
                 )
 
     @property

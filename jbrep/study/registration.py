@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jbrep.errors import differences
-from jbrep.records.commit import commits
+from jbrep.records.commit import CHANGES, commits
 from jbrep.records.document import Document, read_document
 from jbrep.records.record import Version, from_plain, to_plain
 from jbrep.records.storage import exists
@@ -87,9 +87,19 @@ class Registration(Document, frozen=True, kw_only=True):
         for name, version in self.versions.items():
             if others := {run.versions.get(name, "none") for run in runs} - {version}:
                 found.append(f"{name} was {_listed(sorted(others))}, not {version}")
-        if {run.commits.get("jbrep") for run in runs} - {self.commits.get("jbrep"), None}:
-            found.append("some runs were made by other commits of jbrep's code")
-        return found
+        return [*found, *self._other_code(run.commits.get("jbrep") for run in runs)]
+
+    def _other_code(self, ran: Iterable[str | None]) -> list[str]:
+        """How the code that ran, by its commits, differs from that which was registered."""
+        registered = self.commits.get("jbrep")
+        every = {registered, *ran}
+        if any(each.endswith(CHANGES) for each in every if each):
+            return ["jbrep's code had changes that are in no commit, so it can't be compared"]
+        if every == {registered}:
+            return []
+        if None in every:
+            return ["some of jbrep's code was of no known commit, so it can't be compared"]
+        return ["some runs were made by other commits of jbrep's code"]
 
 
 def read_registration(folder: Path) -> Registration | None:

@@ -67,7 +67,7 @@ _SHADES = (0.25, 0.5)  # how far from a colour to that of text, where colours ar
 _LINES = ("-", "--", ":", "-.")  # of codes of a family, from the largest on
 _FILLED = 1 / 3  # of an axis of returns, at least, by the returns themselves
 _BEYOND = 0.25  # of their range, for the ends of intervals on either side
-_DASHES = ("--", "-.", (0, (6, 1.5)))
+_DASHES = ("--", "-.", (0, (6, 1.5)), (0, (6, 1.5, 1, 1.5, 1, 1.5)))
 
 
 def ink() -> str:
