@@ -26,7 +26,6 @@ from jbrep.study.runner import register_study, run_study
 from jbrep.study.tables import REFERENCE_RETURNS
 
 ROOT = Path(__file__).parent.parent
-CAN_NOT = "can't be compared"
 TINIER = TINY.replace(representations=("full",), seeds=(0, 1))
 
 
@@ -147,9 +146,9 @@ def test_every_deviation_is_told(registered):
         ("2" * 40, ["some runs were made by other commits of jbrep's code"]),
         (
             f"{'1' * 40}+changes",
-            ["jbrep's code had changes that are in no commit, so it " + CAN_NOT],
+            ["jbrep's code had changes that are in no commit, so it can't be compared"],
         ),
-        (None, ["some of jbrep's code was of no known commit, so it " + CAN_NOT]),
+        (None, ["some of jbrep's code was of no known commit, so it can't be compared"]),
     ],
 )
 def test_code_that_cannot_be_compared_is_told(commit, told, registered):

@@ -165,17 +165,17 @@ def test_the_command_says_that_an_environment_failed(tmp_path):
     assert line.isprintable()
 
 
+def broken(*_):
+    raise EnvironmentFailedError("out of order", 0)
+
+
 def test_a_failure_while_resuming_leaves_the_checkpoint(tmp_path, monkeypatch):
     run = Run.of(task=CART, algorithm="a2c", steps=320, preset="paper", **ONE_EACH)
     with pytest.raises(StoppedError):
         train(run, tmp_path, Session(stop=iter((False, True)).__next__))
     before = (tmp_path / CHECKPOINT).read_bytes()
-
-    def fail(*_):
-        raise EnvironmentFailedError("out of order", 0)
-
     with monkeypatch.context() as patch:
-        patch.setattr("jbrep.envs.lanes.Lanes.restore", fail)
+        patch.setattr(Lanes, "restore", broken)
         with pytest.raises(InputError, match="can't be resumed: out of order"):
             train(run, tmp_path)
     assert (tmp_path / CHECKPOINT).read_bytes() == before
@@ -249,10 +249,6 @@ def test_a_run_on_a_schedule_does_not_go_on(tmp_path):
         train(Run.of(CART, steps=160, **settings), tmp_path)
 
 
-def broken(*_):
-    raise EnvironmentFailedError("out of order", 0)
-
-
 @pytest.mark.parametrize("trainer", ["cohort", "sb3"])
 def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(trainer, tmp_path, monkeypatch):
     settings = ("rl", "--task", cart.ID, "--algorithm", "sac", "--preset", "modern")
@@ -266,7 +262,9 @@ def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(trainer, tmp_path, mon
         patch.setattr(Lanes, "step", broken)
         told = jbrep(*settings, folder, "--steps", 320)
     assert told.exit_code == 1
-    assert f"out of order after 160 steps; {folder} has what its 160 steps before" in told.stderr
+    assert (
+        f"out of order after 160 steps; {folder} still has what its first 160 steps" in told.stderr
+    )
     assert {name: (folder / name).read_bytes() for name in kept} == before
     assert load_run(folder).settings.steps == 160
     for each in (folder, whole):
@@ -276,7 +274,7 @@ def test_a_run_that_fails_as_it_goes_on_keeps_what_it_had(trainer, tmp_path, mon
 
 
 def test_a_run_that_was_stopped_can_go_on_with_more_steps(tmp_path):
-    """Its evaluations stay as far apart, although as many more steps would have them further."""
+    """Its evaluations stay as far apart as they were."""
     settings = {"algorithm": "a2c", **ONE_EACH}
     with pytest.raises(StoppedError):
         train(Run.of(CART, steps=200_000, **settings), tmp_path, Session(stop=lambda: True))

@@ -167,7 +167,7 @@ def _left(folder: Path) -> str:
     left = read_run(folder)
     if left.status == FAILED:
         return f"see {folder / RUN}"
-    return f"{folder} has what its {left.steps:,} steps before made, and its last checkpoint"
+    return f"{folder} still has what its first {left.steps:,} steps made, and its last checkpoint"
 
 
 @click.command(

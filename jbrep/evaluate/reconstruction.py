@@ -40,11 +40,6 @@ class _Losses(NamedTuple):
     sums: Array  # of each feature over each group of episodes, (groups, d)
     by_row: NDArray[np.float32]  # means over the features of each row, (n,)
 
-    @property
-    def means(self) -> Array:
-        """Sums over each group of the means over features, (groups, 1)."""
-        return self.sums.mean(axis=1, keepdims=True)
-
 
 def reconstruction(encoder: BaseEncoder, held_out: HeldOut) -> Reconstruction:
     """Errors over all held-out rows, of features scaled to [-1, 1] and in physical units.
@@ -54,14 +49,15 @@ def reconstruction(encoder: BaseEncoder, held_out: HeldOut) -> Reconstruction:
     """
     losses = _losses(encoder, held_out, held_out.data.test)
     quantiles = np.quantile(losses.by_row, _QUANTILES).tolist()
-    pca = _pca(held_out, encoder.latent_size)
+    ours, pca = losses.sums, _pca(held_out, encoder.latent_size)
     told = [name not in encoder.untold for name in held_out.data.task.feature_names]
+    over_told = _means(ours[:, told]), _means(pca[:, told])
     is_smaller = encoder.latent_size < held_out.data.task.size
     return Reconstruction(
-        mse=score(bootstrap(_mean, losses.means, held_out.row_counts)),
-        pca_mse=score(bootstrap(_mean, pca.means, held_out.row_counts)),
-        ratio_to_pca=_ratio(losses.sums[:, told], pca.sums[:, told]) if is_smaller else None,
-        features=_by_feature(losses.sums, held_out, encoder.untold),
+        mse=score(bootstrap(_mean, _means(ours), held_out.row_counts)),
+        pca_mse=score(bootstrap(_mean, _means(pca), held_out.row_counts)),
+        ratio_to_pca=score(bootstrap(_mean, *over_told)) if is_smaller else None,
+        features=_by_feature(ours, held_out, encoder.untold),
         quantiles=dict(zip(map(str, _QUANTILES), quantiles, strict=True)),
         worst_episodes=_worst(losses.by_row, held_out),
     )
@@ -77,7 +73,7 @@ def corruption(encoder: BaseEncoder, held_out: HeldOut) -> tuple[Corruption, ...
     (counts,) = held_out.sums(rows, np.ones((len(rows), 1)))
     levels = []
     for noise in NOISES:
-        ours = _losses(encoder, held_out, rows, noise).means
+        ours = _means(_losses(encoder, held_out, rows, noise).sums)
         best = _best_linear(held_out, encoder.latent_size, noise)
         levels.append(
             Corruption(
@@ -90,10 +86,9 @@ def corruption(encoder: BaseEncoder, held_out: HeldOut) -> tuple[Corruption, ...
     return tuple(levels)
 
 
-def _ratio(ours: Array, theirs: Array) -> Score:
-    """The ratio of errors of features, (groups, k) each, over all of them."""
-    both = (each.mean(axis=1, keepdims=True) for each in (ours, theirs))
-    return score(bootstrap(_mean, *both))
+def _means(sums: Array) -> Array:
+    """Sums over each group of the means over features, (groups, 1), from those of each."""
+    return sums.mean(axis=1, keepdims=True)
 
 
 def _mean(total: Array, rows: Array) -> Array:
@@ -130,14 +125,14 @@ def _best_linear(held_out: HeldOut, latent: int, noise: float) -> Array:
     """The sums over each group of the best linear denoiser's errors, (groups, 1)."""
     data = held_out.data
     linear = _linear(data, linear_denoiser(latent, noise, data.moments))
-    return _losses(linear, held_out, sample(data.test, _CORRUPTED_ROWS), noise).means
+    return _means(_losses(linear, held_out, sample(data.test, _CORRUPTED_ROWS), noise).sums)
 
 
 @lru_cache(1024)
-def _pca(held_out: HeldOut, latent: int) -> _Losses:
-    """What PCA loses."""
+def _pca(held_out: HeldOut, latent: int) -> Array:
+    """The sums over each group of PCA's errors, of each feature, (groups, d)."""
     data = held_out.data
-    return _losses(_linear(data, principal_code(data, latent)), held_out, data.test)
+    return _losses(_linear(data, principal_code(data, latent)), held_out, data.test).sums
 
 
 def _linear(data: ScaledDataset, layers: tuple[Layers, Layers]) -> Encoder:
