@@ -1,6 +1,5 @@
 """Encoders: their arithmetic, their file, what they refuse, and the ones that ship."""
 
-import dataclasses
 import io
 import json
 import os
@@ -336,7 +335,7 @@ def test_an_encoder_of_another_environment_or_other_features_is_refused(encoder)
 def test_what_needs_no_data_is_made_of_renamed_or_shifted_features():
     """Where what ships for the task was made for others."""
     first, *others = TASK.features
-    renamed = TASK.replace(features=(dataclasses.replace(first, name="x"), *others))
+    renamed = TASK.replace(features=(first.replace(name="x"), *others))
     for task in (renamed, TASK.replace(offsets={"position_x": 0.5})):
         assert find("full", task).task == task
         assert source_of("full", task).startswith("full, ")

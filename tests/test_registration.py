@@ -3,11 +3,11 @@
 import hashlib
 import json
 import shutil
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from command import in_this_process, jbrep
+from made_up import COMMITS, of_a_commit
 from small import forge
 from test_study import TINY, written
 
@@ -38,15 +38,6 @@ def registered(tmp_path_factory):
         assert run_study(Plan(TINIER, folder), in_this_process, 1) == 0
     write_tables(folder)
     return Plan(TINIER, folder)
-
-
-@contextmanager
-def of_a_commit():
-    """Code is of a commit in here, also where a contributor has changed some."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module in ("jbrep.study.registration", "jbrep.rl.job"):
-            patch.setattr(f"{module}.commits", lambda: {"jbrep": "1" * 40})
-        yield
 
 
 def test_a_plan_is_written_down(tmp_path):
@@ -142,10 +133,10 @@ def test_every_deviation_is_told(registered):
 @pytest.mark.parametrize(
     ("commit", "told"),
     [
-        ("1" * 40, []),
+        (COMMITS["jbrep"], []),
         ("2" * 40, ["some runs were made by other commits of jbrep's code"]),
         (
-            f"{'1' * 40}+changes",
+            COMMITS["jbrep"] + "+changes",
             ["jbrep's code had changes that are in no commit, so it can't be compared"],
         ),
         (None, ["some of jbrep's code was of no known commit, so it can't be compared"]),

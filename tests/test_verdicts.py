@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import jbrep
-from made_up import SEEDS, STUDY, make_runs
+from made_up import SEEDS, STUDY, make_runs, of_a_commit
 
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
@@ -28,7 +28,8 @@ DOCS = Path(__file__).parent.parent / "docs" / "verdicts.md"
 def looks(tmp_path_factory):
     """The reports of a study after 5, 8 and all of its seeds, and after more were added."""
     folder = tmp_path_factory.mktemp("looks") / "runs" / "decide"
-    register_study(Plan(STUDY, folder))
+    with of_a_commit():
+        register_study(Plan(STUDY, folder))
     found = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "study_plots", lambda *_: [])

@@ -1,7 +1,10 @@
 """Studies whose truth is known: their runs are made up, all else is real."""
 
+from contextlib import contextmanager
+
 import matplotlib as mpl
 import numpy as np
+import pytest
 
 from jbrep.encoders import find, save
 from jbrep.records.tables import write_rows
@@ -25,6 +28,7 @@ from jbrep.study.config import as_study
 from jbrep.study.record import EncoderFacts, Label, LabelSettings
 from jbrep.study.tables import Return
 
+COMMITS = {"jbrep": "1" * 40}
 STILL = 250
 # what runs of each representation end with on average, with what SD, and when they come to half
 TRUTH = {"full": (850, 25, 5000), "dae-8": (848, 5, 3500), "pca-8": (500, 40, 6000)}
@@ -106,11 +110,20 @@ def _make_run(plan, cell):
     write_record(folder, run, tables=tables)
 
 
+@contextmanager
+def of_a_commit():
+    """Code is of a commit in here, also where a contributor has changed some."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("jbrep.study.registration", "jbrep.rl.job"):
+            patch.setattr(f"{module}.commits", lambda: COMMITS)
+        yield
+
+
 def write_record(folder, run, reason=None, **changes):
     """The run.json of a run that has ended as planned, or failed for a reason."""
     encoder = find(run.encoder, run.task)
     facts = {"latent_size": encoder.latent_size, "steps": run.steps, "seconds": 60.0}
-    facts |= {"versions": packages(), "commits": {}, "cpu": "a processor"}
+    facts |= {"versions": packages(), "commits": COMMITS, "cpu": "a processor"}
     facts["tables"] = {EVALUATIONS: "0" * 64}
     RunRecord(
         status=FINISHED if reason is None else FAILED,
