@@ -181,6 +181,19 @@ def test_an_evaluation_is_told_in_one_screen(evaluation):
     assert re.search(r"without load +load \((<0|0\.\d\d)\)\nwithout idle +nothing", shown)
 
 
+def test_the_smallest_code_without_a_loss_is_named_beside_a_smaller_one_with(evaluation):
+    good = evaluation.encoders["without idle"]
+    codes = {
+        "full": evaluation.encoders["full"],
+        "large": good.replace(latent=3, loses=()),
+        "larger": good.replace(latent=4, loses=()),
+        "small": good.replace(latent=2, loses=evaluation.encoders["without load"].loses),
+    }
+    told = serving(evaluation.replace(encoders=codes))
+    smallest = "The smallest is small, and of those that lack nothing large."
+    assert told.endswith(f"{smallest} But see what small lacks.")
+
+
 def test_nothing_is_said_where_it_cannot_be(evaluation):
     codes = {name: evaluation.encoders[name] for name in ("full", "without load", "noise")}
     assert serving(evaluation.replace(encoders=codes)).startswith(

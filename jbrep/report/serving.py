@@ -1,6 +1,6 @@
 """Which codes serve a controller as the full observation does, in a sentence."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 from jbrep.encoders import FULL
@@ -45,19 +45,27 @@ def serving(evaluation: Evaluation) -> str:
             f"{_told(measured, [r2])}."
         )
     told = _told(measured, [measured.r2[label] for label in good])
+    lost = [label for label in good if lacking(evaluation)[label]]
     if len(good) == 1:
         answer = f"{good[0]} should serve a controller: it tells {told}."
     else:
-        smallest = min(good, key=lambda label: evaluation.encoders[label].latent)
         answer = (
-            f"{listed(good)} should serve a controller: each tells {told}. The smallest is "
-            f"{smallest}."
+            f"{listed(good)} should serve a controller: each tells {told}. "
+            f"{_smallest(evaluation, good, lost)}."
         )
-    lost = [label for label in good if lacking(evaluation)[label]]
     return (
         f"{answer} But see what {listed(lost)} {'lacks' if len(lost) == 1 else 'lack'}."
         if lost
         else answer
+    )
+
+
+def _smallest(evaluation: Evaluation, good: Sequence[str], lost: Collection[str]) -> str:
+    """Which good code is the smallest, and where that lacks something, which without a loss."""
+    by_size = sorted(good, key=lambda label: evaluation.encoders[label].latent)
+    whole = [label for label in by_size if label not in lost]
+    return f"The smallest is {by_size[0]}" + (
+        f", and of those that lack nothing {whole[0]}" if by_size[0] in lost and whole else ""
     )
 
 
