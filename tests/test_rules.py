@@ -14,6 +14,7 @@ from scipy.stats import (
 )
 
 from jbrep.errors import InputError
+from jbrep.stats.analysis import analyse
 from jbrep.stats.arms import Arm, Frame, Sides, measure
 from jbrep.stats.claims import NOT_WORSE, kept_gain
 from jbrep.stats.intervals import Bounds, difference_within, mean_within, p_of_difference
@@ -157,6 +158,7 @@ def replace_x(curves, x):
 
 def frame(**changes):
     usual = {"reference": 250, "half": 575, "bounds": Bounds(), "steps": 1e5}
+    usual["half_in_training"] = usual["half"]
     return Frame(**(usual | changes), weights=np.ones(1), resolution=1.0)
 
 
@@ -430,3 +432,66 @@ def test_the_bound_on_failing_runs_errs_as_rarely_as_the_test():
     assert obstacle(one, "not worse", arms) is None
     most = round(100 * (1 - (0.05 / 3) ** (1 / 16)))
     assert f"up to {most} % may fail" in obstacle(three, "not worse", arms)
+
+
+def test_half_of_a_gain_is_counted_on_the_starts_of_the_curve_that_comes_to_it():
+    """The last evaluation's other starts return less: 50 of 1,000 in place of 250, then 350."""
+    facts = {"reference": 50, "reference_in_training": 250, "final": np.full(20, 350.0)}
+    runs = arm("full", drawn(850, 20, 8, 0), **facts)
+    frame, arms = measure({"full": runs}, range(8))
+    assert (frame.reference, frame.half, frame.half_in_training) == (50, 200, 550)
+    assert arms["full"].time == pytest.approx(np.full(8, 50_000), abs=1000)
+    analysis = analyse(runs + [replace(run, representation="dae-12") for run in runs])
+    (group,) = analysis.groups
+    assert group.thresholds["steps_to_50_percent"] == pytest.approx(550, abs=10)
+    assert group.labels[0].numbers["gain"].value == pytest.approx(600)
+    assert group.labels[0].numbers["final_return_mean"].value == 350
+
+
+def test_a_failed_run_counts_as_failed_whatever_it_was_played_from_at_its_end():
+    ends = drawn(850, 20, 16, 0)
+    good = [
+        replace(run, final=np.full(20, end))
+        for run, end in zip(arm("full", ends), ends, strict=True)
+    ]
+    bad = arm("dae-12", drawn(850, 20, 16, 1), final=np.full(20, 850.0), failed_at=90_000)
+    verdict, *_ = verdicts(good, bad)["dae-12"]
+    assert verdict.verdict == "contradicted"
+    assert verdict.estimate.value == pytest.approx(-250 / 600, abs=0.02)
+
+
+def test_fifteen_seeds_have_one_look():
+    assert [Planned(seeds=tuple(range(n))).looks for n in (15, 16)] == [(1.0,), (0.5, 1.0)]
+
+
+def test_there_is_no_verdict_where_it_is_not_known_what_gains_count_over():
+    runs = {
+        "full": arm("full", drawn(850, 20, 16, 0)),
+        "dae-12": arm("dae-12", drawn(30, 1, 16, 1)),
+    }
+    planned = Planned(Rules(primary=(CELL,)), tuple(range(16)))
+    (found,) = planned({KEY: runs})[KEY].values()
+    assert found[0].verdict == "contradicted"
+    prevented = replace(planned, prevented={"face_direction": "nobody stood still"})
+    (found,) = prevented({KEY: runs})[KEY].values()
+    assert {(each.verdict, each.reason) for each in found} == {("not yet", "nobody stood still")}
+
+
+@pytest.mark.parametrize("runs", [10, 15, 20])
+def test_only_the_runs_of_a_look_may_be_looked_at(runs):
+    full, other = (arm(name, drawn(850, 80, 20, i)) for i, name in enumerate(("full", "dae-12")))
+    planned = Planned(Rules(primary=(CELL,), failing=0.4), tuple(range(20)))
+    analysis = analyse([*full[:runs], *other[:runs]], planned)
+    (comparison,) = analysis.groups[0].comparisons
+    assert comparison.verdicts[0].look == (2 if runs == 20 else 1)
+    assert comparison.is_open == (runs != 15)
+    (group,) = analysis.open_groups
+    assert bool(group.comparisons[0].numbers) == comparison.is_open
+
+
+def test_curves_that_do_not_differ_at_all_have_no_spread():
+    x, y = np.full((8, 5), 3.0), np.random.default_rng(0).normal(0, 9, (8, 5))
+    how = (np.full(5, 0.2), 1e-3)
+    assert ratio_of_spreads(Curves(x, y, *how), 0.95, 0) == (0, 0, 0)
+    assert ratio_of_spreads(Curves(y, x, *how), 0.95, 0)[::2] == (np.inf, np.inf)
+    assert np.isnan(ratio_of_spreads(Curves(x, x, *how), 0.95, 0)).all()

@@ -1,16 +1,19 @@
 """A study of known truth, registered, looked at twice, and extended; and what can't be decided."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import jbrep
 from made_up import SEEDS, STUDY, make_runs, of_a_commit
+from small import adopt
 
 from jbrep.errors import InputError
 from jbrep.records.record import to_plain
 from jbrep.report import report
+from jbrep.report.markdown import markdown
 from jbrep.report.report import statistics, write_report
 from jbrep.report.statistics import group_tables
 from jbrep.report.tables import read_tables
@@ -18,8 +21,10 @@ from jbrep.stats.power import Arms, Prospect, prospects
 from jbrep.stats.rules import Planned, Rules
 from jbrep.study.config import as_study
 from jbrep.study.plan import Plan
+from jbrep.study.record import RECORD
 from jbrep.study.results import write_tables
 from jbrep.study.runner import register_study
+from jbrep.study.tables import REFERENCE_RETURNS
 
 DOCS = Path(__file__).parent.parent / "docs" / "verdicts.md"
 
@@ -110,10 +115,27 @@ def test_the_end_says_what_is_true(looks):
 
 
 def test_seeds_that_were_added_are_exploratory(looks):
-    analysis, page, _ = looks[1][SEEDS + 2]
+    analysis, page, text = looks[1][SEEDS + 2]
     first, *_ = cell(analysis, "face_direction", "dae-8")
     assert (first.verdict, first.runs) == ("supported", (SEEDS, SEEDS))
     assert "seeds were added, whose runs are exploratory: 16, 17" in page
+    assert "gains are over constant drive; shares are of the runs that verdicts count" in text
+    assert f"Difference of final returns, of all {2 * SEEDS + 4} runs" in page
+
+
+def test_there_is_no_verdict_over_policies_that_are_not_known(looks, tmp_path):
+    shutil.copytree(looks[0].parent / "whole", tmp_path / "less")
+    path = tmp_path / "less" / REFERENCE_RETURNS
+    path.write_text(re.sub(r".*constant drive.*\n", "", path.read_text()))
+    adopt(tmp_path / "less" / RECORD, REFERENCE_RETURNS)
+    tables = read_tables(tmp_path / "less")
+    found = cell(tables.analysis, "face_direction", "dae-8")
+    why = (
+        "what constant drive would return isn't known, and gains count over it: make the report "
+        "where face_direction is installed"
+    )
+    assert {(each.verdict, each.reason) for each in found} == {("not yet", why)}
+    assert f"**Nothing is decided yet: {why}.**" in markdown(tables, [], [], "figure.png")
 
 
 def test_a_reader_gets_the_numbers_with_numpy_alone(looks, monkeypatch, capsys):

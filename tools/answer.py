@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -20,11 +21,12 @@ from jbrep.report.figures.style import PAGE, PAPER, reference, styles
 from jbrep.report.tables import read_tables
 from jbrep.report.words import shown
 from jbrep.stats.analysis import GroupAnalysis
-from jbrep.stats.claims import CONTRADICTED, NOT_WORSE, UNDECIDED, Verdict
+from jbrep.stats.claims import CONTRADICTED, NOT_WORSE, SUPPORTED, Verdict
 from jbrep.stats.labels import YES, RepresentationResult
 
 ORDER = ("coordinates", "symmetry")  # first; the others as their names are
-INSIDE = {CONTRADICTED: "white", UNDECIDED: "lightgrey"}  # of a mean's marker; else as the rest
+INSIDE = {CONTRADICTED: "white", SUPPORTED: None}  # of a mean's marker; None as the rest of it
+OPEN = "lightgrey"  # where nothing is decided
 
 
 class Judged(NamedTuple):
@@ -83,7 +85,7 @@ def _cell(study: Judged, name: str) -> str:
     if name not in study.verdicts:
         return returned
     verdict = study.verdicts[name]
-    if study.group.labels[0].learnt != YES:  # a share of nothing
+    if study.group.labels[0].learnt != YES or np.isnan(verdict.estimate.value):
         return f"{returned}, {verdict.verdict}"
     return f"{returned}, {verdict.estimate.value:.2f}, {verdict.verdict}"
 
@@ -91,8 +93,8 @@ def _cell(study: Judged, name: str) -> str:
 def draw(studies: Sequence[Judged]) -> Figure:
     """The final return of each run and their means with 95 % intervals, a panel for each task.
 
-    A marker is filled where *not worse* is supported, white where it is contradicted, grey where it
-    is undecided. Dashed: the best policy that doesn't look; dotted: what has to be kept.
+    A marker is filled where *not worse* is supported, white where it is contradicted, else grey.
+    Dashed: the best policy that doesn't look; dotted: what has to be kept.
     """
     names = representations(studies)
     figure = Figure(figsize=(PAGE, 0.7 + 0.22 * len(names)))
@@ -126,9 +128,9 @@ def _draw_runs(axes: Axes, row: int, study: Judged, name: str, style: dict[str, 
     mean = label.numbers["final_return_mean"]
     axes.plot([mean.low, mean.high], [row, row], color=colour, linewidth=1.6)
     verdict = study.verdicts.get(name)
-    inside = INSIDE.get(verdict.verdict, colour) if verdict else colour
+    inside = INSIDE.get(verdict.verdict, OPEN) if verdict else None
     place = ([mean.value], [row], style["marker"])
-    axes.plot(*place, color=colour, ms=4.5, markerfacecolor=inside)
+    axes.plot(*place, color=colour, ms=4.5, markerfacecolor=inside or colour)
 
 
 def main(out: str, *folders: str) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 from jbrep.report.returns import by_task, named, shown_return
 from jbrep.report.tables import Tables
-from jbrep.report.words import listed
+from jbrep.report.words import listed, over
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.arms import FEWEST_UNITS
 from jbrep.stats.claims import CONTRADICTED, EXPLORATORY, NOT_YET, SUPPORTED, UNDECIDED, Verdict
@@ -98,9 +98,10 @@ def _conclusion(analysis: Analysis) -> Iterable[str]:
     if silent:
         surely = "" if all(group.labels[0].learnt == NO for group in silent) else "clearly "
         where = f" on {listed([group.name for group in silent])}" if len(compared) > 1 else ""
+        what = "but what was registered " if any(group.is_judged for group in silent) else ""
         yield (
-            f"Agents on {analysis.baseline} didn't {surely}learn{where}: nothing can be compared "
-            f"{'there' if where else 'with them'}."
+            f"Agents on {analysis.baseline} didn't {surely}learn{where}: nothing {what}can be "
+            f"compared {'there' if where else 'with them'}."
         )
     cells = [(group, each) for group in compared for each in group.comparisons]
     judged = [(group, each) for group, each in cells if each.is_judged]
@@ -113,15 +114,13 @@ def _conclusion(analysis: Analysis) -> Iterable[str]:
                 for g, c in judged
             ],
         )
-        if analysis.planned.rules.gains_over == "still":
-            yield "As it was registered, gains count over standing still."
+        if analysis.planned.rules.gains_over != "drives":
+            yield f"As it was registered, gains count over {over(analysis.planned.rules)}."
     elif len(silent) < len(compared):
-        fewest = min(len(label.seeds) for group in compared for label in group.labels)
-        none = ": no conclusion" if fewest < FEWEST_UNITS else ""
-        yield (
-            f"With {counted(fewest, 'run')} of each and no claim registered, this is "
-            f"exploratory{none}."
-        )
+        runs = [len(label.seeds) for group in compared for label in group.labels]
+        each = counted(runs[0], "run") if len({*runs}) == 1 else f"{min(runs)} to {max(runs)} runs"
+        none = ": no conclusion" if max(runs) < FEWEST_UNITS else ""
+        yield f"With {each} of each and no claim registered, this is exploratory{none}."
 
 
 def _decided(

@@ -8,7 +8,7 @@ import numpy as np
 
 from jbrep.report.shares import Cells, share_cells
 from jbrep.report.tables import Tables
-from jbrep.report.words import over, shown, shown_number
+from jbrep.report.words import reference_words, shown, shown_number
 from jbrep.stats.analysis import Analysis, GroupAnalysis
 from jbrep.stats.labels import REACHED, RepresentationResult
 from jbrep.stats.scale import STILL, best_blind
@@ -82,9 +82,10 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: 
     title += "; 95 % intervals over runs" if several else ""
     found = _without_nothing(Table(title, (what, *columns), rows))
     if f"of {analysis.baseline}'s gain" in found.header:
-        gained = f"gains are over {first.reference_policy or over(analysis.planned.rules)}"
-        if counted_over_still:
-            gained += ", as it was registered"
+        gained = f"gains are over {first.reference_policy or reference_words(first)}"
+        gained += ", as it was registered" if counted_over_still else ""
+        counts_all = all(comparison.counts_all for comparison in first.comparisons)
+        gained += "" if counts_all else "; shares are of the runs that verdicts count"
         return found._replace(title=f"{found.title}; {gained}")
     return found
 

@@ -231,7 +231,8 @@ def details(
         rows.append(("Why", verdict.reason))
     if verdict.claim in _BESIDE and comparison.is_open:
         words, name = _BESIDE[verdict.claim]
-        rows.append((words, shown(comparison.numbers[name])))
+        runs = "" if comparison.counts_all else f", of all {sum(comparison.runs)} runs"
+        rows.append((f"{words}{runs}", shown(comparison.numbers[name])))
     runs = "{} of {} and {} of {}".format(
         *(verdict.runs[0], comparison.representation),
         *(verdict.runs[1], group.labels[0].representation),

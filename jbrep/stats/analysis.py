@@ -13,7 +13,7 @@ from jbrep.stats.comparison import Comparison, compare
 from jbrep.stats.curves import compared
 from jbrep.stats.intervals import LEVEL, mean_within
 from jbrep.stats.labels import YES, RepresentationResult, describe
-from jbrep.stats.rules import Planned, Rules
+from jbrep.stats.rules import Planned
 from jbrep.stats.runs import Group, RunCurve, groups
 from jbrep.stats.scale import SOLVED, scale_of
 
@@ -80,7 +80,7 @@ class Analysis:
 
     @property
     def open_groups(self) -> tuple[GroupAnalysis, ...]:
-        """The groups, without the numbers of comparisons that wait for a look."""
+        """The groups, without the numbers of comparisons that may not be looked at."""
         return tuple(
             replace(
                 group,
@@ -94,7 +94,7 @@ class Analysis:
 
     @property
     def open_aggregates(self) -> list[Aggregate]:
-        """Results across tasks of the representations that wait for a look on none."""
+        """Results across tasks of the representations that may be looked at on all."""
         every = (each for group in self.groups for each in group.comparisons)
         closed = {each.representation for each in every if not each.is_open}
         return [each for each in self.aggregates if each.representation not in closed]
@@ -122,7 +122,7 @@ def analyse(
     by_group, played = groups(runs, planned.rules.baseline), references or {}
     verdicts = planned(by_group, seed)
     analysed = tuple(
-        _analyse_group(group, verdicts[key], played.get(key[0], {}), planned.rules, seed)
+        _analyse_group(group, verdicts[key], played.get(key[0], {}), planned, seed)
         for key, group in by_group.items()
     )
     return Analysis(
@@ -137,7 +137,7 @@ def _analyse_group(
     group: Group,
     verdicts: Mapping[str, tuple[Verdict, ...]],
     references: Mapping[str, Sequence[float]],
-    rules: Rules,
+    planned: Planned,
     seed: int,
 ) -> GroupAnalysis:
     first = next(iter(group.values()))[0]
@@ -159,10 +159,15 @@ def _analyse_group(
         return_ceiling=_or_nan(first.return_ceiling),
         failure_return=_or_nan(first.failure_return),
         references=played,
-        reference_policy=rules.reference(means),
+        reference_policy=planned.rules.reference(means),
         labels=(baseline, *others),
         comparisons=tuple(
-            compare(each, baseline, verdicts[each.representation], first.bounds, seed)
+            compare(
+                *(each, baseline, verdicts[each.representation]),
+                looks=len(planned.looks),
+                bounds=first.bounds,
+                seed=seed,
+            )
             for each in others
         ),
         **scale._asdict(),

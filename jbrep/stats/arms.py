@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.stats.bootstrap import Array
-from jbrep.stats.curves import compared, steps_to
+from jbrep.stats.curves import compared, final_return, steps_to
 from jbrep.stats.intervals import Bounds, surely_above
 from jbrep.stats.runs import Group, RunCurve, with_failure_returns
-from jbrep.stats.scale import reference_of
+from jbrep.stats.scale import reference_in_training, reference_of
 
 FEWEST_UNITS = 8  # units on either side of a verdict
 _HALF = 0.5  # of the baseline's gain: what a run that learns comes to
@@ -22,6 +22,7 @@ class Frame(NamedTuple):
 
     reference: float  # the return that gains are counted over
     half: float  # the return half-way from there to the baseline's mean final return
+    half_in_training: float  # the same on the starts of the evaluations during training
     bounds: Bounds  # of returns
     steps: float  # of training
     weights: Array  # of the evaluations in a mean over training, (g,), with a sum of 1
@@ -36,7 +37,7 @@ class Arm(NamedTuple):
     """
 
     final: Array  # the mean final return of each unit, (u,)
-    time: Array  # the mean of its runs' steps to the frame's half, at most all of training, (u,)
+    time: Array  # the mean of its runs' steps to half of the gain, at most all of training, (u,)
     curves: Array  # the first run of each unit over training, (u, g)
     runs: int  # how many there are
     learnt: int  # of how many units all runs end above the frame's half
@@ -88,14 +89,16 @@ def _frame(
 ) -> Frame:
     (first, *_), *_ = group.values()
     of_baseline = next(iter(finals.values()))
-    reference = reference_of(first, curves)
+    reference, over = reference_of(first, curves), reference_in_training(first, curves)
     gain = max(float(of_baseline.mean()) - reference, 0.0)
+    gain_in_training = max(float(final_return(curves, grid).mean()) - over, 0.0)
     widths = np.diff(grid)
     weights = (np.append(widths, 0) + np.append(0, widths)) / 2
     largest = max(float(np.abs(each).max()) for each in finals.values())
     return Frame(
         reference=reference,
         half=reference + _HALF * gain,
+        half_in_training=over + _HALF * gain_in_training,
         bounds=first.bounds,
         steps=float(grid[-1] - grid[0]),
         weights=weights / weights.sum(),
@@ -107,7 +110,7 @@ def _arm(
     runs: list[RunCurve], by_encoder: bool, final: Array, curves: Array, grid: Array, frame: Frame
 ) -> Arm:
     units = of_encoders(runs) if by_encoder else [[number] for number in range(len(runs))]
-    time = np.minimum(steps_to(curves, grid, frame.half) - grid[0], frame.steps)
+    time = np.minimum(steps_to(curves, grid, frame.half_in_training) - grid[0], frame.steps)
     return Arm(
         final=np.array([final[unit].mean() for unit in units]),
         time=np.array([time[unit].mean() for unit in units]),

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import levene
 
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.claims import EXPLORATORY, NOT_YET, Verdict
+from jbrep.stats.claims import CONTRADICTED, EXPLORATORY, NOT_YET, SUPPORTED, Verdict
 from jbrep.stats.intervals import (
     FEWEST_RUNS,
     LEVEL,
@@ -31,11 +31,23 @@ class Comparison:
     numbers: Mapping[str, Interval]
     brown_forsythe_p: float  # of equal variances of final returns; NaN where it is undefined
     verdicts: tuple[Verdict, ...]  # one for each claim
+    looks: int  # after which there may be verdicts
+    runs: tuple[int, int]  # of the representation and of the baseline
 
     @property
     def is_open(self) -> bool:
-        """Whether it may be looked at: it has no claim that waits for the first look."""
-        return all(verdict.verdict != NOT_YET for verdict in self.verdicts)
+        """Whether all runs may be looked at: no claim waits for a look that counts more of them."""
+        states = {verdict.verdict for verdict in self.verdicts}
+        if NOT_YET in states:
+            return False
+        is_done = CONTRADICTED in states or states <= {SUPPORTED, EXPLORATORY}
+        was_last = max(verdict.look for verdict in self.verdicts) == self.looks
+        return is_done or was_last or self.counts_all
+
+    @property
+    def counts_all(self) -> bool:
+        """Whether its verdicts count all runs."""
+        return all(verdict.runs == self.runs for verdict in self.verdicts)
 
     @property
     def is_judged(self) -> bool:
@@ -47,10 +59,14 @@ def compare(
     label: RepresentationResult,
     baseline: RepresentationResult,
     verdicts: tuple[Verdict, ...],
+    looks: int,
     bounds: Bounds,
     seed: int,
 ) -> Comparison:
-    """A representation against the baseline of the same task and algorithm, by bounded returns."""
+    """A representation against the baseline of the same task and algorithm, by bounded returns.
+
+    Verdicts may come after so many looks.
+    """
     pairs = {name: (label.by_run[name], baseline.by_run[name]) for name in label.by_run}
     finals, runs = pairs["final_return"], (len(label.seeds), len(baseline.seeds))
     numbers = {}
@@ -70,6 +86,8 @@ def compare(
         numbers=numbers,
         brown_forsythe_p=_brown_forsythe(*finals),
         verdicts=verdicts,
+        looks=looks,
+        runs=runs,
     )
 
 

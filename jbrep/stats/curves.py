@@ -118,9 +118,13 @@ def final_returns(
     finals = {}
     for name, runs in group.items():
         pairs = zip(runs, curves[name], strict=True)
-        each = [curve[-1] if run.final is None else run.final.mean() for run, curve in pairs]
-        finals[name] = np.array(each)
+        finals[name] = np.array([_end(run, curve) for run, curve in pairs])
     return finals
+
+
+def _end(run: RunCurve, curve: Array) -> float:
+    failed = run.failed_at is not None
+    return float(curve[-1] if failed or run.final is None else run.final.mean())
 
 
 class Compared(NamedTuple):

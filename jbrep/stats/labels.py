@@ -8,7 +8,7 @@ from scipy.stats import binomtest, iqr, median_abs_deviation
 
 from jbrep.stats.arms import of_encoders
 from jbrep.stats.bootstrap import Array, Interval
-from jbrep.stats.curves import Curve, bands, iqm, mean_return, steps_to
+from jbrep.stats.curves import Curve, bands, final_return, iqm, mean_return, steps_to
 from jbrep.stats.intervals import (
     LEVEL,
     UNDEFINED,
@@ -68,7 +68,7 @@ def describe(
     by_run = {
         "final_return": final,
         "mean_return": mean_return(curves, grid),
-        "gain": final - curves[:, 0],
+        "gain": final_return(curves, grid) - curves[:, 0],
         **{name: steps_to(curves, grid, each) for name, each in scale.thresholds.items()},
         **within_runs(curves, failed),
         **fixed_policy(runs, grid[-1]),

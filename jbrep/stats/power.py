@@ -40,18 +40,19 @@ class Prospect(NamedTuple):
 
 
 def obstacle(rules: Rules, claim: str, arms: Arms) -> str | None:
-    """Why no outcome of a study could support a claim; None if one could."""
+    """Why no outcome could support a claim before another cell is decided; None if one could."""
     fewest = min(arms.units, arms.baseline)
     if fewest < FEWEST_UNITS:
         return f"a side has {fewest} runs or encoders, and verdicts take {FEWEST_UNITS}"
     level = _level(Planned(rules, (*range(arms.runs),)))
+    first = "before another cell is decided, " if len(rules.primary) > 1 else ""
     if _least_p(claim) > level:
-        return f"its least p-value is {_least_p(claim):.2g}, above its level"
+        return f"{first}its least p-value is {_least_p(claim):.2g}, above its level"
     most = most_failing(0, arms.units, level)
     if most > rules.failing:
         what = "encoders" if arms.units < arms.runs else "runs"
         return (
-            f"even if all {arms.units} {what} learn, up to {100 * most:.0f} % may fail, and the "
+            f"{first}even if all {arms.units} {what} learn, up to {100 * most:.0f} % may fail, and the "
             f"limit is {100 * rules.failing:.0f} %; plan more, or set verdicts.failing"
         )
     return None

@@ -139,10 +139,15 @@ class Rules(Record, frozen=True, kw_only=True, omit_defaults=True):
         every = [*names]
         return self.baseline if self.baseline in every else every[0]
 
+    @property
+    def counted_over(self) -> tuple[str, ...]:
+        """The policies over the best of which gains are counted."""
+        return _OVER[self.gains_over]
+
     def reference(self, returns: Mapping[str, float]) -> str | None:
         """The policy that gains are counted over, of those whose returns are known."""
-        counted = _OVER[self.gains_over]
-        return best_blind({name: value for name, value in returns.items() if name in counted})
+        known = {name: value for name, value in returns.items() if name in self.counted_over}
+        return best_blind(known)
 
 
 @dataclass(frozen=True)
@@ -151,13 +156,16 @@ class Planned:
 
     rules: Rules = field(default_factory=Rules)  # of the study
     seeds: tuple[int, ...] = ()  # of the planned runs, in their order
+    # why there can be no verdict on some tasks, by name
+    prevented: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def looks(self) -> tuple[float, ...]:
         """Shares of the seeds after which there may be verdicts."""
         if self.rules.looks:
             return self.rules.looks
-        return _USUAL_LOOKS if self._count(_USUAL_LOOKS[0]) >= FEWEST_UNITS else (1.0,)
+        half = _USUAL_LOOKS[0] * len(self.seeds)
+        return _USUAL_LOOKS if half >= FEWEST_UNITS else (1.0,)
 
     @cached_property
     def counts(self) -> tuple[int, ...]:
@@ -214,7 +222,7 @@ def _look(
         _cell_name(key, name): _sides(group, name, seeds)
         for key, group in groups.items()
         for name in list(group)[1:]
-        if _has_all(group, name, seeds)
+        if key[0] not in planned.prevented and _has_all(group, name, seeds)
     }
     tested = True
     while tested:
@@ -342,7 +350,9 @@ def _whole(
         return _explored(group, name, rules, every, seed)
     tested = (*cell.verdicts, *([cell.undecided] if cell.undecided else []))
     if not tested:
-        reason = f"the first look is at {planned.counts[0]} runs of each arm"
+        first_look = f"the first look is at {planned.counts[0]} runs of each arm"
+        task = next(iter(group.values()))[0].task
+        reason = planned.prevented.get(task, first_look)
         return tuple(
             replace(each, verdict=NOT_YET, estimate=UNDEFINED, interval=UNDEFINED, reason=reason)
             for each in _explored(group, name, rules, every, seed)

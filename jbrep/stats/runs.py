@@ -16,6 +16,8 @@ from jbrep.stats.intervals import Bounds
 
 LARGEST_RETURN = 1e15  # of either sign: beyond, a number has diverged
 _ROUNDING = 1e-6  # of returns, relative to the largest
+_OF_TASK = ("return_floor", "return_ceiling", "reference", "solved")  # alike for all of its runs
+_NUMBERS = (*_OF_TASK, "reference_in_training", "failure_return")
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +41,7 @@ class RunCurve:
         return_ceiling: the largest possible one; None if unknown.
         reference: the return that gains are counted over, on the starts of evaluation: that of the
             best policy that doesn't look; None if unknown.
+        reference_in_training: the same on the starts of `returns`; None if that is `reference`.
         solved: the return from which on the task counts as solved; None if unknown.
         trainer: what trained it, and how exactly; equal for all runs that are compared.
         final: the returns of the last evaluation, if it has more episodes than the others, (f,).
@@ -62,6 +65,7 @@ class RunCurve:
     return_floor: float | None = None
     return_ceiling: float | None = None
     reference: float | None = None
+    reference_in_training: float | None = None
     solved: float | None = None
     trainer: str = ""
     final: Array | None = None
@@ -98,7 +102,7 @@ class RunCurve:
             object.__setattr__(self, name, value)
 
     def _check_bounds(self, returns: Array) -> None:
-        for what in ("return_floor", "return_ceiling", "reference", "solved", "failure_return"):
+        for what in _NUMBERS:
             value = getattr(self, what)
             if value is not None and not abs(value) <= LARGEST_RETURN:
                 raise self._error(f"its {what} is {value}", "give a number, or None if unknown")
@@ -248,7 +252,7 @@ def _check_task(runs: list[RunCurve], name: str) -> None:
             f"{name}: its runs are of different trainers: {', '.join(trainers)}; report those of "
             "one, or all with --across-trainers"
         )
-    for what in ("return_floor", "return_ceiling", "reference", "solved"):
+    for what in _OF_TASK:
         values = sorted({str(getattr(run, what)) for run in runs})
         if len(values) > 1:
             raise InputError(

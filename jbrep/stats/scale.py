@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jbrep.stats.bootstrap import Array, Interval
+from jbrep.stats.curves import final_return
 from jbrep.stats.intervals import UNDEFINED, surely_above
 from jbrep.stats.runs import RunCurve
 
@@ -49,6 +50,15 @@ def reference_of(run: RunCurve, curves: Array) -> float:
     return float(next(known, curves[:, 0].mean()))
 
 
+def reference_in_training(run: RunCurve, curves: Array) -> float:
+    """The same on the starts of the evaluations during training, which may be fewer.
+
+    What is read off curves is held against returns from the same starts.
+    """
+    known = run.reference_in_training
+    return reference_of(run, curves) if known is None else known
+
+
 def scale_of(
     finals: Sequence[Array],
     curves: Array,
@@ -66,10 +76,11 @@ def scale_of(
         policies: mean returns of policies that don't learn, with their intervals.
     """
     reference, solved = reference_of(run, curves), run.solved
+    over = reference_in_training(run, curves)
     best = best_blind({name: float(each.value) for name, each in policies.items()})
     gained = surely_above(finals[0], reference, run.bounds)
-    gain = float(np.median(finals[0])) - reference if gained else np.nan
-    shares = [reference + share * gain for share in SHARES.values()]
+    gain = float(np.median(final_return(curves, grid))) - over if gained else np.nan
+    shares = [over + share * gain for share in SHARES.values()]
     thresholds = (*shares, np.nan if solved is None else float(solved))
     return Scale(
         grid=grid,

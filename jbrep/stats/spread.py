@@ -50,7 +50,8 @@ def ratio_of_spreads(
 
     The interval has the ratios that the permutation test doesn't reject (Hodges and Lehmann 1963):
     with `PERMUTATIONS`, as `spread_p` has, they agree. Ratios are looked for from e^-12 to
-    e^12; all is NaN where no curves differ from one another.
+    e^12; those beyond are 0 and infinity, as of curves that don't differ at all. All is NaN where
+    no curves of either differ from one another.
     """
     most, least = _excess(curves, -_FURTHEST), _excess(curves, _FURTHEST)
     if most == least == 0:
@@ -65,7 +66,13 @@ def ratio_of_spreads(
         return _p(curves, log_ratio, drawn) <= 1 - level
 
     kept = (_last_kept(value, direction, is_rejected) for direction in (-1, 1))
-    return Interval(*(float(np.exp(each)) for each in (value, *kept)))
+    return Interval(*map(_ratio, (value, *kept)))
+
+
+def _ratio(log_ratio: float) -> float:
+    if abs(log_ratio) < _FURTHEST:
+        return float(np.exp(log_ratio))
+    return np.inf if log_ratio > 0 else 0.0
 
 
 def spread_p(curves: Curves, seed: int, permutations: int = PERMUTATIONS) -> float:

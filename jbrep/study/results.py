@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import InputError, listed
 from jbrep.evaluate.table import DIAGNOSTICS
 from jbrep.records.record import to_plain
 from jbrep.records.storage import exists
@@ -97,6 +97,7 @@ def found(
         InputError: a run has returns that it can't have.
     """
     runs = _curves(record, returns, references, planned.rules)
+    planned = replace(planned, prevented=_prevented(record, references, planned.rules))
     if across_trainers:
         runs = [replace(run, trainer="") for run in runs]
     compared, left_out = _comparable(runs, planned.rules.baseline)
@@ -180,24 +181,42 @@ def _curves(
 ) -> list[RunCurve]:
     """The runs of a study, from its tables."""
     evaluated = by_run(returns)
-    counted_over = {task: _reference(played, rules) for task, played in references.items()}
+    counted_over = {task: _counted_over(played, rules) for task, played in references.items()}
     return [
         _curve(
             run,
             settings,
             record.draws_of(settings.learner),
             evaluated.get((run.label, run.seed), {}),
-            counted_over,
+            counted_over.get(settings.task, ()),
         )
         for run, settings in ((run, record.settings_of(run)) for run in record.runs)
     ]
 
 
-def _reference(played: Mapping[str, Sequence[float]], rules: Rules) -> float | None:
-    """The return that gains are counted over, from those of policies that don't learn."""
-    means = {policy: float(np.mean(returns)) for policy, returns in played.items()}
-    policy = rules.reference(means)
-    return means[policy] if policy else None
+def _prevented(record: RunsRecord, references: References, rules: Rules) -> dict[str, str]:
+    """Why there are no verdicts on tasks, by name, where what gains count over isn't known."""
+    tasks = {record.settings_of(run).task for run in record.runs}
+    unknown = {
+        task: [policy for policy in rules.counted_over if policy not in references.get(task, {})]
+        for task in tasks
+    }
+    return {
+        task: f"what {listed(policies)} would return isn't known, and gains count over it: make "
+        f"the report where {task} is installed"
+        for task, policies in unknown.items()
+        if policies
+    }
+
+
+def _mean(returns: Sequence[float]) -> float | None:
+    return float(np.mean(returns)) if len(returns) else None
+
+
+def _counted_over(played: Mapping[str, Sequence[float]], rules: Rules) -> Sequence[float]:
+    """The returns of the policy that gains are counted over; none if it isn't known."""
+    policy = rules.reference({name: float(np.mean(each)) for name, each in played.items()})
+    return played[policy] if policy else ()
 
 
 def _curve(
@@ -205,9 +224,12 @@ def _curve(
     shared: LabelSettings,
     drawn: Collection[str],
     by_step: Mapping[int, list[float]],
-    counted_over: Mapping[str, float | None],
+    counted_over: Sequence[float],
 ) -> RunCurve:
-    """A run, from its settings without the seed and what that draws, and its returns by step."""
+    """A run, from its settings without the seed and what that draws, and its returns by step.
+
+    The returns that gains are counted over are those of a policy in the first episodes.
+    """
     task, settings = shared.environment, to_plain(shared)
     if drawn:  # the overrides say the hyperparameters
         del settings["hyperparameters"]
@@ -230,7 +252,8 @@ def _curve(
         failed_at=run.steps if run.status == FAILED else None,
         return_floor=task.return_floor,
         return_ceiling=task.return_ceiling,
-        reference=counted_over.get(task.name),
+        reference=_mean(counted_over),
+        reference_in_training=_mean(counted_over[:episodes]),
         solved=task.solved_return,
         trainer=" ".join(trainer),
         final=np.array(returns[-1]) if returns and len(returns[-1]) > episodes else None,
