@@ -526,7 +526,7 @@ def test_an_unfinished_study_says_what_is_missing(tmp_path):
     text = (plan.folder / PAGE).read_text()
     assert "This study is unfinished: 5 runs are missing" in text
     assert "700</td>" in text
-    assert "With 3 to 4 runs of each" in text
+    assert "With 2 to 3 runs of each" in text
 
 
 def test_of_single_runs_it_shows_what_there_is(tmp_path):

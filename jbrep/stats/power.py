@@ -52,8 +52,8 @@ def obstacle(rules: Rules, claim: str, arms: Arms) -> str | None:
     if most > rules.failing:
         what = "encoders" if arms.units < arms.runs else "runs"
         return (
-            f"{first}even if all {arms.units} {what} learn, up to {100 * most:.0f} % may fail, and the "
-            f"limit is {100 * rules.failing:.0f} %; plan more, or set verdicts.failing"
+            f"{first}even if all {arms.units} {what} learn, up to {100 * most:.0f} % may fail, and "
+            f"the limit is {100 * rules.failing:.0f} %; plan more, or set verdicts.failing"
         )
     return None
 
