@@ -10,13 +10,13 @@ import h5py
 import numpy as np
 import pytest
 from command import jbrep
-from small import settings, write_again
+from small import flip_bit, settings, write_again
 
 from jbrep.collect import collect, write_shards
 from jbrep.dataset import Dataset, ScaledDataset, Scaler, manifest, reader
 from jbrep.dataset.card import card
 from jbrep.dataset.columns import Column
-from jbrep.errors import InputError
+from jbrep.errors import DamageError, InputError
 from jbrep.jitterbug.tasks import TASKS
 
 
@@ -247,6 +247,24 @@ def test_a_reader_sees_the_committed_part_while_a_collector_writes(
     monkeypatch.setattr(manifest.Manifest, "write", look)
     write_again(collected, tmp_path / "growing")
     assert seen == [(k, 1000 * k, k == 5) for k in range(1, 6)]
+
+
+def test_a_reader_keeps_what_it_opened_when_its_last_shard_grows(tmp_path):
+    folder = tmp_path / "growing"
+    collect(settings(steps=2000, shard_episodes=4), folder, num_threads=1)
+    used, unused = Dataset(folder), Dataset(folder)
+    seen, late = used["observation"][:], used["action"]
+    collect(settings(steps=3000, shard_episodes=4), folder, num_threads=1)
+    for each in (used, unused):
+        np.testing.assert_array_equal(each["observation"][:], seen)
+        assert len(each["reward"][:]) == len(each) == 2000
+        assert each.episodes["length"].tolist() == [1000, 1000]
+    np.testing.assert_array_equal(late[:], Dataset(folder)["action"][:2000])
+    flip_bit(folder / "shard-00000.h5", 8 * 100_000)
+    with pytest.raises(DamageError, match=r"shard-00000\.h5 is damaged"):
+        Dataset(folder)["reward"][:]
+    with pytest.raises(DamageError, match=r"shard-00000\.h5 is damaged"):
+        used["reward"][:]
 
 
 def test_shards_committed_while_it_opens_are_no_strangers(collected, tmp_path, monkeypatch):

@@ -200,6 +200,21 @@ def test_what_is_exported_comes_back(to, any_data, tmp_path):
     assert not list(find_problems(back.folder))
 
 
+@pytest.mark.parametrize("to", [to for to in FORMATS if to != "lerobot"])
+def test_an_episode_may_have_ended_in_both_ways(to, tmp_path):
+    rows, last = np.arange(12.0)[:, None], np.arange(12) % 4 == 3
+    ends = {"terminations": last & (rows[:, 0] > 4), "truncations": last & (rows[:, 0] < 8)}
+    final = {"final_observations": np.zeros((3, 1))}
+    dataset = Dataset.write(tmp_path / "both", rows, rows, rows[:, 0], **ends, **final)
+    out = tmp_path / (f"data.{to}" if to != "minari" else "minari")
+    export(dataset, to, out)
+    given = next(out.glob("**/imported-v0")) if to == "minari" else out
+    import_data(str(given), tmp_path / "back", dataset.task if to == "npz" else None)
+    for each in (dataset, Dataset(tmp_path / "back")):
+        assert each.episodes["terminated"].tolist() == [0, 1, 1]
+        assert each.episodes["truncated"].tolist() == [1, 1, 0]
+
+
 def test_seeds_that_are_not_known_stay_so(written, tmp_path):
     export(written, "minari", tmp_path)
     exported = tmp_path / written.task.slug / "imported-v0"

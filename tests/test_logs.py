@@ -23,7 +23,7 @@ from jbrep.collect import collect
 from jbrep.dataset import Dataset, DataSettings, Layout, ScaledDataset
 from jbrep.dataset.verify import find_problems
 from jbrep.envs import describe
-from jbrep.errors import InputError
+from jbrep.errors import InputError, Notice
 from jbrep.evaluate.diagnosis import diagnose
 from jbrep.methods.fit import Fitter
 from jbrep.report.serving import untold
@@ -91,8 +91,7 @@ def test_missing_cells_are_cut_or_held_and_counted(tmp_path):
     assert "a.csv, line 32: 'gyro' is empty" in done.output
     told, data = imported(path, *NAMED, "--gap", "1", "--missing", "skip")
     assert data.episodes["length"].tolist() == [29, 27, 59]
-    assert "2 missing readings (skip)" in told
-    assert "3 steps without all readings: left out" in told
+    assert "2 missing readings (skip): 3 steps left out" in " ".join(told.split())
     told, data = imported(path, *NAMED, "--gap", "1", "--missing", "hold:2", out="held")
     np.testing.assert_allclose(data["gyro"][29:33], [8.29, 8.29, 8.29, 8.32], rtol=1e-6)
     assert data.episodes["missing"].tolist() == [2, 0]
@@ -503,3 +502,108 @@ def test_the_page_on_logs_does_what_it_says(tmp_path, monkeypatch):
     assert "1 missing readings (hold:3)" in told[0].output
     assert "400 rows at 50 Hz, by the linear readings" in told[1].output
     sys.modules.pop("my_rewards", None)
+
+
+def test_units_stay_with_columns_whose_names_are_told_apart_by_others(tmp_path):
+    """Headers such as pos (x) and pos (y) have no units in brackets; others keep theirs."""
+    rows = {"t [ms]": [0, 10, 20, 30], "pos (x)": [1] * 4, "pos (y)": [2] * 4}
+    rows |= {"pitch [deg]": [80, 90, 100, 110], "pitch [rad]": [1, 2, 3, 4], "u": [0, 1, 0, 1]}
+    path = write_csv(tmp_path / "a.csv", rows)
+    columns = ("--observations", "pos*,pitch*", "--actions", "u", "--time", "t")
+    _, data = imported(path, *columns, "--angles", "pitch*")
+    assert data.task.timestep == 0.01
+    expected = [[np.deg2rad(d), r] for d, r in zip((80, 90, 100), (1, 2, 3), strict=True)]
+    np.testing.assert_allclose(data["observation"][:, 2:], expected, rtol=1e-6)
+    assert [each.unit for each in data.task.features] == ["", "", "rad", "rad"]
+
+
+def test_units_are_of_columns_or_their_numbers_and_of_no_others(tmp_path):
+    table = {"t": np.arange(5) * 100.0, "s": [[80.0 + i, i] for i in range(5)], "u": np.zeros(5)}
+    layout = Layout(observations=("s",), actions=("u",), time="t", angles=("s.0",))
+    data = Dataset.from_table(
+        tmp_path / "a", table, layout.replace(units={"s.0": "deg", "t": "ms"})
+    )
+    np.testing.assert_allclose(data["observation"][:, 0], np.deg2rad(80 + np.arange(4)), rtol=1e-6)
+    assert data.task.timestep == 0.1
+    with pytest.raises(InputError, match="table has no column 'S': it has t, s"):
+        Dataset.from_table(tmp_path / "b", table, layout.replace(units={"S": "deg"}))
+
+
+def test_an_option_comes_before_the_file_even_where_it_is_the_default(tmp_path):
+    rows = {"t": [i / 5 for i in range(6)], "x": range(6), "u": [0.5] * 6}
+    path, file = write_csv(tmp_path / "a.csv", rows), tmp_path / "layout.toml"
+    file.write_text('observations=["x"]\nactions=["u"]\ntime="t"\nrate=10\nfill="linear"\n')
+    _, data = imported(path, "--layout", file)
+    np.testing.assert_allclose(data["x"][:4], [0, 0.5, 1, 1.5], rtol=1e-6)
+    _, data = imported(path, "--layout", file, "--fill", "latest", out="latest")
+    np.testing.assert_array_equal(data["x"][:4], [0, 0, 1, 1])
+
+
+@pytest.mark.parametrize(("rate", "digits"), [(30, 3), (60, 3), (100, 2)])
+def test_a_clock_that_is_rounded_keeps_every_row(tmp_path, rate, digits):
+    rows = np.arange(301)
+    table = {"t": np.round(rows / rate, digits), "x": rows * 1.0, "u": rows * 1.0}
+    layout = Layout(observations=("x",), actions=("u",), time="t", rate=rate)
+    data = Dataset.from_table(tmp_path / "even", table, layout)
+    np.testing.assert_array_equal(data["x"][:], rows[:-1])
+    data = Dataset.from_table(tmp_path / "own", table, layout.replace(rate=None))
+    assert data.task.timestep == 1 / rate
+
+
+def test_linear_readings_at_a_tick_are_kept_before_a_gap(tmp_path):
+    x = np.array([0, 1, 2, *[np.nan] * 4, 7, 8, 9])
+    table = {"t": np.arange(10) / 10, "x": x, "u": np.zeros(10)}
+    layout = Layout(observations=("x",), actions=("u",), time="t", rate=10, gap=0.25)
+    data = Dataset.from_table(tmp_path / "a", table, layout.replace(fill="linear"))
+    assert data.episodes["length"].tolist() == [2, 2]
+    assert data.episodes["final_observation"][:, 0].tolist() == [2, 9]
+
+
+def test_rewards_see_what_the_data_set_has(tmp_path, rewards):
+    """An offset is taken off, whether rewards are made with the data or after."""
+    (tmp_path / "features.toml").write_text('[[features]]\nname = "x"\noffset = 1000000\n')
+    rows = {"t": [i / 10 for i in range(8)], "x": [1e6 + i / 8 for i in range(8)], "u": [0.5] * 8}
+    path = write_csv(tmp_path / "a.csv", rows)
+    how = ("--observations", "x", "--actions", "u", "--time", "t")
+    how += ("--features", tmp_path / "features.toml")
+    code = ("--reward", "my_rewards:upright")
+    _, data = imported(path, *how, *code)
+    expected = np.cos(np.arange(7) / 8) - 0.01 * 0.5**2
+    np.testing.assert_allclose(data["reward"], expected, rtol=1e-6)
+    imported(path, *how, out="later")
+    derive = ("data", "derive", tmp_path / "later", *code, "--out", tmp_path / "derived")
+    assert jbrep(*derive).exit_code == 0
+    np.testing.assert_array_equal(Dataset(tmp_path / "derived")["reward"], data["reward"])
+
+
+def test_whole_numbers_that_floats_do_not_hold_are_refused(tmp_path):
+    table = {"t": np.arange(8) / 10, "x": (1 << 53) + np.arange(8), "u": np.zeros(8)}
+    layout = Layout(observations=("x",), actions=("u",), time="t")
+    with pytest.raises(InputError, match=r"table, row 1: 'x' is 9007199254740993: whole numbers"):
+        Dataset.from_table(tmp_path / "a", table, layout)
+    table["x"] -= 1
+    with pytest.raises(InputError, match="row 2"):
+        Dataset.from_table(tmp_path / "b", table, layout)
+
+
+def test_missing_readings_count_where_an_episode_has_no_whole_step(tmp_path):
+    x = [0, 1, np.nan, 3, *[np.nan] * 4]
+    table = {"ep": [0] * 4 + [1] * 4, "x": x, "u": np.zeros(8)}
+    layout = Layout(observations=("x",), actions=("u",), episode="ep")
+    with pytest.warns(Notice, match=r"had 5 missing readings \(skip\): 5 steps left out"):
+        Dataset.from_table(tmp_path / "a", table, layout, missing="skip")
+
+
+def test_empty_lines_are_no_rows_and_count_as_lines(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("# a\n\nt,x,u\n0,1,2\n\n1,2,3\n2,,3\n")
+    done = jbrep("data", "import", path, "--time", "t", "--actions", "u", "--out", tmp_path / "no")
+    assert "a.csv, line 7: 'x' is empty" in done.output
+
+
+def test_a_folder_of_lerobot_s_that_lacks_rows_is_refused(tmp_path):
+    folder = lerobot_folder(tmp_path / "le")
+    told = json.loads((folder / "meta/info.json").read_text())
+    (folder / "meta/info.json").write_text(json.dumps(told | {"total_frames": 10_000}))
+    said = mistake("data", "import", folder, "--out", tmp_path / "no")
+    assert re.search(r"has \d+ rows, and meta/info\.json says 10,000: download it whole", said)

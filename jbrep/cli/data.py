@@ -256,7 +256,7 @@ def export(data: Path, to: str, out: Path) -> None:
 @click.argument("source", nargs=-1, required=True)
 @task_option
 @click.option("--out", required=True, type=PATH, help="A new folder.")
-@record_options(Layout)
+@record_options(Layout, fill=None)
 @click.option(
     "--layout", type=PATH, help="A TOML file with the options from --observations to --fill."
 )
@@ -305,8 +305,8 @@ def _layout(options: dict[str, Any]) -> Layout:
     from jbrep.records.toml import read_toml
 
     given = {name: options.pop(name) for name in Layout.__struct_fields__}
-    usual, path = Layout(), options.pop("layout")
-    said = {n: value for n, value in given.items() if value not in (None, getattr(usual, n))}
+    path = options.pop("layout")
+    said = {name: value for name, value in given.items() if value not in (None, "")}
     try:
         return from_plain({**(read_toml(path) if path else {}), **said}, Layout)
     except InputError as error:

@@ -71,6 +71,7 @@ class Layout(Record, frozen=True, kw_only=True):
         Literal["latest", "linear"],
         Meta(
             description="What stands between readings then: the latest, or for observations what "
-            "lies between two."
+            "lies between two.",
+            extra={"default": "latest"},  # in words, as an option that isn't given is none
         ),
     ] = "latest"

@@ -2,6 +2,7 @@
 
 import resource
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate
@@ -21,10 +22,10 @@ from jbrep.dataset.manifest import (
     shard_name,
 )
 from jbrep.dataset.scaling import EXTREMA, Scaler, fit_scaler
-from jbrep.dataset.schema import EPISODES, episode_bounds, episode_columns
-from jbrep.dataset.shard import FileState, Shard, file_state
+from jbrep.dataset.schema import EPISODES, Columns, episode_bounds, episode_columns
+from jbrep.dataset.shard import FileState, file_state
 from jbrep.envs.task import Task
-from jbrep.errors import InputError
+from jbrep.errors import DamageError, InputError
 
 if TYPE_CHECKING:
     from jbrep.dataset.formats.episodes import Source
@@ -217,12 +218,28 @@ class Dataset:
         opened = together([open_source(str(each), layout, missing) for each in (file, *more)])
         return _written(folder, opened, layout, missing, task)
 
-    def _shard(self, shard: int) -> Shard:
+    def _shard(self, shard: int) -> Columns:
         """A shard as it is on disk now: another state of its file is another entry of the cache."""
         return self._opened(shard, file_state(self.folder / shard_name(shard)))
 
-    def _open(self, shard: int, state: FileState) -> Shard:
-        return open_shard(self.folder, self.manifest, shard, self._checked)
+    def _open(self, shard: int, state: FileState) -> Columns:
+        try:
+            return open_shard(self.folder, self.manifest, shard, self._checked)
+        except DamageError:
+            if (grown := self._grown(shard)) is None:
+                raise
+            return grown
+
+    def _grown(self, shard: int) -> Columns | None:
+        """What there was of a shard to which a collector has added episodes since; None if none."""
+        with suppress(InputError):
+            settings, now = self.manifest.settings, current_manifest(self.folder)
+            before, entry = self.manifest.shards[shard], now.shards[shard]
+            is_ours = now.settings.replace(steps=settings.steps) == settings
+            if is_ours and entry.episodes > before.episodes:
+                whole = open_shard(self.folder, now, shard, self._checked)
+                return whole.first(before.rows, before.episodes)
+        return None
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0

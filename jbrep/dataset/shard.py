@@ -87,7 +87,7 @@ class Shard(Mapping[str, NDArray[Any]]):
     external file, virtual data set or filter is followed.
 
     Attributes:
-        path: of the shard, for messages and for reading HDF5's structure.
+        path: of the shard, for messages.
         content: its bytes.
         specs: the expected columns, no more and no fewer.
         rows: how many there are.
@@ -105,6 +105,10 @@ class Shard(Mapping[str, NDArray[Any]]):
     episodes: int
     max_length: int
     _views: dict[str, NDArray[Any]] = field(default_factory=dict, init=False)
+
+    def first(self, rows: int, episodes: int) -> Columns:
+        """The first rows and episodes of each column."""
+        return {n: self[n][: episodes if n.startswith(EPISODES) else rows] for n in self}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.specs)
@@ -141,7 +145,7 @@ class Shard(Mapping[str, NDArray[Any]]):
     def _structure(self) -> Iterator[h5py.h5f.FileID]:
         """The file as HDF5 sees it; anything that HDF5 can't parse is damage."""
         try:
-            with h5py.File(self.path, "r", locking=False) as file:
+            with h5py.File(self.content, "r") as file:  # at that path may be another by now
                 yield file.id
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             if isinstance(error, DamageError):

@@ -86,6 +86,7 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: 
         gained += ", as it was registered" if counted_over_still else ""
         counts_all = all(comparison.counts_all for comparison in first.comparisons)
         gained += "" if counts_all else "; shares are of the runs that verdicts count"
+        gained += "; shares compare each two as far as both go" if first.cut else ""
         return found._replace(title=f"{found.title}; {gained}")
     return found
 

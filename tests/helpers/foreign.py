@@ -38,7 +38,8 @@ def csv_rows(**changes):
 
 
 def write_csv(path, rows, separator=",", before=(), decimal="."):
-    lines = [separator.join(rows), *map(separator.join, zip(*rows.values(), strict=True))]
+    cells = (map(str, row) for row in zip(*rows.values(), strict=True))
+    lines = [separator.join(rows), *map(separator.join, cells)]
     lines[1:] = [line.replace(".", decimal) for line in lines[1:]]
     path.write_text("\n".join([*before, *lines]) + "\n", encoding="utf-8-sig")
     return path

@@ -15,8 +15,10 @@ from jbrep.errors import InputError
 Array = NDArray[Any]
 
 MOST_RAW = 20_000_000  # rows of what is cut, or brought to another clock
-_SLACK = 1e-6  # of a step, by which rounding may shift a reading
+_SLACK = 1e-6  # of a step, by which rounding may shift a time
+_LATE = 0.1  # of a step, by which a reading of an even clock may be late and count as on time
 _EVEN = 0.1  # by which most steps of an even clock may differ from the median
+_ROUND = 1e-3  # by which a rate may differ from a whole number [Hz], relative to that
 _SIGNALS = ("observation", "action", "reward")
 
 
@@ -121,11 +123,15 @@ class Clock:
         self, grid: Array, time: Array, values: Array, linear: bool, turning: bool
     ) -> Array:
         """A column on the clock; NaN where its readings are too far away."""
-        slack = _SLACK / (self._layout.rate or 1.0)
-        last = np.searchsorted(time, grid + slack, side="right") - 1
+        step = 1 / (self._layout.rate or 1.0)
+        slack, late = _SLACK * step, _SLACK * step
+        if not linear and (own := timestep_of(time)):
+            late = max(slack, _LATE * min(step, own))
+        last = np.searchsorted(time, grid + late, side="right") - 1
         age = grid - time[last]
         if linear:
-            age = np.maximum(age, time[np.minimum(last + 1, len(time) - 1)] - time[last])
+            following = time[np.minimum(last + 1, len(time) - 1)]
+            age = np.where(age > slack, np.maximum(age, following - time[last]), age)
             even = np.interp(grid, time, np.unwrap(values) if turning else values)
             even = wrapped(even) if turning else even
         else:
@@ -143,4 +149,10 @@ def timestep_of(time: Array) -> float | None:
     low, median, high = np.percentile(steps, (5, 50, 95))
     even = (1 - _EVEN) * median <= low and high <= (1 + _EVEN) * median
     usual = steps[np.abs(steps - median) <= _EVEN * median]
-    return float(f"{usual.mean():.4g}") if even else None
+    return _rounded(float(usual.mean())) if even else None
+
+
+def _rounded(step: float) -> float:
+    """A step [s] that makes a whole number of them a second, if it nearly does; else 4 digits."""
+    rate = round(1 / step)
+    return 1 / rate if rate and abs(1 / step - rate) <= _ROUND * rate else float(f"{step:.4g}")

@@ -2,6 +2,7 @@
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -11,13 +12,14 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 
 from jbrep.dataset.formats.episodes import label
-from jbrep.dataset.formats.tables import UNIT, Table
+from jbrep.dataset.formats.tables import DEGREES, RADIANS, SECONDS, UNIT, Table
 from jbrep.errors import InputError, first_line
 
 _SEPARATORS = ",;\t|"
 _COMMENTS = ("#", "%")
 _EMPTY = [*pa_csv.ConvertOptions().null_values, "-", "--", "None", "NAN", "Nan"]
 _UNIT = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\])]*)[\])]")
+_TELLING = {*RADIANS, *DEGREES, *SECONDS}  # units that change what numbers mean
 _PLACE = re.compile(r"\w[\[(]\d+[\])]$")  # of q[0], which is no unit
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d\S*")
@@ -56,8 +58,15 @@ def open_table(given: str) -> Table:
         label(path.stem),
         schema,
         lambda columns: _batches(path, form, schema, columns),
-        place=lambda row: f"line {form.begin + 1 + row}",
+        place=lambda row: f"line {_line_of(path, form.begin, row)}",
     )
+
+
+def _line_of(path: Path, begin: int, row: int) -> int:
+    """The line of a row, from 1; empty lines are none."""
+    with path.open(encoding="utf-8-sig", newline=None) as file:
+        lines = (i for i, line in enumerate(file, 1) if i > begin and line.strip("\n"))
+        return next(islice(lines, row, None), begin + 1 + row)
 
 
 def _form(path: Path) -> _Form:
@@ -100,8 +109,11 @@ def _names(header: list[str]) -> tuple[list[str], list[str]]:
     found = [None if _PLACE.search(cell) else f for f, cell in zip(found, header, strict=True)]
     names = [f["name"] if f else cell for f, cell in zip(found, header, strict=True)]
     units = [f["unit"].strip() if f else "" for f in found]
-    if len(set(names)) < len(names):
-        names, units = header, [""] * len(header)
+    several = Counter(names)
+    for i, name in enumerate(names):
+        if several[name] > 1:  # pos (x) and pos (y)
+            names[i] = header[i]
+            units[i] = units[i] if units[i] in _TELLING else ""
     return [name or f"column_{i}" for i, name in enumerate(names)], units
 
 

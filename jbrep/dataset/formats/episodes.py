@@ -43,6 +43,7 @@ class Incoming(NamedTuple):
     terminated: bool
     seed: int
     missing: int = 0  # numbers in whose place are others, or at which it was divided
+    truncated: bool = False  # also where it was terminated; else it counts as truncated anyway
     is_cut: bool = False  # whether its last step was left out, for want of a final observation
 
 
@@ -126,7 +127,7 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
     Args:
         where: it is, for messages.
         rows: of its steps.
-        once: its final observation, whether it was terminated and its seed, where they are known.
+        once: its final observation, how it ended and its seed, where they are known.
 
     Raises:
         InputError: gaps.
@@ -137,8 +138,8 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
     following = _following(where, rows)
     final = once.get("final_observation", following)
     observation = _flat(rows["observation"])
-    by_row = bool(rows["terminated"][-1]) if "terminated" in rows else False
-    terminated = bool(once.get("terminated", by_row))
+    by_row = {name: rows[name][-1] for name in ENDS if name in rows}
+    terminated, truncated = (bool((by_row | {**once}).get(name, False)) for name in ENDS)
     if final is None:
         observation, last, terminated = observation[:-1], observation[-1], False
     else:
@@ -157,7 +158,8 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
     action = _flat(rows["action"][:steps])
     reward = _flat(rows["reward"][:steps])[:, 0] if "reward" in rows else np.zeros(steps)
     is_cut = final is None
-    yield Incoming(where, observation, action, reward, last, terminated, seed, is_cut=is_cut)
+    ends = {"truncated": truncated, "is_cut": is_cut}
+    yield Incoming(where, observation, action, reward, last, terminated, seed, **ends)
 
 
 def _check_steps(where: str, rows: Rows) -> None:

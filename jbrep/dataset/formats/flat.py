@@ -36,8 +36,8 @@ def per_episode(name: str, given: Mapping[str, Any]) -> dict[str, Array]:
 
     Args:
         name: of the source.
-        given: final_observation (episodes, ...), terminated (episodes,) and seed (episodes,), as
-            far as they are known.
+        given: final_observation (episodes, ...), terminated, truncated and seed (episodes,), as far
+            as they are known.
 
     Raises:
         InputError: one holds what can't be imported, or two are of different lengths.

@@ -57,6 +57,10 @@ def open_table(given: str) -> Table:
                 raise InputError(f"{path} has no column {lacking[0]!r}, unlike {paths[0].name}")
             rows += file.metadata.num_rows
     assert schema is not None
+    if info["frames"] not in (None, rows):
+        raise InputError(
+            f"{given} has {rows:,} rows, and {INFO} says {info['frames']:,}: download it whole"
+        )
     known = info["features"]
     images = [name for name, each in known.items() if each["dtype"] in _IMAGES]
     seen = [n for n in known if n.startswith("observation.") and n not in images]
@@ -77,6 +81,7 @@ def _info(path: Path) -> dict[str, Any]:
     try:
         info = json.loads(read_regular(path, _MAX_BYTES))
         version, fps = str(info["codebase_version"]), float(info["fps"])
+        frames = int(info["total_frames"]) if "total_frames" in info else None
         known = {str(name): dict(each) for name, each in info["features"].items()}
         known = {name: each | {"dtype": str(each["dtype"])} for name, each in known.items()}
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -85,7 +90,7 @@ def _info(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is of LeRobot's layout {version}: it must be v3.0 or v2.1")
     if not 0 < fps < np.inf:
         raise InputError(f"{path} has {fps} frames a second")
-    return {"fps": fps, "features": known}
+    return {"fps": fps, "frames": frames, "features": known}
 
 
 def _named(schema: pa.Schema, known: Mapping[str, Any]) -> pa.Schema:

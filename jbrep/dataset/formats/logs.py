@@ -13,9 +13,9 @@ from jbrep.coordinates import wrapped
 from jbrep.dataset.formats.clock import MOST_RAW, Clock, timestep_of
 from jbrep.dataset.formats.episodes import WIDE, Incoming, Rows, Source
 from jbrep.dataset.formats.flat import split
-from jbrep.dataset.formats.missing import without_missing
 from jbrep.dataset.formats.tables import (
     DEGREES,
+    SECONDS,
     Leaf,
     Roles,
     Table,
@@ -31,7 +31,8 @@ from jbrep.text import counted
 
 Array = NDArray[Any]
 
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+_LARGEST = 1 << 53  # whole number that floats hold, and all below
+
 _SAID = {  # of what is counted: what it is, and what became of it
     "rows": ("row", "read"),
     "repeated": ("row", "at the time of the row before: left out"),
@@ -42,7 +43,6 @@ _SAID = {  # of what is counted: what it is, and what became of it
     "stale": ("row", "of these without a reading of each column within {gap} s: left out"),
     "cuts": ("cut", "after {length} rows"),
     "last": ("row", "after the last action of an episode, or alone: no step begins there"),
-    "missing": ("step", "without all readings: left out"),
 }
 
 
@@ -99,7 +99,7 @@ class _Reader:
 
     def __init__(self, table: Table, layout: Layout, roles: Roles, missing: str):
         self._table, self._layout, self._roles = table, layout, roles
-        self._missing, self._counts = missing, Counter[str]()
+        self._counts = Counter[str]()
         self._may_miss = bool(missing or layout.rate)
         seen = roles["observation"]
         self._angles = np.array([each.is_angle for each in seen])
@@ -123,10 +123,7 @@ class _Reader:
         most = MOST_RAW if layout.rate or layout.length else MAX_EPISODE_STEPS
         for episode in split(name, chunks, self._table.once, most, clock.parts):
             self._counts["last"] -= len(episode.action)
-            self._counts["missing"] += len(episode.action)
-            for part in without_missing(episode, self._missing):
-                self._counts["missing"] -= len(part.action)
-                yield part
+            yield episode
 
     def _rows(self) -> Iterator[Rows]:
         """The rows by role, some at a time."""
@@ -142,6 +139,8 @@ class _Reader:
                 ]
                 for leaf, values in zip(leaves, each, strict=True):
                     self._check(leaf, role, values, first)
+                    if role in WIDE:
+                        self._check_whole(leaf, values, first)
                 rows[role] = np.stack(each, axis=1) if role in WIDE else each[0]
             if "time" in rows:
                 time = rows["time"]
@@ -170,16 +169,28 @@ class _Reader:
                 "correct it, leave the row out, or give --missing"
             )
 
+    def _check_whole(self, leaf: Leaf, values: Array, first: int) -> None:
+        """Refuse whole numbers that floats of 64 bits don't hold."""
+        if values.dtype.kind not in "iu" or not len(values):
+            return
+        beyond = (values > _LARGEST) | (values < -_LARGEST if values.dtype.kind == "i" else False)
+        if len(wrong := np.flatnonzero(beyond)):
+            raise InputError(
+                f"{self._at(first + int(wrong[0]))}: {leaf.name!r} is {values[wrong[0]]}: whole "
+                "numbers beyond 2**53 lose digits; subtract something from the column first, or "
+                "leave it out"
+            )
+
     def _seconds(self, leaf: Leaf) -> float:
         """What brings the times to seconds."""
         kind = self._table.schema.field(leaf.column).type
         unit = "ns" if pa.types.is_temporal(kind) else leaf.unit or "s"
-        if unit not in _SECONDS:
+        if unit not in SECONDS:
             raise InputError(
                 f"{self._table.name}: the times {leaf.name!r} are in {unit!r}: choose one of "
-                f"{', '.join(_SECONDS)}"
+                f"{', '.join(SECONDS)}"
             )
-        return _SECONDS[unit]
+        return SECONDS[unit]
 
     def _at(self, row: int) -> str:
         return f"{self._table.name}, {self._table.place(row)}"

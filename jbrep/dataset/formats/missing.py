@@ -71,6 +71,7 @@ def _whole_parts(episode: Incoming) -> Iterator[Incoming]:
             reward=episode.reward[begin:end],
             final=seen[end],
             terminated=episode.terminated and end == len(steps),
+            truncated=episode.truncated and end == len(steps),
             seed=episode.seed if begin == 0 else UNKNOWN_SEED,
             missing=episode.missing if begin == edges[0] else 0,
         )

@@ -33,6 +33,7 @@ _LENGTHS = "episodes/length"  # which only jbrep writes
 _ONCE = {  # what is known once for each episode
     "final_observation": ("episodes/final_observation", "final_observations"),
     "terminated": ("episodes/terminated",),
+    "truncated": ("episodes/truncated",),
     "seed": ("episodes/seed", "seeds"),
 }
 

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import xxhash
 from numpy.typing import NDArray
 
-from jbrep.dataset.formats.episodes import label
+from jbrep.dataset.formats.episodes import ENDS, label
 from jbrep.dataset.formats.flat import CHUNK, per_episode
 from jbrep.dataset.formats.tables import Table, with_widths
 from jbrep.dataset.reader import Dataset
@@ -171,7 +171,7 @@ def _once(path: Path, known: Checksums) -> dict[str, NDArray[Any]]:
     with reading(beside):
         table = pq.read_table(io.BytesIO(content))
         final = np.stack(table["final_observation"].to_numpy())
-        once = {name: table[name].to_numpy() for name in ("terminated", "seed")}
+        once = {name: table[name].to_numpy() for name in (*ENDS, "seed")}
         return per_episode(str(beside), {"final_observation": final, **once})
 
 

@@ -25,6 +25,8 @@ UNIT, NAMES = b"unit", b"names"  # in a field's metadata: its unit, and those of
 _ACTION = re.compile(r"actions?(_\d+)?")
 _NOT_FEATURES = re.compile(r"__index_level_\d+__|seed")  # pandas writes the former
 DEGREES = ("deg", "°", "degrees", "degree")
+RADIANS = ("", "rad")
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}  # by unit
 _WORDS = (
     *(pa.types.is_string, pa.types.is_large_string, pa.types.is_string_view),
     pa.types.is_dictionary,
@@ -81,11 +83,19 @@ class Leaf(NamedTuple):
 Roles = Mapping[str, list[Leaf]]  # by the names of ALIASES, and time
 
 
-def _leaves(schema: pa.Schema, layout: Layout) -> Iterator[Leaf]:
-    """All that could be used of a table."""
+def _leaves(table: Table, units: Mapping[str, str]) -> list[Leaf]:
+    """All that could be used of a table, in units by names or patterns, or else its own."""
+    leaves = list(_own_leaves(table.schema))
+    for name, unit in units.items():
+        some = {each.name for each in _matching(table, leaves, (name,))}
+        leaves = [each._replace(unit=unit) if each.name in some else each for each in leaves]
+    return leaves
+
+
+def _own_leaves(schema: pa.Schema) -> Iterator[Leaf]:
     for each in schema:
         said = each.metadata or {}
-        unit = layout.units.get(each.name, said.get(UNIT, b"").decode())
+        unit = said.get(UNIT, b"").decode()
         names = said.get(NAMES, b"").decode().split("\n") if NAMES in said else []
         size = width(each.type)
         for i in range(1 if size is None else size):
@@ -130,7 +140,7 @@ def roles_of(table: Table, layout: Layout) -> Roles:
     name, names = table.name, table.schema.names
     if twice := [each for each, n in Counter(names).items() if n > 1]:
         raise InputError(f"{name} has two columns {twice[0]!r}: rename one")
-    leaves = list(_leaves(table.schema, layout))
+    leaves = _leaves(table, layout.units)
     roles = {role: _matching(table, leaves, said) for role, said in _said(table, layout).items()}
     roles.setdefault("action", [each for each in leaves if _ACTION.fullmatch(each.column)])
     roles.setdefault("observation", list(_others(table, leaves, roles)))
@@ -226,7 +236,7 @@ def features_of_table(table: Table, leaves: list[Leaf]) -> Iterator[Feature]:
     for each, name in zip(leaves, names, strict=True):
         if not each.is_angle:
             yield Feature(name=name, unit=each.unit[:40])
-        elif each.unit in ("", "rad", *DEGREES):
+        elif each.unit in (*RADIANS, *DEGREES):
             pi = math.pi
             yield Feature(name=name, unit="rad", low=-pi, high=pi, bounded=True, kind="angle")
         else:

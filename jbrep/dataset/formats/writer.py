@@ -12,8 +12,8 @@ from gymnasium import spaces
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from jbrep.dataset.formats.episodes import Incoming, Source, single
-from jbrep.dataset.formats.missing import without_missing
+from jbrep.dataset.formats.episodes import ENDS, Incoming, Source, single
+from jbrep.dataset.formats.missing import count_missing, without_missing
 from jbrep.dataset.manifest import Manifest, commit, new_manifest, write_manifest
 from jbrep.dataset.rewards import reward_function, with_hash, without_range
 from jbrep.dataset.schema import EPISODES, Columns, DataSettings
@@ -62,7 +62,8 @@ def write(
         missing: what becomes of numbers that aren't finite, see `without_missing`; by default as
             the task says.
         reward: code, as module:function, that gives rewards in place of the source's, (n,), of the
-            observations (n, d) and actions (n, k) of an episode.
+            observations (n, d) and actions (n, k) of an episode, as the data set has them: without
+            the offsets of features.
 
     Raises:
         InputError: the folder exists already, there are no episodes, they don't fit the task, or
@@ -72,7 +73,6 @@ def write(
     try:
         with unfinished(folder) as partial:
             missing = missing or (task.missing if task else "") or ""
-            source = _rewarded(source, reward, missing) if reward else source
             survey = _survey(source, missing)
             fitting = _fitting(source, survey, task or source.task)
             fitting = with_features(fitting, features) if features else fitting
@@ -80,6 +80,7 @@ def write(
                 warnings.warn(problem, Notice, stacklevel=2)
             fitting = fitting.replace(missing=missing) if missing else fitting
             fitting = without_range(fitting) if reward else fitting
+            source = _rewarded(source, reward, missing, fitting) if reward else source
             settings = _settings(source, survey, fitting, reward)
             check_space(folder.parent, settings.steps * settings.row_bytes())
             partial.mkdir()
@@ -90,13 +91,15 @@ def write(
     return manifest
 
 
-def _rewarded(source: Source, reward: str, missing: str) -> Source:
-    """A source with rewards of its user's."""
-    rewards = reward_function(reward)
+def _rewarded(source: Source, reward: str, missing: str, task: Task) -> Source:
+    """A source with rewards of its user's, of what will be stored."""
+    rewards, offset = reward_function(reward), _offset(source, task)
 
     def episodes() -> Iterator[Incoming]:
         for each in _episodes(source, missing):
-            yield each._replace(reward=rewards(each.observation, each.action))
+            observation = single(each.where, "observation", each.observation - offset)
+            action = _bounded(task, single(each.where, "action", each.action))
+            yield each._replace(reward=rewards(observation, action))
 
     return replace(source, episodes=episodes, has_rewards=True)
 
@@ -108,28 +111,34 @@ def _episodes(source: Source, missing: str) -> Iterator[Incoming]:
 
 
 def _survey(source: Source, missing: str) -> _Survey:
-    sizes, lengths, count, cut = (0, 0), list[int](), 0, 0
+    sizes, lengths, count, left, cut = (0, 0), list[int](), 0, 0, 0
     signals: Signals | None = None
     low: Any = np.inf
     high: Any = -np.inf
     with Progress(total=source.rows, unit="step", unit_scale=True, desc="read") as progress:
-        for episode in _episodes(source, missing):
-            count, cut = count + episode.missing, cut + episode.is_cut
-            found = episode.observation.shape[1], episode.action.shape[1]
-            sizes = sizes if lengths else found
-            if found != sizes:
-                raise InputError(
-                    f"{source.name} has {found[0]} features and {found[1]} numbers in an action in "
-                    f"an episode, but {sizes[0]} and {sizes[1]} before: all must be alike"
-                )
-            seen = Signals.of([episode.observation])
-            signals = signals.with_more(seen) if signals else seen
-            low = np.minimum(low, episode.action.min(axis=0))
-            high = np.maximum(high, episode.action.max(axis=0))
-            lengths.append(len(episode.reward))
-            progress.update(lengths[-1])
+        for whole in source.episodes():
+            parts = list(without_missing(whole, missing))
+            count, cut = count + count_missing(whole), cut + whole.is_cut
+            left += len(whole.action) - sum(len(part.action) for part in parts)
+            for episode in parts:
+                found = episode.observation.shape[1], episode.action.shape[1]
+                sizes = sizes if lengths else found
+                if found != sizes:
+                    raise InputError(
+                        f"{source.name} has {found[0]} features and {found[1]} numbers in an "
+                        f"action in an episode, but {sizes[0]} and {sizes[1]} before: all must be "
+                        "alike"
+                    )
+                seen = Signals.of([episode.observation])
+                signals = signals.with_more(seen) if signals else seen
+                low = np.minimum(low, episode.action.min(axis=0))
+                high = np.maximum(high, episode.action.max(axis=0))
+                lengths.append(len(episode.reward))
+                progress.update(lengths[-1])
     if count:
-        warnings.warn(f"{source.name} had {count:,} missing readings ({missing})", Notice, 2)
+        told = f"{source.name} had {count:,} missing readings ({missing})"
+        told += f": {counted(left, 'step')} left out" if left else ""
+        warnings.warn(told, Notice, 2)
     if cut:
         told = f"the last step of {counted(cut, 'episode')} of {source.name} is left out"
         warnings.warn(f"{told}: what was observed after it isn't known", Notice, 2)
@@ -214,10 +223,11 @@ def _settings(source: Source, survey: _Survey, task: Task, reward: str) -> DataS
 def _fill(source: Source, settings: DataSettings, folder: Path) -> Manifest:
     manifest = new_manifest(settings)
     write_manifest(folder, manifest)
+    offset = _offset(source, settings.task)
     episodes = _episodes(source, settings.task.missing or "")
     with Progress(total=settings.steps, unit="step", unit_scale=True, desc="write") as progress:
         while some := list(islice(episodes, settings.shard_episodes)):
-            columns = _columns(settings, some, manifest.episodes, source.is_shifted)
+            columns = _columns(settings, some, manifest.episodes, offset)
             for problem in range_problems(settings.task, columns):
                 raise InputError(
                     f"{source.name} doesn't fit {settings.task.name}: {problem}; correct the data, "
@@ -231,7 +241,7 @@ def _fill(source: Source, settings: DataSettings, folder: Path) -> Manifest:
 
 
 def _columns(
-    settings: DataSettings, episodes: list[Incoming], first: int, is_shifted: bool
+    settings: DataSettings, episodes: list[Incoming], first: int, offset: Array | float
 ) -> Columns:
     """The columns of a shard."""
 
@@ -239,10 +249,9 @@ def _columns(
         given = zip(episodes, values, strict=True)
         return np.concatenate([single(episode.where, what, each) for episode, each in given])
 
-    offset: Array | float = 0.0 if is_shifted else settings.task.offset
     action = rows("action", [episode.action for episode in episodes])
     finals = [episode.final[None] - offset for episode in episodes]
-    terminated = np.array([episode.terminated for episode in episodes])
+    ends = {name: np.array([getattr(e, name) for e in episodes]) for name in ENDS}
     known = {
         EPISODES + "episode": np.arange(first, first + len(episodes)),
         EPISODES + "seed": np.array([episode.seed for episode in episodes]),
@@ -251,11 +260,16 @@ def _columns(
         "observation": rows("observation", [episode.observation - offset for episode in episodes]),
         "action": _bounded(settings.task, action),
         "reward": rows("reward", [episode.reward for episode in episodes]),
-        EPISODES + "terminated": terminated,
-        EPISODES + "truncated": ~terminated,
+        EPISODES + "terminated": ends["terminated"],
+        EPISODES + "truncated": ends["truncated"] | ~ends["terminated"],
         EPISODES + "final_observation": rows("final observation", finals),
     }
     return settings.columns(known)
+
+
+def _offset(source: Source, task: Task) -> Array | float:
+    """What is still to be taken off observations."""
+    return 0.0 if source.is_shifted else task.offset
 
 
 def _bounded(task: Task, action: Array) -> Array:
