@@ -1,6 +1,6 @@
 """Exceptions for what a user can fix, and words for their messages."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, TypeVar
 
@@ -9,6 +9,7 @@ _Choice = TypeVar("_Choice")
 _MOST_NAMES = 20
 _MOST_SHOWN = 3  # settings that differ
 _MOST_LETTERS = 40  # of a value
+_BEFORE = 10  # letters that are shown before where two values differ
 
 
 class InputError(ValueError):
@@ -81,15 +82,36 @@ def listed(names: Sequence[str]) -> str:
 
 def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
     """The settings that differ, as text for a message: at most three; empty if none does."""
-    differing = [name for name in {**wanted, **there} if there.get(name) != wanted.get(name)]
+    differing = list(_differing(there, wanted))
     shown = [
-        f"{name} {_shown(there.get(name))} (now: {_shown(wanted.get(name))})"
-        for name in differing[:_MOST_SHOWN]
+        "{} {} (now: {})".format(name, *_shown(str(before), str(now)))
+        for name, before, now in differing[:_MOST_SHOWN]
     ]
     more = len(differing) - _MOST_SHOWN
     return ", ".join([*shown, f"and {more} more"] if more > 0 else shown)
 
 
-def _shown(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= _MOST_LETTERS else f"{text[: _MOST_LETTERS - 3]}..."
+def _differing(
+    there: Mapping[str, Any], wanted: Mapping[str, Any], where: str = ""
+) -> Iterator[tuple[str, Any, Any]]:
+    """The settings that differ, of tables the entries that do."""
+    for name in {**wanted, **there}:
+        before, now = there.get(name), wanted.get(name)
+        if isinstance(before, Mapping) and isinstance(now, Mapping):
+            yield from _differing(before, now, f"{where}{name}.")
+        elif before != now:
+            yield f"{where}{name}", before, now
+
+
+def _shown(*texts: str) -> Iterator[str]:
+    """Texts that are cut where they are long, from a little before where they differ on."""
+    pairs = enumerate(zip(*texts, strict=False))
+    alike = next((place for place, letters in pairs if len({*letters}) > 1), 0)
+    begin = alike - _BEFORE if alike > _MOST_LETTERS // 2 else 0
+    for text in texts:
+        if len(text) > _MOST_LETTERS:
+            some = text[begin:] if begin else text
+            more = "..." if len(some) > _MOST_LETTERS else ""
+            yield f"{'...' if begin else ''}{some[: _MOST_LETTERS - 3 if more else None]}{more}"
+        else:
+            yield text

@@ -109,6 +109,12 @@ def test_lists_of_commands_say_what_each_does_in_whole_sentences(group):
     assert not group or "Options:" in above
 
 
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_group_without_a_command_shows_its_help(group):
+    told = jbrep(group)
+    assert (told.exit_code, told.output) == (2, jbrep(group, "--help").output)
+
+
 def test_a_terminal_of_24_lines_holds_all_commands():
     text = jbrep("--help").output
     assert len(text.splitlines()) <= 24
@@ -123,6 +129,9 @@ def test_folders_of_other_things_are_left_alone(tmp_path):
         ("collect", *short, "--steps", 10),
         ("rl", *short, "--steps", 10),
         ("study", demo, "--register"),
+        ("behaviour", "heuristic", "--task", "face_direction", "--episodes", 1),
+        ("evaluate", "--encoder", "pca-4", "--data", "data/sample/face_direction"),
+        ("report", "results/cart-pole"),
     ):
         told = jbrep(*command, "--out", tmp_path)
         last = told.output.splitlines()[-1]

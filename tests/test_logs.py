@@ -263,8 +263,13 @@ BAD = {
     "--gap needs --time": ({}, (*NAMED[:4], "--gap", "1")),
     "the times 'time' are in 'days'": ({}, (*NAMED, "--units", "time=days")),
     "the angle 'gyro' in 'rad/s'": ({}, (*NAMED, "--angles", "gyro")),
-    "has no column 'u': it has pitch, gyro, ticks": ({}, (*NAMED, "--angles", "u")),
+    "has no observation 'u': it has pitch, gyro, ticks": ({}, (*NAMED, "--angles", "u")),
     "an episode comes in two parts": ({"status": {9: "b"}}, (*NAMED, "--episode", "status")),
+    "missing is 'hld:1': it must be skip, or hold and": (
+        {"gyro": {5: ""}},
+        (*NAMED, "--missing", "hld:1"),
+    ),
+    "of a log name the column of times": ({}, NAMED[:4]),
     "fill is 'cubic': it must be": ({}, (*NAMED, "--fill", "cubic")),
     "can't be read as rows of text: field larger": ({"status": {3: "a" * 200_000}}, NAMED),
 }
@@ -499,7 +504,7 @@ def test_the_page_on_logs_does_what_it_says(tmp_path, monkeypatch):
     told = [jbrep(*shlex.split(line)) for line in re.findall(r"^ {4}jbrep (.*)", page, re.M)]
     assert [done.exit_code for done in told] == [0] * len(told) == [0] * 6, told
     assert "3 gaps of more than 0.5 s: an episode ends there" in told[0].output
-    assert "1 missing readings (hold:3)" in told[0].output
+    assert "1 missing reading (hold:3)" in told[0].output
     assert "400 rows at 50 Hz, by the linear readings" in told[1].output
     sys.modules.pop("my_rewards", None)
 

@@ -231,7 +231,7 @@ def test_arguments_and_time_limit_are_those_of_the_environments(tmp_path):
     assert (task.id, task.arguments, task.max_episode_steps) == ("Pendulum-v1", {"g": 1.6}, 70)
     plan.write()
     other = Plan(study.replace(environment={"g": 9.8}), tmp_path)
-    with pytest.raises(InputError, match=r"another study: environment .*'g': 1.6"):
+    with pytest.raises(InputError, match=r"another study: environment\.g 1\.6 \(now: 9\.8\)"):
         other.write()
 
 

@@ -146,6 +146,8 @@ def test_it_is_verified_repaired_and_not_derived(data, tmp_path):
     (folder / POLICY).write_bytes(b"another")
     (problem,) = find_problems(folder)
     assert "policy-0.safetensors is damaged or missing: it is the policy of" in problem
+    told = jbrep("data", "repair", folder)
+    assert (told.exit_code, problem in told.output) == (2, True)
     (folder / "shard-00000.h5").unlink()
     (folder / POLICY).unlink()
     told = jbrep("data", "repair", folder)

@@ -34,6 +34,8 @@ def test_a_stopped_search_resumes_to_the_same_trials(tmp_path):
     assert parts == whole[:1]
     assert tune(RUN, 3, 1, tmp_path / "parts", parts.append) == best
     assert parts[1:] == whole
+    with pytest.raises(InputError, match="whole has 3 trials: ask for as many, or more"):
+        tune(RUN, 1, 1, tmp_path / "whole")
     assert best == max(whole, key=lambda trial: trial.value)
     assert len({trial.overrides["learning_rate"] for trial in whole}) == 3
     expected = ("modern", {"net_arch": [8], **best.overrides})

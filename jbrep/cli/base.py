@@ -121,6 +121,8 @@ class Cli(click.Group):
             if mistake := _mistake_of(error):
                 raise mistake from None
             raise
+        except click.exceptions.NoArgsIsHelpError:
+            raise  # of a group, whose help it shows
         except click.UsageError as error:
             command = error.ctx.command_path if error.ctx else "jbrep"
             message = error.format_message()

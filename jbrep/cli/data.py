@@ -93,7 +93,7 @@ def _tell_missing(dataset: "Dataset") -> None:
     """Say how many readings were missing."""
     if dataset.task.missing:
         count = int(dataset.episodes["missing"].sum())
-        say(f"{count:,} missing readings ({dataset.task.missing})", err=True)
+        say(f"{counted(count, 'missing reading')} ({dataset.task.missing})", err=True)
 
 
 def _report_size(out: Path, manifest: Any) -> None:
@@ -148,7 +148,7 @@ def verify(ctx: click.Context, data: Path, replay: int, threads: int | None) -> 
     unfinished = "" if manifest.complete else "; unfinished"
     say(f"{data}: no problems in {len(dataset):,} rows, {shards}{unfinished}")
     if replay:
-        click.echo(f"{replay} episodes simulated again: equal in every bit")
+        click.echo(f"{counted(replay, 'episode')} simulated again: equal in every bit")
 
 
 def _say_all(lines: Iterable[str]) -> bool:

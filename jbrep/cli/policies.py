@@ -128,7 +128,8 @@ def evaluate_policy(
         if source is not None:
             say(f"encoder: {source}")
         title = _title(policy, player)
-        tell(f"{title}: median return {interval_of(returns)} (10-90 % of {len(returns)} episodes)")
+        played = counted(len(returns), "episode")
+        tell(f"{title}: median return {interval_of(returns)} (10-90 % of {played})")
         if told := shares_text(values):
             tell(told)
     if failure:
@@ -340,7 +341,7 @@ def behaviour(
 
     from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
     from jbrep.play.sources import check_source
-    from jbrep.records.storage import check_writable, exists
+    from jbrep.records.storage import check_writable, exists, make_folder
 
     if not np.isfinite(target_yaw):
         raise InputError(f"--target-yaw is {target_yaw}: it must be a number of degrees")
@@ -348,8 +349,10 @@ def behaviour(
     for policy in policies:
         if not exists(policy):
             check_source(policy)
+    from jbrep.report.figures import BEHAVIOUR, behaviour_plots, write  # imports torch
+
+    make_folder(out, [f"{name}.png" for name in BEHAVIOUR])
     check_writable(out)
-    from jbrep.report.figures import behaviour_plots, write  # imports torch
 
     with stoppable("the same command starts again"):
         shared_task, behaviours = observe(policies, task, episodes, yaw)

@@ -234,8 +234,9 @@ def parse_policy(text: str, other: Callable[[str], Policy | None] = lambda text:
         kind, _, constants = text.partition(":")
         if kind not in POLICIES:
             raise InputError(
-                f"unknown policy {kind!r}: choose one of {', '.join(POLICIES)}, the folder of a "
-                "run with a policy or checkpoint, or a mixture: uniform:0.8+heuristic:0.2"
+                f"unknown policy {kind!r}: choose one of {', '.join(POLICIES)}, trained, the "
+                "folder of a run with a policy or checkpoint, or a mixture, such as "
+                "uniform:0.8+heuristic:0.2"
             )
         pairs = (pair.partition("=") for pair in constants.split(",") if pair)
         return _make(kind, {name.strip(): value for name, _, value in pairs})

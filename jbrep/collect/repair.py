@@ -23,6 +23,7 @@ from jbrep.dataset.manifest import (
     write_shard,
 )
 from jbrep.dataset.shard import column_hashes
+from jbrep.dataset.verify import policy_files
 from jbrep.envs.lanes import check_counts
 from jbrep.envs.origin import changes_of
 from jbrep.errors import DamageError, InputError
@@ -52,7 +53,8 @@ def repair(
 
     Raises:
         InputError: there is no data set, or a shard comes out differently here, as it does if
-            another machine or other versions made it, or the data set was imported.
+            another machine or other versions made it, or the data set was imported; or the file of
+            a policy that acted in it is damaged or missing.
     """
     check_counts(lanes, num_threads)
     intact = _intact_manifest(folder)
@@ -71,6 +73,7 @@ def repair(
         if not _is_backed_up(folder, manifest):
             write_manifest(folder, manifest)
             yield f"{folder / MANIFEST} and its backup restored"
+        policy_files(folder, manifest)
 
 
 def _intact_manifest(folder: Path) -> str:

@@ -64,7 +64,7 @@ class Layout(Record, frozen=True, kw_only=True):
         Meta(description="An episode is cut after so many rows."),
     ] = None
     rate: Annotated[
-        Annotated[float, Meta(gt=0, le=1e6, title="a rate above 0")] | None,
+        Annotated[float, Meta(gt=0, le=1e6, title="a rate above 0, at most 1e6")] | None,
         Meta(description="Bring the rows to an even clock of so many a second [Hz]."),
     ] = None
     fill: Annotated[

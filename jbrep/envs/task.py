@@ -58,7 +58,7 @@ SPATIAL: Mapping[Kind, range] = {  # kinds of several features, a group of their
 _Positive = Annotated[float, Meta(gt=0, le=1e12)]
 _Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", title="a SHA-256")]
 _Part = Annotated[str, Meta(pattern=r"\A[^\x00-\x1f\x7f-\x9f]{1,200}\Z", title="a name")]
-_Missing = Annotated[
+Missing = Annotated[
     str,
     Meta(
         pattern=r"\A(skip|hold:[1-9]\d{0,5})\Z", title="skip, or hold and a number of steps: hold:3"
@@ -230,7 +230,7 @@ class Task(Record, frozen=True):
     constants: _Arrays = {}
     made_from: Mapping[_Part, _Sha256] | UnsetType = UNSET  # left out of files that have none
     offsets: Mapping[Word, Finite] | UnsetType = UNSET
-    missing: _Missing | UnsetType = UNSET
+    missing: Missing | UnsetType = UNSET
     view: View | UnsetType = UNSET
     domain: Domain | UnsetType = UNSET
 

@@ -48,7 +48,7 @@ def write(
     """
     path = folder / EVALUATION
     judged = {label: find(each, data.task) for label, each in encoders.items()}
-    make_folder(folder)
+    make_folder(folder, (EVALUATION,))
     with exclusive(path, beside=True):
         before = _before(path, data, hashes(judged), policy, truth)
         evaluation = diagnose(judged, data, policy, truth)

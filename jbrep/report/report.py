@@ -93,7 +93,7 @@ def make_report(
     out, ran = out or folder, has_runs(folder)
     if not ran:
         check_tables(folder)
-    make_folder(out)
+    make_folder(out, () if out.resolve() == folder.resolve() else (SUMMARY,))
     written = [folder, out] if ran or evaluations else [out]
     with ExitStack() as stack:
         for each in sorted({each.resolve() for each in written}):

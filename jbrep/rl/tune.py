@@ -88,7 +88,8 @@ def tune(
         The best trial.
 
     Raises:
-        InputError: as `train`; or the folder holds another search; or each trial failed.
+        InputError: as `train`; or the folder holds another search, or more trials; or each trial
+            failed.
         StoppedError: `stop` was true.
     """
     search = Search(
@@ -97,6 +98,9 @@ def tune(
     make_folder(folder)
     with exclusive(folder):
         _claim(folder / SEARCH, search)
+        if there := len([*folder.glob("trial-*")][trials:]):
+            begun = trials + there
+            raise InputError(f"{folder} has {begun} trials: ask for as many, or more")
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         study = optuna.create_study(direction="maximize")
         ended = []

@@ -120,8 +120,8 @@ def read_runs(folder: Path) -> list[RunCurve]:
 
 
 def has_runs(folder: Path) -> bool:
-    """Whether a folder is of a study, or there is a run below it that has finished or failed."""
-    return exists(folder / STUDY) or any(folder.rglob(RUN))
+    """Whether there are runs below a folder that have ended, or tables alone: of a study or not."""
+    return any(folder.rglob(RUN)) or (exists(folder / STUDY) and not exists(folder / RECORD))
 
 
 def _ended(folder: Path) -> Ended:

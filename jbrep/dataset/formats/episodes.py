@@ -262,7 +262,8 @@ def check_names(name: str, columns: Iterable[str]) -> None:
     if not columns & {*ENDS, "episode", "step"}:
         raise InputError(
             f"{name} doesn't tell where an episode ends: give it terminations and truncations, or "
-            "the number of the episode in each row"
+            "the number of the episode in each row; of a log name the column of times or episodes "
+            "(--time, --episode), or give the --length"
         )
 
 

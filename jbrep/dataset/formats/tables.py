@@ -144,7 +144,7 @@ def roles_of(table: Table, layout: Layout) -> Roles:
     roles = {role: _matching(table, leaves, said) for role, said in _said(table, layout).items()}
     roles.setdefault("action", [each for each in leaves if _ACTION.fullmatch(each.column)])
     roles.setdefault("observation", list(_others(table, leaves, roles)))
-    angles = _matching(table, roles["observation"], layout.angles)
+    angles = _matching(table, roles["observation"], layout.angles, "observation")
     roles["observation"] = [each._replace(is_angle=each in angles) for each in roles["observation"]]
     if layout.observations:
         roles["next_observation"] = _after(table, leaves, roles["observation"])
@@ -187,14 +187,16 @@ def _others(table: Table, leaves: list[Leaf], roles: Roles) -> Iterator[Leaf]:
             yield each
 
 
-def _matching(table: Table, leaves: list[Leaf], names: tuple[str, ...]) -> list[Leaf]:
+def _matching(
+    table: Table, leaves: list[Leaf], names: tuple[str, ...], what: str = "column"
+) -> list[Leaf]:
     """Those of such names, in the order of the names and each once.
 
     Raises:
         InputError: none has one of the names.
     """
     own, columns = [each.name for each in leaves], [each.column for each in leaves]
-    return [leaves[i] for i in matching(names, own, columns, f"{table.name} has no column")]
+    return [leaves[i] for i in matching(names, own, columns, f"{table.name} has no {what}")]
 
 
 def _check_types(table: Table, role: str, leaves: list[Leaf], named: bool) -> None:
@@ -215,8 +217,8 @@ def _check_types(table: Table, role: str, leaves: list[Leaf], named: bool) -> No
             )
         if sort_of(kind) != "number":
             raise InputError(
-                f"{table.name} has {kind} in the column {each.column!r}: it must be plain numbers; "
-                "or name the observations and actions without it"
+                f"{table.name} has {kind} in the column {each.column!r}: it must be plain numbers"
+                + ("; or name the observations and actions without it" if role in WIDE else "")
             )
         if role == "action" and not named and not pa.types.is_floating(kind):
             raise InputError(

@@ -21,9 +21,10 @@ from jbrep.dataset.settings import IMPORTED, MAX_LETTERS
 from jbrep.dataset.verify import range_problems
 from jbrep.envs.description import features_of, with_features
 from jbrep.envs.precision import Signals, precision_problems
-from jbrep.envs.task import Task
+from jbrep.envs.task import Missing, Task
 from jbrep.errors import InputError, Notice, kind_and_line
 from jbrep.progress import Progress
+from jbrep.records.record import converted
 from jbrep.records.storage import check_space, make_folder, publish_folder, unfinished
 from jbrep.text import counted
 
@@ -69,6 +70,8 @@ def write(
         InputError: the folder exists already, there are no episodes, they don't fit the task, or
             they can't be written.
     """
+    if missing:
+        converted(missing, Missing, "missing")
     make_folder(folder.parent)
     try:
         with unfinished(folder) as partial:
@@ -136,7 +139,7 @@ def _survey(source: Source, missing: str) -> _Survey:
                 lengths.append(len(episode.reward))
                 progress.update(lengths[-1])
     if count:
-        told = f"{source.name} had {count:,} missing readings ({missing})"
+        told = f"{source.name} had {counted(count, 'missing reading')} ({missing})"
         told += f": {counted(left, 'step')} left out" if left else ""
         warnings.warn(told, Notice, 2)
     if cut:

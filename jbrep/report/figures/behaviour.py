@@ -12,6 +12,7 @@ from jbrep.report.figures.plot import Plot
 from jbrep.report.figures.style import COLUMN, PAGE, ink, plain, styles
 from jbrep.stats.bootstrap import Array
 
+BEHAVIOUR = ("motor_velocity", "positions")  # the names of its figures
 _ACROSS = 4  # panels, at most
 
 
@@ -30,7 +31,7 @@ def behaviour_plots(
     episodes = f"{' or '.join(map(str, counts))} episodes"
     return [
         Plot(
-            "motor_velocity",
+            BEHAVIOUR[0],
             f"{task}: how the motor turns",
             f"Share of time at each motor velocity over {episodes}, with their median return.",
             ("policy", "low", "high", "share"),
@@ -42,7 +43,7 @@ def behaviour_plots(
             lambda: _draw_motor(task, behaviours, speeds),
         ),
         Plot(
-            "positions",
+            BEHAVIOUR[1],
             f"{task}: where the robot goes",
             f"Share of time in each 2 cm cell over {episodes} that start at the circle; "
             "the arrow points in the target's direction.",
