@@ -269,6 +269,7 @@ BAD = {
         {"gyro": {5: ""}},
         (*NAMED, "--missing", "hld:1"),
     ),
+    "--hide and --history need a --task here": ({}, (*NAMED, "--hide", "gyro")),
     "of a log name the column of times": ({}, NAMED[:4]),
     "fill is 'cubic': it must be": ({}, (*NAMED, "--fill", "cubic")),
     "can't be read as rows of text: field larger": ({"status": {3: "a" * 200_000}}, NAMED),
