@@ -541,6 +541,9 @@ def test_an_option_comes_before_the_file_even_where_it_is_the_default(tmp_path):
     file.write_text('observations=["x"]\nactions=["u"]\ntime="t"\nrate=10\nfill="linear"\n')
     _, data = imported(path, "--layout", file)
     np.testing.assert_allclose(data["x"][:4], [0, 0.5, 1, 1.5], rtol=1e-6)
+    file.with_name("cut.toml").write_text("x = [")
+    said = mistake("data", "import", path, "--layout", file.with_name("cut.toml"), "--out", "no")
+    assert said.count("cut.toml") == 1
     _, data = imported(path, "--layout", file, "--fill", "latest", out="latest")
     np.testing.assert_array_equal(data["x"][:4], [0, 0, 1, 1])
 

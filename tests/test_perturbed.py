@@ -228,7 +228,8 @@ def test_the_command_shows_what_a_policy_keeps(tmp_path):
     file = tmp_path / "table.json"
     told = jbrep(*played, "--perturb", "--out", file)
     assert told.exit_code == 0, told.output
-    lines = told.output.splitlines()
+    *lines, empty, last = told.output.splitlines()
+    assert (empty, last) == ("", str(file))
     assert max(map(len, lines)) <= 80
     assert [line.split()[0] for line in lines[3:6]] == ["undisturbed", "noise=0.03", "noise=0.1"]
     rows = json.loads(file.read_text())["rows"]

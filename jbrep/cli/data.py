@@ -312,8 +312,9 @@ def _layout(options: dict[str, Any]) -> Layout:
     given = {name: options.pop(name) for name in Layout.__struct_fields__}
     path = options.pop("layout")
     said = {name: value for name, value in given.items() if value not in (None, "")}
+    told = read_toml(path) if path else {}
     try:
-        return from_plain({**(read_toml(path) if path else {}), **said}, Layout)
+        return from_plain({**told, **said}, Layout)
     except InputError as error:
         raise InputError(f"{path}: {error}" if path else f"{error}") from None
 

@@ -189,6 +189,8 @@ def _perturb(
                 say(_line(row.cells, left))
     if as_json:
         echo_json(to_plain(result))
+    elif out:
+        echo_paths([out])
 
 
 def _line(cells: Sequence[str], left: int) -> str:
