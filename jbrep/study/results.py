@@ -120,7 +120,7 @@ def read_runs(folder: Path) -> list[RunCurve]:
 
 
 def has_runs(folder: Path) -> bool:
-    """Whether there are runs below a folder that have ended, or tables alone: of a study or not."""
+    """Whether a run below a folder has ended, or it is of a study that has no tables yet."""
     return any(folder.rglob(RUN)) or (exists(folder / STUDY) and not exists(folder / RECORD))
 
 
