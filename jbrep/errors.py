@@ -106,7 +106,7 @@ def _differing(
 def _shown(*texts: str) -> Iterator[str]:
     """Texts that are cut where they are long, from a little before where they differ on."""
     pairs = enumerate(zip(*texts, strict=False))
-    alike = next((place for place, letters in pairs if len({*letters}) > 1), 0)
+    alike = next((place for place, letters in pairs if len({*letters}) > 1), min(map(len, texts)))
     begin = alike - _BEFORE if alike > _MOST_LETTERS // 2 else 0
     for text in texts:
         if len(text) > _MOST_LETTERS:

@@ -260,6 +260,8 @@ def test_a_reader_keeps_what_it_opened_when_its_last_shard_grows(tmp_path):
         assert len(each["reward"][:]) == len(each) == 2000
         assert each.episodes["length"].tolist() == [1000, 1000]
     np.testing.assert_array_equal(late[:], Dataset(folder)["action"][:2000])
+    used._opened.cache_clear()
+    np.testing.assert_array_equal(used["observation"][:], seen)
     flip_bit(folder / "shard-00000.h5", 8 * 100_000)
     with pytest.raises(DamageError, match=r"shard-00000\.h5 is damaged"):
         Dataset(folder)["reward"][:]

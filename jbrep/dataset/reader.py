@@ -234,10 +234,10 @@ class Dataset:
         """What there was of a shard to which a collector has added episodes since; None if none."""
         with suppress(InputError):
             settings, now = self.manifest.settings, current_manifest(self.folder)
-            before, entry = self.manifest.shards[shard], now.shards[shard]
+            before, entry = self.manifest.shards[shard], now.shards[shard : shard + 1]
             is_ours = now.settings.replace(steps=settings.steps) == settings
-            if is_ours and entry.episodes > before.episodes:
-                whole = open_shard(self.folder, now, shard, self._checked)
+            if is_ours and entry and entry[0].episodes > before.episodes:
+                whole = open_shard(self.folder, now, shard)
                 return whole.first(before.rows, before.episodes)
         return None
 

@@ -18,7 +18,6 @@ MOST_RAW = 20_000_000  # rows of what is cut, or brought to another clock
 _SLACK = 1e-6  # of a step, by which rounding may shift a time
 _LATE = 0.1  # of a step, by which a reading of an even clock may be late and count as on time
 _EVEN = 0.1  # by which most steps of an even clock may differ from the median
-_ROUND = 1e-3  # by which a rate may differ from a whole number [Hz], relative to that
 _SIGNALS = ("observation", "action", "reward")
 
 
@@ -153,6 +152,11 @@ def timestep_of(time: Array) -> float | None:
 
 
 def _rounded(step: float) -> float:
-    """A step [s] that makes a whole number of them a second, if it nearly does; else 4 digits."""
-    rate = round(1 / step)
-    return 1 / rate if rate and abs(1 / step - rate) <= _ROUND * rate else float(f"{step:.4g}")
+    """A step [s] to 4 digits, or the one of a whole number a second that has the same 4 digits.
+
+    Digits that end before the fourth say the step themselves: 0.007 isn't 1/143.
+    """
+    short = float(f"{step:.4g}")
+    rate = round(1 / short) if short > 1e-9 else 0
+    is_short = short == float(f"{step:.3g}")
+    return 1 / rate if rate and not is_short and float(f"{1 / rate:.4g}") == short else short
