@@ -110,8 +110,7 @@ def _shown(*texts: str) -> Iterator[str]:
     begin = alike - _BEFORE if alike > _MOST_LETTERS // 2 else 0
     for text in texts:
         if len(text) > _MOST_LETTERS:
-            some = text[begin:] if begin else text
-            more = "..." if len(some) > _MOST_LETTERS else ""
-            yield f"{'...' if begin else ''}{some[: _MOST_LETTERS - 3 if more else None]}{more}"
-        else:
-            yield text
+            text = f"...{text[begin:]}" if begin else text
+            some = _MOST_LETTERS + 3 if begin else _MOST_LETTERS
+            text = text if len(text) <= some else f"{text[: some - 3]}..."
+        yield text

@@ -278,13 +278,13 @@ def import_(source: tuple[str, ...], out: Path, **options: Any) -> None:
     layout = _layout(options)
     reward = layout.reward if is_code(layout.reward) else ""
     told = {name: options[name] for name in ("features", "missing")}
-    if options["task"] is None and (options["hide"] or options["history"] > 1):
-        raise InputError(
-            "--hide and --history need a --task here: import without them, and give them to jbrep "
-            "data derive"
-        )
-    if options["task"] is None:  # they can be said of data alone
-        options |= dict.fromkeys(told)
+    if options["task"] is None:
+        if options["hide"] or options["history"] > 1:
+            raise InputError(
+                "--hide and --history need a --task here: import without them, and give them to "
+                "jbrep data derive"
+            )
+        options |= dict.fromkeys(told)  # they can be said of data alone
     task = given_task(options)
     with stoppable("nothing was imported"):
         with deferred_stop():

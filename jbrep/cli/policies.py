@@ -341,9 +341,9 @@ def behaviour(
     """
     import numpy as np
 
-    from jbrep.play.behaviour import FAST, SPEEDS, fast_shares, mean_place, observe
+    from jbrep.play.behaviour import FAST, FIGURES, SPEEDS, fast_shares, mean_place, observe
     from jbrep.play.sources import check_source
-    from jbrep.records.storage import check_writable, exists, make_folder
+    from jbrep.records.storage import check_writable, exists
 
     if not np.isfinite(target_yaw):
         raise InputError(f"--target-yaw is {target_yaw}: it must be a number of degrees")
@@ -351,10 +351,8 @@ def behaviour(
     for policy in policies:
         if not exists(policy):
             check_source(policy)
-    from jbrep.report.figures import BEHAVIOUR, behaviour_plots, write  # imports torch
-
-    make_folder(out, [f"{name}.png" for name in BEHAVIOUR])
-    check_writable(out)
+    check_writable(out, [f"{name}.png" for name in FIGURES])
+    from jbrep.report.figures import behaviour_plots, write  # imports torch
 
     with stoppable("the same command starts again"):
         shared_task, behaviours = observe(policies, task, episodes, yaw)

@@ -19,7 +19,6 @@ from jbrep.dataset.rewards import reward_function, with_hash, without_range
 from jbrep.dataset.schema import EPISODES, Columns, episode_columns
 from jbrep.dataset.verify import policy_files
 from jbrep.envs.lanes import check_counts
-from jbrep.envs.names import spec_of
 from jbrep.envs.recording import Tick
 from jbrep.envs.task import Task
 from jbrep.envs.view import seen_in_episodes, with_view
@@ -161,8 +160,6 @@ def _check_finished(dataset: Dataset) -> None:
 
 def _check_versions(dataset: Dataset, settings: DataSettings) -> None:
     """Check that MuJoCo, NumPy and h5py are those of a data set; jbrep may be later."""
-    if not settings.is_imported:
-        spec_of(settings.task)  # whose message names the module that the task is from
     earlier, versions = dataset.manifest.versions, new_manifest(settings).versions
     if differing := differences({**earlier, "jbrep": versions["jbrep"]}, versions):
         raise InputError(

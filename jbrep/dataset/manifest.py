@@ -167,7 +167,7 @@ def new_manifest(settings: DataSettings) -> Manifest:
 
     versions = {name: version(name) for name in _PACKAGES}
     if not settings.is_imported:  # or else they come from an environment that may not be here
-        versions |= environment_versions(settings.task.id)
+        versions |= environment_versions(settings.task)
     return Manifest(settings=settings, versions=versions, commits=dict(commits()))
 
 

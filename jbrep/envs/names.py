@@ -161,13 +161,13 @@ def name_given(text: str) -> str:
     return name
 
 
-def environment_versions(env_id: str) -> dict[str, str]:
-    """Versions of the packages that an environment comes from, but jbrep's own.
+def environment_versions(task: Task) -> dict[str, str]:
+    """Versions of the packages that a task's environment comes from, but jbrep's own.
 
     Raises:
-        InputError: as `find_spec`.
+        InputError: as `spec_of`.
     """
-    entry_point: Any = find_spec(env_id).entry_point
+    entry_point: Any = spec_of(task).entry_point
     maker = getattr(entry_point, "func", entry_point)  # shimmy's are partial functions
     module = maker if isinstance(maker, str) else getattr(maker, "__module__", "")
     package = module.partition(":")[0].partition(".")[0]

@@ -17,6 +17,7 @@ from jbrep.play.sources import find_player, find_untrained, is_by_name, run_fold
 from jbrep.rl.files import runs_below
 
 SPEEDS = np.linspace(-180, 180, 73)  # edges of the bins of the motor's velocity [rad/s]
+FIGURES = ("motor_velocity", "positions")  # that show it, by name
 FAST = 30.0  # of the motor, either way [rad/s]
 _CELL = 0.02  # edge of a cell of the floor [m]
 

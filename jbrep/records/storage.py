@@ -137,13 +137,13 @@ def make_folder(folder: Path, own: Collection[str] = ()) -> None:
         )
 
 
-def check_writable(folder: Path) -> None:
+def check_writable(folder: Path, own: Collection[str] = ()) -> None:
     """Make a folder unless it exists, and see that files can be written into it.
 
     Raises:
-        InputError: it can't be made, or not be written into.
+        InputError: as `make_folder`; or it can't be written into.
     """
-    make_folder(folder)
+    make_folder(folder, own)
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass

@@ -185,7 +185,7 @@ class Job:
     @cached_property
     def versions(self) -> dict[str, str]:
         """What, with the settings, decides every number."""
-        return environment_versions(self.run.task.id) | packages()
+        return environment_versions(self.run.task) | packages()
 
     @cached_property
     def checkpoint(self) -> CheckpointFile:

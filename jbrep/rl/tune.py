@@ -98,8 +98,7 @@ def tune(
     make_folder(folder)
     with exclusive(folder):
         _claim(folder / SEARCH, search)
-        if there := len([*folder.glob("trial-*")][trials:]):
-            begun = trials + there
+        if (begun := len([*folder.glob("trial-*")])) > trials:
             raise InputError(f"{folder} has {begun} trials: ask for as many, or more")
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         study = optuna.create_study(direction="maximize")

@@ -44,7 +44,7 @@ from jbrep.study.runner import run_study
 from jbrep.study.tables import REFERENCE_RETURNS, RETURNS
 
 PENDULUM = describe("Pendulum-v1", max_episode_steps=20)
-environment_versions(PENDULUM.id)  # or every fork looks through the files of all packages
+environment_versions(PENDULUM)  # or every fork looks through the files of all packages
 SHORT = ("--task", "Pendulum-v1", "--episode-steps", 20, "--steps", 40, "--evaluation-episodes", 1)
 TINY = Study(
     tasks=("face_direction",),

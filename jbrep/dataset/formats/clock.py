@@ -123,9 +123,9 @@ class Clock:
     ) -> Array:
         """A column on the clock; NaN where its readings are too far away."""
         step = 1 / (self._layout.rate or 1.0)
-        slack, late = _SLACK * step, _SLACK * step
-        if not linear and (own := timestep_of(time)):
-            late = max(slack, _LATE * min(step, own))
+        own = None if linear else timestep_of(time)
+        slack = _SLACK * step
+        late = max(slack, _LATE * min(step, own)) if own else slack
         last = np.searchsorted(time, grid + late, side="right") - 1
         age = grid - time[last]
         if linear:

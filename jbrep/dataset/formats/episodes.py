@@ -138,8 +138,8 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
     following = _following(where, rows)
     final = once.get("final_observation", following)
     observation = _flat(rows["observation"])
-    by_row = {name: rows[name][-1] for name in ENDS if name in rows}
-    terminated, truncated = (bool((by_row | {**once}).get(name, False)) for name in ENDS)
+    ended = {name: rows[name][-1] for name in ENDS if name in rows} | {**once}
+    terminated, truncated = (bool(ended.get(name, False)) for name in ENDS)
     if final is None:
         observation, last, terminated = observation[:-1], observation[-1], False
     else:
@@ -158,8 +158,8 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
     action = _flat(rows["action"][:steps])
     reward = _flat(rows["reward"][:steps])[:, 0] if "reward" in rows else np.zeros(steps)
     is_cut = final is None
-    ends = {"truncated": truncated, "is_cut": is_cut}
-    yield Incoming(where, observation, action, reward, last, terminated, seed, **ends)
+    how = {"terminated": terminated, "truncated": truncated, "is_cut": is_cut}
+    yield Incoming(where, observation, action, reward, last, seed=seed, **how)
 
 
 def _check_steps(where: str, rows: Rows) -> None:

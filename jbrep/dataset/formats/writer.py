@@ -1,6 +1,7 @@
 """Writing a data set of episodes that were made elsewhere: one pass to see them, one to write."""
 
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
@@ -107,43 +108,46 @@ def _rewarded(source: Source, reward: str, missing: str, task: Task) -> Source:
     return replace(source, episodes=episodes, has_rewards=True)
 
 
-def _episodes(source: Source, missing: str) -> Iterator[Incoming]:
-    """Those of a source without what is missing in them."""
-    for episode in source.episodes():
-        yield from without_missing(episode, missing)
+def _episodes(
+    source: Source, missing: str, counts: Counter[str] | None = None
+) -> Iterator[Incoming]:
+    """Those of a source without what is missing in them; what that is may be counted."""
+    for whole in source.episodes():
+        steps = 0
+        for part in without_missing(whole, missing):
+            steps += len(part.action)
+            yield part
+        if counts is not None:
+            left = len(whole.action) - steps
+            counts.update(missing=count_missing(whole), left=left, cut=whole.is_cut)
 
 
 def _survey(source: Source, missing: str) -> _Survey:
-    sizes, lengths, count, left, cut = (0, 0), list[int](), 0, 0, 0
+    sizes, lengths, counts = (0, 0), list[int](), Counter[str]()
     signals: Signals | None = None
     low: Any = np.inf
     high: Any = -np.inf
     with Progress(total=source.rows, unit="step", unit_scale=True, desc="read") as progress:
-        for whole in source.episodes():
-            parts = list(without_missing(whole, missing))
-            count, cut = count + count_missing(whole), cut + whole.is_cut
-            left += len(whole.action) - sum(len(part.action) for part in parts)
-            for episode in parts:
-                found = episode.observation.shape[1], episode.action.shape[1]
-                sizes = sizes if lengths else found
-                if found != sizes:
-                    raise InputError(
-                        f"{source.name} has {found[0]} features and {found[1]} numbers in an "
-                        f"action in an episode, but {sizes[0]} and {sizes[1]} before: all must be "
-                        "alike"
-                    )
-                seen = Signals.of([episode.observation])
-                signals = signals.with_more(seen) if signals else seen
-                low = np.minimum(low, episode.action.min(axis=0))
-                high = np.maximum(high, episode.action.max(axis=0))
-                lengths.append(len(episode.reward))
-                progress.update(lengths[-1])
-    if count:
-        told = f"{source.name} had {counted(count, 'missing reading')} ({missing})"
-        told += f": {counted(left, 'step')} left out" if left else ""
+        for episode in _episodes(source, missing, counts):
+            found = episode.observation.shape[1], episode.action.shape[1]
+            sizes = sizes if lengths else found
+            if found != sizes:
+                raise InputError(
+                    f"{source.name} has {found[0]} features and {found[1]} numbers in an action in "
+                    f"an episode, but {sizes[0]} and {sizes[1]} before: all must be alike"
+                )
+            seen = Signals.of([episode.observation])
+            signals = signals.with_more(seen) if signals else seen
+            low = np.minimum(low, episode.action.min(axis=0))
+            high = np.maximum(high, episode.action.max(axis=0))
+            lengths.append(len(episode.reward))
+            progress.update(lengths[-1])
+    if counts["missing"]:
+        told = f"{source.name} had {counted(counts['missing'], 'missing reading')} ({missing})"
+        told += f": {counted(counts['left'], 'step')} left out" if counts["left"] else ""
         warnings.warn(told, Notice, 2)
-    if cut:
-        told = f"the last step of {counted(cut, 'episode')} of {source.name} is left out"
+    if counts["cut"]:
+        told = f"the last step of {counted(counts['cut'], 'episode')} of {source.name} is left out"
         warnings.warn(f"{told}: what was observed after it isn't known", Notice, 2)
     if signals is None:
         raise InputError(

@@ -7,12 +7,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from jbrep.play.behaviour import Behaviour
+from jbrep.play.behaviour import FIGURES, Behaviour
 from jbrep.report.figures.plot import Plot
 from jbrep.report.figures.style import COLUMN, PAGE, ink, plain, styles
 from jbrep.stats.bootstrap import Array
 
-BEHAVIOUR = ("motor_velocity", "positions")  # the names of its figures
 _ACROSS = 4  # panels, at most
 
 
@@ -31,7 +30,7 @@ def behaviour_plots(
     episodes = f"{' or '.join(map(str, counts))} episodes"
     return [
         Plot(
-            BEHAVIOUR[0],
+            FIGURES[0],
             f"{task}: how the motor turns",
             f"Share of time at each motor velocity over {episodes}, with their median return.",
             ("policy", "low", "high", "share"),
@@ -43,7 +42,7 @@ def behaviour_plots(
             lambda: _draw_motor(task, behaviours, speeds),
         ),
         Plot(
-            BEHAVIOUR[1],
+            FIGURES[1],
             f"{task}: where the robot goes",
             f"Share of time in each 2 cm cell over {episodes} that start at the circle; "
             "the arrow points in the target's direction.",
