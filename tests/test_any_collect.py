@@ -328,7 +328,12 @@ def test_reading_makes_no_environment(tmp_path, monkeypatch):
 def test_a_data_set_whose_package_isn_t_imported(sledges, tmp_path, monkeypatch):
     monkeypatch.delitem(gymnasium.registry, ID)
     assert not list(find_problems(sledges))
-    for command in (("verify", sledges, "--replay", 1), ("export", sledges, "--to", "minari")):
-        told = jbrep("data", *command, *(("--out", tmp_path / "x") if "--to" in command else ()))
+    out = ("--out", tmp_path / "x")
+    for command in (
+        ("verify", sledges, "--replay", 1),
+        ("export", sledges, "--to", "minari", *out),
+        ("derive", sledges, "--history", 2, *out),
+    ):
+        told = jbrep("data", *command)
         assert (told.exit_code, told.output.count("\n")) == (2, 1)
         assert "it was made by environments; add --import environments" in told.output

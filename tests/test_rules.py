@@ -448,6 +448,16 @@ def test_half_of_a_gain_is_counted_on_the_starts_of_the_curve_that_comes_to_it()
     assert group.labels[0].numbers["final_return_mean"].value == 350
 
 
+def test_no_step_comes_to_a_share_of_a_gain_that_curves_do_not_show():
+    facts = {"reference": 10, "reference_in_training": 300, "final": np.linspace(38, 42, 20)}
+    ends = drawn(280, 5, 8, 0)
+    runs = [replace(run, final=run.final + i) for i, run in enumerate(arm("full", ends, **facts))]
+    (group,) = analyse(runs + [replace(run, representation="dae-12") for run in runs]).groups
+    names = ("steps_to_50_percent", "steps_to_90_percent")
+    assert all(np.isnan(group.thresholds[name]) for name in names)
+    assert group.labels[0].learnt == "yes"
+
+
 def test_a_failed_run_counts_as_failed_whatever_it_was_played_from_at_its_end():
     ends = drawn(850, 20, 16, 0)
     good = [

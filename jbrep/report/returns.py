@@ -84,7 +84,7 @@ def _returns_table(groups: Sequence[GroupAnalysis], analysis: Analysis, shares: 
     if f"of {analysis.baseline}'s gain" in found.header:
         gained = f"gains are over {first.reference_policy or reference_words(first)}"
         gained += ", as it was registered" if counted_over_still else ""
-        counts_all = all(comparison.counts_all for comparison in first.comparisons)
+        counts_all = all(c.counts_all for c in first.comparisons if c.representation in kept)
         gained += "" if counts_all else "; shares are of the runs that verdicts count"
         gained += "; shares compare each two as far as both go" if first.cut else ""
         return found._replace(title=f"{found.title}; {gained}")

@@ -36,7 +36,7 @@ class Comparison:
 
     @property
     def is_open(self) -> bool:
-        """Whether all runs may be looked at: no claim waits for a look that counts more of them."""
+        """Whether all runs may be looked at: no verdict is still to come on more of them."""
         states = {verdict.verdict for verdict in self.verdicts}
         if NOT_YET in states:
             return False

@@ -79,8 +79,8 @@ def scale_of(
     over = reference_in_training(run, curves)
     best = best_blind({name: float(each.value) for name, each in policies.items()})
     gained = surely_above(finals[0], reference, run.bounds)
-    gain = float(np.median(final_return(curves, grid))) - over if gained else np.nan
-    shares = [over + share * gain for share in SHARES.values()]
+    gain = float(np.median(final_return(curves, grid))) - over
+    shares = [over + share * gain if gained and gain > 0 else np.nan for share in SHARES.values()]
     thresholds = (*shares, np.nan if solved is None else float(solved))
     return Scale(
         grid=grid,
