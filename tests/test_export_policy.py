@@ -78,12 +78,25 @@ def test_the_returns_of_a_file_are_those_of_its_run(run):
     assert alone.output.splitlines() == done.output.splitlines()[:1]  # in the run's environment
 
 
+def test_the_policy_that_ships_is_exported_by_its_name(tmp_path):
+    model, task = tmp_path / "trained.onnx", ("--task", "face_direction")
+    exporting = ("policy", "export", "trained", "--out", model)
+    assert "policy trained needs a --task" in mistake(*exporting)
+    told = jbrep(*exporting, *task).output.splitlines()[-1]
+    _, _, checking = told.partition("check it with jbrep ")
+    model_played, shipped = jbrep(*checking.split(), "--episodes", 1).output.splitlines()[:2]
+    assert model_played.startswith(f"face_direction, {model}: 9")
+    assert shipped.startswith("trained: 9")
+
+
 def test_mistakes_are_a_line(run, tmp_path):
     model, bad, other = run.with_suffix(".onnx"), tmp_path / "bad.onnx", tmp_path / "other.onnx"
     exporting, checking = ("policy", "export", run, "--out"), ("policy", "check")
     assert f"{model} exists already: choose another name" in mistake(*exporting, model)
     said = mistake(*exporting, tmp_path / "x", "--format", "tflite")
     assert "unknown format 'tflite': choose one of onnx, torch" in said
+    said = mistake(*exporting, tmp_path / "x", "--task", "face_direction")
+    assert f"{run} has its own task: leave out --task" in said
     bad.write_bytes(b"no model")
     assert "is no ONNX model that can be run: " in mistake(*checking, bad)
     said = mistake(*checking, model, "--task", "face_direction")

@@ -148,7 +148,7 @@ def test_a_camera_that_follows_the_robot():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"note": "It differs"}, "It differs: it can't be filmed; jbrep inspect shows signals"),
+        ({"note": "It differs"}, "It differs; it can't be filmed, but jbrep inspect shows its"),
         ({"task": {"timestep": None}}, "the time step of Hopper-v5 is not known: give it as"),
     ],
 )

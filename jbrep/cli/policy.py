@@ -9,6 +9,7 @@ import click
 from jbrep.cli.base import PATH, POSITIVE
 from jbrep.cli.environment import environment_options, given_task, task_option
 from jbrep.cli.output import say
+from jbrep.errors import InputError
 from jbrep.text import interval_of, returns_text
 
 
@@ -18,7 +19,8 @@ def policy() -> None:
 
 
 @policy.command(epilog="Example: jbrep policy export runs/a --out controller.onnx")
-@click.argument("run", type=PATH)
+@click.argument("policy")
+@task_option
 @click.option(
     "--format",
     "form",
@@ -27,36 +29,42 @@ def policy() -> None:
     help="onnx, or torch for a program of torch.export.",
 )
 @click.option("--out", required=True, type=PATH, help="A new file.")
-def export(run: Path, form: str, out: Path) -> None:
+def export(policy: str, task: str | None, form: str, out: Path) -> None:
     """Write a policy as one model, from raw observations to actions.
 
-    RUN is the folder of a run, or a policy's file. Scaling, encoder, running normalisation, network
-    and bounds are all in the model; names, units, ranges and the rate are in its metadata. Each
-    action is to be held for as many control steps as the run's action_repeat says.
+    POLICY is the folder of a run, a policy's file, or trained, which ships and needs a --task.
+    Scaling, encoder, running normalisation, network and bounds are all in the model; names, units,
+    ranges and the rate are in its metadata. Each action is to be held for as many control steps as
+    the run's action_repeat says.
     """
+    from jbrep.envs.description import describe
+    from jbrep.play.sources import policy_file
     from jbrep.rl.controller import load_policy
     from jbrep.rl.export import described
     from jbrep.rl.export import export as write
+    from jbrep.rl.shipped import SHIPPED
 
-    controller = load_policy(run)
+    if task and policy != SHIPPED:
+        raise InputError(f"{policy} has its own task: leave out --task")
+    controller = load_policy(policy_file(policy, describe(task) if task else None))
     write(controller, out, form)
-    said, task = described(controller), controller.task
+    said, own = described(controller), controller.task
     rate = "" if said["rate"] is None else f", {said['rate']:g} times a second"
-    say(f"{out}: {task.size} numbers of {task.name} to {task.action_size}{rate}")
+    say(f"{out}: {own.size} numbers of {own.name} to {own.action_size}{rate}")
     if form == "onnx":
-        check = ("jbrep", "policy", "check", str(out), "--run", str(run))
-        click.echo(f"check it with {shlex.join(check)}")
+        check = ["jbrep", "policy", "check", str(out), "--run", policy]
+        click.echo(f"check it with {shlex.join(check + (['--task', task] if task else []))}")
     else:
         click.echo(f"open it with torch.export.load({str(out)!r}).module()")
 
 
 @policy.command(epilog="Example: jbrep policy check controller.onnx --run runs/a")
 @click.argument("model", type=PATH)
-@click.option("--run", type=PATH, help="That it was taken from, to play beside it.")
+@click.option("--run", help="That it was taken from, or trained, to play beside it.")
 @click.option("--episodes", default=20, show_default=True, type=POSITIVE, help="How many.")
 @task_option
 @environment_options
-def check(model: Path, run: Path | None, episodes: int, **options: Any) -> None:
+def check(model: Path, run: str | None, episodes: int, **options: Any) -> None:
     """Play an exported policy in its environment.
 
     MODEL is an ONNX file that jbrep policy export wrote. It plays the episodes that every run is
@@ -67,7 +75,7 @@ def check(model: Path, run: Path | None, episodes: int, **options: Any) -> None:
     from jbrep.play.exported import exported_player
     from jbrep.play.sources import find_player
 
-    beside = find_player(str(run), given_task(options)) if run else None
+    beside = find_player(run, given_task(options)) if run else None
     player = exported_player(model, beside.task if beside else given_task(options))
     returns = player.returns(episodes)
     say(f"{player.task.name}, {model}: {returns_text(returns)}")

@@ -40,7 +40,11 @@ def replay_problems(
         raise InputError(f"{episodes} episodes can't be replayed: the data set has {total:,}")
     if not episodes:
         return  # without a look at the environment, whose package need not be there
-    _check_collected(dataset)
+    if dataset.manifest.settings.is_imported:
+        raise InputError(
+            f"{dataset.folder} was imported: to compare it with its source, import that again in "
+            "another folder"
+        )
     if not dataset.task.reproducible:
         raise InputError(
             f"episodes can't be replayed: {dataset.task.name} is not reproducible, the same seed "
@@ -69,14 +73,6 @@ def replay_problems(
                     )
 
 
-def _check_collected(dataset: Dataset) -> None:
-    if dataset.manifest.settings.is_imported:
-        raise InputError(
-            f"{dataset.folder} was imported, its episodes can't be simulated again: to compare it "
-            "with its source, import that again in another folder"
-        )
-
-
 def simulate_again(
     episodes: Sequence[Episode], read: Read, tick: Tick, num_threads: int | None = None
 ) -> Recording:
@@ -92,7 +88,8 @@ def simulate_again(
         InputError: the data set was imported, or its environment can't be made.
     """
     dataset = episodes[0].dataset
-    _check_collected(dataset)
+    if dataset.manifest.settings.is_imported:
+        raise InputError("imported episodes can't be simulated again")
     task = dataset.task
     middle = (np.array(task.action_low) + np.array(task.action_high)) / 2
     actions = np.tile(middle, (max(map(len, episodes)), len(episodes), 1))

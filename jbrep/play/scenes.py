@@ -38,7 +38,7 @@ def scene_of(rollout: Rollout, camera: Camera) -> Scene:
         InputError: nothing can; or its time step is not known, or it has no such camera.
     """
     if rollout.note:
-        raise InputError(f"{rollout.note}: it can't be filmed; jbrep inspect shows signals")
+        raise InputError(f"{rollout.note}; it can't be filmed, but jbrep inspect shows its signals")
     return Simulated(rollout, camera) if rollout.motion else Drawn(rollout, camera)
 
 

@@ -150,6 +150,8 @@ def _survey(source: Source, missing: str) -> _Survey:
         told = f"the last step of {counted(counts['cut'], 'episode')} of {source.name} is left out"
         warnings.warn(f"{told}: what was observed after it isn't known", Notice, 2)
     if signals is None:
+        if not source.rows:
+            raise InputError(f"{source.name} has no rows")
         raise InputError(
             f"{source.name} has no episode with a step, the last one's observation being the final "
             "one where no other is given"
