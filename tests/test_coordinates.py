@@ -2,9 +2,11 @@
 
 from collections import Counter
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.registration import EnvSpec
 
 from jbrep.coordinates import INGREDIENTS, Coordinates, make_coordinates
 from jbrep.coordinates.coordinates import Part
@@ -267,6 +269,49 @@ def test_a_group_that_cant_be(kinds, said):
 def test_what_cant_be_left_out(system, leave_out, said):
     with pytest.raises(InputError, match=said):
         make_coordinates(TASK, system, leave_out)
+
+
+class Disc(gymnasium.Env):
+    """Where a disc that turns is, and its goal; its reward is how near they are."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (5,), np.float64)
+    action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.yaw, self.places = self.np_random.uniform(-3, 3), self.np_random.normal(size=(2, 2))
+        return self._seen(), {}
+
+    def step(self, action):
+        self.yaw += 0.1 * action[0]
+        self.places[0] += 0.1 * action[1] * np.array([np.cos(self.yaw), np.sin(self.yaw)])
+        near = -float(np.hypot(*(self.places[0] - self.places[1])))
+        return self._seen(), near, False, False, {}
+
+    def quarter_turn(self, shift):
+        self.yaw += np.pi / 2
+        self.places = self.places @ np.array([[0, 1], [-1, 0]]) + shift
+        return True
+
+    def _seen(self):
+        return np.array([np.arctan2(np.sin(self.yaw), np.cos(self.yaw)), *self.places.flat])
+
+
+def test_symmetry_is_tried_on_what_encoders_take(monkeypatch):
+    """A place whose numbers are shifted isn't where the others say; nor is it where agents act."""
+    features = [Feature("yaw", "rad", kind="angle", frame="world")]
+    features += [
+        Feature(f"{place}_{axis}", "m", group=place, kind="point", frame="world")
+        for place in ("disc", "goal")
+        for axis in "xy"
+    ]
+    spec = EnvSpec("Disc-v0", Disc, max_episode_steps=50)
+    monkeypatch.setitem(gymnasium.registry, "Disc-v0", spec)
+    task = describe("Disc-v0").replace(features=features)
+    check_invariant(make_coordinates(task, "symmetry"))
+    shifted = make_coordinates(task.replace(offsets={"goal_x": 3.0}), "symmetry")
+    with pytest.raises(InputError, match="use coordinates in place of symmetry"):
+        check_invariant(shifted)
 
 
 def test_a_task_whose_features_say_nothing():

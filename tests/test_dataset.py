@@ -57,6 +57,7 @@ def column(parts):
         (slice(3, 8), 2),
         (slice(None), slice(1, None)),
         (np.array([7, 0]), 0),
+        (np.array([[1, 5], [11, 0]]), 2),
     ],
     ids=str,
 )

@@ -52,7 +52,8 @@ def test_a_program_of_torch_needs_torch_alone(tmp_path):
 
 def test_what_a_file_says_of_its_policy():
     said = described(controller_of(randomised("td3", "full")))
-    assert said["observation"][0] == {"name": "position_x", "unit": "m", "low": -2.0, "high": 2.0}
+    position = {"name": "position_x", "unit": "m", "low": -2.0, "high": 2.0, "offset": 0.0}
+    assert said["observation"][0] == position
     assert (said["action_repeat"], said["control_period"]) == (3, 0.01)
     assert said["rate"] == pytest.approx(100 / 3)
     assert said["action"] == {"low": [-1.0], "high": [1.0]}

@@ -17,7 +17,9 @@ from small import contents
 from jbrep.collect import collect
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.verify import find_problems
+from jbrep.encoders.wrapper import Encoded
 from jbrep.envs import Lanes, describe, instances
+from jbrep.envs.make import make_env
 from jbrep.envs.names import import_modules
 from jbrep.errors import InputError
 from jbrep.pool import Pool, WorkerError
@@ -194,7 +196,18 @@ def test_a_clock_that_32_bits_swallow_is_told_and_shifted(tmp_path):
     clock = 0.25 + 0.02 * dataset["step"][:]
     np.testing.assert_allclose(dataset["clock"][:], clock, atol=1e-6)
     assert dataset.task.offsets == {"clock": 1764000000.0}
+    instances.close_all()
+    env = make_env(arms.ID, {"log": str(tmp_path / "log"), "clock": 1764000000.25})
+    seen, _ = Encoded(env, lambda rows: rows, dataset.task).reset(seed=0)
+    env.close()
+    assert seen[order.index("clock")] == 0.25
     assert jbrep("data", "verify", tmp_path / "e", "--replay", 1).exit_code == 0
+
+
+def test_features_of_a_batch_have_no_offsets():
+    task = describe("face_direction").replace(offsets={"position_x": 100.0})
+    with pytest.raises(InputError, match="is stepped as a batch: its features have no offsets"):
+        Lanes(task, 1)
 
 
 # one robot, which fails

@@ -87,11 +87,13 @@ def test_the_middle_of_an_episode_is_restored_to_the_same_bits(task):
     drive = actions(200, 3, task)
     for action in drive[:70]:
         one.step(action)
-    other.restore(one.state)
-    for action in drive[70:]:  # past the ends of episodes
-        expected, continued = one.step(action), other.step(action)
-        for ours, theirs in zip(continued[:3], expected[:3], strict=True):
-            np.testing.assert_array_equal(ours, theirs)
+    state = one.state
+    expected = [one.step(action)[:3] for action in drive[70:]]  # past the ends of episodes
+    for _ in range(2):
+        other.restore(state)
+        for action, step in zip(drive[70:], expected, strict=True):
+            for ours, theirs in zip(other.step(action)[:3], step, strict=True):
+                np.testing.assert_array_equal(ours, theirs)
 
 
 def test_an_environment_that_is_not_reproducible_is_not_restored():

@@ -64,6 +64,8 @@ def test_what_is_inside_a_folder_is_reached_without_links(tmp_path):
     assert inside(tmp_path / "own", "a", "b/c") == tmp_path / "own" / "a" / "b" / "c"
     (tmp_path / "real" / "a" / "b").symlink_to(tmp_path)
     assert "a/b is a link" in refused(inside, tmp_path / "own", "a", "b/c")
+    for outside in ("../precious", "a/../../b", "/etc/passwd"):
+        assert f"{outside} leads out of " in refused(inside, tmp_path / "own", outside)
 
 
 def test_a_study_with_links_for_files_replaces_the_links(precious, tmp_path):

@@ -124,11 +124,12 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
         for code in finals
     }
     codes = [code for code in finals if code != "full"]
-    seeds, grid = (0, 1), np.array([0, 300, 1000])
+    seeds, grid = (0, 1), np.array([0, 30_000, 60_000, 90_000])
     group = SimpleNamespace(
         task=FACE,
         algorithm="sac",
         grid=grid,
+        failure_return=-1.0,
         labels=[
             SimpleNamespace(
                 representation=code, seeds=seeds, by_run={"final_return": np.full(2, finals[code])}
@@ -137,7 +138,7 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
         ],
     )
     returns = [  # at first those are ahead that end behind
-        Return(FACE, "sac", code, seed, int(step), 0, finals[code] * (1 if step == 1000 else -1))
+        Return(FACE, "sac", code, seed, int(step), 0, finals[code] * (1 if step == 90_000 else -1))
         for code in codes
         for seed in seeds
         for step in grid
@@ -149,6 +150,7 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
         record=SimpleNamespace(
             runs=[SimpleNamespace(label=code, encoder=f"hash of {code}") for code in finals],
             labels=labels,
+            missing={},
         ),
     )
     evaluation = SimpleNamespace(
@@ -163,14 +165,23 @@ def test_scores_are_held_against_returns_of_the_same_encoders(capsys, monkeypatc
     monkeypatch.setattr(worth, "shown", lambda learned: SimpleNamespace(value=learned))
     worth.main("study")
     lines = [re.split(" {2,}", line.strip()) for line in capsys.readouterr().out.splitlines()]
-    assert lines[2] == ["told by", FACE, "mean", "above rewarded", "above 30% of a run"]
-    told = {name: [cell.split()[0] for cell in cells] for name, *cells in lines[3:]}
+    assert lines[2] == ["ranked by", FACE, "mean", "above rewarded", "above a short run"]
+    told = {name: [cell.split()[0] for cell in cells] for name, *cells in lines[3:7]}
     assert told == {
         "rewarded": ["-1.00", "-1.00", "0.00", "0.00"],
         "trees": ["1.00", "1.00", "2.00", "2.00"],
-        "30% of a run": ["-1.00", "-1.00", "0.00", "0.00"],
-        "100% of a run": ["1.00", "1.00", "2.00", "2.00"],
+        "a short run": ["-1.00", "-1.00", "0.00", "0.00"],
+        "a whole run": ["1.00", "1.00", "2.00", "2.00"],
     }
+    assert lines[-1][0].endswith("and clearly above both others: it is so")
+    returns[:] = [r for r in returns if (r.representation, r.seed, r.step) != ("dae-8", 0, 60_000)]
+    worth.main("study")  # of a run that failed before: it counts as -1, above -10 to -40 and -9
+    lines = capsys.readouterr().out.splitlines()
+    assert float(lines[5].split()[3]) > -1
+    tables.record.missing = {"a run": 7}
+    with pytest.raises(InputError, match="a study lacks runs of one task: run the study to its en"):
+        worth.main("study")
+    tables.record.missing = {}
     evaluation.hashes["dae-8"] = "of another"
     with pytest.raises(InputError, match="dae-8: agents trained on another code than the one sco"):
         worth.main("study")

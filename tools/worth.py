@@ -1,11 +1,14 @@
-"""Do scores tell which codes serve? python tools/worth.py results/worth-TASK ...
+"""How well scores rank codes: python tools/worth.py results/worth-TASK ...
 
 Each folder has the tables of a study of one task and, in scores/, the evaluation of its encoders
 with --worth. A code's score is compared with the mean final return of all its runs but one, for
-each that can be left out, and the one left out is the rival: the short run that would have been
-trained instead, as far as each of its evaluations. Printed is how well each ranks the codes:
-Spearman's correlation in each task, and its mean over tasks with a 95 % interval over families of
-codes, and by how much that is above *rewarded* and above a short run of the same CPU time.
+each that can be left out. The one that is left out is the rival: what a single short run would have
+said, which takes as long as to score a code one way, half a minute of CPU time. Whole runs show the
+most that one of them can say.
+
+Printed is Spearman's correlation in each task, and its mean over tasks with a 95 % interval over
+families of codes, and by how much that is above *rewarded* and above the short run. What was hoped
+for was written down before the first run: see PRIMARY.
 """
 
 import sys
@@ -28,30 +31,34 @@ from jbrep.study.tables import by_run
 from jbrep.text import Table, interval
 
 SCORES = "scores"
-REWARDED = "rewarded"
-EQUAL = "30% of a run"  # costs as much as to score a code: half a minute
+REWARDED, SHORT, WHOLE = "rewarded", "a short run", "a whole run"
+SHORT_STEPS = 50_000  # until the first evaluation after them: half a minute
+PRIMARY, LEAST, LEAST_LOW = "trees", 0.8, 0.6  # the mean over tasks, and its interval's low end
 Pairs = list[tuple[Array, Array]]  # what is said of each code, and what others' runs returned
 
 
-class Told(NamedTuple):
-    """What was known of the codes of a task, and what they returned.
+class Scored(NamedTuple):
+    """The codes of a task with what was known of them beforehand, and what they returned.
 
     Attributes:
         task: that the agents learned.
+        codes: n of them.
         families: of the codes, (n,).
-        pairs: for each run that is left out, by what tells.
+        pairs: for each run that is left out, by what ranks the codes.
     """
 
     task: str
+    codes: list[str]
     families: list[str]
     pairs: Mapping[str, Pairs]
 
 
-def told(folder: Path) -> Told:
+def read(folder: Path) -> Scored:
     """What the tables of a study and the evaluation of its encoders say.
 
     Raises:
-        InputError: agents trained on others than those that have scores; or as `read_tables`.
+        InputError: agents trained on others than those that have scores; runs are missing; or as
+            `read_tables`.
     """
     tables = read_tables(folder)
     evaluation = read_document(folder / SCORES / EVALUATION, Evaluation)
@@ -60,50 +67,53 @@ def told(folder: Path) -> Told:
         each.settings.representation: each.encoder.kind for each in tables.record.labels.values()
     }
     codes = [code for code in kinds if code != FULL]
-    finals, curves, steps = returned(tables, codes)
+    finals, short, whole = returned(tables, codes)
     others = (finals.sum(1, keepdims=True) - finals) / (finals.shape[1] - 1)
     pairs: dict[str, Pairs] = {
-        name: [(np.array([said[code] for code in codes]), each) for each in others.T]
-        for name, said in scores(evaluation).items()
+        name: [(np.array([score[code] for code in codes]), each) for each in others.T]
+        for name, score in scores(evaluation).items()
     }
-    short = {
-        f"{step / steps[-1]:.0%} of a run": [*zip(curves[..., g].T, others.T, strict=True)]
-        for g, step in enumerate(steps)
-        if step > 0
-    }
-    return Told(evaluation.data.task, [kinds[code] for code in codes], {**pairs, **short})
+    for name, single in ((SHORT, short), (WHOLE, whole)):
+        pairs[name] = [*zip(single.T, others.T, strict=True)]
+    return Scored(evaluation.data.task, codes, [kinds[code] for code in codes], pairs)
 
 
 def scores(evaluation: Evaluation) -> dict[str, Mapping[str, float]]:
-    """What was said of every code before agents trained, by what said it."""
+    """What was known of every code before agents trained, by what found it out."""
     known = {code: headline(each)[REWARDED] or 0.0 for code, each in evaluation.encoders.items()}
     ways = evaluation.worth.learned if evaluation.worth else {}
-    said = {way: {c: shown(each).value or 0.0 for c, each in ways[way].items()} for way in ways}
-    return {REWARDED: known, **{way: each for way, each in said.items() if each.keys() >= {*known}}}
+    found = {way: {c: shown(each).value or 0.0 for c, each in ways[way].items()} for way in ways}
+    return {REWARDED: known, **{w: each for w, each in found.items() if each.keys() >= {*known}}}
 
 
 def returned(tables: Tables, codes: Sequence[str]) -> tuple[Array, Array, Array]:
-    """Final returns (codes, runs), mean returns of evaluations (codes, runs, g), their steps (g,).
+    """Final returns, and means of a short run's and a whole run's evaluation, (codes, runs) each.
 
     Raises:
-        InputError: runs are missing.
+        InputError: runs are missing, or no run is longer than a short one.
     """
-    if tables.analysis is None or len(tables.analysis.groups) != 1:
-        raise InputError(f"{tables.name} has no runs of one task to compare: run the study first")
-    (group,) = tables.analysis.groups
+    analysis = tables.analysis
+    if analysis is None or len(analysis.groups) != 1 or tables.record.missing:
+        raise InputError(f"{tables.name} lacks runs of one task: run the study to its end")
+    (group,) = analysis.groups
+    if not (later := [int(step) for step in group.grid if step >= SHORT_STEPS]):
+        raise InputError(f"{tables.name} has runs of fewer than {SHORT_STEPS:,} steps")
     labels = {each.representation: each for each in group.labels}
     evaluated = by_run(tables.returns)
 
-    def curve(code: str, seed: int) -> list[float]:
-        by_step = evaluated[f"{group.task}/{group.algorithm}/{code}", seed]
-        return [float(np.mean(by_step[int(step)])) for step in group.grid]
+    def means(step: int) -> Array:
+        of_runs = [
+            [
+                evaluated.get((f"{group.task}/{group.algorithm}/{code}", seed), {}).get(step)
+                for seed in labels[code].seeds
+            ]
+            for code in codes
+        ]
+        failed = [group.failure_return]
+        return np.array([[np.mean(each or failed) for each in runs] for runs in of_runs])
 
-    try:
-        finals = np.stack([labels[code].by_run["final_return"] for code in codes])
-        curves = [[curve(code, seed) for seed in labels[code].seeds] for code in codes]
-        return finals, np.array(curves), group.grid
-    except (KeyError, ValueError) as error:
-        raise InputError(f"{tables.name} lacks runs: run the study to its end") from error
+    finals = np.stack([labels[code].by_run["final_return"] for code in codes])
+    return finals, means(later[0]), means(later[-1])
 
 
 def check(evaluation: Evaluation, tables: Tables) -> None:
@@ -119,25 +129,39 @@ def check(evaluation: Evaluation, tables: Tables) -> None:
 
 
 def main(*folders: str) -> None:
-    tasks = [told(Path(each)) for each in folders]
-    families = tasks[0].families
-    if any(each.families != families for each in tasks):
-        raise InputError("studies of different codes: there is nothing that is told of all")
-    every = {name: [each.pairs[name] for each in tasks] for name in tasks[0].pairs}
-    rivals = [each for each in (REWARDED, EQUAL) if each in every]
+    if not folders:
+        raise SystemExit(__doc__)
+    tasks = [read(Path(each)) for each in folders]
+    first = tasks[0]
+    for each in tasks:
+        if each.codes != first.codes or each.pairs.keys() != first.pairs.keys():
+            raise InputError(f"{each.task} has other codes or scores than {first.task}")
 
     def together(name: str) -> Pairs:
-        return [pair for pairs in every[name] for pair in pairs]
+        return [pair for each in tasks for pair in each.pairs[name]]
 
     def cells(name: str) -> list[Interval]:
-        found = [mean_rank_correlation(pairs, families) for pairs in (*every[name], together(name))]
-        above = [difference(together(name), together(rival), families) for rival in rivals]
-        return found + above
+        alone = [mean_rank_correlation(each.pairs[name], first.families) for each in tasks]
+        mean = mean_rank_correlation(together(name), first.families)
+        rivals = [together(rival) for rival in (REWARDED, SHORT)]
+        return [*alone, mean, *(difference(together(name), r, first.families) for r in rivals)]
 
-    rows = [(name, *(interval(each.tolist(), ".2f") for each in cells(name))) for name in every]
-    header = ("told by", *(each.task for each in tasks), "mean", *(f"above {r}" for r in rivals))
-    counts = f"{len(families)} codes of {len({*families})} families"
-    print(Table(f"Rank correlations with mean final returns, {counts}", header, rows).text())
+    found = {name: cells(name) for name in first.pairs}
+    rows = [(name, *(interval(each.tolist(), ".2f") for each in found[name])) for name in found]
+    header = ("ranked by", *(each.task for each in tasks), "mean", f"above {REWARDED}")
+    counts = f"{len(first.codes)} codes of {len({*first.families})} families"
+    title = f"Rank correlations with mean final returns, {counts}"
+    print(Table(title, (*header, f"above {SHORT}"), rows).text())
+    *_, mean, above_rewarded, above_short = found[PRIMARY]
+    holds = (
+        mean.value >= LEAST
+        and mean.low > LEAST_LOW
+        and min(above_rewarded.low, above_short.low) > 0
+    )
+    print(
+        f"\nHoped for: by {PRIMARY} at least {LEAST} on average, above {LEAST_LOW} at the low end, "
+        f"and clearly above both others: {'it is so' if holds else 'it is not so'}"
+    )
 
 
 if __name__ == "__main__":

@@ -3,10 +3,10 @@
     python controller.py controller.onnx --port 9000
 
 The robot sends a UDP datagram at each control step: a number that counts them (uint32) and its
-sensors (float32 each, in the order and units of the model's metadata). The answer is that number
-and the action. What can go wrong: no datagram for three periods, an old one, one of another size,
-a sensor that says NaN or something far outside its range. The answer is then the safe action, and
-after a second of that the controller stops.
+sensors (float32 each, in the order and units of the model's metadata, less its offsets). The answer
+is that number and the action. What can go wrong: no datagram for three periods, an old one, one of
+another size, a sensor that says NaN or something far outside its range. The answer is then the safe
+action, and after a second of that the controller stops.
 """
 
 import argparse

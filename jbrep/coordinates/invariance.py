@@ -79,7 +79,7 @@ def _played(
     turned = _BEFORE + (task.view.history if task.view else 1)  # steps until all that is seen is
     begun = [env.reset(seed=seed)[0] for env in envs]
     if window:
-        window.begin(range(len(envs)), _flat(envs, begun))
+        window.begin(range(len(envs)), _flat(envs, begun) - task.whole.offset)
     for step in range(turned + _AFTER):
         if step == _BEFORE and not quarter_turn(envs[1], shift):
             raise InputError(
@@ -88,7 +88,7 @@ def _played(
             )
         action = random.uniform(task.action_low, task.action_high).astype(np.float32)
         moved = [env.step(action) for env in envs]
-        seen = _flat(envs, [each[0] for each in moved])
+        seen = _flat(envs, [each[0] for each in moved]) - task.whole.offset
         if window:
             seen = window.step(np.ones(len(envs), bool), np.stack([action] * len(envs)), seen)
         if step >= turned - 1:

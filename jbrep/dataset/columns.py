@@ -49,8 +49,8 @@ class Column:
             first, *others = rows or (slice(None),)
             if any(np.ndim(other) for other in others if not isinstance(other, slice)):
                 raise IndexError("only the first axis can be indexed by an array: index the result")
-            before = () if np.ndim(first) == 0 and not isinstance(first, slice) else (slice(None),)
-            return self[first][(*before, *others)]
+            found = self[first]
+            return found[(*[slice(None)] * (found.ndim - len(self.row)), *others)]
         if isinstance(rows, slice):
             return self._slice(*rows.indices(len(self)))
         numbers = np.asarray(rows)

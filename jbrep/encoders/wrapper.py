@@ -44,7 +44,8 @@ class Encoded:
 
     It is a `gymnasium.Wrapper` of a single environment, a `gymnasium.vector.VectorWrapper` of a
     vector environment. The encoder gets float32 observations in physical units, (n, d), flat in the
-    order of Gymnasium's `flatten`; of a vector environment all lanes at once. Where a vector
+    order of Gymnasium's `flatten`, less the task's offsets; of a vector environment all lanes at
+    once. Where a vector
     environment resets in the step that ends an episode, `infos["final_obs"]` holds latents, too.
 
     Args:
@@ -97,6 +98,10 @@ class Encoded:
         self.encoder = find(encoder, self.task)
         return spaces.Box(-np.inf, np.inf, (self.encoder.latent_size,), np.float32)
 
+    def _encode(self, rows: NDArray[Any]) -> Float32:
+        """The latents (n, l) of what an environment gave, (n, d)."""
+        return self.encoder.encode((rows - self.task.offset).astype(np.float32))
+
 
 class EncodedEnv(Encoded, gymnasium.Wrapper[Float32, Any, Any, Any], RecordConstructorArgs):
     """A single environment, see `Encoded`."""
@@ -119,7 +124,7 @@ class EncodedEnv(Encoded, gymnasium.Wrapper[Float32, Any, Any, Any], RecordConst
         return self._latent(observation), reward, terminated, truncated, info
 
     def _latent(self, observation: Any) -> Float32:
-        return self.encoder.encode(self._flat(observation).astype(np.float32)[None])[0]
+        return self._encode(self._flat(observation)[None])[0]
 
 
 class EncodedVectorEnv(Encoded, VectorWrapper[Float32, Any, Any, Any, Any]):
@@ -136,20 +141,20 @@ class EncodedVectorEnv(Encoded, VectorWrapper[Float32, Any, Any, Any, Any]):
     ) -> tuple[Float32, dict[str, Any]]:
         """Start episodes; the first latents, (n, l)."""
         observation, infos = self.env.reset(seed=seed, options=options)
-        return self._latents(self._rows(observation)), infos
+        return self._encode(self._rows(observation)), infos
 
     def step(self, actions: Any) -> tuple[Float32, Any, Any, Any, dict[str, Any]]:
         """Take a step in every lane; the latents, (n, l), also of `final_obs`."""
         observation, reward, terminated, truncated, infos = self.env.step(actions)
         if "final_obs" in infos:
             infos = {**infos, "final_obs": self._finals(infos["final_obs"], infos["_final_obs"])}
-        return self._latents(self._rows(observation)), reward, terminated, truncated, infos
+        return self._encode(self._rows(observation)), reward, terminated, truncated, infos
 
     def _finals(self, finals: Any, ended: NDArray[np.bool_]) -> NDArray[Any]:
         """The latent of each lane that ended, (n,) of objects as Gymnasium gives them."""
         represented, lanes = np.full(len(ended), None, object), np.flatnonzero(ended).tolist()
         if lanes:
-            latents = self._latents(np.stack([self._flat(finals[lane]) for lane in lanes]))
+            latents = self._encode(np.stack([self._flat(finals[lane]) for lane in lanes]))
             for lane, latent in zip(lanes, latents, strict=True):
                 represented[lane] = latent
         return represented
@@ -160,9 +165,6 @@ class EncodedVectorEnv(Encoded, VectorWrapper[Float32, Any, Any, Any, Any]):
             return observation.reshape(len(observation), -1)
         each = iterate(self.env.observation_space, observation)
         return np.stack([self._flat(lane) for lane in each])
-
-    def _latents(self, rows: NDArray[Any]) -> Float32:
-        return self.encoder.encode(rows.astype(np.float32))
 
 
 def _described(env: Any) -> Task:

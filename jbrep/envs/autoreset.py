@@ -126,7 +126,8 @@ class AutoresetLanes:
             InputError: the environment isn't reproducible.
         """
         lanes = dict(state)
-        self._seeds, self._episodes = lanes.pop("first_seeds"), lanes.pop("episodes")
+        self._seeds = lanes.pop("first_seeds").copy()
+        self._episodes = lanes.pop("episodes").copy()
         self.lanes.restore(lanes)
 
     def _start(self, lanes: Sequence[int]) -> Array:

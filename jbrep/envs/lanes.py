@@ -111,7 +111,7 @@ class Lanes:
         envs: the environments themselves: a batch, or one for each lane.
 
     Raises:
-        InputError: a number below 1, or the environment can't be made.
+        InputError: a number below 1, a batch with offsets, or the environment can't be made.
     """
 
     def __init__(
@@ -124,6 +124,8 @@ class Lanes:
         check_counts(num_lanes, num_threads)
         self.task, self.num_lanes = task, num_lanes
         if is_batched(task):
+            if task.offset.any():
+                raise InputError(f"{task.name} is stepped as a batch: its features have no offsets")
             self._batch: Any = make_batch(task, num_lanes, num_threads)
             self.envs: Any = self._batch
         else:

@@ -86,10 +86,12 @@ def inside(folder: Path, *parts: str) -> Path:
         parts: names below it, or several at once, as in "runs/full".
 
     Raises:
-        InputError: one of them is a link.
+        InputError: one of them is a link, or leads out of the folder.
     """
     path = folder
     for name in Path(*parts).parts:
+        if name == ".." or Path(name).is_absolute():
+            raise InputError(f"{Path(*parts)} leads out of {folder}")
         path = path / name
         if path.is_symlink():
             raise InputError(

@@ -75,7 +75,7 @@ class Acting(NamedTuple):
 
 
 class Controller:
-    """A trained policy that takes observations as the robot gives them, and gives actions.
+    """A trained policy, from a robot's observations to its actions.
 
     It does all that belongs to the policy: scaling, encoder, running normalisation, network,
     bounds, and holding each action for as many calls as it was trained with.
@@ -130,7 +130,7 @@ class Controller:
         self._window: Window | None = None
 
     def __call__(self, observation: ArrayLike) -> NDArray[np.float32]:
-        """The action (k,) at an observation (d,) in the units of the task's features.
+        """The action (k,) at an observation (d,) in the units of the task's features, less offsets.
 
         Several robots may be given at once, (n, d), for (n, k). A policy that was trained with a
         history keeps it: give what the robot shows now.

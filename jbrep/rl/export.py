@@ -48,7 +48,13 @@ def described(controller: Controller) -> dict[str, Any]:
         "task": task.name,
         "environment": to_plain(task),
         "observation": [
-            {"name": each.name, "unit": each.unit, "low": each.low, "high": each.high}
+            {
+                "name": each.name,
+                "unit": each.unit,
+                "low": each.low,
+                "high": each.high,
+                "offset": (task.offsets or {}).get(each.name, 0.0),  # subtracted beforehand
+            }
             for each in now
         ],
         "action": {"low": to_plain(task.action_low), "high": to_plain(task.action_high)},
