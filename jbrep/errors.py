@@ -30,9 +30,9 @@ def first_line(error: BaseException) -> str:
 
 
 def kind_and_line(error: BaseException) -> str:
-    """The same after the name of the error's class: KeyError: 'x'."""
+    """The same after the name of its class, KeyError: 'x', unless it is a user's mistake."""
     kind, line = type(error).__name__, first_line(error)
-    return line if line == kind else f"{kind}: {line}"
+    return line if line == kind or isinstance(error, InputError) else f"{kind}: {line}"
 
 
 def choose(name: str, choices: Mapping[str, _Choice], what: str) -> _Choice:

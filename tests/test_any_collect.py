@@ -16,7 +16,7 @@ from jbrep.collect.derive import derive
 from jbrep.collect.policies import Uniform
 from jbrep.collect.repair import repair
 from jbrep.collect.replay import replay_problems
-from jbrep.collect.shards import Missing, Simulator
+from jbrep.collect.shards import Remaining, Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.formats import export
 from jbrep.dataset.manifest import new_manifest, read_manifest
@@ -100,8 +100,8 @@ def test_shards_of_episodes_that_may_end_early_are_started_together():
     """Though 900 episodes could have more rows than are needed, had they their full length."""
     task = SLEDGE.replace(max_episode_steps=1000)
     made = new_manifest(some(task, steps=200_000, shard_episodes=900))
-    assert Missing(made).wants(1)
-    assert not Missing(made.replace(settings=some(task, steps=900, shard_episodes=1))).wants(1)
+    assert Remaining(made).wants(1)
+    assert not Remaining(made.replace(settings=some(task, steps=900, shard_episodes=1))).wants(1)
 
 
 def test_another_division_into_shards_has_the_same_rows(sledges, tmp_path):
@@ -192,7 +192,7 @@ def test_an_environment_that_fails_ends_the_command_in_one_line(tmp_path):
 def test_a_shard_that_fails_doesn_t_matter_until_it_is_needed():
     """It was begun ahead of time; the one before it takes longer."""
 
-    class Missing:
+    class Remaining:
         rows = 10**6
 
         def wants(self, shard):
@@ -205,7 +205,7 @@ def test_a_shard_that_fails_doesn_t_matter_until_it_is_needed():
     task = describe("Sledges/Broken-v0", arguments)
     wide = some(task, steps=10**6, shard_episodes=300)
     simulator = Simulator(wide, Uniform(), 1, 2)
-    shards = backends.local(simulator)(0, Missing(), lambda steps: None)
+    shards = backends.local(simulator)(0, Remaining(), lambda steps: None)
     assert len(next(shards)["episodes/seed"]) == 300
     with pytest.raises(InputError, match="Sledges/Broken-v0 failed at step 4"):
         next(shards)

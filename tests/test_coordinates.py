@@ -55,7 +55,7 @@ def turn(rows, task, angle, shift=(0.0, 0.0)):
 def test_coordinates_lose_nothing(name, system):
     task = TASKS[name].plain
     made, rows = make_coordinates(task, system), states(TASKS[name].plain)
-    assert not made.lost
+    assert not made.not_decoded
     np.testing.assert_allclose(made.inverse(made.forward(rows)), rows, atol=2e-4)
 
 
@@ -105,7 +105,7 @@ def test_symmetry_gives_back_the_robot_at_the_origin_heading_along_x():
     np.testing.assert_allclose(made.forward(back), made.forward(rows), atol=2e-4)
     np.testing.assert_array_equal(back[:, :2], 0)
     np.testing.assert_allclose(back[:, TASK.groups["orientation"].stop - 1], 0, atol=1e-9)
-    assert set(made.lost) == {"position_x", "position_y", *TASK.feature_names[3:7]}
+    assert set(made.not_decoded) == {"position_x", "position_y", *TASK.feature_names[3:7]}
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -333,7 +333,7 @@ def test_a_strangers_coordinates_are_checked():
         ([["a", "polar", ["x", "y"], True, 0.0]], "the soft length of a is 0"),
         ([["a", "same", ["target_x"], False, 0.0]], "none of the coordinates is shown"),
         ([["../a", "same", ["x"], True, 0.0]], "must be a letter, then letters"),
-        ([["a", "same", ["height"], True, 0.0]], "a takes height, which move_to_pose hasn't"),
+        ([["a", "same", ["height"], True, 0.0]], "a takes height, which move_to_pose doesn't have"),
     ):
         with pytest.raises(InputError, match=said):
             Coordinates(TASK, from_plain(spoiled, tuple[Part, ...]))

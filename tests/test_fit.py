@@ -304,7 +304,7 @@ def test_on_symmetry_an_encoder_is_compared_over_what_symmetry_tells(data, tmp_p
         np.square(lost(each, rows, data), dtype=float).mean(axis=0)
         for each in (ours, fitter.fit("pca", latent=4).encoder)
     ]
-    told = [name not in ours.untold for name in data.task.feature_names]
+    told = [name not in ours.not_decoded for name in data.task.feature_names]
     assert 0 < sum(told) < len(told)
     expected = errors[0][told].sum() / errors[1][told].sum()
     assert ratio_to_pca(ours, data) == pytest.approx(expected, rel=1e-4)

@@ -346,7 +346,9 @@ def test_a_minari_data_set_by_its_id(minari_folder, tmp_path, monkeypatch):
     assert dataset.task.id == "Minari-cart-push-v0"
     assert dataset.task.action_low == (given["actions"][8:].min(),)
     assert dataset.task.action_high == (3,)
-    with pytest.raises(InputError, match=r"no Minari data set: .* where there are cart/push-v0"):
+    with pytest.raises(
+        InputError, match=r"nothing to import at .* a Minari data set in .*: cart/push-v0"
+    ):
         import_data("cart/pull-v0", tmp_path / "other")
 
 

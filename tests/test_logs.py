@@ -404,7 +404,7 @@ def test_what_is_exported_to_lerobot_has_its_layout_and_comes_back(tmp_path):
         tmp_path / "unknown", {"x": [0.0, 1, 2], "action": [0.5] * 3}, Layout(length=9)
     )
     done = jbrep("data", "export", unknown.folder, "--to", "lerobot", "--out", tmp_path / "no")
-    assert "doesn't say how long a step lasts" in done.output
+    assert "the time step of unknown is not known: give it as timestep" in done.output
 
 
 def test_damaged_lerobot_data_sets_are_refused(tmp_path):

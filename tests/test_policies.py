@@ -15,7 +15,6 @@ from jbrep.collect.policies import (
     generators,
     make_policy,
     parse_policy,
-    within_bounds,
 )
 from jbrep.dataset.schema import episode_part
 from jbrep.envs import Feature, Task, describe
@@ -153,8 +152,6 @@ def test_drives_are_not_rescaled_where_the_bounds_are_those_of_drives():
     assert (own > -1).any()
     wide = ARM.replace(action_low=(-1.0,), action_high=(1.0,), timestep=TASK.timestep, draws=6)
     np.testing.assert_array_equal(drives(rough, lanes=2, task=wide), drives(rough, lanes=2))
-    x = np.random.default_rng(0).uniform(-1, 1, (100, 1))
-    assert within_bounds(wide, x) is x
 
 
 def test_a_policy_draws_beyond_what_the_environment_draws():

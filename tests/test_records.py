@@ -41,6 +41,10 @@ class Plan(Document, frozen=True, kw_only=True):
     kind: Annotated[Literal["first", "second"], Meta(description="Which one.")] = "first"
     more: Mapping[str, Any] = {}
     begin: str | None = msgspec.field(name="from", default=None)
+    pair: Annotated[tuple[Finite, ...], Meta(min_length=1, max_length=2)] = (0.0,)
+    chosen: Annotated[tuple[Literal["a", "b"], ...], Meta(min_length=1)] = ("a",)
+    flags: tuple[bool, ...] = ()
+    names: tuple[Annotated[str, Meta(min_length=1, title="a name")], ...] = ()
 
     def check(self):
         if self.steps == 13:
@@ -48,6 +52,7 @@ class Plan(Document, frozen=True, kw_only=True):
 
 
 PLAN = Plan(steps=3, points=[Point("a", 1)], source=Source(sets=2), begin="b", more={"x": [1]})
+LISTS = ("pair", "chosen", "flags", "names")
 MISTAKES = [
     ({"steps": 0}, "steps is 0: it must be a whole number from 1 to 10,000"),
     ({"steps": True}, "steps is True: it must be a whole number from 1 to 10,000"),
@@ -67,6 +72,10 @@ MISTAKES = [
     ({"more": [1]}, r"more is \[1\]: it must be a table"),
     ({"speed": 1}, "unknown speed: it must be one of steps, rate"),
     ({"steps": 13}, "thirteen is one too many"),
+    ({"pair": []}, r"pair is \[\]: it must be a list of 1 to 2 finite numbers$"),
+    ({"chosen": []}, r"chosen is \[\]: it must be a list of at least 1, each one of a, b$"),
+    ({"flags": 3}, "flags is 3: it must be a list, each true or false$"),
+    ({"names": 3}, "names is 3: it must be a list of names$"),
 ]
 
 
@@ -202,7 +211,9 @@ def test_toml_comes_back():
 
 
 def test_the_table_of_keys_says_what_each_may_be():
-    lines = key_table(Plan, of="plan", without=("points", "source", "more", "from")).splitlines()
+    lines = key_table(
+        Plan, of="plan", without=("points", "source", "more", "from", *LISTS)
+    ).splitlines()
     assert lines[2:] == [
         "| `plan.steps` | a whole number from 1 to 10,000 |  | Of training. |",
         "| `plan.rate` | a number above 0 and at most 1 | 0.5 | Of learning. |",

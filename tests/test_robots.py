@@ -111,7 +111,7 @@ def test_an_episode_is_played_again_before_a_data_set_grows(tmp_path, monkeypatc
     observe = import_module("environments").Sledge.observe
     monkeypatch.setattr("environments.Sledge.observe", lambda self: observe(self) * 1.001)
     told = refused(lambda: collect(settings.replace(steps=300), tmp_path / "d", num_threads=1))
-    assert "played again is another one now; has the environment changed" in told
+    assert "when it is played again; has the environment changed" in told
     monkeypatch.undo()
     again = collect(settings.replace(steps=80), tmp_path / "e", num_threads=1)
     assert again == Dataset(tmp_path / "d").manifest
@@ -269,11 +269,11 @@ def test_what_fails_is_closed_kept_and_tried_again(tmp_path):
     peace = (*command[:-1], tmp_path / "e", "--shard-episodes", 50, "--retries", 1)
     told = jbrep(*peace)
     assert told.exit_code == 0, told.output
-    assert "no answer; it is tried again" in told.stderr
+    assert "no answer; retrying" in told.stderr
     assert contents(tmp_path / "d") == contents(tmp_path / "e")
     Arm.steps_of_all = 0  # in the episodes that a shard's size is judged by
     told = jbrep(*command[:-1], tmp_path / "f", "--retries", 1)
-    assert (told.exit_code, told.stderr.count("it is tried again")) == (0, 1), told.output
+    assert (told.exit_code, told.stderr.count("retrying")) == (0, 1), told.output
     assert closed(tmp_path)
 
 
@@ -293,7 +293,7 @@ def test_evaluations_and_training_go_on_after_failures(tmp_path):
     run = (*run, "--steps", 600, "--threads", 1, "--set", "learning_starts=1000")
     told = jbrep(*run, "--retries", 1, "--out", tmp_path / "run")
     assert told.exit_code == 0, told.output
-    assert told.stderr.count("no answer; it is tried again") == 2
+    assert told.stderr.count("no answer; retrying") == 2
     assert read_run(tmp_path / "run").status == "finished"
     assert closed(tmp_path)
     Arm.steps_of_all = 0

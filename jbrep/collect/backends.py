@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from jbrep.collect.shards import Made, Missing, Produce, Simulator, all_of
+from jbrep.collect.shards import Made, Produce, Remaining, Simulator, all_of
 from jbrep.dataset.schema import Columns
 from jbrep.envs.instances import close_kept
 from jbrep.envs.make import is_batched
@@ -43,9 +43,9 @@ def _can_be_sent(*parts: Any) -> bool:
 def _in_processes(simulator: Simulator, workers: int) -> Produce:
     """Shards made side by side, given in order; one whose worker is killed is made again."""
 
-    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
-        if not missing.wants(first + 1):  # one shard alone
-            yield from simulator.in_turn(first, missing, tick)
+    def produce(first: int, remaining: Remaining, tick: Tick) -> Iterator[Columns]:
+        if not remaining.wants(first + 1):  # one shard alone
+            yield from simulator.in_turn(first, remaining, tick)
             return
         made: dict[int, Made] = {}
         started, attempts = first, dict[int, int]()
@@ -54,14 +54,14 @@ def _in_processes(simulator: Simulator, workers: int) -> Produce:
         with Pool[int, Made](make_shard, workers, lambda: None) as pool:
 
             def submit(shard: int) -> None:
-                begun = missing.begun(shard)
-                pool.submit(shard, known, simulator, shard, missing.rows, begun)
+                begun = remaining.begun(shard)
+                pool.submit(shard, known, simulator, shard, remaining.rows, begun)
 
             for shard in count(first):
                 while shard not in made:
                     most = shard + 2 * workers  # held in memory until those before are made
                     while not pool.is_full and (
-                        started == shard or (started < most and missing.wants(started))
+                        started == shard or (started < most and remaining.wants(started))
                     ):
                         submit(started)
                         started += 1
@@ -114,7 +114,7 @@ def on_ray(simulator: Simulator) -> Produce:
     again on another.
     """
 
-    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
+    def produce(first: int, remaining: Remaining, tick: Tick) -> Iterator[Columns]:
         import ray
 
         make = on_cluster(make_shard, simulator.num_threads)
@@ -124,9 +124,9 @@ def on_ray(simulator: Simulator) -> Produce:
         try:
             for shard in count(first):
                 ahead = shard + 2 * int(ray.cluster_resources().get("CPU", 1))
-                while started == shard or (started < ahead and missing.wants(started)):
-                    begun = missing.begun(started)
-                    what = known, alone, started, missing.rows, begun
+                while started == shard or (started < ahead and remaining.wants(started)):
+                    begun = remaining.begun(started)
+                    what = known, alone, started, remaining.rows, begun
                     made[started] = make.remote(*what)
                     started += 1
                 yield from all_of(ray.get(made.pop(shard)))

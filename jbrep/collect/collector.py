@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jbrep.collect.backends import BACKENDS
 from jbrep.collect.policies import Policy, make_policy
 from jbrep.collect.replay import replay_problems
-from jbrep.collect.shards import LANES, SHARD_ROWS, Missing, Produce, Simulator
+from jbrep.collect.shards import LANES, SHARD_ROWS, Produce, Remaining, Simulator
 from jbrep.dataset import Dataset
 from jbrep.dataset.manifest import (
     MANIFEST,
@@ -58,7 +58,7 @@ def collect(
     """Collect a data set, or what is missing of it.
 
     Neither lanes, threads nor backend change a byte, nor does it whether a data set is collected at
-    once or extended. Before one that is there is gone on with, an episode of it is played again: it
+    once or extended. Before one that is there is continued, an episode of it is played again: it
     must be the same to the last bit, where the environment is reproducible.
 
     Args:
@@ -98,9 +98,9 @@ def _check_environment(folder: Path, num_threads: int | None) -> None:
     dataset = Dataset(folder)
     if dataset.task.reproducible and any(replay_problems(dataset, 1, num_threads)):
         raise InputError(
-            f"{folder} can't be gone on with: an episode of {dataset.task.name} played again is "
-            "another one now; has the environment changed, or is this another machine? Choose "
-            "another folder for other data"
+            f"{folder} can't be continued: an episode of {dataset.task.name} comes out differently "
+            "when it is played again; has the environment changed, or is this another machine? "
+            "Choose another folder for other data"
         )
 
 
@@ -151,14 +151,14 @@ def _fill(
 
     Those that are finished are kept whatever ends this.
     """
-    writing = _Writing(folder, there, Missing(manifest))
-    pieces = produce(manifest.full_shards, writing.missing, progress.update)
+    writing = _Writing(folder, there, Remaining(manifest))
+    pieces = produce(manifest.full_shards, writing.remaining, progress.update)
     try:
         for columns in pieces:
             writing.add(columns)
             if writing.is_due:
                 writing.commit(progress)
-            if writing.missing.rows <= 0:
+            if writing.remaining.rows <= 0:
                 break
     except InputError as error:
         if isinstance(error, DamageError) or not writing.commit(progress).episodes:
@@ -168,7 +168,7 @@ def _fill(
         writing.commit(progress)
         if isinstance(pieces, Generator):
             pieces.close()
-    return writing.missing.manifest
+    return writing.remaining.manifest
 
 
 class _Writing:
@@ -177,11 +177,11 @@ class _Writing:
     Args:
         folder: of the data set.
         there: its manifest so far, which counts until there is more.
-        missing: of the manifest that is wanted.
+        remaining: of the manifest that is wanted.
     """
 
-    def __init__(self, folder: Path, there: Manifest, missing: Missing):
-        self.missing = missing
+    def __init__(self, folder: Path, there: Manifest, remaining: Remaining):
+        self.remaining = remaining
         self._folder, self._there = folder, there
         self._held: list[Columns] = []
         self._committed = time.monotonic()
@@ -192,38 +192,41 @@ class _Writing:
         Raises:
             InputError: there are as many shards as there can be.
         """
-        manifest = self.missing.manifest
+        manifest = self.remaining.manifest
         first = manifest.episodes + sum(len(each[_LENGTH]) for each in self._held)
-        known = first - int(columns[EPISODES + "episode"][0])
-        ends = np.cumsum(columns[_LENGTH][known:])
-        needed = int(np.searchsorted(ends, self.missing.rows)) + 1
-        self._held.append(some_episodes(columns, known, known + needed))
-        self.missing.held += len(self._held[-1]["step"])
         if first // manifest.settings.shard_episodes >= _MAX_SHARDS:
+            full = counted(manifest.settings.shard_episodes, "episode")
             raise InputError(
                 f"{self._folder} has {_MAX_SHARDS:,} shards, which is the limit: put more than "
-                f"{manifest.settings.shard_episodes:,} episodes in a shard, in another folder"
+                f"{full} in a shard, in another folder"
             )
+        known = first - int(columns[EPISODES + "episode"][0])
+        ends = np.cumsum(columns[_LENGTH][known:])
+        needed = int(np.searchsorted(ends, self.remaining.rows)) + 1
+        self._held.append(some_episodes(columns, known, known + needed))
+        self.remaining.held += len(self._held[-1]["step"])
 
     @property
     def is_due(self) -> bool:
         """Whether what is held fills a shard, is all that is needed, or has been held for long."""
-        manifest = self.missing.manifest
+        manifest = self.remaining.manifest
         episodes = manifest.episodes + sum(len(each[_LENGTH]) for each in self._held)
         return (
             episodes % manifest.settings.shard_episodes == 0
-            or self.missing.rows <= 0
+            or self.remaining.rows <= 0
             or time.monotonic() - self._committed > _HOLD_SECONDS
         )
 
     def commit(self, progress: Any) -> Manifest:
         """Write what is held; the manifest of what is there then."""
         if self._held:
-            if self.missing.manifest.settings != self._there.settings:
-                write_manifest(self._folder, self.missing.manifest)
+            if self.remaining.manifest.settings != self._there.settings:
+                write_manifest(self._folder, self.remaining.manifest)
             held, self._held = joined(self._held), []
-            self._there = self.missing.manifest = commit(self._folder, self.missing.manifest, held)
-            self.missing.held, self._committed = 0, time.monotonic()
+            self._there = self.remaining.manifest = commit(
+                self._folder, self.remaining.manifest, held
+            )
+            self.remaining.held, self._committed = 0, time.monotonic()
             progress.update(self._there.rows - progress.n)
             size = sum(entry.bytes for entry in self._there.shards)
             progress.set_postfix_str(f"{size / 1e6:,.0f} MB on disk", refresh=False)

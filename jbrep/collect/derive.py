@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jbrep.collect.collector import write_shards
 from jbrep.collect.policies import acts_on_observations
 from jbrep.collect.replay import replay_problems
-from jbrep.collect.shards import Missing, Produce
+from jbrep.collect.shards import Produce, Remaining
 from jbrep.dataset import Dataset, DataSettings
 from jbrep.dataset.manifest import Manifest, new_manifest, open_shard
 from jbrep.dataset.rewards import reward_function, with_hash, without_range
@@ -180,7 +180,7 @@ def _check_replay(dataset: Dataset, settings: DataSettings, num_threads: int | N
 def _each_shard(dataset: Dataset, change: Callable[[Columns], Columns]) -> Produce:
     """Makes the shards of a data set from those of another."""
 
-    def produce(first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
+    def produce(first: int, remaining: Remaining, tick: Tick) -> Iterator[Columns]:
         manifest = dataset.manifest
         for shard in range(first, len(manifest.shards)):
             yield change(open_shard(dataset.folder, manifest, shard))

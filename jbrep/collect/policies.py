@@ -53,14 +53,6 @@ def generators(task: Task, seeds: Sequence[int]) -> list[np.random.Generator]:
     return [np.random.Generator(stream.advance(task.draws)) for stream in streams]
 
 
-def within_bounds(task: Task, drives: Array) -> Array:
-    """Actions (..., k) from drives in [-1, 1], which stand for the task's bounds."""
-    low, high = np.array(task.action_low), np.array(task.action_high)
-    if (low == -1).all() and (high == 1).all():
-        return drives  # scaling would round
-    return np.clip((low + high) / 2 + drives * (high - low) / 2, low, high)
-
-
 class Constants(Record, frozen=True):
     """The base of policies that are records of their constants."""
 
@@ -102,7 +94,7 @@ class Constant(Constants, frozen=True):
 
     def begin(self, task: Task, seeds: Sequence[int]) -> Actor:
         """Nothing is drawn."""
-        actions = within_bounds(task, np.full((len(seeds), task.action_size), self.drive))
+        actions = task.unscale_action(np.full((len(seeds), task.action_size), self.drive))
         return lambda observation: actions
 
 
@@ -151,7 +143,7 @@ class OrnsteinUhlenbeck(Constants, frozen=True):
                 drives[step] = drive
                 drive = drive + self.theta * timestep * (self.mu - drive)
                 drive = drive + self.sigma * np.sqrt(timestep) * increment
-            yield within_bounds(task, np.clip(drives, -1, 1))
+            yield task.unscale_action(drives)
 
 
 class Heuristic(Constants, frozen=True):

@@ -24,8 +24,8 @@ Array = NDArray[Any]
 
 
 @dataclass
-class Missing:
-    """What the shards of a manifest lack.
+class Remaining:
+    """What the shards of a manifest still lack.
 
     Attributes:
         manifest: of what is committed.
@@ -59,7 +59,7 @@ class Missing:
 
 # the columns of episodes in order, from the shard of a number on, some of one shard at a time;
 # episodes that are committed already may be left out
-Produce = Callable[[int, Missing, Tick], Iterator[Columns]]
+Produce = Callable[[int, Remaining, Tick], Iterator[Columns]]
 
 
 class Made(NamedTuple):
@@ -99,11 +99,11 @@ class Simulator:
     num_threads: int | None = None
     retries: int = 0
 
-    def in_turn(self, first: int, missing: Missing, tick: Tick) -> Iterator[Columns]:
+    def in_turn(self, first: int, remaining: Remaining, tick: Tick) -> Iterator[Columns]:
         """Make one shard after the other, each with all threads."""
         for number in count(first):
-            episodes = self._episodes(number)[missing.begun(number) :]
-            yield from self._blocks(episodes, tick, lambda: missing.rows)
+            episodes = self._episodes(number)[remaining.begun(number) :]
+            yield from self._blocks(episodes, tick, lambda: remaining.rows)
 
     def _episodes(self, shard: int) -> Array:
         each = self.settings.shard_episodes

@@ -107,7 +107,9 @@ class Coordinates:
             raise InputError("two parts of the coordinates give the same name")
         for part in self.parts:
             if missing := [name for name in part.of if name not in known]:
-                raise InputError(f"{part.name} takes {missing[0]}, which {self.task.name} hasn't")
+                raise InputError(
+                    f"{part.name} takes {missing[0]}, which {self.task.name} doesn't have"
+                )
             known.update(part.gives)
 
     def __len__(self) -> int:
@@ -118,7 +120,9 @@ class Coordinates:
         library = library_of(observation)
         if isinstance(observation, np.ndarray) and observation.ndim == 1:
             with suppress(ArithmeticError, ValueError):  # of infinities, which NumPy passes on
-                return np.array(self._of_one(observation.tolist()), observation.dtype)
+                return np.array(
+                    self._of_one(observation.tolist()), np.result_type(observation, np.float32)
+                )
         known = {name: observation[..., i] for i, name in enumerate(self.task.feature_names)}
         for part in self.parts:
             _calculate(library, _Step(part, False), known)
@@ -160,7 +164,7 @@ class Coordinates:
         return library.stack([_in_range(known[each.name], each) for each in self.task.features], -1)
 
     @cached_property
-    def lost(self) -> tuple[str, ...]:
+    def not_decoded(self) -> tuple[str, ...]:
         """Features that the inverse doesn't give back, such as a position in the world."""
         tilted = {name for part in self.parts if part.formula == "tilt" for name in part.of}
         return tuple(n for n in self.task.feature_names if n in tilted or n in self._way_back)

@@ -7,7 +7,7 @@ from msgspec import Meta
 
 from jbrep.records.record import Record
 
-_Name = Annotated[str, Meta(min_length=1, max_length=1000, title="names of columns")]
+_Name = Annotated[str, Meta(min_length=1, max_length=1000, title="the name of a column")]
 _Names = tuple[_Name, ...]
 _Seconds = Annotated[float, Meta(gt=0, le=1e9, title="a time above 0")]
 

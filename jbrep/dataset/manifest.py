@@ -308,13 +308,10 @@ def check_files(folder: Path, manifest: Manifest, files: list[Path]) -> None:
 def file_problems(folder: Path, manifest: Manifest, files: list[Path]) -> Iterator[str]:
     """What `check_files` raises, as a line for each file."""
     for shard, entry in enumerate(manifest.shards):
-        path = folder / shard_name(shard)
-        try:
-            size = path.lstat().st_size
-        except FileNotFoundError:
+        path, size = folder / shard_name(shard), _size(folder, shard)
+        if size is None:
             yield f"{path} is missing: {REPAIR}"
-            continue
-        if size != entry.bytes:
+        elif size != entry.bytes:
             yield (f"{path} is damaged: it has {size:,} bytes instead of {entry.bytes:,}; {REPAIR}")
     for path in unlisted_files(manifest, files):
         yield f"{path} is not one of the {len(manifest.shards)} shards of the data set"

@@ -50,7 +50,7 @@ class BaseEncoder(ABC):
         return f"{kind}({self.name}, {self.task.name}, {self.size} to {self.latent_size})"
 
     @property
-    def untold(self) -> tuple[str, ...]:
+    def not_decoded(self) -> tuple[str, ...]:
         """Features that symmetry leaves out, such as where a robot is; decoded, it is at 0."""
         return ()
 

@@ -227,9 +227,9 @@ class Encoder(BaseEncoder):
         return self._on[device]
 
     @property
-    def untold(self) -> tuple[str, ...]:
+    def not_decoded(self) -> tuple[str, ...]:
         """As for `BaseEncoder`."""
-        return self.scaler.coordinates.lost if self.scaler.coordinates else ()
+        return self.scaler.coordinates.not_decoded if self.scaler.coordinates else ()
 
     def check_task(self, task: Task) -> None:
         """As for `BaseEncoder`; other arguments, such as another body of the robot, will do."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jbrep.encoders.layers import ACTIVATIONS, EPSILON, LAYER_NORM, MAX_UNITS, WHOLE, Layer
-from jbrep.errors import InputError
+from jbrep.errors import InputError, listed
 
 Array = NDArray[np.float64]
 
@@ -17,7 +17,6 @@ _HALF = np.concatenate((np.linspace(0, 8, 65)[1:], np.geomspace(8, 100, 40)))
 _PROBES: Array = np.concatenate((-_HALF[::-1], [0], _HALF))  # of functions of one number
 _PRECISION = 1e-6  # to which a function must be an activation
 _MOST_NUMBERS = 1 << 26  # in layers: few nodes of a stranger's model can make many
-_MOST_NAMED = 8  # operations in a message
 _MOST_FORMS = 4  # of a value: a GELU written out needs two
 
 
@@ -170,9 +169,10 @@ class Value:
             InputError: there is none.
         """
         if unknown := self.unknown:
-            named = ", ".join(unknown[:_MOST_NAMED]) + (", ..." if unknown[_MOST_NAMED:] else "")
             choices = ", ".join(ACTIVATIONS)
-            raise InputError(refusal(named, f"no activation that an encoder has: {choices}"))
+            raise InputError(
+                refusal(listed(unknown), f"no activation that an encoder has: {choices}")
+            )
         return [*self.forms][-1]
 
 

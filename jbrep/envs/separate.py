@@ -51,7 +51,7 @@ class Retries:
         if not self._left:
             raise error
         self._left -= 1
-        warnings.warn(f"{error}; it is tried again", Notice, stacklevel=2)
+        warnings.warn(f"{error}; retrying", Notice, stacklevel=2)
 
     def succeeded(self) -> None:
         """Forget the failures so far."""
@@ -145,7 +145,7 @@ class Separate:
                     raise ValueError("too many values to unpack (expected 2")  # old Gym's
                 return self._put(lane, observation, info)
             except Exception as error:
-                self._bear(lane, error)
+                self._handle_failure(lane, error)
 
     def step(self, actions: Array) -> tuple[Array, Array, Flags, Flags, dict[str, Array]]:
         """As a vector environment."""
@@ -167,7 +167,7 @@ class Separate:
                 except _MissingError:
                     self._lose(lane)
                 except Exception as error:
-                    self._bear(lane, error)
+                    self._handle_failure(lane, error)
                     self._lose(lane)
                     self.failed[lane] = True
                 truncated[lane] |= self.lost[lane]
@@ -244,7 +244,7 @@ class Separate:
         self.lost[lane], self._reward[lane] = True, 0.0
         self._episodes[lane].actions.pop()
 
-    def _bear(self, lane: int, error: Exception) -> None:
+    def _handle_failure(self, lane: int, error: Exception) -> None:
         """Go on after a failure, with a new instance at the next reset.
 
         Raises:

@@ -50,14 +50,14 @@ def reconstruction(encoder: BaseEncoder, held_out: HeldOut) -> Reconstruction:
     losses = _losses(encoder, held_out, held_out.data.test)
     quantiles = np.quantile(losses.by_row, _QUANTILES).tolist()
     ours, pca = losses.sums, _pca(held_out, encoder.latent_size)
-    told = [name not in encoder.untold for name in held_out.data.task.feature_names]
-    over_told = _means(ours[:, told]), _means(pca[:, told])
+    decoded = [name not in encoder.not_decoded for name in held_out.data.task.feature_names]
+    over_decoded = _means(ours[:, decoded]), _means(pca[:, decoded])
     is_smaller = encoder.latent_size < held_out.data.task.size
     return Reconstruction(
         mse=score(bootstrap(_mean, _means(ours), held_out.row_counts)),
         pca_mse=score(bootstrap(_mean, _means(pca), held_out.row_counts)),
-        ratio_to_pca=score(bootstrap(_mean, *over_told)) if is_smaller else None,
-        features=_by_feature(ours, held_out, encoder.untold),
+        ratio_to_pca=score(bootstrap(_mean, *over_decoded)) if is_smaller else None,
+        features=_by_feature(ours, held_out, encoder.not_decoded),
         quantiles=dict(zip(map(str, _QUANTILES), quantiles, strict=True)),
         worst_episodes=_worst(losses.by_row, held_out),
     )
@@ -140,7 +140,9 @@ def _linear(data: ScaledDataset, layers: tuple[Layers, Layers]) -> Encoder:
     return Encoder(header, data.scaler, *layers)
 
 
-def _by_feature(sums: Array, held_out: HeldOut, untold: Sequence[str]) -> tuple[FeatureError, ...]:
+def _by_feature(
+    sums: Array, held_out: HeldOut, not_decoded: Sequence[str]
+) -> tuple[FeatureError, ...]:
     """The error of each feature; no R^2 of those that an encoder leaves out."""
     data, rows = held_out.data, held_out.row_counts
     total, squares = held_out.variation
@@ -151,7 +153,8 @@ def _by_feature(sums: Array, held_out: HeldOut, untold: Sequence[str]) -> tuple[
         bootstrap(lambda e, t, s, n: r_squared(e, variation(t, s, n)), sums, total, squares, rows)
     )
     r2 = [
-        _NONE if f.name in untold else each for f, each in zip(data.task.features, r2, strict=True)
+        _NONE if f.name in not_decoded else each
+        for f, each in zip(data.task.features, r2, strict=True)
     ]
     return tuple(
         FeatureError(name=f.name, unit=f.unit, mse=mse[i], rmse_physical=rmse[i], r2=r2[i])

@@ -53,7 +53,7 @@ def record_episode(
     if encoder:
         latent = encoder.encode(rollout.observation)
         decoded = encoder.decode(latent).astype(np.float64) if encoder.can_decode else None
-        if decoded is not None and encoder.untold:
+        if decoded is not None and encoder.not_decoded:
             decoded = placed(task, decoded, rollout.observation)
         send_encoding(recording, times, rollout, encoder, latent, decoded)
         if decoded is not None and robot and motion and jitterbug_task(task):

@@ -14,7 +14,9 @@ from jbrep.encoders.header import EncoderHeader
 from jbrep.methods.linear import principal_code
 
 
-def held_out_error(encoder: Encoder, data: ScaledDataset, untold: Container[str] = ()) -> float:
+def held_out_error(
+    encoder: Encoder, data: ScaledDataset, not_decoded: Container[str] = ()
+) -> float:
     """Mean squared error of the reconstruction over all held-out rows, scaled to [-1, 1].
 
     Rounded to six digits: the others depend on the number of threads.
@@ -22,12 +24,12 @@ def held_out_error(encoder: Encoder, data: ScaledDataset, untold: Container[str]
     Args:
         encoder: that can decode.
         data: whose held-out part is reconstructed.
-        untold: names of features whose errors count as 0.
+        not_decoded: names of features whose errors count as 0.
     """
-    told = [name not in untold for name in data.task.feature_names]
+    decoded = [name not in not_decoded for name in data.task.feature_names]
     total = 0.0
     for rows in data.observations(data.test):
-        error = lost(encoder, rows, data)[:, told]
+        error = lost(encoder, rows, data)[:, decoded]
         total += float(np.square(error, dtype=np.float64).sum())
     return float(f"{total / (len(data.test) * data.task.size):.6g}")
 
@@ -73,5 +75,5 @@ def ratio_to_pca(encoder: Encoder, data: ScaledDataset) -> float | None:
     layers = principal_code(data, encoder.latent_size)
     header = EncoderHeader(kind="pca", name="pca", environment=data.task)
     pca = Encoder(header, data.scaler, *layers)
-    ours, theirs = (held_out_error(each, data, encoder.untold) for each in (encoder, pca))
+    ours, theirs = (held_out_error(each, data, encoder.not_decoded) for each in (encoder, pca))
     return ours / theirs if theirs else None

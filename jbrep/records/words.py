@@ -152,8 +152,7 @@ def _collection(node: inspect.Type) -> str:
         case inspect.TupleType(item_types=items):
             return f"a list of {len(items)}: {', '.join(map(must_be, items))}"
         case inspect.CollectionType(item_type=item, min_length=least, max_length=most):
-            count = _range(least or None, most).replace(" from", " at least")
-            return f"a list of{count} {_plural(must_be(item))}"
+            return _list_of(must_be(item), least or None, most)
     return ""
 
 
@@ -167,9 +166,11 @@ def _range(least: float | None, most: float | None, above: float | None = None) 
     return "" if upper is None else f" at most {upper:,}"
 
 
-def _plural(words: str) -> str:
-    """A list's items in words: "whole numbers from 1 to 10", "text"."""
-    plain = words.removeprefix("a ").removeprefix("an ")
-    for one, many in (("number", "numbers"), ("name", "names"), ("table", "tables")):
-        plain = re.sub(rf"\b{one}\b", many, plain, count=1)
-    return plain
+def _list_of(item: str, least: float | None, most: float | None) -> str:
+    """A list in words: "a list of 1 to 3 numbers", "a list of at most 3, each true or false"."""
+    count = _range(least, most)
+    count = count.removeprefix(" from") if least and most else count.replace(" from", " at least")
+    items = re.sub(r"^an? ((?:finite |whole )?)(name|number|table)\b", r"\1\2s", item)
+    if items != item or item.startswith("text"):
+        return f"a list of{count} {items}"
+    return f"a list{f' of{count}' if count else ''}, each {item}"

@@ -150,7 +150,7 @@ def checked(where: str, rows: Rows, once: Mapping[str, Any]) -> Iterator[Incomin
     if len(last) != observation.shape[1]:
         raise InputError(
             f"{where} has {observation.shape[1]} numbers in an observation, and {len(last)} in its "
-            "final one: they must be as many"
+            "final one: the two must be equal"
         )
     seed = int(once.get("seed", UNKNOWN_SEED))
     if not UNKNOWN_SEED <= seed < 1 << 63:
@@ -277,8 +277,8 @@ def check_lengths(name: str, lengths: Mapping[str, int], unit: str = "rows") -> 
     for what, length in lengths.items():
         if length != expected:
             raise InputError(
-                f"{name} has {expected:,} {unit} of {first}s, and {length:,} of {what}s: they must "
-                "be as many"
+                f"{name} has {expected:,} {unit} of {first}s, and {length:,} of {what}s: the "
+                "two must be equal"
             )
 
 

@@ -22,6 +22,7 @@ from jbrep.dataset.formats.episodes import (
     plain,
     whole_episode,
 )
+from jbrep.dataset.schema import joined
 from jbrep.envs.task import MAX_EPISODE_STEPS, Feature
 from jbrep.errors import InputError
 from jbrep.text import words
@@ -112,8 +113,8 @@ def split(
     for what, values in known.items():
         if len(values) != count:
             raise InputError(
-                f"{name} has a {what} for {len(values):,} episodes, but {count:,} episodes: they "
-                "must be as many"
+                f"{name} has a {what} for {len(values):,} episodes, but {count:,} episodes: the "
+                "two must be equal"
             )
 
 
@@ -123,7 +124,7 @@ def _divided(name: str, chunks: Iterable[Rows], most: int) -> Iterator[Rows]:
     for given in chunks:
         chunk, begin = {n: narrow(n, values) for n, values in given.items()}, 0
         for end in _ends(name, begun[-1:], chunk):
-            yield _joined([*begun, _some(chunk, begin, end)])
+            yield joined([*begun, _some(chunk, begin, end)])
             begun, begin = [], end
         if begin < len(chunk["action"]):
             begun.append(_some(chunk, begin, None))
@@ -133,15 +134,11 @@ def _divided(name: str, chunks: Iterable[Rows], most: int) -> Iterator[Rows]:
                 "ends?"
             )
     if begun:
-        yield _joined(begun)
+        yield joined(begun)
 
 
 def _some(rows: Rows, begin: int, end: int | None) -> Rows:
     return {n: values[begin:end] for n, values in rows.items()}
-
-
-def _joined(several: list[Rows]) -> Rows:
-    return {n: np.concatenate([rows[n] for rows in several]) for n in several[0]}
 
 
 def narrow(name: str, values: Array) -> Array:

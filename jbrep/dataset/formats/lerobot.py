@@ -19,7 +19,7 @@ from jbrep.dataset.formats.tables import NAMES, Table, width, with_widths
 from jbrep.dataset.layout import Layout
 from jbrep.dataset.reader import Dataset
 from jbrep.dataset.scaling import extrema, mean_and_std
-from jbrep.errors import InputError
+from jbrep.errors import InputError, kind_and_line
 from jbrep.progress import Progress
 from jbrep.records.storage import publish_folder, read_regular, unfinished, write_whole
 
@@ -78,14 +78,15 @@ def open_table(given: str) -> Table:
 
 def _info(path: Path) -> dict[str, Any]:
     """What the data set says of itself, as far as it is used."""
+    raw = read_regular(path, _MAX_BYTES)
     try:
-        info = json.loads(read_regular(path, _MAX_BYTES))
+        info = json.loads(raw)
         version, fps = str(info["codebase_version"]), float(info["fps"])
         frames = int(info["total_frames"]) if "total_frames" in info else None
         known = {str(name): dict(each) for name, each in info["features"].items()}
         known = {name: each | {"dtype": str(each["dtype"])} for name, each in known.items()}
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(f"{path} isn't as LeRobot writes it: {error!r}") from None
+        raise InputError(f"{path} isn't as LeRobot writes it: {kind_and_line(error)}") from None
     if not version.startswith(_VERSIONS):
         raise InputError(f"{path} is of LeRobot's layout {version}: it must be v3.0 or v2.1")
     if not 0 < fps < np.inf:
@@ -119,13 +120,8 @@ def write(dataset: Dataset, out: Path) -> str:
     Raises:
         InputError: it isn't known how long a step lasts.
     """
-    if dataset.task.timestep is None:
-        raise InputError(
-            f"{dataset.task.name} doesn't say how long a step lasts, which LeRobot needs to know: "
-            "give a timestep in --features when the data are made"
-        )
+    fps = 1 / dataset.task.known_timestep
     with unfinished(out) as partial:
-        fps = 1 / dataset.task.timestep
         fps = round(fps) if abs(fps - round(fps)) < 1e-6 * fps else fps
         (partial / "meta").mkdir(parents=True)
         files = _write_steps(dataset, partial, fps)

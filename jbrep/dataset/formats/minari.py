@@ -35,7 +35,7 @@ from jbrep.dataset.settings import Digest
 from jbrep.envs.description import describe, features_of
 from jbrep.envs.names import spec_of
 from jbrep.envs.task import Task
-from jbrep.errors import DamageError, InputError, kind_and_line
+from jbrep.errors import DamageError, InputError, kind_and_line, listed
 from jbrep.progress import Progress
 from jbrep.records.document import Document, read_document
 from jbrep.records.storage import (
@@ -55,7 +55,6 @@ _METADATA, _CHECKSUMS = "metadata.json", "jbrep.json"
 _MAX_BYTES = 1 << 24  # of the metadata
 _WORD = re.compile(r"[\w-]{1,40}")
 EPISODE_BYTES = 1 << 14  # that HDF5 takes for each episode besides its rows
-_MOST_SHOWN = 10  # ids of data sets
 
 
 class Checksums(Document, frozen=True, kw_only=True):
@@ -116,10 +115,9 @@ def _folder(given: str) -> Path:
             return folder
     there = sorted(path.parents[1] for path in root.glob(f"**/data/{_METADATA}"))
     names = [path.relative_to(root).as_posix() for path in there]
-    shown = ", ".join(names[:_MOST_SHOWN]) + (", ..." if len(names) > _MOST_SHOWN else "")
     raise InputError(
-        f"{given} is no .npz or .parquet file, and no Minari data set: it must be a path, or an id "
-        f"in {root} ({_ROOT}), where there {f'are {shown}' if names else 'is none'}"
+        f"nothing to import at {given}: give a file or folder that docs/logs.md lists, or the id "
+        f"of a Minari data set in {root} ({_ROOT}): {listed(names) or 'there are none'}"
     )
 
 

@@ -183,8 +183,8 @@ def _from_data(source: Source, survey: _Survey) -> Task:
     low, high = _action_bounds(source, survey)
     if source.features and len(source.features) != survey.size:
         raise InputError(
-            f"{source.name} has {survey.size} features, and names of {len(source.features)}: they "
-            "must be as many"
+            f"{source.name} has {survey.size} features, and names of {len(source.features)}: the "
+            "two must be equal"
         )
     try:
         return Task(
